@@ -1,0 +1,77 @@
+"""What every conditional density can do, whatever it is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from zakai.errors import InputError
+
+
+@runtime_checkable
+class Density(Protocol):
+    """A conditional density of the n state coordinates `names`; angles (`periodic`) live on (-pi, pi].
+
+    `log_density(x)` takes (..., n) and gives (...); `mean()` (n,), `cov()` (n, n), `mode()` (n,), `quantile(q)` (len(q), n) of
+    the marginals, `marginal(...)` the density of some of the coordinates, `sample(key, count)` (count, n).
+    """
+
+    names: tuple[str, ...]
+    periodic: tuple[bool, ...]
+
+    def log_density(self, x: np.ndarray) -> np.ndarray: ...
+
+    def mean(self) -> np.ndarray: ...
+
+    def cov(self) -> np.ndarray: ...
+
+    def mode(self) -> np.ndarray: ...
+
+    def quantile(self, q: Sequence[float]) -> np.ndarray: ...
+
+    def marginal(self, coordinates: int | str | Sequence[int | str]) -> Density: ...
+
+    def sample(self, key: object, count: int) -> np.ndarray: ...
+
+
+def coordinate_numbers(names: tuple[str, ...], coordinates: int | str | Sequence[int | str]) -> list[int]:
+    """The numbers of the coordinates that are given by names or numbers."""
+    wanted = [coordinates] if isinstance(coordinates, int | str | np.integer) else list(coordinates)
+    numbers = []
+    for one in wanted:
+        if isinstance(one, str):
+            if one not in names:
+                raise InputError(f"marginal: there is no state '{one}'; the states are {', '.join(names)}")
+            numbers.append(names.index(one))
+        else:
+            if not 0 <= int(one) < len(names):
+                raise InputError(f"marginal: there is no state number {one}; numbers run from 0 to {len(names) - 1}")
+            numbers.append(int(one))
+    return numbers
+
+
+def generator(key: object) -> np.random.Generator:
+    """NumPy's generator from an integer, a generator, or a JAX key."""
+    if isinstance(key, np.random.Generator):
+        return key
+    if isinstance(key, int | np.integer):
+        return np.random.default_rng(int(key))
+    import jax
+
+    data = jax.random.key_data(key) if jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) else key  # type: ignore[attr-defined,arg-type]
+    return np.random.default_rng(np.asarray(data).astype(np.uint64).tolist())
+
+
+def wrap(angle: np.ndarray) -> np.ndarray:
+    """An angle in (-pi, pi]."""
+    return np.pi - np.mod(np.pi - np.asarray(angle, float), 2.0 * np.pi)
+
+
+def probabilities(q: Sequence[float]) -> np.ndarray:
+    """The probabilities asked for, checked."""
+    wanted = np.atleast_1d(np.asarray(q, float))
+    if not np.all((wanted >= 0.0) & (wanted <= 1.0)):
+        raise InputError("quantile: probabilities lie between 0 and 1")
+    return wanted

@@ -1,0 +1,123 @@
+"""Gaussians and finite mixtures of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.special import logsumexp, ndtr
+
+from zakai.densities._density import coordinate_numbers, generator, probabilities, wrap
+
+
+@dataclass(frozen=True)
+class GaussianMixture:
+    """sum_k w_k N(m_k, P_k): `weights` (k,), `means` (k, n), `covs` (k, n, n); one component is a Gaussian.
+
+    A coordinate in `periodic` is wrapped to the circle: its density is summed over the windings that matter.
+    """
+
+    weights: np.ndarray
+    means: np.ndarray
+    covs: np.ndarray
+    names: tuple[str, ...]
+    periodic: tuple[bool, ...]
+
+    @classmethod
+    def gaussian(cls, mean, cov, names, periodic) -> GaussianMixture:
+        """A single Gaussian with mean (n,) and covariance (n, n)."""
+        return cls(np.ones(1), np.asarray(mean)[None], np.asarray(cov)[None], names, periodic)
+
+    def log_density(self, x: np.ndarray) -> np.ndarray:
+        x = np.asarray(x, float)
+        if x.shape[-1:] != (len(self.names),):
+            x = x[..., None] if len(self.names) == 1 else x
+        parts = []
+        for weight, mean, cov in zip(self.weights, self.means, self.covs, strict=True):
+            factor = np.linalg.cholesky(cov)
+            constant = np.log(weight) - np.sum(np.log(np.diag(factor))) - 0.5 * len(mean) * np.log(2 * np.pi)
+            for winding in self._windings(cov):
+                difference = self._difference(x, mean) + winding
+                white = solve_triangular(factor, difference.reshape(-1, len(mean)).T, lower=True)
+                parts.append(constant - 0.5 * np.sum(white**2, axis=0).reshape(x.shape[:-1]))
+        return logsumexp(np.stack(parts), axis=0)
+
+    def _difference(self, x, mean):
+        difference = x - mean
+        return np.where(self.periodic, wrap(difference), difference)
+
+    def _windings(self, cov):
+        turns = [
+            np.arange(-k, k + 1) * 2 * np.pi
+            for k in (
+                int(np.ceil((np.pi + 9 * np.sqrt(cov[i, i])) / (2 * np.pi))) if angle else 0
+                for i, angle in enumerate(self.periodic)
+            )
+        ]
+        return np.stack(np.meshgrid(*turns, indexing="ij"), axis=-1).reshape(-1, len(turns))
+
+    def mean(self) -> np.ndarray:
+        plain = self.weights @ self.means
+        damping = np.exp(-0.5 * np.diagonal(self.covs, axis1=1, axis2=2))
+        circular = np.angle(self.weights @ (damping * np.exp(1j * self.means)))
+        return np.where(self.periodic, circular, plain)
+
+    def cov(self) -> np.ndarray:
+        deviation = self._difference(self.means, self.mean())
+        return np.einsum("k,kij->ij", self.weights, self.covs) + np.einsum(
+            "k,ki,kj->ij", self.weights, deviation, deviation
+        )
+
+    def mode(self) -> np.ndarray:
+        x = self.means[np.argmax(self.log_density(self.means))]
+        for _ in range(200):  # the mean-shift iteration climbs to the mode near the best component
+            precisions = np.linalg.inv(self.covs)
+            logs = (
+                np.log(self.weights)
+                + 0.5 * np.linalg.slogdet(precisions)[1]
+                - 0.5 * np.einsum("ki,kij,kj->k", x - self.means, precisions, x - self.means)
+            )
+            share = np.exp(logs - logs.max())
+            new = np.linalg.solve(
+                np.einsum("k,kij->ij", share, precisions), np.einsum("k,kij,kj->i", share, precisions, self.means)
+            )
+            if np.allclose(new, x, rtol=1e-12, atol=1e-14):
+                break
+            x = new
+        return np.where(self.periodic, wrap(x), x)
+
+    def quantile(self, q: Sequence[float]) -> np.ndarray:
+        wanted = probabilities(q)
+        deviations = np.sqrt(np.diagonal(self.covs, axis1=1, axis2=2))
+        centre = self.mean()
+        means = centre + self._difference(self.means, centre)
+        out = np.empty((len(wanted), len(self.names)))
+        for i in range(len(self.names)):
+            low = np.full(len(wanted), (means[:, i] - 40 * deviations[:, i]).min())
+            high = np.full(len(wanted), (means[:, i] + 40 * deviations[:, i]).max())
+            for _ in range(200):
+                middle = 0.5 * (low + high)
+                below = ndtr((middle[:, None] - means[:, i]) / deviations[:, i]) @ self.weights < wanted
+                low, high = np.where(below, middle, low), np.where(below, high, middle)
+            out[:, i] = 0.5 * (low + high)
+        out[wanted == 0.0], out[wanted == 1.0] = -np.inf, np.inf
+        return out
+
+    def marginal(self, coordinates) -> GaussianMixture:
+        keep = coordinate_numbers(self.names, coordinates)
+        return GaussianMixture(
+            self.weights,
+            self.means[:, keep],
+            self.covs[:, keep][:, :, keep],
+            tuple(self.names[i] for i in keep),
+            tuple(self.periodic[i] for i in keep),
+        )
+
+    def sample(self, key: object, count: int) -> np.ndarray:
+        rng = generator(key)
+        which = rng.choice(len(self.weights), size=count, p=self.weights)
+        noise = rng.standard_normal((count, len(self.names)))
+        x = self.means[which] + np.einsum("cij,cj->ci", np.linalg.cholesky(self.covs)[which], noise)
+        return np.where(self.periodic, wrap(x), x)

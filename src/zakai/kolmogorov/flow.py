@@ -1,0 +1,228 @@
+"""The affine Hamiltonian flow: how a density moves between observations in a linear-quadratic system.
+
+The equation, with every coefficient a function of time,
+
+    v_t = 1/2 G:Hess v - (L x + l).grad v + (x'Q x + p.x + r) v                                            (1)
+
+is solved by its characteristics.  They obey a linear system in x-coordinates (no square root of G, no inverse of G):
+
+    d/dt [xi; eta] = [[L, -2 G], [Q, -L']] [xi; eta] + [l; p/2],
+
+and its solution over one interval, Phi = [[P11, P12], [P21, P22]], turns (1) into three plain operations:
+
+    v(t1, c1 + P11 xi) = exp(kappa + 2 e1'P11 xi + xi'P11'P21 xi) . (N(0, Sigma) * v(t0, c0 + .))(xi),
+    Sigma = -P11^-1 P12 / 2,                                                                               (2)
+
+*spread* by a Gaussian, *move* along the flow that starts in (c0, 0) and ends in (c1, e1), *weigh* by the potential.  No step
+subtracts large numbers, singular G is allowed, and for Q <= 0 nothing can blow up.  (2) follows from the classical action
+of the quadratic Hamiltonian; it is the kernel of Chen, Luo and Yau (2017), Theorem 2, without its restrictions, and for one
+Gaussian it is the linear-fractional solution of the Riccati equation.
+
+The forcing may depend linearly on inputs e = (1, e_1, ...): l and p are then matrices with a column for each input, and so is
+r.  A rate of observation enters in this way after the flow has been prepared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+from zakai import _float64  # noqa: F401
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+STAGES = 8
+TOLERANCE = 1e-13
+MOST_SUBSTEPS = 4096
+
+
+class Coefficients(NamedTuple):
+    """The coefficients of equation (1) at one time, for n states and k inputs.
+
+    `matrix` is L (n, n), `offset` l (n, k), `covariance` G (n, n), `quadratic` Q (n, n), `linear` p (n, k), `constant` r (k,).
+    """
+
+    matrix: jax.Array
+    offset: jax.Array
+    covariance: jax.Array
+    quadratic: jax.Array
+    linear: jax.Array
+    constant: jax.Array
+
+
+class Flow(NamedTuple):
+    """Equation (2) for one interval, or for many with a leading axis.
+
+    `map` is P11, `spread` Sigma, `bend` the symmetric P11'P21, `lift` P21, `shift` and `push` (n, k) the response of
+    (xi, eta) to the inputs, `action` (k, n) and `action_inputs` (k, k) the linear functional J of the classical action,
+    `growth` (k,) the integral of r, `trace` that of tr L / 2, and `log_volume` log |det P11|.
+    """
+
+    map: jax.Array
+    spread: jax.Array
+    bend: jax.Array
+    lift: jax.Array
+    shift: jax.Array
+    push: jax.Array
+    action: jax.Array
+    action_inputs: jax.Array
+    growth: jax.Array
+    trace: jax.Array
+    log_volume: jax.Array
+
+
+class Motion(NamedTuple):
+    """Equation (2) for one interval and one centre: v(t1, `centre` + map xi) = exp(`log_mass` + `tilt`.xi + xi'bend xi) ..."""
+
+    centre: jax.Array
+    tilt: jax.Array
+    log_mass: jax.Array
+
+
+def motion(flow: Flow, centre: jax.Array, inputs: jax.Array) -> Motion:
+    """The numbers of equation (2) for a lattice or a Gaussian that is centred at `centre` (n,) with inputs e (k,)."""
+    end = flow.map @ centre + flow.shift @ inputs
+    costate = flow.lift @ centre + flow.push @ inputs
+    log_mass = (
+        costate @ end
+        + inputs @ (flow.action @ centre + flow.action_inputs @ inputs)
+        + flow.growth @ inputs
+        + flow.trace
+        - 0.5 * flow.log_volume
+    )
+    return Motion(end, 2.0 * flow.map.T @ costate, log_mass)
+
+
+def move_gaussian(
+    flow: Flow, mean: jax.Array, cov: jax.Array, inputs: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The mean, the covariance and the log-mass of N(mean, cov) after one interval; `cov` may be singular.
+
+    This is the linear-fractional step P = (P11 P0 - P12/2)(P22 - 2 P21 P0)^-1 of the Riccati equation, written as equation (2).
+    """
+    moved = motion(flow, mean, inputs)
+    spread = cov + flow.spread
+    weigh = jnp.eye(mean.shape[0]) - 2.0 * spread @ flow.bend
+    inner = jnp.linalg.solve(weigh, spread)
+    inner = 0.5 * (inner + inner.T)
+    offset = inner @ moved.tilt
+    log_mass = moved.log_mass + 0.5 * moved.tilt @ offset - 0.5 * jnp.linalg.slogdet(weigh)[1]
+    new_cov = flow.map @ inner @ flow.map.T
+    return moved.centre + flow.map @ offset, 0.5 * (new_cov + new_cov.T), log_mass
+
+
+def _gauss_collocation(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The nodes c, the matrix a and the weights b of Gauss' collocation method of order 2 `stages` on [0, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(stages)
+    nodes, weights = (nodes + 1.0) / 2.0, weights / 2.0
+    matrix = np.empty((stages, stages))
+    for j in range(stages):
+        others = np.delete(nodes, j)
+        basis = np.poly1d(np.poly(others) / np.prod(nodes[j] - others))
+        integral = basis.integ()
+        matrix[:, j] = integral(nodes) - integral(0.0)
+    return nodes, matrix, weights
+
+
+_NODES, _MATRIX, _WEIGHTS = _gauss_collocation(STAGES)
+
+
+def _generator(c: Coefficients) -> jax.Array:
+    """The linear system of (xi, eta, inputs, J): J' = (p/2)'xi - l'eta is the action's linear part, a row for each input."""
+    n, k = c.offset.shape
+    top = jnp.hstack([c.matrix, -2.0 * c.covariance, c.offset, jnp.zeros((n, k))])
+    middle = jnp.hstack([c.quadratic, -c.matrix.T, 0.5 * c.linear, jnp.zeros((n, k))])
+    inputs = jnp.zeros((k, 2 * n + 2 * k))
+    action = jnp.hstack([0.5 * c.linear.T, -c.offset.T, jnp.zeros((k, 2 * k))])
+    return jnp.vstack([top, middle, inputs, action])
+
+
+def _one_step(coefficients: Callable[[jax.Array], Coefficients], start: jax.Array, length: jax.Array):
+    """One collocation step from the identity: (Phi - 1, integral of r, integral of tr L / 2)."""
+    at_nodes = jax.vmap(coefficients)(start + length * _NODES)
+    generators = length * jax.vmap(_generator)(at_nodes)
+    size = generators.shape[-1]
+    system = jnp.eye(STAGES * size) - jnp.einsum("ij,iab->iajb", _MATRIX, generators).reshape(STAGES * size, -1)
+    slopes = jnp.linalg.solve(system, generators.reshape(STAGES * size, size)).reshape(STAGES, size, size)
+    deviation = jnp.einsum("i,iab->ab", _WEIGHTS, slopes)
+    growth = length * jnp.einsum("i,ik->k", _WEIGHTS, at_nodes.constant)
+    trace = 0.5 * length * jnp.einsum("i,iaa->", _WEIGHTS, at_nodes.matrix)
+    return deviation, growth, trace
+
+
+def integrate(
+    coefficients: Callable[[jax.Array], Coefficients], start: jax.Array, stop: jax.Array, substeps: int
+) -> Flow:
+    """The flow over [start, stop] in `substeps` equal steps of Gauss' collocation method (order 16); pure."""
+    length = (stop - start) / substeps
+
+    def add(carry, index):
+        deviation, growth, trace = carry
+        step, more_growth, more_trace = _one_step(coefficients, start + index * length, length)
+        return (deviation + step + step @ deviation, growth + more_growth, trace + more_trace), None
+
+    first = _one_step(coefficients, start, length)
+    (deviation, growth, trace), _ = jax.lax.scan(add, first, jnp.arange(1, substeps))
+    k = growth.shape[0]
+    n = deviation.shape[0] // 2 - k
+    one = jnp.eye(n)
+    p11, p12 = one + deviation[:n, :n], deviation[:n, n : 2 * n]
+    p21 = deviation[n : 2 * n, :n]
+    spread = -0.5 * jnp.linalg.solve(p11, p12)
+    bend = p11.T @ p21
+    return Flow(
+        map=p11,
+        spread=0.5 * (spread + spread.T),
+        bend=0.5 * (bend + bend.T),
+        lift=p21,
+        shift=deviation[:n, 2 * n : 2 * n + k],
+        push=deviation[n : 2 * n, 2 * n : 2 * n + k],
+        action=deviation[2 * n + k :, :n],
+        action_inputs=deviation[2 * n + k :, 2 * n : 2 * n + k],
+        growth=growth,
+        trace=trace,
+        log_volume=jnp.linalg.slogdet(p11)[1],
+    )
+
+
+@partial(jax.jit, static_argnums=(0, 4))
+def _integrate_all(coefficients, starts, stops, arguments, substeps):
+    def one(start, stop, argument):
+        return integrate(lambda t: coefficients(t, argument), start, stop, substeps)
+
+    return jax.vmap(one)(starts, stops, arguments)
+
+
+def flows(
+    coefficients: Callable[[jax.Array, object], Coefficients],
+    starts: np.ndarray,
+    stops: np.ndarray,
+    arguments: object,
+    tolerance: float = TOLERANCE,
+) -> Flow:
+    """The flows over all intervals [starts_i, stops_i] at once, accurate to `tolerance`.
+
+    `coefficients(t, argument)` gives the `Coefficients` at time t; `arguments` is a pytree with an entry for each interval.
+    The number of substeps is doubled until halving the step changes nothing on the intervals that are tried: the longest and
+    a spread of others.
+    """
+    lengths = stops - starts
+    tried = np.unique(np.r_[np.argmax(lengths), np.linspace(0, len(starts) - 1, min(len(starts), 48)).astype(int)])
+    sample = jax.tree.map(lambda a: a[tried], arguments)
+    substeps, previous, error = 1, None, np.inf
+    while True:
+        flow = _integrate_all(coefficients, starts[tried], stops[tried], sample, substeps)
+        if previous is not None:
+            last, error = error, max(_difference(a, b) for a, b in zip(previous, flow, strict=True))
+            # Below 1e-11 rounding may stop the error from falling further.
+            if error <= tolerance or (error <= 1e-11 and error >= 0.25 * last) or substeps >= MOST_SUBSTEPS:
+                break
+        previous, substeps = flow, 2 * substeps
+    return _integrate_all(coefficients, starts, stops, arguments, substeps // 2)
+
+
+def _difference(a: jax.Array, b: jax.Array) -> float:
+    difference = float(jnp.max(jnp.abs(a - b), initial=0.0)) / (1.0 + float(jnp.max(jnp.abs(b), initial=0.0)))
+    return difference if np.isfinite(difference) else np.inf
