@@ -1,0 +1,46 @@
+# What a newcomer types: `make demo`, then `make test`. PYTHON=python3.12 chooses another interpreter (3.11 or newer).
+
+PYTHON ?= python3
+BIN := .venv/bin
+EXAMPLE := examples/wind-vane
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test slow clean
+
+help:
+	@echo "make demo    filter a year of real wind directions; draws $(EXAMPLE)/out/wind-vane.html"
+	@echo "make test    linter, type checker and the fast tests"
+	@echo "make slow    the tests that take minutes"
+	@echo "make clean   remove the environment and everything that was generated"
+
+# The stamps say which extras the environment holds; they are older than pyproject.toml when it must be brought up to date.
+.venv/pyvenv.cfg:
+	$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("zakai needs Python 3.11 or newer: make PYTHON=python3.12 ...")'
+	$(PYTHON) -m venv .venv
+
+.venv/.plots: pyproject.toml | .venv/pyvenv.cfg
+	$(BIN)/python -m pip install --quiet --editable '.[plots]'
+	@touch $@
+
+.venv/.dev: pyproject.toml | .venv/pyvenv.cfg
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@touch $@
+
+demo: .venv/.plots
+	mkdir -p $(EXAMPLE)/out
+	$(BIN)/zakai filter $(EXAMPLE)/wind-vane.toml $(EXAMPLE)/observations.csv \
+	    -o $(EXAMPLE)/out/wind-vane.nc --report $(EXAMPLE)/out/wind-vane.html
+	@echo "Open $(EXAMPLE)/out/wind-vane.html in a browser."
+
+test: .venv/.dev
+	$(BIN)/ruff check .
+	$(BIN)/mypy src
+	$(BIN)/python -m pytest -q -m "not slow"
+
+# pytest says 5 when no test is marked slow, which is no failure.
+slow: .venv/.dev
+	$(BIN)/python -m pytest -q -m slow || [ $$? -eq 5 ]
+
+clean:
+	rm -rf .venv build dist $(EXAMPLE)/out .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
