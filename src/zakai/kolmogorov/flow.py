@@ -108,7 +108,7 @@ def move_gaussian(
     inner = jnp.linalg.solve(weigh, spread)
     inner = 0.5 * (inner + inner.T)
     offset = inner @ moved.tilt
-    log_mass = moved.log_mass + 0.5 * moved.tilt @ offset - 0.5 * jnp.linalg.slogdet(weigh)[1]
+    log_mass = moved.log_mass + 0.5 * moved.tilt @ offset - 0.5 * jnp.linalg.slogdet(weigh)[1] + flow.log_volume
     new_cov = flow.map @ inner @ flow.map.T
     return moved.centre + flow.map @ offset, 0.5 * (new_cov + new_cov.T), log_mass
 
