@@ -1,0 +1,170 @@
+"""What a user may write for a key, as plain Python: formulas as text, numbers, lists of a required shape, names."""
+
+from __future__ import annotations
+
+import keyword
+import math
+import numbers
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from decimal import Decimal
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import sympy
+from sympy.printing.str import StrPrinter
+
+from zakai.errors import InputError
+from zakai.models._errors import did_you_mean, echo, listing, named
+from zakai.models.expressions import RESERVED, parse_expression
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}\Z")
+
+
+class _GrammarPrinter(StrPrinter):
+    """SymPy to a formula in the grammar of model files."""
+
+    def _print_Abs(self, expr: sympy.Abs) -> str:
+        return f"abs({self._print(expr.args[0])})"
+
+    def _print_Exp1(self, expr: sympy.Expr) -> str:
+        return "exp(1)"
+
+    def _print_Float(self, expr: sympy.Float) -> str:
+        return self._print(sympy.Rational(str(expr)))
+
+
+def kind_of(value: Any) -> str:
+    """What a value is, in the user's words."""
+    if isinstance(value, bool | np.bool_):
+        return "a boolean"
+    if isinstance(value, str):
+        return f"the text {echo(value)}"
+    if isinstance(value, numbers.Number | Decimal | sympy.Number):
+        return f"the number {echo(value)}"
+    if isinstance(value, Mapping):
+        return "a table"
+    if isinstance(value, list | tuple | np.ndarray | sympy.MatrixBase):
+        return "a list"
+    return "nothing" if value is None else f"a {type(value).__name__}"
+
+
+def formula(value: Any) -> str:
+    """The text of one formula given as text, number or SymPy expression."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, bool | np.bool_):
+        raise InputError("expected a formula in quotes or a number, got a boolean")
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float | Decimal) and not math.isfinite(value):
+        raise InputError(f"expected a finite number, got {value}")
+    if isinstance(value, float | int | Decimal | Fraction):
+        try:
+            return str(value)
+        except ValueError:  # Python refuses to print integers of more than 4,300 digits
+            raise InputError("the number has more than 40 significant digits") from None
+    if isinstance(value, sympy.Expr):
+        return _GrammarPrinter().doprint(value)
+    raise InputError(f"expected a formula in quotes or a number, got {kind_of(value)}")
+
+
+def exact_number(value: Any) -> sympy.Rational:
+    """A rational number, given as a number or as a text like \"1/3\"."""
+    text = formula(value)
+    result = parse_expression(text, {})
+    if not result.is_Rational:
+        raise InputError(f"expected a rational number, got {echo(text)}")
+    return result
+
+
+def number(value: Any) -> float:
+    """A finite number as a double."""
+    if isinstance(value, str) or not isinstance(value, numbers.Real | Decimal | sympy.Number) or isinstance(value, bool | np.bool_):
+        raise InputError(f"expected a number, got {kind_of(value)}")
+    try:
+        result = float(value)
+    except OverflowError:
+        result = math.inf
+    if not math.isfinite(result):
+        raise InputError(f"expected a finite number, got {echo(value)}")
+    return result
+
+
+def array(value: Any, shape: tuple[int, ...], expected: str) -> np.ndarray:
+    """Numbers in nested lists of exactly this shape; `expected` says the shape in words."""
+    if not shape:
+        return np.float64(number(value))
+    entries = items(value, shape[0], expected)
+    parts = []
+    for index, entry in enumerate(entries):
+        with named(f"entry {index + 1}"):
+            parts.append(array(entry, shape[1:], expected))
+    return np.array(parts, dtype=float).reshape(shape)
+
+
+def items(value: Any, length: int | None, expected: str) -> list[Any]:
+    """A list of the required length; `expected` says in words what it should be."""
+    if isinstance(value, sympy.MatrixBase | np.ndarray):
+        value = value.tolist()
+    if not isinstance(value, list | tuple):
+        raise InputError(f"expected {expected}, got {kind_of(value)}")
+    if length is not None and len(value) != length:
+        raise InputError(f"expected {expected}, got a list of {len(value)}")
+    return list(value)
+
+
+def vector_of_formulas(value: Any, length: int | None, expected: str) -> list[str]:
+    """A list of formulas; a SymPy column is one too."""
+    if isinstance(value, sympy.MatrixBase) and 1 in value.shape:
+        value = list(value)
+    texts = []
+    for index, entry in enumerate(items(value, length, expected)):
+        with named(f"[{index}]"):
+            texts.append(formula(entry))
+    return texts
+
+
+def matrix_of_formulas(value: Any, rows: int, columns: int | None, expected: str) -> list[list[str]]:
+    """Rows of formulas, all of one length."""
+    table = items(value, rows, expected)
+    for index, row in enumerate(table):
+        with named(f"[{index}]"):
+            row = items(row, None, expected)
+            columns = columns if columns is not None else max(len(row), 1)
+            if len(row) != columns:
+                raise InputError(f"expected {expected}: {columns} in each row, got {len(row)}")
+            table[index] = vector_of_formulas(row, columns, expected)
+    return table
+
+
+def names(value: Any, expected: str) -> tuple[str, ...]:
+    """A list of different, allowed names."""
+    found: list[str] = []
+    for index, name in enumerate(items(value, None, expected)):
+        with named(f"[{index}]"):
+            if not isinstance(name, str):
+                raise InputError(f"expected a name in quotes, got {kind_of(name)}")
+            allowed_name(name)
+            if name in found:
+                raise InputError(f"the name {name!r} is given twice")
+            found.append(name)
+    return tuple(found)
+
+
+def allowed_name(name: str) -> None:
+    """Raise InputError unless the name can stand in a formula."""
+    if not _NAME.match(name):
+        raise InputError(f"{echo(name)} is not a name; use ASCII letters, digits and _, a letter first, at most 64")
+    if keyword.iskeyword(name):
+        raise InputError(f"{name!r} is a keyword of Python and cannot be a name; try {name + '_'!r}")
+    if name in RESERVED:
+        raise InputError(f"{name!r} already has a meaning in formulas and cannot be a name")
+
+
+def known_keys(keys: Iterable[str], allowed: Sequence[str]) -> None:
+    """Raise InputError at the first key that is not allowed."""
+    for key in keys:
+        if key not in allowed:
+            raise InputError(f"unknown key {echo(key, 40)}{did_you_mean(key, allowed)} (the keys are {listing(allowed)})")

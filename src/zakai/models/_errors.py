@@ -1,0 +1,36 @@
+"""Words shared by the errors of this room: where something is wrong, and what the user may have meant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from difflib import get_close_matches
+
+from zakai.errors import InputError
+
+
+@contextmanager
+def named(place: str) -> Iterator[None]:
+    """Put the place (a file, a key) in front of any InputError raised inside; its type is kept."""
+    try:
+        yield
+    except InputError as error:
+        error.args = (f"{place}: {error}",)
+        raise
+
+
+def echo(value: object, length: int = 20) -> str:
+    """The value as one short printable word, whatever it holds."""
+    text = value if isinstance(value, str) else str(value)[:200]
+    return ascii(text if len(text) <= length else text[:length] + "...")
+
+
+def did_you_mean(word: str, options: Iterable[str]) -> str:
+    """`; did you mean 'drift'?`, or nothing when no option is close."""
+    close = get_close_matches(word[:64], list(options), n=1, cutoff=0.6)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def listing(options: Iterable[str]) -> str:
+    """The options as a list in words, or 'none'."""
+    return ", ".join(options) or "none"

@@ -1,0 +1,212 @@
+"""SymPy expressions as a straight-line program, run on NumPy, on JAX or on plain floats; no code is generated or executed.
+
+Every distinct sub-expression is one instruction, so that common parts are computed once, and the first instruction whose
+value is not finite is the innermost cause of a value that is not finite.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import sympy
+from sympy.core.function import AppliedUndef
+
+from zakai.errors import InputError
+
+_UNARY: dict[type, str] = {
+    sympy.sin: "sin", sympy.cos: "cos", sympy.tan: "tan", sympy.asin: "asin", sympy.acos: "acos", sympy.atan: "atan",
+    sympy.sinh: "sinh", sympy.cosh: "cosh", sympy.tanh: "tanh", sympy.exp: "exp", sympy.log: "log", sympy.erf: "erf",
+    sympy.Abs: "abs", sympy.sign: "sign",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Instruction:
+    """`operation` applied to the values in the slots `operands`; `constant` is a constant or a power's exponent."""
+
+    operation: str
+    operands: tuple[int, ...]
+    constant: Any
+    expr: sympy.Expr
+
+
+class Program:
+    """A list of instructions that computes `expressions` from x (..., n), t and theta (..., p).
+
+    `symbols` are the coordinates of x, then t, then the parameters. Raises InputError for what has no numerical value.
+    """
+
+    def __init__(self, expressions: Sequence[sympy.Expr], symbols: tuple[Sequence, sympy.Symbol, Sequence]):
+        state, time, parameters = symbols
+        self._inputs: dict[sympy.Symbol, tuple[str, int]] = {s: ("x", i) for i, s in enumerate(state)}
+        self._inputs |= {time: ("t", 0)} | {s: ("theta", i) for i, s in enumerate(parameters)}
+        self._slots: dict[sympy.Expr, int] = {}
+        self.instructions: list[Instruction] = []
+        self.outputs = [self._slot(sympy.sympify(e, strict=True)) for e in expressions]
+
+    def _slot(self, expr: sympy.Expr) -> int:
+        if expr not in self._slots:
+            operation, operands, constant = self._translate(expr)
+            slots = tuple(self._slot(operand) for operand in operands)
+            self.instructions.append(Instruction(operation, slots, constant, expr))
+            self._slots[expr] = len(self.instructions) - 1
+        return self._slots[expr]
+
+    def _translate(self, expr: sympy.Expr) -> tuple[str, Sequence[sympy.Expr], Any]:
+        if expr in self._inputs:
+            kind, index = self._inputs[expr]
+            return kind, (), index
+        if expr.is_Number or expr.is_NumberSymbol:
+            return "constant", (), _number(expr)
+        if isinstance(expr, sympy.Add):
+            return "add", expr.args, None
+        if isinstance(expr, sympy.Mul):
+            above, below = [], []
+            for factor in expr.args:
+                base, power = factor.as_base_exp()
+                divides = power.is_Rational and power < 0 and not base.is_Rational
+                (below if divides else above).append(base**-power if divides else factor)
+            if below:
+                return "divide", (_product(above), _product(below)), None
+            return "multiply", expr.args, None
+        if isinstance(expr, sympy.Pow):
+            return self._power(expr)
+        if isinstance(expr, sympy.log) and isinstance(expr.args[0], sympy.cosh):
+            return "logcosh", expr.args[0].args, None  # cosh overflows at 710; its logarithm does not
+        if type(expr) in _UNARY:
+            return _UNARY[type(expr)], expr.args, None
+        if isinstance(expr, AppliedUndef | sympy.Derivative):
+            raise InputError(f"{str(expr)[:60]} is an undetermined function: the model can be analysed, not computed with")
+        if expr.is_Symbol:
+            raise InputError(f"{expr} is neither a state, nor t, nor a parameter")
+        raise InputError(f"{str(expr)[:60]} has no real numerical value")
+
+    @staticmethod
+    def _power(expr: sympy.Pow) -> tuple[str, Sequence[sympy.Expr], Any]:
+        base, power = expr.as_base_exp()
+        if power == sympy.S.Half:
+            return "sqrt", (base,), None
+        if power.is_Rational and power < 0:
+            return "divide", (sympy.S.One, base**-power), None
+        if power.is_Integer:
+            return "power", (base,), int(power)
+        if power.is_Rational:
+            return "power", (base,), _number(power)
+        return "general_power", (base, power), None
+
+    @property
+    def constant_outputs(self) -> bool:
+        """Whether every output is a plain number."""
+        return all(self.instructions[slot].operation == "constant" for slot in self.outputs)
+
+    def run(self, x: Any, t: Any, theta: Any, functions: Mapping[str, Callable]) -> list[Any]:
+        """The value of every instruction; `functions` holds the operations of the array library."""
+        values: list[Any] = []
+        for instruction in self.instructions:
+            match instruction.operation:
+                case "x":
+                    value = x[..., instruction.constant]
+                case "t":
+                    value = t
+                case "theta":
+                    value = theta[..., instruction.constant]
+                case "constant":
+                    value = instruction.constant
+                case "power":
+                    value = functions["power"](values[instruction.operands[0]], instruction.constant)
+                case operation:
+                    value = functions[operation](*(values[slot] for slot in instruction.operands))
+            values.append(value)
+        return values
+
+    def scalar(self, theta: Sequence[float]) -> Callable[[Sequence[float], float], list[float]]:
+        """The program as a function of plain floats (x, t), for loops over time; what does not exist raises ValueError."""
+        steps, fixed, moving = [], [0.0] * len(self.instructions), []
+        for slot, instruction in enumerate(self.instructions):
+            if instruction.operation == "constant":
+                fixed[slot] = instruction.constant
+            elif instruction.operation == "theta":
+                fixed[slot] = float(theta[instruction.constant])
+            elif instruction.operation in ("x", "t"):
+                moving.append((slot, instruction.operation == "x", instruction.constant))
+            else:
+                steps.append((slot, SCALAR[instruction.operation], instruction.operands, instruction.constant))
+
+        def call(x: Sequence[float], t: float) -> list[float]:
+            values = fixed.copy()
+            for slot, is_state, index in moving:
+                values[slot] = x[index] if is_state else t
+            for slot, function, operands, constant in steps:
+                if constant is not None:
+                    values[slot] = function(values[operands[0]], constant)
+                elif len(operands) == 1:
+                    values[slot] = function(values[operands[0]])
+                else:
+                    values[slot] = function(*[values[operand] for operand in operands])
+            return [values[slot] for slot in self.outputs]
+
+        return call
+
+
+def _product(factors: list[sympy.Expr]) -> sympy.Expr:
+    if len(factors) < 2:
+        return factors[0] if factors else sympy.S.One
+    return sympy.Mul(*factors, evaluate=False)
+
+
+def _number(expr: sympy.Expr) -> float:
+    """The nearest double to an exact number of any size."""
+    if not expr.is_Rational:
+        return float(expr)
+    try:
+        return int(expr.p) / int(expr.q)
+    except OverflowError:
+        return math.inf if expr > 0 else -math.inf
+
+
+def operations(xp: Any, erf: Callable, **special: Callable) -> dict[str, Callable]:
+    """The operations of an array library with NumPy's names."""
+    names = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}
+    plain = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "abs", "sign", "sqrt")
+    return {name: getattr(xp, names.get(name, name)) for name in plain} | {
+        "erf": erf,
+        "add": _add,
+        "multiply": _multiply,
+        "divide": lambda a, b: a / b,
+        "power": lambda base, power: base**power,
+        "general_power": lambda base, power: base**power,
+        "logcosh": lambda u: xp.logaddexp(u, -u) - math.log(2),
+    } | special
+
+
+def _add(*terms: Any) -> Any:
+    total = terms[0]
+    for term in terms[1:]:
+        total = total + term
+    return total
+
+
+def _multiply(*factors: Any) -> Any:
+    product = factors[0]
+    for factor in factors[1:]:
+        product = product * factor
+    return product
+
+
+def _float_power(base: float, power: float) -> float:
+    result = base**power
+    if isinstance(result, complex):
+        raise ValueError("fractional power of a negative number")
+    return result
+
+
+_MATH = SimpleNamespace(**{name: getattr(math, name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt")},
+                        arcsin=math.asin, arccos=math.acos, arctan=math.atan, abs=abs, sign=lambda u: (u > 0) - (u < 0))
+SCALAR = operations(
+    _MATH, math.erf, power=_float_power, general_power=_float_power,
+    logcosh=lambda u: abs(u) + math.log1p(math.exp(-2 * abs(u))) - math.log(2),
+)

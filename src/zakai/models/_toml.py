@@ -1,0 +1,46 @@
+"""The keys of a model as the text of a model file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from decimal import Context, Decimal, Inexact
+from typing import Any
+
+import sympy
+
+from zakai.models.expressions import MAX_DIGITS
+
+_OPTIONAL: dict[str, Any] = {"observation_kind": "increments", "start": 0.0, "periodic": (), "functions": ()}
+_ORDER = ("name", "state", "drift", "observation", "observation_kind", "diffusion", "process_noise", "observation_noise",
+          "start", "periodic", "functions")
+
+
+def to_toml(keys: Mapping[str, Any]) -> str:
+    """The TOML of a model's keys, all formulas as text; keys that hold their default are left out."""
+    lines = [f"{key} = {_value(keys[key])}" for key in _ORDER if key not in _OPTIONAL or keys[key] != _OPTIONAL[key]]
+    if keys["parameters"]:
+        lines += ["", "[parameters]", *(f"{name} = {_value(value)}" for name, value in keys["parameters"].items())]
+    if keys["prior"]:
+        lines += ["", "[prior]", *(f"{name} = {_value(value)}" for name, value in keys["prior"].items())]
+    return "\n".join(lines) + "\n"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_value(entry) for entry in value) + "]"
+    if isinstance(value, sympy.Rational):
+        return _rational(value)
+    return repr(float(value))
+
+
+def _rational(value: sympy.Rational) -> str:
+    """A decimal where that is exact and short, otherwise a fraction in quotes."""
+    context = Context(prec=MAX_DIGITS, traps=[Inexact])
+    try:
+        decimal = context.divide(Decimal(int(value.p)), Decimal(int(value.q)))
+    except Inexact:
+        return f'"{value.p}/{value.q}"'
+    return str(decimal).replace("E", "e")

@@ -1,0 +1,105 @@
+"""Checks of a model that need numbers: noise that is noise, and angles on which everything is periodic."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import sympy
+from sympy.core.function import AppliedUndef
+
+from zakai.errors import InputError
+from zakai.models._definite import ROUNDING, is_symmetric, smallest_eigenvalue
+from zakai.models.numeric import numpy_function
+from zakai.models.prior import DensityPrior
+
+if TYPE_CHECKING:
+    from zakai.models.model import Model
+
+COEFFICIENTS = ("diffusion", "process_noise", "observation_noise")
+
+
+def check_noise_at(model: Model, times: Any) -> None:
+    """Check that the noise of a model is noise at every given time.
+
+    S(t) must be positive definite, Q(t) positive semidefinite, and g(t), Q(t), S(t) finite.
+
+    `times` has shape (K,), in the model's unit of time. Raises InputError naming the model, the key and the first time.
+
+        >>> check_noise_at(zakai.load_model("gallery:spiral-sensor"), [0.0, 10.0])
+    """
+    for key in COEFFICIENTS:
+        problem = _problem(model, key, np.atleast_1d(np.asarray(times, dtype=float)))
+        if problem:
+            index, words = problem
+            when = f" at t = {np.atleast_1d(times)[index]:.12g}" if getattr(model, key).has(model.t) else ""
+            raise InputError(f"{model.source}: {key}: {words[0]}{when}{words[1]}")
+
+
+def check_constant_noise(model: Model) -> None:
+    """The checks of `check_noise_at` for those matrices that do not depend on time; the error names the key only."""
+    for key in COEFFICIENTS:
+        matrix = getattr(model, key)
+        if not matrix.has(model.t) and not matrix.atoms(AppliedUndef):
+            problem = _problem(model, key, np.array([model.start]))
+            if problem:
+                raise InputError(f"{key}: {problem[1][0]}{problem[1][1]}")
+
+
+def _problem(model: Model, key: str, times: np.ndarray) -> tuple[int, tuple[str, str]] | None:
+    """The first time at which the matrix is not what it must be, and the words before and after that time."""
+    matrices = numpy_function(getattr(model, key), model, getattr(model, key).shape)(np.zeros(model.n), times, model.theta())
+    finite = np.isfinite(matrices).all(axis=(-2, -1))
+    if not finite.all():
+        return int(np.argmin(finite)), ("is not finite", "")
+    if key == "diffusion":
+        return None
+    symmetric = is_symmetric(matrices)
+    if not symmetric.all():
+        return int(np.argmin(symmetric)), ("is not symmetric", "")
+    smallest = smallest_eigenvalue(matrices)
+    if key == "observation_noise":
+        good = smallest > ROUNDING * model.m
+        words = ("is not positive definite", "; every direction of the observation needs noise of its own")
+    else:
+        good = smallest >= -ROUNDING * len(matrices[0])
+        words = ("is not positive semidefinite", "; a covariance has no negative direction")
+    return None if good.all() else (int(np.argmin(good)), words)
+
+
+def check_periodic(model: Model) -> None:
+    """Check that drift, observation and a prior density are 2 pi-periodic in every angle, at random points.
+
+    Raises InputError naming the entry. Undetermined functions are taken as periodic.
+    """
+    rng = np.random.default_rng(0)
+    entries = [(f"{key}[{i}]", expr) for key in ("drift", "observation") for i, expr in enumerate(getattr(model, key))]
+    if isinstance(model.prior, DensityPrior):
+        entries.append(("prior: log_density", model.prior.log_density))
+    for angle in model.periodic:
+        column = model.state.index(angle)
+        x = rng.normal(size=(24, model.n)) * 3
+        x[:, column] = rng.uniform(-np.pi, np.pi, size=24)
+        turned = x.copy()
+        turned[:, column] += 2 * np.pi * rng.choice([-2, -1, 1, 3], size=24)
+        t = model.start + rng.uniform(0, 10, size=24)
+        for place, expr in entries:
+            if not expr.has(model.x[column]) or expr.atoms(AppliedUndef):
+                continue
+            value = numpy_function([expr], model, ())
+            here, there = value(x, t, model.theta()), value(turned, t, model.theta())
+            with np.errstate(invalid="ignore"):
+                same = (np.abs(here - there) <= 1e-8 * (1 + np.abs(here))) | (~np.isfinite(here) & ~np.isfinite(there))
+            if not same.all():
+                text = str(expr)[:60]
+                raise InputError(f"{place}: {text} is not 2*pi-periodic in {angle!r}, which is listed in periodic")
+
+
+def check_independent_of_state(matrix: sympy.MatrixBase, x: tuple[sympy.Symbol, ...]) -> None:
+    """Raise InputError at the first entry that depends on the state."""
+    for index, expr in enumerate(matrix):
+        found = expr.free_symbols & set(x)
+        if found:
+            row, column = divmod(index, matrix.shape[1])
+            name = min(str(symbol) for symbol in found)
+            raise InputError(f"[{row}][{column}]: depends on the state {name!r}; it may depend on t and on parameters only")

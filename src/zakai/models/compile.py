@@ -1,0 +1,80 @@
+"""The formulas of a model as JAX functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+from zakai import _float64  # noqa: F401  (sets double precision before JAX is used)
+
+import jax  # isort: skip
+import jax.numpy as jnp  # isort: skip
+import numpy as np
+
+from zakai.models._program import operations
+from zakai.models.numeric import flattened, program_of
+
+if TYPE_CHECKING:
+    from zakai.models.model import Model
+
+JaxFunction = Callable[[Any, Any, Any], jax.Array]
+_JAX = operations(jnp, jax.scipy.special.erf)
+
+
+def jax_function(expressions: Any, model: Model, shape: Sequence[int] | None = None) -> JaxFunction:
+    """The expressions as one pure JAX function f(x, t, theta).
+
+    `expressions` is a list or Matrix in the model's state, t and parameters; `shape` is the shape of the value (by default the
+    Matrix' own, and (k,) for a column). f takes x (n,), a scalar t and theta (p,), returns float64, and may be used under `jit`,
+    `vmap` and `grad`. Raises InputError for an undetermined function.
+
+        >>> jax_function(model.drift, model)(jnp.zeros(1), 0.0, model.theta())
+        Array([0.], dtype=float64)
+    """
+    flat, shape = flattened(expressions, shape)
+    program = program_of(flat, model)
+
+    if program.constant_outputs:
+        constant = np.array([program.instructions[slot].constant for slot in program.outputs], dtype=float).reshape(shape)
+        return lambda x, t, theta: jnp.asarray(constant)
+
+    def function(x: Any, t: Any, theta: Any) -> jax.Array:
+        x, t, theta = (jnp.asarray(a, dtype=jnp.float64) for a in (x, t, theta))
+        values = program.run(x, t, theta, _JAX)
+        return jnp.stack([jnp.asarray(values[slot], dtype=jnp.float64) for slot in program.outputs]).reshape(shape)
+
+    return function
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledModel:
+    """The parts of a model as JAX functions of (x, t, theta); `covariance` is G = g Q g'."""
+
+    drift: JaxFunction
+    observation: JaxFunction
+    diffusion: JaxFunction
+    process_noise: JaxFunction
+    covariance: JaxFunction
+    observation_noise: JaxFunction
+
+
+_COMPILED: WeakKeyDictionary[Model, CompiledModel] = WeakKeyDictionary()
+
+
+def compile_model(model: Model) -> CompiledModel:
+    """All parts of a model as JAX functions, made once for each model object.
+
+    Values have the shapes drift (n,), observation (m,), diffusion (n, r), process_noise (r, r), covariance (n, n) and
+    observation_noise (m, m). Raises InputError for a model with undetermined functions.
+
+        >>> compile_model(model).covariance(jnp.zeros(1), 0.0, model.theta())
+        Array([[1.]], dtype=float64)
+    """
+    if model not in _COMPILED:
+        matrices = ("diffusion", "process_noise", "covariance", "observation_noise")
+        parts = {key: jax_function(getattr(model, key), model, getattr(model, key).shape) for key in matrices}
+        vectors = {key: jax_function(getattr(model, key), model) for key in ("drift", "observation")}
+        _COMPILED[model] = CompiledModel(**vectors, **parts)
+    return _COMPILED[model]

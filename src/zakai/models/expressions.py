@@ -1,0 +1,250 @@
+"""Formulas of model files: text -> our own immutable tree (`parse`) -> SymPy (`to_sympy`), with bounds on everything.
+
+    sum      = product (("+" | "-") product)*
+    product  = unary (("*" | "/") unary)*
+    unary    = ("+" | "-")* power
+    power    = atom ["**" unary]                    as in Python: -x**2 = -(x**2), 2**-1 = 1/2, 2**3**2 = 2**9
+    atom     = number | "pi" | name | name "(" sum ("," sum)* ")" | "(" sum ")"
+
+Nothing is ever evaluated as Python; a formula from a stranger can do nothing but be a formula.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+
+import sympy
+
+from zakai.errors import InputError
+from zakai.models._errors import echo
+
+MAX_LENGTH = 10_000
+MAX_DEPTH = 100
+MAX_DIGITS = 40
+MAX_DECIMAL_EXPONENT = 308
+
+FUNCTIONS = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "erf", "abs")
+RESERVED = ("t", "pi", *FUNCTIONS)
+
+
+class ExpressionError(InputError):
+    """A formula that cannot be read, with the 1-based column where it goes wrong in `position`."""
+
+    def __init__(self, message: str, position: int):
+        super().__init__(f"column {position}: {message}")
+        self.position = position
+
+
+# ---- the tree; `position` is the 1-based column where the node begins
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    value: Fraction
+    position: int
+
+
+@dataclass(frozen=True, slots=True)
+class Name:
+    name: str
+    position: int
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    name: str
+    arguments: tuple[Node, ...]
+    position: int
+
+
+@dataclass(frozen=True, slots=True)
+class Negative:
+    operand: Node
+    position: int
+
+
+@dataclass(frozen=True, slots=True)
+class Power:
+    base: Node
+    exponent: Node
+    position: int
+
+
+@dataclass(frozen=True, slots=True)
+class Sum:
+    """The sum of the terms, those with sign False subtracted: long sums stay flat."""
+
+    terms: tuple[tuple[bool, Node], ...]
+    position: int
+
+
+@dataclass(frozen=True, slots=True)
+class Product:
+    """The product of the factors, those with sign False divided by."""
+
+    factors: tuple[tuple[bool, Node], ...]
+    position: int
+
+
+Node = Number | Name | Call | Negative | Power | Sum | Product
+
+
+# ---- text -> tree
+
+_TOKEN = re.compile(
+    r"(?P<space>[ \t\r\n]+)|(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
+    r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*)|(?P<symbol>\*\*|[-+*/(),])"
+)
+_HINTS = {"^": "; write ** for a power", "%": "; there is no modulo", "[": "; there is no indexing", ".": "; there are no attributes",
+          "=": "; write one formula, not an equation", "<": "; there are no comparisons", ">": "; there are no comparisons"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Token:
+    kind: str  # number, name, end, or the symbol itself
+    text: str
+    position: int
+
+
+def _tokens(text: str) -> Iterator[_Token]:
+    start = 0
+    while start < len(text):
+        match = _TOKEN.match(text, start)
+        if match is None:
+            raise ExpressionError(f"unexpected character in {echo(text[start:start + 21])}{_HINTS.get(text[start], '')}", start + 1)
+        kind, word = match.lastgroup or "", match.group()
+        if kind != "space":
+            yield _Token(word if kind == "symbol" else kind, word, start + 1)
+        start = match.end()
+    yield _Token("end", "", len(text) + 1)
+
+
+def parse(text: str) -> Node:
+    """Read a formula into a tree.
+
+    `text` is one formula in the grammar above. Raises `ExpressionError`, with the column, for anything that is not in the
+    grammar, longer than 10,000 characters or nested deeper than 100 levels.
+
+        >>> parse("-2*x")
+        Product(factors=((True, Negative(operand=Number(value=Fraction(2, 1), position=2), position=1)), ...
+    """
+    if len(text) > MAX_LENGTH:
+        raise ExpressionError(f"the formula has {len(text)} characters; at most {MAX_LENGTH} are read", MAX_LENGTH + 1)
+    parser = _Parser(text)
+    if parser.token.kind == "end":
+        raise ExpressionError("the formula is empty", 1)
+    tree = parser.sum(0)
+    if parser.token.kind != "end":
+        raise parser.unexpected("an operator")
+    return tree
+
+
+class _Parser:
+    """Recursive descent; `depth` counts open parentheses, signs and exponents and bounds Python's own stack."""
+
+    def __init__(self, text: str):
+        self._rest = _tokens(text)
+        self.token = next(self._rest)
+
+    def advance(self) -> _Token:
+        token, self.token = self.token, next(self._rest, self.token)
+        return token
+
+    def unexpected(self, wanted: str) -> ExpressionError:
+        token = self.token
+        if token.kind == "end":
+            return ExpressionError(f"the formula ends where {wanted} was expected", token.position)
+        hint = "; write * to multiply" if wanted == "an operator" and token.kind in ("name", "number", "(") else ""
+        return ExpressionError(f"expected {wanted}, got {echo(token.text)}{hint}", token.position)
+
+    def expect(self, kind: str) -> None:
+        if self.token.kind != kind:
+            raise self.unexpected(f"'{kind}'")
+        self.advance()
+
+    def sum(self, depth: int) -> Node:
+        position = self.token.position
+        terms = [(True, self.product(depth))]
+        while self.token.kind in ("+", "-"):
+            terms.append((self.advance().kind == "+", self.product(depth)))
+        return terms[0][1] if len(terms) == 1 else Sum(tuple(terms), position)
+
+    def product(self, depth: int) -> Node:
+        position = self.token.position
+        factors = [(True, self.unary(depth))]
+        while self.token.kind in ("*", "/"):
+            factors.append((self.advance().kind == "*", self.unary(depth)))
+        return factors[0][1] if len(factors) == 1 else Product(tuple(factors), position)
+
+    def unary(self, depth: int) -> Node:
+        position, negative = self.token.position, False
+        while self.token.kind in ("+", "-"):
+            negative ^= self.advance().kind == "-"
+        base_position, base = self.token.position, self.atom(depth)
+        if self.token.kind == "**":
+            self.advance()
+            base = Power(base, self.unary(self.deeper(depth)), base_position)
+        return Negative(base, position) if negative else base
+
+    def atom(self, depth: int) -> Node:
+        token = self.token
+        if token.kind == "number":
+            return Number(_number(self.advance()), token.position)
+        if token.kind == "name":
+            self.advance()
+            if self.token.kind != "(":
+                return Name(token.text, token.position)
+            self.advance()
+            arguments = [self.sum(self.deeper(depth))]
+            while self.token.kind == ",":
+                self.advance()
+                arguments.append(self.sum(self.deeper(depth)))
+            self.expect(")")
+            return Call(token.text, tuple(arguments), token.position)
+        if token.kind == "(":
+            self.advance()
+            inside = self.sum(self.deeper(depth))
+            self.expect(")")
+            return inside
+        raise self.unexpected("a number, a name or '('")
+
+    def deeper(self, depth: int) -> int:
+        if depth >= MAX_DEPTH:
+            raise ExpressionError(f"nested deeper than {MAX_DEPTH} levels", self.token.position)
+        return depth + 1
+
+
+def _number(token: _Token) -> Fraction:
+    """The decimal as an exact rational; its size is checked before any large integer is made."""
+    mantissa, _, exponent = token.text.lower().partition("e")
+    whole, _, decimals = mantissa.partition(".")
+    digits = (whole + decimals).strip("0")
+    if len(digits) > MAX_DIGITS:
+        raise ExpressionError(f"the number {echo(token.text)} has more than {MAX_DIGITS} significant digits", token.position)
+    if not digits:
+        return Fraction(0)
+    magnitude = exponent.lstrip("+-").lstrip("0")
+    leading = len(whole.lstrip("0")) or -(len(decimals) - len(decimals.lstrip("0")))
+    if len(magnitude) > 3 or abs(int(exponent or "0") + leading - 1) > MAX_DECIMAL_EXPONENT:
+        raise ExpressionError(f"the number {echo(token.text)} is outside 1e-308 to 1e308", token.position)
+    return Fraction(int(digits)) * Fraction(10) ** (int(exponent or "0") + leading - len(digits))
+
+
+def parse_expression(
+    text: str, symbols: Mapping[str, sympy.Expr], functions: Collection[str] = ()
+) -> sympy.Expr:
+    """Read a formula into SymPy, with decimals as exact rationals.
+
+    `text` is one formula; `symbols` maps each name it may use to the symbol that stands for it; `functions` names the
+    undetermined functions. Raises `ExpressionError` with the column for anything else, for a constant that does not exist
+    (1/0, log(-1)) and for powers and numbers that grow beyond the bounds.
+
+        >>> x = sympy.Symbol("x", real=True)
+        >>> parse_expression("0.5*x**2", {"x": x})
+        x**2/2
+    """
+    from zakai.models._exact import to_sympy
+
+    return to_sympy(parse(text), symbols, functions)

@@ -1,0 +1,72 @@
+"""Model files: TOML in, a Model out, and every error as one line that names the file and the key."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+from zakai.errors import InputError
+from zakai.models._errors import named
+from zakai.models.model import Model
+
+MAX_BYTES = 1 << 20
+
+
+def load_model(source: str | os.PathLike[str]) -> Model:
+    """Read a model from a model file or from the gallery.
+
+    `source` is the path of a TOML file of at most 1 MiB, or `gallery:NAME`. Raises InputError, in one line that names the
+    file and the key, for a file that cannot be read or is not a model.
+
+        >>> load_model("gallery:spiral-sensor").state
+        ('x',)
+    """
+    if isinstance(source, str) and source.startswith("gallery:"):
+        from zakai.models import gallery
+
+        return gallery.load(source.removeprefix("gallery:"))
+    try:
+        path = Path(source)
+    except TypeError:
+        raise InputError(f"a model is a path or gallery:NAME, got a {type(source).__name__}") from None
+    shown = str(source) if str(source).isprintable() else ascii(str(source))
+    return read_model(_read_text(path, shown), shown)
+
+
+def read_model(text: str, source: str) -> Model:
+    """The model in the text of a model file; `source` is what errors call it."""
+    with named(source):
+        return Model(**_read_keys(text), _source=source, _text=text)
+
+
+def _read_text(path: Path, shown: str) -> str:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        hint = "; the models of the gallery are named gallery:NAME" if path.suffix == "" else ""
+        raise InputError(f"{shown}: there is no such file{hint}") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{shown}: cannot be read: {getattr(error, 'strerror', None) or 'not a path'}") from None
+    if len(data) > MAX_BYTES:
+        raise InputError(f"{shown}: larger than 1 MiB, which no model file is")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{shown}: byte {error.start + 1} is not UTF-8 text; a model file is TOML") from None
+
+
+def _read_keys(text: str) -> dict[str, Any]:
+    try:
+        # Decimals stay exact, and 1e999999999 is never computed.
+        keys = tomllib.loads(text, parse_float=Decimal)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"is not TOML: {' '.join(str(error).split())[:200]}") from None
+    except (ValueError, ArithmeticError):
+        raise InputError("is not TOML: it holds a number that cannot be read") from None
+    except RecursionError:
+        raise InputError("is not a model: its lists are nested too deep") from None
+    return keys

@@ -1,0 +1,230 @@
+"""The model: what the system is, checked once and then immutable. SymPy inside, no numerics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import sympy
+
+from zakai.errors import InputError
+from zakai.models import _entries, checks
+from zakai.models._errors import did_you_mean, listing, named
+from zakai.models._toml import to_toml
+from zakai.models.expressions import parse_expression
+from zakai.models.prior import Prior, read_prior
+
+KEYS = ("name", "state", "drift", "observation", "observation_kind", "diffusion", "process_noise", "observation_noise",
+        "start", "periodic", "functions", "parameters", "prior")
+OBSERVATION_KINDS = ("increments", "path", "rates", "samples")
+
+
+class Model:
+    """A continuous-time stochastic system and what is observed of it.
+
+        dx = f(x,t) dt + g(t) dv      E dv dv' = Q(t) dt      x in R^n
+        dy = h(x,t) dt + dw           E dw dw' = S(t) dt      y in R^m       ("increments", "path", "rates")
+        z_k = h(x(t_k), t_k) + r_k    r_k ~ N(0, S(t_k))                     ("samples")
+
+    Keywords, each as in a model file; a formula is a text, a number or a SymPy expression whose symbols are meant by name:
+
+    * `state`: n names; `drift`: f, n formulas; `observation`: h, m formulas (these three are required);
+    * `observation_kind`: increments (the default), path, rates or samples;
+    * `diffusion`: g, n rows of r formulas; `process_noise`: Q, r x r; `observation_noise`: S, m x m; in t and parameters only,
+      by default identities; covariances are per unit time, or per reading for samples;
+    * `start`: the time at which the prior holds; `periodic`: states that are angles (period 2 pi);
+    * `parameters`: name -> number; `functions`: names of undetermined functions, for analysis only;
+    * `prior`: a table as in a model file, or a `GaussianPrior`, `MixturePrior` or `DensityPrior`; `name`: a title.
+
+    Raises InputError, in one line that names the key, for anything that is missing, unknown or does not fit.
+
+        >>> Model(state=["x"], drift=["-a*x"], observation=["sin(x)"], parameters={"a": 0.5}).drift
+        Matrix([[-x/2*a]])
+    """
+
+    name: str
+    state: tuple[str, ...]
+    x: tuple[sympy.Symbol, ...]
+    t: sympy.Symbol
+    n: int
+    m: int
+    parameters: dict[str, sympy.Rational]
+    parameter_symbols: tuple[sympy.Symbol, ...]
+    drift: sympy.ImmutableMatrix
+    diffusion: sympy.ImmutableMatrix
+    process_noise: sympy.ImmutableMatrix
+    observation: sympy.ImmutableMatrix
+    observation_noise: sympy.ImmutableMatrix
+    observation_kind: str
+    start: float
+    periodic: tuple[str, ...]
+    functions: tuple[str, ...]
+    prior: Prior | None
+    text: str
+    source: str
+
+    def __init__(self, **keys: Any):
+        source, text = keys.pop("_source", "<python>"), keys.pop("_text", None)
+        _entries.known_keys(keys, KEYS)
+        for key in ("state", "drift", "observation"):
+            if keys.get(key) is None:
+                raise InputError(f"{key}: missing; a model needs state, drift and observation")
+        canonical: dict[str, Any] = {}
+        vars(self).update(source=source, _keys=canonical)
+        self._read_names(keys)
+        self._read_formulas(keys)
+        with named("start"):
+            vars(self)["start"] = canonical["start"] = _entries.number(keys.get("start", 0.0))
+        with named("prior"):
+            prior, table = read_prior(keys.get("prior"), self.n, lambda text: self._parse(text, in_time=False))
+            vars(self)["prior"], canonical["prior"] = prior, table
+        checks.check_constant_noise(self)
+        checks.check_periodic(self)
+        vars(self)["text"] = self.to_toml() if text is None else text
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError("a Model is immutable; make another one, or use with_parameters")
+
+    __delattr__ = __setattr__  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return f"<Model {self.name!r}: state ({', '.join(self.state)}), {self.m} observations as {self.observation_kind}>"
+
+    def _read_names(self, keys: Mapping[str, Any]) -> None:
+        canonical, attributes = self._keys, vars(self)
+        with named("name"):
+            name = keys.get("name", "unnamed")
+            if not isinstance(name, str):
+                raise InputError(f"expected a text, got {_entries.kind_of(name)}")
+            attributes["name"] = canonical["name"] = name
+        with named("state"):
+            state = _entries.names(keys["state"], "a list of names")
+            if not state:
+                raise InputError("expected a list of at least one name, got an empty list")
+        with named("functions"):
+            functions = _entries.names(keys.get("functions", ()), "a list of names")
+            _refuse_clash(functions, state, "a state")
+        with named("parameters"):
+            parameters = _read_parameters(keys.get("parameters") or {})
+            _refuse_clash(parameters, state, "a state")
+            _refuse_clash(parameters, functions, "an undetermined function")
+        with named("periodic"):
+            periodic = _entries.names(keys.get("periodic", ()), "a list of states that are angles")
+            for angle in periodic:
+                if angle not in state:
+                    raise InputError(f"{angle!r} is not a state{did_you_mean(angle, state)} (the states are {listing(state)})")
+        with named("observation_kind"):
+            kind = keys.get("observation_kind", "increments")
+            if not isinstance(kind, str) or kind not in OBSERVATION_KINDS:
+                hint = did_you_mean(kind, OBSERVATION_KINDS) if isinstance(kind, str) else ""
+                raise InputError(f"expected one of {listing(OBSERVATION_KINDS)}, got {_entries.kind_of(kind)}{hint}")
+        attributes.update(
+            state=state, functions=functions, parameters=parameters, periodic=periodic, observation_kind=kind, n=len(state),
+            x=tuple(sympy.Symbol(name, real=True) for name in state), t=sympy.Symbol("t", real=True),
+            parameter_symbols=tuple(sympy.Symbol(name, real=True) for name in parameters),
+        )
+        canonical.update(state=state, functions=functions, parameters=parameters, periodic=periodic, observation_kind=kind)
+
+    def _read_formulas(self, keys: Mapping[str, Any]) -> None:
+        canonical, n = self._keys, self.n
+        with named("drift"):
+            canonical["drift"] = _entries.vector_of_formulas(keys["drift"], n, f"a list of {n} formulas (one a state)")
+        with named("observation"):
+            canonical["observation"] = _entries.vector_of_formulas(keys["observation"], None, "a list of formulas (one a sensor)")
+            if not canonical["observation"]:
+                raise InputError("expected a list of at least one formula, got an empty list")
+        m = vars(self)["m"] = len(canonical["observation"])
+        given = {key: keys.get(key) for key in checks.COEFFICIENTS}
+        if given["diffusion"] is not None:
+            with named("diffusion"):
+                rows = f"{n} rows (one a state) of formulas (one a noise)"
+                canonical["diffusion"] = _entries.matrix_of_formulas(given["diffusion"], n, None, rows)
+        else:
+            canonical["diffusion"] = _identity(n)
+        r = len(canonical["diffusion"][0])
+        for key, size, what in (("process_noise", r, "noise"), ("observation_noise", m, "sensor")):
+            if given[key] is None:
+                canonical[key] = _identity(size)
+                continue
+            with named(key):
+                rows = f"{size} rows of {size} formulas (one a {what})"
+                canonical[key] = _entries.matrix_of_formulas(given[key], size, size, rows)
+        for key in ("drift", "observation"):
+            vars(self)[key] = sympy.ImmutableMatrix([
+                [self._parse(text, place=f"{key}[{i}]")] for i, text in enumerate(canonical[key])])
+        for key in checks.COEFFICIENTS:
+            vars(self)[key] = sympy.ImmutableMatrix([
+                [self._parse(text, place=f"{key}[{i}][{j}]") for j, text in enumerate(row)]
+                for i, row in enumerate(canonical[key])])
+            with named(key):
+                checks.check_independent_of_state(vars(self)[key], self.x)
+
+    def _parse(self, text: str, place: str = "", in_time: bool = True) -> sympy.Expr:
+        symbols = dict(zip((*self.state, *self.parameters), (*self.x, *self.parameter_symbols), strict=True))
+        if in_time:
+            symbols["t"] = self.t
+        if not place:
+            return parse_expression(text, symbols, self.functions)
+        with named(place):
+            return parse_expression(text, symbols, self.functions)
+
+    @cached_property
+    def covariance(self) -> sympy.ImmutableMatrix:
+        """G = g Q g', the covariance of the state's noise per unit time, of shape (n, n)."""
+        return sympy.ImmutableMatrix(self.diffusion * self.process_noise * self.diffusion.T)
+
+    def theta(self) -> np.ndarray:
+        """The values of the parameters in their order, of shape (p,), in double precision."""
+        return np.array([float(value) for value in self.parameters.values()], dtype=float)
+
+    def with_parameters(self, **values: Any) -> Model:
+        """The same model with other values of some parameters.
+
+        `values` are numbers by parameter name. Raises InputError for an unknown name, or if a noise matrix is no longer one.
+
+            >>> model.with_parameters(a=0.7).parameters["a"]
+            7/10
+        """
+        with named(f"{self.source}: parameters"):
+            for name in values:
+                if name not in self.parameters:
+                    known = f"(the parameters are {listing(self.parameters)})"
+                    raise InputError(f"unknown parameter {name!r}{did_you_mean(name, self.parameters)} {known}")
+            parameters = {**self.parameters, **_read_parameters(values)}
+        other = object.__new__(Model)
+        vars(other).update({**vars(self), "parameters": parameters, "_keys": {**self._keys, "parameters": parameters}})
+        with named(self.source):
+            checks.check_constant_noise(other)
+        vars(other)["text"] = other.to_toml()
+        return other
+
+    def to_toml(self) -> str:
+        """The model as the text of a model file that gives this model again."""
+        return to_toml(self._keys)
+
+    @property
+    def _keys(self) -> dict[str, Any]:
+        return vars(self)["_keys"]
+
+
+def _identity(size: int) -> list[list[str]]:
+    return [["1" if i == j else "0" for j in range(size)] for i in range(size)]
+
+
+def _read_parameters(table: Any) -> dict[str, sympy.Rational]:
+    if not isinstance(table, Mapping):
+        raise InputError(f"expected a table of names and numbers, got {_entries.kind_of(table)}")
+    parameters = {}
+    for name, value in table.items():
+        _entries.allowed_name(str(name))
+        with named(name):
+            parameters[name] = _entries.exact_number(value)
+    return parameters
+
+
+def _refuse_clash(names: Any, others: tuple[str, ...], what: str) -> None:
+    for name in names:
+        if name in others:
+            raise InputError(f"the name {name!r} is already {what}")

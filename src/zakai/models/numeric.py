@@ -1,0 +1,114 @@
+"""The formulas of a model as NumPy functions, and the reason in words when one of them is not finite."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import sympy
+from scipy.special import erf
+
+from zakai.models._program import Program, operations
+
+if TYPE_CHECKING:
+    from zakai.models.model import Model
+
+NumericFunction = Callable[..., np.ndarray]
+_NUMPY = operations(np, erf)
+
+
+def flattened(expressions: Any, shape: Sequence[int] | None = None) -> tuple[list[sympy.Expr], tuple[int, ...]]:
+    """The expressions of a list or Matrix in order, and the shape of their values: a column (k, 1) gives (k,)."""
+    if isinstance(expressions, sympy.MatrixBase):
+        natural: tuple[int, ...] = expressions.shape if expressions.shape[1] != 1 else (expressions.shape[0],)
+        flat = list(expressions)
+    elif isinstance(expressions, sympy.Basic):
+        natural, flat = (), [expressions]
+    else:
+        flat = list(expressions)
+        natural = (len(flat),)
+    shape = natural if shape is None else tuple(shape)
+    if int(np.prod(shape, dtype=int)) != len(flat):
+        raise ValueError(f"{len(flat)} expressions do not fill the shape {shape}")
+    return flat, shape
+
+
+def program_of(expressions: Sequence[sympy.Expr], model: Model) -> Program:
+    """The program that computes the expressions from the model's x, t and parameters."""
+    return Program(expressions, (model.x, model.t, model.parameter_symbols))
+
+
+def numpy_function(expressions: Any, model: Model, shape: Sequence[int] | None = None) -> NumericFunction:
+    """The expressions as one function f(x, t, theta) of NumPy arrays.
+
+    `expressions` is a list or Matrix in the model's state, t and parameters; `shape` is the shape of one value (the Matrix'
+    own by default). f takes x (..., n), t (...) and theta (p,) and broadcasts them; what does not exist is nan. Raises
+    InputError for an undetermined function.
+
+        >>> f = numpy_function(model.drift, model)
+        >>> f(np.zeros((5, model.n)), 0.0, model.theta()).shape
+        (5, 1)
+    """
+    flat, shape = flattened(expressions, shape)
+    program = program_of(flat, model)
+
+    def function(x: Any, t: Any, theta: Any) -> np.ndarray:
+        x, t, theta = (np.asarray(a, dtype=float) for a in (x, t, theta))
+        batch = np.broadcast_shapes(x.shape[:-1], t.shape, theta.shape[:-1])
+        with np.errstate(all="ignore"):
+            values = program.run(x, t, theta, _NUMPY)
+        result = np.empty((*batch, len(flat)))
+        for column, slot in enumerate(program.outputs):
+            result[..., column] = values[slot]
+        return result.reshape(*batch, *shape)
+
+    return function
+
+
+_DOMAINS = {
+    "log": lambda u: "log of a negative number" if u < 0 else "log of zero",
+    "sqrt": lambda u: "square root of a negative number",
+    "asin": lambda u: "asin outside [-1, 1]",
+    "acos": lambda u: "acos outside [-1, 1]",
+    "power": lambda u: "division by zero" if u == 0 else "fractional power of a negative number",
+    "general_power": lambda u: "power of a negative number",
+}
+
+
+def explain_nonfinite(model: Model, key: str, expressions: Any, x: Any, t: float) -> str:
+    """Say which innermost part of the expressions is not finite at a point, and why, in one line.
+
+    `key` is the name of the expressions in the model file; `x` has shape (n,). The empty string if all are finite.
+
+        >>> explain_nonfinite(model, "observation", model.observation, [-0.3], 0.2)
+        'observation[0] = log(x): log of a negative number at x = -0.3, t = 0.2'
+    """
+    flat, shape = flattened(expressions)
+    x = np.asarray(x, dtype=float)
+    point = ", ".join([*(f"{name} = {value:.6g}" for name, value in zip(model.state, x, strict=True)), f"t = {float(t):.6g}"])
+    for index, expr in enumerate(flat):
+        program = program_of([expr], model)
+        with np.errstate(all="ignore"):
+            values = program.run(x, np.float64(t), model.theta(), _NUMPY)
+        if np.isfinite(values[program.outputs[0]]):
+            continue
+        place = key + "".join(f"[{i}]" for i in np.unravel_index(index, shape))
+        for instruction, value in zip(program.instructions, values, strict=True):
+            if not np.isfinite(value):
+                arguments = [float(values[slot]) for slot in instruction.operands]
+                inner = "" if instruction.expr == expr else f" in {str(instruction.expr)[:60]}"
+                return f"{place} = {str(expr)[:80]}: {_reason(instruction.operation, arguments, float(value))}{inner} at {point}"
+    return ""
+
+
+def _reason(operation: str, arguments: list[float], value: float) -> str:
+    if operation in ("x", "t", "theta"):
+        return "the point itself is not finite"
+    if operation == "divide" and arguments[1] == 0:
+        return "division by zero"
+    if operation in _DOMAINS and (np.isnan(value) or arguments[0] == 0):
+        return _DOMAINS[operation](arguments[0])
+    return "larger than double precision can hold" if np.isinf(value) else "no numerical value"
+
+

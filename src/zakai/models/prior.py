@@ -1,0 +1,171 @@
+"""What is known of the state at the start: a Gaussian, a mixture of Gaussians, or any density given by its logarithm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sympy
+
+from zakai.errors import InputError
+from zakai.models._definite import ROUNDING, is_symmetric, smallest_eigenvalue, square_root
+from zakai.models._entries import array, formula, items, kind_of, known_keys
+from zakai.models._errors import did_you_mean, listing, named
+
+
+def _gaussian_log_density(x: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    """log N(x; mean, cov) for x of shape (..., n); the covariance must be positive definite."""
+    try:
+        factor = np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        raise InputError("prior: its covariance is singular, so it has no density; give every direction a variance") from None
+    whitened = np.linalg.solve(factor, (np.asarray(x, dtype=float) - mean)[..., None])[..., 0]
+    log_volume = np.log(np.diag(factor)).sum() + 0.5 * len(mean) * np.log(2 * np.pi)
+    return -0.5 * (whitened**2).sum(axis=-1) - log_volume
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianPrior:
+    """N(mean, cov), with `mean` of shape (n,) and `cov` of shape (n, n), which may be singular.
+
+        >>> GaussianPrior(np.zeros(1), np.eye(1)).log_density(np.zeros(1))
+        np.float64(-0.9189385332046727)
+    """
+
+    mean: np.ndarray
+    cov: np.ndarray
+
+    def log_density(self, x: np.ndarray) -> np.ndarray:
+        """The logarithm of the density at `x` (..., n); raises InputError where the covariance is singular."""
+        return _gaussian_log_density(x, self.mean, self.cov)
+
+    def sample(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """`count` draws, of shape (count, n)."""
+        return self.mean + rng.standard_normal((count, len(self.mean))) @ square_root(self.cov).T
+
+
+@dataclass(frozen=True, eq=False)
+class MixturePrior:
+    """sum_i weights_i N(means_i, covs_i), with `weights` (k,) that sum to 1, `means` (k, n) and `covs` (k, n, n).
+
+        >>> MixturePrior(np.array([0.5, 0.5]), np.array([[-1.0], [1.0]]), np.ones((2, 1, 1))).cov
+        array([[2.]])
+    """
+
+    weights: np.ndarray
+    means: np.ndarray
+    covs: np.ndarray
+
+    @property
+    def mean(self) -> np.ndarray:
+        """The mean of the mixture, of shape (n,)."""
+        return self.weights @ self.means
+
+    @property
+    def cov(self) -> np.ndarray:
+        """The covariance of the mixture, of shape (n, n)."""
+        deviations = self.means - self.mean
+        return np.einsum("k,kij->ij", self.weights, self.covs + deviations[:, :, None] * deviations[:, None, :])
+
+    def log_density(self, x: np.ndarray) -> np.ndarray:
+        """The logarithm of the density at `x` (..., n); raises InputError where a covariance is singular."""
+        parts = [
+            np.log(weight) + _gaussian_log_density(x, mean, cov)
+            for weight, mean, cov in zip(self.weights, self.means, self.covs, strict=True)
+        ]
+        return np.logaddexp.reduce(parts, axis=0)
+
+    def sample(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """`count` draws, of shape (count, n)."""
+        chosen = rng.choice(len(self.weights), size=count, p=self.weights)
+        noise = rng.standard_normal((count, self.means.shape[1]))
+        return self.means[chosen] + np.einsum("kij,kj->ki", square_root(self.covs)[chosen], noise)
+
+
+@dataclass(frozen=True, eq=False)
+class DensityPrior:
+    """A density, not necessarily normalised, given by its logarithm: a SymPy expression in the state and the parameters."""
+
+    log_density: sympy.Expr
+
+
+Prior = GaussianPrior | MixturePrior | DensityPrior
+
+_KEYS = {"gaussian": ("mean", "cov"), "mixture": ("weights", "means", "covs"), "density": ("log_density",)}
+
+
+def read_prior(keys: Any, n: int, read_formula: Callable[[str], sympy.Expr]) -> tuple[Prior | None, dict[str, Any] | None]:
+    """The prior of the table `[prior]`, and the table in plain numbers and text.
+
+    `keys` is the table (or a prior, or None), `n` the number of states, `read_formula` reads the formula of a density.
+    Raises InputError, naming the key.
+    """
+    if keys is None:
+        return None, None
+    if isinstance(keys, GaussianPrior):
+        keys = {"kind": "gaussian", "mean": keys.mean, "cov": keys.cov}
+    elif isinstance(keys, MixturePrior):
+        keys = {"kind": "mixture", "weights": keys.weights, "means": keys.means, "covs": keys.covs}
+    elif isinstance(keys, DensityPrior):
+        keys = {"kind": "density", "log_density": keys.log_density}
+    if not isinstance(keys, Mapping):
+        raise InputError(f"expected a table with the key kind, got {kind_of(keys)}")
+    kind = keys.get("kind")
+    if not isinstance(kind, str) or kind not in _KEYS:
+        hint = did_you_mean(kind, _KEYS) if isinstance(kind, str) else ""
+        got = f"got {kind_of(kind)}" if "kind" in keys else "it is missing"
+        raise InputError(f"kind: expected one of {listing(_KEYS)}; {got}{hint}")
+    known_keys(keys, ("kind", *_KEYS[kind]))
+    for key in _KEYS[kind]:
+        if key not in keys:
+            raise InputError(f"{key}: missing; a {kind} prior needs {listing(_KEYS[kind])}")
+    if kind == "gaussian":
+        prior: Prior = _read_gaussian(keys, n)
+    elif kind == "mixture":
+        prior = _read_mixture(keys, n)
+    else:
+        with named("log_density"):
+            text = formula(keys["log_density"])
+            return DensityPrior(read_formula(text)), {"kind": kind, "log_density": text}
+    return prior, {"kind": kind} | {key: getattr(prior, key).tolist() for key in _KEYS[kind]}
+
+
+def _read_gaussian(keys: Mapping[str, Any], n: int) -> GaussianPrior:
+    with named("mean"):
+        mean = array(keys["mean"], (n,), f"a list of {n} numbers (one a state)")
+    with named("cov"):
+        return GaussianPrior(mean, _read_covariance(keys["cov"], n))
+
+
+def _read_mixture(keys: Mapping[str, Any], n: int) -> MixturePrior:
+    with named("weights"):
+        count = len(items(keys["weights"], None, "a list of positive numbers"))
+        weights = array(keys["weights"], (count,), "a list of positive numbers")
+        if count == 0 or not (weights > 0).all() or not np.isfinite(weights.sum()):
+            raise InputError("expected a list of positive numbers, at least one")
+    with named("means"):
+        means = array(keys["means"], (count, n), f"{count} lists of {n} numbers (one list a component)")
+    with named("covs"):
+        tables = items(keys["covs"], count, f"{count} covariances (one a component), each {n} x {n} or {n} variances")
+        covs = []
+        for index, table in enumerate(tables):
+            with named(f"[{index}]"):
+                covs.append(_read_covariance(table, n))
+    return MixturePrior(weights / weights.sum(), means, np.array(covs))
+
+
+def _read_covariance(value: Any, n: int) -> np.ndarray:
+    expected = f"a {n} x {n} list of rows, or a list of {n} variances"
+    rows = items(value, n, expected)
+    if all(not isinstance(row, list | tuple | np.ndarray) for row in rows):
+        cov = np.diag(array(rows, (n,), expected))
+    else:
+        cov = array(rows, (n, n), expected)
+    if not is_symmetric(cov):
+        raise InputError("is not symmetric")
+    smallest = smallest_eigenvalue(cov)
+    if smallest < -ROUNDING * n:
+        raise InputError("is not positive semidefinite; variances cannot be negative nor correlations exceed 1")
+    return (cov + cov.T) / 2
