@@ -1,0 +1,8 @@
+"""Observations in, arrays out: records, CSV and NetCDF files; pure reading, atomic writing."""
+
+from zakai.records.csv import read_record
+from zakai.records.netcdf import load_dataset, save_dataset
+from zakai.records.record import Record
+from zakai.records.writing import atomic_write, write_record
+
+__all__ = ["Record", "atomic_write", "load_dataset", "read_record", "save_dataset", "write_record"]

@@ -1,0 +1,121 @@
+"""Files that are whole or not there: everything that `zakai` writes goes through here."""
+
+from __future__ import annotations
+
+import csv
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from zakai.errors import InputError
+
+if TYPE_CHECKING:
+    from zakai.records.record import Record
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary file beside `path` that takes its place when the block ends well, and vanishes if not.
+
+    The temporary file keeps the suffix of `path`, is on disk (fsync) before it is renamed, and is removed on
+    every exception, an interruption included; what was at `path` before is then still there.
+
+    Arguments:
+        path: where the finished file is to be. Its folder must exist; a link is followed.
+
+    Raises:
+        InputError: the file cannot be written (no such folder, no permission, a full disk).
+
+    Example:
+        >>> import tempfile, pathlib
+        >>> from zakai.records import atomic_write
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "note.txt"
+        >>> with atomic_write(path) as temporary:
+        ...     _ = temporary.write_text("all of it")
+        >>> path.read_text()
+        'all of it'
+    """
+    given = path
+    with _one_line(given):
+        path = Path(os.path.realpath(path))
+        if path.exists() and not path.is_file():
+            what = "is a folder" if path.is_dir() else "is not a regular file"
+            raise InputError(f"{shown(given)}: cannot be written: it {what}; give the name of a file")
+        temporary = path.with_name(f".{path.stem[:40]}.{secrets.token_hex(4)}.part{path.suffix}")
+        # Not tempfile, whose files are private to their owner: a result has the permissions of any new file.
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    try:
+        with _one_line(given):
+            yield temporary
+            _sync(temporary)
+            os.replace(temporary, path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
+    with suppress(OSError):  # not every file system lets a folder be synced; the rename itself is done
+        _sync(path.parent)
+
+
+def write_record(path: str | os.PathLike[str], record: Record, names: list[str] | None = None) -> None:
+    """Write a record as CSV, atomically; `read_record` gives the same float64 numbers back, bit for bit.
+
+    Arguments:
+        path: the file to write.
+        record: times (K,) and values (K, m); nan becomes an empty cell.
+        names: m column names, y1 to ym if not given.
+
+    Raises:
+        InputError: the file cannot be written, or there are not m names.
+
+    Example:
+        >>> import tempfile, pathlib
+        >>> from zakai.records import Record, write_record
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "record.csv"
+        >>> write_record(path, Record([0.1, 0.3], [[1.5], [float("nan")]], "samples"), ["range"])
+        >>> path.read_text().split()
+        ['time,range', '0.1,1.5', '0.3,']
+    """
+    m = record.values.shape[1]
+    names = [f"y{i + 1}" for i in range(m)] if names is None else list(names)
+    if len(names) != m or any(set(name) & set("\r\n\0") for name in names):
+        raise InputError(f"{shown(path)}: names must be {m} names of one line each, one a column")
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerow(["time", *names])
+        rows = (
+            ",".join([repr(time), *("" if value != value else repr(value) for value in row)]) + "\n"
+            for part in (slice(start, start + 65536) for start in range(0, len(record), 65536))
+            for time, row in zip(record.times[part].tolist(), record.values[part].tolist())
+        )
+        while block := "".join(islice(rows, 4096)):
+            file.write(block)
+
+
+def shown(path: str | os.PathLike[str]) -> str:
+    """A path as it may appear in a one-line error."""
+    return "".join(character if character.isprintable() else "?" for character in os.fsdecode(path))
+
+
+@contextmanager
+def _one_line(path: str | os.PathLike[str]) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        # A path with a NUL in it raises ValueError; any other one is a bug in the block that writes.
+        if isinstance(error, ValueError) and "null" not in str(error):
+            raise
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        fault = f"{shown(path)}: cannot be written: {reason}; choose another place or make room"
+        raise InputError(fault) from error
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
