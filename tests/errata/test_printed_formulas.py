@@ -80,7 +80,7 @@ def test_the_robust_equation_9_and_11_needs_the_coupling_of_gradients():
 
 
 def gauge_residual(drift_gradient, time_term):
-    """What u = e^phi v leaves of (19), for q with time_term phi_t and f = L x + l + drift_gradient grad phi."""
+    """What u = e^phi v leaves of (19): q with time_term phi_t, f = L x + l + drift_gradient grad phi."""
     v = of_x("v")
     f = L * X + l + drift_gradient * gradient(phi)
     u = exp(phi) * v
