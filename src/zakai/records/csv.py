@@ -156,10 +156,10 @@ def _cells(line: str) -> list[str]:
 
 
 def _not_text(line: str) -> str | None:
-    if "\0" in line:
-        return "a NUL byte; is this a CSV file?"
     if any("\ud800" <= character <= "\udfff" for character in line):
         return "bytes that are not UTF-8 text; save the file as UTF-8"
+    if "\0" in line:
+        return "a NUL byte; is this a CSV file?"
     return None
 
 

@@ -76,7 +76,8 @@ class Record:
         if self.kind != model.observation_kind:
             raise InputError(f"record: holds {self.kind}; the model observes {model.observation_kind}")
         if self.values.shape[1] != model.m:
-            raise InputError(f"record: values has shape {self.values.shape}; expected ({len(self)}, {model.m})")
+            expected = f"expected ({len(self)}, {model.m})"
+            raise InputError(f"record: values has shape {self.values.shape}; {expected}")
         fault = early(self.times[0], self.kind, model.start)
         if fault is not None:
             raise InputError(f"record: row 0: {fault}")
@@ -176,7 +177,7 @@ def first_fault(times: np.ndarray, values: np.ndarray) -> tuple[int, str] | None
 
 
 def early(first: float, kind: str, start: float) -> str | None:
-    """What is wrong with the first time of a record of this kind for a model that starts at `start`, if any."""
+    """What is wrong with the first time of a record of this kind for a model's `start`, or None."""
     if first > start or (kind == "samples" and first == start):
         return None
     need = "at or after" if kind == "samples" else "after"
