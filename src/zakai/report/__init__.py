@@ -1,0 +1,21 @@
+"""Pictures and the HTML report of a filtering run; plotly and matplotlib are imported only when they are
+used.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+__all__ = ["diagnostics_figure", "posterior_figure", "save_figure", "write_report"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "write_report":
+        from zakai.report.html import write_report
+
+        return write_report
+    if name in __all__:
+        from zakai.report import pictures
+
+        return getattr(pictures, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,118 @@
+"""One HTML file about a filtering run: no network, no other file, nothing that must be known beforehand."""
+
+from __future__ import annotations
+
+import platform
+from html import escape
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from zakai.report import _style, plots, sections, words
+from zakai.report.heatmap import is_periodic, true_states, wrapped
+from zakai.report.words import signed
+
+# The page may not fetch anything, whatever a file that was put into it says.
+_POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
+
+
+def write_report(result: Any, path: str | Path, truth: Any = None) -> None:
+    """Write the HTML report of a filtering run to one file that opens without a network.
+
+    Arguments: `result`, a `FilterResult`; `path`, the file to write, replaced only when the whole report is
+    ready; `truth`, the true states where they are known, (K+1, n) or an object with `times` and `values`.
+    Raises `InputError` for a truth of the wrong shape, or when the extra `plots` is not installed.
+
+    Example: `write_report(zakai.filter(model, record), "report.html")`.
+    """
+    from zakai.records.writing import atomic_write
+
+    text = page(result, truth)
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def page(result: Any, truth: Any = None) -> str:
+    """The text of the report."""
+    states = true_states(truth, result)
+    parts = [
+        ("posterior", "The posterior over time", sections.posterior(result, states)),
+        ("snapshots", "The density at moments of note", sections.snapshots(result, states)),
+        ("log-likelihood", "Log-likelihood", sections.likelihood(result)),
+        ("health", "Health of the computation", sections.health(result)),
+        ("method", "Which method, and why", sections.method(result)),
+        ("model", "The model", sections.model(result)),
+    ]
+    links = "".join(f'<a href="#{key}">{key.capitalize()}</a>' for key, _, _ in parts)
+    body = "".join(
+        f'<section id="{key}"><h2>{escape(title)}</h2>{text}</section>' for key, title, text in parts
+    )
+    name = escape(result.model.name)
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{name}: filtering report</title><style>{_style.css()}</style>"
+        "<script>window.PlotlyConfig = {MathJaxConfig: 'local'};</script>"
+        f"<script>{plots.library()}</script></head>\n"
+        f'<body><main><header><p class="eyebrow">Filtering report</p><h1>{name}</h1>'
+        f'<p class="verdict">{escape(words.verdict(result))}</p>{_warnings(result)}{_facts(result, states)}'
+        "<noscript><p>The pictures on this page need JavaScript; the text and the tables do "
+        "not.</p></noscript>"
+        f"<nav>{links}</nav></header>{body}<footer>{_versions(result)}</footer></main></body></html>\n"
+    )
+
+
+def _warnings(result: Any) -> str:
+    if not result.warnings:
+        return ""
+    items = "".join(f"<li>{escape(str(warning))}</li>" for warning in result.warnings)
+    return f'<div class="warnings" role="alert"><h2>Warnings</h2><ul>{items}</ul></div>'
+
+
+def _facts(result: Any, truth: np.ndarray | None) -> str:
+    model, times = result.model, result.times
+    facts = [
+        ("observations", f"{len(times) - 1:,}"),
+        ("time", signed(f"{times[0]:.6g} to {times[-1]:.6g}")),
+        ("states", f"{model.n}"),
+        ("observed as", f"{model.m} × {model.observation_kind}" if model.m > 1 else model.observation_kind),
+        ("log-likelihood", signed(f"{result.log_likelihood:,.2f}")),
+        *words.errors(result, _errors(result, truth)),
+    ]
+    return (
+        '<dl class="facts">'
+        + "".join(f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in facts)
+        + "</dl>"
+    )
+
+
+def _errors(result: Any, truth: np.ndarray | None) -> np.ndarray | None:
+    if truth is None:
+        return None
+    error = truth - np.asarray(result.mean)
+    for i in range(result.model.n):
+        if is_periodic(result, i):
+            error[:, i] = wrapped(error[:, i])
+    return error
+
+
+def _versions(result: Any) -> str:
+    versions = dict(getattr(result, "versions", None) or _installed())
+    return (
+        "Made with "
+        + ", ".join(f"{escape(str(name))} {escape(str(value))}" for name, value in versions.items())
+        + "."
+    )
+
+
+def _installed() -> dict[str, str]:
+    found = {}
+    for name in ("zakai", "jax", "numpy", "sympy", "plotly"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return {**found, "python": platform.python_version()}

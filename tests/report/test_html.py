@@ -1,0 +1,142 @@
+"""The HTML report: complete, self-contained, escaped, small and fast."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+
+import numpy as np
+import pytest
+import sympy
+
+from report.fakes import fake_result
+from zakai.algebra.conditions import Condition
+from zakai.errors import InputError
+from zakai.report import write_report
+from zakai.report.equations import equations
+from zakai.report.html import page
+from zakai.report.plots import library, thinned
+from zakai.report.sections import special_moments
+
+
+def without_library(text):
+    assert text.count(library()) == 1
+    return text.replace(library(), "")
+
+
+@pytest.fixture(scope="module")
+def small():
+    result, truth = fake_result(observations=60, warnings=["The window cut off 2% of the mass."])
+    return without_library(page(result, truth))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "The posterior over time", "The density at moments of note", "Log-likelihood",
+        "Health of the computation",
+        "Which method, and why", "The model", "limited-direct", "exact in its class", "60 observations",
+        "The window cut off 2% of the mass.", "The drift has the Yau form", "✓ holds",
+        "does not hold", "undecided",
+        "Theorem 3 holds", "edge mass", "<math", "Parameters", "numpy", "rms error of the mean",
+    ],
+)  # fmt: skip
+def test_the_page_contains(small, text):
+    assert text in small
+
+
+def test_nothing_on_the_page_comes_from_a_network(small):
+    assert not re.findall(r"(?i)https?:|<link|@import|url\(|<iframe|<img|<script[^>]*src", small)
+    assert "default-src 'none'" in small
+    assert '"showSendToCloud": false' in small
+
+
+def test_hostile_texts_are_escaped_everywhere():
+    hostile = '</script><script>alert("x")</script><img src=x onerror=alert(1)>'
+    result, truth = fake_result(observations=20, warnings=[hostile], name=hostile)
+    result.why = result.model.text = result.method = result.exactness = hostile
+    result.health = {hostile: np.arange(21.0)}
+    result.conditions = {hostile: (Condition(hostile, False, hostile, hostile),)}
+    result.model.state = (hostile,)
+    result.model.parameters = {hostile: 1}
+    result.model.drift = sympy.ImmutableMatrix([sympy.Symbol(hostile) ** 2])
+    text = without_library(page(result, truth))
+    assert "<img" not in text and 'alert("x")</script>' not in text
+    assert text.count("&lt;img") > 12
+
+
+def test_warnings_come_before_the_first_picture(small):
+    assert small.index('role="alert"') < small.index("Plotly.newPlot")
+
+
+def test_a_run_without_densities_says_so_and_draws_the_band():
+    result, _ = fake_result(observations=30, densities=False)
+    text = without_library(page(result))
+    assert "The densities of this run were not kept" in text and 'id="posterior-0"' in text
+
+
+def test_a_band_that_is_thin_is_drawn_again_about_its_mean():
+    result, _ = fake_result(observations=100, step=5.0)
+    assert "about-mean-0" in without_library(page(result))
+
+
+def test_a_run_without_observations_or_health_or_conditions_is_a_page_too():
+    result, _ = fake_result(observations=0)
+    result.health, result.conditions = {}, {}
+    assert "There was no observation" in without_library(page(result))
+
+
+def test_nine_thousand_observations_take_seconds_and_little_space(tmp_path):
+    result, truth = fake_result(observations=9000, state=("theta",), periodic=("theta",), kind="samples")
+    begin = time.perf_counter()
+    write_report(result, tmp_path / "report.html", truth)
+    assert time.perf_counter() - begin < 15
+    assert (tmp_path / "report.html").stat().st_size < 12e6
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "of 9,001 times are drawn, evenly spaced" in text and "The last 240 times" in text
+
+
+def test_a_refused_truth_leaves_no_file(tmp_path):
+    result, _ = fake_result(observations=10)
+    with pytest.raises(InputError, match="truth has shape"):
+        write_report(result, tmp_path / "report.html", np.zeros((3, 3)))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_moments_of_note_hold_the_surprise_the_spread_and_both_ends():
+    result, _ = fake_result(observations=100)
+    moments = dict(special_moments(result))
+    assert len(moments) == 6 and 0 in moments and 100 in moments
+    assert "largest surprise" in moments[1 + int(np.argmin(result.log_likelihood_increments[1:]))]
+    assert "most uncertain" in moments[1 + int(np.argmax(result.variance[1:, 0]))]
+
+
+def test_thinning_keeps_both_extremes():
+    values = np.random.default_rng(0).standard_normal(100_000)
+    kept = thinned(values, 1000)
+    assert len(kept) <= 1000 and values.argmin() in kept and values.argmax() in kept
+
+
+def test_a_figure_of_health_that_only_the_method_knows_is_explained_in_its_words():
+    result, _ = fake_result(observations=20)
+    result.health["wobble"], result.bounds = (
+        np.linspace(0.1, 1.0, 21),
+        {"wobble": (0.5, "how far it wobbles")},
+    )
+    text = without_library(page(result))
+    assert "How far it wobbles." in text and '"y0":0.5' in text
+
+
+def test_the_equations_name_the_kind_of_observation_and_keep_long_decimals():
+    result, _ = fake_result(observations=5, kind="samples")
+    result.model.drift = sympy.ImmutableMatrix([sympy.Rational("0.12345") * result.model.x[0]])
+    text = equations(result.model)
+    assert "samples z" in text and "<mn>0.12345</mn>" in text
+
+
+def test_a_missing_library_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "plotly.offline", None)
+    result, _ = fake_result(observations=5)
+    with pytest.raises(InputError, match=r'pip install "zakai\[plots\]"'):
+        page(result)
