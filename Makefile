@@ -4,6 +4,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 EXAMPLE := examples/wind-vane
 
+# A half-made environment or stamp would look finished to the next run.
+.DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 .PHONY: help demo test slow clean
 
