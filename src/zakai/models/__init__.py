@@ -1,4 +1,4 @@
-"""What the system is: formulas, models, model files, the gallery, simulation, and compilation to NumPy and JAX."""
+"""What the system is: formulas, models, model files, the gallery, simulation, compilation."""
 
 from zakai.models.files import load_model
 from zakai.models.model import Model

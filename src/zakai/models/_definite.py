@@ -8,7 +8,7 @@ ROUNDING = 1e-12
 
 
 def smallest_eigenvalue(matrices: np.ndarray) -> np.ndarray:
-    """The smallest eigenvalue of each symmetric matrix in (..., n, n), with its rows scaled to a unit diagonal.
+    """The smallest eigenvalue of each symmetric matrix in (..., n, n), scaled to a unit diagonal.
 
     The scaling makes the answer independent of units: diag(1e-20, 1e20) is as positive as the identity.
     """

@@ -1,4 +1,4 @@
-"""What a user may write for a key, as plain Python: formulas as text, numbers, lists of a required shape, names."""
+"""What a user may write for a key: formulas as text, numbers, lists of a required shape, names."""
 
 from __future__ import annotations
 
@@ -81,7 +81,11 @@ def exact_number(value: Any) -> sympy.Rational:
 
 def number(value: Any) -> float:
     """A finite number as a double."""
-    if isinstance(value, str) or not isinstance(value, numbers.Real | Decimal | sympy.Number) or isinstance(value, bool | np.bool_):
+    if (
+        isinstance(value, str)
+        or not isinstance(value, numbers.Real | Decimal | sympy.Number)
+        or isinstance(value, bool | np.bool_)
+    ):
         raise InputError(f"expected a number, got {kind_of(value)}")
     try:
         result = float(value)
@@ -95,7 +99,7 @@ def number(value: Any) -> float:
 def array(value: Any, shape: tuple[int, ...], expected: str) -> np.ndarray:
     """Numbers in nested lists of exactly this shape; `expected` says the shape in words."""
     if not shape:
-        return np.float64(number(value))
+        return np.array(number(value))
     entries = items(value, shape[0], expected)
     parts = []
     for index, entry in enumerate(entries):
@@ -141,7 +145,7 @@ def matrix_of_formulas(value: Any, rows: int, columns: int | None, expected: str
 
 def names(value: Any, expected: str) -> tuple[str, ...]:
     """A list of different, allowed names."""
-    found: list[str] = []
+    found: dict[str, None] = {}
     for index, name in enumerate(items(value, None, expected)):
         with named(f"[{index}]"):
             if not isinstance(name, str):
@@ -149,14 +153,16 @@ def names(value: Any, expected: str) -> tuple[str, ...]:
             allowed_name(name)
             if name in found:
                 raise InputError(f"the name {name!r} is given twice")
-            found.append(name)
+            found[name] = None
     return tuple(found)
 
 
 def allowed_name(name: str) -> None:
     """Raise InputError unless the name can stand in a formula."""
     if not _NAME.match(name):
-        raise InputError(f"{echo(name)} is not a name; use ASCII letters, digits and _, a letter first, at most 64")
+        raise InputError(
+            f"{echo(name)} is not a name; use ASCII letters, digits and _, a letter first, at most 64"
+        )
     if keyword.iskeyword(name):
         raise InputError(f"{name!r} is a keyword of Python and cannot be a name; try {name + '_'!r}")
     if name in RESERVED:
@@ -167,4 +173,6 @@ def known_keys(keys: Iterable[str], allowed: Sequence[str]) -> None:
     """Raise InputError at the first key that is not allowed."""
     for key in keys:
         if key not in allowed:
-            raise InputError(f"unknown key {echo(key, 40)}{did_you_mean(key, allowed)} (the keys are {listing(allowed)})")
+            raise InputError(
+                f"unknown key {echo(key, 40)}{did_you_mean(key, allowed)} (the keys are {listing(allowed)})"
+            )

@@ -15,7 +15,8 @@ def named(place: str) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        error.args = (f"{place}: {error}",)
+        # A part of a key, such as [0], follows the key at once: drift[0], not drift: [0].
+        error.args = (f"{place}{error}" if str(error).startswith("[") else f"{place}: {error}",)
         raise
 
 

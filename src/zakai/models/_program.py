@@ -1,7 +1,7 @@
-"""SymPy expressions as a straight-line program, run on NumPy, on JAX or on plain floats; no code is generated or executed.
+"""SymPy expressions as a straight-line program for NumPy, JAX or plain floats; no code is generated.
 
-Every distinct sub-expression is one instruction, so that common parts are computed once, and the first instruction whose
-value is not finite is the innermost cause of a value that is not finite.
+Every distinct sub-expression is one instruction, so that common parts are computed once, and the first
+instruction whose value is not finite is the innermost cause of a value that is not finite.
 """
 
 from __future__ import annotations
@@ -18,15 +18,26 @@ from sympy.core.function import AppliedUndef
 from zakai.errors import InputError
 
 _UNARY: dict[type, str] = {
-    sympy.sin: "sin", sympy.cos: "cos", sympy.tan: "tan", sympy.asin: "asin", sympy.acos: "acos", sympy.atan: "atan",
-    sympy.sinh: "sinh", sympy.cosh: "cosh", sympy.tanh: "tanh", sympy.exp: "exp", sympy.log: "log", sympy.erf: "erf",
-    sympy.Abs: "abs", sympy.sign: "sign",
+    sympy.sin: "sin",
+    sympy.cos: "cos",
+    sympy.tan: "tan",
+    sympy.asin: "asin",
+    sympy.acos: "acos",
+    sympy.atan: "atan",
+    sympy.sinh: "sinh",
+    sympy.cosh: "cosh",
+    sympy.tanh: "tanh",
+    sympy.exp: "exp",
+    sympy.log: "log",
+    sympy.erf: "erf",
+    sympy.Abs: "abs",
+    sympy.sign: "sign",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Instruction:
-    """`operation` applied to the values in the slots `operands`; `constant` is a constant or a power's exponent."""
+    """`operation` on the values in the slots `operands`; `constant` is a constant, index or exponent."""
 
     operation: str
     operands: tuple[int, ...]
@@ -37,7 +48,8 @@ class Instruction:
 class Program:
     """A list of instructions that computes `expressions` from x (..., n), t and theta (..., p).
 
-    `symbols` are the coordinates of x, then t, then the parameters. Raises InputError for what has no numerical value.
+    `symbols` are the coordinates of x, then t, then the parameters. Raises InputError for what has no
+    numerical value.
     """
 
     def __init__(self, expressions: Sequence[sympy.Expr], symbols: tuple[Sequence, sympy.Symbol, Sequence]):
@@ -65,7 +77,8 @@ class Program:
         if isinstance(expr, sympy.Add):
             return "add", expr.args, None
         if isinstance(expr, sympy.Mul):
-            above, below = [], []
+            above: list[sympy.Expr] = []
+            below: list[sympy.Expr] = []
             for factor in expr.args:
                 base, power = factor.as_base_exp()
                 divides = power.is_Rational and power < 0 and not base.is_Rational
@@ -80,7 +93,9 @@ class Program:
         if type(expr) in _UNARY:
             return _UNARY[type(expr)], expr.args, None
         if isinstance(expr, AppliedUndef | sympy.Derivative):
-            raise InputError(f"{str(expr)[:60]} is an undetermined function: the model can be analysed, not computed with")
+            raise InputError(
+                f"{str(expr)[:60]} is an undetermined function: the model can be analysed, not computed with"
+            )
         if expr.is_Symbol:
             raise InputError(f"{expr} is neither a state, nor t, nor a parameter")
         raise InputError(f"{str(expr)[:60]} has no real numerical value")
@@ -124,7 +139,10 @@ class Program:
         return values
 
     def scalar(self, theta: Sequence[float]) -> Callable[[Sequence[float], float], list[float]]:
-        """The program as a function of plain floats (x, t), for loops over time; what does not exist raises ValueError."""
+        """The program as a function of plain floats (x, t), for loops over time.
+
+        What does not exist raises ValueError or ArithmeticError.
+        """
         steps, fixed, moving = [], [0.0] * len(self.instructions), []
         for slot, instruction in enumerate(self.instructions):
             if instruction.operation == "constant":
@@ -134,7 +152,9 @@ class Program:
             elif instruction.operation in ("x", "t"):
                 moving.append((slot, instruction.operation == "x", instruction.constant))
             else:
-                steps.append((slot, SCALAR[instruction.operation], instruction.operands, instruction.constant))
+                steps.append(
+                    (slot, SCALAR[instruction.operation], instruction.operands, instruction.constant)
+                )
 
         def call(x: Sequence[float], t: float) -> list[float]:
             values = fixed.copy()
@@ -171,16 +191,35 @@ def _number(expr: sympy.Expr) -> float:
 def operations(xp: Any, erf: Callable, **special: Callable) -> dict[str, Callable]:
     """The operations of an array library with NumPy's names."""
     names = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}
-    plain = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "abs", "sign", "sqrt")
-    return {name: getattr(xp, names.get(name, name)) for name in plain} | {
-        "erf": erf,
-        "add": _add,
-        "multiply": _multiply,
-        "divide": lambda a, b: a / b,
-        "power": lambda base, power: base**power,
-        "general_power": lambda base, power: base**power,
-        "logcosh": lambda u: xp.logaddexp(u, -u) - math.log(2),
-    } | special
+    plain = (
+        "sin",
+        "cos",
+        "tan",
+        "asin",
+        "acos",
+        "atan",
+        "sinh",
+        "cosh",
+        "tanh",
+        "exp",
+        "log",
+        "abs",
+        "sign",
+        "sqrt",
+    )
+    return (
+        {name: getattr(xp, names.get(name, name)) for name in plain}
+        | {
+            "erf": erf,
+            "add": _add,
+            "multiply": _multiply,
+            "divide": lambda a, b: a / b,
+            "power": lambda base, power: base**power,
+            "general_power": lambda base, power: base**power,
+            "logcosh": lambda u: xp.logaddexp(u, -u) - math.log(2),
+        }
+        | special
+    )
 
 
 def _add(*terms: Any) -> Any:
@@ -204,9 +243,21 @@ def _float_power(base: float, power: float) -> float:
     return result
 
 
-_MATH = SimpleNamespace(**{name: getattr(math, name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt")},
-                        arcsin=math.asin, arccos=math.acos, arctan=math.atan, abs=abs, sign=lambda u: (u > 0) - (u < 0))
+_MATH = SimpleNamespace(
+    **{
+        name: getattr(math, name)
+        for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt")
+    },
+    arcsin=math.asin,
+    arccos=math.acos,
+    arctan=math.atan,
+    abs=abs,
+    sign=lambda u: (u > 0) - (u < 0),
+)
 SCALAR = operations(
-    _MATH, math.erf, power=_float_power, general_power=_float_power,
+    _MATH,
+    math.erf,
+    power=_float_power,
+    general_power=_float_power,
     logcosh=lambda u: abs(u) + math.log1p(math.exp(-2 * abs(u))) - math.log(2),
 )

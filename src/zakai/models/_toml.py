@@ -12,15 +12,34 @@ import sympy
 from zakai.models.expressions import MAX_DIGITS
 
 _OPTIONAL: dict[str, Any] = {"observation_kind": "increments", "start": 0.0, "periodic": (), "functions": ()}
-_ORDER = ("name", "state", "drift", "observation", "observation_kind", "diffusion", "process_noise", "observation_noise",
-          "start", "periodic", "functions")
+_ORDER = (
+    "name",
+    "state",
+    "drift",
+    "observation",
+    "observation_kind",
+    "diffusion",
+    "process_noise",
+    "observation_noise",
+    "start",
+    "periodic",
+    "functions",
+)
 
 
 def to_toml(keys: Mapping[str, Any]) -> str:
     """The TOML of a model's keys, all formulas as text; keys that hold their default are left out."""
-    lines = [f"{key} = {_value(keys[key])}" for key in _ORDER if key not in _OPTIONAL or keys[key] != _OPTIONAL[key]]
+    lines = [
+        f"{key} = {_value(keys[key])}"
+        for key in _ORDER
+        if key not in _OPTIONAL or keys[key] != _OPTIONAL[key]
+    ]
     if keys["parameters"]:
-        lines += ["", "[parameters]", *(f"{name} = {_value(value)}" for name, value in keys["parameters"].items())]
+        lines += [
+            "",
+            "[parameters]",
+            *(f"{name} = {_value(value)}" for name, value in keys["parameters"].items()),
+        ]
     if keys["prior"]:
         lines += ["", "[prior]", *(f"{name} = {_value(value)}" for name, value in keys["prior"].items())]
     return "\n".join(lines) + "\n"

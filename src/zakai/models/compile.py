@@ -26,9 +26,10 @@ _JAX = operations(jnp, jax.scipy.special.erf)
 def jax_function(expressions: Any, model: Model, shape: Sequence[int] | None = None) -> JaxFunction:
     """The expressions as one pure JAX function f(x, t, theta).
 
-    `expressions` is a list or Matrix in the model's state, t and parameters; `shape` is the shape of the value (by default the
-    Matrix' own, and (k,) for a column). f takes x (n,), a scalar t and theta (p,), returns float64, and may be used under `jit`,
-    `vmap` and `grad`. Raises InputError for an undetermined function.
+    `expressions` is a list or Matrix in the model's state, t and parameters; `shape` is the shape of the
+    value (by default the Matrix' own, and (k,) for a column). f takes x (n,), a scalar t and theta (p,),
+    returns float64, and may be used under `jit`, `vmap` and `grad`. Raises InputError for an undetermined
+    function.
 
         >>> jax_function(model.drift, model)(jnp.zeros(1), 0.0, model.theta())
         Array([0.], dtype=float64)
@@ -37,13 +38,17 @@ def jax_function(expressions: Any, model: Model, shape: Sequence[int] | None = N
     program = program_of(flat, model)
 
     if program.constant_outputs:
-        constant = np.array([program.instructions[slot].constant for slot in program.outputs], dtype=float).reshape(shape)
+        constant = np.array(
+            [program.instructions[slot].constant for slot in program.outputs], dtype=float
+        ).reshape(shape)
         return lambda x, t, theta: jnp.asarray(constant)
 
     def function(x: Any, t: Any, theta: Any) -> jax.Array:
         x, t, theta = (jnp.asarray(a, dtype=jnp.float64) for a in (x, t, theta))
         values = program.run(x, t, theta, _JAX)
-        return jnp.stack([jnp.asarray(values[slot], dtype=jnp.float64) for slot in program.outputs]).reshape(shape)
+        return jnp.stack([jnp.asarray(values[slot], dtype=jnp.float64) for slot in program.outputs]).reshape(
+            shape
+        )
 
     return function
 
@@ -66,8 +71,8 @@ _COMPILED: WeakKeyDictionary[Model, CompiledModel] = WeakKeyDictionary()
 def compile_model(model: Model) -> CompiledModel:
     """All parts of a model as JAX functions, made once for each model object.
 
-    Values have the shapes drift (n,), observation (m,), diffusion (n, r), process_noise (r, r), covariance (n, n) and
-    observation_noise (m, m). Raises InputError for a model with undetermined functions.
+    Values have the shapes drift (n,), observation (m,), diffusion (n, r), process_noise (r, r), covariance
+    (n, n) and observation_noise (m, m). Raises InputError for a model with undetermined functions.
 
         >>> compile_model(model).covariance(jnp.zeros(1), 0.0, model.theta())
         Array([[1.]], dtype=float64)

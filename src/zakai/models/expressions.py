@@ -1,4 +1,4 @@
-"""Formulas of model files: text -> our own immutable tree (`parse`) -> SymPy (`to_sympy`), with bounds on everything.
+"""Formulas of model files: text -> our own immutable tree (`parse`) -> SymPy, with bounds on everything.
 
     sum      = product (("+" | "-") product)*
     product  = unary (("*" | "/") unary)*
@@ -26,7 +26,22 @@ MAX_DEPTH = 100
 MAX_DIGITS = 40
 MAX_DECIMAL_EXPONENT = 308
 
-FUNCTIONS = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "erf", "abs")
+FUNCTIONS = (
+    "sin",
+    "cos",
+    "tan",
+    "asin",
+    "acos",
+    "atan",
+    "sinh",
+    "cosh",
+    "tanh",
+    "exp",
+    "log",
+    "sqrt",
+    "erf",
+    "abs",
+)
 RESERVED = ("t", "pi", *FUNCTIONS)
 
 
@@ -39,6 +54,7 @@ class ExpressionError(InputError):
 
 
 # ---- the tree; `position` is the 1-based column where the node begins
+
 
 @dataclass(frozen=True, slots=True)
 class Number:
@@ -97,8 +113,15 @@ _TOKEN = re.compile(
     r"(?P<space>[ \t\r\n]+)|(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
     r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*)|(?P<symbol>\*\*|[-+*/(),])"
 )
-_HINTS = {"^": "; write ** for a power", "%": "; there is no modulo", "[": "; there is no indexing", ".": "; there are no attributes",
-          "=": "; write one formula, not an equation", "<": "; there are no comparisons", ">": "; there are no comparisons"}
+_HINTS = {
+    "^": "; write ** for a power",
+    "%": "; there is no modulo",
+    "[": "; there is no indexing",
+    ".": "; there are no attributes",
+    "=": "; write one formula, not an equation",
+    "<": "; there are no comparisons",
+    ">": "; there are no comparisons",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +136,10 @@ def _tokens(text: str) -> Iterator[_Token]:
     while start < len(text):
         match = _TOKEN.match(text, start)
         if match is None:
-            raise ExpressionError(f"unexpected character in {echo(text[start:start + 21])}{_HINTS.get(text[start], '')}", start + 1)
+            raise ExpressionError(
+                f"unexpected character in {echo(text[start : start + 21])}{_HINTS.get(text[start], '')}",
+                start + 1,
+            )
         kind, word = match.lastgroup or "", match.group()
         if kind != "space":
             yield _Token(word if kind == "symbol" else kind, word, start + 1)
@@ -124,14 +150,16 @@ def _tokens(text: str) -> Iterator[_Token]:
 def parse(text: str) -> Node:
     """Read a formula into a tree.
 
-    `text` is one formula in the grammar above. Raises `ExpressionError`, with the column, for anything that is not in the
-    grammar, longer than 10,000 characters or nested deeper than 100 levels.
+    `text` is one formula in the grammar above. Raises `ExpressionError`, with the column, for anything that
+    is not in the grammar, longer than 10,000 characters or nested deeper than 100 levels.
 
         >>> parse("-2*x")
         Product(factors=((True, Negative(operand=Number(value=Fraction(2, 1), position=2), position=1)), ...
     """
     if len(text) > MAX_LENGTH:
-        raise ExpressionError(f"the formula has {len(text)} characters; at most {MAX_LENGTH} are read", MAX_LENGTH + 1)
+        raise ExpressionError(
+            f"the formula has {len(text)} characters; at most {MAX_LENGTH} are read", MAX_LENGTH + 1
+        )
     parser = _Parser(text)
     if parser.token.kind == "end":
         raise ExpressionError("the formula is empty", 1)
@@ -142,7 +170,7 @@ def parse(text: str) -> Node:
 
 
 class _Parser:
-    """Recursive descent; `depth` counts open parentheses, signs and exponents and bounds Python's own stack."""
+    """Recursive descent; `depth` counts open parentheses and exponents and bounds Python's own stack."""
 
     def __init__(self, text: str):
         self._rest = _tokens(text)
@@ -156,7 +184,11 @@ class _Parser:
         token = self.token
         if token.kind == "end":
             return ExpressionError(f"the formula ends where {wanted} was expected", token.position)
-        hint = "; write * to multiply" if wanted == "an operator" and token.kind in ("name", "number", "(") else ""
+        hint = (
+            "; write * to multiply"
+            if wanted == "an operator" and token.kind in ("name", "number", "(")
+            else ""
+        )
         return ExpressionError(f"expected {wanted}, got {echo(token.text)}{hint}", token.position)
 
     def expect(self, kind: str) -> None:
@@ -222,7 +254,9 @@ def _number(token: _Token) -> Fraction:
     whole, _, decimals = mantissa.partition(".")
     digits = (whole + decimals).strip("0")
     if len(digits) > MAX_DIGITS:
-        raise ExpressionError(f"the number {echo(token.text)} has more than {MAX_DIGITS} significant digits", token.position)
+        raise ExpressionError(
+            f"the number {echo(token.text)} has more than {MAX_DIGITS} significant digits", token.position
+        )
     if not digits:
         return Fraction(0)
     magnitude = exponent.lstrip("+-").lstrip("0")
@@ -237,9 +271,9 @@ def parse_expression(
 ) -> sympy.Expr:
     """Read a formula into SymPy, with decimals as exact rationals.
 
-    `text` is one formula; `symbols` maps each name it may use to the symbol that stands for it; `functions` names the
-    undetermined functions. Raises `ExpressionError` with the column for anything else, for a constant that does not exist
-    (1/0, log(-1)) and for powers and numbers that grow beyond the bounds.
+    `text` is one formula; `symbols` maps each name it may use to the symbol that stands for it; `functions`
+    names the undetermined functions. Raises `ExpressionError` with the column for anything else, for a
+    constant that does not exist (1/0, log(-1)) and for powers and numbers that grow beyond the bounds.
 
         >>> x = sympy.Symbol("x", real=True)
         >>> parse_expression("0.5*x**2", {"x": x})

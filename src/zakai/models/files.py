@@ -18,8 +18,8 @@ MAX_BYTES = 1 << 20
 def load_model(source: str | os.PathLike[str]) -> Model:
     """Read a model from a model file or from the gallery.
 
-    `source` is the path of a TOML file of at most 1 MiB, or `gallery:NAME`. Raises InputError, in one line that names the
-    file and the key, for a file that cannot be read or is not a model.
+    `source` is the path of a TOML file of at most 1 MiB, or `gallery:NAME`. Raises InputError, in one line
+    that names the file and the key, for a file that cannot be read or is not a model.
 
         >>> load_model("gallery:spiral-sensor").state
         ('x',)
@@ -50,7 +50,9 @@ def _read_text(path: Path, shown: str) -> str:
         hint = "; the models of the gallery are named gallery:NAME" if path.suffix == "" else ""
         raise InputError(f"{shown}: there is no such file{hint}") from None
     except (OSError, ValueError) as error:
-        raise InputError(f"{shown}: cannot be read: {getattr(error, 'strerror', None) or 'not a path'}") from None
+        raise InputError(
+            f"{shown}: cannot be read: {getattr(error, 'strerror', None) or 'not a path'}"
+        ) from None
     if len(data) > MAX_BYTES:
         raise InputError(f"{shown}: larger than 1 MiB, which no model file is")
     try:

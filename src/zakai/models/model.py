@@ -16,8 +16,22 @@ from zakai.models._toml import to_toml
 from zakai.models.expressions import parse_expression
 from zakai.models.prior import Prior, read_prior
 
-KEYS = ("name", "state", "drift", "observation", "observation_kind", "diffusion", "process_noise", "observation_noise",
-        "start", "periodic", "functions", "parameters", "prior")
+KEYS = (
+    "name",
+    "state",
+    "drift",
+    "observation",
+    "observation_kind",
+    "diffusion",
+    "process_noise",
+    "observation_noise",
+    "start",
+    "periodic",
+    "functions",
+    "parameters",
+    "prior",
+)
+MOST_STATES = 256  # of states, sensors and noises: a default identity matrix has this many squared entries
 OBSERVATION_KINDS = ("increments", "path", "rates", "samples")
 
 
@@ -28,20 +42,22 @@ class Model:
         dy = h(x,t) dt + dw           E dw dw' = S(t) dt      y in R^m       ("increments", "path", "rates")
         z_k = h(x(t_k), t_k) + r_k    r_k ~ N(0, S(t_k))                     ("samples")
 
-    Keywords, each as in a model file; a formula is a text, a number or a SymPy expression whose symbols are meant by name:
+    Keywords, each as in a model file; a formula is a text, a number or a SymPy expression whose symbols are
+    meant by name:
 
     * `state`: n names; `drift`: f, n formulas; `observation`: h, m formulas (these three are required);
     * `observation_kind`: increments (the default), path, rates or samples;
-    * `diffusion`: g, n rows of r formulas; `process_noise`: Q, r x r; `observation_noise`: S, m x m; in t and parameters only,
-      by default identities; covariances are per unit time, or per reading for samples;
+    * `diffusion`: g, n rows of r formulas; `process_noise`: Q, r x r; `observation_noise`: S, m x m; in t
+      and parameters only, by default identities; covariances are per unit time, or per reading for samples;
     * `start`: the time at which the prior holds; `periodic`: states that are angles (period 2 pi);
     * `parameters`: name -> number; `functions`: names of undetermined functions, for analysis only;
-    * `prior`: a table as in a model file, or a `GaussianPrior`, `MixturePrior` or `DensityPrior`; `name`: a title.
+    * `prior`: a table as in a model file, or a `GaussianPrior`, `MixturePrior` or `DensityPrior`; `name`: a
+      title.
 
     Raises InputError, in one line that names the key, for anything that is missing, unknown or does not fit.
 
         >>> Model(state=["x"], drift=["-a*x"], observation=["sin(x)"], parameters={"a": 0.5}).drift
-        Matrix([[-x/2*a]])
+        Matrix([[-a*x]])
     """
 
     name: str
@@ -78,7 +94,9 @@ class Model:
         with named("start"):
             vars(self)["start"] = canonical["start"] = _entries.number(keys.get("start", 0.0))
         with named("prior"):
-            prior, table = read_prior(keys.get("prior"), self.n, lambda text: self._parse(text, in_time=False))
+            prior, table = read_prior(
+                keys.get("prior"), self.n, lambda text: self._parse(text, in_time=False)
+            )
             vars(self)["prior"], canonical["prior"] = prior, table
         checks.check_constant_noise(self)
         checks.check_periodic(self)
@@ -90,7 +108,8 @@ class Model:
     __delattr__ = __setattr__  # type: ignore[assignment]
 
     def __repr__(self) -> str:
-        return f"<Model {self.name!r}: state ({', '.join(self.state)}), {self.m} observations as {self.observation_kind}>"
+        state = ", ".join(self.state)
+        return f"<Model {self.name!r}: state ({state}), {self.m} observations as {self.observation_kind}>"
 
     def _read_names(self, keys: Mapping[str, Any]) -> None:
         canonical, attributes = self._keys, vars(self)
@@ -101,8 +120,8 @@ class Model:
             attributes["name"] = canonical["name"] = name
         with named("state"):
             state = _entries.names(keys["state"], "a list of names")
-            if not state:
-                raise InputError("expected a list of at least one name, got an empty list")
+            if not 1 <= len(state) <= MOST_STATES:
+                raise InputError(f"expected a list of 1 to {MOST_STATES} names, got {len(state)}")
         with named("functions"):
             functions = _entries.names(keys.get("functions", ()), "a list of names")
             _refuse_clash(functions, state, "a state")
@@ -114,27 +133,42 @@ class Model:
             periodic = _entries.names(keys.get("periodic", ()), "a list of states that are angles")
             for angle in periodic:
                 if angle not in state:
-                    raise InputError(f"{angle!r} is not a state{did_you_mean(angle, state)} (the states are {listing(state)})")
+                    hint = did_you_mean(angle, state)
+                    raise InputError(f"{angle!r} is not a state{hint} (the states are {listing(state)})")
         with named("observation_kind"):
             kind = keys.get("observation_kind", "increments")
             if not isinstance(kind, str) or kind not in OBSERVATION_KINDS:
                 hint = did_you_mean(kind, OBSERVATION_KINDS) if isinstance(kind, str) else ""
-                raise InputError(f"expected one of {listing(OBSERVATION_KINDS)}, got {_entries.kind_of(kind)}{hint}")
+                raise InputError(
+                    f"expected one of {listing(OBSERVATION_KINDS)}, got {_entries.kind_of(kind)}{hint}"
+                )
         attributes.update(
-            state=state, functions=functions, parameters=parameters, periodic=periodic, observation_kind=kind, n=len(state),
-            x=tuple(sympy.Symbol(name, real=True) for name in state), t=sympy.Symbol("t", real=True),
+            state=state,
+            functions=functions,
+            parameters=parameters,
+            periodic=periodic,
+            observation_kind=kind,
+            n=len(state),
+            x=tuple(sympy.Symbol(name, real=True) for name in state),
+            t=sympy.Symbol("t", real=True),
             parameter_symbols=tuple(sympy.Symbol(name, real=True) for name in parameters),
         )
-        canonical.update(state=state, functions=functions, parameters=parameters, periodic=periodic, observation_kind=kind)
+        canonical.update(
+            state=state, functions=functions, parameters=parameters, periodic=periodic, observation_kind=kind
+        )
 
     def _read_formulas(self, keys: Mapping[str, Any]) -> None:
         canonical, n = self._keys, self.n
         with named("drift"):
-            canonical["drift"] = _entries.vector_of_formulas(keys["drift"], n, f"a list of {n} formulas (one a state)")
+            canonical["drift"] = _entries.vector_of_formulas(
+                keys["drift"], n, f"a list of {n} formulas (one a state)"
+            )
         with named("observation"):
-            canonical["observation"] = _entries.vector_of_formulas(keys["observation"], None, "a list of formulas (one a sensor)")
-            if not canonical["observation"]:
-                raise InputError("expected a list of at least one formula, got an empty list")
+            canonical["observation"] = _entries.vector_of_formulas(
+                keys["observation"], None, "a list of formulas (one a sensor)"
+            )
+            if not 1 <= len(canonical["observation"]) <= MOST_STATES:
+                raise InputError(f"expected a list of 1 to {MOST_STATES} formulas (one a sensor)")
         m = vars(self)["m"] = len(canonical["observation"])
         given = {key: keys.get(key) for key in checks.COEFFICIENTS}
         if given["diffusion"] is not None:
@@ -144,6 +178,8 @@ class Model:
         else:
             canonical["diffusion"] = _identity(n)
         r = len(canonical["diffusion"][0])
+        if r > MOST_STATES:
+            raise InputError(f"diffusion: at most {MOST_STATES} noises are read, got rows of {r}")
         for key, size, what in (("process_noise", r, "noise"), ("observation_noise", m, "sensor")):
             if given[key] is None:
                 canonical[key] = _identity(size)
@@ -152,12 +188,16 @@ class Model:
                 rows = f"{size} rows of {size} formulas (one a {what})"
                 canonical[key] = _entries.matrix_of_formulas(given[key], size, size, rows)
         for key in ("drift", "observation"):
-            vars(self)[key] = sympy.ImmutableMatrix([
-                [self._parse(text, place=f"{key}[{i}]")] for i, text in enumerate(canonical[key])])
+            vars(self)[key] = sympy.ImmutableMatrix(
+                [[self._parse(text, place=f"{key}[{i}]")] for i, text in enumerate(canonical[key])]
+            )
         for key in checks.COEFFICIENTS:
-            vars(self)[key] = sympy.ImmutableMatrix([
-                [self._parse(text, place=f"{key}[{i}][{j}]") for j, text in enumerate(row)]
-                for i, row in enumerate(canonical[key])])
+            vars(self)[key] = sympy.ImmutableMatrix(
+                [
+                    [self._parse(text, place=f"{key}[{i}][{j}]") for j, text in enumerate(row)]
+                    for i, row in enumerate(canonical[key])
+                ]
+            )
             with named(key):
                 checks.check_independent_of_state(vars(self)[key], self.x)
 
@@ -182,7 +222,8 @@ class Model:
     def with_parameters(self, **values: Any) -> Model:
         """The same model with other values of some parameters.
 
-        `values` are numbers by parameter name. Raises InputError for an unknown name, or if a noise matrix is no longer one.
+        `values` are numbers by parameter name. Raises InputError for an unknown name, or if a noise matrix
+        is no longer one.
 
             >>> model.with_parameters(a=0.7).parameters["a"]
             7/10
@@ -191,10 +232,14 @@ class Model:
             for name in values:
                 if name not in self.parameters:
                     known = f"(the parameters are {listing(self.parameters)})"
-                    raise InputError(f"unknown parameter {name!r}{did_you_mean(name, self.parameters)} {known}")
+                    raise InputError(
+                        f"unknown parameter {name!r}{did_you_mean(name, self.parameters)} {known}"
+                    )
             parameters = {**self.parameters, **_read_parameters(values)}
         other = object.__new__(Model)
-        vars(other).update({**vars(self), "parameters": parameters, "_keys": {**self._keys, "parameters": parameters}})
+        vars(other).update(
+            {**vars(self), "parameters": parameters, "_keys": {**self._keys, "parameters": parameters}}
+        )
         with named(self.source):
             checks.check_constant_noise(other)
         vars(other)["text"] = other.to_toml()

@@ -18,8 +18,10 @@ NumericFunction = Callable[..., np.ndarray]
 _NUMPY = operations(np, erf)
 
 
-def flattened(expressions: Any, shape: Sequence[int] | None = None) -> tuple[list[sympy.Expr], tuple[int, ...]]:
-    """The expressions of a list or Matrix in order, and the shape of their values: a column (k, 1) gives (k,)."""
+def flattened(
+    expressions: Any, shape: Sequence[int] | None = None
+) -> tuple[list[sympy.Expr], tuple[int, ...]]:
+    """The expressions of a list or Matrix in order, and the shape of their values ((k,) for a column)."""
     if isinstance(expressions, sympy.MatrixBase):
         natural: tuple[int, ...] = expressions.shape if expressions.shape[1] != 1 else (expressions.shape[0],)
         flat = list(expressions)
@@ -42,9 +44,9 @@ def program_of(expressions: Sequence[sympy.Expr], model: Model) -> Program:
 def numpy_function(expressions: Any, model: Model, shape: Sequence[int] | None = None) -> NumericFunction:
     """The expressions as one function f(x, t, theta) of NumPy arrays.
 
-    `expressions` is a list or Matrix in the model's state, t and parameters; `shape` is the shape of one value (the Matrix'
-    own by default). f takes x (..., n), t (...) and theta (p,) and broadcasts them; what does not exist is nan. Raises
-    InputError for an undetermined function.
+    `expressions` is a list or Matrix in the model's state, t and parameters; `shape` is the shape of one
+    value (the Matrix' own by default). f takes x (..., n), t (...) and theta (p,) and broadcasts them; what
+    does not exist is nan. Raises InputError for an undetermined function.
 
         >>> f = numpy_function(model.drift, model)
         >>> f(np.zeros((5, model.n)), 0.0, model.theta()).shape
@@ -79,14 +81,20 @@ _DOMAINS = {
 def explain_nonfinite(model: Model, key: str, expressions: Any, x: Any, t: float) -> str:
     """Say which innermost part of the expressions is not finite at a point, and why, in one line.
 
-    `key` is the name of the expressions in the model file; `x` has shape (n,). The empty string if all are finite.
+    `key` is the name of the expressions in the model file; `x` has shape (n,). The empty string if all are
+    finite.
 
         >>> explain_nonfinite(model, "observation", model.observation, [-0.3], 0.2)
         'observation[0] = log(x): log of a negative number at x = -0.3, t = 0.2'
     """
     flat, shape = flattened(expressions)
     x = np.asarray(x, dtype=float)
-    point = ", ".join([*(f"{name} = {value:.6g}" for name, value in zip(model.state, x, strict=True)), f"t = {float(t):.6g}"])
+    point = ", ".join(
+        [
+            *(f"{name} = {value:.6g}" for name, value in zip(model.state, x, strict=True)),
+            f"t = {float(t):.6g}",
+        ]
+    )
     for index, expr in enumerate(flat):
         program = program_of([expr], model)
         with np.errstate(all="ignore"):
@@ -98,7 +106,8 @@ def explain_nonfinite(model: Model, key: str, expressions: Any, x: Any, t: float
             if not np.isfinite(value):
                 arguments = [float(values[slot]) for slot in instruction.operands]
                 inner = "" if instruction.expr == expr else f" in {str(instruction.expr)[:60]}"
-                return f"{place} = {str(expr)[:80]}: {_reason(instruction.operation, arguments, float(value))}{inner} at {point}"
+                reason = _reason(instruction.operation, arguments, float(value))
+                return f"{place} = {str(expr)[:80]}: {reason}{inner} at {point}"
     return ""
 
 
@@ -110,5 +119,3 @@ def _reason(operation: str, arguments: list[float], value: float) -> str:
     if operation in _DOMAINS and (np.isnan(value) or arguments[0] == 0):
         return _DOMAINS[operation](arguments[0])
     return "larger than double precision can hold" if np.isinf(value) else "no numerical value"
-
-

@@ -1,4 +1,4 @@
-"""What is known of the state at the start: a Gaussian, a mixture of Gaussians, or any density given by its logarithm."""
+"""What is known of the state at the start: a Gaussian, a mixture, or a density by its logarithm."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ def _gaussian_log_density(x: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> n
     try:
         factor = np.linalg.cholesky(cov)
     except np.linalg.LinAlgError:
-        raise InputError("prior: its covariance is singular, so it has no density; give every direction a variance") from None
+        raise InputError(
+            "prior: its covariance is singular, so it has no density; give every direction a variance"
+        ) from None
     whitened = np.linalg.solve(factor, (np.asarray(x, dtype=float) - mean)[..., None])[..., 0]
     log_volume = np.log(np.diag(factor)).sum() + 0.5 * len(mean) * np.log(2 * np.pi)
     return -0.5 * (whitened**2).sum(axis=-1) - log_volume
@@ -30,15 +32,15 @@ def _gaussian_log_density(x: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> n
 class GaussianPrior:
     """N(mean, cov), with `mean` of shape (n,) and `cov` of shape (n, n), which may be singular.
 
-        >>> GaussianPrior(np.zeros(1), np.eye(1)).log_density(np.zeros(1))
-        np.float64(-0.9189385332046727)
+    >>> GaussianPrior(np.zeros(1), np.eye(1)).log_density(np.zeros(1))
+    np.float64(-0.9189385332046727)
     """
 
     mean: np.ndarray
     cov: np.ndarray
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
-        """The logarithm of the density at `x` (..., n); raises InputError where the covariance is singular."""
+        """The logarithm of the density at `x` (..., n); InputError where the covariance is singular."""
         return _gaussian_log_density(x, self.mean, self.cov)
 
     def sample(self, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -48,10 +50,10 @@ class GaussianPrior:
 
 @dataclass(frozen=True, eq=False)
 class MixturePrior:
-    """sum_i weights_i N(means_i, covs_i), with `weights` (k,) that sum to 1, `means` (k, n) and `covs` (k, n, n).
+    """sum_i weights_i N(means_i, covs_i); `weights` (k,) sum to 1, `means` (k, n), `covs` (k, n, n).
 
-        >>> MixturePrior(np.array([0.5, 0.5]), np.array([[-1.0], [1.0]]), np.ones((2, 1, 1))).cov
-        array([[2.]])
+    >>> MixturePrior(np.array([0.5, 0.5]), np.array([[-1.0], [1.0]]), np.ones((2, 1, 1))).cov
+    array([[2.]])
     """
 
     weights: np.ndarray
@@ -67,7 +69,9 @@ class MixturePrior:
     def cov(self) -> np.ndarray:
         """The covariance of the mixture, of shape (n, n)."""
         deviations = self.means - self.mean
-        return np.einsum("k,kij->ij", self.weights, self.covs + deviations[:, :, None] * deviations[:, None, :])
+        return np.einsum(
+            "k,kij->ij", self.weights, self.covs + deviations[:, :, None] * deviations[:, None, :]
+        )
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
         """The logarithm of the density at `x` (..., n); raises InputError where a covariance is singular."""
@@ -86,7 +90,7 @@ class MixturePrior:
 
 @dataclass(frozen=True, eq=False)
 class DensityPrior:
-    """A density, not necessarily normalised, given by its logarithm: a SymPy expression in the state and the parameters."""
+    """A density, not necessarily normalised; its logarithm is a SymPy expression in state and parameters."""
 
     log_density: sympy.Expr
 
@@ -96,11 +100,13 @@ Prior = GaussianPrior | MixturePrior | DensityPrior
 _KEYS = {"gaussian": ("mean", "cov"), "mixture": ("weights", "means", "covs"), "density": ("log_density",)}
 
 
-def read_prior(keys: Any, n: int, read_formula: Callable[[str], sympy.Expr]) -> tuple[Prior | None, dict[str, Any] | None]:
+def read_prior(
+    keys: Any, n: int, read_formula: Callable[[str], sympy.Expr]
+) -> tuple[Prior | None, dict[str, Any] | None]:
     """The prior of the table `[prior]`, and the table in plain numbers and text.
 
-    `keys` is the table (or a prior, or None), `n` the number of states, `read_formula` reads the formula of a density.
-    Raises InputError, naming the key.
+    `keys` is the table (or a prior, or None), `n` the number of states, `read_formula` reads the formula of
+    a density. Raises InputError, naming the key.
     """
     if keys is None:
         return None, None
@@ -148,7 +154,9 @@ def _read_mixture(keys: Mapping[str, Any], n: int) -> MixturePrior:
     with named("means"):
         means = array(keys["means"], (count, n), f"{count} lists of {n} numbers (one list a component)")
     with named("covs"):
-        tables = items(keys["covs"], count, f"{count} covariances (one a component), each {n} x {n} or {n} variances")
+        tables = items(
+            keys["covs"], count, f"{count} covariances (one a component), each {n} x {n} or {n} variances"
+        )
         covs = []
         for index, table in enumerate(tables):
             with named(f"[{index}]"):
@@ -167,5 +175,7 @@ def _read_covariance(value: Any, n: int) -> np.ndarray:
         raise InputError("is not symmetric")
     smallest = smallest_eigenvalue(cov)
     if smallest < -ROUNDING * n:
-        raise InputError("is not positive semidefinite; variances cannot be negative nor correlations exceed 1")
+        raise InputError(
+            "is not positive semidefinite; variances cannot be negative nor correlations exceed 1"
+        )
     return (cov + cov.T) / 2

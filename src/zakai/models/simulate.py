@@ -1,0 +1,216 @@
+"""A path of the state and a record of its observations, by Euler-Maruyama within each interval."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zakai.errors import InputError
+from zakai.models import checks
+from zakai.models._definite import square_root
+from zakai.models._density_draw import draw_from_density
+from zakai.models._entries import kind_of
+from zakai.models.numeric import explain_nonfinite, numpy_function, program_of
+from zakai.models.prior import DensityPrior
+
+if TYPE_CHECKING:
+    from zakai.models.model import Model
+    from zakai.records import Record
+
+SUBSTEPS = 10
+MOST_SUBSTEPS = 1000
+CHUNK = 100_000  # substeps held in memory at once
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """A path of the state: `times` (K+1,), the start first, `values` (K+1, n); angles in (-pi, pi]."""
+
+    times: np.ndarray
+    values: np.ndarray
+
+
+def simulate(
+    model: Model,
+    times: Any,
+    seed: int | np.random.Generator = 0,
+    initial: Any = None,
+    substeps: int | None = None,
+) -> tuple[Truth, Record]:
+    """Simulate a path of the state and a record of its observations.
+
+        x_{j+1} = x_j + f(x_j, t_j) d + g(t_j) Q(t_j)^{1/2} sqrt(d) e_j        e_j ~ N(0, I)
+        y_{j+1} = y_j + h(x_j, t_j) d + S(t_j)^{1/2} sqrt(d) e'_j
+
+    `times` (K,) are the times of the record, in the model's unit, strictly increasing and after the model's
+    start (samples may begin at it); `seed` is an integer (the same seed gives the same record) or a NumPy
+    generator; `initial` (n,) is the state at the start, drawn from the prior if not given; `substeps` is the
+    number of Euler steps in each interval. By default an interval of median length or less has 10, a longer
+    one proportionally more, at most 1,000.
+
+    Returns the `Truth` at the start and at the K times, and the `Record`. Raises InputError for times, an
+    initial state or a noise that cannot be, and when the state is no longer finite, with the formula that
+    caused it.
+
+        >>> truth, record = simulate(zakai.load_model("gallery:benes"), [0.1, 0.2, 0.3], seed=1)
+        >>> truth.values.shape, record.values.shape
+        ((4, 1), (3, 1))
+    """
+    from zakai.records import Record
+
+    grid = _checked_times(model, times)
+    counts = _substeps(np.diff(grid), substeps)
+    checks.check_noise_at(model, grid)
+    rng = np.random.default_rng(seed)
+    state = _initial_state(model, initial, rng)
+    path = _Path(model, rng)
+    states, readings = [state], []
+    for first, last in _chunks(counts):
+        inner, observed = path.advance(state, grid[first : last + 1], counts[first:last])
+        state = inner[-1]
+        states.extend(inner)
+        readings.append(observed)
+    values = np.array(states)
+    for column, name in enumerate(model.state):
+        if name in model.periodic:
+            values[:, column] = np.pi - np.mod(np.pi - values[:, column], 2 * np.pi)
+    observed = _reading(model, grid, np.concatenate(readings))
+    return Truth(grid, values), Record(grid[1:], observed, model.observation_kind)
+
+
+class _Path:
+    """The equations of one model with fixed parameters, advanced over many intervals at a time."""
+
+    def __init__(self, model: Model, rng: np.random.Generator):
+        self.model = model
+        self._rng = rng
+        self._theta = model.theta()
+        self._drift = program_of(list(model.drift), model).scalar(self._theta.tolist())
+        self._observation = numpy_function(model.observation, model)
+        matrices = {key: getattr(model, key) for key in checks.COEFFICIENTS}
+        self._coefficients = {
+            key: numpy_function(matrix, model, matrix.shape) for key, matrix in matrices.items()
+        }
+
+    def _coefficient(self, key: str, times: np.ndarray) -> np.ndarray:
+        """The matrix at all times, (N, ., .), or at one, (., .), if it does not depend on time."""
+        t = times if getattr(self.model, key).has(self.model.t) else times[0]
+        return self._coefficients[key](np.zeros(self.model.n), t, self._theta)
+
+    def advance(
+        self, state: np.ndarray, grid: np.ndarray, counts: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The states at the ends of the intervals, (K, n), and the increments or samples there, (K, m)."""
+        model, rng = self.model, self._rng
+        steps = np.repeat(np.diff(grid) / counts, counts)
+        first = np.concatenate([[0], np.cumsum(counts)])
+        times = np.repeat(grid[:-1], counts) + (np.arange(first[-1]) - np.repeat(first[:-1], counts)) * steps
+        root = self._coefficient("diffusion", times) @ square_root(self._coefficient("process_noise", times))
+        noise = rng.standard_normal((len(times), root.shape[-1]))
+        fine = self._integrate(state, times, steps, _times(root, noise) * np.sqrt(steps)[:, None])
+        ends = fine[first[1:]]
+        if model.observation_kind == "samples":
+            root = square_root(self._coefficient("observation_noise", grid[1:]))
+            noise = rng.standard_normal((len(ends), model.m))
+            return ends, self._observe(ends, grid[1:]) + _times(root, noise)
+        root = square_root(self._coefficient("observation_noise", times))
+        noise = _times(root, rng.standard_normal((len(times), model.m))) * np.sqrt(steps)[:, None]
+        return ends, np.add.reduceat(self._observe(fine[:-1], times) * steps[:, None] + noise, first[:-1])
+
+    def _integrate(
+        self, state: np.ndarray, times: np.ndarray, steps: np.ndarray, noise: np.ndarray
+    ) -> np.ndarray:
+        """The states at every substep, (N+1, n); plain floats are faster than arrays of a few numbers."""
+        drift, x = self._drift, state.tolist()
+        fine = [x]
+        try:
+            for t, step, shock in zip(times.tolist(), steps.tolist(), noise.tolist()):
+                x = [xi + fi * step + wi for xi, fi, wi in zip(x, drift(x, t), shock)]
+                fine.append(x)
+        except (ValueError, ArithmeticError):  # no such number, or too large a one; said below
+            fine.append([float("nan")] * len(x))
+        result = np.array(fine)
+        finite = np.isfinite(result).all(axis=1)
+        if not finite.all():
+            last = max(int(np.argmin(finite)) - 1, 0)
+            self._refuse("drift", result[last], times[last], "the state grows beyond double precision")
+        return result
+
+    def _observe(self, x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        values = self._observation(x, t, self._theta)
+        finite = np.isfinite(values).all(axis=1)
+        if not finite.all():
+            first = int(np.argmin(finite))
+            self._refuse("observation", x[first], t[first], "the observation is not finite")
+        return values
+
+    def _refuse(self, key: str, x: np.ndarray, t: float, otherwise: str) -> None:
+        reason = explain_nonfinite(self.model, key, getattr(self.model, key), x, t)
+        reason = reason or f"{key}: {otherwise} after t = {t:.6g}; try more substeps"
+        raise InputError(f"{self.model.source}: {reason}")
+
+
+def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    return (matrices @ vectors[..., None])[..., 0]
+
+
+def _checked_times(model: Model, times: Any) -> np.ndarray:
+    """The start, then the times of the record."""
+    try:
+        grid = np.concatenate([[model.start], np.asarray(times, dtype=float)])
+    except (TypeError, ValueError):
+        raise InputError("times: expected a list of numbers") from None
+    if len(grid) == 1 or not np.isfinite(grid).all():
+        raise InputError("times: expected at least one time, all of them finite")
+    steps = np.diff(grid)
+    if model.observation_kind == "samples":
+        steps[0] = 1.0 if steps[0] == 0 else steps[0]
+    if not (steps > 0).all():
+        row = int(np.argmin(steps > 0))
+        before = f"the start {model.start:.12g}" if row == 0 else f"{grid[row]:.12g}"
+        time = f"{grid[row + 1]:.12g}"
+        raise InputError(f"times: entry {row} ({time}) is not after {before}; times must increase")
+    return grid
+
+
+def _substeps(intervals: np.ndarray, substeps: Any) -> np.ndarray:
+    if substeps is None:
+        relative = intervals / np.median(intervals[intervals > 0]) if (intervals > 0).any() else intervals
+        return np.clip(np.ceil(SUBSTEPS * relative), SUBSTEPS, MOST_SUBSTEPS).astype(int)
+    if isinstance(substeps, bool) or not isinstance(substeps, int | np.integer) or substeps < 1:
+        raise InputError(f"substeps: expected a whole number of at least 1, got {kind_of(substeps)}")
+    return np.full(len(intervals), int(substeps))
+
+
+def _initial_state(model: Model, initial: Any, rng: np.random.Generator) -> np.ndarray:
+    if initial is None:
+        if model.prior is None:
+            raise InputError(f"{model.source}: prior: missing; give the model a prior, or initial=...")
+        if isinstance(model.prior, DensityPrior):
+            return draw_from_density(model, rng)
+        return model.prior.sample(rng, 1)[0]
+    try:
+        state = np.atleast_1d(np.asarray(initial, dtype=float))
+    except (TypeError, ValueError):
+        raise InputError(f"initial: expected {model.n} numbers (one a state)") from None
+    if state.shape != (model.n,) or not np.isfinite(state).all():
+        raise InputError(f"initial: expected {model.n} finite numbers (one a state), got shape {state.shape}")
+    return state
+
+
+def _chunks(counts: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Ranges of intervals with about CHUNK substeps each."""
+    block = (np.cumsum(counts) - 1) // CHUNK
+    edges = [0, *(np.flatnonzero(np.diff(block)) + 1).tolist(), len(counts)]
+    yield from zip(edges, edges[1:])
+
+
+def _reading(model: Model, grid: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    if model.observation_kind == "path":
+        return np.cumsum(observed, axis=0)
+    if model.observation_kind == "rates":
+        return observed / np.diff(grid)[:, None]
+    return observed
