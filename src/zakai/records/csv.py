@@ -40,7 +40,7 @@ def read_record(path: str | os.PathLike[str], model: Any) -> Record:
         >>> import zakai, tempfile, pathlib
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "record.csv"
         >>> _ = path.write_text("time,y\\n0.1,0.5\\n0.2,\\n0.4,-0.1\\n")
-        >>> zakai.read_record(path, zakai.gallery.load("cubic-sensor"))
+        >>> zakai.read_record(path, zakai.load_model("gallery:cubic-sensor"))
         Record(3 rows x 1 increments, times 0.1 to 0.4)
     """
     path = Path(path)
