@@ -27,7 +27,6 @@ from jax import lax
 
 from zakai.kolmogorov.flow import Flow, motion
 
-TAPS = 26  # cells on each side of the banded filter
 REACH = 8.5  # standard deviations after which a Gaussian is zero in double precision
 FAR = 12.0  # how far `move_dense` looks around the source: an observation may contradict it
 SUPPORT = 36.0  # a point whose logarithm is lower than the maximum's by more than this does not matter
@@ -52,7 +51,7 @@ class Lattice(NamedTuple):
 
     def log_volume(self) -> jax.Array:
         """The logarithm of the volume of a cell."""
-        return jnp.linalg.slogdet(self.basis)[1]
+        return jnp.log(jnp.abs(determinant(self.basis)))
 
 
 class Moved(NamedTuple):
@@ -61,6 +60,25 @@ class Moved(NamedTuple):
     lattice: Lattice
     exponent: jax.Array
     first_look: jax.Array
+
+
+def determinant(matrix: jax.Array) -> jax.Array:
+    """The determinant, written out for one and two states: a call into LAPACK would cost more than the rest of a step."""
+    if matrix.shape[0] == 1:
+        return matrix[0, 0]
+    if matrix.shape[0] == 2:
+        return matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
+    return jnp.linalg.det(matrix)
+
+
+def inverse(matrix: jax.Array) -> jax.Array:
+    """The inverse, written out for one and two states."""
+    if matrix.shape[0] == 1:
+        return 1.0 / matrix
+    if matrix.shape[0] == 2:
+        (a, b), (c, d) = matrix
+        return jnp.array([[d, -b], [-c, a]]) / determinant(matrix)
+    return jnp.linalg.inv(matrix)
 
 
 def _indices(sizes: tuple[int, ...]) -> np.ndarray:
@@ -127,9 +145,9 @@ def recentred(lattice: Lattice) -> Lattice:
 
 
 def move_banded(
-    lattice: Lattice, before: jax.Array, flow: Flow, inputs: jax.Array, after: LogFunction
+    lattice: Lattice, before: jax.Array, flow: Flow, inputs: jax.Array, after: LogFunction, taps: int
 ) -> Moved:
-    """One interval for one state by a filter of 2 `TAPS` + 1 taps; the cell must be 0.33 to 0.75 kernel deviations wide.
+    """One interval for one state by a filter of 2 `taps` + 1 cells, which must reach `REACH` kernel deviations.
 
     `before` (size,) is the logarithm that multiplies the density at the start, `after(x)` that at the end.
     """
@@ -138,10 +156,14 @@ def move_banded(
     size = gauged.shape[0]
     cell = lattice.basis[0, 0]
     variance = flow.spread[0, 0]
-    taps = jnp.exp(-0.5 * (jnp.arange(-TAPS, TAPS + 1) * cell) ** 2 / variance)
-    padded = jnp.pad(jnp.exp(gauged - top), TAPS)
-    # A sum of shifted slices becomes one fused, vectorised loop.
-    total = sum(taps[j] * lax.slice(padded, (j,), (j + size,)) for j in range(2 * TAPS + 1))
+    weights = lax.optimization_barrier(jnp.exp(-0.5 * (jnp.arange(-taps, taps + 1) * cell) ** 2 / variance))
+    values = jnp.exp(gauged - top)
+    if taps <= 40:  # a sum of shifted slices becomes one fused, vectorised loop
+        padded = lax.optimization_barrier(jnp.pad(values, taps))
+        total = sum(weights[j] * lax.slice(padded, (j,), (j + size,)) for j in range(2 * taps + 1))
+        total = lax.optimization_barrier(total)
+    else:
+        total = jnp.maximum(jnp.convolve(values, weights, mode="full")[taps : taps + size], 0.0)
     moved = motion(flow, lattice.centre, inputs)
     offset = cell * _indices((size,))[:, 0]
     logs = (
@@ -153,7 +175,7 @@ def move_banded(
     )
     target = Lattice(logs, moved.centre, flow.map @ lattice.basis)
     target = target._replace(log_values=logs + after(target.points()))
-    return Moved(target, _exponent_range(lattice.log_values, gauged), jnp.array(jnp.inf))
+    return Moved(target, _exponent_range(lattice.log_values, gauged), jnp.array(1.0))
 
 
 def move_dense(

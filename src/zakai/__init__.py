@@ -1,0 +1,51 @@
+"""Nonlinear filtering with the Duncan-Mortensen-Zakai equation: the conditional density itself, in real time.
+
+    import zakai
+
+    model = zakai.load_model("system.toml")
+    record = zakai.read_record("observations.csv", model)
+    result = zakai.filter(model, record)
+
+Each public name is loaded when it is first used, so that `import zakai` and `zakai.analyze` never wait for JAX.
+Numerical work is done in double precision: the first numerical import sets JAX's `jax_enable_x64`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_PUBLIC = {
+    "Model": "zakai.models.model",
+    "load_model": "zakai.models.files",
+    "gallery": "zakai.models.gallery",
+    "simulate": "zakai.models.simulate",
+    "Analysis": "zakai.algebra.analysis",
+    "analyze": "zakai.algebra.analysis",
+    "Record": "zakai.records",
+    "read_record": "zakai.records",
+    "filter": "zakai.filters.driver",
+    "FilterResult": "zakai.filters.results",
+    "load_result": "zakai.filters.results",
+    "Density": "zakai.densities",
+    "ZakaiError": "zakai.errors",
+    "InputError": "zakai.errors",
+    "ConditionError": "zakai.errors",
+}
+
+__version__ = "0.1.0"
+__all__ = [*_PUBLIC, "__version__"]  # noqa: PLE0604
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'zakai' has no attribute '{name}'")
+    if name == "gallery":
+        return import_module(_PUBLIC[name])
+    value = getattr(import_module(_PUBLIC[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

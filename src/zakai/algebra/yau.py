@@ -1,0 +1,254 @@
+"""The Yau form of a drift, Wong's Omega, and the function q of a time-varying Yau system.
+
+A drift has Yau form if f(x, t) = L(t) x + l(t) + G(t) grad phi(x, t).  With g = G^-1 f that is so if and only if Wong's
+matrix omega_ij = d_i g_j - d_j g_i does not depend on x (Yau 1993, Theorem 1, for G = I).  Then u = e^phi v takes the
+Kolmogorov equation to one whose drift is affine and whose potential is -q/2, with
+
+    q = 2 phi_t + G:Hess phi + grad phi'G grad phi + 2 (L x + l).grad phi + 2 tr L + h'S^-1 h.
+
+The printed q (Chen, Luo and Yau 2017, (20)) lacks 2 phi_t and its Yau form (17) lacks the G before grad phi.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import sympy as sp
+
+from zakai.algebra.identities import grouped, is_zero, tidy
+from zakai.models.model import Model
+
+
+@dataclass(frozen=True)
+class YauForm:
+    """f = `matrix` x + `offset` + G grad `potential`: L (n, n), l (n, 1), phi; `gradient` is grad phi (n, 1)."""
+
+    matrix: sp.ImmutableMatrix
+    offset: sp.ImmutableMatrix
+    potential: sp.Expr
+    gradient: sp.ImmutableMatrix
+
+
+@dataclass(frozen=True)
+class NoYauForm:
+    """Why no Yau form was found: `holds` is False if there is none, None if that is not known."""
+
+    holds: bool | None
+    evidence: str
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """x'`matrix` x + `linear`.x + `constant`: what -q/2 is when q is quadratic in x."""
+
+    matrix: sp.ImmutableMatrix
+    linear: sp.ImmutableMatrix
+    constant: sp.Expr
+
+
+def inverse(matrix: sp.MatrixBase) -> sp.MatrixBase:
+    """The inverse by cofactors, with tidied entries."""
+    if matrix.is_diagonal():
+        return sp.diag(*[1 / entry for entry in matrix.diagonal()])
+    return matrix.inv(method="ADJ").applyfunc(tidy)
+
+
+def wong_omega(model: Model) -> sp.Matrix | None:
+    """Wong's matrix omega_ij = d_i g_j - d_j g_i with g = G^-1 f, or None where G is singular."""
+    if is_zero(model.covariance.det()) is not False:
+        return None
+    g = inverse(model.covariance) * model.drift
+    return curl(g, model.x)
+
+
+def curl(field: sp.MatrixBase, x: tuple[sp.Symbol, ...]) -> sp.Matrix:
+    """The matrix d_i field_j - d_j field_i, with what is provably zero set to zero."""
+    n = len(x)
+    omega = sp.zeros(n, n)
+    for i in range(n):
+        for j in range(i + 1, n):
+            entry = sp.expand(sp.diff(field[j], x[i]) - sp.diff(field[i], x[j]))
+            omega[i, j] = sp.Integer(0) if is_zero(entry) else tidy_state(entry, x)
+            omega[j, i] = -omega[i, j]
+    return omega
+
+
+def tidy_state(expression: sp.Expr, x: tuple[sp.Symbol, ...]) -> sp.Expr:
+    """Like terms in the state collected, with tidied coefficients."""
+    return sp.Add(*[c * function for function, c in grouped(expression, x).items()])
+
+
+def yau_form(model: Model) -> YauForm | NoYauForm:
+    """The Yau form of the drift; affine parts, and quadratic parts of the potential, are kept in L and l."""
+    x, n = model.x, model.n
+    matrix, offset, rest = _affine_and_rest(model.drift, x)
+    if all(term == 0 for term in rest):
+        zero = sp.ImmutableMatrix.zeros(n, 1)
+        return YauForm(sp.ImmutableMatrix(matrix), sp.ImmutableMatrix(offset), sp.Integer(0), zero)
+    covariance = model.covariance
+    if is_zero(covariance.det()) is not False:
+        return NoYauForm(False, "the drift is not affine and G is singular, so that G grad phi cannot be solved for phi")
+    gradient = (inverse(covariance) * rest).applyfunc(lambda e: tidy_state(e, x))
+    omega = curl(gradient, x)
+    for i in range(n):
+        for j in range(i + 1, n):
+            for symbol in x:
+                answer = is_zero(sp.diff(omega[i, j], symbol))
+                if answer is not True:
+                    what = f"omega_{i + 1}{j + 1} = {omega[i, j]} depends on {symbol}"
+                    return NoYauForm(answer, what if answer is False else f"it is not decided whether {what}")
+    # A constant curl belongs to L: f contains -G omega x / 2.
+    matrix = matrix - covariance * omega / 2
+    gradient = gradient + omega * sp.Matrix(x) / 2
+    potential = _potential(gradient, x)
+    if potential is None:
+        return NoYauForm(None, f"no closed form was found for phi with grad phi = {list(gradient)}")
+    return YauForm(
+        sp.ImmutableMatrix(matrix.applyfunc(tidy)),
+        sp.ImmutableMatrix(offset.applyfunc(tidy)),
+        potential,
+        sp.ImmutableMatrix(gradient),
+    )
+
+
+def _affine_and_rest(field, x):
+    """A field as matrix x + offset + rest, no term of the rest being affine."""
+    n = len(x)
+    matrix, offset, rest = sp.zeros(n, n), sp.zeros(n, 1), sp.zeros(n, 1)
+    for i in range(n):
+        for function, coefficient in grouped(field[i], x).items():
+            if function in x:
+                matrix[i, x.index(function)] += coefficient
+            elif not function.has(*x):
+                offset[i] += coefficient * function
+            else:
+                rest[i] += coefficient * function
+    return matrix, offset, rest
+
+
+def _potential(gradient: sp.MatrixBase, x: tuple[sp.Symbol, ...]) -> sp.Expr | None:
+    """phi with the given gradient, coordinate by coordinate, normalised to vanish nowhere in particular."""
+    phi = sp.Integer(0)
+    for i, symbol in enumerate(x):
+        left = tidy_state(gradient[i] - sp.diff(phi, symbol), x)
+        part = _antiderivative(left, symbol, x)
+        if part is None:
+            return None
+        phi += part
+    for i, symbol in enumerate(x):
+        if is_zero(gradient[i] - sp.diff(phi, symbol)) is not True:
+            return None
+    return phi
+
+
+def _antiderivative(expression: sp.Expr, symbol: sp.Symbol, x: tuple[sp.Symbol, ...]) -> sp.Expr | None:
+    total = sp.Integer(0)
+    for function, coefficient in grouped(expression, x).items():
+        part = _known_antiderivative(function, symbol)
+        if part is None:
+            part = sp.integrate(function, symbol, conds="none")
+            if part.has(sp.Integral) or part.has(sp.Piecewise):
+                return None
+        total += coefficient * part
+    return total
+
+
+def _known_antiderivative(function: sp.Expr, symbol: sp.Symbol) -> sp.Expr | None:
+    """Antiderivatives of F(a x + b) in the forms that stay smooth on the whole line, such as log cosh for tanh."""
+    if not function.has(symbol):
+        return function * symbol
+    rules = {
+        sp.tanh: lambda u: sp.log(sp.cosh(u)),
+        sp.coth: lambda u: sp.log(sp.sinh(u)),
+        sp.sin: lambda u: -sp.cos(u),
+        sp.cos: sp.sin,
+        sp.sinh: sp.cosh,
+        sp.cosh: sp.sinh,
+        sp.tan: lambda u: -sp.log(sp.cos(u)),
+        sp.exp: sp.exp,
+    }
+    rule = rules.get(function.func)
+    if rule is None:
+        return None
+    argument = function.args[0]
+    slope = sp.diff(argument, symbol)
+    if slope.has(symbol) or slope == 0:
+        return None
+    return rule(argument) / slope
+
+
+def q_without_observation(model: Model, form: YauForm) -> sp.Expr:
+    """2 phi_t + G:Hess phi + grad phi'G grad phi + 2 (L x + l).grad phi + 2 tr L."""
+    x, G, gradient = model.x, model.covariance, form.gradient
+    hessian = gradient.jacobian(x)
+    affine = form.matrix * sp.Matrix(x) + form.offset
+    return (
+        2 * sp.diff(form.potential, model.t)
+        + sp.expand(sum(G[i, j] * hessian[j, i] for i in range(model.n) for j in range(model.n)))
+        + (gradient.T * G * gradient)[0, 0]
+        + 2 * (affine.T * gradient)[0, 0]
+        + 2 * form.matrix.trace()
+    )
+
+
+def observation_energy(model: Model) -> sp.Expr:
+    """h'S^-1 h."""
+    return (model.observation.T * inverse(model.observation_noise) * model.observation)[0, 0]
+
+
+def eta(model: Model) -> sp.Expr | None:
+    """Wong's eta = f'G^-1 f + div f + h'S^-1 h, or None where G is singular."""
+    if is_zero(model.covariance.det()) is not False:
+        return None
+    kinetic = (model.drift.T * inverse(model.covariance) * model.drift)[0, 0]
+    divergence = sum(sp.diff(model.drift[i], symbol) for i, symbol in enumerate(model.x))
+    return kinetic + divergence + observation_energy(model)
+
+
+def as_quadratic(q: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Quadratic | None, bool | None, str]:
+    """-q/2 as a quadratic in x, whether q is one, and the expression that decided it."""
+    undecided = ""
+    n = len(x)
+    for i in range(n):
+        for j in range(i, n):
+            for k in range(j, n):
+                third = sp.diff(q, x[i], x[j], x[k])
+                answer = is_zero(third)
+                if answer is False:
+                    return None, False, f"q contains {not_quadratic_part(q, x)}"
+                if answer is None:
+                    undecided = f"it is not decided whether {third} vanishes"
+    if undecided:
+        return None, None, undecided
+    # q is quadratic, so its derivatives at any one point give its coefficients; the origin reads best where q is defined there.
+    for value in (sp.Integer(0), sp.Rational(1, 2), sp.Rational(7, 5)):
+        point = {symbol: value for symbol in x}
+        hessian = sp.Matrix(n, n, lambda i, j: sp.diff(q, x[i], x[j]).subs(point))
+        slope = sp.Matrix(n, 1, lambda i, _: sp.diff(q, x[i]).subs(point))
+        level = q.subs(point)
+        if all(e.is_finite is not False and not e.has(sp.nan, sp.zoo) for e in [*hessian, *slope, level]):
+            break
+    at = sp.ones(n, 1) * value
+    matrix = (-hessian / 4).applyfunc(tidy)
+    linear = (-slope / 2 - 2 * matrix * at).applyfunc(tidy)
+    constant = tidy(-level / 2 - (at.T * matrix * at)[0, 0] - (linear.T * at)[0, 0])
+    quadratic = Quadratic(sp.ImmutableMatrix(matrix), sp.ImmutableMatrix(linear), constant)
+    return quadratic, True, f"q = {quadratic_text(quadratic, x)}"
+
+
+def quadratic_text(quadratic: Quadratic, x: tuple[sp.Symbol, ...]) -> str:
+    """q itself, printed."""
+    state = sp.Matrix(x)
+    value = (state.T * quadratic.matrix * state)[0, 0] + (quadratic.linear.T * state)[0, 0] + quadratic.constant
+    return str(sp.collect(sp.expand(-2 * value), list(x)))
+
+
+def not_quadratic_part(q: sp.Expr, x: tuple[sp.Symbol, ...]) -> str:
+    """The terms of q that are not quadratic in x, for a sentence."""
+    terms = []
+    for function, coefficient in grouped(q, x).items():
+        if all(is_zero(sp.diff(function, a, b, c)) for a in x for b in x for c in x):
+            continue
+        terms.append(coefficient * function)
+    text = str(sp.Add(*terms))
+    return f"{text}, which is not quadratic in x" if len(text) < 300 else text[:300] + " ..., which is not quadratic in x"

@@ -1,0 +1,314 @@
+"""Which lattice: the window, the cell and the way to convolve, decided between runs of steps, from the density itself.
+
+Nothing here is part of a compiled step.  A run of steps is tried with a plan; if its health says that mass came near an edge or
+that a feature grew narrower than a few cells, it is tried again with a larger window or a finer cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from zakai import _float64  # noqa: F401
+import jax.numpy as jnp
+import numpy as np
+
+from zakai.densities import GaussianMixture
+from zakai.errors import InputError
+from zakai.kolmogorov.lattice import FAR, REACH, SUPPORT, Lattice
+from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
+from zakai.models.prior import DensityPrior, GaussianPrior
+
+CELLS = 2.5  # standard deviations of the narrowest feature, in cells: below it, values between the points lose digits
+COARSEST = 0.75  # the largest cell in kernel standard deviations
+EDGE = 1e-12
+QUADRATURE = 1e-11
+BASE = {1: 128, 2: 64}
+MOST = {1: 8192, 2: 384}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How the next steps move the density; static, so that each plan is compiled once.
+
+    `banded` steps keep a window of `sizes` that moves along; the others choose a lattice of `sizes` each time. `window` and `cells`
+    say how generous the banded window and its cell are.
+    """
+
+    banded: bool
+    sizes: tuple[int, ...]
+    taps: int = 32
+    angles: tuple[int, ...] = ()
+    images: int = 0
+    window: float = 1.3
+    cells: float = CELLS
+
+
+def rounded_up(size: float) -> int:
+    """The next number of the form 2^k or 3 2^k, from 64: few shapes, few compilations."""
+    power = 64
+    while power < size:
+        if 1.5 * power >= size:
+            return power * 3 // 2
+        power *= 2
+    return power
+
+
+def features(logs: np.ndarray) -> np.ndarray:
+    """The standard deviation, in cells, of the narrowest feature along each axis."""
+    out = []
+    for axis in range(logs.ndim):
+        moved = np.moveaxis(logs, axis, 0)
+        if len(moved) < 3:
+            out.append(np.inf)
+            continue
+        with np.errstate(invalid="ignore"):
+            curvature = 2 * moved[1:-1] - moved[:-2] - moved[2:]
+        used = (moved[1:-1] > logs.max() - 14.0) & np.isfinite(curvature)
+        out.append(1 / np.sqrt(max(curvature[used].max(initial=0.0), 1e-12)))
+    return np.array(out)
+
+
+def first_plan(model: Model, lattice: Lattice) -> Plan:
+    """The plan before anything is known of the steps."""
+    angles = tuple(model.state.index(name) for name in model.periodic)
+    return Plan(False, (BASE[model.n],) * model.n, angles=angles)
+
+
+def first_lattice(
+    model: Model, prior: Any, log_factor: Callable[[np.ndarray], np.ndarray] | None
+) -> tuple[Lattice, float]:
+    """The prior, times a factor if there is one, on a lattice; and the logarithm of its mass."""
+    axes, log_prior, box = _prior_box(model, prior)
+    factor = log_factor or (lambda x: np.zeros(x.shape[:-1]))
+
+    def log_density(x: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            logs = log_prior(x)
+            logs = logs + np.where(np.isfinite(logs), factor(x), 0.0)
+        if np.isnan(logs).any():
+            raise InputError(f"{model.source}: prior: log_density is not a number at x = {x[np.isnan(logs)][0].tolist()}")
+        return logs
+
+    low, high = box
+    point = high - low == 0
+    turn = np.array([2 * np.pi if i in [model.state.index(p) for p in model.periodic] else np.inf for i in _order(model)])
+    size = np.where(point, 1, 2 * BASE[model.n])
+    for _ in range(60):
+        whole = high - low >= turn * (1 - 1e-12)
+        low, high = np.where(whole, (low + high - turn) / 2, low), np.where(whole, (low + high + turn) / 2, high)
+        cell = np.where(point, 1.0, (high - low) / np.where(whole, size, size - 1))
+        index = np.stack(np.meshgrid(*[np.arange(s) for s in size], indexing="ij"), axis=-1)
+        logs = log_density((low + cell * index) @ axes.T)
+        if not np.isfinite(logs.max()):
+            raise InputError(f"{model.source}: prior: log_density is not finite anywhere; give a density")
+        used = logs > logs.max() - SUPPORT
+        first, last = low.copy(), high.copy()
+        for d in range(model.n):
+            line = np.flatnonzero(used.any(axis=tuple(a for a in range(model.n) if a != d)))
+            if not point[d]:
+                first[d] = low[d] + cell[d] * max(line[0] - 1, 0)
+                last[d] = low[d] + cell[d] * min(line[-1] + 1, size[d] - 1)
+                if whole[d] and line[0] == 0 and line[-1] == size[d] - 1:
+                    first[d], last[d] = low[d], high[d]
+        if np.any((last - first < 0.7 * (high - low)) & ~point):
+            low, high = first, last
+            continue
+        fine = features(logs) >= 2 * CELLS
+        if np.all(fine | point | (size >= MOST[model.n])):
+            break
+        size = np.where(fine | point, size, size * 2)
+    size_half = size // 2
+    basis = axes * cell
+    mass = logs.max() + np.log(np.exp(logs - logs.max()).sum()) + np.log(abs(np.linalg.det(basis)))
+    centre = axes @ (low + cell * size_half)
+    return Lattice(jnp.asarray(logs - mass), jnp.asarray(centre), jnp.asarray(basis)), float(mass)
+
+
+def _order(model: Model) -> list[int]:
+    """The states in the order of the lattice's axes: angles first."""
+    angles = [model.state.index(name) for name in model.periodic]
+    return angles + [i for i in range(model.n) if i not in angles]
+
+
+def _prior_box(model, prior):
+    """Axes (columns), the prior's logarithm, and a box in their coordinates that holds all of it; no width: a point mass."""
+    n, periodic = model.n, tuple(name in model.periodic for name in model.state)
+    axes = np.eye(n)[:, _order(model)]
+    if isinstance(prior, DensityPrior):
+        function = numpy_function([prior.log_density], model)
+
+        def log_prior(x):
+            return function(x, model.start, model.theta())[..., 0]
+
+        return axes, log_prior, _search(model, log_prior, axes)
+    mixture = (
+        GaussianMixture.gaussian(prior.mean, prior.cov, model.state, periodic)
+        if isinstance(prior, GaussianPrior)
+        else GaussianMixture(prior.weights, prior.means, prior.covs, model.state, periodic)
+    )
+    if len(mixture.weights) == 1 and not any(periodic):
+        values, vectors = np.linalg.eigh(mixture.covs[0])
+        axes = vectors if n > 1 else np.eye(1)
+    spreads = np.einsum("ia,kij,ja->ka", axes, mixture.covs, axes)
+    tiny = 1e-14 * np.maximum(np.abs(mixture.means @ axes) ** 2, 1e-6)
+    if np.any(np.all(spreads <= tiny, axis=0)):
+        if len(mixture.weights) > 1:
+            raise InputError(f"{model.source}: prior: a mixture on a lattice needs positive variances in every coordinate")
+        spreads = np.where(spreads <= tiny, 0.0, spreads)
+        flat = spreads[0] == 0
+        white = np.where(flat, 0.0, 1 / np.sqrt(np.where(flat, 1.0, spreads[0])))
+
+        def log_degenerate(x):
+            z = (x - mixture.means[0]) @ axes * white
+            # With a cell of width one along a flat direction, the sum of the cells is the probability.
+            return -0.5 * np.sum(z**2, axis=-1) - np.sum(np.log(np.sqrt(2 * np.pi) / white[~flat]))
+
+        centre = mixture.means[0] @ axes
+        return axes, log_degenerate, (centre - REACH * np.sqrt(spreads[0]), centre + REACH * np.sqrt(spreads[0]))
+    if np.any(spreads <= tiny):
+        raise InputError(f"{model.source}: prior: a component has no variance in some direction; give it a small one")
+    centres = mixture.means @ axes
+    reach = REACH * np.sqrt(spreads)
+    return axes, mixture.log_density, ((centres - reach).min(axis=0), (centres + reach).max(axis=0))
+
+
+def _search(model, log_prior, axes):
+    """A box around a density of which nothing is known: angles have their circle, the rest is looked for up to 10^6."""
+    count = 4001 if model.n == 1 else 401
+    angles = len(model.periodic)
+    lines = [
+        np.linspace(-np.pi, np.pi, count) if d < angles else np.sinh(np.linspace(-21.4, 21.4, count)) * 1e-3
+        for d in range(model.n)
+    ]
+    mesh = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
+    with np.errstate(all="ignore"):
+        logs = log_prior(mesh @ axes.T)
+    logs = np.where(np.isnan(logs), -np.inf, logs)
+    used = logs > logs.max() - SUPPORT
+    low, high = np.zeros(model.n), np.zeros(model.n)
+    for d in range(model.n):
+        line = np.flatnonzero(used.any(axis=tuple(a for a in range(model.n) if a != d)))
+        if d < angles:
+            low[d], high[d] = -np.pi, np.pi
+            continue
+        if not len(line) or line[0] == 0 or line[-1] == count - 1:
+            raise InputError(f"{model.source}: prior: log_density does not fall off within 10^6; it must be a density")
+        low[d], high[d] = lines[d][line[0] - 1], lines[d][line[-1] + 1]
+    return low, high
+
+
+def adapted(
+    model: Model,
+    lattice: Lattice,
+    plan: Plan,
+    deviation: np.ndarray,
+    angle: np.ndarray,
+    maps: np.ndarray,
+    info: Any | None,
+) -> tuple[Lattice, Plan | None]:
+    """A lattice and a plan for a run of intervals with kernels of `deviation` (K,), moving by `maps` (K, parts, n, n).
+
+    With the `info` of a try: a better plan, or None where the try was good or nothing better can be had.
+    """
+    if info is not None:
+        if healthy(info):
+            return lattice, None
+        plan = _more(plan, info)
+        if plan is None:
+            return lattice, None
+    one_line = model.n == 1 and not plan.angles and maps.shape[1] == 1
+    if one_line and lattice.log_values.size > 1:
+        banded = _banded(lattice, plan, deviation, np.abs(maps[:, 0, 0, 0]))
+        if banded is not None:
+            return banded
+    sizes = plan.sizes if not plan.banded else (BASE[1],)
+    if info is None:
+        roomy = features(np.asarray(lattice.log_values)) > 4 * CELLS
+        sizes = tuple(
+            max(s // 2, BASE[model.n]) if room and s > BASE[model.n] else s for s, room in zip(sizes, roomy, strict=True)
+        )
+    images = int(1 + np.ceil(FAR * angle.max(initial=0.0) / (2 * np.pi))) if plan.angles else 0
+    return lattice, replace(plan, banded=False, sizes=sizes, images=images)
+
+
+def healthy(info: Any) -> bool:
+    """Whether a try kept every bound."""
+    health = info.health
+    return bool(
+        np.all(np.isfinite(info.log_likelihood_increment))
+        and np.all(health["edge_mass"] < EDGE)
+        and np.all(health["resolution"] > CELLS)
+        and np.all(health["quadrature_error"] < QUADRATURE)
+    )
+
+
+def _more(plan: Plan, info: Any) -> Plan | None:
+    """A larger window or a finer cell, whichever was missing; None at the limit."""
+    if not plan.banded:
+        if max(plan.sizes) >= MOST[len(plan.sizes)]:
+            return None
+        return replace(plan, sizes=tuple(2 * s for s in plan.sizes))
+    finite = np.all(np.isfinite(info.log_likelihood_increment))
+    coarse = not np.all(info.health["resolution"] > CELLS)
+    narrow = not np.all(info.health["edge_mass"] < EDGE) or not finite
+    if plan.sizes[0] >= 2**17 or plan.cells > 300 or plan.window > 40:
+        return None
+    return replace(plan, cells=plan.cells * (2 if coarse else 1), window=plan.window * (1.6 if narrow else 1))
+
+
+def _banded(lattice: Lattice, plan: Plan, deviation: np.ndarray, maps: np.ndarray) -> tuple[Lattice, Plan] | None:
+    """The window and the cell of a banded run, or None where summing over all pairs is cheaper."""
+    logs = np.asarray(lattice.log_values)
+    cell = abs(float(lattice.basis[0, 0]))
+    growth = np.concatenate([[1.0], np.cumprod(maps)])[: len(deviation)] / deviation
+    widest = min(COARSEST / growth.max(), features(logs)[0] * cell / plan.cells)
+    halvings = int(np.ceil(np.log2(cell / widest) - 1e-9))
+    new_cell = cell / 2.0**halvings
+    taps = 32
+    while taps * new_cell * growth.min() < REACH:
+        taps = taps * 3 // 2
+    used = np.flatnonzero(logs > logs.max() - SUPPORT)
+    span = (used[-1] - used[0] + 1) * cell
+    size = rounded_up(plan.window * span / new_cell + 8)
+    if plan.banded and plan.sizes[0] >= size >= 0.6 * plan.sizes[0]:
+        size = plan.sizes[0]
+    pairs = max(BASE[1], rounded_up(span / (COARSEST * deviation.min())))
+    if size * (12 + 0.2 * taps) > 3 * pairs**2:
+        return None
+    middle = (used[0] + used[-1]) // 2
+    resampled, centre_index = _resampled(logs, middle, halvings)
+    window = np.full(size, -np.inf)
+    shift = size // 2 - centre_index
+    source = np.arange(len(resampled))
+    target = source + shift
+    inside = (target >= 0) & (target < size)
+    window[target[inside]] = resampled[source[inside]]
+    basis = np.asarray(lattice.basis) / 2.0**halvings
+    centre = np.asarray(lattice.centre) + np.asarray(lattice.basis)[:, 0] * (middle - len(logs) // 2)
+    new = replace(plan, banded=True, sizes=(size,), taps=taps)
+    return Lattice(jnp.asarray(window), jnp.asarray(centre), jnp.asarray(basis)), new
+
+
+def _resampled(logs: np.ndarray, middle: int, halvings: int) -> tuple[np.ndarray, int]:
+    """The density with its cell halved so many times (doubled if negative), and where index `middle` went."""
+    if halvings == 0:
+        return logs, middle
+    if halvings < 0:
+        step = 2**-halvings
+        start = middle % step
+        return logs[start::step], middle // step
+    # Trigonometric interpolation is exact where the density is resolved; the far tails, which it would drown in
+    # rounding, are interpolated in the logarithm.
+    factor = 2**halvings
+    top = logs.max()
+    count = len(logs)
+    spectrum = np.fft.rfft(np.exp(logs - top))
+    fine = np.fft.irfft(spectrum, count * factor) * factor
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tail = np.interp(np.arange(count * factor) / factor, np.arange(count), np.maximum(logs, top - 800.0))
+        tail = np.where(tail <= top - 799.0, -np.inf, tail)
+        value = np.where(fine > 1e-12, np.log(np.maximum(fine, 1e-300)) + top, tail)
+    return value, middle * factor

@@ -1,0 +1,64 @@
+"""The shape that every method has.
+
+A method is one module with one `METHOD`.  Its parts are plain functions; arrays travel in pytrees; what decides the shape of an
+array is static.  `prepare` is offline and sees no data, `step` is pure and sees no symbol.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.algebra.conditions import Condition
+from zakai.densities import Density
+from zakai.models.model import Model
+
+
+class Schedule(NamedTuple):
+    """When and which coordinates are observed: `starts` (K,), `stops` (K,), `inside` (K, m).
+
+    `inside` marks the coordinates whose observation is an increment over just this interval, so that it may act inside of it.
+    """
+
+    starts: np.ndarray
+    stops: np.ndarray
+    inside: np.ndarray
+
+
+class Info(NamedTuple):
+    """What one step tells: the increment of the log-likelihood, moments (n,) and (n, n), and its health."""
+
+    log_likelihood_increment: Any
+    mean: Any
+    cov: Any
+    health: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Method:
+    """One filter.
+
+    `prepare(model, schedule, **options)` gives a Prepared whose `intervals` are a pytree with a leading axis of K;
+    `init(prepared, prior)` the first state; `correct(prepared, prior, observation)` the same with an observation at the start;
+    `observations(prepared, data)` what `step` is given, for all intervals at once; `step(interval, state, observation)`
+    gives (State, Info); `density(prepared, state)` a Density.  A method whose arrays have a size that the data decides has
+    `adapt(prepared, state, intervals, info)`: the state to start (or, after a try with `info`, to start again) a run of intervals
+    with, or None where nothing need or can be changed.
+    """
+
+    name: str
+    source: str
+    exactness: str
+    theorem: Callable[[Model], tuple[Condition, ...]]
+    options: Mapping[str, Any]
+    prepare: Callable[..., Any]
+    init: Callable[..., Any]
+    correct: Callable[..., Any]
+    observations: Callable[..., Any]
+    step: Callable[..., Any]
+    density: Callable[..., Density]
+    adapt: Callable[..., Any] | None = None
+    bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)

@@ -1,0 +1,139 @@
+"""What filtering a record gives."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zakai.algebra.conditions import Condition
+from zakai.densities import Density
+from zakai.errors import InputError
+from zakai.models.model import Model
+from zakai.records import Record, load_dataset, save_dataset
+
+if TYPE_CHECKING:
+    import xarray
+
+_LARGEST_COV = 32
+
+
+@dataclass(eq=False)
+class FilterResult:
+    """The posterior at every time of a record.
+
+    Index 0 is the prior at the model's start; index k is after observation k has been used. `times` (K+1,), `mean` and
+    `variance` (K+1, n), `cov` (K+1, n, n), `log_likelihood_increments` (K+1,) with entry 0 zero, and `health`, figures of each
+    step (K+1,). `warnings` are sentences; none means that every bound was kept. `method` and `why` say which filter ran
+    and on what grounds, `conditions` those of every method that was considered.
+    """
+
+    times: np.ndarray
+    mean: np.ndarray
+    cov: np.ndarray
+    log_likelihood_increments: np.ndarray
+    health: dict[str, np.ndarray]
+    warnings: list[str]
+    method: str
+    why: str
+    model: Model | None
+    record: Record | None = None
+    conditions: Mapping[str, tuple[Condition, ...]] = field(default_factory=dict)
+    bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    state: tuple[str, ...] = ()
+    attributes: dict[str, str] = field(default_factory=dict)
+    _density: Callable[[int], Density] | None = None
+    _no_density: str = "the densities were not kept"
+
+    @property
+    def variance(self) -> np.ndarray:
+        """The variances of the coordinates (K+1, n)."""
+        return np.diagonal(self.cov, axis1=1, axis2=2)
+
+    @property
+    def log_likelihood(self) -> float:
+        """The logarithm of the evidence of the whole record."""
+        return float(np.sum(self.log_likelihood_increments))
+
+    @property
+    def has_densities(self) -> bool:
+        """Whether `density` can be asked."""
+        return self._density is not None
+
+    def density(self, k: int) -> Density:
+        """The posterior after observation k (0: the prior; negative numbers count from the end).
+
+        Raises InputError where the densities were not kept.
+        """
+        if self._density is None:
+            raise InputError(self._no_density)
+        count = len(self.times)
+        if not -count <= k < count:
+            raise InputError(f"density: there is no time number {k}; numbers run from 0 to {count - 1}")
+        return self._density(k % count)
+
+    def to_dataset(self) -> xarray.Dataset:
+        """The result as an xarray Dataset with dimensions `time` and `state`."""
+        import xarray
+
+        names = list(self.state)
+        variables: dict[str, Any] = {
+            "mean": (("time", "state"), self.mean),
+            "variance": (("time", "state"), self.variance),
+            "log_likelihood_increment": (("time",), self.log_likelihood_increments),
+        }
+        if len(names) <= _LARGEST_COV:
+            variables["cov"] = (("time", "state", "state_"), self.cov)
+        for name, values in self.health.items():
+            variables[name] = (("time",), values, {"description": self.bounds.get(name, (0, name))[1]})
+        coordinates = {"time": self.times, "state": names, "state_": names}
+        attributes = {
+            "method": self.method,
+            "why": self.why,
+            "log_likelihood": self.log_likelihood,
+            "warnings": "\n".join(self.warnings),
+            "model": self.model.text if self.model is not None else "",
+            **self.attributes,
+        }
+        return xarray.Dataset(variables, coords=coordinates, attrs=attributes)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result as NetCDF, whole or not at all."""
+        save_dataset(self.to_dataset(), path)
+
+
+def load_result(path: str | os.PathLike[str]) -> FilterResult:
+    """A result that was written by `FilterResult.save`; densities are not stored.
+
+    Raises InputError for a file that is not such a result.
+    """
+    from zakai.models.files import read_model
+
+    data = load_dataset(path)
+    known = {"mean", "variance", "cov", "log_likelihood_increment"}
+    mean = data["mean"].values
+    variance = data["variance"].values
+    cov = data["cov"].values if "cov" in data else np.einsum("ki,ij->kij", variance, np.eye(mean.shape[1]))
+    text = str(data.attrs.get("model", ""))
+    return FilterResult(
+        times=data["time"].values,
+        mean=mean,
+        cov=cov,
+        log_likelihood_increments=data["log_likelihood_increment"].values,
+        health={str(name): data[name].values for name in data.data_vars if name not in known},
+        warnings=[line for line in str(data.attrs.get("warnings", "")).split("\n") if line],
+        method=str(data.attrs.get("method", "")),
+        why=str(data.attrs.get("why", "")),
+        model=read_model(text, str(path)) if text else None,
+        state=tuple(str(name) for name in data["state"].values),
+        _no_density=f"{path}: a stored result has no densities; filter again to have them",
+    )
+
+
+def versions() -> dict[str, str]:
+    """The versions of what computed a result."""
+    return {f"version_{name}": version(name) for name in ("zakai", "jax", "numpy", "sympy")}
