@@ -24,9 +24,7 @@ def draw_from_density(model: Model, rng: np.random.Generator) -> np.ndarray:
     Raises InputError for more states, for a density that is not finite, and for one that does not decay.
     """
     if model.n > 2:
-        raise InputError(
-            f"{model.source}: prior: a density over {model.n} states cannot be drawn from; give initial"
-        )
+        raise InputError(f"{model.source}: prior: a density over {model.n} states cannot be drawn from; give initial")
     assert isinstance(model.prior, DensityPrior)
     log_density = numpy_function([model.prior.log_density], model, ())
     points = 4001 if model.n == 1 else 401

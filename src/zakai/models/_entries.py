@@ -160,9 +160,7 @@ def names(value: Any, expected: str) -> tuple[str, ...]:
 def allowed_name(name: str) -> None:
     """Raise InputError unless the name can stand in a formula."""
     if not _NAME.match(name):
-        raise InputError(
-            f"{echo(name)} is not a name; use ASCII letters, digits and _, a letter first, at most 64"
-        )
+        raise InputError(f"{echo(name)} is not a name; use ASCII letters, digits and _, a letter first, at most 64")
     if keyword.iskeyword(name):
         raise InputError(f"{name!r} is a keyword of Python and cannot be a name; try {name + '_'!r}")
     if name in RESERVED:
@@ -173,6 +171,4 @@ def known_keys(keys: Iterable[str], allowed: Sequence[str]) -> None:
     """Raise InputError at the first key that is not allowed."""
     for key in keys:
         if key not in allowed:
-            raise InputError(
-                f"unknown key {echo(key, 40)}{did_you_mean(key, allowed)} (the keys are {listing(allowed)})"
-            )
+            raise InputError(f"unknown key {echo(key, 40)}{did_you_mean(key, allowed)} (the keys are {listing(allowed)})")

@@ -80,9 +80,8 @@ class Program:
             above: list[sympy.Expr] = []
             below: list[sympy.Expr] = []
             for factor in expr.args:
-                base, power = factor.as_base_exp()
-                divides = power.is_Rational and power < 0 and not base.is_Rational
-                (below if divides else above).append(base**-power if divides else factor)
+                divides = isinstance(factor, sympy.Pow) and factor.exp.is_Rational and factor.exp < 0
+                (below if divides else above).append(_reciprocal(factor) if divides else factor)
             if below:
                 return "divide", (_product(above), _product(below)), None
             return "multiply", expr.args, None
@@ -93,9 +92,7 @@ class Program:
         if type(expr) in _UNARY:
             return _UNARY[type(expr)], expr.args, None
         if isinstance(expr, AppliedUndef | sympy.Derivative):
-            raise InputError(
-                f"{str(expr)[:60]} is an undetermined function: the model can be analysed, not computed with"
-            )
+            raise InputError(f"{str(expr)[:60]} is an undetermined function: the model can be analysed, not computed with")
         if expr.is_Symbol:
             raise InputError(f"{expr} is neither a state, nor t, nor a parameter")
         raise InputError(f"{str(expr)[:60]} has no real numerical value")
@@ -106,7 +103,7 @@ class Program:
         if power == sympy.S.Half:
             return "sqrt", (base,), None
         if power.is_Rational and power < 0:
-            return "divide", (sympy.S.One, base**-power), None
+            return "divide", (sympy.S.One, _reciprocal(expr)), None
         if power.is_Integer:
             return "power", (base,), int(power)
         if power.is_Rational:
@@ -152,9 +149,7 @@ class Program:
             elif instruction.operation in ("x", "t"):
                 moving.append((slot, instruction.operation == "x", instruction.constant))
             else:
-                steps.append(
-                    (slot, SCALAR[instruction.operation], instruction.operands, instruction.constant)
-                )
+                steps.append((slot, SCALAR[instruction.operation], instruction.operands, instruction.constant))
 
         def call(x: Sequence[float], t: float) -> list[float]:
             values = fixed.copy()
@@ -170,6 +165,10 @@ class Program:
             return [values[slot] for slot in self.outputs]
 
         return call
+
+
+def _reciprocal(expr: sympy.Pow) -> sympy.Expr:
+    return expr.base if expr.exp == -1 else sympy.Pow(expr.base, -expr.exp, evaluate=False)
 
 
 def _product(factors: list[sympy.Expr]) -> sympy.Expr:
@@ -244,10 +243,7 @@ def _float_power(base: float, power: float) -> float:
 
 
 _MATH = SimpleNamespace(
-    **{
-        name: getattr(math, name)
-        for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt")
-    },
+    **{name: getattr(math, name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt")},
     arcsin=math.asin,
     arccos=math.acos,
     arctan=math.atan,

@@ -29,11 +29,7 @@ _ORDER = (
 
 def to_toml(keys: Mapping[str, Any]) -> str:
     """The TOML of a model's keys, all formulas as text; keys that hold their default are left out."""
-    lines = [
-        f"{key} = {_value(keys[key])}"
-        for key in _ORDER
-        if key not in _OPTIONAL or keys[key] != _OPTIONAL[key]
-    ]
+    lines = [f"{key} = {_value(keys[key])}" for key in _ORDER if key not in _OPTIONAL or keys[key] != _OPTIONAL[key]]
     if keys["parameters"]:
         lines += [
             "",

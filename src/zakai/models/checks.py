@@ -49,9 +49,7 @@ def check_constant_noise(model: Model) -> None:
 
 def _problem(model: Model, key: str, times: np.ndarray) -> tuple[int, tuple[str, str]] | None:
     """The first time at which the matrix is not what it must be, and the words before and after that time."""
-    matrices = numpy_function(getattr(model, key), model, getattr(model, key).shape)(
-        np.zeros(model.n), times, model.theta()
-    )
+    matrices = numpy_function(getattr(model, key), model, getattr(model, key).shape)(np.zeros(model.n), times, model.theta())
     finite = np.isfinite(matrices).all(axis=(-2, -1))
     if not finite.all():
         return int(np.argmin(finite)), ("is not finite", "")
@@ -76,11 +74,7 @@ def check_periodic(model: Model) -> None:
     Raises InputError naming the entry. Undetermined functions are taken as periodic.
     """
     rng = np.random.default_rng(0)
-    entries = [
-        (f"{key}[{i}]", expr)
-        for key in ("drift", "observation")
-        for i, expr in enumerate(getattr(model, key))
-    ]
+    entries = [(f"{key}[{i}]", expr) for key in ("drift", "observation") for i, expr in enumerate(getattr(model, key))]
     if isinstance(model.prior, DensityPrior):
         entries.append(("prior: log_density", model.prior.log_density))
     for angle in model.periodic:
@@ -96,14 +90,10 @@ def check_periodic(model: Model) -> None:
             value = numpy_function([expr], model, ())
             here, there = value(x, t, model.theta()), value(turned, t, model.theta())
             with np.errstate(invalid="ignore"):
-                same = (np.abs(here - there) <= 1e-8 * (1 + np.abs(here))) | (
-                    ~np.isfinite(here) & ~np.isfinite(there)
-                )
+                same = (np.abs(here - there) <= 1e-8 * (1 + np.abs(here))) | (~np.isfinite(here) & ~np.isfinite(there))
             if not same.all():
                 text = str(expr)[:60]
-                raise InputError(
-                    f"{place}: {text} is not 2*pi-periodic in {angle!r}, which is listed in periodic"
-                )
+                raise InputError(f"{place}: {text} is not 2*pi-periodic in {angle!r}, which is listed in periodic")
 
 
 def check_independent_of_state(matrix: sympy.MatrixBase, x: tuple[sympy.Symbol, ...]) -> None:
@@ -113,6 +103,4 @@ def check_independent_of_state(matrix: sympy.MatrixBase, x: tuple[sympy.Symbol, 
         if found:
             row, column = divmod(index, matrix.shape[1])
             name = min(str(symbol) for symbol in found)
-            raise InputError(
-                f"[{row}][{column}]: depends on the state {name!r}; it may depend on t and on parameters only"
-            )
+            raise InputError(f"[{row}][{column}]: depends on the state {name!r}; it may depend on t and on parameters only")

@@ -38,17 +38,34 @@ def jax_function(expressions: Any, model: Model, shape: Sequence[int] | None = N
     program = program_of(flat, model)
 
     if program.constant_outputs:
-        constant = np.array(
-            [program.instructions[slot].constant for slot in program.outputs], dtype=float
-        ).reshape(shape)
+        constant = np.array([program.instructions[slot].constant for slot in program.outputs], dtype=float).reshape(shape)
         return lambda x, t, theta: jnp.asarray(constant)
 
     def function(x: Any, t: Any, theta: Any) -> jax.Array:
         x, t, theta = (jnp.asarray(a, dtype=jnp.float64) for a in (x, t, theta))
         values = program.run(x, t, theta, _JAX)
-        return jnp.stack([jnp.asarray(values[slot], dtype=jnp.float64) for slot in program.outputs]).reshape(
-            shape
-        )
+        return jnp.stack([jnp.asarray(values[slot], dtype=jnp.float64) for slot in program.outputs]).reshape(shape)
+
+    return function
+
+
+def jax_field(expressions: Any, model: Model) -> JaxFunction:
+    """The expressions as one function of many states at once: f(x, t, theta) with x (..., n) gives (k, ...).
+
+    Each expression is one vectorised loop over the points, which `vmap` of `jax_function` is not: there the values of a point
+    lie side by side. Raises InputError for an undetermined function.
+
+        >>> jax_field(model.observation, model)(jnp.zeros((100, 1)), 0.0, model.theta()).shape
+        (2, 100)
+    """
+    flat, _ = flattened(expressions)
+    program = program_of(flat, model)
+
+    def function(x: Any, t: Any, theta: Any) -> jax.Array:
+        values = program.run(x, jnp.asarray(t, dtype=jnp.float64), jnp.asarray(theta, dtype=jnp.float64), _JAX)
+        rows = [jnp.broadcast_to(jnp.asarray(values[slot], dtype=jnp.float64), x.shape[:-1]) for slot in program.outputs]
+        # Without the barrier the sines would be computed anew, one number at a time, inside of what uses them.
+        return jnp.stack(jax.lax.optimization_barrier(rows))
 
     return function
 

@@ -157,9 +157,7 @@ def parse(text: str) -> Node:
         Product(factors=((True, Negative(operand=Number(value=Fraction(2, 1), position=2), position=1)), ...
     """
     if len(text) > MAX_LENGTH:
-        raise ExpressionError(
-            f"the formula has {len(text)} characters; at most {MAX_LENGTH} are read", MAX_LENGTH + 1
-        )
+        raise ExpressionError(f"the formula has {len(text)} characters; at most {MAX_LENGTH} are read", MAX_LENGTH + 1)
     parser = _Parser(text)
     if parser.token.kind == "end":
         raise ExpressionError("the formula is empty", 1)
@@ -184,11 +182,7 @@ class _Parser:
         token = self.token
         if token.kind == "end":
             return ExpressionError(f"the formula ends where {wanted} was expected", token.position)
-        hint = (
-            "; write * to multiply"
-            if wanted == "an operator" and token.kind in ("name", "number", "(")
-            else ""
-        )
+        hint = "; write * to multiply" if wanted == "an operator" and token.kind in ("name", "number", "(") else ""
         return ExpressionError(f"expected {wanted}, got {echo(token.text)}{hint}", token.position)
 
     def expect(self, kind: str) -> None:
@@ -254,9 +248,7 @@ def _number(token: _Token) -> Fraction:
     whole, _, decimals = mantissa.partition(".")
     digits = (whole + decimals).strip("0")
     if len(digits) > MAX_DIGITS:
-        raise ExpressionError(
-            f"the number {echo(token.text)} has more than {MAX_DIGITS} significant digits", token.position
-        )
+        raise ExpressionError(f"the number {echo(token.text)} has more than {MAX_DIGITS} significant digits", token.position)
     if not digits:
         return Fraction(0)
     magnitude = exponent.lstrip("+-").lstrip("0")
@@ -266,9 +258,7 @@ def _number(token: _Token) -> Fraction:
     return Fraction(int(digits)) * Fraction(10) ** (int(exponent or "0") + leading - len(digits))
 
 
-def parse_expression(
-    text: str, symbols: Mapping[str, sympy.Expr], functions: Collection[str] = ()
-) -> sympy.Expr:
+def parse_expression(text: str, symbols: Mapping[str, sympy.Expr], functions: Collection[str] = ()) -> sympy.Expr:
     """Read a formula into SymPy, with decimals as exact rationals.
 
     `text` is one formula; `symbols` maps each name it may use to the symbol that stands for it; `functions`

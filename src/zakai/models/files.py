@@ -50,9 +50,7 @@ def _read_text(path: Path, shown: str) -> str:
         hint = "; the models of the gallery are named gallery:NAME" if path.suffix == "" else ""
         raise InputError(f"{shown}: there is no such file{hint}") from None
     except (OSError, ValueError) as error:
-        raise InputError(
-            f"{shown}: cannot be read: {getattr(error, 'strerror', None) or 'not a path'}"
-        ) from None
+        raise InputError(f"{shown}: cannot be read: {getattr(error, 'strerror', None) or 'not a path'}") from None
     if len(data) > MAX_BYTES:
         raise InputError(f"{shown}: larger than 1 MiB, which no model file is")
     try:

@@ -18,11 +18,7 @@ def names() -> tuple[str, ...]:
     >>> "benes" in names()
     True
     """
-    return tuple(
-        sorted(
-            entry.name.removesuffix(".toml") for entry in _FOLDER.iterdir() if entry.name.endswith(".toml")
-        )
-    )
+    return tuple(sorted(entry.name.removesuffix(".toml") for entry in _FOLDER.iterdir() if entry.name.endswith(".toml")))
 
 
 def text(name: str) -> str:

@@ -94,9 +94,7 @@ class Model:
         with named("start"):
             vars(self)["start"] = canonical["start"] = _entries.number(keys.get("start", 0.0))
         with named("prior"):
-            prior, table = read_prior(
-                keys.get("prior"), self.n, lambda text: self._parse(text, in_time=False)
-            )
+            prior, table = read_prior(keys.get("prior"), self.n, lambda text: self._parse(text, in_time=False))
             vars(self)["prior"], canonical["prior"] = prior, table
         checks.check_constant_noise(self)
         checks.check_periodic(self)
@@ -139,9 +137,7 @@ class Model:
             kind = keys.get("observation_kind", "increments")
             if not isinstance(kind, str) or kind not in OBSERVATION_KINDS:
                 hint = did_you_mean(kind, OBSERVATION_KINDS) if isinstance(kind, str) else ""
-                raise InputError(
-                    f"expected one of {listing(OBSERVATION_KINDS)}, got {_entries.kind_of(kind)}{hint}"
-                )
+                raise InputError(f"expected one of {listing(OBSERVATION_KINDS)}, got {_entries.kind_of(kind)}{hint}")
         attributes.update(
             state=state,
             functions=functions,
@@ -153,20 +149,14 @@ class Model:
             t=sympy.Symbol("t", real=True),
             parameter_symbols=tuple(sympy.Symbol(name, real=True) for name in parameters),
         )
-        canonical.update(
-            state=state, functions=functions, parameters=parameters, periodic=periodic, observation_kind=kind
-        )
+        canonical.update(state=state, functions=functions, parameters=parameters, periodic=periodic, observation_kind=kind)
 
     def _read_formulas(self, keys: Mapping[str, Any]) -> None:
         canonical, n = self._keys, self.n
         with named("drift"):
-            canonical["drift"] = _entries.vector_of_formulas(
-                keys["drift"], n, f"a list of {n} formulas (one a state)"
-            )
+            canonical["drift"] = _entries.vector_of_formulas(keys["drift"], n, f"a list of {n} formulas (one a state)")
         with named("observation"):
-            canonical["observation"] = _entries.vector_of_formulas(
-                keys["observation"], None, "a list of formulas (one a sensor)"
-            )
+            canonical["observation"] = _entries.vector_of_formulas(keys["observation"], None, "a list of formulas (one a sensor)")
             if not 1 <= len(canonical["observation"]) <= MOST_STATES:
                 raise InputError(f"expected a list of 1 to {MOST_STATES} formulas (one a sensor)")
         m = vars(self)["m"] = len(canonical["observation"])
@@ -232,14 +222,10 @@ class Model:
             for name in values:
                 if name not in self.parameters:
                     known = f"(the parameters are {listing(self.parameters)})"
-                    raise InputError(
-                        f"unknown parameter {name!r}{did_you_mean(name, self.parameters)} {known}"
-                    )
+                    raise InputError(f"unknown parameter {name!r}{did_you_mean(name, self.parameters)} {known}")
             parameters = {**self.parameters, **_read_parameters(values)}
         other = object.__new__(Model)
-        vars(other).update(
-            {**vars(self), "parameters": parameters, "_keys": {**self._keys, "parameters": parameters}}
-        )
+        vars(other).update({**vars(self), "parameters": parameters, "_keys": {**self._keys, "parameters": parameters}})
         with named(self.source):
             checks.check_constant_noise(other)
         vars(other)["text"] = other.to_toml()

@@ -18,9 +18,7 @@ NumericFunction = Callable[..., np.ndarray]
 _NUMPY = operations(np, erf)
 
 
-def flattened(
-    expressions: Any, shape: Sequence[int] | None = None
-) -> tuple[list[sympy.Expr], tuple[int, ...]]:
+def flattened(expressions: Any, shape: Sequence[int] | None = None) -> tuple[list[sympy.Expr], tuple[int, ...]]:
     """The expressions of a list or Matrix in order, and the shape of their values ((k,) for a column)."""
     if isinstance(expressions, sympy.MatrixBase):
         natural: tuple[int, ...] = expressions.shape if expressions.shape[1] != 1 else (expressions.shape[0],)

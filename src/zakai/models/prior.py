@@ -20,9 +20,7 @@ def _gaussian_log_density(x: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> n
     try:
         factor = np.linalg.cholesky(cov)
     except np.linalg.LinAlgError:
-        raise InputError(
-            "prior: its covariance is singular, so it has no density; give every direction a variance"
-        ) from None
+        raise InputError("prior: its covariance is singular, so it has no density; give every direction a variance") from None
     whitened = np.linalg.solve(factor, (np.asarray(x, dtype=float) - mean)[..., None])[..., 0]
     log_volume = np.log(np.diag(factor)).sum() + 0.5 * len(mean) * np.log(2 * np.pi)
     return -0.5 * (whitened**2).sum(axis=-1) - log_volume
@@ -69,9 +67,7 @@ class MixturePrior:
     def cov(self) -> np.ndarray:
         """The covariance of the mixture, of shape (n, n)."""
         deviations = self.means - self.mean
-        return np.einsum(
-            "k,kij->ij", self.weights, self.covs + deviations[:, :, None] * deviations[:, None, :]
-        )
+        return np.einsum("k,kij->ij", self.weights, self.covs + deviations[:, :, None] * deviations[:, None, :])
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
         """The logarithm of the density at `x` (..., n); raises InputError where a covariance is singular."""
@@ -100,9 +96,7 @@ Prior = GaussianPrior | MixturePrior | DensityPrior
 _KEYS = {"gaussian": ("mean", "cov"), "mixture": ("weights", "means", "covs"), "density": ("log_density",)}
 
 
-def read_prior(
-    keys: Any, n: int, read_formula: Callable[[str], sympy.Expr]
-) -> tuple[Prior | None, dict[str, Any] | None]:
+def read_prior(keys: Any, n: int, read_formula: Callable[[str], sympy.Expr]) -> tuple[Prior | None, dict[str, Any] | None]:
     """The prior of the table `[prior]`, and the table in plain numbers and text.
 
     `keys` is the table (or a prior, or None), `n` the number of states, `read_formula` reads the formula of
@@ -154,9 +148,7 @@ def _read_mixture(keys: Mapping[str, Any], n: int) -> MixturePrior:
     with named("means"):
         means = array(keys["means"], (count, n), f"{count} lists of {n} numbers (one list a component)")
     with named("covs"):
-        tables = items(
-            keys["covs"], count, f"{count} covariances (one a component), each {n} x {n} or {n} variances"
-        )
+        tables = items(keys["covs"], count, f"{count} covariances (one a component), each {n} x {n} or {n} variances")
         covs = []
         for index, table in enumerate(tables):
             with named(f"[{index}]"):
@@ -175,7 +167,5 @@ def _read_covariance(value: Any, n: int) -> np.ndarray:
         raise InputError("is not symmetric")
     smallest = smallest_eigenvalue(cov)
     if smallest < -ROUNDING * n:
-        raise InputError(
-            "is not positive semidefinite; variances cannot be negative nor correlations exceed 1"
-        )
+        raise InputError("is not positive semidefinite; variances cannot be negative nor correlations exceed 1")
     return (cov + cov.T) / 2

@@ -91,18 +91,14 @@ class _Path:
         self._drift = program_of(list(model.drift), model).scalar(self._theta.tolist())
         self._observation = numpy_function(model.observation, model)
         matrices = {key: getattr(model, key) for key in checks.COEFFICIENTS}
-        self._coefficients = {
-            key: numpy_function(matrix, model, matrix.shape) for key, matrix in matrices.items()
-        }
+        self._coefficients = {key: numpy_function(matrix, model, matrix.shape) for key, matrix in matrices.items()}
 
     def _coefficient(self, key: str, times: np.ndarray) -> np.ndarray:
         """The matrix at all times, (N, ., .), or at one, (., .), if it does not depend on time."""
         t = times if getattr(self.model, key).has(self.model.t) else times[0]
         return self._coefficients[key](np.zeros(self.model.n), t, self._theta)
 
-    def advance(
-        self, state: np.ndarray, grid: np.ndarray, counts: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def advance(self, state: np.ndarray, grid: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The states at the ends of the intervals, (K, n), and the increments or samples there, (K, m)."""
         model, rng = self.model, self._rng
         steps = np.repeat(np.diff(grid) / counts, counts)
@@ -120,9 +116,7 @@ class _Path:
         noise = _times(root, rng.standard_normal((len(times), model.m))) * np.sqrt(steps)[:, None]
         return ends, np.add.reduceat(self._observe(fine[:-1], times) * steps[:, None] + noise, first[:-1])
 
-    def _integrate(
-        self, state: np.ndarray, times: np.ndarray, steps: np.ndarray, noise: np.ndarray
-    ) -> np.ndarray:
+    def _integrate(self, state: np.ndarray, times: np.ndarray, steps: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """The states at every substep, (N+1, n); plain floats are faster than arrays of a few numbers."""
         drift, x = self._drift, state.tolist()
         fine = [x]
