@@ -1,17 +1,33 @@
-"""Every method by its name, loaded when it is asked for."""
+"""Every method by its name: the one list of what there is, loaded when it is asked for.
+
+When a method holds is said by `algebra.theorems.THEOREMS` under the same name.
+"""
 
 from __future__ import annotations
 
 import difflib
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 from zakai.errors import InputError
 
-# name: the module that defines its METHOD, and its entry in algebra.theorems
+
+class Entry(NamedTuple):
+    """Where a method is: the module that defines its METHOD; and what it is, in a line."""
+
+    module: str
+    summary: str
+
+
 METHODS = {
-    "limited-direct": "zakai.filters.limited_direct",
-    "extended-kalman-bucy": "zakai.filters.extended_kalman_bucy",
+    "limited-direct": Entry(
+        "zakai.filters.limited_direct",
+        "exact between observations for time-varying Yau systems whose q is quadratic, in one or two dimensions",
+    ),
+    "extended-kalman-bucy": Entry(
+        "zakai.filters.extended_kalman_bucy",
+        "approximate for any smooth system: linearised at the mean, one Gaussian; only when it is asked for",
+    ),
 }
 # What "auto" tries, most exact and cheapest first.
 AUTO = ("limited-direct",)
@@ -23,4 +39,4 @@ def load(name: str) -> Any:
         close = difflib.get_close_matches(name, METHODS, n=1)
         hint = f'; did you mean "{close[0]}"?' if close else ""
         raise InputError(f'there is no method "{name}"{hint}; methods: auto, {", ".join(METHODS)}')
-    return import_module(METHODS[name]).METHOD
+    return import_module(METHODS[name].module).METHOD

@@ -5,6 +5,7 @@ Each function takes a Model and gives a tuple of `Condition`.  A theorem says wh
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -191,7 +192,14 @@ def _form_text(form: YauForm) -> str:
     return f"L = {form.matrix.tolist()}, l = {list(form.offset)}, phi = {form.potential}"
 
 
+# The theorem that says when a method holds, by the method's name.
+THEOREMS: Mapping[str, Callable[[Model], tuple[Condition, ...]]] = {
+    "limited-direct": limited_direct,
+    "extended-kalman-bucy": smooth_system,
+}
+
 __all__ = [
+    "THEOREMS",
     "YauSystem",
     "affine_observation",
     "cached_yau_form",

@@ -223,8 +223,8 @@ def as_quadratic(q: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Quadratic | None
     # q is quadratic, so its derivatives at any one point give its coefficients; the origin reads best where q is defined there.
     for value in (sp.Integer(0), sp.Rational(1, 2), sp.Rational(7, 5)):
         point = {symbol: value for symbol in x}
-        hessian = sp.Matrix(n, n, lambda i, j: sp.diff(q, x[i], x[j]).subs(point))
-        slope = sp.Matrix(n, 1, lambda i, _: sp.diff(q, x[i]).subs(point))
+        hessian = sp.hessian(q, x).subs(point)
+        slope = sp.Matrix([q]).jacobian(x).T.subs(point)
         level = q.subs(point)
         if all(e.is_finite is not False and not e.has(sp.nan, sp.zoo) for e in [*hessian, *slope, level]):
             break

@@ -3,6 +3,7 @@
 from zakai.records.csv import read_record
 from zakai.records.netcdf import load_dataset, save_dataset
 from zakai.records.record import Record
+from zakai.records.truth import read_truth, write_truth
 from zakai.records.writing import atomic_write, write_record
 
-__all__ = ["Record", "atomic_write", "load_dataset", "read_record", "save_dataset", "write_record"]
+__all__ = ["Record", "atomic_write", "load_dataset", "read_record", "read_truth", "save_dataset", "write_record", "write_truth"]

@@ -6,7 +6,7 @@ import csv
 import os
 import re
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
@@ -44,21 +44,7 @@ def read_record(path: str | os.PathLike[str], model: Any) -> Record:
         Record(3 rows x 1 increments, times 0.1 to 0.4)
     """
     path = Path(path)
-    try:
-        # A pipe or a device could be endless, and cannot be read a second time to find the row that is wrong.
-        if path.exists() and not path.is_file():
-            what = "a folder" if path.is_dir() else "not a regular file"
-            raise InputError(f"{shown(path)}: is {what}; give a CSV file")
-        # Bytes that are not UTF-8 become lone surrogates, which no number has; so their row is found.
-        with path.open(encoding="utf-8-sig", errors="surrogateescape", newline=None) as file:
-            names = _header(path, file, model.m)
-            table = _fast(file, len(names))
-        if table is None or first_fault(table[:, 0], table[:, 1:]) is not None:
-            with path.open(encoding="utf-8-sig", errors="surrogateescape", newline=None) as file:
-                table = _careful(path, file, names)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{shown(path)}: cannot be read: {reason}; give a CSV file") from None
+    table = read_table(path, model.m, "observations")
     record = Record(table[:, 0], table[:, 1:], model.observation_kind)
     fault = early(record.times[0], record.kind, model.start)
     if fault is not None:
@@ -66,7 +52,31 @@ def read_record(path: str | os.PathLike[str], model: Any) -> Record:
     return record
 
 
-def _header(path: Path, file: TextIO, m: int) -> list[str]:
+def read_table(path: Path, columns: int, what: str, names: Sequence[str] | None = None) -> np.ndarray:
+    """The times and the `columns` numbers of every row of a CSV file, (K, 1 + columns).
+
+    `what` is what a column holds, in the plural; with `names` the columns must have just these. Raises
+    InputError as `read_record` does.
+    """
+    try:
+        # A pipe or a device could be endless, and cannot be read a second time to find the row that is wrong.
+        if path.exists() and not path.is_file():
+            kind = "a folder" if path.is_dir() else "not a regular file"
+            raise InputError(f"{shown(path)}: is {kind}; give a CSV file")
+        # Bytes that are not UTF-8 become lone surrogates, which no number has; so their row is found.
+        with path.open(encoding="utf-8-sig", errors="surrogateescape", newline=None) as file:
+            header = _header(path, file, columns, what, names)
+            table = _fast(file, len(header))
+        if table is None or first_fault(table[:, 0], table[:, 1:]) is not None:
+            with path.open(encoding="utf-8-sig", errors="surrogateescape", newline=None) as file:
+                table = _careful(path, file, header)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{shown(path)}: cannot be read: {reason}; give a CSV file") from None
+    return table
+
+
+def _header(path: Path, file: TextIO, m: int, what: str, expected: Sequence[str] | None) -> list[str]:
     line = file.readline()
     if not line:
         raise InputError(f"{shown(path)}: is empty; expected a header of time and {m} names, then rows")
@@ -78,8 +88,11 @@ def _header(path: Path, file: TextIO, m: int) -> list[str]:
         fault = f"the first column is {_quoted(names[0])}; the header must begin with time{hint}"
         raise InputError(f"{shown(path)}: row 1: {fault}")
     if len(names) != m + 1:
-        fault = f"{len(names)} columns; the model needs time and {m} observations, {m + 1} columns in all"
+        fault = f"{len(names)} columns; the model needs time and {m} {what}, {m + 1} columns in all"
         raise InputError(f"{shown(path)}: row 1: {fault}")
+    for name, wanted in zip(names[1:], expected or names[1:]):
+        if name != wanted:
+            raise InputError(f"{shown(path)}: row 1: a column is {_quoted(name)}; expected time, {', '.join(expected or ())}")
     return names
 
 

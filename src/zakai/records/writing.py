@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 from zakai.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from zakai.records.record import Record
 
 
@@ -82,14 +84,19 @@ def write_record(path: str | os.PathLike[str], record: Record, names: list[str] 
     """
     m = record.values.shape[1]
     names = [f"y{i + 1}" for i in range(m)] if names is None else list(names)
-    if len(names) != m or any(set(name) & set("\r\n\0") for name in names):
-        raise InputError(f"{shown(path)}: names must be {m} names of one line each, one a column")
+    write_table(path, record.times, record.values, names)
+
+
+def write_table(path: str | os.PathLike[str], times: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
+    """Write times (K,) and values (K, c) as CSV with a header of `time` and c names; as `write_record` does."""
+    if len(names) != values.shape[1] or any(set(name) & set("\r\n\0") for name in names):
+        raise InputError(f"{shown(path)}: names must be {values.shape[1]} names of one line each, one a column")
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerow(["time", *names])
         rows = (
             ",".join([repr(time), *("" if value != value else repr(value) for value in row)]) + "\n"
-            for part in (slice(start, start + 65536) for start in range(0, len(record), 65536))
-            for time, row in zip(record.times[part].tolist(), record.values[part].tolist())
+            for part in (slice(start, start + 65536) for start in range(0, len(times), 65536))
+            for time, row in zip(times[part].tolist(), values[part].tolist())
         )
         while block := "".join(islice(rows, 4096)):
             file.write(block)
