@@ -71,16 +71,16 @@ def features(logs: np.ndarray) -> np.ndarray:
     return np.array(out)
 
 
-def first_plan(model: Model, lattice: Lattice) -> Plan:
+def first_plan(model: Model) -> Plan:
     """The plan before anything is known of the steps."""
     angles = tuple(model.state.index(name) for name in model.periodic)
     return Plan(False, (BASE[model.n],) * model.n, angles=angles)
 
 
 def first_lattice(
-    model: Model, prior: Any, log_factor: Callable[[np.ndarray], np.ndarray] | None
+    model: Model, prior: Any, log_factor: Callable[[np.ndarray], np.ndarray] | None, widest: float = np.inf
 ) -> tuple[Lattice, float]:
-    """The prior, times a factor if there is one, on a lattice; and the logarithm of its mass."""
+    """The prior, times a factor if there is one, on a lattice whose cell is at most `widest`; and the logarithm of its mass."""
     axes, log_prior, box = _prior_box(model, prior)
     factor = log_factor or (lambda x: np.zeros(x.shape[:-1]))
 
@@ -117,9 +117,15 @@ def first_lattice(
             low, high = first, last
             continue
         fine = features(logs) >= 2 * CELLS
-        if np.all(fine | point | (size >= MOST[model.n])):
+        if not np.all(fine | point | (size >= MOST[model.n])):
+            size = np.where(fine | point, size, size * 2)
+            continue
+        enough = np.clip(np.ceil((high - low) / widest) + 1, size, MOST[model.n]).astype(int)
+        if np.all(point | whole | (enough == size)):
             break
-        size = np.where(fine | point, size, size * 2)
+        high = np.where(point | whole | (enough == size), high, low + widest * (enough - 1))
+        size = np.where(point | whole, size, enough)
+        widest = np.inf
     size_half = size // 2
     basis = axes * cell
     mass = logs.max() + np.log(np.exp(logs - logs.max()).sum()) + np.log(abs(np.linalg.det(basis)))
@@ -265,8 +271,7 @@ def _banded(lattice: Lattice, plan: Plan, deviation: np.ndarray, maps: np.ndarra
     cell = abs(float(lattice.basis[0, 0]))
     growth = np.concatenate([[1.0], np.cumprod(maps)])[: len(deviation)] / deviation
     widest = min(COARSEST / growth.max(), features(logs)[0] * cell / plan.cells)
-    halvings = int(np.ceil(np.log2(cell / widest) - 1e-9))
-    new_cell = cell / 2.0**halvings
+    new_cell = cell if 0.8 * widest <= cell <= widest else 0.97 * widest
     taps = 32
     while taps * new_cell * growth.min() < REACH:
         taps = taps * 3 // 2
@@ -279,36 +284,47 @@ def _banded(lattice: Lattice, plan: Plan, deviation: np.ndarray, maps: np.ndarra
     if size * (12 + 0.2 * taps) > 3 * pairs**2:
         return None
     middle = (used[0] + used[-1]) // 2
-    resampled, centre_index = _resampled(logs, middle, halvings)
-    window = np.full(size, -np.inf)
-    shift = size // 2 - centre_index
-    source = np.arange(len(resampled))
-    target = source + shift
-    inside = (target >= 0) & (target < size)
-    window[target[inside]] = resampled[source[inside]]
-    basis = np.asarray(lattice.basis) / 2.0**halvings
+    window = _resampled(logs, middle, new_cell / cell, size)
     centre = np.asarray(lattice.centre) + np.asarray(lattice.basis)[:, 0] * (middle - len(logs) // 2)
-    new = replace(plan, banded=True, sizes=(size,), taps=taps)
-    return Lattice(jnp.asarray(window), jnp.asarray(centre), jnp.asarray(basis)), new
+    basis = np.asarray(lattice.basis) * (new_cell / cell)
+    return Lattice(jnp.asarray(window), jnp.asarray(centre), jnp.asarray(basis)), replace(
+        plan, banded=True, sizes=(size,), taps=taps
+    )
 
 
-def _resampled(logs: np.ndarray, middle: int, halvings: int) -> tuple[np.ndarray, int]:
-    """The density with its cell halved so many times (doubled if negative), and where index `middle` went."""
-    if halvings == 0:
-        return logs, middle
-    if halvings < 0:
-        step = 2**-halvings
-        start = middle % step
-        return logs[start::step], middle // step
-    # Trigonometric interpolation is exact where the density is resolved; the far tails, which it would drown in
-    # rounding, are interpolated in the logarithm.
-    factor = 2**halvings
+def _resampled(logs: np.ndarray, middle: int, ratio: float, size: int) -> np.ndarray:
+    """The density at the indices middle + ratio (j - size // 2), j < size.
+
+    Trigonometric interpolation is exact where the density is resolved; its rounding would drown the far tails, which are
+    interpolated in the logarithm.
+    """
+    at = middle + ratio * (np.arange(size) - size // 2)
+    inside = (at >= 0) & (at <= len(logs) - 1)
+    if ratio == 1.0:
+        window = np.full(size, -np.inf)
+        window[inside] = logs[at[inside].astype(int)]
+        return window
     top = logs.max()
-    count = len(logs)
-    spectrum = np.fft.rfft(np.exp(logs - top))
-    fine = np.fft.irfft(spectrum, count * factor) * factor
-    with np.errstate(divide="ignore", invalid="ignore"):
-        tail = np.interp(np.arange(count * factor) / factor, np.arange(count), np.maximum(logs, top - 800.0))
-        tail = np.where(tail <= top - 799.0, -np.inf, tail)
-        value = np.where(fine > 1e-12, np.log(np.maximum(fine, 1e-300)) + top, tail)
-    return value, middle * factor
+    value = _trigonometric(np.exp(logs - top), middle, ratio, size)
+    tail = np.interp(at, np.arange(len(logs)), np.maximum(logs, top - 800.0))
+    tail = np.where(tail <= top - 799.0, -np.inf, tail)
+    good = value > 1e-11
+    return np.where(inside, np.where(good, np.log(np.where(good, value, 1.0)) + top, tail), -np.inf)
+
+
+def _trigonometric(values: np.ndarray, middle: int, ratio: float, size: int) -> np.ndarray:
+    """The trigonometric interpolant at the indices middle + ratio (j - size // 2), by Bluestein's chirp transform."""
+    count = len(values)
+    frequency = np.fft.fftfreq(count) * count
+    spectrum = np.fft.fftshift(np.fft.fft(values) * np.exp(2j * np.pi * frequency * middle / count)) / count
+    k = np.sort(frequency)
+    j = np.arange(size) - size // 2
+    angle = np.pi * ratio / count
+    # 2 j k = j^2 + k^2 - (j - k)^2 turns the sum over k into a convolution.
+    distance = np.arange(j[0] - k[-1], j[-1] - k[0] + 1)
+    length = int(2 ** np.ceil(np.log2(count + len(distance))))
+    product = np.fft.fft(spectrum * np.exp(1j * angle * k**2), length) * np.fft.fft(
+        np.exp(-1j * angle * distance**2), length
+    )
+    convolved = np.fft.ifft(product)[count - 1 : count - 1 + size]
+    return np.real(convolved * np.exp(1j * angle * j**2))

@@ -10,7 +10,8 @@ factor, the transition with -h'S^-1 h / 2 inside, the other half.  Samples: exac
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import Any
 
@@ -30,16 +31,25 @@ from zakai.filters.observations import Data, Factors, factors
 from zakai.kolmogorov import lattice as lat
 from zakai.kolmogorov.flow import Coefficients, Flow, flows
 from zakai.kolmogorov.lattice import Lattice
-from zakai.models.compile import jax_function
+from zakai.models.compile import jax_field, jax_function
 from zakai.models.model import Model
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["lattice"], meta_fields=["plan"])
+@partial(
+    jax.tree_util.register_dataclass, data_fields=["lattice", "observed", "cells", "middle"], meta_fields=["plan"]
+)
 @dataclass(frozen=True)
 class State:
-    """The normalised density on a lattice, and the static plan by which the next steps move it."""
+    """The normalised density on a lattice, and the static plan by which the next steps move it.
+
+    What the last step computed and the next one needs again is carried: h at the points, `observed`, an array for each coordinate, the
+    narrowest feature in `cells` (n,), and the `middle` of the support (n,), an index from the centre.
+    """
 
     lattice: Lattice
+    observed: Any
+    cells: Any
+    middle: Any
     plan: choice.Plan
 
 
@@ -77,14 +87,14 @@ class System:
         self.rates = rates and self.affine
         self.inputs = 1 + (model.m if self.rates else 0)
         self.bare = yau.bare is not None
-        self.moving_observation = model.t in model.observation.free_symbols
         # Without a gauge nothing need be evaluated.
         self.gauged = yau.form.potential != 0
-        self.potential = jax_function([yau.form.potential], model)
-        self.observe = jax_function(model.observation, model)
+        # Whether a half of the observation's factor stands at the start of an interval.
+        self.halves = not self.rates and model.observation_kind != "samples"
+        self.potential = jax_field([yau.form.potential], model)
+        self.observe = jax_field(model.observation, model)
         bare, full = yau.bare or yau.full, yau.full or yau.bare
         assert bare is not None and full is not None
-        self.sampled = model.observation_kind == "samples"
         n, m = model.n, model.m
         slope = yau.slope if self.affine else sp.zeros(m, n)
         intercept = yau.intercept if self.affine else sp.zeros(m, 1)
@@ -218,29 +228,54 @@ def init(prepared: Prepared, prior: Any) -> State:
 def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State, Info]:
     """The prior after an observation at the start itself."""
     state, log_mass = _start(prepared, prior, observation)
-    return state, _info(state.lattice, prepared.system.model, log_mass, {})
+    summary = lat.summary(state.lattice, state.plan.angles)
+    nothing = jnp.array(0.0)
+    return state, _info(summary, log_mass, jnp.min(state.cells), nothing, nothing)
 
 
 def _start(prepared, prior, observation):
-    model = prepared.system.model
+    system, model = prepared.system, prepared.system.model
 
     def log_factor(x):
-        if observation is None:
-            return np.zeros(x.shape[:-1])
         factor = jax.tree.map(lambda a: a[0], observation)
-        h = jax.vmap(lambda one: prepared.system.observe(one, model.start, model.theta()))(x.reshape(-1, model.n))
-        return np.asarray(_log_factor(h, factor)).reshape(x.shape[:-1])
+        return np.asarray(_log_factor(system.observe(x, model.start, model.theta()), factor))
 
-    lattice, log_mass = choice.first_lattice(model, prior, log_factor if observation is not None else None)
-    state = State(lattice, choice.first_plan(model, lattice))
-    return state, log_mass
+    cell = choice.COARSEST * prepared.kernel_deviation.min(initial=np.inf) if model.n == 1 else np.inf
+    lattice, log_mass = choice.first_lattice(model, prior, log_factor if observation is not None else None, cell)
+    return _looked_at(prepared, lattice, choice.first_plan(model), model.start), log_mass
 
 
-def _log_factor(h: jax.Array, factor: Factors) -> jax.Array:
-    value = h @ factor.after
+def _looked_at(prepared: Prepared, lattice: Lattice, plan: choice.Plan, time: float) -> State:
+    """A state from a lattice that was chosen outside of a step."""
+    system = prepared.system
+    summary = lat.summary(lattice, plan.angles)
+    return State(
+        lattice,
+        _observed_at(system, lattice, time, system.model.theta()) if system.halves else None,
+        choice.features(np.asarray(lattice.log_values)),
+        np.asarray(summary.middle),
+        plan,
+    )
+
+
+@partial(jax.jit, static_argnums=0)
+def _observed_at(system, lattice, time, theta):
+    return system.observe(lattice.points(), time, theta)
+
+
+def _linear(weights: jax.Array, h: Sequence[jax.Array]) -> jax.Array:
+    """weights . h, an elementwise sum that is fused with what follows."""
+    return sum((weights[i] * values for i, values in enumerate(h)), start=jnp.zeros(()))
+
+
+def _log_factor(h: Sequence[jax.Array] | None, factor: Factors) -> jax.Array:
+    """log factor(x) = after . h - h'(energy) h / 2 + constant, with h an array for each coordinate of the observation."""
+    if h is None:
+        return factor.constant
+    value = _linear(factor.after, h) + factor.constant
     if factor.energy is None:
-        return value + factor.constant
-    return value - 0.5 * jnp.einsum("...i,ij,...j->...", h, factor.energy, h) + factor.constant
+        return value
+    return value - 0.5 * sum(_linear(factor.energy[i], h) * values for i, values in enumerate(h))
 
 
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
@@ -251,109 +286,100 @@ def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> S
         state.plan,
         prepared.kernel_deviation[rows],
         prepared.kernel_angle[rows],
-        jax.tree.map(lambda a: a[rows], prepared.intervals.flow.map),
+        prepared.intervals.flow.map[rows],
         info,
     )
-    return None if plan is None else State(lattice, plan)
+    if plan is None:
+        return None
+    if lattice is state.lattice:
+        return replace(state, plan=plan)
+    return _looked_at(prepared, lattice, plan, prepared.schedule.starts[rows.start])
 
 
 def step(interval: Interval, state: State, observation: Factors) -> tuple[State, Info]:
     """One interval: gauge, half factor, transition, half factor, gauge, normalise."""
     system, plan = interval.system, state.plan
-    lattice = state.lattice
+    lattice, observed, cells = state.lattice, state.observed, state.cells
     if plan.banded:
-        lattice = lat.recentred(lattice)
+        shift = jnp.clip(jnp.rint(state.middle[0]).astype(int), -(plan.sizes[0] // 4), plan.sizes[0] // 4)
+        lattice = Lattice(
+            lat.slid(lattice.log_values, shift, -jnp.inf), lattice.centre + lattice.basis[:, 0] * shift, lattice.basis
+        )
+        observed = jax.tree.map(lambda h: lat.slid(h, shift, 0.0), observed)
     parts = interval.flow.map.shape[0]
     times = interval.start + (interval.stop - interval.start) * jnp.arange(parts + 1) / parts
-    exponent, cells, first_look = jnp.array(0.0), jnp.array(jnp.inf), jnp.array(1.0)
-    log_mass = jnp.array(0.0)
+    # Readings that act as rates leave nothing to multiply with at the end.
+    observed_at_end = not system.rates or observation.energy is not None
+    log_mass, exponent = jnp.array(0.0), jnp.array(0.0)
+    joint, first_look = jnp.array(jnp.inf), jnp.array(1.0)
     for part in range(parts):
         flow = jax.tree.map(lambda a, part=part: a[part], interval.flow)
         last = part == parts - 1
 
-        def before(x, t=times[part], first=part == 0):
-            return _start_factor(system, x, t, interval.theta, observation.before if first else None)
+        def factor(x, h, t=times[part + 1], last=last):
+            value = _potential(system, x, t, interval.theta) if system.gauged else jnp.zeros(x.shape[:-1])
+            return value + _log_factor(h, observation) if last else value
 
-        def after(x, t=times[part + 1], last=last):
-            return _end_factor(system, x, t, interval.theta, observation if last else None)
+        def observe(x, t=times[part + 1], last=last):
+            return system.observe(x, t, interval.theta) if last and (system.halves or observed_at_end) else None
 
-        logs = before(lattice.points())
-        cells = jnp.minimum(cells, _joint_cells(lattice, flow))
+        before = jnp.zeros(lattice.sizes)
+        if part == 0 and observed is not None:
+            before = _linear(observation.before, observed)
+        if system.gauged:
+            before = before - _potential(system, lattice.points(), times[part], interval.theta)
+            exponent = jnp.maximum(exponent, lat.exponent_range(lattice.log_values, lattice.log_values + before))
+        joint = jnp.minimum(joint, _joint_cells(lattice, cells, flow))
         if plan.banded:
-            moved = lat.move_banded(lattice, logs, flow, observation.inputs, after, plan.taps)
+            lattice = lat.move_banded(lattice, before, flow, observation.inputs, plan.taps)
+            points = lattice.points()
+            observed = observe(points)
+            lattice = lattice._replace(log_values=lattice.log_values + factor(points, observed))
         else:
-            moved = lat.move_dense(
-                lattice, logs, flow, observation.inputs, after, plan.sizes, plan.angles, plan.images
+            lattice, coarseness = lat.move_dense(
+                lattice,
+                before,
+                flow,
+                observation.inputs,
+                lambda x, factor=factor, observe=observe: factor(x, observe(x)),
+                plan.sizes,
+                plan.angles,
+                plan.images,
             )
-        mass = lat.log_mass(moved.lattice)
-        lattice = moved.lattice._replace(log_values=moved.lattice.log_values - mass)
-        log_mass = log_mass + mass
-        exponent = jnp.maximum(exponent, moved.exponent)
-        first_look = jnp.maximum(first_look, moved.first_look)
-    health = {"exponent": exponent, "quadrature_error": 2 * jnp.exp(-2 * jnp.pi**2 * cells**2)}
-    return State(lattice, plan), _info(lattice, system.model, log_mass, health, first_look)
-
-
-def _start_factor(system, x, t, theta, linear):
-    value = -_potential(system, x, t, theta) if system.gauged else jnp.zeros(x.shape[:-1])
-    if linear is None or system.rates or system.sampled:
-        return value
-    return value + _observe(system, x, t, theta) @ linear
-
-
-def _end_factor(system, x, t, theta, factor):
-    value = _potential(system, x, t, theta) if system.gauged else jnp.zeros(x.shape[:-1])
-    if factor is None:
-        return value
-    if system.rates and factor.energy is None:
-        return value + factor.constant
-    return value + _log_factor(_observe(system, x, t, theta), factor)
+            first_look = jnp.maximum(first_look, coarseness)
+            observed = observe(lattice.points()) if system.halves else None
+        summary = lat.summary(lattice, plan.angles)
+        lattice = lattice._replace(log_values=lattice.log_values - summary.log_mass)
+        cells = lat.features(lattice)
+        log_mass = log_mass + summary.log_mass
+    # A feature that the first look, over everything that could be reached, may have stepped over counts as unresolved.
+    resolution = jnp.min(cells) * jnp.minimum(1.0, 4.0 / first_look)
+    quadrature_error = 2 * jnp.exp(-2 * jnp.pi**2 * joint**2)
+    info = _info(summary, log_mass, resolution, quadrature_error, exponent)
+    kept = observed if system.halves else None
+    return State(lattice, kept, cells, summary.middle, plan), info
 
 
 def _potential(system, x, t, theta):
-    flat = jax.vmap(lambda one: system.potential(one, t, theta)[0])(x.reshape(-1, x.shape[-1]))
-    return flat.reshape(x.shape[:-1])
+    return system.potential(x, t, theta)[0]
 
 
-def _observe(system, x, t, theta):
-    flat = jax.vmap(lambda one: system.observe(one, t, theta))(x.reshape(-1, x.shape[-1]))
-    return flat.reshape(*x.shape[:-1], -1)
-
-
-def _joint_cells(lattice: Lattice, flow: Flow) -> jax.Array:
-    """The standard deviation, in cells, of the narrowest product of the density and the kernel."""
+def _joint_cells(lattice: Lattice, own: jax.Array, flow: Flow) -> jax.Array:
+    """The standard deviation, in cells, of the narrowest product of the density, `own` (n,), and the kernel."""
     kernel = jnp.sum(lattice.basis * (lat.inverse(flow.spread) @ lattice.basis), axis=0)
-    own = jnp.where(jnp.array(lattice.sizes) > 3, lat.features(lattice), jnp.inf)
-    # A lattice of one point holds a mass without width, for which there is nothing to resolve.
-    joint = jax.lax.rsqrt(1.0 / own**2 + kernel)
-    return jnp.min(jnp.where(jnp.array(lattice.sizes) > 1, joint, jnp.inf))
+    # An axis of one point holds a mass without width, for which there is nothing to resolve.
+    wide = jnp.array(lattice.sizes) > 1
+    return jnp.min(jnp.where(wide, jax.lax.rsqrt(1.0 / own**2 + kernel), jnp.inf))
 
 
-def _info(lattice: Lattice, model: Model, log_mass, health, first_look=1.0) -> Info:
-    angles = tuple(model.state.index(name) for name in model.periodic)
-    weights = jnp.exp(lattice.log_values - jnp.max(lattice.log_values)).ravel()
-    weights = weights / jnp.sum(weights)
-    points = lattice.points().reshape(-1, model.n)
-    mean = weights @ points
-    if angles:
-        index = jnp.array(angles)
-        turned = points[:, index]
-        circular = jnp.arctan2(weights @ jnp.sin(turned), weights @ jnp.cos(turned))
-        mean = mean.at[index].set(circular)
-        deviation = points - mean
-        wrapped = jnp.pi - jnp.mod(jnp.pi - deviation[:, index], 2 * jnp.pi)
-        deviation = deviation.at[:, index].set(wrapped)
-    else:
-        deviation = points - mean
-    cov = jnp.einsum("k,ki,kj->ij", weights, deviation, deviation)
-    cells = lat.features(lattice)
+def _info(summary: lat.Summary, log_mass, resolution, quadrature_error, exponent) -> Info:
     health = {
-        "edge_mass": lat.edge_mass(lattice, lat.closed_axes(lattice, angles)),
-        # A feature that the first look, over everything that could be reached, may have stepped over counts as unresolved.
-        "resolution": jnp.min(cells) * jnp.minimum(1.0, 4.0 / jnp.asarray(first_look)),
-        **health,
+        "edge_mass": summary.edge_mass,
+        "resolution": resolution,
+        "quadrature_error": quadrature_error,
+        "exponent": exponent,
     }
-    return Info(log_mass, mean, cov, health)
+    return Info(log_mass, summary.mean, summary.cov, health)
 
 
 def density(prepared: Prepared, state: State) -> GridDensity:

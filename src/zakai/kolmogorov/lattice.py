@@ -54,14 +54,6 @@ class Lattice(NamedTuple):
         return jnp.log(jnp.abs(determinant(self.basis)))
 
 
-class Moved(NamedTuple):
-    """A lattice after one interval, with the largest exponent range of its gauge and how finely the first look was."""
-
-    lattice: Lattice
-    exponent: jax.Array
-    first_look: jax.Array
-
-
 def determinant(matrix: jax.Array) -> jax.Array:
     """The determinant, written out for one and two states: a call into LAPACK would cost more than the rest of a step."""
     if matrix.shape[0] == 1:
@@ -86,10 +78,55 @@ def _indices(sizes: tuple[int, ...]) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(float)
 
 
-def log_mass(lattice: Lattice) -> jax.Array:
-    """The logarithm of the integral of the density."""
-    top = jnp.max(lattice.log_values)
-    return top + jnp.log(jnp.sum(jnp.exp(lattice.log_values - top))) + lattice.log_volume()
+class Summary(NamedTuple):
+    """Of a density on a lattice: `log_mass`, `mean` and `cov` (n,) and (n, n) of its points, the share of the mass in the two
+    outermost layers of cells (`edge_mass`), and where the middle of its support is, as an index (n,) from the centre."""
+
+    log_mass: jax.Array
+    mean: jax.Array
+    cov: jax.Array
+    edge_mass: jax.Array
+    middle: jax.Array
+
+
+def summary(lattice: Lattice, angles: tuple[int, ...] = ()) -> Summary:
+    """One pass over the values; sums are written as products of matrices, which are vectorised where plain sums are not.
+
+    The mean of an angle is the argument of E exp(i theta), and its deviations are wrapped.
+    """
+    logs = lattice.log_values
+    top = jnp.max(logs)
+    values = jnp.exp(logs - top)
+    index = _indices(lattice.sizes).reshape(-1, logs.ndim)
+    columns = np.concatenate([np.ones((len(index), 1)), index], axis=1)
+    total, *first = values.ravel() @ columns
+    used = (logs > top - SUPPORT).astype(float).ravel() @ columns
+    closed = closed_axes(lattice, angles)
+    outer = 0.0
+    for axis in range(logs.ndim):
+        two = jnp.sum(lax.slice_in_dim(values, 0, 2, axis=axis))
+        two = two + jnp.sum(lax.slice_in_dim(values, lattice.sizes[axis] - 2, None, axis=axis)) if logs.shape[axis] > 3 else 0.0
+        outer = outer + (jnp.where(closed[axis], 0.0, two) if angles else two)
+    mean = jnp.stack(first) / total
+    if angles:
+        mean, cov = _wrapped_moments(lattice, values / total, angles)
+    else:
+        # Deviations are taken from the mean before they are squared: no difference of large numbers.
+        weighted = (values.ravel()[:, None] * (index - mean)) / total
+        cov = lattice.basis @ (weighted.T @ (index - mean)) @ lattice.basis.T
+        mean = lattice.centre + lattice.basis @ mean
+    return Summary(top + jnp.log(total) + lattice.log_volume(), mean, cov, outer / total, used[1:] / used[0])
+
+
+def _wrapped_moments(lattice: Lattice, weights: jax.Array, angles: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
+    points = lattice.points().reshape(-1, weights.ndim)
+    weights = weights.ravel()
+    at = jnp.array(angles)
+    circular = jnp.arctan2(weights @ jnp.sin(points[:, at]), weights @ jnp.cos(points[:, at]))
+    mean = (weights @ points).at[at].set(circular)
+    deviation = points - mean
+    deviation = deviation.at[:, at].set(jnp.pi - jnp.mod(jnp.pi - deviation[:, at], 2 * jnp.pi))
+    return mean, (weights[:, None] * deviation).T @ deviation
 
 
 def features(lattice: Lattice) -> jax.Array:
@@ -107,18 +144,6 @@ def features(lattice: Lattice) -> jax.Array:
     return jnp.stack(cells)
 
 
-def edge_mass(lattice: Lattice, closed: jax.Array | None = None) -> jax.Array:
-    """The share of the mass in the two outermost layers of cells, those of closed axes (n,) left out."""
-    values = jnp.exp(lattice.log_values - jnp.max(lattice.log_values))
-    total = 0.0
-    for axis in range(values.ndim):
-        outer = jnp.sum(lax.slice_in_dim(values, 0, 2, axis=axis)) + jnp.sum(
-            lax.slice_in_dim(values, -2, None, axis=axis)
-        )
-        total = total + (outer if closed is None else jnp.where(closed[axis], 0.0, outer))
-    return total / jnp.sum(values)
-
-
 def closed_axes(lattice: Lattice, angles: tuple[int, ...]) -> jax.Array:
     """Which axes (n,) go once around the circle; axis d belongs to the state `angles[d]`, if there is one."""
     turns = jnp.array([lattice.basis[i, d] * lattice.sizes[d] for d, i in enumerate(angles)])
@@ -126,44 +151,42 @@ def closed_axes(lattice: Lattice, angles: tuple[int, ...]) -> jax.Array:
     return jnp.concatenate([closed, jnp.zeros(len(lattice.sizes) - len(angles), bool)])
 
 
-def _exponent_range(log_values: jax.Array, gauged: jax.Array) -> jax.Array:
+def exponent_range(log_values: jax.Array, gauged: jax.Array) -> jax.Array:
     """How far below the largest gauged value the density's own maximum lies; beyond 600 it would be lost."""
     at = jnp.argmax(log_values.ravel())
     return jnp.max(gauged) - gauged.ravel()[at]
 
 
-def recentred(lattice: Lattice) -> Lattice:
-    """The same density with its window slid, by whole cells, so that the mass is in the middle; one state."""
-    logs = lattice.log_values
-    size = logs.shape[0]
-    used = logs > jnp.max(logs) - SUPPORT
-    first, last = jnp.argmax(used), size - 1 - jnp.argmax(used[::-1])
-    shift = jnp.clip((first + last) // 2 - size // 2, -(size // 4), size // 4)
-    padded = jnp.pad(logs, size // 4, constant_values=-jnp.inf)
-    moved = lax.dynamic_slice(padded, (size // 4 + shift,), (size,))
-    return Lattice(moved, lattice.centre + lattice.basis[:, 0] * shift, lattice.basis)
+def slid(values: jax.Array, shift: jax.Array, fill: float) -> jax.Array:
+    """Values (size,) on a window that moved by `shift` cells; what comes in is `fill`."""
+    size = values.shape[0]
+    padded = jnp.pad(values, size // 4, constant_values=fill)
+    return lax.dynamic_slice(padded, (size // 4 + shift,), (size,))
 
 
 def move_banded(
-    lattice: Lattice, before: jax.Array, flow: Flow, inputs: jax.Array, after: LogFunction, taps: int
-) -> Moved:
+    lattice: Lattice, before: jax.Array, flow: Flow, inputs: jax.Array, taps: int
+) -> Lattice:
     """One interval for one state by a filter of 2 `taps` + 1 cells, which must reach `REACH` kernel deviations.
 
-    `before` (size,) is the logarithm that multiplies the density at the start, `after(x)` that at the end.
+    `before` (size,) is the logarithm that multiplies the density at the start.
     """
     gauged = lattice.log_values + before
     top = jnp.max(gauged)
     size = gauged.shape[0]
     cell = lattice.basis[0, 0]
     variance = flow.spread[0, 0]
-    weights = lax.optimization_barrier(jnp.exp(-0.5 * (jnp.arange(-taps, taps + 1) * cell) ** 2 / variance))
+    weights = jnp.exp(-0.5 * (jnp.arange(taps + 1) * cell) ** 2 / variance)
     values = jnp.exp(gauged - top)
-    if taps <= 40:  # a sum of shifted slices becomes one fused, vectorised loop
-        padded = lax.optimization_barrier(jnp.pad(values, taps))
-        total = sum(weights[j] * lax.slice(padded, (j,), (j + size,)) for j in range(2 * taps + 1))
-        total = lax.optimization_barrier(total)
+    if taps <= 48:  # a sum of shifted slices becomes one fused, vectorised loop
+        padded = jnp.pad(values, taps)
+        total = values
+        for j in range(1, taps + 1):
+            pair = lax.slice(padded, (taps - j,), (taps - j + size,)) + lax.slice(padded, (taps + j,), (taps + j + size,))
+            total = total + weights[j] * pair
     else:
-        total = jnp.maximum(jnp.convolve(values, weights, mode="full")[taps : taps + size], 0.0)
+        both = jnp.concatenate([weights[:0:-1], weights])
+        total = jnp.maximum(jnp.convolve(values, both, mode="full")[taps : taps + size], 0.0)
     moved = motion(flow, lattice.centre, inputs)
     offset = cell * _indices((size,))[:, 0]
     logs = (
@@ -173,9 +196,7 @@ def move_banded(
         + moved.log_mass
         + offset * (moved.tilt[0] + offset * flow.bend[0, 0])
     )
-    target = Lattice(logs, moved.centre, flow.map @ lattice.basis)
-    target = target._replace(log_values=logs + after(target.points()))
-    return Moved(target, _exponent_range(lattice.log_values, gauged), jnp.array(1.0))
+    return Lattice(logs, moved.centre, flow.map @ lattice.basis)
 
 
 def move_dense(
@@ -187,9 +208,11 @@ def move_dense(
     sizes: tuple[int, ...],
     angles: tuple[int, ...] = (),
     images: int = 0,
-) -> Moved:
+) -> tuple[Lattice, jax.Array]:
     """One interval for one or two states by sums over all pairs of points, onto a new lattice of `sizes`.
 
+    `after(x)` is the logarithm that multiplies the density at the end; where it leaves mass decides the second lattice. Also
+    given is how much coarser the first was.
     `angles` names the states that axes 0, 1, ... of the lattice are angles of; `images` is how many turns on either side the
     kernel reaches.  Axis 0 of the lattice must then be parallel to the angle, and stays so.
     """
@@ -256,8 +279,7 @@ def move_dense(
     half = low + fine * (jnp.array(sizes) // 2)
     basis = flow.map @ to_offset * fine
     target = Lattice(logs, moved.centre + flow.map @ to_offset @ half, basis)
-    first_look = jnp.max(coarse / fine)
-    return Moved(target, _exponent_range(lattice.log_values, gauged), first_look)
+    return target, jnp.max(coarse / fine)
 
 
 def _image_shifts(turns: list[jax.Array], images: int, n: int) -> list[jax.Array]:

@@ -49,23 +49,22 @@ def jax_function(expressions: Any, model: Model, shape: Sequence[int] | None = N
     return function
 
 
-def jax_field(expressions: Any, model: Model) -> JaxFunction:
-    """The expressions as one function of many states at once: f(x, t, theta) with x (..., n) gives (k, ...).
+def jax_field(expressions: Any, model: Model) -> Callable[[Any, Any, Any], tuple[jax.Array, ...]]:
+    """The expressions as one function of many states at once: f(x, t, theta) with x (..., n) gives an array (...) for each.
 
-    Each expression is one vectorised loop over the points, which `vmap` of `jax_function` is not: there the values of a point
-    lie side by side. Raises InputError for an undetermined function.
+    Each expression is one vectorised loop over the points. They are not stacked: a compiler that fuses a stack into what
+    uses it computes every entry twice, one number at a time. Raises InputError for an undetermined function.
 
-        >>> jax_field(model.observation, model)(jnp.zeros((100, 1)), 0.0, model.theta()).shape
-        (2, 100)
+        >>> len(jax_field(model.observation, model)(jnp.zeros((100, 1)), 0.0, model.theta()))
+        2
     """
     flat, _ = flattened(expressions)
     program = program_of(flat, model)
 
-    def function(x: Any, t: Any, theta: Any) -> jax.Array:
+    def function(x: Any, t: Any, theta: Any) -> tuple[jax.Array, ...]:
         values = program.run(x, jnp.asarray(t, dtype=jnp.float64), jnp.asarray(theta, dtype=jnp.float64), _JAX)
-        rows = [jnp.broadcast_to(jnp.asarray(values[slot], dtype=jnp.float64), x.shape[:-1]) for slot in program.outputs]
-        # Without the barrier the sines would be computed anew, one number at a time, inside of what uses them.
-        return jnp.stack(jax.lax.optimization_barrier(rows))
+        shape = jnp.shape(x)[:-1]
+        return tuple(jnp.broadcast_to(jnp.asarray(values[slot], dtype=jnp.float64), shape) for slot in program.outputs)
 
     return function
 
