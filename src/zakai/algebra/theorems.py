@@ -22,7 +22,6 @@ from zakai.algebra.yau import (
     inverse,
     observation_energy,
     q_without_observation,
-    quadratic_text,
     yau_form,
 )
 from zakai.models.model import Model
@@ -205,7 +204,6 @@ __all__ = [
     "cached_yau_form",
     "inverse",
     "limited_direct",
-    "quadratic_text",
     "smooth_system",
     "yau_system",
 ]

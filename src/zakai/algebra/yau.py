@@ -233,14 +233,14 @@ def as_quadratic(q: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Quadratic | None
     linear = (-slope / 2 - 2 * matrix * at).applyfunc(tidy)
     constant = tidy(-level / 2 - (at.T * matrix * at)[0, 0] - (linear.T * at)[0, 0])
     quadratic = Quadratic(sp.ImmutableMatrix(matrix), sp.ImmutableMatrix(linear), constant)
-    return quadratic, True, f"q = {quadratic_text(quadratic, x)}"
+    return quadratic, True, f"q = {quadratic_expression(quadratic, x)}"
 
 
-def quadratic_text(quadratic: Quadratic, x: tuple[sp.Symbol, ...]) -> str:
-    """q itself, printed."""
+def quadratic_expression(quadratic: Quadratic, x: tuple[sp.Symbol, ...]) -> sp.Expr:
+    """q itself."""
     state = sp.Matrix(x)
     value = (state.T * quadratic.matrix * state)[0, 0] + (quadratic.linear.T * state)[0, 0] + quadratic.constant
-    return str(sp.collect(sp.expand(-2 * value), list(x)))
+    return sp.collect(sp.expand(-2 * value), list(x))
 
 
 def not_quadratic_part(q: sp.Expr, x: tuple[sp.Symbol, ...]) -> str:

@@ -1,0 +1,158 @@
+"""An Analysis as a readable page and as LaTeX."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import sympy as sp
+
+from zakai.algebra.conditions import Condition, all_hold
+from zakai.models.model import Model
+
+if TYPE_CHECKING:
+    from zakai.algebra.analysis import Analysis
+
+WIDTH = 110
+_WORDS = {True: "holds", False: "fails", None: "undecided"}
+_SINGULAR = "not defined: G = g Q g' is singular"
+_MEANING = {
+    "increments": "the record holds the increments of y",
+    "path": "the record holds y itself",
+    "rates": "the record holds the increments of y over the length of their interval",
+    "samples": "the record holds z",
+}
+
+
+def text(analysis: Analysis) -> str:
+    """The page that `print(analysis)` shows."""
+    model = analysis.model
+    title = "".join(character if character.isprintable() else " " for character in model.name)
+    blocks = [
+        [title, "=" * len(title), *_equations(model)],
+        ["Omega_ij = d_i g_j - d_j g_i  with g = G^-1 f", *_omega(analysis)],
+        ["eta = f'G^-1 f + div f + h'S^-1 h", f"  {_SINGULAR}" if analysis.eta is None else f"  eta = {analysis.eta}"],
+        ["Yau form  f = L x + l + G grad phi", *_yau_form(analysis)],
+        ["Estimation algebra", *_algebra(analysis)],
+    ]
+    for name, conditions in analysis.methods.items():
+        blocks.append([f"Method {name}: {_WORDS[all_hold(conditions)]}", *_conditions(conditions)])
+    blocks.append([_recommendation(analysis)])
+    return "\n\n".join("\n".join(line.rstrip() for line in block) for block in blocks)
+
+
+def _equations(model: Model) -> Iterator[str]:
+    noises = model.diffusion.cols
+    for i, name in enumerate(model.state):
+        terms = [_times(model.drift[i], "dt")]
+        terms += [_times(model.diffusion[i, j], f"dv{j + 1}" if noises > 1 else "dv") for j in range(noises)]
+        angle = "   (an angle)" if name in model.periodic else ""
+        yield f"  d{name} = {' + '.join(term for term in terms if term) or '0'}{angle}"
+    yield f"  E dv dv' = Q dt,  Q = {_flat(model.process_noise)},  G = g Q g' = {_flat(model.covariance)}"
+    samples = model.observation_kind == "samples"
+    for j in range(model.m):
+        number = f"{j + 1}" if model.m > 1 else ""
+        if samples:
+            yield f"  z{number} = {model.observation[j]} + r{number}"
+        else:
+            yield f"  dy{number} = {_times(model.observation[j], 'dt') or '0'} + dw{number}"
+    law = "r ~ N(0, S)" if samples else "E dw dw' = S dt"
+    yield f"  {law},  S = {_flat(model.observation_noise)};  {_MEANING[model.observation_kind]}"
+    if model.parameters:
+        yield "  with " + ", ".join(f"{name} = {float(value):.10g}" for name, value in model.parameters.items())
+    if model.functions:
+        yield f"  undetermined: {', '.join(model.functions)}"
+
+
+def _omega(analysis: Analysis) -> Iterator[str]:
+    omega, n = analysis.omega, analysis.model.n
+    if omega is None:
+        yield f"  {_SINGULAR}"
+    elif omega.is_zero_matrix:
+        yield "  Omega = 0" + ("" if n > 1 else "  (as for every system with one state)")
+    else:
+        for i in range(n):
+            yield from (f"  omega_{i + 1},{j + 1} = {omega[i, j]}" for j in range(i + 1, n) if omega[i, j] != 0)
+
+
+def _yau_form(analysis: Analysis) -> Iterator[str]:
+    form = analysis.yau_form
+    if form is None:
+        yield f"  none was found: {analysis.no_yau_form}"
+        return
+    yield f"  L = {_flat(form.matrix)},  l = {[*form.offset]}"
+    yield f"  phi = {form.potential}"
+    sampled = analysis.model.observation_kind == "samples"
+    energy = "" if sampled else " + h'S^-1 h"
+    yield f"  q = 2 phi_t + G:Hess phi + grad phi'G grad phi + 2 (L x + l).grad phi + 2 tr L{energy}"
+    yield f"    = {analysis.q}"
+
+
+def _algebra(analysis: Analysis) -> Iterator[str]:
+    algebra = analysis.algebra
+    yield f"  {algebra.verdict}: {algebra.note}"
+    if algebra.linear_rank is not None:
+        yield f"  h is affine in x; the rank of its gradients is {algebra.linear_rank}"
+
+
+def _conditions(conditions: tuple[Condition, ...]) -> Iterator[str]:
+    for condition in conditions:
+        yield from _wrapped(f"  {_WORDS[condition.holds]:<9}  ", condition.statement)
+        yield from _wrapped(" " * 13, f"{condition.evidence}  [{condition.source}]")
+
+
+def _wrapped(head: str, body: str) -> list[str]:
+    return textwrap.wrap(
+        body, WIDTH, initial_indent=head, subsequent_indent=" " * 13, break_long_words=False, break_on_hyphens=False
+    )
+
+
+def _recommendation(analysis: Analysis) -> str:
+    if analysis.recommended is None:
+        others = [name for name, conditions in analysis.methods.items() if all_hold(conditions) is True]
+        named = f"; if it is named, {' or '.join(others)} can be used" if others else ""
+        return f"Recommended: none, for no method that auto tries holds{named}"
+    prior = "" if analysis.model.prior is not None else "; to filter, the model needs a prior"
+    return f"Recommended: {analysis.recommended}{prior}"
+
+
+def _flat(matrix: sp.MatrixBase) -> str:
+    return str(matrix[0, 0]) if matrix.shape == (1, 1) else str(matrix.tolist())
+
+
+def _times(factor: sp.Expr, noise: str) -> str:
+    if factor == 0:
+        return ""
+    short = factor.is_Symbol or factor.is_Integer or factor.is_Function
+    return noise if factor == 1 else f"{factor} {noise}" if short else f"({factor}) {noise}"
+
+
+def latex(analysis: Analysis) -> str:
+    """The equations and what was found, as LaTeX displays."""
+    model = analysis.model
+    # A name of several letters is not a product.
+    names = {s: rf"\mathrm{{{s.name}}}" for s in (*model.x, *model.parameter_symbols) if sp.latex(s) == s.name and s.name[1:]}
+
+    def tex(value: sp.Basic) -> str:
+        scalar = isinstance(value, sp.MatrixBase) and value.shape == (1, 1)
+        return sp.latex(value[0, 0] if scalar else value, symbol_names=names)
+
+    noise = "" if model.diffusion == sp.ones(1, 1) else rf"{tex(model.diffusion)}\,"
+    lines = [
+        rf"d{tex(sp.Matrix(model.x))} &= {tex(model.drift)}\,dt + {noise}dv,"
+        rf" & \mathrm E\,dv\,dv^\top &= {tex(model.process_noise)}\,dt",
+    ]
+    h, S = tex(model.observation), tex(model.observation_noise)
+    if model.observation_kind == "samples":
+        lines.append(rf"z_k &= {h} + r_k, & r_k &\sim N\left(0, {S}\right)")
+    else:
+        lines.append(rf"dy &= {h}\,dt + dw, & \mathrm E\,dw\,dw^\top &= {S}\,dt")
+    if analysis.omega is not None:
+        lines.append(rf"\Omega &= {tex(analysis.omega)}, & \eta &= {tex(analysis.eta)}")
+    form = analysis.yau_form
+    if form is not None:
+        lines.append(rf"L &= {tex(form.matrix)}, & l &= {tex(form.offset)}")
+        lines.append(rf"\phi &= {tex(form.potential)}, & q &= {tex(analysis.q)}")
+    body = " \\\\\n".join(lines)
+    return f"\\begin{{align*}}\n{body}\n\\end{{align*}}"
