@@ -1,0 +1,27 @@
+"""What a command checks of its files before the long work begins."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from zakai.errors import InputError
+from zakai.records.writing import shown
+
+
+def check_outputs(outputs: list[Path | None], inputs: list[Path | str | None]) -> None:
+    """Refuse an output that cannot be written, that is also an input, or that is named twice."""
+    seen = {os.path.realpath(path): "is also an input" for path in inputs if path is not None}
+    for path in outputs:
+        if path is None:
+            continue
+        place = Path(os.path.realpath(path))
+        if path.is_dir():
+            raise InputError(f"{shown(path)}: is a folder; give the name of a file")
+        if not place.parent.is_dir():
+            raise InputError(f"{shown(path)}: there is no folder {shown(place.parent)}; make it first")
+        if not os.access(place.parent, os.W_OK | os.X_OK):
+            raise InputError(f"{shown(path)}: the folder {shown(place.parent)} cannot be written to; choose another place")
+        if str(place) in seen:
+            raise InputError(f"{shown(path)}: {seen[str(place)]}; choose another name")
+        seen[str(place)] = "is named for two outputs"

@@ -1,0 +1,110 @@
+"""The commands and their arguments; what each does is in a module of its own, imported when it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import zakai
+
+app = typer.Typer(
+    name="zakai",
+    help="The conditional density of the state of a continuous-time stochastic system, given noisy observations.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+_Model = Annotated[str, typer.Argument(metavar="MODEL", help="A model file (TOML), or gallery:NAME.")]
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        print(f"zakai {zakai.__version__}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Say the version.")] = False,
+) -> None:
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+@app.command()
+def analyze(
+    model: _Model,
+    json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    latex: Annotated[bool, typer.Option("--latex", help="As LaTeX.")] = False,
+) -> None:
+    """Say from the equations alone which methods hold for a system, and why."""
+    from zakai.cli import looking
+
+    looking.analyze(model, json, latex)
+
+
+@app.command()
+def simulate(
+    model: _Model,
+    until: Annotated[float, typer.Option(metavar="T", help="Simulate up to this time.")],
+    step: Annotated[float, typer.Option(metavar="DT", help="One observation every DT, the first at the start + DT.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="RECORD.csv", help="Where the record goes.")],
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="The same seed gives the same record.")] = 0,
+    truth: Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="Where the true states go.")] = None,
+    initial: Annotated[str, typer.Option(metavar="NUMBERS", help='The state at the start, as "0.1" or "0.1, 2".')] = "",
+) -> None:
+    """Simulate a path of the state and a record of its observations."""
+    from zakai.cli import simulating
+
+    simulating.simulate(model, until, step, seed, output, truth, initial)
+
+
+@app.command()
+def filter(
+    model: _Model,
+    record: Annotated[Path, typer.Argument(metavar="RECORD", help="The observations (CSV).")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="RESULT.nc", help="Where the result goes (NetCDF).")],
+    method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
+    option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
+    truth: Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="The true states, for the report.")] = None,
+    report: Annotated[Path | None, typer.Option(metavar="REPORT.html", help="Write a report with pictures.")] = None,
+) -> None:
+    """Compute the conditional density of the state at every time of a record."""
+    from zakai.cli import filtering
+
+    filtering.filter(model, record, output, method, option or [], truth, report)
+
+
+@app.command()
+def methods(
+    model: Annotated[str | None, typer.Argument(metavar="[MODEL]", help="Say which hold for this model.")] = None,
+) -> None:
+    """List the methods; for a model, say of each whether it holds."""
+    from zakai.cli import looking
+
+    looking.methods(model)
+
+
+@app.command()
+def gallery(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Print the file of this model.")] = None,
+) -> None:
+    """List the models that come with zakai, or print one of them."""
+    from zakai.cli import looking
+
+    looking.gallery(name)
+
+
+@app.command()
+def reproduce(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A published experiment, such as chen-luo-yau-2017.")],
+    folder: Annotated[Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="Where pictures and tables go.")] = None,
+) -> None:
+    """Run a published experiment again, and print its table beside ours."""
+    from zakai.cli import studying
+
+    studying.reproduce(name, folder)
