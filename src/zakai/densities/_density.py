@@ -18,8 +18,11 @@ class Density(Protocol):
     the marginals, `marginal(...)` the density of some of the coordinates, `sample(key, count)` (count, n).
     """
 
-    names: tuple[str, ...]
-    periodic: tuple[bool, ...]
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def periodic(self) -> tuple[bool, ...]: ...
 
     def log_density(self, x: np.ndarray) -> np.ndarray: ...
 
