@@ -55,17 +55,28 @@ def filter(
         result = zakai.filter(model, record)
         result.mean[-1], result.density(-1).quantile([0.025, 0.975])
     """
+    return _filter(model, record, model.prior, method, keep, progress, options)
+
+
+def filter_from(prior: Any, model: Model, record: Record, method: str = "auto", **options: Any) -> FilterResult:
+    """`filter` with another prior than the model's, moments only: many runs of one system are then compiled once.
+
+    The result has no model, since none has this prior; the method is chosen for the model's own.
+    """
+    result = _filter(model, record, prior, method, "moments", None, options)
+    result.model = None
+    return result
+
+
+def _filter(model, record, prior, method, keep, progress, options) -> FilterResult:
     _check(model, record, keep)
     chosen, why, considered = choose(model, method)
     unknown = set(options) - set(chosen.options)
     if unknown:
         listed = ", ".join(sorted(chosen.options)) or "none"
         raise InputError(f'{chosen.name} has no option "{sorted(unknown)[0]}"; its options are: {listed}')
-    try:
-        check_noise_at(model, np.concatenate([[model.start], record.times]))
-    except InputError:
-        raise
-    run = _Run(model, record, chosen, {**chosen.options, **options}, keep)
+    check_noise_at(model, np.concatenate([[model.start], record.times]))
+    run = _Run(model, record, prior, chosen, {**chosen.options, **options}, keep)
     run.all(progress)
     return run.result(why, considered)
 
@@ -164,8 +175,10 @@ def _rows(tree: Any, rows: slice, length: int) -> Any:
 class _Run:
     """One record on its way through one method."""
 
-    def __init__(self, model: Model, record: Record, method: Method, options: Mapping[str, Any], keep: str | None):
-        self.model, self.record, self.method, self.options = model, record, method, options
+    def __init__(
+        self, model: Model, record: Record, prior: Any, method: Method, options: Mapping[str, Any], keep: str | None
+    ):
+        self.model, self.record, self.prior, self.method, self.options = model, record, prior, method, options
         self.data = data_of(model, record)
         self.infos: list[Info] = []
         self.states: list[tuple[int, Any, Any]] = []
@@ -195,15 +208,15 @@ class _Run:
         schedule = schedule_of(data, True)
         if not at_start:
             prepared = _prepared(self.method, self.model, schedule, self.options)
-            state = self.method.init(prepared, self.model.prior)
+            state = self.method.init(prepared, self.prior)
             self._keep_one(prepared, state, 0)
             return state
         # A sample at the start itself: the interval has no length, so the first one that has stands in for it.
         after = self.data.part(slice(1, 2)) if len(self.record.times) > 1 else data._replace(stops=data.stops + 1.0)
         prepared = _prepared(self.method, self.model, schedule_of(after, True), self.options)
-        self._keep_one(prepared, self.method.init(prepared, self.model.prior), 0)
+        self._keep_one(prepared, self.method.init(prepared, self.prior), 0)
         observation = self.method.observations(prepared, data)
-        state, info = self.method.correct(prepared, self.model.prior, observation)
+        state, info = self.method.correct(prepared, self.prior, observation)
         self.infos.append(jax.tree.map(lambda a: np.asarray(a)[None], info))
         self._keep_one(prepared, state, 1)
         return state
@@ -250,6 +263,8 @@ class _Run:
         theta = self.model.theta()
         lattice = getattr(begin, "lattice", None)
         points = np.asarray(lattice.points()).reshape(-1, self.model.n) if lattice is not None else info.mean[:k]
+        # Where a mean has itself overflowed, no formula is to blame.
+        points = points[np.isfinite(points).all(axis=-1)]
         from zakai.models.numeric import numpy_function
 
         for key in ("drift", "observation"):
@@ -265,7 +280,7 @@ class _Run:
             first = self.density(0)
         else:
             prepared = _prepared(self.method, self.model, schedule_of(self.data.part(slice(0, 1)), True), self.options)
-            first = self.method.density(prepared, self.method.init(prepared, self.model.prior))
+            first = self.method.density(prepared, self.method.init(prepared, self.prior))
         joined = jax.tree.map(lambda *parts: np.concatenate(parts), *self.infos)
         increments = np.concatenate([[0.0], joined.log_likelihood_increment])
         health = {name: np.concatenate([[np.nan], values]) for name, values in joined.health.items()}
