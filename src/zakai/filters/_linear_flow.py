@@ -41,7 +41,4 @@ def linear_flow(
 def _exponential(matrix: jax.Array) -> jax.Array:
     """The Taylor polynomial of the exponential, for a matrix whose norm is well below one."""
     identity = jnp.eye(len(matrix))
-    value = identity
-    for k in range(TERMS, 0, -1):
-        value = identity + matrix @ value / k
-    return value
+    return jax.lax.fori_loop(0, TERMS, lambda k, value: identity + matrix @ value / (TERMS - k), identity)

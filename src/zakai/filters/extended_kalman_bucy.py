@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import cho_solve, solve_triangular
 
 from zakai import _float64  # noqa: F401
 from zakai.algebra.theorems import smooth_system as theorem
@@ -197,7 +198,7 @@ def _euler(system, state, reading, start, length, theta):
         H = reading.seen[:, None] * system.observe_slope(mean, start, theta)
         missing = jnp.diag(1.0 - reading.seen)
         noise = jnp.outer(reading.seen, reading.seen) * system.noise(mean, start, theta) + missing
-        gain = cov @ jnp.linalg.solve(noise, H).T
+        gain = cov @ cho_solve((jnp.linalg.cholesky(noise), True), H).T
         residual = reading.values - reading.seen * system.observe(mean, start, theta)
         moved = moved + gain @ residual * length
         growth = growth - gain @ H @ cov
@@ -216,23 +217,22 @@ def _update(system, state, reading, share, t, theta):
     noise = both * share * reading.scale * system.noise(mean, t, theta) + jnp.diag(1.0 - reading.seen)
     H = reading.seen[:, None] * system.observe_slope(mean, t, theta)
     residual = reading.values - reading.seen * system.observe(mean, t, theta)
-    total = H @ cov @ H.T + noise
-    gain = jnp.linalg.solve(total, H @ cov).T
+    factor = jnp.linalg.cholesky(H @ cov @ H.T + noise)
+    gain = cho_solve((factor, True), H @ cov).T
     keep = jnp.eye(len(mean)) - gain @ H
-    log_factor = _log_normal(residual, total)
+    log_factor = _log_normal(residual, factor)
     if system.sampled:
         log_factor = log_factor - 0.5 * jnp.log(2 * jnp.pi) * jnp.sum(reading.seen)
     else:
-        log_factor = log_factor - _log_normal(reading.values, noise)
+        log_factor = log_factor - _log_normal(reading.values, jnp.linalg.cholesky(noise))
     new = keep @ cov @ keep.T + gain @ noise @ gain.T
     return State(_wrapped(system, mean + gain @ residual), new), log_factor
 
 
-def _log_normal(residual, cov):
-    """log N(residual; 0, 2 pi cov); not a number for an indefinite covariance."""
-    sign, log_volume = jnp.linalg.slogdet(cov)
-    value = -0.5 * residual @ jnp.linalg.solve(cov, residual) - 0.5 * log_volume
-    return jnp.where(sign > 0, value, jnp.nan)
+def _log_normal(residual, factor):
+    """log N(residual; 0, 2 pi C) with C = factor factor'; not a number where C was indefinite."""
+    white = solve_triangular(factor, residual, lower=True)
+    return -0.5 * white @ white - jnp.sum(jnp.log(jnp.diag(factor)))
 
 
 def _wrapped(system, mean):
