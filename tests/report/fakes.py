@@ -51,10 +51,7 @@ def fake_result(
     deviation = 0.25 + 0.2 * np.sin(np.linspace(0, 12, count)) ** 2
     deviation = np.concatenate([[1.7], deviation[1:]])[:, None] * np.ones(n)
     truth = np.cumsum(step * random.standard_normal((count, n)), axis=0)
-    mean = (
-        truth
-        + deviation * random.standard_normal((count, n)) * np.where(np.arange(count) > 0, 0.8, 0.1)[:, None]
-    )
+    mean = truth + deviation * random.standard_normal((count, n)) * np.where(np.arange(count) > 0, 0.8, 0.1)[:, None]
     angles = tuple(i for i, s in enumerate(state) if s in periodic)
     for i in angles:
         truth[:, i], mean[:, i] = np.angle(np.exp(1j * truth[:, i])), np.angle(np.exp(1j * mean[:, i]))
@@ -67,16 +64,15 @@ def fake_result(
         away = 0.9 * deviation[k] if peaks else np.zeros(n)
         spread = np.diag((0.19 if peaks else 1.0) * variance[k])
         means, covs = np.stack([mean[k] - away, mean[k] + away]), np.stack([spread, spread])
-        return GaussianMixture(
-            np.full(2, 0.5), means, covs, tuple(state), tuple(s in periodic for s in state)
-        )
+        return GaussianMixture(np.full(2, 0.5), means, covs, tuple(state), tuple(s in periodic for s in state))
 
     def condition(holds, text):
         return Condition(text, holds, "q = x**2 + 1", "CLY (12)")
 
     result = SimpleNamespace(
         times=times, mean=mean, variance=variance, log_likelihood=float(increments.sum()),
-        log_likelihood_increments=increments, method="limited-direct", exactness="exact in its class",
+        log_likelihood_increments=increments, method="limited-direct", attributes={"exactness": "exact in its class"},
+        state=tuple(state), bounds={},
         warnings=list(warnings),
         health={
             "edge_mass": np.concatenate([[0.0], 10.0 ** random.uniform(-17, -12, observations)]),

@@ -77,9 +77,7 @@ def test_without_densities_the_band_is_gaussian_and_no_density_is_asked_for():
     picture = density_over_time(result)
     assert not picture.kept
     assert set(np.unique(picture.density)) == {0.0, 1.0}
-    np.testing.assert_allclose(
-        picture.upper, result.mean[:, 0] + 1.959963984540054 * np.sqrt(result.variance[:, 0])
-    )
+    np.testing.assert_allclose(picture.upper, result.mean[:, 0] + 1.959963984540054 * np.sqrt(result.variance[:, 0]))
 
 
 def test_two_states_are_drawn_by_their_marginals():

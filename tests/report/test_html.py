@@ -55,7 +55,8 @@ def test_nothing_on_the_page_comes_from_a_network(small):
 def test_hostile_texts_are_escaped_everywhere():
     hostile = '</script><script>alert("x")</script><img src=x onerror=alert(1)>'
     result, truth = fake_result(observations=20, warnings=[hostile], name=hostile)
-    result.why = result.model.text = result.method = result.exactness = hostile
+    result.why = result.model.text = result.method = hostile
+    result.attributes = {"exactness": hostile, "version_zakai": hostile}
     result.health = {hostile: np.arange(21.0)}
     result.conditions = {hostile: (Condition(hostile, False, hostile, hostile),)}
     result.model.state = (hostile,)

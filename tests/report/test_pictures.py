@@ -54,9 +54,7 @@ def test_an_unknown_state_is_refused_with_the_states_there_are():
 
 
 def test_the_colours_of_the_density_fall_evenly_in_grey():
-    grey = [
-        0.299 * int(c[1:3], 16) + 0.587 * int(c[3:5], 16) + 0.114 * int(c[5:7], 16) for c in DENSITY_COLOURS
-    ]
+    grey = [0.299 * int(c[1:3], 16) + 0.587 * int(c[3:5], 16) + 0.114 * int(c[5:7], 16) for c in DENSITY_COLOURS]
     steps = -np.diff(grey)
     assert (steps > 8).all() and steps.max() < 4 * steps.min()
 

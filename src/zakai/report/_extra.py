@@ -14,6 +14,4 @@ def plotting(module: str) -> Any:
         return import_module(module)
     except ImportError as error:
         library = module.partition(".")[0]
-        raise InputError(
-            f'{library} is not installed; pictures need it: pip install "zakai[plots]"'
-        ) from error
+        raise InputError(f'{library} is not installed; pictures need it: pip install "zakai[plots]"') from error

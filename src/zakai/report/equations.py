@@ -28,8 +28,7 @@ def _state(model: Any) -> list[str]:
         terms += [(model.diffusion[i, j], [_differential(_indexed("v", j, noises))]) for j in range(noises)]
         rows.append(_row(_differential(symbol), _operator("="), *_sum(terms)))
     said = "State" + (
-        f": {_names(model.periodic)} {'is an angle' if len(model.periodic) == 1 else 'are angles'}, on "
-        f"the circle"
+        f": {_names(model.periodic)} {'is an angle' if len(model.periodic) == 1 else 'are angles'}, on the circle"
         if model.periodic
         else ""
     )
@@ -102,14 +101,9 @@ def _prior(model: Any) -> list[str]:
         )
         return [_words(said), _block([body])]
     if hasattr(prior, "weights"):
-        rows = [
-            _row(_number(w), _normal(m, c))
-            for w, m, c in list(zip(prior.weights, prior.means, prior.covs, strict=True))[:8]
-        ]
+        rows = [_row(_number(w), _normal(m, c)) for w, m, c in list(zip(prior.weights, prior.means, prior.covs, strict=True))[:8]]
         more = len(prior.weights) - len(rows)
-        said += f": a mixture of {len(prior.weights)} Gaussians" + (
-            f", of which the first {len(rows)}" if more else ""
-        )
+        said += f": a mixture of {len(prior.weights)} Gaussians" + (f", of which the first {len(rows)}" if more else "")
         return [_words(said), _block(rows)]
     return [_words(said), _block([_normal(prior.mean, prior.cov)])]
 

@@ -148,11 +148,21 @@ def density_over_time(
     if periodic and not about_mean:
         lower, upper = wrapped(lower), wrapped(upper)
         truth_here = None if truth_here is None else wrapped(truth_here)
-    name = result.model.state[state]
     times = np.asarray(result.times, dtype=float)[index]
     shown_on_circle = periodic and not about_mean
     return DensityOverTime(
-        name, index, times, edges, density, centre, lower, upper, truth_here, shown_on_circle, kept, profiles
+        state_names(result)[state],
+        index,
+        times,
+        edges,
+        density,
+        centre,
+        lower,
+        upper,
+        truth_here,
+        shown_on_circle,
+        kept,
+        profiles,
     )
 
 
@@ -160,9 +170,7 @@ def profile(result: Any, k: int, state: int) -> Profile:
     """The marginal density of one state at time k on a window that holds its mass, the circle at most."""
     mean = float(np.asarray(result.mean)[k, state])
     spread = float(np.sqrt(np.asarray(result.variance)[k, state]))
-    certain = (
-        not spread > 0
-    )  # a state that is known exactly, or a run that was lost, has no density to ask for
+    certain = not spread > 0  # a state that is known exactly, or a run that was lost, has no density to ask for
     if certain:
         spread = 1e-9 * max(1.0, abs(mean))
     periodic = is_periodic(result, state)
@@ -196,7 +204,12 @@ def chosen_times(
 
 def is_periodic(result: Any, state: int) -> bool:
     """Whether this coordinate is an angle on the circle."""
-    return result.model.state[state] in result.model.periodic
+    return result.model is not None and result.model.state[state] in result.model.periodic
+
+
+def state_names(result: Any) -> tuple[str, ...]:
+    """The names of the coordinates; a result that was read back without its model still has them."""
+    return tuple(result.state if result.model is None else result.model.state)
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:
@@ -249,15 +262,11 @@ def true_states(truth: Any, result: Any) -> np.ndarray | None:
     if values.shape == (shape[0] - 1, shape[1]):
         values = np.vstack([np.full((1, shape[1]), np.nan), values])
     if values.shape != shape:
-        raise InputError(
-            f"truth has shape {values.shape}; expected {shape}: a row for the start and one an observation"
-        )
+        raise InputError(f"truth has shape {values.shape}; expected {shape}: a row for the start and one an observation")
     return values
 
 
-def _edges(
-    mean: np.ndarray, lower: np.ndarray, upper: np.ndarray, truth: np.ndarray | None, index: np.ndarray
-) -> np.ndarray:
+def _edges(mean: np.ndarray, lower: np.ndarray, upper: np.ndarray, truth: np.ndarray | None, index: np.ndarray) -> np.ndarray:
     """The range of the common grid: it follows mean, band and truth, but not a wide prior or a few wide
     moments.
     """

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from zakai.report import _style, plots, sections, words
-from zakai.report.heatmap import is_periodic, true_states, wrapped
+from zakai.report.heatmap import is_periodic, state_names, true_states, wrapped
 from zakai.report.words import signed
 
 # The page may not fetch anything, whatever a file that was put into it says.
@@ -46,10 +46,8 @@ def page(result: Any, truth: Any = None) -> str:
         ("model", "The model", sections.model(result)),
     ]
     links = "".join(f'<a href="#{key}">{key.capitalize()}</a>' for key, _, _ in parts)
-    body = "".join(
-        f'<section id="{key}"><h2>{escape(title)}</h2>{text}</section>' for key, title, text in parts
-    )
-    name = escape(result.model.name)
+    body = "".join(f'<section id="{key}"><h2>{escape(title)}</h2>{text}</section>' for key, title, text in parts)
+    name = escape(result.model.name if result.model is not None else "Filtering run")
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
@@ -74,38 +72,34 @@ def _warnings(result: Any) -> str:
 
 def _facts(result: Any, truth: np.ndarray | None) -> str:
     model, times = result.model, result.times
+    observed = []
+    if model is not None:
+        observed = [("observed as", f"{model.m} × {model.observation_kind}" if model.m > 1 else model.observation_kind)]
     facts = [
         ("observations", f"{len(times) - 1:,}"),
         ("time", signed(f"{times[0]:.6g} to {times[-1]:.6g}")),
-        ("states", f"{model.n}"),
-        ("observed as", f"{model.m} × {model.observation_kind}" if model.m > 1 else model.observation_kind),
+        ("states", f"{len(state_names(result))}"),
+        *observed,
         ("log-likelihood", signed(f"{result.log_likelihood:,.2f}")),
         *words.errors(result, _errors(result, truth)),
     ]
-    return (
-        '<dl class="facts">'
-        + "".join(f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in facts)
-        + "</dl>"
-    )
+    return '<dl class="facts">' + "".join(f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in facts) + "</dl>"
 
 
 def _errors(result: Any, truth: np.ndarray | None) -> np.ndarray | None:
     if truth is None:
         return None
     error = truth - np.asarray(result.mean)
-    for i in range(result.model.n):
+    for i in range(error.shape[1]):
         if is_periodic(result, i):
             error[:, i] = wrapped(error[:, i])
     return error
 
 
 def _versions(result: Any) -> str:
-    versions = dict(getattr(result, "versions", None) or _installed())
-    return (
-        "Made with "
-        + ", ".join(f"{escape(str(name))} {escape(str(value))}" for name, value in versions.items())
-        + "."
-    )
+    computed = {k.removeprefix("version_"): v for k, v in result.attributes.items() if k.startswith("version_")}
+    versions = {**_installed(), **computed}
+    return "Made with " + ", ".join(f"{escape(str(name))} {escape(str(value))}" for name, value in versions.items()) + "."
 
 
 def _installed() -> dict[str, str]:

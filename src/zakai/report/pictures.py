@@ -13,7 +13,7 @@ from zakai.errors import InputError
 from zakai.report import _style as style
 from zakai.report import words
 from zakai.report._extra import plotting
-from zakai.report.heatmap import circle_line, density_over_time, true_states
+from zakai.report.heatmap import circle_line, density_over_time, state_names, true_states
 from zakai.report.plots import on_log_scale, thinned
 
 _FORMATS = ("png", "pdf", "svg")
@@ -64,14 +64,8 @@ def posterior_figure(
         axes.set_yticks(np.pi * np.array([-1, -0.5, 0, 0.5, 1]), ["−π", "−π/2", "0", "π/2", "π"])
     axes.set_xlabel("time")
     axes.set_ylabel(_plain(picture.name) + (" (radians)" if picture.periodic else ""))
-    axes.legend(
-        loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False, borderaxespad=0.2, handlelength=1.6
-    )
-    said = (
-        "shade: density relative to its peak at each time"
-        if picture.kept
-        else "densities not kept: Gaussian 95% band"
-    )
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False, borderaxespad=0.2, handlelength=1.6)
+    said = "shade: density relative to its peak at each time" if picture.kept else "densities not kept: Gaussian 95% band"
     axes.set_title(said, loc="right", fontsize=8, color=style.FAINT)
     axes.spines[["top", "right"]].set_visible(False)
     return figure
@@ -90,9 +84,7 @@ def diagnostics_figure(result: Any) -> Any:
     figure = _figure(8.0, 1.55 * (2 + len(series)) + 0.4)
     panels = figure.subplots(2 + len(series), 1, sharex=True)
     few = thinned(increments)
-    panels[0].plot(
-        times[1:][few], increments[few], ".", color=style.SERIES_COLOUR, markersize=2.5, rasterized=True
-    )
+    panels[0].plot(times[1:][few], increments[few], ".", color=style.SERIES_COLOUR, markersize=2.5, rasterized=True)
     panels[0].set_title("log-likelihood per observation", loc="left", fontsize=9)
     panels[1].plot(times, np.concatenate([[0.0], np.nancumsum(increments)]), color=style.INK, linewidth=1.1)
     panels[1].set_title("cumulative log-likelihood", loc="left", fontsize=9)
@@ -121,9 +113,7 @@ def save_figure(figure: Any, path: str | Path, dpi: int = 160) -> None:
 
     ending = Path(path).suffix.lstrip(".").lower()
     if ending not in _FORMATS:
-        raise InputError(
-            f"{path}: pictures are written as {', '.join(_FORMATS)}; the file's name must end in one of them"
-        )
+        raise InputError(f"{path}: pictures are written as {', '.join(_FORMATS)}; the file's name must end in one of them")
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format=ending, dpi=dpi)
 
@@ -135,7 +125,7 @@ def _figure(width: float, height: float) -> Any:
 
 
 def _state_number(result: Any, state: int | str) -> int:
-    names = tuple(result.model.state)
+    names = state_names(result)
     if isinstance(state, str):
         if state not in names:
             raise InputError(f"state '{state}' is not in the model; its states are {', '.join(names)}")

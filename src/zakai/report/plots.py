@@ -89,9 +89,7 @@ def snapshots(shots: list[tuple[str, float, Profile, float | None]], name: str, 
     columns = min(3, len(shots))
     rows = -(-len(shots) // columns)
     titles = [f"{title}, t = {time:.6g}" for title, time, _, _ in shots]
-    figure = make_subplots(
-        rows=rows, cols=columns, subplot_titles=titles, vertical_spacing=0.3 / rows, horizontal_spacing=0.07
-    )
+    figure = make_subplots(rows=rows, cols=columns, subplot_titles=titles, vertical_spacing=0.3 / rows, horizontal_spacing=0.07)
     for position, (_, _, shot, truth) in enumerate(shots):
         row, column = divmod(position, columns)
         where = {"row": row + 1, "col": column + 1}
@@ -110,9 +108,7 @@ def snapshots(shots: list[tuple[str, float, Profile, float | None]], name: str, 
         if truth is not None and np.isfinite(truth):
             if periodic:
                 truth = shot.centre + float(np.angle(np.exp(1j * (truth - shot.centre))))
-            figure.add_vline(
-                x=truth, line={"color": style.TRUTH_COLOUR, "width": 1.6, "dash": "4px,2px"}, **where
-            )
+            figure.add_vline(x=truth, line={"color": style.TRUTH_COLOUR, "width": 1.6, "dash": "4px,2px"}, **where)
     _layout(figure, 235 * rows + 50)
     figure.update_annotations(font={"size": 13, "color": style.INK})
     figure.update_yaxes(rangemode="tozero", nticks=4)
@@ -167,9 +163,7 @@ def health(times: np.ndarray, series: dict[str, np.ndarray], bounds: dict[str, f
     go, make_subplots = plotting("plotly.graph_objects"), plotting("plotly.subplots").make_subplots
     rows = len(series)
     titles = [escape(words.spoken(name)) for name in series]
-    figure = make_subplots(
-        rows=rows, cols=1, shared_xaxes=True, vertical_spacing=0.22 / rows, subplot_titles=titles
-    )
+    figure = make_subplots(rows=rows, cols=1, shared_xaxes=True, vertical_spacing=0.22 / rows, subplot_titles=titles)
     for row, (name, values) in enumerate(series.items(), start=1):
         drawn, logarithmic = on_log_scale(values)
         keep = thinned(drawn, 1600)
@@ -181,7 +175,9 @@ def health(times: np.ndarray, series: dict[str, np.ndarray], bounds: dict[str, f
             ), row=row, col=1,
         )  # fmt: skip
         if logarithmic:
-            figure.update_yaxes(type="log", exponentformat="power", nticks=5, row=row, col=1)
+            few = np.nanmax(drawn) < 100 * np.nanmin(drawn)  # decades: then the ticks are 1, 2, 5
+            ticks = {"dtick": "D2"} if few else {"nticks": 5}
+            figure.update_yaxes(type="log", exponentformat="power", row=row, col=1, **ticks)
         bound = bounds.get(name)
         if bound is not None and np.nanmax(drawn) > 1e-3 * bound:
             line = {"color": style.TRUTH_COLOUR, "width": 1.2, "dash": "dot"}
@@ -214,16 +210,11 @@ def thinned(values: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
     bounds = np.linspace(0, count, most // 2 + 1).astype(int)
     low = np.where(np.isfinite(values), values, np.inf)
     high = np.where(np.isfinite(values), values, -np.inf)
-    kept = [
-        (a + int(np.argmin(low[a:b])), a + int(np.argmax(high[a:b])))
-        for a, b in zip(bounds[:-1], bounds[1:], strict=True)
-    ]
+    kept = [(a + int(np.argmin(low[a:b])), a + int(np.argmax(high[a:b]))) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
     return np.unique(np.array(kept))
 
 
-def _line(
-    figure: Any, picture: DensityOverTime, values: np.ndarray, name: str, line: dict, legend: bool = True
-) -> None:
+def _line(figure: Any, picture: DensityOverTime, values: np.ndarray, name: str, line: dict, legend: bool = True) -> None:
     go = plotting("plotly.graph_objects")
     times = picture.times
     if picture.periodic:

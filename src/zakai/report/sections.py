@@ -9,7 +9,7 @@ import numpy as np
 
 from zakai.report import plots, words
 from zakai.report.equations import equations
-from zakai.report.heatmap import density_over_time, is_periodic, profile, wrapped
+from zakai.report.heatmap import density_over_time, is_periodic, profile, state_names, wrapped
 from zakai.report.words import signed
 
 _COLUMNS = 600
@@ -20,10 +20,11 @@ _MOST_STATES = 6
 def posterior(result: Any, truth: np.ndarray | None) -> str:
     """The heat maps, one per state, with a closer look where the record is long or the band thin."""
     total = len(result.times)
-    shown = min(result.model.n, _MOST_STATES)
+    names = state_names(result)
+    shown = min(len(names), _MOST_STATES)
     parts = [f"<p>{_how_to_read(result, truth)}</p>"]
-    if shown < result.model.n:
-        parts.append(f"<p>The first {shown} of {result.model.n} states are drawn.</p>")
+    if shown < len(names):
+        parts.append(f"<p>The first {shown} of {len(names)} states are drawn.</p>")
     moments = tuple(k for k, _ in special_moments(result))
     for i in range(shown):
         picture = density_over_time(result, i, truth, columns=_COLUMNS, extra=moments)
@@ -33,23 +34,19 @@ def posterior(result: Any, truth: np.ndarray | None) -> str:
         )  # fmt: skip
         if picture.coverage is not None:
             note += f" The band holds the true state at {picture.coverage:.1%} of them."
-        title = f"<h3>{escape(result.model.state[i])}</h3>" if result.model.n > 1 else ""
+        title = f"<h3>{escape(names[i])}</h3>" if len(names) > 1 else ""
         parts.append(title + _figure(plots.posterior(picture), f"posterior-{i}", note))
         if total > _COLUMNS:
             last = density_over_time(result, i, truth, start=total - _DETAIL)
             note = f"The last {_DETAIL} times, every one drawn."
             parts.append(_figure(plots.posterior(last, 330), f"detail-{i}", note))
-        spread = np.median(
-            np.abs(
-                wrapped(picture.upper - picture.lower) if picture.periodic else picture.upper - picture.lower
-            )
-        )
+        spread = np.median(np.abs(wrapped(picture.upper - picture.lower) if picture.periodic else picture.upper - picture.lower))
         if not picture.periodic and spread < 0.05 * (picture.edges[-1] - picture.edges[0]):
             close = density_over_time(
                 result, i, truth, columns=_COLUMNS, extra=moments, about_mean=True, profiles=picture.profiles
             )
             note = "The same about its mean, since the band is thin against the range above."
-            label = f"{result.model.state[i]} − mean"
+            label = f"{names[i]} − mean"
             parts.append(_figure(plots.posterior(close, 330, label), f"about-mean-{i}", note))
     return "".join(parts)
 
@@ -73,10 +70,8 @@ def _how_to_read(result: Any, truth: np.ndarray | None) -> str:
         )
     if truth is not None:
         text += " The dashed orange line is the true state."
-    if result.model.periodic:
-        text += (
-            " An angle is drawn on the circle from −π to π: what leaves at the top comes back at the bottom."
-        )
+    if any(is_periodic(result, i) for i in range(len(state_names(result)))):
+        text += " An angle is drawn on the circle from −π to π: what leaves at the top comes back at the bottom."
     return text
 
 
@@ -107,10 +102,7 @@ def special_moments(result: Any) -> list[tuple[int, str]]:
 def snapshots(result: Any, truth: np.ndarray | None) -> str:
     """The densities themselves at a few moments."""
     if not result.has_densities:
-        return (
-            "<p>The densities of this run were not kept. Filter again with "
-            '<code>keep="densities"</code> to see them.</p>'
-        )
+        return '<p>The densities of this run were not kept. Filter again with <code>keep="densities"</code> to see them.</p>'
     parts = [
         "<p>The vertical line is the mean"
         + (", the dashed orange line the true state" if truth is not None else "")
@@ -119,7 +111,8 @@ def snapshots(result: Any, truth: np.ndarray | None) -> str:
         "largest variance after an observation. Every panel has axes of its own.</p>"
     ]
     moments = special_moments(result)
-    for i in range(min(result.model.n, _MOST_STATES)):
+    names = state_names(result)
+    for i in range(min(len(names), _MOST_STATES)):
         shots = [
             (
                 name[0].upper() + name[1:],
@@ -129,8 +122,8 @@ def snapshots(result: Any, truth: np.ndarray | None) -> str:
             )
             for k, name in moments
         ]
-        drawn = plots.snapshots(shots, result.model.state[i], is_periodic(result, i))
-        title = f"<h3>{escape(result.model.state[i])}</h3>" if result.model.n > 1 else ""
+        drawn = plots.snapshots(shots, names[i], is_periodic(result, i))
+        title = f"<h3>{escape(names[i])}</h3>" if len(names) > 1 else ""
         parts.append(title + _figure(drawn, f"snapshots-{i}", ""))
     return "".join(parts)
 
@@ -147,13 +140,11 @@ def likelihood(result: Any) -> str:
         "A run of low values is "
         "where model and data disagree. "
     )
-    if result.model.observation_kind == "samples":
+    kind = result.model.observation_kind if result.model is not None else None
+    if kind == "samples":
         text += "It is the logarithm of the probability density of the reading."
-    else:
-        text += (
-            "It is the logarithm of the density ratio against pure observation noise (h = 0): "
-            "above 0, there is signal."
-        )
+    elif kind is not None:
+        text += "It is the logarithm of the density ratio against pure observation noise (h = 0): above 0, there is signal."
     note = signed(f"The sum is {result.log_likelihood:,.4f}.")
     if surprise is not None:
         worst = signed(f"{increments[surprise]:.4g}")
@@ -173,16 +164,10 @@ def health(result: Any) -> str:
     figure = ""
     if varying:
         bounds = {name: words.health_bound(result, name) for name in varying}
-        note = (
-            "Dotted line: the bound beyond which to worry. "
-            "On a logarithmic scale an exact zero lies a decade below the rest."
-        )
-        figure = _figure(
-            plots.health(np.asarray(result.times, dtype=float), varying, bounds), "health-figures", note
-        )
+        note = "Dotted line: the bound beyond which to worry. On a logarithmic scale an exact zero lies a decade below the rest."
+        figure = _figure(plots.health(np.asarray(result.times, dtype=float), varying, bounds), "health-figures", note)
     meaning = "".join(
-        f"<dt>{escape(words.spoken(name))}</dt><dd>{escape(words.health_span(v))} "
-        f"{escape(words.health_words(result, name))}</dd>"
+        f"<dt>{escape(words.spoken(name))}</dt><dd>{escape(words.health_span(v))} {escape(words.health_words(result, name))}</dd>"
         for name, v in series.items()
     )
     return (
@@ -198,9 +183,7 @@ def method(result: Any) -> str:
     conditions = getattr(result, "conditions", None) or {}
     used = [name for name in conditions if name == result.method]
     for name in used:
-        parts.append(
-            f"<h3>What {escape(name)} needs, and whether it holds here</h3>" + _conditions(conditions[name])
-        )
+        parts.append(f"<h3>What {escape(name)} needs, and whether it holds here</h3>" + _conditions(conditions[name]))
     others = [name for name in conditions if name not in used]
     if others:
         parts.append("<h3>The other methods</h3>")
@@ -232,6 +215,8 @@ def _conditions(conditions: Any) -> str:
 def model(result: Any) -> str:
     """The equations, the parameters and the model file."""
     model = result.model
+    if model is None:
+        return "<p>The result does not hold the model that it came from.</p>"
     parts = [equations(model)]
     if model.parameters:
         rows = "".join(

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from zakai.report.heatmap import state_names
+
 # Figures that say the same for every method: what they are, and the bound where it is not the method's own.
 _HEALTH: dict[str, tuple[str, float | None]] = {
     "edge_mass": (
@@ -15,8 +17,7 @@ _HEALTH: dict[str, tuple[str, float | None]] = {
         1e-9,
     ),
     "discarded_mass": (
-        "Probability thrown away when small parts of the density were dropped. Its sum over the record "
-        "bounds the error.",
+        "Probability thrown away when small parts of the density were dropped. Its sum over the record bounds the error.",
         1e-6,
     ),
     "quadrature_error": (
@@ -35,8 +36,7 @@ _HEALTH: dict[str, tuple[str, float | None]] = {
         600.0,
     ),
     "effective_sample_size": (
-        "The number of equally weighted particles that would carry the same information: low means few of "
-        "them count.",
+        "The number of equally weighted particles that would carry the same information: low means few of them count.",
         None,
     ),
 }
@@ -85,20 +85,21 @@ def count(number: int, noun: str) -> str:
 
 def exactness(result: Any) -> str:
     """What the method promises, if the result says it: exact, convergent or approximate."""
-    return str(getattr(result, "exactness", "") or "")
+    return str(result.attributes.get("exactness", ""))
 
 
 def verdict(result: Any) -> str:
-    """One sentence: which method, how exact, how much data, how likely, and whether anything went wrong."""
+    """In a sentence or two: which method, how much data, how likely, whether anything went wrong, how exact."""
     observations = len(result.times) - 1
-    kind = exactness(result)
-    text = f"The method {result.method}" + (f" ({kind})" if kind else "")
+    text = f"The method {result.method}"
     total = signed(f"{result.log_likelihood:,.2f}")
     text += f" filtered {count(observations, 'observation')} with a log-likelihood of {total}"
     if observations:
         text += f" ({signed(f'{result.log_likelihood / observations:.3f}')} per observation)"
     warned = len(result.warnings)
-    return text + (f"; it raised {count(warned, 'warning')}, below." if warned else "; it raised no warning.")
+    text += f"; it raised {count(warned, 'warning')}, below." if warned else "; it raised no warning."
+    kind = exactness(result)
+    return text + (f" The method is {kind.rstrip('.')}." if kind else "")
 
 
 def errors(result: Any, error: np.ndarray | None) -> list[tuple[str, str]]:
@@ -108,9 +109,10 @@ def errors(result: Any, error: np.ndarray | None) -> list[tuple[str, str]]:
     facts: list[tuple[str, str]] = []
     if error is None:
         return facts
-    for i, name in enumerate(result.model.state):
+    names = state_names(result)
+    for i, name in enumerate(names):
         known = error[np.isfinite(error[:, i]), i]
         if known.size:
-            label = "rms error of the mean" + (f" of {name}" if result.model.n > 1 else "")
+            label = "rms error of the mean" + (f" of {name}" if len(names) > 1 else "")
             facts.append((label, f"{np.sqrt(np.mean(known**2)):.4g}"))
     return facts
