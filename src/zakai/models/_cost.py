@@ -13,8 +13,9 @@ MAX_EXPONENT = 64
 MAX_ROOT = 12
 MAX_DEGREE = 256
 MAX_BITS = 65_536
-SMALL_SIZE = 300
-SMALL_EXPANSION = 200
+SMALL_SIZE = 100
+SMALL_EXPANSION = 100
+TINY_SIZE = 40
 _MANY = 10**6  # expansions larger than this need not be told apart
 
 
@@ -33,6 +34,11 @@ class Cost:
     def small(self) -> bool:
         """Whether SymPy may look for simpler forms: its searches expand, and a stranger's formula can be large."""
         return self.size <= SMALL_SIZE and self.terms <= SMALL_EXPANSION
+
+    @property
+    def tiny(self) -> bool:
+        """Whether SymPy may ask for its sign or its zeros, as functions and roots of it do; that is slower yet."""
+        return self.small and self.size <= TINY_SIZE
 
     def checked(self, position: int) -> Cost:
         """The cost itself, if the formula at this position may be computed; raises ExpressionError if not."""

@@ -162,7 +162,7 @@ class _Converter:
             expr = _raised(part, sympy.S.Half)
         else:
             # SymPy may only simplify the absolute value of what is real: it would make |sqrt(x)| of sqrt(|x|).
-            simplify = cost.small and (node.name != "abs" or bool(part.expr.is_extended_real))
+            simplify = cost.tiny and (node.name != "abs" or bool(part.expr.is_extended_real))
             expr = _SYMPY[node.name](part.expr, evaluate=simplify)
         if expr.has(sympy.I):
             raise ExpressionError(_DOMAINS.get(node.name, f"{node.name} has no real value here"), node.position)
@@ -182,7 +182,8 @@ def _float_call(node: Call, argument: float) -> float:
 def _raised(base: _Part, exponent: sympy.Rational) -> sympy.Expr:
     if exponent == 1:
         return base.expr
-    return sympy.Pow(base.expr, exponent, evaluate=base.cost.small or bool(exponent == 0))
+    simplify = base.cost.small if exponent.is_Integer else base.cost.tiny
+    return sympy.Pow(base.expr, exponent, evaluate=simplify or exponent == 0)
 
 
 def _constant(value: Fraction) -> _Part:

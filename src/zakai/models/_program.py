@@ -33,6 +33,15 @@ _UNARY: dict[type, str] = {
     sympy.Abs: "abs",
     sympy.sign: "sign",
 }
+# SymPy makes these of the grammar's functions: tan(x + pi/2) becomes -cot(x), and derivatives hold others.
+_QUOTIENTS: dict[type, tuple[Callable, Callable]] = {
+    sympy.cot: (sympy.cos, sympy.sin),
+    sympy.sec: (lambda u: sympy.S.One, sympy.cos),
+    sympy.csc: (lambda u: sympy.S.One, sympy.sin),
+    sympy.coth: (lambda u: sympy.S.One, sympy.tanh),
+    sympy.sech: (lambda u: sympy.S.One, sympy.cosh),
+    sympy.csch: (lambda u: sympy.S.One, sympy.sinh),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +100,9 @@ class Program:
             return "logcosh", expr.args[0].args, None  # cosh overflows at 710; its logarithm does not
         if type(expr) in _UNARY:
             return _UNARY[type(expr)], expr.args, None
+        if type(expr) in _QUOTIENTS:
+            above_function, below_function = _QUOTIENTS[type(expr)]
+            return "divide", (above_function(expr.args[0]), below_function(expr.args[0])), None
         if isinstance(expr, AppliedUndef | sympy.Derivative):
             raise InputError(f"{str(expr)[:60]} is an undetermined function: the model can be analysed, not computed with")
         if expr.is_Symbol:

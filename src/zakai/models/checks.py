@@ -98,8 +98,9 @@ def check_periodic(model: Model) -> None:
 
 def check_independent_of_state(matrix: sympy.MatrixBase, x: tuple[sympy.Symbol, ...]) -> None:
     """Raise InputError at the first entry that depends on the state."""
+    state = set(x)
     for index, expr in enumerate(matrix):
-        found = expr.free_symbols & set(x)
+        found = expr.free_symbols & state
         if found:
             row, column = divmod(index, matrix.shape[1])
             name = min(str(symbol) for symbol in found)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from decimal import Decimal
 from pathlib import Path
@@ -13,6 +14,8 @@ from zakai.models._errors import named
 from zakai.models.model import Model
 
 MAX_BYTES = 1 << 20
+# Nine dotted parts are never a model's key, and the time of tomllib grows with the square of their number.
+_LONG_KEY = re.compile(r"""(?<![A-Za-z0-9_-])(?:(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){9}""")
 
 
 def load_model(source: str | os.PathLike[str]) -> Model:
@@ -39,7 +42,7 @@ def load_model(source: str | os.PathLike[str]) -> Model:
 def read_model(text: str, source: str) -> Model:
     """The model in the text of a model file; `source` is what errors call it."""
     with named(source):
-        return Model(**_read_keys(text), _source=source, _text=text)
+        return Model._from_file(_read_keys(text), source, text)
 
 
 def _read_text(path: Path, shown: str) -> str:
@@ -60,6 +63,8 @@ def _read_text(path: Path, shown: str) -> str:
 
 
 def _read_keys(text: str) -> dict[str, Any]:
+    if _LONG_KEY.search(text):
+        raise InputError("is not a model: it has a key of nine or more parts with dots")
     try:
         # Decimals stay exact, and 1e999999999 is never computed.
         keys = tomllib.loads(text, parse_float=Decimal)

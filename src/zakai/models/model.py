@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from functools import cached_property
 from typing import Any
 
@@ -81,8 +82,16 @@ class Model:
     text: str
     source: str
 
-    def __init__(self, **keys: Any):
-        source, text = keys.pop("_source", "<python>"), keys.pop("_text", None)
+    def __init__(self, /, **keys: Any):
+        self._read(keys, source="<python>", text=None)
+
+    @classmethod
+    def _from_file(cls, keys: Mapping[str, Any], source: str, text: str) -> Model:
+        model = object.__new__(cls)
+        model._read(keys, source, text)
+        return model
+
+    def _read(self, keys: Mapping[str, Any], source: str, text: str | None) -> None:
         _entries.known_keys(keys, KEYS)
         for key in ("state", "drift", "observation"):
             if keys.get(key) is None:
@@ -94,7 +103,7 @@ class Model:
         with named("start"):
             vars(self)["start"] = canonical["start"] = _entries.number(keys.get("start", 0.0))
         with named("prior"):
-            prior, table = read_prior(keys.get("prior"), self.n, lambda text: self._parse(text, in_time=False))
+            prior, table = read_prior(keys.get("prior"), self.n, self._reader(in_time=False))
             vars(self)["prior"], canonical["prior"] = prior, table
         checks.check_constant_noise(self)
         checks.check_periodic(self)
@@ -177,28 +186,31 @@ class Model:
             with named(key):
                 rows = f"{size} rows of {size} formulas (one a {what})"
                 canonical[key] = _entries.matrix_of_formulas(given[key], size, size, rows)
+        read = self._reader()
         for key in ("drift", "observation"):
-            vars(self)[key] = sympy.ImmutableMatrix(
-                [[self._parse(text, place=f"{key}[{i}]")] for i, text in enumerate(canonical[key])]
-            )
-        for key in checks.COEFFICIENTS:
-            vars(self)[key] = sympy.ImmutableMatrix(
-                [
-                    [self._parse(text, place=f"{key}[{i}][{j}]") for j, text in enumerate(row)]
-                    for i, row in enumerate(canonical[key])
-                ]
-            )
             with named(key):
+                column = [[read(text, f"[{i}]")] for i, text in enumerate(canonical[key])]
+            vars(self)[key] = sympy.ImmutableMatrix(column)
+        for key in checks.COEFFICIENTS:
+            with named(key):
+                table = [[read(text, f"[{i}][{j}]") for j, text in enumerate(row)] for i, row in enumerate(canonical[key])]
+                vars(self)[key] = sympy.ImmutableMatrix(table)
                 checks.check_independent_of_state(vars(self)[key], self.x)
 
-    def _parse(self, text: str, place: str = "", in_time: bool = True) -> sympy.Expr:
+    def _reader(self, in_time: bool = True) -> Callable[..., sympy.Expr]:
+        """A function that reads a formula at a place; it remembers, for large matrices repeat few formulas."""
         symbols = dict(zip((*self.state, *self.parameters), (*self.x, *self.parameter_symbols), strict=True))
         if in_time:
             symbols["t"] = self.t
-        if not place:
-            return parse_expression(text, symbols, self.functions)
-        with named(place):
-            return parse_expression(text, symbols, self.functions)
+        known: dict[str, sympy.Expr] = {}
+
+        def read(text: str, place: str = "") -> sympy.Expr:
+            if text not in known:
+                with named(place) if place else nullcontext():
+                    known[text] = parse_expression(text, symbols, self.functions)
+            return known[text]
+
+        return read
 
     @cached_property
     def covariance(self) -> sympy.ImmutableMatrix:
@@ -209,7 +221,7 @@ class Model:
         """The values of the parameters in their order, of shape (p,), in double precision."""
         return np.array([float(value) for value in self.parameters.values()], dtype=float)
 
-    def with_parameters(self, **values: Any) -> Model:
+    def with_parameters(self, /, **values: Any) -> Model:
         """The same model with other values of some parameters.
 
         `values` are numbers by parameter name. Raises InputError for an unknown name, or if a noise matrix
