@@ -16,10 +16,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return _run(arguments)
     except KeyboardInterrupt:
-        print("interrupted; nothing half-written was left behind", file=sys.stderr)
+        print("interrupted; nothing half-written was left behind", file=sys.stderr, flush=True)
+        if arguments is None and "jax" in sys.modules:
+            os._exit(130)  # JAX may still be compiling, and would take an orderly exit for a crash
         return 130
     except BrokenPipeError:
-        return _nobody_reads()
+        _discard_output()  # the reader closed the pipe, which is no error
+        return 0
 
 
 def _run(arguments: Sequence[str] | None) -> int:
@@ -33,7 +36,8 @@ def _run(arguments: Sequence[str] | None) -> int:
             stream.reconfigure(errors="replace")
     try:
         code = app(arguments, prog_name="zakai", standalone_mode=False)
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
         if code == 130:
             raise KeyboardInterrupt
         return int(code or 0)
@@ -42,8 +46,16 @@ def _run(arguments: Sequence[str] | None) -> int:
     except SystemExit as leaving:
         # Typer leaves with 1 where the reader of a pipe is gone.
         if isinstance(leaving.__context__, BrokenPipeError):
-            return _nobody_reads()
+            raise BrokenPipeError from None
         raise
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        # What is written to a file says so itself; what has no name is the output of print.
+        if error.filename is not None:
+            raise
+        _discard_output()
+        return _refused(f"standard output: cannot be written: {error.strerror}; make room or choose another place", 2)
     except ZakaiError as error:
         return _refused(str(error), error.exit_code)
     except Exception as error:
@@ -58,7 +70,6 @@ def _refused(message: str, code: int) -> int:
     return code
 
 
-def _nobody_reads() -> int:
-    """The reader closed the pipe, which is no error; what Python would still flush at its end goes nowhere."""
+def _discard_output() -> None:
+    """What Python would still flush at its end goes nowhere."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 0

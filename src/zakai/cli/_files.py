@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from zakai.errors import InputError
 from zakai.records.writing import shown
@@ -20,8 +21,12 @@ def check_outputs(outputs: list[Path | None], inputs: list[Path | str | None]) -
             raise InputError(f"{shown(path)}: is a folder; give the name of a file")
         if not place.parent.is_dir():
             raise InputError(f"{shown(path)}: there is no folder {shown(place.parent)}; make it first")
-        if not os.access(place.parent, os.W_OK | os.X_OK):
-            raise InputError(f"{shown(path)}: the folder {shown(place.parent)} cannot be written to; choose another place")
+        try:
+            with TemporaryFile(dir=place.parent):
+                pass
+        except OSError as error:
+            fault = f"the folder {shown(place.parent)} cannot be written to: {error.strerror}"
+            raise InputError(f"{shown(path)}: {fault}; choose another place") from None
         if str(place) in seen:
             raise InputError(f"{shown(path)}: {seen[str(place)]}; choose another name")
         seen[str(place)] = "is named for two outputs"

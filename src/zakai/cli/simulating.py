@@ -29,7 +29,7 @@ def simulate(
     if truth_path is not None:
         write_truth(truth_path, truth, model.state)
     write_record(output, record)
-    print(f"{len(record):,} observations of {model.n} state{'s' if model.n > 1 else ''} in {output}")
+    print(f"{len(record):,} observation{'s' if len(record) > 1 else ''} written to {output}")
 
 
 def clock(start: float, until: float, step: float) -> np.ndarray:
@@ -54,5 +54,5 @@ def _numbers(text: str, state: tuple[str, ...]) -> list[float]:
     except ValueError:
         values = []
     if len(values) != len(state) or not all(map(isfinite, values)):
-        raise InputError(f'--initial "{text}": expected {len(state)} finite numbers, one for each of {", ".join(state)}')
+        raise InputError(f'--initial "{text}": expected finite numbers for {", ".join(state)}, separated by commas')
     return values
