@@ -27,6 +27,7 @@ from zakai import _float64  # noqa: F401
 from zakai.algebra.theorems import smooth_system as theorem
 from zakai.densities import GaussianMixture
 from zakai.errors import InputError
+from zakai.filters._formulas import Formulas, formulas
 from zakai.filters._linear_flow import linear_flow
 from zakai.filters._moments import prior_moments
 from zakai.filters._protocol import Info, Method, Schedule
@@ -58,10 +59,10 @@ class Observation(NamedTuple):
 
 
 class System:
-    """A model compiled for this method, with the static options."""
+    """The formulas of a model compiled for this method, with the static options."""
 
     def __init__(self, model: Model, riccati: str, substeps: int):
-        self.model, self.riccati, self.substeps = model, riccati, substeps
+        self.riccati, self.substeps = riccati, substeps
         compiled = compile_model(model)
         self.drift, self.observe = compiled.drift, compiled.observation
         self.covariance, self.noise = compiled.covariance, compiled.observation_noise
@@ -72,8 +73,8 @@ class System:
 
 
 @lru_cache(maxsize=32)
-def _system(model: Model, riccati: str, substeps: int) -> System:
-    return System(model, riccati, substeps)
+def _system(of: Formulas, riccati: str, substeps: int) -> System:
+    return System(of.model, riccati, substeps)
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["start", "stop", "theta"], meta_fields=["system"])
@@ -91,6 +92,7 @@ class Interval:
 class Prepared:
     """The intervals; nothing else is known without data."""
 
+    model: Model
     system: System
     schedule: Schedule
     intervals: Interval
@@ -105,9 +107,9 @@ def prepare(model: Model, schedule: Schedule, *, riccati: str = "stable", subste
         raise InputError(f'option riccati: "{riccati}" is neither "stable" nor "euler"')
     if isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1:
         raise InputError(f"option substeps: {substeps!r} is not a whole number from 1")
-    system = _system(model, riccati, substeps)
+    system = _system(formulas(model), riccati, substeps)
     theta = np.tile(model.theta(), (len(schedule.starts), 1))
-    return Prepared(system, schedule, Interval(schedule.starts, schedule.stops, theta, system))
+    return Prepared(model, system, schedule, Interval(schedule.starts, schedule.stops, theta, system))
 
 
 def observations(prepared: Prepared, data: Data) -> Observation:
@@ -133,12 +135,12 @@ def observations(prepared: Prepared, data: Data) -> Observation:
 
 def init(prepared: Prepared, prior: Any) -> State:
     """The prior's mean and covariance."""
-    return State(*prior_moments(prepared.system.model, prior))
+    return State(*prior_moments(prepared.model, prior))
 
 
 def correct(prepared: Prepared, prior: Any, observation: Observation) -> tuple[State, Info]:
     """The prior after an observation at the start itself."""
-    model = prepared.system.model
+    model = prepared.model
     reading = jax.tree.map(lambda a: a[0], observation.at_end)
     state, log_factor = _update(prepared.system, init(prepared, prior), reading, 1.0, model.start, model.theta())
     return state, _info(state, log_factor)
@@ -250,7 +252,7 @@ def _info(state: State, log_factor: Any) -> Info:
 
 def density(prepared: Prepared, state: State) -> GaussianMixture:
     """The Gaussian, wrapped where a coordinate is an angle."""
-    model = prepared.system.model
+    model = prepared.model
     periodic = tuple(name in model.periodic for name in model.state)
     return GaussianMixture.gaussian(np.asarray(state.mean), np.asarray(state.cov), model.state, periodic)
 

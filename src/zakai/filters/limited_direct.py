@@ -26,6 +26,7 @@ from zakai.algebra.theorems import yau_system
 from zakai.densities import GridDensity
 from zakai.errors import InputError
 from zakai.filters import _lattice_choice as choice
+from zakai.filters._formulas import Formulas, formulas
 from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters.observations import Data, Factors, factors
 from zakai.kolmogorov import lattice as lat
@@ -57,6 +58,7 @@ class State:
 class Prepared:
     """Everything that is known without data: `intervals`, a pytree with a leading axis, and what is static."""
 
+    model: Model
     system: System
     schedule: Schedule
     intervals: Interval
@@ -77,12 +79,12 @@ class Interval:
 
 
 class System:
-    """A model compiled for this method: JAX functions of (x, t, theta) and the coefficients of its flow."""
+    """The formulas of a model compiled for this method: JAX functions of (x, t, theta) and the coefficients of its flow."""
 
     def __init__(self, model: Model, rates: bool):
         yau = yau_system(model)
         assert yau is not None
-        self.model = model
+        self.n = model.n
         self.affine = yau.slope is not None and model.observation_kind != "samples"
         self.rates = rates and self.affine
         self.inputs = 1 + (model.m if self.rates else 0)
@@ -121,7 +123,7 @@ class System:
     def coefficients(self, t: jax.Array, argument: tuple[jax.Array, jax.Array]) -> Coefficients:
         """The coefficients of the flow at time t; `argument` is (theta, inside), the coordinates that act inside."""
         theta, inside = argument
-        numbers = self._numbers(jnp.zeros(self.model.n), t, theta)
+        numbers = self._numbers(jnp.zeros(self.n), t, theta)
         ends = np.cumsum([rows * columns for rows, columns in self._shapes])[:-1]
         parts = jnp.split(numbers, ends)
         L, l, G, Qb, pb, rb, Qf, pf, rf, C, c, S = (
@@ -142,8 +144,8 @@ class System:
 
 
 @lru_cache(maxsize=32)
-def _system(model: Model, rates: bool) -> System:
-    return System(model, rates)
+def _system(of: Formulas, rates: bool) -> System:
+    return System(of.model, rates)
 
 
 def prepare(
@@ -160,10 +162,10 @@ def prepare(
         raise InputError(f'option splitting: "{splitting}" is neither "strang" nor "lie"')
     series = kernel == "power-series"
     # The series knows no inputs, and the papers' order of the factors none inside.
-    system = _system(model, rates=not series and splitting == "strang")
+    system = _system(formulas(model), rates=not series and splitting == "strang")
     which, first = _distinct(system, schedule)
     starts, stops, inside = schedule.starts[first], schedule.stops[first], schedule.inside[first].astype(float)
-    parts = _parts(system, starts, stops, inside)
+    parts = _parts(system, model, starts, stops, inside)
     edges = starts[:, None] + (stops - starts)[:, None] * np.arange(parts + 1) / parts
     theta = np.tile(model.theta(), (len(starts) * parts, 1))
     argument = (theta, np.repeat(inside, parts, axis=0))
@@ -179,7 +181,7 @@ def prepare(
     )
     deviation = np.sqrt(np.diagonal(flow.spread, axis1=2, axis2=3))
     angles = [model.state.index(name) for name in model.periodic]
-    return Prepared(system, schedule, intervals, deviation.min(axis=1), deviation[..., angles].max(axis=1))
+    return Prepared(model, system, schedule, intervals, deviation.min(axis=1), deviation[..., angles].max(axis=1))
 
 
 def _distinct(system: System, schedule: Schedule) -> tuple[np.ndarray, np.ndarray]:
@@ -195,11 +197,11 @@ def _distinct(system: System, schedule: Schedule) -> tuple[np.ndarray, np.ndarra
     return which.ravel(), first
 
 
-def _parts(system: System, starts: np.ndarray, stops: np.ndarray, inside: np.ndarray) -> int:
+def _parts(system: System, model: Model, starts: np.ndarray, stops: np.ndarray, inside: np.ndarray) -> int:
     """Into how many equal parts the intervals are cut so that no flow grows by more than about e^4."""
     if not len(starts):
         return 1
-    arguments = (np.tile(system.model.theta(), (len(starts), 1)), inside)
+    arguments = (np.tile(model.theta(), (len(starts), 1)), inside)
     rate = 0.0
     for times in (starts, stops):
         c = jax.jit(jax.vmap(system.coefficients))(times, arguments)
@@ -207,7 +209,7 @@ def _parts(system: System, starts: np.ndarray, stops: np.ndarray, inside: np.nda
         speed = np.linalg.norm(np.asarray(c.matrix), ord=2, axis=(1, 2)) + np.sqrt(2 * waves)
         rate = max(rate, float(np.max(speed * (stops - starts))))
     if not np.isfinite(rate):
-        raise InputError(f"{system.model.source}: a coefficient is not finite between t = {starts[0]:g} and {stops[-1]:g}")
+        raise InputError(f"{model.source}: a coefficient is not finite between t = {starts[0]:g} and {stops[-1]:g}")
     return max(1, int(np.ceil(rate / 4.0)))
 
 
@@ -216,7 +218,7 @@ def observations(prepared: Prepared, data: Data) -> Factors:
     system = prepared.system
     splitting = "lie" if not system.rates and system.affine else "strang"
     return factors(
-        system.model, data, prepared.schedule, rates=system.rates, splitting=splitting, remove=not system.bare
+        prepared.model, data, prepared.schedule, rates=system.rates, splitting=splitting, remove=not system.bare
     )
 
 
@@ -234,7 +236,7 @@ def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State
 
 
 def _start(prepared, prior, observation):
-    system, model = prepared.system, prepared.system.model
+    system, model = prepared.system, prepared.model
 
     def log_factor(x):
         factor = jax.tree.map(lambda a: a[0], observation)
@@ -251,7 +253,7 @@ def _looked_at(prepared: Prepared, lattice: Lattice, plan: choice.Plan, time: fl
     summary = lat.summary(lattice, plan.angles)
     return State(
         lattice,
-        _observed_at(system, lattice, time, system.model.theta()) if system.halves else None,
+        _observed_at(system, lattice, time, prepared.model.theta()) if system.halves else None,
         choice.features(np.asarray(lattice.log_values)),
         np.asarray(summary.middle),
         plan,
@@ -281,7 +283,7 @@ def _log_factor(h: Sequence[jax.Array] | None, factor: Factors) -> jax.Array:
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
     """The state to begin the intervals `rows` with: the window, the cell and the way to convolve."""
     lattice, plan = choice.adapted(
-        prepared.system.model,
+        prepared.model,
         state.lattice,
         state.plan,
         prepared.kernel_deviation[rows],
@@ -384,7 +386,7 @@ def _info(summary: lat.Summary, log_mass, resolution, quadrature_error, exponent
 
 def density(prepared: Prepared, state: State) -> GridDensity:
     """The posterior as a `GridDensity`."""
-    model = prepared.system.model
+    model = prepared.model
     lattice = state.lattice
     return GridDensity(
         np.asarray(lattice.log_values),
