@@ -1,120 +1,240 @@
 """Is an expression identically zero?
 
-A point where it is clearly not zero, found in 50-digit arithmetic, refutes; the proof is algebra.  Trigonometric and
-hyperbolic functions become exponentials, exponentials of rationally independent arguments are independent
-variables, and what is left is a rational function whose numerator is expanded.  This knows sin^2 + cos^2,
-1 - tanh^2 - sech^2, double angles and the like.  What neither refutes nor proves is undecided, and said so.
+A point where it is clearly not zero, found in 50-digit arithmetic, refutes.  The proof is algebra: trigonometric and
+hyperbolic functions become exponentials, exponentials of rationally independent arguments are independent variables, and
+what is left is a rational function whose numerator is expanded.  This knows sin^2 + cos^2, 1 - tanh^2 - sech^2, double angles
+and the like.  Where that would be too long, an expression that is analytic on the whole line and vanishes to 40 digits at a
+dozen random points is taken to be zero.  Everything else is undecided, and said so.
 """
 
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
-from functools import reduce
-from math import lcm
+from collections.abc import Mapping, Sequence
 
 import mpmath
 import sympy as sp
 
-DIGITS = 50
-POINTS = 4
-MOST_OPERATIONS = 6000
+DIGITS = 60
+POINTS = 12
+SHORT = 160  # operations up to which the algebraic proof is tried
 
-_TO_EXP = (sp.sin, sp.cos, sp.tan, sp.sinh, sp.cosh, sp.tanh, sp.cot, sp.coth, sp.sech, sp.csch, sp.sec, sp.csc)
+_CIRCULAR = (sp.sin, sp.cos, sp.tan, sp.cot, sp.sec, sp.csc)
+_HYPERBOLIC = (sp.sinh, sp.cosh, sp.tanh, sp.coth, sp.sech, sp.csch)
+_FUNCTIONS = {
+    **{f: getattr(mpmath, f.__name__) for f in (*_CIRCULAR, *_HYPERBOLIC)},
+    sp.exp: mpmath.exp,
+    sp.log: mpmath.log,
+    sp.asin: mpmath.asin,
+    sp.acos: mpmath.acos,
+    sp.atan: mpmath.atan,
+    sp.erf: mpmath.erf,
+    sp.Abs: abs,
+    sp.sign: mpmath.sign,
+}
+_ENTIRE = (sp.sin, sp.cos, sp.sinh, sp.cosh, sp.tanh, sp.sech, sp.exp, sp.erf, sp.atan)
 
 
 def is_zero(expression: sp.Expr) -> bool | None:
     """True if the expression is identically zero, False if it is not, None if neither could be shown."""
-    expression = sp.sympify(expression)
-    if expression.is_zero or expression == 0:
-        return True
-    if not expression.free_symbols:
-        expression_value = expression.evalf(DIGITS)
-        if expression_value.is_number and abs(expression_value) > sp.Float(10) ** (-DIGITS // 2):
-            return False
-    if witness(expression) is not None:
-        return False
-    return True if _provably_zero(expression) else None
-
-
-def witness(expression: sp.Expr) -> dict[sp.Symbol, sp.Rational] | None:
-    """A point at which the expression is not zero, or None if none was found."""
+    if expression.is_number and expression.is_Rational:
+        return bool(expression == 0)
     symbols = sorted(expression.free_symbols, key=lambda s: s.name)
-    rng = random.Random(20170111)
-    try:
-        function = sp.lambdify(symbols, expression, modules="mpmath", cse=True)
-        size = sp.lambdify(symbols, list(sp.Add.make_args(expression)), modules="mpmath", cse=True)
-    except Exception:  # an undetermined function: SymPy's printers reject it in several ways
-        return None
-    for _ in range(POINTS * 3):
-        point = [sp.Rational(rng.randint(-4000, 4000), 3001) for _ in symbols]
+    vanished = 0
+    for point in _points(symbols):
+        answer = _vanishes(expression, point)
+        if answer is False:
+            return False
+        vanished += answer is True
+    if expression.count_ops() <= SHORT and _provably_zero(expression):
+        return True
+    return True if vanished >= POINTS and _is_analytic(expression) else None
+
+
+def all_zero(expressions: Sequence[sp.Expr]) -> bool | None:
+    """`is_zero` for several expressions at once: False wins over None, None over True."""
+    answers = [is_zero(expression) for expression in expressions]
+    return False if False in answers else None if None in answers else True
+
+
+def is_quadratic(q: sp.Expr, x: Sequence[sp.Symbol]) -> bool | None:
+    """Whether q is a polynomial of degree two at most in x, its coefficients being any functions of the other symbols.
+
+    Its third differences along random lines refute; a zero third derivative proves.
+    """
+    others = sorted(q.free_symbols - set(x), key=lambda s: s.name)
+    vanished = 0
+    for point in _points([*x, *others]):
+        rng = random.Random(repr(sorted((s.name, str(v)) for s, v in point.items())))
+        step = {s: mpmath.mpf(rng.randint(500, 2000)) / 1511 for s in x}
         with mpmath.workdps(DIGITS):
-            try:
-                arguments = [mpmath.mpf(p.p) / p.q for p in point]
-                value = abs(function(*arguments))
-                scale = 1 + sum(abs(term) for term in size(*arguments))
-                # A cancellation inside a term is not seen in `scale`, so a wide margin is left.
-                if mpmath.isfinite(value) and value > scale * mpmath.mpf(10) ** (-DIGITS // 2 + 2):
-                    return dict(zip(symbols, point, strict=True))
-            except (ZeroDivisionError, ValueError, OverflowError, TypeError, NameError):
+            values = [evaluate(q, {s: v + k * step.get(s, 0) for s, v in point.items()}) for k in range(4)]
+            if any(v is None for v in values):
                 continue
-    return None
+            difference = abs(values[3] - 3 * values[2] + 3 * values[1] - values[0])
+            if difference > sum(abs(v) for v in values) * _margin() + _margin():
+                return False
+        vanished += 1
+    if q.count_ops() <= SHORT:
+        thirds = [sp.diff(q, a, b, c) for i, a in enumerate(x) for j, b in enumerate(x[i:], i) for c in x[j:]]
+        if all(_provably_zero(third) for third in thirds):
+            return True
+    return True if vanished >= POINTS and _is_analytic(q) else None
+
+
+def evaluate(expression: sp.Expr, values: Mapping[sp.Symbol, mpmath.mpf], known: dict | None = None):
+    """The value in mpmath's current precision, or None where the expression has none."""
+    known = {} if known is None else known
+
+    def value(e: sp.Expr):
+        if e not in known:
+            known[e] = compute(e)
+        return known[e]
+
+    def compute(e: sp.Expr):
+        if e.is_Rational:
+            return mpmath.mpf(int(e.p)) / int(e.q)
+        if e.is_Symbol:
+            return values[e]
+        if isinstance(e, sp.Add):
+            return mpmath.fsum(value(a) for a in e.args)
+        if isinstance(e, sp.Mul):
+            return mpmath.fprod(value(a) for a in e.args)
+        if isinstance(e, sp.Pow):
+            return mpmath.power(value(e.base), int(e.exp) if e.exp.is_Integer else value(e.exp))
+        if e.func in _FUNCTIONS:
+            return _FUNCTIONS[e.func](value(e.args[0]))
+        if e.is_number:
+            return mpmath.mpmathify(e.evalf(mpmath.mp.dps))
+        raise ValueError(e)  # an undetermined function
+
+    try:
+        result = value(expression)
+        return result if mpmath.isfinite(result) else None
+    except (ZeroDivisionError, ValueError, OverflowError, TypeError, KeyError):
+        return None
+
+
+def _margin() -> mpmath.mpf:
+    return mpmath.mpf(10) ** (-(2 * DIGITS) // 3)
+
+
+def _points(symbols: Sequence[sp.Symbol]):
+    rng = random.Random(20170111)
+    for _ in range(POINTS + 4):
+        with mpmath.workdps(DIGITS):
+            yield {s: mpmath.mpf(rng.randint(-4000, 4000)) / 3001 for s in symbols}
+
+
+def _vanishes(expression: sp.Expr, point: Mapping[sp.Symbol, mpmath.mpf]) -> bool | None:
+    with mpmath.workdps(DIGITS):
+        known: dict = {}
+        value = evaluate(expression, point, known)
+        if value is None:
+            return None
+        # What was added up anywhere inside tells how many digits a true zero could have lost.
+        scale = 1 + max((abs(v) for v in known.values() if v is not None), default=0)
+        return bool(abs(value) <= scale * _margin())
+
+
+def _is_analytic(expression: sp.Expr) -> bool:
+    """Whether the expression is analytic for all real values of its symbols, as far as its form shows."""
+    for e in sp.preorder_traversal(expression):
+        if isinstance(e, sp.Function):
+            inside = isinstance(e, sp.log) and isinstance(e.args[0], sp.cosh)
+            if not (isinstance(e, _ENTIRE) or inside):
+                return False
+        elif isinstance(e, sp.Pow) and not (e.exp.is_Integer or not e.base.free_symbols):
+            return False
+    return True
 
 
 def _provably_zero(expression: sp.Expr) -> bool:
     if sp.expand(expression) == 0:
         return True
-    if expression.count_ops() > MOST_OPERATIONS:
-        return False
-    rational = _as_rational(expression)
-    if rational is None:
-        return False
-    numerator = sp.expand(sp.fraction(sp.together(rational))[0])
-    return bool(_reduce_roots(numerator) == 0)
+    numerator = sp.expand(sp.fraction(sp.together(_as_rational(expression)))[0])
+    return bool(sp.expand(sp.powdenest(numerator)) == 0)
 
 
-def _as_rational(expression: sp.Expr) -> sp.Expr | None:
-    """The expression as a rational function of symbols that stand for independent exponentials and other functions."""
-    exponential = expression.replace(lambda e: isinstance(e, _TO_EXP), lambda e: e.rewrite(sp.exp))
-    exponential = exponential.rewrite(sp.exp) if exponential.has(*_TO_EXP) else exponential
-    arguments = {sp.expand(e.exp) for e in exponential.atoms(sp.exp)}
-    rates: dict[sp.Expr, list[int]] = {}
-    for argument in arguments:
-        for term in sp.Add.make_args(argument):
-            number, monomial = term.as_coeff_Mul(rational=True)
-            if not number.is_Rational:
-                return None
-            rates.setdefault(monomial, []).append(number.q)
-    generators = {
-        monomial: (sp.Dummy(f"e{k}", positive=True), reduce(lcm, denominators))
-        for k, (monomial, denominators) in enumerate(rates.items())
-    }
+def _as_rational(expression: sp.Expr) -> sp.Expr:
+    """The expression as a rational function of symbols that stand for independent exponentials and other functions.
 
-    def power(e: sp.Expr) -> sp.Expr:
+    exp(sum_k c_k m_k), c_k rational and m_k monomials, becomes prod_k e_k^c_k.  Arguments are treated before what contains them.
+    """
+    generators: dict[sp.Expr, sp.Symbol] = {}
+
+    def exponential(argument: sp.Expr) -> sp.Expr:
         result = sp.Integer(1)
-        for term in sp.Add.make_args(sp.expand(e.exp)):
+        for term in sp.Add.make_args(sp.expand(argument)):
             number, monomial = term.as_coeff_Mul(rational=True)
-            symbol, denominator = generators[monomial]
-            result *= symbol ** (number * denominator)
+            symbol = generators.setdefault(monomial, sp.Dummy(f"e{len(generators)}", positive=True))
+            result *= symbol**number
         return result
 
-    return exponential.replace(lambda e: isinstance(e, sp.exp), power)
+    def convert(e: sp.Expr) -> sp.Expr:
+        if not e.args:
+            return e
+        arguments = [convert(argument) for argument in e.args]
+        if isinstance(e, sp.exp):
+            return exponential(arguments[0])
+        if isinstance(e, _CIRCULAR):
+            forward = exponential(sp.I * arguments[0])
+            return _from_exponential(e.func, forward, sp.I)
+        if isinstance(e, _HYPERBOLIC):
+            return _from_exponential(_CIRCULAR[_HYPERBOLIC.index(e.func)], exponential(arguments[0]), sp.Integer(1))
+        return e.func(*arguments)
+
+    return convert(expression)
 
 
-def _reduce_roots(numerator: sp.Expr) -> sp.Expr:
-    """Even powers of square roots are what stands under the root."""
-    return sp.expand(sp.powdenest(sp.expand(numerator)))
+def _from_exponential(function: type, e: sp.Expr, unit: sp.Expr) -> sp.Expr:
+    """sin, cos and their quotients (unit = I), or sinh, cosh and theirs (unit = 1), of u from e = exp(unit u)."""
+    sine, cosine = (e - 1 / e) / (2 * unit), (e + 1 / e) / 2
+    return {
+        sp.sin: sine,
+        sp.cos: cosine,
+        sp.tan: sine / cosine,
+        sp.cot: cosine / sine,
+        sp.sec: 1 / cosine,
+        sp.csc: 1 / sine,
+    }[function]
 
 
-def all_zero(expressions: Sequence[sp.Expr]) -> bool | None:
-    """`is_zero` for several expressions at once: False wins over None, None over True."""
-    undecided = False
-    for expression in expressions:
-        answer = is_zero(expression)
-        if answer is False:
-            return False
-        undecided = undecided or answer is None
-    return None if undecided else True
+def normal_form(expression: sp.Expr, variables: Sequence[sp.Symbol]) -> sp.Expr:
+    """Expanded, with tanh and cosh for hyperbolic and sin and cos for circular functions of the variables, sin at most once.
+
+    In this form most identities between them are gone: 1/cosh^2 is 1 - tanh^2, sin^2 is 1 - cos^2.
+    """
+
+    def of_variables(e: sp.Expr) -> bool:
+        return isinstance(e, (*_CIRCULAR, *_HYPERBOLIC)) and e.has(*variables)
+
+    def basic(e: sp.Expr) -> sp.Expr:
+        u = e.args[0]
+        return {
+            sp.sinh: lambda: sp.tanh(u) * sp.cosh(u),
+            sp.coth: lambda: 1 / sp.tanh(u),
+            sp.sech: lambda: 1 / sp.cosh(u),
+            sp.csch: lambda: 1 / (sp.tanh(u) * sp.cosh(u)),
+            sp.tan: lambda: sp.sin(u) / sp.cos(u),
+            sp.cot: lambda: sp.cos(u) / sp.sin(u),
+            sp.sec: lambda: 1 / sp.cos(u),
+            sp.csc: lambda: 1 / sp.sin(u),
+        }.get(e.func, lambda: e)()
+
+    def power(e: sp.Expr) -> bool:
+        return e.is_Pow and e.exp.is_Integer and of_variables(e.base) and isinstance(e.base, sp.sin | sp.cosh)
+
+    def reduced(e: sp.Expr) -> sp.Expr:
+        u, k = e.base.args[0], int(e.exp)
+        if isinstance(e.base, sp.sin) and k >= 2:
+            return (1 - sp.cos(u) ** 2) ** (k // 2) * sp.sin(u) ** (k % 2)
+        if isinstance(e.base, sp.cosh) and k <= -2:
+            return (1 - sp.tanh(u) ** 2) ** (-k // 2) * sp.cosh(u) ** (-(-k % 2))
+        return e
+
+    basics = expression.replace(of_variables, basic)
+    return sp.expand(sp.expand(basics).replace(power, reduced))
 
 
 def grouped(expression: sp.Expr, variables: Sequence[sp.Symbol]) -> dict[sp.Expr, sp.Expr]:
@@ -128,8 +248,6 @@ def grouped(expression: sp.Expr, variables: Sequence[sp.Symbol]) -> dict[sp.Expr
 
 def tidy(expression: sp.Expr) -> sp.Expr:
     """A shorter form of a coefficient that depends on time and parameters only."""
-    expression = sp.sympify(expression)
-    if expression.is_number or expression.is_Symbol:
+    if expression.is_number or expression.is_Symbol or expression.count_ops() > 80:
         return expression
-    short = sp.cancel(sp.together(expression)) if expression.count_ops() < 400 else expression
-    return min((expression, short), key=sp.count_ops)
+    return min((expression, sp.cancel(sp.together(expression))), key=sp.count_ops)

@@ -22,6 +22,7 @@ from zakai.algebra.yau import (
     inverse,
     observation_energy,
     q_without_observation,
+    short,
     yau_form,
 )
 from zakai.models.model import Model
@@ -178,7 +179,7 @@ def definite_covariance(model: Model) -> Condition:
             # The record may never reach this time, so that only the start refutes.
             holds = False if time == model.start else None
             return Condition(statement, holds, f"G is not positive definite at t = {time:g}", source)
-    return Condition(statement, True, f"det G = {determinant}", source)
+    return Condition(statement, True, f"det G = {short(str(determinant))}", source)
 
 
 @lru_cache(maxsize=64)
@@ -188,7 +189,7 @@ def smooth_system(model: Model) -> tuple[Condition, ...]:
 
 
 def _form_text(form: YauForm) -> str:
-    return f"L = {form.matrix.tolist()}, l = {list(form.offset)}, phi = {form.potential}"
+    return f"L = {short(str(form.matrix.tolist()))}, l = {short(str(list(form.offset)))}, phi = {short(str(form.potential))}"
 
 
 # The theorem that says when a method holds, by the method's name.

@@ -80,7 +80,8 @@ class GridDensity:
         floor = np.max(self.log_values) - 700.0
         logs = np.maximum(self.log_values, floor)
         level = logs[at]
-        exponent = np.broadcast_to(logs, (len(index), *shape)) - level.reshape(-1, *([1] * len(shape)))
+        plain = np.broadcast_to(logs, (len(index), *shape)) - level.reshape(-1, *([1] * len(shape)))
+        tilted = plain
         kernels = []
         for axis, size in enumerate(shape):
             distance = np.arange(size) - size // 2 - index[:, axis][:, None]
@@ -91,8 +92,11 @@ class GridDensity:
             kernels.append(np.sinc(distance).reshape(view))
             if size > 1:
                 slope = np.gradient(logs, axis=axis)[at]
-                exponent = exponent - (slope[:, None] * distance).reshape(view)
-        values = np.exp(np.minimum(exponent, 600.0))
+                tilted = tilted - (slope[:, None] * distance).reshape(view)
+        # Of the two, the one with the smaller largest term loses fewer digits: with several modes it may be the plain one.
+        axes = tuple(range(1, plain.ndim))
+        better = (tilted.max(axis=axes) < plain.max(axis=axes)).reshape(-1, *([1] * len(shape)))
+        values = np.exp(np.minimum(np.where(better, tilted, plain), 600.0))
         for kernel in kernels:
             values = values * kernel
         total = values.reshape(len(index), -1).sum(axis=1)

@@ -61,6 +61,7 @@ class Prepared:
     model: Model
     system: System
     schedule: Schedule
+    splitting: str
     intervals: Interval
     kernel_deviation: np.ndarray
     kernel_angle: np.ndarray
@@ -81,7 +82,7 @@ class Interval:
 class System:
     """The formulas of a model compiled for this method: JAX functions of (x, t, theta) and the coefficients of its flow."""
 
-    def __init__(self, model: Model, rates: bool):
+    def __init__(self, model: Model, rates: bool, splitting: str):
         yau = yau_system(model)
         assert yau is not None
         self.n = model.n
@@ -92,7 +93,7 @@ class System:
         # Without a gauge nothing need be evaluated.
         self.gauged = yau.form.potential != 0
         # Whether a half of the observation's factor stands at the start of an interval.
-        self.halves = not self.rates and model.observation_kind != "samples"
+        self.halves = splitting == "strang" and not self.rates and model.observation_kind != "samples"
         self.potential = jax_field([yau.form.potential], model)
         self.observe = jax_field(model.observation, model)
         bare, full = yau.bare or yau.full, yau.full or yau.bare
@@ -117,7 +118,7 @@ class System:
         self._shapes = [block.shape for block in blocks]
         flat = [entry for block in blocks for entry in block]
         used = flat if self.rates else flat[: -m * m]
-        self.varying = any(model.t in sp.sympify(entry).free_symbols for entry in used)
+        self.varying = any(model.t in entry.free_symbols for entry in used)
         self._numbers = jax_function(flat, model)
 
     def coefficients(self, t: jax.Array, argument: tuple[jax.Array, jax.Array]) -> Coefficients:
@@ -144,8 +145,8 @@ class System:
 
 
 @lru_cache(maxsize=32)
-def _system(of: Formulas, rates: bool) -> System:
-    return System(of.model, rates)
+def _system(of: Formulas, rates: bool, splitting: str) -> System:
+    return System(of.model, rates, splitting)
 
 
 def prepare(
@@ -161,8 +162,8 @@ def prepare(
     if splitting not in ("strang", "lie"):
         raise InputError(f'option splitting: "{splitting}" is neither "strang" nor "lie"')
     series = kernel == "power-series"
-    # The series knows no inputs, and the papers' order of the factors none inside.
-    system = _system(formulas(model), rates=not series and splitting == "strang")
+    # The series knows no inputs, and the papers' order of the factors has none.
+    system = _system(formulas(model), not series and splitting == "strang", splitting)
     which, first = _distinct(system, schedule)
     starts, stops, inside = schedule.starts[first], schedule.stops[first], schedule.inside[first].astype(float)
     parts = _parts(system, model, starts, stops, inside)
@@ -181,7 +182,7 @@ def prepare(
     )
     deviation = np.sqrt(np.diagonal(flow.spread, axis1=2, axis2=3))
     angles = [model.state.index(name) for name in model.periodic]
-    return Prepared(model, system, schedule, intervals, deviation.min(axis=1), deviation[..., angles].max(axis=1))
+    return Prepared(model, system, schedule, splitting, intervals, deviation.min(axis=1), deviation[..., angles].max(axis=1))
 
 
 def _distinct(system: System, schedule: Schedule) -> tuple[np.ndarray, np.ndarray]:
@@ -216,9 +217,13 @@ def _parts(system: System, model: Model, starts: np.ndarray, stops: np.ndarray, 
 def observations(prepared: Prepared, data: Data) -> Factors:
     """What `step` is given for each interval."""
     system = prepared.system
-    splitting = "lie" if not system.rates and system.affine else "strang"
     return factors(
-        prepared.model, data, prepared.schedule, rates=system.rates, splitting=splitting, remove=not system.bare
+        prepared.model,
+        data,
+        prepared.schedule,
+        rates=system.rates,
+        splitting=prepared.splitting,
+        remove=not system.bare,
     )
 
 
