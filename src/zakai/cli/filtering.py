@@ -30,6 +30,9 @@ def filter(
     options = _options(settings)
     if report is not None:
         from zakai.report import write_report
+        from zakai.report._extra import plotting
+
+        plotting("plotly")
     model = load_model(source)
     record = read_record(record_path, model)
     truth = None if truth_path is None else _truth(truth_path, model, record)

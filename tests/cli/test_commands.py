@@ -1,0 +1,90 @@
+"""The commands, end to end."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import zakai as package
+from zakai import _registry
+from zakai.cli import simulating
+
+
+def test_a_simulated_record_is_filtered_into_a_result_and_a_report(zakai, tmp_path):
+    simulated = zakai(
+        "simulate", "model.toml", "--until", "1", "--step", "0.1", "--seed", "3", "-o", "made.csv", "--truth", "truth.csv"
+    )
+    assert simulated.code == 0 and simulated.err == ""
+    answer = zakai("filter", "model.toml", "made.csv", "-o", "r.nc", "--truth", "truth.csv", "--report", "r.html")
+    assert answer.code == 0 and answer.err == ""
+    result = package.load_result("r.nc")
+    assert result.mean.shape == (11, 1)
+    assert f"{result.log_likelihood:.6f}" in answer.out and result.method in answer.out
+    assert "rms error" in (tmp_path / "r.html").read_text()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "made.csv", "model.toml", "r.html", "r.nc", "record.csv", "truth.csv",
+    ]  # fmt: skip
+
+
+def test_the_command_and_the_function_give_the_same_numbers(zakai):
+    assert zakai("filter", "model.toml", "record.csv", "-o", "r.nc", "--option", "splitting=strang").code == 0
+    model = package.load_model("model.toml")
+    direct = package.filter(model, package.read_record("record.csv", model))
+    np.testing.assert_array_equal(package.load_result("r.nc").mean, direct.mean)
+
+
+def test_the_same_seed_simulates_the_same_record_as_the_function(zakai, tmp_path):
+    arguments = ("simulate", "gallery:kalman-bucy-2d", "--until", "0.5", "--step", "0.1", "--initial", "1, -2")
+    assert zakai(*arguments, "--seed", "4", "-o", "a.csv", "--truth", "truth.csv").code == 0
+    assert zakai(*arguments, "--seed", "5", "-o", "b.csv").code == 0
+    model = package.load_model("gallery:kalman-bucy-2d")
+    truth, record = package.simulate(model, [0.1, 0.2, 0.3, 0.4, 0.5], seed=4, initial=[1, -2])
+    np.testing.assert_array_equal(package.read_record("a.csv", model).values, record.values)
+    from zakai.records import read_truth
+
+    np.testing.assert_array_equal(read_truth("truth.csv", model).values, truth.values)
+    assert (tmp_path / "a.csv").read_text() != (tmp_path / "b.csv").read_text()
+
+
+def test_the_clock_has_decimals_and_reaches_its_end():
+    assert simulating.clock(0.0, 1.0, 0.1).tolist() == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]
+    assert simulating.clock(0.5, 1.2, 0.25).tolist() == [0.75, 1.0]
+    np.testing.assert_allclose(simulating.clock(0.0, 1.0, 1 / 3), [1 / 3, 2 / 3, 1.0], rtol=1e-15)
+
+
+def test_a_negative_initial_state_is_a_value_and_not_an_option(zakai, tmp_path):
+    arguments = ("--until", "1", "--step", "1", "--initial", "-0.5", "-o", "a.csv", "--truth", "b.csv")
+    assert zakai("simulate", "model.toml", *arguments).code == 0
+    assert "0.0,-0.5" in (tmp_path / "b.csv").read_text()
+
+
+@pytest.mark.parametrize("name", ["spiral-sensor", "falling-body"])
+def test_analyze_prints_a_page_json_or_latex(zakai, name):
+    page = zakai("analyze", f"gallery:{name}")
+    assert page.code == 0 and "omega_ij" in page.out.lower() and "limited-direct" in page.out
+    assert set(json.loads(zakai("analyze", f"gallery:{name}", "--json").out)["methods"]) == set(_registry.METHODS)
+    assert zakai("analyze", f"gallery:{name}", "--latex").out.startswith("\\begin{align*}")
+
+
+def test_methods_lists_every_method_and_says_which_hold(zakai):
+    assert all(name in zakai("methods").out for name in (*_registry.METHODS, *_registry.AUTO))
+    answer = zakai("methods", "gallery:cubic-sensor").out
+    assert "fails: " in answer and "x**6" in answer and "auto takes: none" in answer
+    assert "auto takes: limited-direct" in zakai("methods", "gallery:benes").out
+
+
+def test_gallery_lists_every_model_and_prints_one(zakai, tmp_path):
+    listed = zakai("gallery").out
+    assert all(name in listed for name in package.gallery.names())
+    (tmp_path / "copy.toml").write_text(zakai("gallery", "spiral-sensor").out)
+    assert package.load_model("copy.toml").name == package.load_model("gallery:spiral-sensor").name
+
+
+def test_the_version_and_the_help_are_printed(zakai):
+    assert zakai("--version").out == f"zakai {package.__version__}\n"
+    commands = ["analyze", "simulate", "filter", "methods", "gallery", "reproduce"]
+    assert all(command in zakai().out for command in commands)
+    for command in commands:
+        assert zakai(command, "--help").code == 0

@@ -1,0 +1,146 @@
+"""Exit codes: 0, 2, 3 and 130, and 1 for a bug of ours; what else is written, and where."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from zakai.cli import looking
+
+USAGE = {
+    "unknown command": ["filtre", "model.toml"],
+    "unknown option": ["analyze", "model.toml", "--jsn"],
+    "missing argument": ["analyze"],
+    "missing output": ["filter", "model.toml", "record.csv"],
+    "one argument too many": ["gallery", "benes", "encoder"],
+    "text for a number": ["simulate", "model.toml", "--until", "later", "--step", "1", "-o", "a.csv"],
+    "step of zero": ["simulate", "model.toml", "--until", "1", "--step", "0", "-o", "a.csv"],
+    "endless": ["simulate", "model.toml", "--until", "inf", "--step", "1", "-o", "a.csv"],
+    "too many": ["simulate", "model.toml", "--until", "1", "--step", "1e-300", "-o", "a.csv"],
+    "until before the start": ["simulate", "model.toml", "--until", "-1", "--step", "1", "-o", "a.csv"],
+    "step beyond the end": ["simulate", "model.toml", "--until", "1", "--step", "2", "-o", "a.csv"],
+    "negative seed": ["simulate", "model.toml", "--until", "1", "--step", "1", "--seed", "-1", "-o", "a.csv"],
+    "initial text": ["simulate", "model.toml", "--until", "1", "--step", "1", "--initial", "x", "-o", "a.csv"],
+    "initial of another size": ["simulate", "model.toml", "--until", "1", "--step", "1", "--initial", "1,2", "-o", "a.csv"],
+    "two forms": ["analyze", "model.toml", "--json", "--latex"],
+    "unknown model": ["gallery", "nowhere"],
+    "methods of no model": ["methods", "nowhere.toml"],
+    "no folder": ["filter", "model.toml", "record.csv", "-o", "nowhere/result.nc"],
+    "no folder for the report": ["filter", "model.toml", "record.csv", "-o", "result.nc", "--report", "nowhere/r.html"],
+    "output is a folder": ["filter", "model.toml", "record.csv", "-o", "."],
+    "output is an input": ["filter", "model.toml", "record.csv", "-o", "record.csv"],
+    "output named twice": ["filter", "model.toml", "record.csv", "-o", "a", "--report", "a"],
+    "unknown method": ["filter", "model.toml", "record.csv", "-o", "result.nc", "--method", "limited"],
+    "unknown option of a method": ["filter", "model.toml", "record.csv", "-o", "result.nc", "--option", "kernal=1"],
+    "wrong value of an option": ["filter", "model.toml", "record.csv", "-o", "result.nc", "--option", "kernel=flaw"],
+    "option without a value": ["filter", "model.toml", "record.csv", "-o", "result.nc", "--option", "kernel"],
+    "option given twice": ["filter", "model.toml", "record.csv", "-o", "r.nc", "--option", "order=1", "--option", "order=2"],
+    "option that is none": ["filter", "model.toml", "record.csv", "-o", "result.nc", "--option", "method=auto"],
+}
+
+
+@pytest.mark.parametrize("arguments", USAGE.values(), ids=USAGE.keys())
+def test_wrong_usage_is_one_line_and_code_2(zakai, tmp_path, arguments):
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    answer = zakai(*arguments)
+    assert answer.code == 2, answer
+    assert answer.out == "" and answer.err.startswith("error: ") and answer.err.count("\n") == 1, answer.err
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_an_unknown_option_is_answered_with_those_that_there_are(zakai):
+    error = zakai("filter", "model.toml", "record.csv", "-o", "result.nc", "--option", "kernal=1").err
+    assert all(word in error for word in ("kernal", "kernel", "splitting", "order"))
+
+
+@pytest.mark.parametrize("method", ["auto", "limited-direct"])
+def test_a_method_that_does_not_hold_is_code_3_and_says_what_fails(zakai, tmp_path, method):
+    answer = zakai("filter", "gallery:cubic-sensor", "record.csv", "-o", "result.nc", "--method", method)
+    assert answer.code == 3
+    assert answer.err.count("\n") == 1 and "x**6" in answer.err and "Assumption 3" in answer.err
+    assert not (tmp_path / "result.nc").exists()
+
+
+def test_a_missing_extra_is_code_2_and_names_it_before_the_work(zakai, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "plotly", None)
+    monkeypatch.setattr("zakai.filters.driver.filter", lambda *_, **__: pytest.fail("the work was begun"))
+    answer = zakai("filter", "model.toml", "record.csv", "-o", "result.nc", "--report", "report.html")
+    assert answer.code == 2 and "zakai[plots]" in answer.err and answer.err.count("\n") == 1
+    assert not list(tmp_path.glob("re*t.*[lc]")) and not (tmp_path / "result.nc").exists()
+
+
+def test_warnings_go_to_stderr_and_the_code_is_0(zakai, monkeypatch):
+    from zakai.filters import driver
+
+    monkeypatch.setattr(driver, "_warnings", lambda result: ["the sky is falling"])
+    answer = zakai("filter", "model.toml", "record.csv", "-o", "result.nc")
+    assert answer.code == 0 and answer.err == "warning: the sky is falling\n"
+
+
+def test_a_bug_leaves_with_its_traceback(zakai, monkeypatch):
+    def broken(*_):
+        raise ZeroDivisionError("ours")
+
+    monkeypatch.setattr(looking, "gallery", broken)
+    with pytest.raises(ZeroDivisionError):
+        zakai("gallery")
+
+
+def test_an_interruption_is_code_130_and_leaves_nothing(zakai, tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.setattr("zakai.records.netcdf.atomic_write", interrupted)
+    answer = zakai("filter", "model.toml", "record.csv", "-o", "result.nc")
+    assert answer.code == 130 and answer.err.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def process(*arguments: str, **more):
+    return subprocess.Popen(
+        [sys.executable, "-c", "import sys; from zakai.cli import main; sys.exit(main())", *arguments],
+        stderr=subprocess.PIPE,
+        **more,
+    )
+
+
+def test_control_c_is_code_130(tmp_path):
+    times = "".join(f"{k},0\n" for k in range(1, 20_000))
+    (tmp_path / "record.csv").write_text("time,c,s\n" + times.replace(",0", ",0,0"))
+    running = process("filter", "gallery:encoder", "record.csv", "-o", "result.nc", cwd=tmp_path)
+    time.sleep(3.0)
+    running.send_signal(signal.SIGINT)
+    error = running.communicate(timeout=60)[1]
+    assert running.returncode == 130, error
+    assert error.count(b"\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["record.csv"]
+
+
+def test_a_pipe_that_is_closed_is_code_0():
+    read, write = os.pipe()
+    os.close(read)
+    running = process("analyze", "gallery:benes", stdout=write)
+    os.close(write)
+    assert running.communicate(timeout=60)[1] == b"" and running.returncode == 0
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is always full")
+def test_a_full_disk_behind_stdout_is_code_2():
+    with open("/dev/full", "w") as full:
+        running = process("gallery", stdout=full)
+        error = running.communicate(timeout=60)[1]
+    assert running.returncode == 2 and error.count(b"\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--version"], ["--help"], ["gallery"], ["methods"], ["methods", "gallery:benes"], ["analyze", "gallery:benes"]]
+)
+def test_what_only_looks_never_loads_jax(arguments):
+    code = f"import sys; from zakai.cli import main; assert main({arguments!r}) == 0; assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
