@@ -1,0 +1,86 @@
+"""The analysis of a model: what it finds, and how it says it."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import sympy as sp
+
+import zakai
+
+
+def test_omega_has_the_sign_of_its_convention():
+    # f = (x2, 0) and G = 1: omega_12 = d_1 f_2 - d_2 f_1 = -1
+    analysis = zakai.analyze(zakai.Model(state=["x1", "x2"], drift=["x2", "0"], observation=["x1"]))
+    assert analysis.omega == sp.ImmutableMatrix([[0, -1], [1, 0]])
+
+
+def test_omega_is_that_of_the_whitened_drift():
+    model = zakai.Model(state=["x1", "x2"], drift=["x2", "0"], observation=["x1"], diffusion=[["2", "0"], ["0", "1"]])
+    assert zakai.analyze(model).omega[0, 1] == -sp.Rational(1, 4)
+
+
+def test_eta_of_benes_is_quadratic_whatever_the_functions():
+    analysis = zakai.analyze(zakai.load_model("gallery:benes"))
+    (x,) = analysis.model.x
+    assert analysis.eta == x**2 + 1 == analysis.q  # tanh^2 + sech^2 + x^2
+    assert analysis.yau_form.potential == sp.log(sp.cosh(x))
+    assert analysis.recommended == "limited-direct"
+
+
+def test_a_singular_covariance_leaves_omega_and_eta_undefined_and_says_so():
+    analysis = zakai.analyze(zakai.load_model("gallery:falling-body"))
+    assert analysis.omega is None and analysis.eta is None
+    assert "singular" in str(analysis)
+    assert analysis.recommended is None
+
+
+@pytest.mark.parametrize(
+    ("observation", "rank"),
+    [(["x1"], 1), (["x1 + x2", "2*x1 + 2*x2 + 1"], 1), (["x1", "t*x2"], 2), (["3"], 0), (["x1**2"], None)],
+)
+def test_the_linear_rank_counts_the_directions_that_affine_observations_see(observation, rank):
+    analysis = zakai.analyze(zakai.Model(state=["x1", "x2"], drift=["0", "0"], observation=observation))
+    assert analysis.algebra.linear_rank == rank
+
+
+def test_the_estimation_algebra_is_undecided_and_says_that_it_was_not_explored():
+    algebra = zakai.analyze(zakai.load_model("gallery:benes")).algebra
+    assert (algebra.verdict, algebra.dimension, algebra.basis, algebra.brackets) == ("undecided", None, (), {})
+    assert algebra.certificate is None and "not explored" in algebra.note
+
+
+@pytest.mark.parametrize("name", zakai.gallery.names())
+def test_every_form_of_the_analysis_says_the_same(name):
+    analysis = zakai.analyze(zakai.load_model(f"gallery:{name}"))
+    read = json.loads(analysis.to_json())
+    page = str(analysis)
+    assert read["recommended"] == analysis.recommended
+    for method, conditions in analysis.methods.items():
+        assert [c["holds"] for c in read["methods"][method]["conditions"]] == [c.holds for c in conditions]
+        assert all(set(c) == {"statement", "holds", "evidence", "source"} for c in read["methods"][method]["conditions"])
+        assert method in page
+    words = "".join(page.split())
+    for conditions in analysis.methods.values():
+        for condition in conditions:
+            assert "".join(f"{condition.evidence}[{condition.source}]".split()) in words
+    latex = analysis.to_latex()
+    assert latex.count("{") == latex.count("}") and latex.startswith("\\begin{align*}") and latex.endswith("\\end{align*}")
+
+
+def test_a_model_without_prior_or_with_undetermined_functions_is_analysed():
+    model = zakai.Model(
+        state=["x1", "x2"], drift=["gamma(x1 + x2) - x2", "gamma(x1 + x2)"], observation=["x1"], functions=["gamma"]
+    )
+    analysis = zakai.analyze(model)
+    assert analysis.omega == sp.ImmutableMatrix([[0, 1], [-1, 0]])
+    assert analysis.recommended is None
+    assert "undetermined: gamma" in str(analysis)
+    json.loads(analysis.to_json())
+
+
+def test_a_recommendation_for_a_model_without_prior_says_what_is_missing():
+    analysis = zakai.analyze(zakai.Model(state=["x"], drift=["-x"], observation=["x"]))
+    assert analysis.recommended == "limited-direct"
+    assert "needs a prior" in str(analysis)
