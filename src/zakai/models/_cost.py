@@ -15,7 +15,7 @@ MAX_DEGREE = 256
 MAX_BITS = 65_536
 SMALL_SIZE = 100
 SMALL_EXPANSION = 100
-TINY_SIZE = 40
+TINY_SIZE = 20
 _MANY = 10**6  # expansions larger than this need not be told apart
 
 
@@ -37,7 +37,7 @@ class Cost:
 
     @property
     def tiny(self) -> bool:
-        """Whether SymPy may ask for its sign or its zeros, as functions and roots of it do; that is slower yet."""
+        """Whether SymPy may ask for its sign or its zeros, as functions and powers of it do: slower yet."""
         return self.small and self.size <= TINY_SIZE
 
     def checked(self, position: int) -> Cost:

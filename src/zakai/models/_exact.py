@@ -162,7 +162,7 @@ class _Converter:
             expr = _raised(part, sympy.S.Half)
         else:
             # SymPy may only simplify the absolute value of what is real: it would make |sqrt(x)| of sqrt(|x|).
-            simplify = cost.tiny and (node.name != "abs" or bool(part.expr.is_extended_real))
+            simplify = cost.tiny and (node.name != "abs" or _always_real(part.expr))
             expr = _SYMPY[node.name](part.expr, evaluate=simplify)
         if expr.has(sympy.I):
             raise ExpressionError(_DOMAINS.get(node.name, f"{node.name} has no real value here"), node.position)
@@ -182,8 +182,14 @@ def _float_call(node: Call, argument: float) -> float:
 def _raised(base: _Part, exponent: sympy.Rational) -> sympy.Expr:
     if exponent == 1:
         return base.expr
-    simplify = base.cost.small if exponent.is_Integer else base.cost.tiny
-    return sympy.Pow(base.expr, exponent, evaluate=simplify or exponent == 0)
+    return sympy.Pow(base.expr, exponent, evaluate=base.cost.tiny or exponent == 0)
+
+
+def _always_real(expr: sympy.Expr) -> bool:
+    """Whether nothing in the expression can leave the real numbers; a walk, for SymPy's own answer can be slow."""
+    partial = (sympy.log, sympy.asin, sympy.acos)
+    parts = sympy.preorder_traversal(expr)
+    return not any(isinstance(part, partial) or part.is_Pow and not part.exp.is_Integer for part in parts)
 
 
 def _constant(value: Fraction) -> _Part:
