@@ -95,7 +95,7 @@ def test_nine_thousand_observations_take_seconds_and_little_space(tmp_path):
     assert time.perf_counter() - begin < 15
     assert (tmp_path / "report.html").stat().st_size < 12e6
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "of 9,001 times are drawn, evenly spaced" in text and "The last 240 times" in text
+    assert "of 9,001 times are drawn, evenly spaced" in text and "The last 200 times" in text
 
 
 def test_a_refused_truth_leaves_no_file(tmp_path):

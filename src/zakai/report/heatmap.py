@@ -16,8 +16,8 @@ from zakai.errors import InputError
 
 BAND = 0.95
 _NORMAL_QUANTILE = 1.959963984540054
-_WINDOW = 6.5  # standard deviations on each side of the mean
-_POINTS = 521  # evaluations of one density: 40 to a standard deviation
+_WINDOW = 5.5  # standard deviations on each side of the mean
+_POINTS = 281  # evaluations of one density: 25 to a standard deviation
 _ROWS = 280
 
 

@@ -13,7 +13,7 @@ from zakai.report.heatmap import density_over_time, is_periodic, profile, state_
 from zakai.report.words import signed
 
 _COLUMNS = 600
-_DETAIL = 240
+_DETAIL = 200
 _MOST_STATES = 6
 
 
