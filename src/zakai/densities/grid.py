@@ -68,10 +68,7 @@ class GridDensity:
         return (np.concatenate(parts) if parts else np.empty(0)).reshape(x.shape[:-1]) - self._log_scale
 
     def _interpolate(self, index: np.ndarray) -> np.ndarray:
-        """The sinc interpolant of exp(log value), computed after the local slope of the logarithm is taken out.
-
-        Without the slope the rounding of the largest value would drown the tails.
-        """
+        """The sinc interpolant of exp(log value); in the far tails of one whose local exponential slope is taken out first."""
         shape = np.array(self.log_values.shape)
         nearest = np.rint(index).astype(int) + shape // 2
         inside = np.all((nearest >= 0) & (nearest < shape) | np.array(self._closed), axis=1)
@@ -93,9 +90,10 @@ class GridDensity:
             if size > 1:
                 slope = np.gradient(logs, axis=axis)[at]
                 tilted = tilted - (slope[:, None] * distance).reshape(view)
-        # Of the two, the one with the smaller largest term loses fewer digits: with several modes it may be the plain one.
+        # Rounding of the largest term matters only where the density is below 1e-11 of it; there the slope is taken out.
         axes = tuple(range(1, plain.ndim))
-        better = (tilted.max(axis=axes) < plain.max(axis=axes)).reshape(-1, *([1] * len(shape)))
+        deep = plain.max(axis=axes) > 25.0
+        better = (deep & (tilted.max(axis=axes) < plain.max(axis=axes))).reshape(-1, *([1] * len(shape)))
         values = np.exp(np.minimum(np.where(better, tilted, plain), 600.0))
         for kernel in kernels:
             values = values * kernel

@@ -32,6 +32,8 @@ from zakai.filters.observations import Data, Factors, factors
 from zakai.kolmogorov import lattice as lat
 from zakai.kolmogorov.flow import Coefficients, Flow, flows
 from zakai.kolmogorov.lattice import Lattice
+from zakai.kolmogorov.power_series import TaylorData, power_series_kernels, taylor_data
+from zakai.kolmogorov.series_flow import flow_of_kernel
 from zakai.models.compile import jax_field, jax_function
 from zakai.models.model import Model
 
@@ -171,9 +173,7 @@ def prepare(
     theta = np.tile(model.theta(), (len(starts) * parts, 1))
     argument = (theta, np.repeat(inside, parts, axis=0))
     if series:
-        from zakai.filters._series_flow import series_flows
-
-        flow = series_flows(model, edges[:, :-1].ravel(), edges[:, 1:].ravel(), argument[1].min(axis=1), order)
+        flow = _series_flows(model, edges[:, :-1].ravel(), edges[:, 1:].ravel(), argument[1].min(axis=1) > 0, order)
     else:
         flow = flows(system.coefficients, edges[:, :-1].ravel(), edges[:, 1:].ravel(), argument)
     flow = jax.tree.map(lambda a: np.asarray(a).reshape(len(starts), parts, *a.shape[1:])[which], flow)
@@ -183,6 +183,28 @@ def prepare(
     deviation = np.sqrt(np.diagonal(flow.spread, axis1=2, axis2=3))
     angles = [model.state.index(name) for name in model.periodic]
     return Prepared(model, system, schedule, splitting, intervals, deviation.min(axis=1), deviation[..., angles].max(axis=1))
+
+
+def _series_flows(model: Model, starts: np.ndarray, stops: np.ndarray, whole: np.ndarray, order: int | None) -> Flow:
+    """The flows by the papers' power series; `whole` (K,) says where the observation's energy is inside."""
+    yau = yau_system(model)
+    assert yau is not None
+    values = dict(zip(model.parameter_symbols, model.theta(), strict=True))
+    parts = []
+    for inside, quadratic in ((True, yau.full or yau.bare), (False, yau.bare or yau.full)):
+        rows = np.flatnonzero(whole == inside)
+        if not len(rows) or quadratic is None:
+            continue
+        # The series is written for q itself, the flow for -q/2.
+        q = (-2 * quadratic.matrix, -2 * quadratic.linear, -2 * quadratic.constant)
+
+        def expand(points: np.ndarray, terms: int, q=q) -> TaylorData:
+            form = yau.form
+            return taylor_data(model.t, model.covariance, form.matrix, form.offset, *q, points, terms, values)
+
+        parts.append((rows, flow_of_kernel(power_series_kernels(expand, starts[rows], stops[rows], order))))
+    back = np.argsort(np.concatenate([rows for rows, _ in parts]))
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays)[back], *[flow for _, flow in parts])
 
 
 def _distinct(system: System, schedule: Schedule) -> tuple[np.ndarray, np.ndarray]:
