@@ -86,7 +86,8 @@ class _Path:
 
     def __init__(self, model: Model, rng: np.random.Generator):
         self.model = model
-        self._rng = rng
+        # Two streams, so that the path does not depend on what is observed, nor either on the chunks.
+        self._state_rng, self._observation_rng = rng.spawn(2)
         self._theta = model.theta()
         self._drift = program_of(list(model.drift), model).scalar(self._theta.tolist())
         self._observation = numpy_function(model.observation, model)
@@ -100,12 +101,12 @@ class _Path:
 
     def advance(self, state: np.ndarray, grid: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The states at the ends of the intervals, (K, n), and the increments or samples there, (K, m)."""
-        model, rng = self.model, self._rng
+        model, rng = self.model, self._observation_rng
         steps = np.repeat(np.diff(grid) / counts, counts)
         first = np.concatenate([[0], np.cumsum(counts)])
         times = np.repeat(grid[:-1], counts) + (np.arange(first[-1]) - np.repeat(first[:-1], counts)) * steps
         root = self._coefficient("diffusion", times) @ square_root(self._coefficient("process_noise", times))
-        noise = rng.standard_normal((len(times), root.shape[-1]))
+        noise = self._state_rng.standard_normal((len(times), root.shape[-1]))
         fine = self._integrate(state, times, steps, _times(root, noise) * np.sqrt(steps)[:, None])
         ends = fine[first[1:]]
         if model.observation_kind == "samples":

@@ -1,0 +1,223 @@
+import pickle
+
+import numpy as np
+import pytest
+import sympy
+
+from zakai.errors import InputError
+from zakai.models import Model, gallery, load_model
+from zakai.models.files import read_model
+
+GOOD = {
+    "state": '["x", "v"]',
+    "drift": '["v", "-a*x"]',
+    "diffusion": '[["0"], ["1"]]',
+    "process_noise": '[["1"]]',
+    "observation": '["x", "sin(x)"]',
+    "observation_noise": '[["1", "0"], ["0", "2"]]',
+    "observation_kind": '"samples"',
+    "start": "0.5",
+    "periodic": "[]",
+    "functions": "[]",
+    "parameters": "{a = 0.1}",
+    "prior": '{kind = "gaussian", mean = [0, 0], cov = [1, 2]}',
+}
+
+
+def text(**changes):
+    keys = {**GOOD, **changes}
+    return "\n".join(f"{key} = {value}" for key, value in keys.items() if value is not None)
+
+
+MIXTURE = 'kind = "mixture", means = [[0, 0], [1, 1]], covs = [[1, 1], [1, 1]]'
+FAULTS = [
+    ("state", None, "missing"),
+    ("drift", None, "missing"),
+    ("observation", None, "missing"),
+    ("state", "[]", "1 to 256 names"),
+    ("state", '"x"', "a list of names, got the text 'x'"),
+    ("state", '["x", "x"]', "given twice"),
+    ("state", '["x", 1]', "a name in quotes"),
+    ("state", '["x", "pi"]', "already has a meaning"),
+    ("state", '["x", "t"]', "already has a meaning"),
+    ("state", '["x", "sin"]', "already has a meaning"),
+    ("state", '["x", "lambda"]', "keyword of Python"),
+    ("state", '["x", "v w"]', "not a name"),
+    ("state", '["x", "\u03b8"]', "not a name"),
+    ("drift", '["v"]', "a list of 2 formulas (one a state), got a list of 1"),
+    ("drift", '"v"', "a list of 2 formulas"),
+    ("drift", '["v", true]', "[1]: expected a formula in quotes or a number, got a boolean"),
+    ("drift", '["v", ["x"]]', "[1]: expected a formula"),
+    ("drift", '["v", "-b*x"]', "[1]: column 2: unknown name 'b'"),
+    ("drift", '["v", "1/0"]', "division by zero"),
+    ("drift", '["v", nan]', "finite number"),
+    ("diffusion", '["1", "1"]', "2 rows (one a state)"),
+    ("diffusion", '[["1"]]', "2 rows (one a state)"),
+    ("diffusion", '[["1", "0"], ["1"]]', "[1]: expected 2 rows"),
+    ("diffusion", '[["x"], ["1"]]', "[0][0]: depends on the state 'x'"),
+    ("diffusion", '[["1/(a - 0.1)"], ["1"]]', "not finite"),
+    ("process_noise", '[["1", "0"], ["0", "1"]]', "1 rows of 1 formulas"),
+    ("process_noise", '[["-1"]]', "not positive semidefinite"),
+    ("process_noise", '[["v"]]', "depends on the state 'v'"),
+    ("observation", "[]", "formulas (one a sensor)"),
+    ("observation", '["y", "x"]', "[0]: column 1: unknown name 'y'"),
+    ("observation_noise", '[["1", "0"]]', "2 rows of 2 formulas (one a sensor)"),
+    ("observation_noise", '[["1", "0.5"], ["0", "1"]]', "not symmetric"),
+    ("observation_noise", '[["1", "2"], ["2", "1"]]', "not positive definite"),
+    ("observation_noise", '[["1", "0"], ["0", "0"]]', "not positive definite"),
+    ("observation_noise", '[["1", "0"], ["0", "x"]]', "[1][1]: depends on the state"),
+    ("observation_kind", '"rate"', "did you mean 'rates'"),
+    ("observation_kind", "3", "got the number"),
+    ("start", '"now"', "expected a number"),
+    ("start", "true", "got a boolean"),
+    ("start", "inf", "finite number"),
+    ("start", "1e999", "finite number"),
+    ("periodic", '["w"]', "not a state"),
+    ("periodic", '["x"]', "drift[1]: -a*x is not 2*pi-periodic in 'x'"),
+    ("functions", '["x"]', "already a state"),
+    ("functions", '["exp"]', "already has a meaning"),
+    ("parameters", "{a = 0.1, x = 2}", "already a state"),
+    ("parameters", "{a = true}", "a: expected"),
+    ("parameters", "{a = nan}", "a: expected a finite number"),
+    ("parameters", '{a = "x"}', "a: column 1: unknown name"),
+    ("parameters", '{a = "sqrt(2)"}', "a: expected a rational number"),
+    ("parameters", "3", "a table of names"),
+    ("name", "3", "expected a text"),
+    ("prior", "3", "expected a table"),
+    ("prior", "{}", "kind: expected one of gaussian, mixture, density; it is missing"),
+    ("prior", '{kind = "gausian"}', "did you mean 'gaussian'"),
+    ("prior", '{kind = "gaussian", mean = [0, 0]}', "cov: missing"),
+    ("prior", '{kind = "gaussian", mean = [0, 0], cov = [1, 1], weights = [1]}', "unknown key 'weights'"),
+    ("prior", '{kind = "gaussian", mean = [0], cov = [1, 1]}', "mean: expected a list of 2 numbers"),
+    ("prior", '{kind = "gaussian", mean = [0, "1"], cov = [1, 1]}', "mean: entry 2: expected a number"),
+    ("prior", '{kind = "gaussian", mean = [0, true], cov = [1, 1]}', "mean: entry 2: expected a number"),
+    ("prior", '{kind = "gaussian", mean = [0, 0], cov = [1, -1]}', "cov: is not positive semidefinite"),
+    ("prior", '{kind = "gaussian", mean = [0, 0], cov = [[1, 2], [2, 1]]}', "cov: is not positive semidefinite"),
+    ("prior", '{kind = "gaussian", mean = [0, 0], cov = [[1, 2], [0, 9]]}', "cov: is not symmetric"),
+    ("prior", '{kind = "gaussian", mean = [0, 0], cov = [[1, 2]]}', "2 x 2"),
+    ("prior", f"{{{MIXTURE}, weights = [1, -1]}}", "weights: expected a list of positive numbers"),
+    ("prior", f"{{{MIXTURE}, weights = [1]}}", "means: expected 1 lists of 2 numbers"),
+    ("prior", '{kind = "density", log_density = "-x**2 - t"}', "log_density: column 9: unknown name 't'"),
+    ("drfit", "[]", "unknown key 'drfit'; did you mean 'drift'"),
+    ("_source", '"x"', "unknown key"),
+    ("self", "1", "unknown key"),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "words"), FAULTS)
+def test_a_wrong_key_is_one_line_that_names_file_and_key(key, value, words, tmp_path):
+    path = tmp_path / "vane.toml"
+    path.write_text(text(**{key: value}), encoding="utf-8")
+    with pytest.raises(InputError) as error:
+        load_model(path)
+    message = str(error.value)
+    assert message.startswith(f"{path}: ") and message.isprintable() and len(message) < 500
+    named = message.removeprefix(f"{path}: ")
+    assert named.startswith(key) or f"'{key}'" in named or key == "periodic" and named.startswith("drift")
+    assert words in message
+
+
+def test_the_good_file_is_good(tmp_path):
+    (tmp_path / "good.toml").write_text(text())
+    assert load_model(tmp_path / "good.toml").start == 0.5
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"state = [", "is not TOML"),
+        (b"\xff\xfe", "byte 1 is not UTF-8"),
+        (b"state = 'x'\x00", "is not TOML"),
+        (b"#" * (1 << 20) + b"#", "larger than 1 MiB"),
+        (b"drift = " + b"[" * 100_000, "nested too deep"),
+        (b"a" + b".a" * 400_000, "nine or more parts"),
+        (b"start = " + b"9" * 100_000, "cannot be read"),
+        (b"", "state: missing"),
+    ],
+)
+def test_a_file_that_is_no_model_is_one_line_that_names_it(content, words, tmp_path):
+    path = tmp_path / "odd.toml"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=words) as error:
+        load_model(path)
+    assert str(error.value).startswith(str(path)) and str(error.value).isprintable()
+
+
+def test_a_byte_order_mark_and_windows_line_ends_are_accepted(tmp_path):
+    path = tmp_path / "windows.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + text().replace("\n", "\r\n").encode())
+    assert load_model(path).state == ("x", "v")
+
+
+def test_a_missing_file_and_a_folder_are_one_line(tmp_path):
+    with pytest.raises(InputError, match="there is no such file"):
+        load_model(tmp_path / "none.toml")
+    with pytest.raises(InputError, match="cannot be read"):
+        load_model(tmp_path)
+
+
+@pytest.mark.parametrize("name", gallery.names())
+def test_every_model_of_the_gallery_loads_and_survives_being_written(name):
+    model = load_model(f"gallery:{name}")
+    assert model.source == f"gallery:{name}" and model.text.startswith("#")
+    again = read_model(model.to_toml(), "again")
+    for key in ("state", "drift", "diffusion", "observation", "observation_noise", "process_noise", "parameters",
+                "periodic", "start", "observation_kind"):  # fmt: skip
+        assert getattr(again, key) == getattr(model, key)
+    assert again.to_toml() == model.to_toml()
+    assert 20 < len(gallery.describe(name)) < 140
+
+
+def test_the_gallery_holds_the_promised_models():
+    promised = {"spiral-sensor", "falling-body", "kalman-bucy-1d", "kalman-bucy-2d", "benes", "cubic-sensor",
+                "encoder", "wind-vane", "wind-vane-rate"}  # fmt: skip
+    assert promised <= set(gallery.names())
+    with pytest.raises(InputError, match="did you mean 'spiral-sensor'"):
+        load_model("gallery:spiral-senor")
+
+
+def test_python_keys_may_be_sympy_numpy_and_numbers():
+    x, a = sympy.symbols("x a")
+    model = Model(
+        state=["x"],
+        drift=sympy.Matrix([-a * x + 0.1]),
+        observation=[sympy.Abs(x) * sympy.exp(1), x / 3],
+        observation_noise=np.diag([0.25, 4.0]),
+        parameters={"a": sympy.Rational(1, 3)},
+    )
+    assert model.drift[0] == -model.parameter_symbols[0] * model.x[0] + sympy.Rational(1, 10)
+    assert model.observation_noise[0, 0] == sympy.Rational(1, 4)
+    again = read_model(model.to_toml(), "again")
+    assert again.observation == model.observation and again.parameters == model.parameters
+    with pytest.raises(InputError, match=r"drift\[0\]: .*unknown function 'gamma'"):
+        Model(state=["x"], drift=[sympy.gamma(x)], observation=["x"])
+
+
+def test_a_model_is_immutable_and_can_be_pickled():
+    model = load_model("gallery:encoder")
+    with pytest.raises(AttributeError):
+        model.name = "other"
+    assert pickle.loads(pickle.dumps(model)).drift == model.drift
+
+
+def test_with_parameters_changes_values_and_nothing_else():
+    model = load_model("gallery:wind-vane")
+    other = model.with_parameters(sigma=0.7)
+    assert other.theta().tolist() == [0.7, 0.2] and model.theta().tolist() == [0.4, 0.2]
+    assert other.drift == model.drift and "sigma = 0.7" in other.text
+    with pytest.raises(InputError, match="unknown parameter 'sigm'; did you mean 'sigma'"):
+        model.with_parameters(sigm=1)
+    with pytest.raises(InputError, match="gallery:wind-vane: observation_noise: is not positive definite"):
+        model.with_parameters(r=0)
+
+
+def test_models_do_not_import_jax():
+    import subprocess
+    import sys
+
+    code = "import sys, zakai.models.simulate, zakai.models.gallery as g; g.load('benes'); assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_matrix_is_a_covariance_whatever_its_units():
+    Model(state=["x"], drift=["0"], observation=["x", "x"], observation_noise=[["1e-200", "0"], ["0", "1e200"]])
