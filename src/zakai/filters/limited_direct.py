@@ -269,8 +269,13 @@ def _start(prepared, prior, observation):
         factor = jax.tree.map(lambda a: a[0], observation)
         return np.asarray(_log_factor(system.observe(x, model.start, model.theta()), factor))
 
-    cell = choice.COARSEST * prepared.kernel_deviation.min(initial=np.inf) if model.n == 1 else np.inf
+    # An interval of no length, before a sample at the start itself, asks for no cell.
+    kernels = prepared.kernel_deviation[prepared.kernel_deviation > 0]
+    cell = choice.COARSEST * kernels.min(initial=np.inf) if model.n == 1 else np.inf
     lattice, log_mass = choice.first_lattice(model, prior, log_factor if observation is not None else None, cell)
+    if observation is not None:
+        # A density prior need not be normalised; the evidence is that of the reading alone.
+        log_mass = log_mass - choice.first_lattice(model, prior, None, cell)[1]
     return _looked_at(prepared, lattice, choice.first_plan(model), model.start), log_mass
 
 
