@@ -151,7 +151,7 @@ def test_a_hostile_formula_is_refused_at_once_in_one_short_line(text, words):
         "abs(" + "-".join(f"sqrt({k})" for k in range(2, 900)) + ")",
         "*".join(f"{k}**(1/{k % 11 + 2})" for k in range(2, 200)),
         "sqrt((x+y+t+1)**64*tanh((x+2*y+3*t+1)**64))",
-        "cosh(abs(tanh(sinh(tan(asin((x*y+t)**7)))*tanh((x+y+t)**64)**-2)))**0.5",
+        "cosh(abs((((tanh(sinh((tanh(((((t)**64*abs(2)*(pi*x)*cosh(1/3)*(y/2)*atan(y)))**-2)**(3/2)))**-2)))**-2)**2)**2))",
     ],
 )
 def test_a_large_formula_within_the_bounds_is_read_in_a_moment(text):

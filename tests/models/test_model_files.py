@@ -211,6 +211,13 @@ def test_with_parameters_changes_values_and_nothing_else():
         model.with_parameters(r=0)
 
 
+def test_decimals_of_a_file_are_exact_and_weights_are_normalised():
+    prior = f"{{{MIXTURE}, weights = [1, 3]}}"
+    model = read_model(text(parameters="{a = 0.1234567890123456789012345}", prior=prior), "file")
+    assert model.parameters["a"] == sympy.Rational(1234567890123456789012345, 10**25)
+    assert model.prior.weights.tolist() == [0.25, 0.75]
+
+
 def test_models_do_not_import_jax():
     import subprocess
     import sys

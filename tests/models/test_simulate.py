@@ -98,6 +98,7 @@ def test_a_result_does_not_depend_on_how_the_time_is_cut_into_pieces(monkeypatch
         (linear("samples"), [1.0], {"initial": [1, 2]}, "initial: expected 1 finite numbers"),
         (linear("samples"), [1.0], {"initial": "x"}, "initial: expected 1 numbers"),
         (linear("samples"), [1.0], {"substeps": 0}, "substeps: expected a whole number"),
+        (linear("samples"), [1.0], {"seed": -1}, "seed: expected a whole number of at least 0"),
         (linear("samples", drift=["x**3"]), [9.0], {"initial": 5.0}, "drift"),
         (linear("samples", drift=["log(x)"]), [9.0], {"initial": -0.3}, "drift[0] = log(x): log of a negative"),
         (linear("samples", drift=["1/x"]), [9.0], {"initial": 0.0}, "drift[0] = 1/x: division by zero"),

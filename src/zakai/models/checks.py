@@ -27,7 +27,8 @@ def check_noise_at(model: Model, times: Any) -> None:
     `times` has shape (K,), in the model's unit of time. Raises InputError naming the model, the key and the
     first time.
 
-        >>> check_noise_at(zakai.load_model("gallery:spiral-sensor"), [0.0, 10.0])
+        >>> from zakai.models import load_model
+        >>> check_noise_at(load_model("gallery:spiral-sensor"), [0.0, 10.0])
     """
     for key in COEFFICIENTS:
         problem = _problem(model, key, np.atleast_1d(np.asarray(times, dtype=float)))

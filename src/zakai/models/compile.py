@@ -31,6 +31,8 @@ def jax_function(expressions: Any, model: Model, shape: Sequence[int] | None = N
     returns float64, and may be used under `jit`, `vmap` and `grad`. Raises InputError for an undetermined
     function.
 
+        >>> from zakai.models import load_model
+        >>> model = load_model("gallery:benes")
         >>> jax_function(model.drift, model)(jnp.zeros(1), 0.0, model.theta())
         Array([0.], dtype=float64)
     """
@@ -55,6 +57,8 @@ def jax_field(expressions: Any, model: Model) -> Callable[[Any, Any, Any], tuple
     Each expression is one vectorised loop over the points. They are not stacked: a compiler that fuses a stack into what
     uses it computes every entry twice, one number at a time. Raises InputError for an undetermined function.
 
+        >>> from zakai.models import load_model
+        >>> model = load_model("gallery:spiral-sensor")
         >>> len(jax_field(model.observation, model)(jnp.zeros((100, 1)), 0.0, model.theta()))
         2
     """
@@ -90,6 +94,8 @@ def compile_model(model: Model) -> CompiledModel:
     Values have the shapes drift (n,), observation (m,), diffusion (n, r), process_noise (r, r), covariance
     (n, n) and observation_noise (m, m). Raises InputError for a model with undetermined functions.
 
+        >>> from zakai.models import load_model
+        >>> model = load_model("gallery:benes")
         >>> compile_model(model).covariance(jnp.zeros(1), 0.0, model.theta())
         Array([[1.]], dtype=float64)
     """

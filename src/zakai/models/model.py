@@ -227,6 +227,8 @@ class Model:
         `values` are numbers by parameter name. Raises InputError for an unknown name, or if a noise matrix
         is no longer one.
 
+            >>> from zakai.models import load_model
+            >>> model = load_model("gallery:kalman-bucy-1d")
             >>> model.with_parameters(a=0.7).parameters["a"]
             7/10
         """

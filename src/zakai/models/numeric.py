@@ -46,6 +46,8 @@ def numpy_function(expressions: Any, model: Model, shape: Sequence[int] | None =
     value (the Matrix' own by default). f takes x (..., n), t (...) and theta (p,) and broadcasts them; what
     does not exist is nan. Raises InputError for an undetermined function.
 
+        >>> from zakai.models import load_model
+        >>> model = load_model("gallery:benes")
         >>> f = numpy_function(model.drift, model)
         >>> f(np.zeros((5, model.n)), 0.0, model.theta()).shape
         (5, 1)
@@ -82,6 +84,8 @@ def explain_nonfinite(model: Model, key: str, expressions: Any, x: Any, t: float
     `key` is the name of the expressions in the model file; `x` has shape (n,). The empty string if all are
     finite.
 
+        >>> from zakai.models import Model
+        >>> model = Model(state=["x"], drift=["0"], observation=["log(x)"])
         >>> explain_nonfinite(model, "observation", model.observation, [-0.3], 0.2)
         'observation[0] = log(x): log of a negative number at x = -0.3, t = 0.2'
     """

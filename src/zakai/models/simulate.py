@@ -55,7 +55,8 @@ def simulate(
     initial state or a noise that cannot be, and when the state is no longer finite, with the formula that
     caused it.
 
-        >>> truth, record = simulate(zakai.load_model("gallery:benes"), [0.1, 0.2, 0.3], seed=1)
+        >>> from zakai.models import load_model
+        >>> truth, record = simulate(load_model("gallery:benes"), [0.1, 0.2, 0.3], seed=1)
         >>> truth.values.shape, record.values.shape
         ((4, 1), (3, 1))
     """
@@ -64,7 +65,10 @@ def simulate(
     grid = _checked_times(model, times)
     counts = _substeps(np.diff(grid), substeps)
     checks.check_noise_at(model, grid)
-    rng = np.random.default_rng(seed)
+    try:
+        rng = np.random.default_rng(seed)
+    except (TypeError, ValueError):
+        raise InputError(f"seed: expected a whole number of at least 0, got {kind_of(seed)}") from None
     state = _initial_state(model, initial, rng)
     path = _Path(model, rng)
     states, readings = [state], []
