@@ -1,0 +1,48 @@
+"""Many runs: published experiments, done again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+from zakai.errors import InputError
+
+_STUDIES = {"chen-luo-yau-2017": "zakai.studies.chen_luo_yau_2017"}
+
+
+def names() -> tuple[str, ...]:
+    """The published experiments that can be reproduced."""
+    return tuple(_STUDIES)
+
+
+def reproduce(
+    name: str,
+    folder: str | os.PathLike[str] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **options: Any,
+) -> Any:
+    """Run a published experiment again, print its figures beside ours, and give them back.
+
+    name: one of `names()`. folder: where the pictures and the figures as JSON go; it is made if it is not there; None: nowhere.
+    progress: called with the work done and all of it. options: those of the study, such as `paths=100`.
+
+    Raises InputError for another name, or a folder that cannot be made.
+
+    Example:
+
+        figures = reproduce("chen-luo-yau-2017", "chen-luo-yau-2017", paths=20)
+    """
+    if name not in _STUDIES:
+        raise InputError(f'there is no study "{name}"; there is: {", ".join(_STUDIES)}')
+    if folder is not None:
+        try:
+            os.makedirs(folder, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{os.fspath(folder)}: the folder cannot be made: {error.strerror}") from None
+    study = import_module(_STUDIES[name]).run(progress=progress, **options)
+    print(study.text())
+    if folder is not None:
+        study.save(folder)
+    return study

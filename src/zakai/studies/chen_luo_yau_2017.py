@@ -1,0 +1,227 @@
+"""Chen, Luo and Yau (2017), section V: the spiral sensor (79), Table II and Figures 1 to 3.
+
+    dx = t/40 x dt + dv,    dy_1 = x sin x dt + dw_1,    dy_2 = x cos x dt + dw_2,    x(0) = 0.1,    0 <= t <= 10
+
+100 Euler paths with dt = 0.01; the mean squared error of one path is mu = mean_k (x(t_k) - xhat(t_k))^2, k = 0 .. 1000 (80).
+The first estimate is drawn about x(0) with a spread P0 that can be read in two ways: xhat(0) = x(0) + sqrt(P0) eta ("variance")
+or x(0) + P0 eta ("standard deviation"); the prior of every filter is N(xhat(0), P0).
+
+On the same paths: the direct method, the grid-optimal filter of the Euler model, which shares no code with it, and the extended
+Kalman-Bucy filter by explicit Euler, as in the paper, and with a step that cannot blow up.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import ndtr
+
+from zakai import _float64  # noqa: F401
+from zakai.filters import extended_kalman_bucy
+from zakai.filters.driver import filter_from
+from zakai.filters.observations import data_of, schedule_of
+from zakai.models.files import load_model
+from zakai.models.model import Model
+from zakai.models.prior import GaussianPrior
+from zakai.records import Record
+from zakai.records.writing import atomic_write
+from zakai.studies._chen_luo_yau_2017_text import text_of
+from zakai.studies._grid_optimal import grid_optimal
+
+STEP = 0.01
+START = 0.1
+# Table II and the text below it; None: not given.
+PAPER: dict[float, dict[str, float | None]] = {
+    0.1: {"direct": 1.9671, "ekf-euler": 7.1694, "lost": None},
+    3.0: {"direct": 2.1196, "ekf-euler": None, "lost": 8},
+    10.0: {"direct": 2.2753, "ekf-euler": None, "lost": 80},
+}
+CUT = 11.0  # half the width of the window that would explain the paper's figures
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One column of the table: a reading of P0 and its value."""
+
+    reading: str
+    spread: float
+
+    @property
+    def deviation(self) -> float:
+        """The standard deviation with which the first estimate is drawn."""
+        return self.spread if self.reading == "standard deviation" else float(np.sqrt(self.spread))
+
+    @property
+    def expected_losses(self) -> float:
+        """The probability that explicit Euler makes the variance negative in its first step: P0 (1 + xhat(0)^2) dt > 1."""
+        edge = np.sqrt(1 / (self.spread * STEP) - 1)
+        return float(ndtr((-edge - START) / self.deviation) + ndtr((START - edge) / self.deviation))
+
+
+SETTINGS = tuple(Setting(reading, spread) for reading in ("variance", "standard deviation") for spread in PAPER)
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """What was run: `times` (N+1,), `states` (paths, N+1), `means[method]` (settings, paths, N+1), `lost` (settings, paths).
+
+    `lost` marks the paths on which explicit Euler lost its variance. `figures` are the table's, ready for JSON.
+    """
+
+    settings: tuple[Setting, ...]
+    times: np.ndarray
+    states: np.ndarray
+    means: dict[str, np.ndarray]
+    lost: np.ndarray
+    figures: dict[str, Any]
+
+    def text(self) -> str:
+        """Table II beside our figures, the comparison on the same paths, and what can be reproduced."""
+        return text_of(self.figures, PAPER)
+
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Write figures.json, table.txt and figure-1.png to figure-3.png."""
+        from zakai.studies._chen_luo_yau_2017_figures import draw
+
+        for name, content in (("figures.json", json.dumps(self.figures, indent=1)), ("table.txt", self.text())):
+            with atomic_write(Path(folder) / name) as temporary:
+                temporary.write_text(content + "\n", encoding="utf-8")
+        for number, spread in enumerate(PAPER, 1):
+            if all(setting.spread != spread for setting in self.settings):
+                continue
+            with atomic_write(Path(folder) / f"figure-{number}.png") as temporary:
+                draw(self, spread, number).savefig(temporary, format="png", dpi=160)
+
+
+def run(
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    paths: int = 100,
+    steps: int = 1000,
+    seed: int = 20170111,
+    settings: tuple[Setting, ...] = SETTINGS,
+) -> Study:
+    """The whole experiment.
+
+    progress: called with the work done and all of it. paths, steps: of the Monte-Carlo experiment (the paper: 100 and 1000).
+    seed: of NumPy's generator, which draws the paths, then the first estimates. settings: the columns of the table.
+    """
+    rng = np.random.default_rng(seed)
+    states, increments = euler_paths(rng, paths, steps)
+    deviates = rng.standard_normal(paths)
+    first = np.stack([START + setting.deviation * deviates for setting in settings])
+    variances = np.array([setting.spread for setting in settings])
+    work = _Work(progress, len(settings) * paths + 2 * steps)
+
+    model = load_model("gallery:spiral-sensor")
+    times = STEP * np.arange(1, steps + 1)
+    means = {"direct": _direct(model, times, increments, first, variances, work.one)}
+    wide = max(40.0, np.abs(states).max() + 8, (np.abs(first) + 7 * np.sqrt(variances)[:, None]).max())
+    for name, half_width in (("grid-optimal", wide), ("grid-cut", CUT)):
+        means[name] = grid_optimal(_drift, _observation, increments, STEP, first, variances, half_width, work.one)
+    means["ekf-euler"], lost = _extended(model, times, increments, first, variances, "euler")
+    means["ekf-stable"], _ = _extended(model, times, increments, first, variances, "stable")
+
+    figures = _figures(settings, states, means, lost) | {"paths": paths, "steps": steps, "seed": seed, "grid": wide}
+    return Study(settings, np.concatenate([[0.0], times]), states, means, lost, figures)
+
+
+def _drift(x: np.ndarray, t: float) -> np.ndarray:
+    return t / 40 * x
+
+
+def _observation(x: np.ndarray) -> np.ndarray:
+    return np.stack([x * np.sin(x), x * np.cos(x)], axis=-1)
+
+
+def euler_paths(rng: np.random.Generator, paths: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Euler's paths of (79): the state (paths, steps + 1) and the increments of the observation (paths, steps, 2)."""
+    states, increments = np.full((paths, steps + 1), START), np.empty((paths, steps, 2))
+    for k in range(steps):
+        noise = np.sqrt(STEP) * rng.standard_normal((paths, 3))
+        x = states[:, k]
+        increments[:, k] = _observation(x) * STEP + noise[:, 1:]
+        states[:, k + 1] = x + _drift(x, k * STEP) * STEP + noise[:, 0]
+    return states, increments
+
+
+class _Work:
+    """Counts what is done."""
+
+    def __init__(self, progress: Callable[[int, int], None] | None, total: int):
+        self.progress, self.total, self.done = progress, total, 0
+
+    def one(self) -> None:
+        self.done += 1
+        if self.progress is not None:
+            self.progress(self.done, self.total)
+
+
+def _direct(model, times, increments, first, variances, one) -> np.ndarray:
+    """The direct method, filter by filter."""
+    means = np.empty((*first.shape, len(times) + 1))
+    for path, observed in enumerate(increments):
+        record = Record(times, observed, "increments")
+        for number, variance in enumerate(variances):
+            prior = GaussianPrior(first[number, path, None], np.array([[variance]]))
+            means[number, path] = filter_from(prior, model, record, "limited-direct").mean[:, 0]
+            one()
+    return means
+
+
+def _extended(model: Model, times, increments, first, variances, riccati) -> tuple[np.ndarray, np.ndarray]:
+    """The extended Kalman-Bucy filters, all at once: means, and where a variance was lost."""
+    method = extended_kalman_bucy.METHOD
+    data = data_of(model, Record(times, increments[0], "increments"))
+    prepared = method.prepare(model, schedule_of(data, True), riccati=riccati, substeps=1)
+    observed = method.observations(prepared, data).inside
+
+    def one(mean, variance, values):
+        def step(state, slices):
+            interval, reading = slices
+            state, _ = method.step(interval, state, extended_kalman_bucy.Observation(reading, None))
+            return state, (state.mean[0], state.cov[0, 0])
+
+        start = extended_kalman_bucy.State(mean[None], variance[None, None])
+        return jax.lax.scan(step, start, (prepared.intervals, observed._replace(values=values)))[1]
+
+    paths = jax.vmap(one, in_axes=(0, None, 0))
+    means, covs = jax.jit(jax.vmap(paths, in_axes=(0, 0, None)))(first, jnp.asarray(variances), increments / STEP)
+    lost = ~np.all((np.asarray(covs) >= 0) & np.isfinite(np.asarray(means)), axis=-1)
+    return np.concatenate([first[..., None], np.asarray(means)], axis=-1), lost
+
+
+def _figures(settings, states, means, lost) -> dict[str, Any]:
+    """The numbers of the table: averages over paths of (80), their standard errors, and the comparisons on the same paths."""
+    out = []
+    for number, setting in enumerate(settings):
+        kept = {name: np.ones(len(states), bool) for name in means} | {"ekf-euler": ~lost[number]}
+        errors = {name: np.mean((states - m[number])[kept[name]] ** 2, axis=-1) for name, m in means.items()}
+        paired = errors["direct"] - errors["grid-optimal"]
+        rms = np.sqrt(np.mean((means["direct"][number] - means["grid-optimal"][number]) ** 2))
+        out.append(
+            {
+                "reading": setting.reading,
+                "P0": setting.spread,
+                "mse": {name: float(e.mean()) if len(e) else None for name, e in errors.items()},
+                "standard_error": {name: _standard_error(e) for name, e in errors.items()},
+                "direct_minus_grid": {"mse": float(paired.mean()), "standard_error": _standard_error(paired)},
+                "direct_over_grid_percent": float(100 * paired.mean() / errors["grid-optimal"].mean()),
+                "rms_difference_of_means": float(rms),
+                "lost": int(lost[number].sum()),
+                "expected_lost": setting.expected_losses * len(states),
+            }
+        )
+    return {"settings": out}
+
+
+def _standard_error(values: np.ndarray) -> float | None:
+    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
