@@ -47,14 +47,17 @@ def filter(
     if report is not None:
         write_report(result, report, truth=truth)
     result.save(output)
-    print(f"method          {result.method}: {result.why}")
-    print(f"observations    {len(record):,}, times {record.times[0]:g} to {record.times[-1]:g}")
-    print(f"log-likelihood  {result.log_likelihood:.6f}")
-    for name, mean, variance in zip(result.state, result.mean[-1], result.variance[-1]):
-        print(f"{name + ' at the end':<15} {mean:.6g} +- {np.sqrt(variance):.3g}")
-    for path in (output, report):
-        if path is not None:
-            print(f"written         {path}")
+    lines = [
+        ("method", f"{result.method}: {result.why}"),
+        ("observations", f"{len(record):,}, times {record.times[0]:g} to {record.times[-1]:g}"),
+        ("log-likelihood", f"{result.log_likelihood:.6f}"),
+    ]
+    last = zip(result.state, result.mean[-1], np.sqrt(result.variance[-1]), strict=True)
+    lines += [(f"{name} at the end", f"{mean:.6g} +- {deviation:.3g}") for name, mean, deviation in last]
+    lines += [("written", str(path)) for path in (output, report) if path is not None]
+    width = max(len(what) for what, _ in lines)
+    for what, said in lines:
+        print(f"{what:<{width}}  {said}")
 
 
 def _truth(path: Path, model: Any, record: Record) -> Truth:
