@@ -42,8 +42,7 @@ def draw(study: Study, spread: float, number: int) -> Any:
             if kept.any():
                 above.plot(study.times, means.mean(axis=0), label=label, **style)
                 below.semilogy(study.times, np.mean((study.states[kept] - means) ** 2, axis=0), **style)
-        said = f"explicit Euler: {survivors.sum()} of {len(survivors)} paths survive"
-        below.text(0.03, 0.04, said, transform=below.transAxes, fontsize=8)
+        below.set_title(f"of explicit Euler's {len(survivors)} paths {survivors.sum()} survive", fontsize=9)
         below.set_xlabel("t")
     panels[0, 0].set_ylabel("state and estimates,\naveraged over paths")
     panels[1, 0].set_ylabel("squared error,\naveraged over paths")

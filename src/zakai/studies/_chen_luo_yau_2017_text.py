@@ -23,9 +23,9 @@ _WORDS = (
     "first estimate drawn with standard deviation P0 (6 and 76 expected); with variance P0, 0 and 34 are expected.",
     "What is not: the absolute errors of Table II. They change by 5 to 8 percent from one draw of 100 paths to another, and the "
     "paper's direct method at P0 = 0.1 lies several times that above the optimum, so that no exact filter gives its figure. A "
-    "window of integration of about [-11, 11], which the state leaves on some paths, brings an exact filter near the paper's "
-    "direct row (see the row that is cut so); this is a hypothesis, since the paper does not give its window. The mean of the EKF is fragile "
-    "too: a few paths that lost track decide it.",
+    "window of integration of about [-11, 11], which the state leaves on some paths, brings an exact filter nearer to the "
+    "paper's direct row (see the row that is cut so); this is a hypothesis, since the paper does not give its window. The mean "
+    "of the EKF is fragile too: a few paths that lost track decide it.",
 )
 
 
