@@ -88,8 +88,7 @@ def test_the_step_has_its_order_against_the_integrated_riccati_equation(incremen
         miss = [abs(result.mean[-1] - mean).max(), abs(result.cov[-1] - cov).max(), abs(result.log_likelihood - evidence)]
         errors.append(miss)
     measured = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-    assert np.all(abs(measured[-1, :2] - order) < 0.3), measured
-    assert measured[-1, 2] > 0.8, "the evidence of a step is of first order in the step at least"
+    assert np.all(abs(measured[-1] - order) < 0.2), measured
     assert errors[-1][0] < (2e-4 if order == 2 else 2e-2)
 
 

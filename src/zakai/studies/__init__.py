@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import Any
 
 from zakai.errors import InputError
+from zakai.studies._drawing import new_figure
 
 _STUDIES = {"chen-luo-yau-2017": "zakai.studies.chen_luo_yau_2017"}
 
@@ -28,7 +29,7 @@ def reproduce(
     name: one of `names()`. folder: where the pictures and the figures as JSON go; it is made if it is not there; None: nowhere.
     progress: called with the work done and all of it. options: those of the study, such as `paths=100`.
 
-    Raises InputError for another name, or a folder that cannot be made.
+    Raises InputError for another name, a folder that cannot be made, or pictures without matplotlib.
 
     Example:
 
@@ -37,6 +38,7 @@ def reproduce(
     if name not in _STUDIES:
         raise InputError(f'there is no study "{name}"; there is: {", ".join(_STUDIES)}')
     if folder is not None:
+        new_figure(1.0, 1.0)  # a missing library is better said before the minutes of work than after
         try:
             os.makedirs(folder, exist_ok=True)
         except OSError as error:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zakai.errors import InputError
+from zakai.studies._drawing import new_figure
 
 if TYPE_CHECKING:
     from zakai.studies.chen_luo_yau_2017 import Study
@@ -21,14 +21,7 @@ _LINES = {
 
 def draw(study: Study, spread: float, number: int) -> Any:
     """The paper's picture (state and estimates, averaged over the paths) above the averaged squared error, for both readings."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise InputError('matplotlib is not installed; pictures need it: pip install "zakai[plots]"') from error
-
-    figure = Figure(figsize=(10.0, 6.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(10.0, 6.4)
     columns = [i for i, setting in enumerate(study.settings) if setting.spread == spread]
     panels = figure.subplots(2, len(columns), sharex=True, sharey="row", squeeze=False)
     for column, index in enumerate(columns):
