@@ -68,6 +68,14 @@ def test_no_segment_of_a_drawn_line_goes_across_the_circle():
     assert (np.diff(times) >= 0).all()
 
 
+def test_an_angle_is_not_joined_across_times_that_are_left_out():
+    result, _ = fake_result(observations=2000, state=("theta",), periodic=("theta",), step=0.5)
+    assert not density_over_time(result, 0, None, columns=600).joined
+    assert density_over_time(result, 0, None, start=1800).joined
+    line, _ = fake_result(observations=2000)
+    assert density_over_time(line, 0, None, columns=600).joined
+
+
 def test_wrapping_gives_pi_and_never_minus_pi():
     np.testing.assert_allclose(wrapped(np.array([np.pi, -np.pi, 3 * np.pi, 0.0])), [np.pi, np.pi, np.pi, 0.0])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -111,6 +112,17 @@ def test_the_moments_of_note_hold_the_surprise_the_spread_and_both_ends():
     assert len(moments) == 6 and 0 in moments and 100 in moments
     assert "largest surprise" in moments[1 + int(np.argmin(result.log_likelihood_increments[1:]))]
     assert "most uncertain" in moments[1 + int(np.argmax(result.variance[1:, 0]))]
+
+
+def test_a_time_without_an_observation_is_not_the_most_uncertain_moment():
+    result, _ = fake_result()
+    values = np.ones((len(result.times) - 1, 1))
+    widest = int(np.argmax(result.variance[1:, 0]))
+    values[widest] = np.nan
+    result.record = SimpleNamespace(values=values)
+    moments = dict(special_moments(result))
+    assert "most uncertain" not in moments.get(1 + widest, "")
+    assert any("most uncertain" in name for name in moments.values())
 
 
 def test_thinning_keeps_both_extremes():

@@ -65,6 +65,11 @@ class DensityOverTime:
     profiles: tuple[Profile, ...]  # the marginal densities that were binned; none if they were not kept
 
     @property
+    def joined(self) -> bool:
+        """Whether lines may join the columns: where times between them are left out, an angle may have gone either way round."""
+        return not self.periodic or len(self.index) < 3 or float(np.median(np.diff(self.index))) <= 1
+
+    @property
     def grid(self) -> np.ndarray:
         """The centres of the cells."""
         return 0.5 * (self.edges[1:] + self.edges[:-1])

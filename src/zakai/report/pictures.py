@@ -50,11 +50,15 @@ def posterior_figure(
     )
 
     def line(values: np.ndarray, **kind: Any) -> None:
+        if not picture.joined:
+            axes.plot(picture.times, values, **{**kind, "linestyle": "none", "marker": ".", "markersize": 2.5})
+            return
         times, values = circle_line(picture.times, values) if picture.periodic else (picture.times, values)
         axes.plot(times, values, **kind)
 
-    line(picture.lower, color=style.BAND_COLOUR, linewidth=0.6, label="95% band")
-    line(picture.upper, color=style.BAND_COLOUR, linewidth=0.6)
+    if picture.joined:
+        line(picture.lower, color=style.BAND_COLOUR, linewidth=0.6, label="95% band")
+        line(picture.upper, color=style.BAND_COLOUR, linewidth=0.6)
     line(picture.mean, color=style.INK, linewidth=1.1, label="mean")
     if picture.truth is not None:
         line(picture.truth, color=style.TRUTH_COLOUR, linewidth=1.1, linestyle=(0, (3, 1.5)), label="truth")

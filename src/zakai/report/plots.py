@@ -55,15 +55,10 @@ def posterior(picture: DensityOverTime, height: int = 430, label: str | None = N
             hoverinfo=None if picture.kept else "skip", showscale=False, name="density",
         )
     )  # fmt: skip
-    for values, name, width in ((picture.lower, "95% lower", 0.8), (picture.upper, "95% upper", 0.8)):
-        _line(
-            figure,
-            picture,
-            values,
-            name,
-            {"color": style.BAND_COLOUR, "width": width},
-            legend=name == "95% lower",
-        )
+    if picture.joined:
+        band = {"color": style.BAND_COLOUR, "width": 0.8}
+        _line(figure, picture, picture.lower, "95% lower", band)
+        _line(figure, picture, picture.upper, "95% upper", band, legend=False)
     _line(figure, picture, picture.mean, "mean", {"color": style.INK, "width": 1.5})
     if picture.truth is not None:
         _line(
@@ -217,13 +212,14 @@ def thinned(values: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
 def _line(figure: Any, picture: DensityOverTime, values: np.ndarray, name: str, line: dict, legend: bool = True) -> None:
     go = plotting("plotly.graph_objects")
     times = picture.times
-    if picture.periodic:
+    if picture.periodic and picture.joined:
         times, values = circle_line(times, values)
     shown = "95% band" if name.startswith("95%") else name
     figure.add_trace(
         go.Scatter(
-            x=times, y=values.astype(np.float32), mode="lines", line=line, name=shown, showlegend=legend,
-            legendgroup=shown, hovertemplate=f"{name} %{{y:.5g}}<extra></extra>", connectgaps=False,
+            x=times, y=values.astype(np.float32), mode="lines" if picture.joined else "markers", line=line,
+            marker={"color": line["color"], "size": 3.5}, name=shown, showlegend=legend, legendgroup=shown,
+            hovertemplate=f"{name} %{{y:.5g}}<extra></extra>", connectgaps=False,
         )
     )  # fmt: skip
 

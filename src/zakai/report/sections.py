@@ -32,6 +32,8 @@ def posterior(result: Any, truth: np.ndarray | None) -> str:
             f"{len(picture.index):,} of {total:,} times are drawn, evenly spaced, and the moments of the "
             f"next section."
         )  # fmt: skip
+        if not picture.joined:
+            note += " Between them the angle may have gone either way round: the means are dots."
         if picture.coverage is not None:
             note += f" The band holds the true state at {picture.coverage:.1%} of them."
         title = f"<h3>{escape(names[i])}</h3>" if len(names) > 1 else ""
@@ -83,6 +85,9 @@ def special_moments(result: Any) -> list[tuple[int, str]]:
         after = np.arange(1, last + 1)
         with np.errstate(divide="ignore"):
             spread = np.sum(np.log(np.asarray(result.variance, dtype=float)), axis=1)[1:]
+        if result.record is not None and len(result.record.values) == last:
+            # Only what an observation has left is of note; without one the density just spreads.
+            spread = np.where(np.isnan(result.record.values).all(axis=1), np.nan, spread)
         increments = np.asarray(result.log_likelihood_increments, dtype=float)[1:]
         named.setdefault(last, "last")
         for values, name in (
