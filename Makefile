@@ -32,7 +32,8 @@ demo: .venv/.plots
 	mkdir -p $(EXAMPLE)/out
 	$(BIN)/zakai filter $(EXAMPLE)/wind-vane.toml $(EXAMPLE)/observations.csv \
 	    -o $(EXAMPLE)/out/wind-vane.nc --report $(EXAMPLE)/out/wind-vane.html
-	@echo "Open $(EXAMPLE)/out/wind-vane.html in a browser."
+	$(BIN)/python $(EXAMPLE)/picture.py
+	@echo "Open $(EXAMPLE)/out/wind-vane.html in a browser; $(EXAMPLE)/out/wind-vane.png shows ten days of it."
 
 test: .venv/.dev
 	$(BIN)/ruff check .
