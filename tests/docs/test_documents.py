@@ -1,0 +1,124 @@
+"""What the documents show is what happens."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from types import ModuleType
+
+import pytest
+
+import zakai
+from docs.documents import ROOT, blocks, table
+from zakai import _registry
+from zakai.algebra import theorems
+from zakai.cli import main
+from zakai.models.files import read_model
+
+DOCUMENTS = sorted(path.relative_to(ROOT).as_posix() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+
+
+@pytest.mark.parametrize("name", [name for name in DOCUMENTS if blocks(name, "python")])
+def test_the_python_of_a_document_runs_and_prints_what_is_shown(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    for block in blocks(name, "python"):
+        exec(compile(block.code, name, "exec"), names)
+        printed = capsys.readouterr().out
+        assert block.output is None or printed == block.output
+
+
+def test_the_first_shell_session_runs_and_prints_what_is_shown(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("plotly")
+    monkeypatch.chdir(tmp_path)
+    sessions = [block for block in blocks("README.md", "sh") if "zakai " in block.code]
+    assert sessions
+    for block in sessions:
+        for line in block.code.replace("\\\n", " ").splitlines():
+            assert main(shlex.split(line, comments=True)[1:]) == 0
+        assert block.output is None or capsys.readouterr().out == block.output
+
+
+def test_every_command_and_exit_code_is_in_the_page_of_the_command(capsys):
+    main(["--help"])
+    commands = re.findall(r"^│ ([a-z]+) ", capsys.readouterr().out, re.MULTILINE)
+    page = (ROOT / "docs/command.md").read_text()
+    assert len(commands) >= 6
+    assert [command for command in commands if f"| `zakai {command} " not in page] == []
+    for error in (zakai.InputError, zakai.ConditionError):
+        assert f"| {error.exit_code} |" in page
+
+
+def test_the_methods_of_the_readme_are_those_that_exist():
+    assert [row[0] for row in table("README.md", "method")] == list(_registry.METHODS)
+
+
+MODEL = blocks("docs/model-files.md", "toml")[0].code
+
+
+def test_the_model_file_that_is_shown_is_one():
+    model = read_model(MODEL, "model.toml")
+    assert read_model(model.to_toml(), "again").drift == model.drift
+
+
+@pytest.mark.parametrize(("line", "error"), table("docs/model-files.md", "the line"))
+def test_a_wrong_line_of_a_model_file_gives_the_error_that_is_shown(line, error):
+    key = line.partition("=")[0].strip()
+    changed, count = re.subn(rf"^{key} *=.*$", lambda _: line, MODEL, count=1, flags=re.MULTILINE)
+    with pytest.raises(zakai.InputError) as raised:
+        read_model(changed if count else f"{line}\n{MODEL}", "model.toml")
+    assert str(raised.value) == f"model.toml: {error}"
+
+
+@pytest.mark.parametrize(("text", "error"), table("docs/records.md", "the file"))
+def test_a_wrong_record_gives_the_error_that_is_shown(text, error, tmp_path):
+    path = tmp_path / "record.csv"
+    path.write_text(text.replace("\\n", "\n") + "\n")
+    with pytest.raises(zakai.InputError) as raised:
+        zakai.read_record(path, zakai.load_model("gallery:benes"))
+    assert str(raised.value) == f"{path}: {error}"
+
+
+def test_every_key_of_a_model_file_is_in_its_page():
+    from zakai.models.model import KEYS
+
+    rows = [row[0].strip("[]") for row in table("docs/model-files.md", "key")]
+    assert sorted(rows) == sorted(KEYS)
+
+
+def test_the_method_that_contributing_adds_works_as_it_stands_there(monkeypatch):
+    theorem, entry, method, registry, test = (block.code for block in blocks("CONTRIBUTING.md", "python"))
+    name = "continuous-discrete-kalman"
+
+    names = dict(vars(theorems))
+    exec(compile(theorem, "CONTRIBUTING.md", "exec"), names)
+    monkeypatch.setattr(theorems, "continuous_discrete_kalman", names["continuous_discrete_kalman"], raising=False)
+    monkeypatch.setattr(theorems, "THEOREMS", {**theorems.THEOREMS, **eval(f"{{{entry}}}", names)})
+
+    entries = eval(f"{{{registry}}}", vars(_registry))
+    module = ModuleType(entries[name].module)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    exec(compile(method, "CONTRIBUTING.md", "exec"), vars(module))
+    monkeypatch.setitem(_registry.METHODS, name, entries[name])
+    assert _registry.load(name).theorem is theorems.THEOREMS[name]
+
+    tests: dict = {}
+    exec(compile(test, "CONTRIBUTING.md", "exec"), tests)
+    for function in [value for key, value in tests.items() if key.startswith("test_")]:
+        function()
+    with pytest.raises(zakai.ConditionError, match="it fails that the observations are samples"):
+        model = zakai.load_model("gallery:kalman-bucy-1d")
+        zakai.filter(model, zakai.Record([0.1], [0.2], "increments"), name)
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", *DOCUMENTS])
+def test_every_link_inside_the_repository_leads_somewhere(name):
+    text = re.sub(r"^```.*?^```$", "", (ROOT / name).read_text(), flags=re.DOTALL | re.MULTILINE)
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
+        assert ((ROOT / name).parent / target).exists(), target
+
+
+def test_every_misprint_of_the_errata_has_its_test():
+    tests = set(re.findall(r"^def (test_\w+)", (ROOT / "tests/errata/test_printed_formulas.py").read_text(), re.MULTILINE))
+    assert {row[3] for row in table("docs/limited-direct.md", "where")} == tests
