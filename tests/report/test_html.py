@@ -91,9 +91,9 @@ def test_a_run_without_observations_or_health_or_conditions_is_a_page_too():
 
 def test_nine_thousand_observations_take_seconds_and_little_space(tmp_path):
     result, truth = fake_result(observations=9000, state=("theta",), periodic=("theta",), kind="samples")
-    begin = time.perf_counter()
+    begin = time.process_time()  # a busy machine is not a slow report
     write_report(result, tmp_path / "report.html", truth)
-    assert time.perf_counter() - begin < 15
+    assert time.process_time() - begin < 15
     assert (tmp_path / "report.html").stat().st_size < 12e6
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "of 9,001 times are drawn, evenly spaced" in text and "The last 200 times" in text

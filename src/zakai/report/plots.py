@@ -71,6 +71,8 @@ def posterior(picture: DensityOverTime, height: int = 430, label: str | None = N
     _layout(figure, height)
     figure.update_layout(hovermode="x unified")
     figure.update_xaxes(title_text="time", hoverformat=".6g")
+    if not picture.joined:  # plotly leaves a margin around dots
+        figure.update_xaxes(range=[picture.times[0], picture.times[-1]])
     figure.update_yaxes(title_text=escape(label or picture.name), range=[picture.edges[0], picture.edges[-1]])
     if picture.periodic:
         angle = [-np.pi, -np.pi / 2, 0.0, np.pi / 2, np.pi]
@@ -83,7 +85,8 @@ def snapshots(shots: list[tuple[str, float, Profile, float | None]], name: str, 
     go, make_subplots = plotting("plotly.graph_objects"), plotting("plotly.subplots").make_subplots
     columns = min(3, len(shots))
     rows = -(-len(shots) // columns)
-    titles = [f"{title}, t = {time:.6g}" for title, time, _, _ in shots]
+    # A panel is about thirty letters wide.
+    titles = [f"{title},{'<br>' if len(title) > 18 else ' '}t = {time:.6g}" for title, time, _, _ in shots]
     figure = make_subplots(rows=rows, cols=columns, subplot_titles=titles, vertical_spacing=0.3 / rows, horizontal_spacing=0.07)
     for position, (_, _, shot, truth) in enumerate(shots):
         row, column = divmod(position, columns)
