@@ -22,11 +22,14 @@ from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior, GaussianPrior
 
 CELLS = 2.5  # standard deviations of the narrowest feature, in cells: below it, values between the points lose digits
+CELLS_SHARPENED = 4.2  # the same where the highest fifth of the frequencies is taken out
 COARSEST = 0.75  # the largest cell in kernel standard deviations
 EDGE = 1e-12
+EDGE_SHARPENED = 1e-9  # sharpening cuts the tails at 1e-13 of the maximum, and the cells along the cut add up
 QUADRATURE = 1e-11
+JOINT = 1.16  # standard deviation, in cells, from which the error of a sum is below QUADRATURE
 BASE = {1: 128, 2: 64}
-MOST = {1: 8192, 2: 384}
+MOST = {1: 8192, 2: 1024}
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Plan:
     """How the next steps move the density; static, so that each plan is compiled once.
 
     `banded` steps keep a window of `sizes` that moves along; the others choose a lattice of `sizes` each time. `window` and `cells`
-    say how generous the banded window and its cell are.
+    say how generous the banded window and its cell are, `run` how many steps it is for.
     """
 
     banded: bool
@@ -42,8 +45,15 @@ class Plan:
     taps: int = 32
     angles: tuple[int, ...] = ()
     images: int = 0
+    sharpen: bool = False
     window: float = 1.3
     cells: float = CELLS
+    run: int = 256
+
+    @property
+    def needed(self) -> float:
+        """The fewest cells that a standard deviation may have."""
+        return CELLS_SHARPENED if self.sharpen else CELLS
 
 
 def rounded_up(size: float) -> int:
@@ -74,14 +84,21 @@ def features(logs: np.ndarray) -> np.ndarray:
 def first_plan(model: Model) -> Plan:
     """The plan before anything is known of the steps."""
     angles = tuple(model.state.index(name) for name in model.periodic)
-    return Plan(False, (BASE[model.n],) * model.n, angles=angles)
+    # What observations leave of a prior on two states is much smaller, so that the first runs are short.
+    return Plan(False, (BASE[model.n],) * model.n, angles=angles, run=256 if model.n == 1 else 2)
 
 
 def first_lattice(
-    model: Model, prior: Any, log_factor: Callable[[np.ndarray], np.ndarray] | None, widest: float = np.inf
+    model: Model, prior: Any, log_factor: Callable[[np.ndarray], np.ndarray] | None, spread: np.ndarray | None = None
 ) -> tuple[Lattice, float]:
-    """The prior, times a factor if there is one, on a lattice whose cell is at most `widest`; and the logarithm of its mass."""
+    """The prior, times a factor if there is one, on a lattice; and the logarithm of its mass.
+
+    `spread` (n, n) is the covariance of the first kernel; a window that moves needs cells that are small enough for it.
+    """
     axes, log_prior, box = _prior_box(model, prior)
+    widest = np.full(model.n, np.inf)
+    if spread is not None and model.n == 1 and not model.periodic:
+        widest = COARSEST / np.sqrt(np.diag(axes.T @ np.linalg.solve(spread, axes)))
     factor = log_factor or (lambda x: np.zeros(x.shape[:-1]))
 
     def log_density(x: np.ndarray) -> np.ndarray:
@@ -121,11 +138,10 @@ def first_lattice(
             size = np.where(fine | point, size, size * 2)
             continue
         enough = np.clip(np.ceil((high - low) / widest) + 1, size, MOST[model.n]).astype(int)
-        if np.all(point | whole | (enough == size)):
+        if np.all(point | (enough == size)):
             break
-        high = np.where(point | whole | (enough == size), high, low + widest * (enough - 1))
-        size = np.where(point | whole, size, enough)
-        widest = np.inf
+        size = np.where(point, size, enough)
+        widest = np.full(model.n, np.inf)
     size_half = size // 2
     basis = axes * cell
     mass = logs.max() + np.log(np.exp(logs - logs.max()).sum()) + np.log(abs(np.linalg.det(basis)))
@@ -210,43 +226,51 @@ def adapted(
     model: Model,
     lattice: Lattice,
     plan: Plan,
-    deviation: np.ndarray,
-    angle: np.ndarray,
+    spreads: np.ndarray,
     maps: np.ndarray,
     info: Any | None,
 ) -> tuple[Lattice, Plan | None]:
-    """A lattice and a plan for a run of intervals with kernels of `deviation` (K,), moving by `maps` (K, parts, n, n).
+    """A lattice and a plan for a run of intervals with kernels of covariance `spreads` and moving by `maps` (K, parts, n, n).
 
     With the `info` of a try: a better plan, or None where the try was good or nothing better can be had.
     """
     if info is not None:
-        if healthy(info):
+        if healthy(info, plan):
             return lattice, None
         plan = _more(plan, info)
         if plan is None:
             return lattice, None
     one_line = model.n == 1 and not plan.angles and maps.shape[1] == 1
     if one_line and lattice.log_values.size > 1:
-        banded = _banded(lattice, plan, deviation, np.abs(maps[:, 0, 0, 0]))
+        banded = _banded(lattice, plan, np.sqrt(spreads[:, 0, 0, 0]), np.abs(maps[:, 0, 0, 0]))
         if banded is not None:
             return banded
     sizes = plan.sizes if not plan.banded else (BASE[1],)
+    run = plan.run
     if info is None:
-        roomy = features(np.asarray(lattice.log_values)) > 4 * CELLS
-        sizes = tuple(
-            max(s // 2, BASE[model.n]) if room and s > BASE[model.n] else s for s, room in zip(sizes, roomy, strict=True)
-        )
-    images = int(1 + np.ceil(FAR * angle.max(initial=0.0) / (2 * np.pi))) if plan.angles else 0
-    return lattice, replace(plan, banded=False, sizes=sizes, images=images)
+        own = lattice.log_values.shape == sizes
+        # Only a lattice of the plan's own sizes tells whether they were more than enough.
+        if own:
+            basis = np.asarray(lattice.basis)
+            kernel = np.sqrt(np.max(np.einsum("id,kpij,jd->kpd", basis, np.linalg.inv(spreads), basis), axis=(0, 1)))
+            roomy = (features(np.asarray(lattice.log_values)) > 3 * plan.needed) & ((2.4 * kernel < COARSEST) | plan.sharpen)
+            sizes = tuple(max(s // 2, BASE[model.n]) if room else s for s, room in zip(sizes, roomy, strict=True))
+        if model.n == 2:
+            run = 64 if own and np.prod(sizes) * sizes[0] < 4e6 else 4
+    angle = np.sqrt(max((spreads[:, :, i, i].max() for i in plan.angles), default=0.0))
+    reach = REACH * angle / (2 * np.pi)
+    images = max(0, int(np.ceil(reach - 0.5))) if plan.angles else 0
+    return lattice, replace(plan, banded=False, sizes=sizes, images=images, run=run)
 
 
-def healthy(info: Any) -> bool:
+def healthy(info: Any, plan: Plan) -> bool:
     """Whether a try kept every bound."""
     health = info.health
+    edge = EDGE_SHARPENED if plan.sharpen else EDGE
     return bool(
         np.all(np.isfinite(info.log_likelihood_increment))
-        and np.all(health["edge_mass"] < EDGE)
-        and np.all(health["resolution"] > CELLS)
+        and np.all(health["edge_mass"] < edge)
+        and np.all(health["resolution"] > plan.needed)
         and np.all(health["quadrature_error"] < QUADRATURE)
     )
 
@@ -254,9 +278,22 @@ def healthy(info: Any) -> bool:
 def _more(plan: Plan, info: Any) -> Plan | None:
     """A larger window or a finer cell, whichever was missing; None at the limit."""
     if not plan.banded:
-        if max(plan.sizes) >= MOST[len(plan.sizes)]:
-            return None
-        return replace(plan, sizes=tuple(2 * s for s in plan.sizes))
+        most = MOST[len(plan.sizes)]
+        need = np.nanmax(np.where(np.isfinite(info.need), info.need, 2.0), axis=0)
+        if np.all(info.health["resolution"] > plan.needed) and np.all(np.isfinite(info.log_likelihood_increment)):
+            if plan.sharpen and not np.all(info.health["edge_mass"] < EDGE_SHARPENED):
+                # The tails that sharpening loses matter here: resolve the kernel instead.
+                return replace(plan, sharpen=False)
+            if not plan.sharpen and np.any(info.health["quadrature_error"] >= QUADRATURE):
+                return replace(plan, sharpen=True)
+        elif not plan.sharpen:
+            # What a lattice that is too coarse says of the kernel may be far off; its own features come first.
+            need = np.nanmax(np.where(np.isfinite(info.need), CELLS / info.health["resolution"][:, None], 2.0), axis=0)
+        need = np.clip(1.1 * need if need.max() > 1 else np.full(len(plan.sizes), 1.5), None, 2.0)
+        sizes = tuple(
+            min(most, max(s, rounded_up(s * f))) if f > 1.1 else s for s, f in zip(plan.sizes, need, strict=True)
+        )
+        return None if sizes == plan.sizes else replace(plan, sizes=sizes)
     finite = np.all(np.isfinite(info.log_likelihood_increment))
     coarse = not np.all(info.health["resolution"] > CELLS)
     narrow = not np.all(info.health["edge_mass"] < EDGE) or not finite

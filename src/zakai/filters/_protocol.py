@@ -29,12 +29,16 @@ class Schedule(NamedTuple):
 
 
 class Info(NamedTuple):
-    """What one step tells: the increment of the log-likelihood, moments (n,) and (n, n), and its health."""
+    """What one step tells: the increment of the log-likelihood, moments (n,) and (n, n), and its health.
+
+    `need` is for `adapt` alone: by what factor (n,) each axis of a lattice was too coarse, above one.
+    """
 
     log_likelihood_increment: Any
     mean: Any
     cov: Any
     health: dict[str, Any]
+    need: Any = None
 
 
 @dataclass(frozen=True)

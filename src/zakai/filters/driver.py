@@ -198,8 +198,8 @@ class _Run:
             schedule = schedule_of(data, True)
             prepared = _prepared(self.method, self.model, schedule, self.options)
             observations = self.method.observations(prepared, data)
-            for first in range(0, rows.stop - rows.start, RUN):
-                state = self._run(prepared, state, observations, first, rows)
+            while self.done < rows.stop:
+                state = self._run(prepared, state, observations, self.done - rows.start, rows)
                 if progress is not None:
                     progress(self.done, count)
 
@@ -227,9 +227,10 @@ class _Run:
 
     def _run(self, prepared: Any, state: Any, observations: Any, first: int, rows: slice) -> Any:
         """A run of steps from one look at the lattice to the next, tried until its health is good."""
-        count = min(RUN, rows.stop - rows.start - first)
-        length = RUN if count == RUN or self.done else max(16, 2 ** int(np.ceil(np.log2(count))))
-        length = min(length, RUN)
+        run = getattr(state, "run_length", RUN)
+        count = min(run, rows.stop - rows.start - first)
+        # A short rest is padded to a power of two: few shapes, few compilations.
+        length = run if run <= 64 or 2 * count > run else max(16, 2 ** int(np.ceil(np.log2(count))))
         part = slice(first, first + count)
         intervals = _rows(prepared.intervals, part, length)
         given = _rows(observations, part, length)

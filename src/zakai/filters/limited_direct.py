@@ -55,6 +55,11 @@ class State:
     middle: Any
     plan: choice.Plan
 
+    @property
+    def run_length(self) -> int:
+        """How many steps to take before the lattice is looked at again."""
+        return self.plan.run
+
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
@@ -65,8 +70,6 @@ class Prepared:
     schedule: Schedule
     splitting: str
     intervals: Interval
-    kernel_deviation: np.ndarray
-    kernel_angle: np.ndarray
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["start", "stop", "flow", "theta"], meta_fields=["system"])
@@ -180,9 +183,7 @@ def prepare(
     intervals = Interval(
         schedule.starts, schedule.stops, flow, np.tile(model.theta(), (len(which), 1)), system
     )
-    deviation = np.sqrt(np.diagonal(flow.spread, axis1=2, axis2=3))
-    angles = [model.state.index(name) for name in model.periodic]
-    return Prepared(model, system, schedule, splitting, intervals, deviation.min(axis=1), deviation[..., angles].max(axis=1))
+    return Prepared(model, system, schedule, splitting, intervals)
 
 
 def _series_flows(model: Model, starts: np.ndarray, stops: np.ndarray, whole: np.ndarray, order: int | None) -> Flow:
@@ -259,7 +260,7 @@ def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State
     state, log_mass = _start(prepared, prior, observation)
     summary = lat.summary(state.lattice, state.plan.angles)
     nothing = jnp.array(0.0)
-    return state, _info(summary, log_mass, jnp.min(state.cells), nothing, nothing)
+    return state, _info(summary, log_mass, state.cells, nothing, nothing, choice.CELLS / state.cells)
 
 
 def _start(prepared, prior, observation):
@@ -270,12 +271,13 @@ def _start(prepared, prior, observation):
         return np.asarray(_log_factor(system.observe(x, model.start, model.theta()), factor))
 
     # An interval of no length, before a sample at the start itself, asks for no cell.
-    kernels = prepared.kernel_deviation[prepared.kernel_deviation > 0]
-    cell = choice.COARSEST * kernels.min(initial=np.inf) if model.n == 1 else np.inf
-    lattice, log_mass = choice.first_lattice(model, prior, log_factor if observation is not None else None, cell)
+    spreads = prepared.intervals.flow.spread
+    moving = np.flatnonzero(np.linalg.det(spreads[:, 0]) > 0)
+    spread = spreads[moving[0], 0] if len(moving) else None
+    lattice, log_mass = choice.first_lattice(model, prior, log_factor if observation is not None else None, spread)
     if observation is not None:
         # A density prior need not be normalised; the evidence is that of the reading alone.
-        log_mass = log_mass - choice.first_lattice(model, prior, None, cell)[1]
+        log_mass = log_mass - choice.first_lattice(model, prior, None)[1]
     return _looked_at(prepared, lattice, choice.first_plan(model), model.start), log_mass
 
 
@@ -318,8 +320,7 @@ def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> S
         prepared.model,
         state.lattice,
         state.plan,
-        prepared.kernel_deviation[rows],
-        prepared.kernel_angle[rows],
+        prepared.intervals.flow.spread[rows],
         prepared.intervals.flow.map[rows],
         info,
     )
@@ -345,7 +346,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
     # Readings that act as rates leave nothing to multiply with at the end.
     observed_at_end = not system.rates or observation.energy is not None
     log_mass, exponent = jnp.array(0.0), jnp.array(0.0)
-    joint, first_look = jnp.array(jnp.inf), jnp.array(1.0)
+    joint, first_look, need = jnp.array(jnp.inf), jnp.ones(len(lattice.sizes)), jnp.zeros(len(lattice.sizes))
     for part in range(parts):
         flow = jax.tree.map(lambda a, part=part: a[part], interval.flow)
         last = part == parts - 1
@@ -363,7 +364,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
         if system.gauged:
             before = before - _potential(system, lattice.points(), times[part], interval.theta)
             exponent = jnp.maximum(exponent, lat.exponent_range(lattice.log_values, lattice.log_values + before))
-        joint = jnp.minimum(joint, _joint_cells(lattice, cells, flow))
+        joint, need = _joint_cells(lattice, cells, flow, plan.sharpen, joint, need)
         if plan.banded:
             lattice = lat.move_banded(lattice, before, flow, observation.inputs, plan.taps)
             points = lattice.points()
@@ -379,6 +380,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
                 plan.sizes,
                 plan.angles,
                 plan.images,
+                plan.sharpen,
             )
             first_look = jnp.maximum(first_look, coarseness)
             observed = observe(lattice.points()) if system.halves else None
@@ -387,9 +389,10 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
         cells = lat.features(lattice)
         log_mass = log_mass + summary.log_mass
     # A feature that the first look, over everything that could be reached, may have stepped over counts as unresolved.
-    resolution = jnp.min(cells) * jnp.minimum(1.0, 4.0 / first_look)
+    resolution = cells * jnp.minimum(1.0, 4.0 / first_look)
     quadrature_error = 2 * jnp.exp(-2 * jnp.pi**2 * joint**2)
-    info = _info(summary, log_mass, resolution, quadrature_error, exponent)
+    need = jnp.maximum(need, plan.needed / resolution)
+    info = _info(summary, log_mass, resolution, quadrature_error, exponent, need)
     kept = observed if system.halves else None
     return State(lattice, kept, cells, summary.middle, plan), info
 
@@ -398,22 +401,29 @@ def _potential(system, x, t, theta):
     return system.potential(x, t, theta)[0]
 
 
-def _joint_cells(lattice: Lattice, own: jax.Array, flow: Flow) -> jax.Array:
-    """The standard deviation, in cells, of the narrowest product of the density, `own` (n,), and the kernel."""
+def _joint_cells(lattice: Lattice, own: jax.Array, flow: Flow, sharpen: bool, joint, need):
+    """The standard deviation, in cells, of the narrowest product of the density, `own` (n,), and the kernel; and what is needed.
+
+    Both are worst cases over the parts of an interval.
+    """
     kernel = jnp.sum(lattice.basis * (lat.inverse(flow.spread) @ lattice.basis), axis=0)
+    if sharpen:
+        extra = lat.added_variance(lattice, flow)
+        own = jnp.sqrt(jnp.maximum(own**2 - extra, 1e-12))
+        kernel = 1.0 / (1.0 / kernel + extra)
     # An axis of one point holds a mass without width, for which there is nothing to resolve.
-    wide = jnp.array(lattice.sizes) > 1
-    return jnp.min(jnp.where(wide, jax.lax.rsqrt(1.0 / own**2 + kernel), jnp.inf))
+    cells = jnp.where(jnp.array(lattice.sizes) > 1, jax.lax.rsqrt(1.0 / own**2 + kernel), jnp.inf)
+    return jnp.minimum(joint, jnp.min(cells)), jnp.maximum(need, choice.JOINT / cells)
 
 
-def _info(summary: lat.Summary, log_mass, resolution, quadrature_error, exponent) -> Info:
+def _info(summary: lat.Summary, log_mass, resolution, quadrature_error, exponent, need) -> Info:
     health = {
         "edge_mass": summary.edge_mass,
-        "resolution": resolution,
+        "resolution": jnp.min(resolution),
         "quadrature_error": quadrature_error,
         "exponent": exponent,
     }
-    return Info(log_mass, summary.mean, summary.cov, health)
+    return Info(log_mass, summary.mean, summary.cov, health, need)
 
 
 def density(prepared: Prepared, state: State) -> GridDensity:

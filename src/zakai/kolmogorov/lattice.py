@@ -24,12 +24,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from scipy.special import erfc
 
 from zakai.kolmogorov.flow import Flow, motion
 
 REACH = 8.5  # standard deviations after which a Gaussian is zero in double precision
 FAR = 12.0  # how far `move_dense` looks around the source: an observation may contradict it
 SUPPORT = 36.0  # a point whose logarithm is lower than the maximum's by more than this does not matter
+
+SUMMED = 1.0 / 0.75**2  # variance, in cells, from which a Gaussian may be summed on a lattice
+CUT = 1e-13  # what rounding leaves of a sharpened density
+_AT_ONCE = 2**22  # pairs of points whose kernel is held in memory at once
 
 LogFunction = Callable[[jax.Array], jax.Array]
 
@@ -80,7 +85,7 @@ def _indices(sizes: tuple[int, ...]) -> np.ndarray:
 
 class Summary(NamedTuple):
     """Of a density on a lattice: `log_mass`, `mean` and `cov` (n,) and (n, n) of its points, the share of the mass in the two
-    outermost layers of cells (`edge_mass`), and where the middle of its support is, as an index (n,) from the centre."""
+    outermost layers of cells and beside cells that hold nothing (`edge_mass`), and where the middle of its support is, as an index (n,) from the centre."""
 
     log_mass: jax.Array
     mean: jax.Array
@@ -107,6 +112,8 @@ def summary(lattice: Lattice, angles: tuple[int, ...] = ()) -> Summary:
         two = jnp.sum(lax.slice_in_dim(values, 0, 2, axis=axis))
         two = two + jnp.sum(lax.slice_in_dim(values, lattice.sizes[axis] - 2, None, axis=axis)) if logs.shape[axis] > 3 else 0.0
         outer = outer + (jnp.where(closed[axis], 0.0, two) if angles else two)
+    if logs.ndim > 1 or angles:
+        outer = outer + _beside_nothing(values)
     mean = jnp.stack(first) / total
     if angles:
         mean, cov = _wrapped_moments(lattice, values / total, angles)
@@ -116,6 +123,18 @@ def summary(lattice: Lattice, angles: tuple[int, ...] = ()) -> Summary:
         cov = lattice.basis @ (weighted.T @ (index - mean)) @ lattice.basis.T
         mean = lattice.centre + lattice.basis @ mean
     return Summary(top + jnp.log(total) + lattice.log_volume(), mean, cov, outer / total, used[1:] / used[0])
+
+
+def _beside_nothing(values: jax.Array) -> jax.Array:
+    """The mass in cells that have a neighbour without any: where tails were cut, it must not matter."""
+    beside = jnp.zeros(values.shape, bool)
+    for axis in range(values.ndim):
+        inner = [slice(1, -1) if a == axis else slice(None) for a in range(values.ndim)]
+        left = lax.slice_in_dim(values, 0, values.shape[axis] - 2, axis=axis) == 0
+        right = lax.slice_in_dim(values, 2, values.shape[axis], axis=axis) == 0
+        if values.shape[axis] > 3:
+            beside = beside.at[tuple(inner)].max(left | right)
+    return jnp.sum(jnp.where(beside, values, 0.0))
 
 
 def _wrapped_moments(lattice: Lattice, weights: jax.Array, angles: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
@@ -208,20 +227,30 @@ def move_dense(
     sizes: tuple[int, ...],
     angles: tuple[int, ...] = (),
     images: int = 0,
+    sharpen: bool = False,
 ) -> tuple[Lattice, jax.Array]:
     """One interval for one or two states by sums over all pairs of points, onto a new lattice of `sizes`.
 
     `after(x)` is the logarithm that multiplies the density at the end; where it leaves mass decides the second lattice. Also
-    given is how much coarser the first was.
-    `angles` names the states that axes 0, 1, ... of the lattice are angles of; `images` is how many turns on either side the
-    kernel reaches.  Axis 0 of the lattice must then be parallel to the angle, and stays so.
+    given is how much coarser the first was, along each axis (n,).
+    `angles` names the states that axes 0, 1, ... of the lattice are angles of; `images` is how many turns beyond the
+    nearest the kernel reaches.  Axis 0 of the lattice must then be parallel to the angle, and stays so.
+
+    A kernel narrower than a cell cannot be summed.  With `sharpen`, a Gaussian of about a cell is taken out of the density, by a
+    Fourier transform on the lattice, and added to the kernel: exact for a density that the lattice resolves, but rounding then
+    leaves nothing of the tails below 1e-13 of the maximum.
     """
     n = len(sizes)
     gauged = lattice.log_values + before
     top = jnp.max(gauged)
     values = jnp.exp(gauged - top)
+    spread = flow.spread
+    if sharpen:
+        extra = added_variance(lattice, flow)
+        values = _sharpened(values, extra)
+        spread = spread + lattice.basis * extra @ lattice.basis.T
     # Whitened coordinates z = R i in which the kernel is a standard Gaussian and the source lattice is triangular.
-    factor = jnp.linalg.cholesky(flow.spread)
+    factor = jnp.linalg.cholesky(spread)
     frame, triangle = jnp.linalg.qr(jax.scipy.linalg.solve_triangular(factor, lattice.basis, lower=True))
     signs = jnp.where(jnp.diag(triangle) < 0, -1.0, 1.0)
     frame, triangle = frame * signs, triangle * signs[:, None]
@@ -230,7 +259,9 @@ def move_dense(
     to_offset = factor @ frame
     log_scale = top + jnp.linalg.slogdet(triangle)[1] - 0.5 * n * np.log(2 * np.pi) + moved.log_mass
     turns = [triangle @ jnp.linalg.solve(lattice.basis, 2 * jnp.pi * jnp.eye(n)[i]) for i in angles]
-    shifts = _image_shifts(turns, images, n)
+    # A turn of the first angle is along the first axis and is wrapped there; one of a second angle moves both coordinates.
+    turn = turns[0][0] if turns else None
+    shifts = [k * turns[1] for k in range(-images - 1, images + 2)] if len(turns) > 1 else [jnp.zeros(n)]
 
     def axes(low, spacing):
         return [low[d] + spacing[d] * jnp.arange(sizes[d]) for d in range(n)]
@@ -238,7 +269,9 @@ def move_dense(
     def evaluate(low, spacing):
         """The logarithm of the density, everything included, on the target lattice of whitened coordinates."""
         target = axes(low, spacing)
-        total = sum(_sum_axes(target, source, triangle, values, shift) for shift in shifts)
+        total = sum(_sum_axes(target, source, triangle, values, shift, turn, images) for shift in shifts)
+        if sharpen:
+            total = jnp.where(total > CUT * jnp.max(total), total, 0.0)
         offset = jnp.stack(jnp.meshgrid(*target, indexing="ij"), axis=-1) @ to_offset.T
         exponent = offset @ moved.tilt + jnp.einsum("...i,ij,...j->...", offset, flow.bend, offset)
         logs = log_scale + jnp.log(total) + exponent
@@ -279,24 +312,49 @@ def move_dense(
     half = low + fine * (jnp.array(sizes) // 2)
     basis = flow.map @ to_offset * fine
     target = Lattice(logs, moved.centre + flow.map @ to_offset @ half, basis)
-    return target, jnp.max(coarse / fine)
+    return target, coarse / fine
 
 
-def _image_shifts(turns: list[jax.Array], images: int, n: int) -> list[jax.Array]:
-    shifts = [jnp.zeros(n)]
-    for turn in turns:
-        shifts = [shift + k * turn for shift in shifts for k in range(-images, images + 1)]
-    return shifts
+def added_variance(lattice: Lattice, flow: Flow) -> jax.Array:
+    """The variances (n,), in cells, that make the kernel wide enough to be summed; zero where it is."""
+    kernel = jnp.sum(lattice.basis * (inverse(flow.spread) @ lattice.basis), axis=0)
+    return jnp.maximum(0.0, SUMMED - 1.0 / kernel)
 
 
-def _sum_axes(target, source, triangle, values, shift):
+def _sharpened(values: jax.Array, variances: jax.Array) -> jax.Array:
+    """Values on a lattice with Gaussians of these variances, in cells, taken out.
+
+    Frequencies above 0.8 of the highest, in which a density that the lattice resolves has nothing, are taken out too: the sum that
+    follows would fold their rounding errors back and let them grow from step to step.
+    """
+    factor = 1.0
+    for axis, size in enumerate(values.shape):
+        share = 2 * (np.fft.rfftfreq(size) if axis == values.ndim - 1 else np.fft.fftfreq(size))
+        passed = 0.5 * erfc((np.abs(share) - 0.8) / 0.04)
+        view = [-1 if a == axis else 1 for a in range(values.ndim)]
+        symbol = jnp.where(variances[axis] > 0, passed, 1.0) * jnp.exp(0.5 * variances[axis] * (np.pi * share) ** 2)
+        factor = factor * symbol.reshape(view)
+    return jnp.fft.irfftn(jnp.fft.rfftn(values) * factor, values.shape)
+
+
+def _sum_axes(target, source, triangle, values, shift, turn, images):
     """sum_i exp(-|z' - R i - shift|^2 / 2) values_i, one axis after the other; R is upper triangular."""
+
+    def kernel(distance):
+        if turn is None:
+            return jnp.exp(-0.5 * distance**2)
+        nearest = distance - turn * jnp.rint(distance / turn)
+        return sum(jnp.exp(-0.5 * (nearest + k * turn) ** 2) for k in range(-images, images + 1))
+
+    first = target[0] - shift[0]
     if values.ndim == 1:
-        return jnp.exp(-0.5 * (target[0][:, None] - shift[0] - source[:, 0]) ** 2) @ values
-    # A kernel matrix for each row of the source, laid out so that exp runs over contiguous numbers.
-    across = jnp.swapaxes(source[..., 0], 0, 1)[:, None, :]
-    kernels = jnp.exp(-0.5 * (target[0][None, :, None] - shift[0] - across) ** 2)
-    total = jnp.einsum("kji,ik->jk", kernels, values)
+        return kernel(first[:, None] - source[:, 0]) @ values
+    across = source[..., 0].T
+    if first.size * values.size <= _AT_ONCE:
+        # A kernel matrix for each row of the source, laid out so that exp runs over contiguous numbers.
+        total = jnp.einsum("kji,ik->jk", kernel(first[None, :, None] - across[:, None, :]), values)
+    else:
+        total = lax.map(lambda row: kernel(first[:, None] - row[0]) @ row[1], (across, values.T)).T
     size = values.shape[1]
     rows = (jnp.arange(size) - size // 2) * triangle[1, 1] + shift[1]
     return total @ jnp.exp(-0.5 * (target[1][:, None] - rows) ** 2).T
