@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from references.kolmogorov import Box, filter_system
-from references.systems import planar, scalar
 
 import zakai
+from references.kolmogorov import Box, filter_system
+from references.systems import planar, scalar
 
 
 def relative_error(result, reference, box, k):

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from zakai import _float64  # noqa: F401
 import jax.numpy as jnp
 import numpy as np
 
+from zakai import _float64  # noqa: F401
 from zakai.densities import GaussianMixture
 from zakai.errors import InputError
-from zakai.kolmogorov.lattice import FAR, REACH, SUPPORT, Lattice
+from zakai.kolmogorov.lattice import REACH, SUPPORT, Lattice
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior, GaussianPrior
@@ -36,8 +36,8 @@ MOST = {1: 8192, 2: 1024}
 class Plan:
     """How the next steps move the density; static, so that each plan is compiled once.
 
-    `banded` steps keep a window of `sizes` that moves along; the others choose a lattice of `sizes` each time. `window` and `cells`
-    say how generous the banded window and its cell are, `run` how many steps it is for.
+    `banded` steps keep a window of `sizes` that moves along; the others choose a lattice of `sizes` each time. `window` and
+    `cells` say how generous the banded window and its cell are, `run` how many steps it is for.
     """
 
     banded: bool
@@ -237,9 +237,10 @@ def adapted(
     if info is not None:
         if healthy(info, plan):
             return lattice, None
-        plan = _more(plan, info)
-        if plan is None:
+        better = _more(plan, info)
+        if better is None:
             return lattice, None
+        plan = better
     one_line = model.n == 1 and not plan.angles and maps.shape[1] == 1
     if one_line and lattice.log_values.size > 1:
         banded = _banded(lattice, plan, np.sqrt(spreads[:, 0, 0, 0]), np.abs(maps[:, 0, 0, 0]))

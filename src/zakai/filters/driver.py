@@ -8,12 +8,14 @@ from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from zakai import _float64  # noqa: F401
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zakai import _registry
+from zakai import (
+    _float64,  # noqa: F401
+    _registry,
+)
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.densities import Density
 from zakai.errors import ConditionError, InputError

@@ -1,8 +1,8 @@
 """The direct method for time-varying Yau systems, on a lattice.
 
 Chen, Luo and Yau (2017), Theorems 1 to 3, corrected and freed of Assumption 2: for f = L x + l + G grad phi and a quadratic
-q the gauge u = e^phi v makes the Kolmogorov equation linear-quadratic, and its kernel is applied exactly by the affine Hamiltonian
-flow (`zakai.kolmogorov.flow`).  What remains is a sum over a lattice, whose error is watched and kept below 1e-11.
+q the gauge u = e^phi v makes the Kolmogorov equation linear-quadratic, and its kernel is applied exactly by the affine
+Hamiltonian flow (`zakai.kolmogorov.flow`).  What remains is a sum over a lattice, whose error is watched and kept below 1e-11.
 
 Affine h with increments: y runs linearly between readings and the step is exact.  Nonlinear h: half of the observation's
 factor, the transition with -h'S^-1 h / 2 inside, the other half.  Samples: exact for every h.
@@ -10,17 +10,17 @@ factor, the transition with -h'S^-1 h / 2 inside, the other half.  Samples: exac
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
-from zakai import _float64  # noqa: F401
 import jax
 import jax.numpy as jnp
 import numpy as np
 import sympy as sp
 
+from zakai import _float64  # noqa: F401
 from zakai.algebra.theorems import limited_direct as theorem
 from zakai.algebra.theorems import yau_system
 from zakai.densities import GridDensity
@@ -45,8 +45,8 @@ from zakai.models.model import Model
 class State:
     """The normalised density on a lattice, and the static plan by which the next steps move it.
 
-    What the last step computed and the next one needs again is carried: h at the points, `observed`, an array for each coordinate, the
-    narrowest feature in `cells` (n,), and the `middle` of the support (n,), an index from the centre.
+    What the last step computed and the next one needs again is carried: h at the points, `observed`, an array for each coordinate,
+    the narrowest feature in `cells` (n,), and the `middle` of the support (n,), an index from the centre.
     """
 
     lattice: Lattice
@@ -201,7 +201,10 @@ def _series_flows(model: Model, starts: np.ndarray, stops: np.ndarray, whole: np
 
         def expand(points: np.ndarray, terms: int, q=q) -> TaylorData:
             form = yau.form
-            return taylor_data(model.t, model.covariance, form.matrix, form.offset, *q, points, terms, values)
+            matrix, linear, constant = q
+            return taylor_data(
+                model.t, model.covariance, form.matrix, form.offset, matrix, linear, constant, points, terms, values
+            )
 
         parts.append((rows, flow_of_kernel(power_series_kernels(expand, starts[rows], stops[rows], order))))
     back = np.argsort(np.concatenate([rows for rows, _ in parts]))
@@ -299,12 +302,12 @@ def _observed_at(system, lattice, time, theta):
     return system.observe(lattice.points(), time, theta)
 
 
-def _linear(weights: jax.Array, h: Sequence[jax.Array]) -> jax.Array:
+def _linear(weights: Any, h: Sequence[jax.Array]) -> Any:
     """weights . h, an elementwise sum that is fused with what follows."""
     return sum((weights[i] * values for i, values in enumerate(h)), start=jnp.zeros(()))
 
 
-def _log_factor(h: Sequence[jax.Array] | None, factor: Factors) -> jax.Array:
+def _log_factor(h: Sequence[jax.Array] | None, factor: Factors) -> Any:
     """log factor(x) = after . h - h'(energy) h / 2 + constant, with h an array for each coordinate of the observation."""
     if h is None:
         return factor.constant
@@ -364,6 +367,9 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
         if system.gauged:
             before = before - _potential(system, lattice.points(), times[part], interval.theta)
             exponent = jnp.maximum(exponent, lat.exponent_range(lattice.log_values, lattice.log_values + before))
+        def after(x, factor=factor, observe=observe):
+            return factor(x, observe(x))
+
         joint, need = _joint_cells(lattice, cells, flow, plan.sharpen, joint, need)
         if plan.banded:
             lattice = lat.move_banded(lattice, before, flow, observation.inputs, plan.taps)
@@ -376,7 +382,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
                 before,
                 flow,
                 observation.inputs,
-                lambda x, factor=factor, observe=observe: factor(x, observe(x)),
+                after,
                 plan.sizes,
                 plan.angles,
                 plan.images,

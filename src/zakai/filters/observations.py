@@ -35,7 +35,9 @@ class Data(NamedTuple):
 
 class Factors(NamedTuple):
     """What multiplies the density, for K intervals: `before` (K, m) at the start, `after` (K, m), `energy` (K, m, m), or None
-    where it is zero throughout, and `constant` (K,) at the end, and the rates `inputs` (K, 1 + k) that act inside, the first of them one."""
+    where it is zero throughout, and `constant` (K,) at the end, and the rates `inputs` (K, 1 + k) that act
+    inside, the first of them one.
+    """
 
     before: np.ndarray
     after: np.ndarray
@@ -96,9 +98,9 @@ def factors(model: Model, data: Data, schedule: Schedule, *, rates: bool, splitt
     noise = numpy_function(model.observation_noise, model, model.observation_noise.shape)
     origin, theta = np.zeros(model.n), model.theta()
     noise_end = np.broadcast_to(noise(origin, data.stops, theta), (count, m, m))
-    seen = ~np.isnan(data.values)
+    seen = np.logical_not(np.isnan(data.values))
     inside = schedule.inside
-    whole = inside.all(axis=1)
+    whole: np.ndarray = inside.all(axis=1)
     values = np.where(seen, data.values, 0.0)
     lengths = data.stops - data.starts
     if rates:

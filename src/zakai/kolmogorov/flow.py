@@ -26,16 +26,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from zakai import _float64  # noqa: F401
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zakai import _float64  # noqa: F401
+
 STAGES = 8
 TOLERANCE = 1e-13
 MOST_SUBSTEPS = 4096
+
+
+# Prepared flows are held as NumPy arrays and traced as JAX arrays.
+Array = Any
 
 
 class Coefficients(NamedTuple):
@@ -44,12 +49,12 @@ class Coefficients(NamedTuple):
     `matrix` is L (n, n), `offset` l (n, k), `covariance` G (n, n), `quadratic` Q (n, n), `linear` p (n, k), `constant` r (k,).
     """
 
-    matrix: jax.Array
-    offset: jax.Array
-    covariance: jax.Array
-    quadratic: jax.Array
-    linear: jax.Array
-    constant: jax.Array
+    matrix: Array
+    offset: Array
+    covariance: Array
+    quadratic: Array
+    linear: Array
+    constant: Array
 
 
 class Flow(NamedTuple):
@@ -60,25 +65,25 @@ class Flow(NamedTuple):
     `growth` (k,) the integral of r, `trace` that of tr L / 2, and `log_volume` log |det P11|.
     """
 
-    map: jax.Array
-    spread: jax.Array
-    bend: jax.Array
-    lift: jax.Array
-    shift: jax.Array
-    push: jax.Array
-    action: jax.Array
-    action_inputs: jax.Array
-    growth: jax.Array
-    trace: jax.Array
-    log_volume: jax.Array
+    map: Array
+    spread: Array
+    bend: Array
+    lift: Array
+    shift: Array
+    push: Array
+    action: Array
+    action_inputs: Array
+    growth: Array
+    trace: Array
+    log_volume: Array
 
 
 class Motion(NamedTuple):
     """Equation (2) for one interval and one centre: v(t1, `centre` + map xi) = exp(`log_mass` + `tilt`.xi + xi'bend xi) ..."""
 
-    centre: jax.Array
-    tilt: jax.Array
-    log_mass: jax.Array
+    centre: Array
+    tilt: Array
+    log_mass: Array
 
 
 def motion(flow: Flow, centre: jax.Array, inputs: jax.Array) -> Motion:
@@ -196,10 +201,10 @@ def _integrate_all(coefficients, starts, stops, arguments, substeps):
 
 
 def flows(
-    coefficients: Callable[[jax.Array, object], Coefficients],
+    coefficients: Callable[[jax.Array, Any], Coefficients],
     starts: np.ndarray,
     stops: np.ndarray,
-    arguments: object,
+    arguments: Any,
     tolerance: float = TOLERANCE,
 ) -> Flow:
     """The flows over all intervals [starts_i, stops_i] at once, accurate to `tolerance`.

@@ -19,14 +19,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from zakai import _float64  # noqa: F401
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from scipy.special import erfc
 
-from zakai.kolmogorov.flow import Flow, motion
+from zakai import _float64  # noqa: F401
+from zakai.kolmogorov.flow import Array, Flow, motion
 
 REACH = 8.5  # standard deviations after which a Gaussian is zero in double precision
 FAR = 12.0  # how far `move_dense` looks around the source: an observation may contradict it
@@ -85,7 +85,9 @@ def _indices(sizes: tuple[int, ...]) -> np.ndarray:
 
 class Summary(NamedTuple):
     """Of a density on a lattice: `log_mass`, `mean` and `cov` (n,) and (n, n) of its points, the share of the mass in the two
-    outermost layers of cells and beside cells that hold nothing (`edge_mass`), and where the middle of its support is, as an index (n,) from the centre."""
+    outermost layers of cells and beside cells that hold nothing (`edge_mass`), and where the middle of its support is, as an index
+    (n,) from the centre.
+    """
 
     log_mass: jax.Array
     mean: jax.Array
@@ -107,10 +109,12 @@ def summary(lattice: Lattice, angles: tuple[int, ...] = ()) -> Summary:
     total, *first = values.ravel() @ columns
     used = (logs > top - SUPPORT).astype(float).ravel() @ columns
     closed = closed_axes(lattice, angles)
-    outer = 0.0
+    outer = jnp.zeros(())
     for axis in range(logs.ndim):
-        two = jnp.sum(lax.slice_in_dim(values, 0, 2, axis=axis))
-        two = two + jnp.sum(lax.slice_in_dim(values, lattice.sizes[axis] - 2, None, axis=axis)) if logs.shape[axis] > 3 else 0.0
+        two = jnp.sum(lax.slice_in_dim(values, 0, min(2, lattice.sizes[axis]), axis=axis))
+        two = two + jnp.sum(lax.slice_in_dim(values, max(lattice.sizes[axis] - 2, 0), None, axis=axis))
+        if lattice.sizes[axis] < 4:  # a point mass has no edge
+            continue
         outer = outer + (jnp.where(closed[axis], 0.0, two) if angles else two)
     if logs.ndim > 1 or angles:
         outer = outer + _beside_nothing(values)
@@ -184,7 +188,7 @@ def slid(values: jax.Array, shift: jax.Array, fill: float) -> jax.Array:
 
 
 def move_banded(
-    lattice: Lattice, before: jax.Array, flow: Flow, inputs: jax.Array, taps: int
+    lattice: Lattice, before: jax.Array, flow: Flow, inputs: Array, taps: int
 ) -> Lattice:
     """One interval for one state by a filter of 2 `taps` + 1 cells, which must reach `REACH` kernel deviations.
 
@@ -222,7 +226,7 @@ def move_dense(
     lattice: Lattice,
     before: jax.Array,
     flow: Flow,
-    inputs: jax.Array,
+    inputs: Array,
     after: LogFunction,
     sizes: tuple[int, ...],
     angles: tuple[int, ...] = (),
@@ -324,10 +328,10 @@ def added_variance(lattice: Lattice, flow: Flow) -> jax.Array:
 def _sharpened(values: jax.Array, variances: jax.Array) -> jax.Array:
     """Values on a lattice with Gaussians of these variances, in cells, taken out.
 
-    Frequencies above 0.8 of the highest, in which a density that the lattice resolves has nothing, are taken out too: the sum that
-    follows would fold their rounding errors back and let them grow from step to step.
+    Frequencies above 0.8 of the highest, in which a density that the lattice resolves has nothing, are taken out too: the
+    sum that follows would fold their rounding errors back and let them grow from step to step.
     """
-    factor = 1.0
+    factor = jnp.ones(())
     for axis, size in enumerate(values.shape):
         share = 2 * (np.fft.rfftfreq(size) if axis == values.ndim - 1 else np.fft.fftfreq(size))
         passed = 0.5 * erfc((np.abs(share) - 0.8) / 0.04)

@@ -1,7 +1,7 @@
 """The flow that belongs to a kernel given by its coefficients, such as those of the power series.
 
-A kernel exp(x'A x + x'B y + y'C y + D.x + E.y + s) is the exponential of the classical action of an affine Hamiltonian flow, which
-it determines: B = -2 P12^-T, C = P12^-1 P11, A = P22 P12^-1, and the shifts from D and E.
+A kernel exp(x'A x + x'B y + y'C y + D.x + E.y + s) is the exponential of the classical action of an affine Hamiltonian flow,
+which it determines: B = -2 P12^-T, C = P12^-1 P11, A = P22 P12^-1, and the shifts from D and E.
 """
 
 from __future__ import annotations
