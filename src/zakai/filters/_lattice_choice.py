@@ -42,11 +42,11 @@ class Plan:
 
     banded: bool
     sizes: tuple[int, ...]
-    taps: int = 32
+    taps: int = 16
     angles: tuple[int, ...] = ()
     images: int = 0
     sharpen: bool = False
-    window: float = 1.3
+    window: float = 1.08
     cells: float = CELLS
     run: int = 256
 
@@ -57,13 +57,11 @@ class Plan:
 
 
 def rounded_up(size: float) -> int:
-    """The next number of the form 2^k or 3 2^k, from 64: few shapes, few compilations."""
+    """The next number of the form 2^k (1 + j/4), from 64: few shapes, few compilations."""
     power = 64
-    while power < size:
-        if 1.5 * power >= size:
-            return power * 3 // 2
+    while 2 * power < size:
         power *= 2
-    return power
+    return next(power * (4 + j) // 4 for j in range(5) if power * (4 + j) // 4 >= size or j == 4)
 
 
 def features(logs: np.ndarray) -> np.ndarray:
@@ -79,6 +77,12 @@ def features(logs: np.ndarray) -> np.ndarray:
         used = (moved[1:-1] > logs.max() - 14.0) & np.isfinite(curvature)
         out.append(1 / np.sqrt(max(curvature[used].max(initial=0.0), 1e-12)))
     return np.array(out)
+
+
+def middle(logs: np.ndarray) -> np.ndarray:
+    """Where the middle of the support is, as an index (n,) from the centre."""
+    used = np.argwhere(logs > logs.max() - SUPPORT)
+    return used.mean(axis=0) - np.array(logs.shape) // 2
 
 
 def first_plan(model: Model) -> Plan:
@@ -310,10 +314,10 @@ def _banded(lattice: Lattice, plan: Plan, deviation: np.ndarray, maps: np.ndarra
     growth = np.concatenate([[1.0], np.cumprod(maps)])[: len(deviation)] / deviation
     widest = min(COARSEST / growth.max(), features(logs)[0] * cell / plan.cells)
     new_cell = cell if 0.8 * widest <= cell <= widest else 0.97 * widest
-    taps = 32
+    taps = 16
     while taps * new_cell * growth.min() < REACH:
-        taps = taps * 3 // 2
-    used = np.flatnonzero(logs > logs.max() - SUPPORT)
+        taps *= 2
+    used = np.flatnonzero(logs > logs.max() + np.log(0.1 * EDGE))
     span = (used[-1] - used[0] + 1) * cell
     size = rounded_up(plan.window * span / new_cell + 8)
     if plan.banded and plan.sizes[0] >= size >= 0.6 * plan.sizes[0]:

@@ -151,7 +151,7 @@ def _prepared(method: Method, model: Model, schedule: Any, options: Mapping[str,
 def _scan(step, state, intervals, observations, keep):
     def one(carry, slices):
         new, info = step(slices[0], carry, slices[1])
-        return new, (info, new if keep else None)
+        return new, (info, getattr(new, "kept", new) if keep else None)
 
     slices = (intervals, observations)
     head = jax.tree.map(lambda a: a[0], slices)
@@ -225,7 +225,7 @@ class _Run:
 
     def _keep_one(self, prepared: Any, state: Any, index: int) -> None:
         if self.keep:
-            self.states.append((index, prepared, jax.tree.map(lambda a: np.asarray(a)[None], state)))
+            self.states.append((index, prepared, jax.tree.map(lambda a: np.asarray(a)[None], getattr(state, "kept", state))))
 
     def _run(self, prepared: Any, state: Any, observations: Any, first: int, rows: slice) -> Any:
         """A run of steps from one look at the lattice to the next, tried until its health is good."""

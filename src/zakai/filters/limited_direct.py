@@ -56,6 +56,11 @@ class State:
     plan: choice.Plan
 
     @property
+    def kept(self) -> State:
+        """What a result keeps of the state."""
+        return replace(self, observed=None)
+
+    @property
     def run_length(self) -> int:
         """How many steps to take before the lattice is looked at again."""
         return self.plan.run
@@ -287,12 +292,11 @@ def _start(prepared, prior, observation):
 def _looked_at(prepared: Prepared, lattice: Lattice, plan: choice.Plan, time: float) -> State:
     """A state from a lattice that was chosen outside of a step."""
     system = prepared.system
-    summary = lat.summary(lattice, plan.angles)
     return State(
         lattice,
         _observed_at(system, lattice, time, prepared.model.theta()) if system.halves else None,
         choice.features(np.asarray(lattice.log_values)),
-        np.asarray(summary.middle),
+        choice.middle(np.asarray(lattice.log_values)),
         plan,
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -134,6 +135,7 @@ def load_result(path: str | os.PathLike[str]) -> FilterResult:
     )
 
 
+@lru_cache(maxsize=1)
 def versions() -> dict[str, str]:
     """The versions of what computed a result."""
     return {f"version_{name}": version(name) for name in ("zakai", "jax", "numpy", "sympy")}
