@@ -2,8 +2,8 @@
 
     python benchmarks/spiral_sensor.py [--observations 1000] [--repeats 15]
 
-Everything in a call is counted.  The median of the repeats is printed, and as JSON what was measured.  Pin the process to one core
-(`taskset -c 0`) for the time on one core.  Expected on one core of a quiet machine: at most 30 microseconds an observation.
+Everything in a call is counted.  The median of the repeats is printed, and as JSON what was measured.  Pin the process to one
+core (`taskset -c 0`) for the time on one core.  Expected on one core of a quiet machine: at most 30 microseconds an observation.
 """
 
 from __future__ import annotations

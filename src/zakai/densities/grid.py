@@ -13,7 +13,7 @@ from zakai.densities._density import coordinate_numbers, generator, probabilitie
 _BLOCK = 4_000_000  # numbers held at once while a density is interpolated
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GridDensity:
     """A density by its `log_values` on the lattice x = `centre` + `basis` (i - size // 2), i the index (n,).
 
@@ -27,6 +27,10 @@ class GridDensity:
     basis: np.ndarray
     names: tuple[str, ...]
     periodic: tuple[bool, ...]
+
+    def __repr__(self) -> str:
+        size = " x ".join(map(str, self.log_values.shape))
+        return f"GridDensity({', '.join(self.names)}: {size} points, mean {self.mean().tolist()})"
 
     @cached_property
     def points(self) -> np.ndarray:
@@ -106,7 +110,9 @@ class GridDensity:
     def mean(self) -> np.ndarray:
         flat = self.points.reshape(-1, len(self.names))
         weights = self.weights.ravel()
-        circular = np.angle(weights @ np.exp(1j * np.where(self.periodic, flat, 0.0)))
+        resultant = weights @ np.exp(1j * np.where(self.periodic, flat, 0.0))
+        # Of an angle that could be anything, rounding would make up a direction.
+        circular = np.where(np.abs(resultant) < 1e-9, 0.0, np.angle(resultant))
         return np.where(self.periodic, circular, weights @ flat)
 
     def cov(self) -> np.ndarray:

@@ -57,6 +57,9 @@ def filter(
         result = zakai.filter(model, record)
         result.mean[-1], result.density(-1).quantile([0.025, 0.975])
     """
+    for given, kind, how in ((model, Model, "zakai.load_model"), (record, Record, "zakai.read_record")):
+        if not isinstance(given, kind):
+            raise InputError(f"filter: expected a {kind.__name__}, got a {type(given).__name__}; {how} reads one from a file")
     return _filter(model, record, model.prior, method, keep, progress, options)
 
 
@@ -183,6 +186,7 @@ class _Run:
         self.model, self.record, self.prior, self.method, self.options = model, record, prior, method, options
         self.data = data_of(model, record)
         self.infos: list[Info] = []
+        self.notes: dict[str, None] = {}
         self.states: list[tuple[int, Any, Any]] = []
         self.keep, self.must_keep = keep != "moments", keep == "densities"
         self.bytes = 0
@@ -199,6 +203,7 @@ class _Run:
             data = self.data.part(rows)
             schedule = schedule_of(data, True)
             prepared = _prepared(self.method, self.model, schedule, self.options)
+            self.notes.update(dict.fromkeys(getattr(prepared, "notes", ())))
             observations = self.method.observations(prepared, data)
             while self.done < rows.stop:
                 state = self._run(prepared, state, observations, self.done - rows.start, rows)
@@ -310,7 +315,7 @@ class _Run:
                 else 'the densities were not kept; keep="densities" keeps them'
             ),
         )
-        result.warnings.extend(_warnings(result))
+        result.warnings.extend([*self.notes, *_warnings(result)])
         return result
 
     def density(self, index: int) -> Density:

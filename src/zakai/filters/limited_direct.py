@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +37,9 @@ from zakai.kolmogorov.series_flow import flow_of_kernel
 from zakai.models.compile import jax_field, jax_function
 from zakai.models.model import Model
 
+# How deep, in units of the logarithm, the tails are kept: where they are cut at 1e-13, and where only rounding ends them.
+_HELD_CUT, _HELD = 28.0, 60.0
+
 
 @partial(
     jax.tree_util.register_dataclass, data_fields=["lattice", "observed", "cells", "middle"], meta_fields=["plan"]
@@ -45,8 +48,8 @@ from zakai.models.model import Model
 class State:
     """The normalised density on a lattice, and the static plan by which the next steps move it.
 
-    What the last step computed and the next one needs again is carried: h at the points, `observed`, an array for each coordinate,
-    the narrowest feature in `cells` (n,), and the `middle` of the support (n,), an index from the centre.
+    What the last step computed and the next one needs again is carried: h at the points, `observed`, an array for each
+    coordinate, the narrowest feature in `cells` (n,), and the `middle` of the support (n,), an index from the centre.
     """
 
     lattice: Lattice
@@ -75,6 +78,17 @@ class Prepared:
     schedule: Schedule
     splitting: str
     intervals: Interval
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Where the method is not exact in its class, for the warnings of a result."""
+        gaps = not self.schedule.inside.all() and self.model.observation_kind != "samples"
+        if self.system.bare or not gaps:
+            return ()
+        return (
+            "where readings are missing the transition without the observation's potential is not linear-quadratic: its "
+            "potential is kept inside and taken out again at the end, which is exact only as the intervals shrink",
+        )
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["start", "stop", "flow", "theta"], meta_fields=["system"])
@@ -172,6 +186,8 @@ def prepare(
     if splitting not in ("strang", "lie"):
         raise InputError(f'option splitting: "{splitting}" is neither "strang" nor "lie"')
     series = kernel == "power-series"
+    if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1 or not series):
+        raise InputError(f'option order: {order!r} must be a whole number from 1, and needs kernel="power-series"')
     # The series knows no inputs, and the papers' order of the factors has none.
     system = _system(formulas(model), not series and splitting == "strang", splitting)
     which, first = _distinct(system, schedule)
@@ -267,8 +283,15 @@ def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State
     """The prior after an observation at the start itself."""
     state, log_mass = _start(prepared, prior, observation)
     summary = lat.summary(state.lattice, state.plan.angles)
-    nothing = jnp.array(0.0)
-    return state, _info(summary, log_mass, state.cells, nothing, nothing, choice.CELLS / state.cells)
+    zero = jnp.array(0.0)
+    health = {
+        "edge_mass": summary.edge_mass,
+        "resolution": jnp.min(state.cells),
+        "quadrature_error": zero,
+        "exponent": zero,
+        "surprise": zero,
+    }
+    return state, Info(log_mass, summary.mean, summary.cov, health, choice.CELLS / state.cells)
 
 
 def _start(prepared, prior, observation):
@@ -350,61 +373,95 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
         observed = jax.tree.map(lambda h: lat.slid(h, shift, 0.0), observed)
     parts = interval.flow.map.shape[0]
     times = interval.start + (interval.stop - interval.start) * jnp.arange(parts + 1) / parts
-    # Readings that act as rates leave nothing to multiply with at the end.
-    observed_at_end = not system.rates or observation.energy is not None
-    log_mass, exponent = jnp.array(0.0), jnp.array(0.0)
-    joint, first_look, need = jnp.array(jnp.inf), jnp.ones(len(lattice.sizes)), jnp.zeros(len(lattice.sizes))
-    for part in range(parts):
-        flow = jax.tree.map(lambda a, part=part: a[part], interval.flow)
-        last = part == parts - 1
+    slices = (interval.flow, times[:-1], times[1:])
+    zero, n = jnp.array(0.0), len(lattice.sizes)
+    worst = _Worst(zero, jnp.array(jnp.inf), jnp.ones(n), jnp.zeros(n), zero)
+    carry = (lattice, cells, observed, zero, worst)
 
-        def factor(x, h, t=times[part + 1], last=last):
-            value = _potential(system, x, t, interval.theta) if system.gauged else jnp.zeros(x.shape[:-1])
-            return value + _log_factor(h, observation) if last else value
+    def inner(carry, slices):
+        return _part(system, plan, interval.theta, observation, carry, slices, False, False)[0], None
 
-        def observe(x, t=times[part + 1], last=last):
-            return system.observe(x, t, interval.theta) if last and (system.halves or observed_at_end) else None
+    def at(k):
+        return jax.tree.map(lambda a: a[k], slices)
 
-        before = jnp.zeros(lattice.sizes)
-        if part == 0 and observed is not None:
-            before = _linear(observation.before, observed)
-        if system.gauged:
-            before = before - _potential(system, lattice.points(), times[part], interval.theta)
-            exponent = jnp.maximum(exponent, lat.exponent_range(lattice.log_values, lattice.log_values + before))
-        def after(x, factor=factor, observe=observe):
-            return factor(x, observe(x))
-
-        joint, need = _joint_cells(lattice, cells, flow, plan.sharpen, joint, need)
-        if plan.banded:
-            lattice = lat.move_banded(lattice, before, flow, observation.inputs, plan.taps)
-            points = lattice.points()
-            observed = observe(points)
-            lattice = lattice._replace(log_values=lattice.log_values + factor(points, observed))
-        else:
-            lattice, coarseness = lat.move_dense(
-                lattice,
-                before,
-                flow,
-                observation.inputs,
-                after,
-                plan.sizes,
-                plan.angles,
-                plan.images,
-                plan.sharpen,
-            )
-            first_look = jnp.maximum(first_look, coarseness)
-            observed = observe(lattice.points()) if system.halves else None
-        summary = lat.summary(lattice, plan.angles)
-        lattice = lattice._replace(log_values=lattice.log_values - summary.log_mass)
-        cells = lat.features(lattice)
-        log_mass = log_mass + summary.log_mass
+    carry, summary = _part(system, plan, interval.theta, observation, carry, at(0), True, parts == 1)
+    if parts > 2:
+        carry, _ = jax.lax.scan(inner, carry, jax.tree.map(lambda a: a[1:-1], slices))
+    if parts > 1:
+        carry, summary = _part(system, plan, interval.theta, observation, carry, at(parts - 1), False, True)
+    lattice, cells, observed, log_mass, worst = carry
     # A feature that the first look, over everything that could be reached, may have stepped over counts as unresolved.
-    resolution = cells * jnp.minimum(1.0, 4.0 / first_look)
-    quadrature_error = 2 * jnp.exp(-2 * jnp.pi**2 * joint**2)
-    need = jnp.maximum(need, plan.needed / resolution)
-    info = _info(summary, log_mass, resolution, quadrature_error, exponent, need)
+    resolution = cells * jnp.minimum(1.0, 4.0 / worst.first_look)
+    health = {
+        "edge_mass": summary.edge_mass,
+        "resolution": jnp.min(resolution),
+        "quadrature_error": 2 * jnp.exp(-2 * jnp.pi**2 * worst.joint**2),
+        "exponent": worst.exponent,
+        "surprise": worst.surprise,
+    }
+    need = jnp.maximum(worst.need, plan.needed / resolution)
     kept = observed if system.halves else None
-    return State(lattice, kept, cells, summary.middle, plan), info
+    return State(lattice, kept, cells, summary.middle, plan), Info(log_mass, summary.mean, summary.cov, health, need)
+
+
+class _Worst(NamedTuple):
+    """The worst cases over the parts of an interval: see the health figures of `METHOD.bounds`."""
+
+    exponent: jax.Array
+    joint: jax.Array
+    first_look: jax.Array
+    need: jax.Array
+    surprise: jax.Array
+
+
+def _part(system, plan, theta, observation, carry, slices, first: bool, last: bool):
+    """One part of an interval; the halves of the observation's factor stand at the `first` and the `last`."""
+    lattice, cells, observed, log_mass, worst = carry
+    flow, start, stop = slices
+    # Readings that act as rates leave nothing to multiply with at the end.
+    needs_h = last and (system.halves or not system.rates or observation.energy is not None)
+
+    def observe(x):
+        return system.observe(x, stop, theta) if needs_h else None
+
+    def factor(x, h):
+        value = _potential(system, x, stop, theta) if system.gauged else jnp.zeros(x.shape[:-1])
+        return value + _log_factor(h, observation) if last else value
+
+    before = jnp.zeros(lattice.sizes)
+    if first and observed is not None:
+        before = _linear(observation.before, observed)
+    exponent = worst.exponent
+    if system.gauged:
+        before = before - _potential(system, lattice.points(), start, theta)
+        exponent = jnp.maximum(exponent, lat.exponent_range(lattice.log_values, lattice.log_values + before))
+    joint, need = _joint_cells(lattice, cells, flow, plan.sharpen, worst.joint, worst.need)
+    first_look, held = worst.first_look, _HELD_CUT
+    if plan.banded:
+        lattice, spread = lat.move_banded(lattice, before, flow, observation.inputs, plan.taps)
+        points = lattice.points()
+        observed = observe(points)
+        lattice = lattice._replace(log_values=lattice.log_values + factor(points, observed))
+    else:
+        lattice, coarseness, spread = lat.move_dense(
+            lattice,
+            before,
+            flow,
+            observation.inputs,
+            lambda x: factor(x, observe(x)),
+            plan.sizes,
+            plan.angles,
+            plan.images,
+            plan.sharpen,
+        )
+        first_look = jnp.maximum(first_look, coarseness)
+        observed = observe(lattice.points()) if system.halves and last else None
+        held = _HELD_CUT if plan.sharpen else _HELD
+    surprise = jnp.maximum(worst.surprise, lat.reach(lattice, spread) / held)
+    summary = lat.summary(lattice, plan.angles)
+    lattice = lattice._replace(log_values=lattice.log_values - summary.log_mass)
+    worst = _Worst(exponent, joint, first_look, need, surprise)
+    return (lattice, lat.features(lattice), observed, log_mass + summary.log_mass, worst), summary
 
 
 def _potential(system, x, t, theta):
@@ -424,16 +481,6 @@ def _joint_cells(lattice: Lattice, own: jax.Array, flow: Flow, sharpen: bool, jo
     # An axis of one point holds a mass without width, for which there is nothing to resolve.
     cells = jnp.where(jnp.array(lattice.sizes) > 1, jax.lax.rsqrt(1.0 / own**2 + kernel), jnp.inf)
     return jnp.minimum(joint, jnp.min(cells)), jnp.maximum(need, choice.JOINT / cells)
-
-
-def _info(summary: lat.Summary, log_mass, resolution, quadrature_error, exponent, need) -> Info:
-    health = {
-        "edge_mass": summary.edge_mass,
-        "resolution": jnp.min(resolution),
-        "quadrature_error": quadrature_error,
-        "exponent": exponent,
-    }
-    return Info(log_mass, summary.mean, summary.cov, health, need)
 
 
 def density(prepared: Prepared, state: State) -> GridDensity:
@@ -467,5 +514,6 @@ METHOD = Method(
         "edge_mass": (1e-9, "probability in the outermost cells of the window"),
         "quadrature_error": (1e-9, "error of a lattice sum that replaces an integral"),
         "exponent": (600.0, "largest exponent of the gauge over the window; beyond 700 mass would be lost"),
+        "surprise": (1.0, "how far into its tails the observation drives the density, as a share of the tails that were kept"),
     },
 )

@@ -100,7 +100,7 @@ def factors(model: Model, data: Data, schedule: Schedule, *, rates: bool, splitt
     noise_end = np.broadcast_to(noise(origin, data.stops, theta), (count, m, m))
     seen = np.logical_not(np.isnan(data.values))
     inside = schedule.inside
-    whole: np.ndarray = inside.all(axis=1)
+    whole = np.asarray(inside.all(axis=1))
     values = np.where(seen, data.values, 0.0)
     lengths = data.stops - data.starts
     if rates:

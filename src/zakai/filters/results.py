@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _LARGEST_COV = 32
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class FilterResult:
     """The posterior at every time of a record.
 
@@ -50,6 +50,12 @@ class FilterResult:
     _density: Callable[[int], Density] | None = None
     _no_density: str = "the densities were not kept"
 
+    def __repr__(self) -> str:
+        return (
+            f"FilterResult({self.method}, {len(self.times) - 1} observations of {', '.join(self.state)}, "
+            f"log-likelihood {self.log_likelihood:.6g}, {len(self.warnings)} warnings)"
+        )
+
     @property
     def variance(self) -> np.ndarray:
         """The variances of the coordinates (K+1, n)."""
@@ -73,8 +79,8 @@ class FilterResult:
         if self._density is None:
             raise InputError(self._no_density)
         count = len(self.times)
-        if not -count <= k < count:
-            raise InputError(f"density: there is no time number {k}; numbers run from 0 to {count - 1}")
+        if not isinstance(k, int | np.integer) or not -count <= k < count:
+            raise InputError(f"density: there is no time number {k!r}; numbers run from 0 to {count - 1}")
         return self._density(k % count)
 
     def to_dataset(self) -> xarray.Dataset:

@@ -85,8 +85,8 @@ def _indices(sizes: tuple[int, ...]) -> np.ndarray:
 
 class Summary(NamedTuple):
     """Of a density on a lattice: `log_mass`, `mean` and `cov` (n,) and (n, n) of its points, the share of the mass in the two
-    outermost layers of cells and beside cells that hold nothing (`edge_mass`), and where the middle of its support is, as an index
-    (n,) from the centre.
+    outermost layers of cells and beside cells that hold nothing (`edge_mass`), and where the middle of its support is, as an
+    index (n,) from the centre.
     """
 
     log_mass: jax.Array
@@ -146,7 +146,9 @@ def _wrapped_moments(lattice: Lattice, weights: jax.Array, angles: tuple[int, ..
     weights = weights.ravel()
     at = jnp.array(angles)
     circular = jnp.arctan2(weights @ jnp.sin(points[:, at]), weights @ jnp.cos(points[:, at]))
-    mean = (weights @ points).at[at].set(circular)
+    # Of an angle that could be anything, rounding would make up a direction.
+    undirected = weights @ jnp.cos(points[:, at] - circular) < 1e-9
+    mean = (weights @ points).at[at].set(jnp.where(undirected, 0.0, circular))
     deviation = points - mean
     deviation = deviation.at[:, at].set(jnp.pi - jnp.mod(jnp.pi - deviation[:, at], 2 * jnp.pi))
     return mean, (weights[:, None] * deviation).T @ deviation
@@ -189,10 +191,11 @@ def slid(values: jax.Array, shift: jax.Array, fill: float) -> jax.Array:
 
 def move_banded(
     lattice: Lattice, before: jax.Array, flow: Flow, inputs: Array, taps: int
-) -> Lattice:
+) -> tuple[Lattice, jax.Array]:
     """One interval for one state by a filter of 2 `taps` + 1 cells, which must reach `REACH` kernel deviations.
 
-    `before` (size,) is the logarithm that multiplies the density at the start.
+    `before` (size,) is the logarithm that multiplies the density at the start. Also given is the logarithm of what was only
+    spread, up to a constant: `reach` needs it.
     """
     gauged = lattice.log_values + before
     top = jnp.max(gauged)
@@ -212,14 +215,22 @@ def move_banded(
         total = jnp.maximum(jnp.convolve(values, both, mode="full")[taps : taps + size], 0.0)
     moved = motion(flow, lattice.centre, inputs)
     offset = cell * _indices((size,))[:, 0]
+    spread = jnp.log(total)
     logs = (
         top
-        + jnp.log(total)
+        + spread
         + 0.5 * jnp.log(cell**2 / (2 * jnp.pi * variance))
         + moved.log_mass
         + offset * (moved.tilt[0] + offset * flow.bend[0, 0])
     )
-    return Lattice(logs, moved.centre, flow.map @ lattice.basis)
+    return Lattice(logs, moved.centre, flow.map @ lattice.basis), spread
+
+
+def reach(lattice: Lattice, spread: jax.Array) -> jax.Array:
+    """How deep in the tails of what was only spread, in units of the logarithm, the mass lies now, on average."""
+    values = jnp.exp(lattice.log_values - jnp.max(lattice.log_values))
+    depth = jnp.where(values > 0, jnp.max(spread) - spread, 0.0)
+    return (depth.ravel() @ values.ravel()) / jnp.sum(values)
 
 
 def move_dense(
@@ -232,11 +243,11 @@ def move_dense(
     angles: tuple[int, ...] = (),
     images: int = 0,
     sharpen: bool = False,
-) -> tuple[Lattice, jax.Array]:
+) -> tuple[Lattice, jax.Array, jax.Array]:
     """One interval for one or two states by sums over all pairs of points, onto a new lattice of `sizes`.
 
     `after(x)` is the logarithm that multiplies the density at the end; where it leaves mass decides the second lattice. Also
-    given is how much coarser the first was, along each axis (n,).
+    given is how much coarser the first was, along each axis (n,), and the logarithm of what was only spread, for `reach`.
     `angles` names the states that axes 0, 1, ... of the lattice are angles of; `images` is how many turns beyond the
     nearest the kernel reaches.  Axis 0 of the lattice must then be parallel to the angle, and stays so.
 
@@ -248,13 +259,13 @@ def move_dense(
     gauged = lattice.log_values + before
     top = jnp.max(gauged)
     values = jnp.exp(gauged - top)
-    spread = flow.spread
+    covariance = flow.spread
     if sharpen:
         extra = added_variance(lattice, flow)
         values = _sharpened(values, extra)
-        spread = spread + lattice.basis * extra @ lattice.basis.T
+        covariance = covariance + lattice.basis * extra @ lattice.basis.T
     # Whitened coordinates z = R i in which the kernel is a standard Gaussian and the source lattice is triangular.
-    factor = jnp.linalg.cholesky(spread)
+    factor = jnp.linalg.cholesky(covariance)
     frame, triangle = jnp.linalg.qr(jax.scipy.linalg.solve_triangular(factor, lattice.basis, lower=True))
     signs = jnp.where(jnp.diag(triangle) < 0, -1.0, 1.0)
     frame, triangle = frame * signs, triangle * signs[:, None]
@@ -279,7 +290,7 @@ def move_dense(
         offset = jnp.stack(jnp.meshgrid(*target, indexing="ij"), axis=-1) @ to_offset.T
         exponent = offset @ moved.tilt + jnp.einsum("...i,ij,...j->...", offset, flow.bend, offset)
         logs = log_scale + jnp.log(total) + exponent
-        return logs + after(moved.centre + offset @ flow.map.T)
+        return logs + after(moved.centre + offset @ flow.map.T), jnp.log(total)
 
     def lattice_over(low, high, closed):
         """The start and the spacing of a target lattice over [low, high], or around the whole circle."""
@@ -302,7 +313,7 @@ def move_dense(
     high = jnp.stack([jnp.max(jnp.where(reached, source[..., d], -jnp.inf)) for d in range(n)]) + FAR
     low, high, closed = limited(low, high)
     low, coarse = lattice_over(low, high, closed)
-    logs = evaluate(low, coarse)
+    logs, _ = evaluate(low, coarse)
     if angles:  # cut the circle opposite to the maximum
         peak = jnp.unravel_index(jnp.argmax(logs), logs.shape)[0]
         roll = jnp.where(closed[0], peak - sizes[0] // 2, 0)
@@ -312,11 +323,11 @@ def move_dense(
     low, high = _box(used, low, coarse, closed)
     low, high, closed = limited(low, high)
     low, fine = lattice_over(low, high, closed)
-    logs = evaluate(low, fine)
+    logs, spread = evaluate(low, fine)
     half = low + fine * (jnp.array(sizes) // 2)
     basis = flow.map @ to_offset * fine
     target = Lattice(logs, moved.centre + flow.map @ to_offset @ half, basis)
-    return target, coarse / fine
+    return target, coarse / fine, spread
 
 
 def added_variance(lattice: Lattice, flow: Flow) -> jax.Array:

@@ -178,7 +178,7 @@ def _checked_times(model: Model, times: Any) -> np.ndarray:
 def _substeps(intervals: np.ndarray, substeps: Any) -> np.ndarray:
     if substeps is None:
         relative = intervals / np.median(intervals[intervals > 0]) if (intervals > 0).any() else intervals
-        return np.clip(np.ceil(SUBSTEPS * relative), SUBSTEPS, MOST_SUBSTEPS).astype(int)
+        return np.clip(np.ceil(SUBSTEPS * relative * (1 - 1e-9)), SUBSTEPS, MOST_SUBSTEPS).astype(int)
     if isinstance(substeps, bool) or not isinstance(substeps, int | np.integer) or substeps < 1:
         raise InputError(f"substeps: expected a whole number of at least 1, got {kind_of(substeps)}")
     return np.full(len(intervals), int(substeps))
