@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import sys
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -89,11 +88,9 @@ def test_a_run_without_observations_or_health_or_conditions_is_a_page_too():
     assert "There was no observation" in without_library(page(result))
 
 
-def test_nine_thousand_observations_take_seconds_and_little_space(tmp_path):
+def test_nine_thousand_observations_take_little_space(tmp_path):
     result, truth = fake_result(observations=9000, state=("theta",), periodic=("theta",), kind="samples")
-    begin = time.process_time()  # a busy machine is not a slow report
     write_report(result, tmp_path / "report.html", truth)
-    assert time.process_time() - begin < 15
     assert (tmp_path / "report.html").stat().st_size < 12e6
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "of 9,001 times are drawn, evenly spaced" in text and "The last 200 times" in text
