@@ -1,0 +1,105 @@
+"""The direct method where the answer is known: Kalman and Bucy's equations, integrated here without any of the package's code."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import zakai
+
+
+def kalman_bucy(times, increments, mean, cov, L, l, G, C, S, start=0.0):
+    """Mean, covariance and evidence after each interval, y running linearly inside of it; a nan is not observed."""
+    n = len(mean)
+    out, evidence = [], 0.0
+    for stop, dy in zip(times, increments, strict=True):
+        rate = dy / (stop - start)
+        seen = ~np.isnan(dy)
+
+        def slope(t, z, rate=rate, seen=seen):
+            m, P = z[:n], z[n : n + n * n].reshape(n, n)
+            H = C[seen]
+            gain = np.linalg.solve(S[np.ix_(seen, seen)], H) if seen.any() else np.zeros((0, n))
+            y = rate[seen]
+            dm = L(t) @ m + l(t) + P @ gain.T @ (y - H @ m)
+            dP = L(t) @ P + P @ L(t).T + G(t) - P @ H.T @ gain @ P
+            de = (gain @ m) @ y - 0.5 * m @ H.T @ gain @ m - 0.5 * np.trace(gain @ P @ H.T)
+            return np.concatenate([dm, dP.ravel(), [de]])
+
+        z = solve_ivp(
+            slope, (start, stop), np.concatenate([mean, cov.ravel(), [0.0]]), method="DOP853", rtol=1e-12, atol=1e-13
+        ).y[:, -1]
+        mean, cov, evidence, start = z[:n], z[n : n + n * n].reshape(n, n), evidence + z[-1], stop
+        out.append((mean, cov, evidence))
+    return out
+
+
+def assert_agrees(result, expected, tolerance):
+    for k, (mean, cov, evidence) in enumerate(expected, start=1):
+        assert result.mean[k] == pytest.approx(mean, abs=tolerance)
+        assert result.cov[k] == pytest.approx(cov, abs=tolerance)
+        assert result.log_likelihood_increments[: k + 1].sum() == pytest.approx(evidence, abs=tolerance)
+
+
+def test_one_state_with_two_sensors_gaps_and_irregular_times_is_kalman_and_bucy():
+    model = zakai.Model(
+        state=["x"],
+        drift=["(-1/2 + sin(t)/3)*x + cos(t)"],
+        process_noise=[["1 + t/4"]],
+        observation=["x", "2*x"],
+        observation_noise=[["1/2", "1/10"], ["1/10", "1"]],
+        prior={"kind": "gaussian", "mean": [0.4], "cov": [[0.7]]},
+    )
+    times = np.array([0.05, 0.11, 0.2, 0.22, 0.4, 0.47])
+    dy = np.array([[0.3, -0.1], [np.nan, 0.2], [0.1, 0.4], [np.nan, np.nan], [0.2, np.nan], [-0.3, 0.1]])
+    result = zakai.filter(model, zakai.Record(times, dy, "increments"))
+    expected = kalman_bucy(
+        times,
+        dy,
+        np.array([0.4]),
+        np.array([[0.7]]),
+        lambda t: np.array([[-0.5 + np.sin(t) / 3]]),
+        lambda t: np.array([np.cos(t)]),
+        lambda t: np.array([[1 + t / 4]]),
+        np.array([[1.0], [2.0]]),
+        np.array([[0.5, 0.1], [0.1, 1.0]]),
+    )
+    assert not result.warnings
+    assert_agrees(result, expected, 1e-9)
+
+
+def test_two_states_are_kalman_and_bucy():
+    model = zakai.load_model("gallery:kalman-bucy-2d")
+    times = 0.05 * np.arange(1, 9)
+    dy = 0.1 * np.cos(np.arange(8))[:, None]
+    result = zakai.filter(model, zakai.Record(times, dy, "increments"))
+    omega, zeta = 1.5, 0.1
+    expected = kalman_bucy(
+        times,
+        dy,
+        np.array([1.0, 0.0]),
+        np.array([[0.5, 0.1], [0.1, 0.5]]),
+        lambda t: np.array([[0.0, 1.0], [-(omega**2), -2 * zeta * omega]]),
+        lambda t: np.zeros(2),
+        lambda t: np.array([[0.1, 0.05], [0.05, 0.5]]),
+        np.array([[1.0, 0.0]]),
+        np.array([[0.2]]),
+    )
+    assert not result.warnings
+    assert_agrees(result, expected, 1e-8)
+
+
+def test_an_observation_far_beyond_the_prediction_is_said():
+    model = zakai.load_model("gallery:kalman-bucy-1d")
+    result = zakai.filter(model, zakai.Record([0.01, 0.02], [[1e6], [0.0]], "increments"))
+    assert any("surprise" in warning and "t = 0.01" in warning for warning in result.warnings)
+
+
+def test_a_long_interval_is_taken_in_parts_and_agrees_with_many_short_ones():
+    model = zakai.load_model("gallery:kalman-bucy-1d")
+    long = zakai.filter(model, zakai.Record([40.0], [[0.0]], "increments"))
+    short = zakai.filter(model, zakai.Record(np.arange(1.0, 41.0), np.zeros((40, 1)), "increments"))
+    assert long.mean[-1] == pytest.approx(short.mean[-1], abs=1e-10)
+    assert long.cov[-1] == pytest.approx(short.cov[-1], abs=1e-10)
+    assert long.log_likelihood == pytest.approx(short.log_likelihood, abs=1e-8)
