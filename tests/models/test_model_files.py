@@ -203,7 +203,8 @@ def test_a_model_is_immutable_and_can_be_pickled():
 def test_with_parameters_changes_values_and_nothing_else():
     model = load_model("gallery:wind-vane")
     other = model.with_parameters(sigma=0.7)
-    assert other.theta().tolist() == [0.7, 0.2] and model.theta().tolist() == [0.4, 0.2]
+    sigma, r = model.theta()
+    assert other.theta().tolist() == [0.7, r] and sigma != 0.7
     assert other.drift == model.drift and "sigma = 0.7" in other.text
     with pytest.raises(InputError, match="unknown parameter 'sigm'; did you mean 'sigma'"):
         model.with_parameters(sigm=1)

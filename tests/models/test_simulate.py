@@ -1,4 +1,3 @@
-import time
 
 import numpy as np
 import pytest
@@ -68,10 +67,11 @@ def test_angles_are_wrapped():
     assert (np.abs(truth.values[:, 0]) <= np.pi).all() and np.abs(np.diff(truth.values[:, 0])).max() > 5
 
 
-def test_ten_thousand_steps_take_a_moment():
-    began = time.perf_counter()
-    simulate(load_model("gallery:spiral-sensor"), np.arange(1, 10_001) * 1e-3, seed=0)
-    assert time.perf_counter() - began < 2.0
+def test_a_clock_that_is_regular_up_to_rounding_is_regular():
+    model = load_model("gallery:spiral-sensor")
+    first, _ = simulate(model, np.arange(1, 1_001) / 100, seed=0)
+    second, _ = simulate(model, np.arange(1, 1_001) * 0.01, seed=0)
+    assert first.values == pytest.approx(second.values, rel=1e-9)
 
 
 def test_a_result_does_not_depend_on_how_the_time_is_cut_into_pieces(monkeypatch):
