@@ -93,13 +93,13 @@ def choose(model: Model, method: str) -> tuple[Method, str, Mapping[str, tuple[C
         conditions = chosen.theorem(model)
         if all_hold(conditions) is not True:
             raise ConditionError(f"{model.source}: {chosen.name} does not hold: {_failure(conditions)}")
-        return chosen, f"{chosen.name} was asked for, and every assumption of its theorem holds", {method: conditions}
+        return chosen, "asked for by name, and every assumption of its theorem holds", {method: conditions}
     considered: dict[str, tuple[Condition, ...]] = {}
     for name in _registry.AUTO:
         candidate = _registry.load(name)
         considered[name] = candidate.theorem(model)
         if all_hold(considered[name]) is True:
-            return candidate, f"{name} is the first method whose every assumption holds for this system", considered
+            return candidate, "the first method whose every assumption holds for this system", considered
     reasons = "; ".join(f"{name}: {_failure(conditions)}" for name, conditions in considered.items())
     raise ConditionError(
         f"{model.source}: no method holds for this system ({reasons}); "
