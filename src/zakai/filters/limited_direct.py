@@ -12,13 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import sympy as sp
 
 from zakai import _float64  # noqa: F401
 from zakai.algebra.theorems import limited_direct as theorem
@@ -26,15 +25,15 @@ from zakai.algebra.theorems import yau_system
 from zakai.densities import GridDensity
 from zakai.errors import InputError
 from zakai.filters import _lattice_choice as choice
-from zakai.filters._formulas import Formulas, formulas
+from zakai.filters._formulas import formulas
 from zakai.filters._protocol import Info, Method, Schedule
+from zakai.filters._yau_flow import System, distinct, parts_of, system_of
 from zakai.filters.observations import Data, Factors, factors
 from zakai.kolmogorov import lattice as lat
-from zakai.kolmogorov.flow import Coefficients, Flow, flows
+from zakai.kolmogorov.flow import Flow, flows
 from zakai.kolmogorov.lattice import Lattice
 from zakai.kolmogorov.power_series import TaylorData, power_series_kernels, taylor_data
 from zakai.kolmogorov.series_flow import flow_of_kernel
-from zakai.models.compile import jax_field, jax_function
 from zakai.models.model import Model
 
 # How deep, in units of the logarithm, the tails are kept: where they are cut at 1e-13, and where only rounding ends them.
@@ -103,76 +102,6 @@ class Interval:
     system: System
 
 
-class System:
-    """The formulas of a model compiled for this method: JAX functions of (x, t, theta) and the coefficients of its flow."""
-
-    def __init__(self, model: Model, rates: bool, splitting: str):
-        yau = yau_system(model)
-        assert yau is not None
-        self.n = model.n
-        self.affine = yau.slope is not None and model.observation_kind != "samples"
-        self.rates = rates and self.affine
-        self.inputs = 1 + (model.m if self.rates else 0)
-        self.bare = yau.bare is not None
-        # Without a gauge nothing need be evaluated.
-        self.gauged = yau.form.potential != 0
-        # Whether a half of the observation's factor stands at the start of an interval.
-        self.halves = splitting == "strang" and not self.rates and model.observation_kind != "samples"
-        self.potential = jax_field([yau.form.potential], model)
-        self.observe = jax_field(model.observation, model)
-        bare, full = yau.bare or yau.full, yau.full or yau.bare
-        assert bare is not None and full is not None
-        n, m = model.n, model.m
-        slope = yau.slope if self.affine else sp.zeros(m, n)
-        intercept = yau.intercept if self.affine else sp.zeros(m, 1)
-        blocks = [
-            yau.form.matrix,
-            yau.form.offset,
-            model.covariance,
-            bare.matrix,
-            bare.linear,
-            sp.Matrix([bare.constant]),
-            full.matrix,
-            full.linear,
-            sp.Matrix([full.constant]),
-            slope,
-            intercept,
-            model.observation_noise,
-        ]
-        self._shapes = [block.shape for block in blocks]
-        flat = [entry for block in blocks for entry in block]
-        used = flat if self.rates else flat[: -m * m]
-        self.varying = any(model.t in entry.free_symbols for entry in used)
-        self._numbers = jax_function(flat, model)
-
-    def coefficients(self, t: jax.Array, argument: tuple[jax.Array, jax.Array]) -> Coefficients:
-        """The coefficients of the flow at time t; `argument` is (theta, inside), the coordinates that act inside."""
-        theta, inside = argument
-        numbers = self._numbers(jnp.zeros(self.n), t, theta)
-        ends = np.cumsum([rows * columns for rows, columns in self._shapes])[:-1]
-        parts = jnp.split(numbers, ends)
-        L, l, G, Qb, pb, rb, Qf, pf, rf, C, c, S = (
-            part.reshape(shape) for part, shape in zip(parts, self._shapes, strict=True)
-        )
-        if not self.rates:
-            whole = jnp.min(inside)
-            Q, p, r = (jnp.where(whole > 0, full, bare) for full, bare in ((Qf, Qb), (pf, pb), (rf, rb)))
-            return Coefficients(L, l, G, Q, p, r[:, 0])
-        # The precision of the observed coordinates alone, with zeros elsewhere.
-        mask = jnp.diag(inside)
-        precision = mask @ jnp.linalg.inv(mask @ S @ mask + jnp.eye(len(inside)) - mask) @ mask
-        gain = C.T @ precision
-        linear = jnp.hstack([pb - gain @ c, gain])
-        constant = jnp.concatenate([rb[:, 0] - 0.5 * (c.T @ precision @ c)[:, 0], (precision @ c)[:, 0]])
-        offset = jnp.hstack([l, jnp.zeros((len(l), self.inputs - 1))])
-        return Coefficients(L, offset, G, Qb - 0.5 * gain @ C, linear, constant)
-
-
-@lru_cache(maxsize=32)
-def _system(of: Formulas, rates: bool, splitting: str) -> System:
-    return System(of.model, rates, splitting)
-
-
 def prepare(
     model: Model, schedule: Schedule, *, kernel: str = "flow", splitting: str = "strang", order: int | None = None
 ) -> Prepared:
@@ -189,10 +118,10 @@ def prepare(
     if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1 or not series):
         raise InputError(f'option order: {order!r} must be a whole number from 1, and needs kernel="power-series"')
     # The series knows no inputs, and the papers' order of the factors has none.
-    system = _system(formulas(model), not series and splitting == "strang", splitting)
-    which, first = _distinct(system, schedule)
+    system = system_of(formulas(model), not series and splitting == "strang", splitting)
+    which, first = distinct(system, schedule)
     starts, stops, inside = schedule.starts[first], schedule.stops[first], schedule.inside[first].astype(float)
-    parts = _parts(system, model, starts, stops, inside)
+    parts = parts_of(system, model, starts, stops, inside)
     edges = starts[:, None] + (stops - starts)[:, None] * np.arange(parts + 1) / parts
     theta = np.tile(model.theta(), (len(starts) * parts, 1))
     argument = (theta, np.repeat(inside, parts, axis=0))
@@ -230,35 +159,6 @@ def _series_flows(model: Model, starts: np.ndarray, stops: np.ndarray, whole: np
         parts.append((rows, flow_of_kernel(power_series_kernels(expand, starts[rows], stops[rows], order))))
     back = np.argsort(np.concatenate([rows for rows, _ in parts]))
     return jax.tree.map(lambda *arrays: np.concatenate(arrays)[back], *[flow for _, flow in parts])
-
-
-def _distinct(system: System, schedule: Schedule) -> tuple[np.ndarray, np.ndarray]:
-    """The intervals that differ: (which of them each interval is, the first interval of each kind)."""
-    count = len(schedule.starts)
-    if system.varying or count == 0:
-        return np.arange(count), np.arange(count)
-    # A uniform clock is uniform to rounding of the times only.
-    unit = 1e-9 * np.min(schedule.stops - schedule.starts) + 4 * np.spacing(np.abs(schedule.stops).max())
-    length = np.rint((schedule.stops - schedule.starts) / unit)
-    pattern = schedule.inside @ (2.0 ** np.arange(schedule.inside.shape[1]))
-    _, first, which = np.unique(np.stack([length, pattern]), axis=1, return_index=True, return_inverse=True)
-    return which.ravel(), first
-
-
-def _parts(system: System, model: Model, starts: np.ndarray, stops: np.ndarray, inside: np.ndarray) -> int:
-    """Into how many equal parts the intervals are cut so that no flow grows by more than about e^4."""
-    if not len(starts):
-        return 1
-    arguments = (np.tile(model.theta(), (len(starts), 1)), inside)
-    rate = 0.0
-    for times in (starts, stops):
-        c = jax.jit(jax.vmap(system.coefficients))(times, arguments)
-        waves = np.linalg.norm(np.asarray(c.covariance @ c.quadratic), ord=2, axis=(1, 2))
-        speed = np.linalg.norm(np.asarray(c.matrix), ord=2, axis=(1, 2)) + np.sqrt(2 * waves)
-        rate = max(rate, float(np.max(speed * (stops - starts))))
-    if not np.isfinite(rate):
-        raise InputError(f"{model.source}: a coefficient is not finite between t = {starts[0]:g} and {stops[-1]:g}")
-    return max(1, int(np.ceil(rate / 4.0)))
 
 
 def observations(prepared: Prepared, data: Data) -> Factors:

@@ -1,0 +1,125 @@
+"""What the direct methods share: the linear-quadratic equation of a time-varying Yau system, and its flows, offline.
+
+After the gauge u = e^phi v the density between observations obeys
+
+    v_t = 1/2 G:Hess v - (L x + l).grad v + (x'Q x + p.x + r) v,
+
+and everything that a method needs of it is the affine Hamiltonian flow of each interval (`zakai.kolmogorov.flow`).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import sympy as sp
+
+from zakai import _float64  # noqa: F401
+from zakai.algebra.theorems import yau_system
+from zakai.errors import InputError
+from zakai.filters._formulas import Formulas
+from zakai.filters._protocol import Schedule
+from zakai.kolmogorov.flow import Coefficients
+from zakai.models.compile import jax_field, jax_function
+from zakai.models.model import Model
+
+
+class System:
+    """The formulas of a model compiled for this method: JAX functions of (x, t, theta) and the coefficients of its flow."""
+
+    def __init__(self, model: Model, rates: bool, splitting: str):
+        yau = yau_system(model)
+        assert yau is not None
+        self.n = model.n
+        self.affine = yau.slope is not None and model.observation_kind != "samples"
+        self.rates = rates and self.affine
+        self.inputs = 1 + (model.m if self.rates else 0)
+        self.bare = yau.bare is not None
+        # Without a gauge nothing need be evaluated.
+        self.gauged = yau.form.potential != 0
+        # Whether a half of the observation's factor stands at the start of an interval.
+        self.halves = splitting == "strang" and not self.rates and model.observation_kind != "samples"
+        self.potential = jax_field([yau.form.potential], model)
+        self.observe = jax_field(model.observation, model)
+        bare, full = yau.bare or yau.full, yau.full or yau.bare
+        assert bare is not None and full is not None
+        n, m = model.n, model.m
+        slope = yau.slope if self.affine else sp.zeros(m, n)
+        intercept = yau.intercept if self.affine else sp.zeros(m, 1)
+        blocks = [
+            yau.form.matrix,
+            yau.form.offset,
+            model.covariance,
+            bare.matrix,
+            bare.linear,
+            sp.Matrix([bare.constant]),
+            full.matrix,
+            full.linear,
+            sp.Matrix([full.constant]),
+            slope,
+            intercept,
+            model.observation_noise,
+        ]
+        self._shapes = [block.shape for block in blocks]
+        flat = [entry for block in blocks for entry in block]
+        used = flat if self.rates else flat[: -m * m]
+        self.varying = any(model.t in entry.free_symbols for entry in used)
+        self._numbers = jax_function(flat, model)
+
+    def coefficients(self, t: jax.Array, argument: tuple[jax.Array, jax.Array]) -> Coefficients:
+        """The coefficients of the flow at time t; `argument` is (theta, inside), the coordinates that act inside."""
+        theta, inside = argument
+        numbers = self._numbers(jnp.zeros(self.n), t, theta)
+        ends = np.cumsum([rows * columns for rows, columns in self._shapes])[:-1]
+        parts = jnp.split(numbers, ends)
+        L, l, G, Qb, pb, rb, Qf, pf, rf, C, c, S = (
+            part.reshape(shape) for part, shape in zip(parts, self._shapes, strict=True)
+        )
+        if not self.rates:
+            whole = jnp.min(inside)
+            Q, p, r = (jnp.where(whole > 0, full, bare) for full, bare in ((Qf, Qb), (pf, pb), (rf, rb)))
+            return Coefficients(L, l, G, Q, p, r[:, 0])
+        # The precision of the observed coordinates alone, with zeros elsewhere.
+        mask = jnp.diag(inside)
+        precision = mask @ jnp.linalg.inv(mask @ S @ mask + jnp.eye(len(inside)) - mask) @ mask
+        gain = C.T @ precision
+        linear = jnp.hstack([pb - gain @ c, gain])
+        constant = jnp.concatenate([rb[:, 0] - 0.5 * (c.T @ precision @ c)[:, 0], (precision @ c)[:, 0]])
+        offset = jnp.hstack([l, jnp.zeros((len(l), self.inputs - 1))])
+        return Coefficients(L, offset, G, Qb - 0.5 * gain @ C, linear, constant)
+
+
+@lru_cache(maxsize=32)
+def system_of(of: Formulas, rates: bool, splitting: str) -> System:
+    return System(of.model, rates, splitting)
+
+
+def distinct(system: System, schedule: Schedule) -> tuple[np.ndarray, np.ndarray]:
+    """The intervals that differ: (which of them each interval is, the first interval of each kind)."""
+    count = len(schedule.starts)
+    if system.varying or count == 0:
+        return np.arange(count), np.arange(count)
+    # A uniform clock is uniform to rounding of the times only.
+    unit = 1e-9 * np.min(schedule.stops - schedule.starts) + 4 * np.spacing(np.abs(schedule.stops).max())
+    length = np.rint((schedule.stops - schedule.starts) / unit)
+    pattern = schedule.inside @ (2.0 ** np.arange(schedule.inside.shape[1]))
+    _, first, which = np.unique(np.stack([length, pattern]), axis=1, return_index=True, return_inverse=True)
+    return which.ravel(), first
+
+
+def parts_of(system: System, model: Model, starts: np.ndarray, stops: np.ndarray, inside: np.ndarray) -> int:
+    """Into how many equal parts the intervals are cut so that no flow grows by more than about e^4."""
+    if not len(starts):
+        return 1
+    arguments = (np.tile(model.theta(), (len(starts), 1)), inside)
+    rate = 0.0
+    for times in (starts, stops):
+        c = jax.jit(jax.vmap(system.coefficients))(times, arguments)
+        waves = np.linalg.norm(np.asarray(c.covariance @ c.quadratic), ord=2, axis=(1, 2))
+        speed = np.linalg.norm(np.asarray(c.matrix), ord=2, axis=(1, 2)) + np.sqrt(2 * waves)
+        rate = max(rate, float(np.max(speed * (stops - starts))))
+    if not np.isfinite(rate):
+        raise InputError(f"{model.source}: a coefficient is not finite between t = {starts[0]:g} and {stops[-1]:g}")
+    return max(1, int(np.ceil(rate / 4.0)))
