@@ -51,6 +51,18 @@ class Method:
     gives (State, Info); `density(prepared, state)` a Density.  A method whose arrays have a size that the data decides has
     `adapt(prepared, state, intervals, info)`: the state to start (or, after a try with `info`, to start again) a run of intervals
     with, or None where nothing need or can be changed.
+
+    Gradients.  A Prepared has `theta` (p,), the values of the parameters: the model's own, a NumPy array, out of `prepare`.
+    `with_parameters(prepared, theta)` gives the same Prepared with another `theta` and the `intervals` that belong to it.  It
+    is traced by JAX: what is adaptive (substeps, parts, nodes, sizes) stays as it was decided for the model's own values, which
+    `prepared.model` still has.  `init`, `correct` and `observations` read `prepared.theta` and nothing else, and are traced too.
+    A method with `adapt` has `resume(prepared, state, rows, begin)` beside it: the traced `state`, laid on the lattice and
+    given the static plan of `begin`, the state with which an ordinary run began the intervals `rows` (a slice of those of
+    `prepared`).  Only the values depend on theta; the lattice of `begin` is a constant.  None: the method has no gradient.
+
+    Batches.  `init`, `observations` and `step` serve many records at once as they are.  A method with `adapt` has
+    `adapt_many(prepared, states, rows, info)`: `states` and `info` have a leading axis of records, and all records get one
+    plan and arrays of one size.  None: records are filtered one by one.
     """
 
     name: str
@@ -65,4 +77,7 @@ class Method:
     step: Callable[..., Any]
     density: Callable[..., Density]
     adapt: Callable[..., Any] | None = None
+    with_parameters: Callable[..., Any] | None = None
+    resume: Callable[..., Any] | None = None
+    adapt_many: Callable[..., Any] | None = None
     bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)

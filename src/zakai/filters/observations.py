@@ -8,11 +8,15 @@ is a factor on the density,
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from zakai import _float64  # noqa: F401
 from zakai.filters._protocol import Schedule
+from zakai.models.compile import jax_function
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.records import Record
@@ -39,11 +43,11 @@ class Factors(NamedTuple):
     inside, the first of them one.
     """
 
-    before: np.ndarray
-    after: np.ndarray
-    energy: np.ndarray | None
-    constant: np.ndarray
-    inputs: np.ndarray
+    before: Any
+    after: Any
+    energy: Any
+    constant: Any
+    inputs: Any
 
 
 def data_of(model: Model, record: Record) -> Data:
@@ -84,56 +88,69 @@ def schedule_of(data: Data, per_coordinate: bool) -> Schedule:
     return Schedule(data.starts, data.stops, inside)
 
 
-def factors(model: Model, data: Data, schedule: Schedule, *, rates: bool, splitting: str, remove: bool) -> Factors:
-    """The factors of a run of intervals.
+def factors(
+    model: Model, data: Data, schedule: Schedule, *, rates: bool, splitting: str, remove: bool, theta: Any = None
+) -> Factors:
+    """The factors of a run of intervals, for the parameters `theta` (p,), by default the model's; JAX may trace them.
 
     Readings that act inside enter as rates (`rates`: y runs linearly, for affine h) or as exp(h'S^-1 dy), in two halves or,
     with `splitting="lie"`, whole at the end.  The others are whole factors at the end; with `remove` the energy
     that the transition holds inside, h'S^-1 h dt / 2, is taken out again there.
     """
     count, m = data.values.shape
-    before, after = np.zeros((count, m)), np.zeros((count, m))
-    energy, constant = np.zeros((count, m, m)), np.zeros(count)
-    inputs = np.ones((count, 1 + (m if rates else 0)))
-    noise = numpy_function(model.observation_noise, model, model.observation_noise.shape)
-    origin, theta = np.zeros(model.n), model.theta()
-    noise_end = np.broadcast_to(noise(origin, data.stops, theta), (count, m, m))
+    theta = model.theta() if theta is None else theta
+    xp = np if isinstance(theta, np.ndarray) else jnp
     seen = np.logical_not(np.isnan(data.values))
     inside = schedule.inside
-    whole = np.asarray(inside.all(axis=1))
+    whole = np.asarray(inside.all(axis=1))[:, None]
     values = np.where(seen, data.values, 0.0)
-    lengths = data.stops - data.starts
+    lengths = (data.stops - data.starts)[:, None]
+    before, energy = np.zeros((count, m)), None
+    after, constant = before, np.zeros(count)
+    inputs = np.ones((count, 1 + (m if rates else 0)))
+    noise_end = noise_at(model, data.stops, theta)
     if rates:
         with np.errstate(divide="ignore", invalid="ignore"):
-            inputs[:, 1:] = np.where(inside, values / lengths[:, None], 0.0)
+            inputs[:, 1:] = np.where(inside, values / lengths, 0.0)
     elif splitting == "lie":
-        after[whole] = _solve(noise_end[whole], values[whole])
+        after = xp.where(whole, _times(xp.linalg.inv(noise_end), values), 0.0)
     elif whole.any():
-        noise_start = np.broadcast_to(noise(origin, data.starts, theta), (count, m, m))
-        before[whole] = 0.5 * _solve(noise_start[whole], values[whole])
-        after[whole] = 0.5 * _solve(noise_end[whole], values[whole])
-    at_end = seen & ~inside if rates else seen & ~whole[:, None]
-    if remove and not rates:
-        energy[~whole] -= np.linalg.inv(noise_end[~whole]) * lengths[~whole, None, None]
-    for pattern in np.unique(at_end[at_end.any(axis=1)], axis=0):
-        rows = np.flatnonzero((at_end == pattern).all(axis=1))
-        which = np.flatnonzero(pattern)
-        block = np.ix_(rows, which, which)
-        z = values[np.ix_(rows, which)]
-        if model.observation_kind == "samples":
-            precision = np.linalg.inv(noise_end[block])
-            energy[block] += precision
-            after[np.ix_(rows, which)] = np.einsum("kij,kj->ki", precision, z)
-            log_volume = np.linalg.slogdet(2 * np.pi * noise_end[block])[1]
-            constant[rows] = -0.5 * np.einsum("ki,kij,kj->k", z, precision, z) - 0.5 * log_volume
-            continue
-        spans = data.elapsed[np.ix_(rows, which)]
-        # Increments that end together share the noise of the time that they have in common.
-        precision = np.linalg.inv(noise_end[block] * np.minimum(spans[:, :, None], spans[:, None, :]))
-        energy[block] += precision * spans[:, :, None] * spans[:, None, :]
-        after[np.ix_(rows, which)] = spans * np.einsum("kij,kj->ki", precision, z)
-    return Factors(before, after, energy if energy.any() else None, constant, inputs)
+        before = xp.where(whole, 0.5 * _times(xp.linalg.inv(noise_at(model, data.starts, theta)), values), 0.0)
+        after = xp.where(whole, 0.5 * _times(xp.linalg.inv(noise_end), values), 0.0)
+    if remove and not rates and not whole.all():
+        energy = -xp.where(whole[..., None], 0.0, xp.linalg.inv(noise_end) * lengths[..., None])
+    at_end = seen & ~inside if rates else seen & ~whole
+    if at_end.any():
+        more = _at_end(xp, model.observation_kind, values, data.elapsed, at_end, noise_end)
+        energy, after, constant = more[0] if energy is None else energy + more[0], after + more[1], constant + more[2]
+    return Factors(before, after, energy, constant, inputs)
 
 
-def _solve(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    return np.linalg.solve(matrices, vectors[..., None])[..., 0]
+def noise_at(model: Model, times: np.ndarray, theta: Any) -> Any:
+    """S (K, m, m) at the times (K,), for the parameters `theta` (p,), which JAX may trace."""
+    m, origin = model.m, np.zeros(model.n)
+    if isinstance(theta, np.ndarray):
+        return np.broadcast_to(numpy_function(model.observation_noise, model, (m, m))(origin, times, theta), (len(times), m, m))
+    return jax.vmap(jax_function(model.observation_noise, model, (m, m)), (None, 0, None))(origin, jnp.asarray(times), theta)
+
+
+def _at_end(xp, kind, values, elapsed, at_end, noise):
+    """(energy, after, constant) of the readings that act as whole factors at the end; a row may have none."""
+    both = at_end[:, :, None] & at_end[:, None, :]
+    # A coordinate without a reading has a unit variance of its own, which leaves the block of the others alone.
+    alone = np.eye(values.shape[1]) * ~at_end[:, None, :]
+    if kind == "samples":
+        noise = xp.where(both, noise, 0.0) + alone
+        precision = xp.where(both, xp.linalg.inv(noise), 0.0)
+        after = _times(precision, values)
+        log_volume = xp.linalg.slogdet(noise)[1] + np.log(2 * np.pi) * at_end.sum(axis=1)
+        return precision, after, -0.5 * (values * after).sum(axis=1) - 0.5 * log_volume
+    spans = np.where(at_end, elapsed, 0.0)
+    # Increments that end together share the noise of the time that they have in common.
+    precision = xp.linalg.inv(noise * np.minimum(spans[:, :, None], spans[:, None, :]) + alone)
+    precision = xp.where(both, precision, 0.0)
+    return precision * spans[:, :, None] * spans[:, None, :], spans * _times(precision, values), 0.0
+
+
+def _times(matrices, vectors):
+    return (matrices @ vectors[..., None])[..., 0]
