@@ -37,6 +37,7 @@ from zakai import _float64  # noqa: F401
 STAGES = 8
 TOLERANCE = 1e-13
 MOST_SUBSTEPS = 4096
+MOST_IMPLICIT = 12  # states up to which the implicit method is the cheaper one
 
 
 # Prepared flows are held as NumPy arrays and traced as JAX arrays.
@@ -172,9 +173,15 @@ def integrate(
     (deviation, growth, trace), _ = jax.lax.scan(add, first, jnp.arange(1, substeps))
     k = growth.shape[0]
     n = deviation.shape[0] // 2 - k
-    one = jnp.eye(n)
-    p11, p12 = one + deviation[:n, :n], deviation[:n, n : 2 * n]
-    p21 = deviation[n : 2 * n, :n]
+    forced, action = slice(2 * n, 2 * n + k), slice(2 * n + k, None)
+    responses = deviation[: 2 * n, forced], deviation[action, :n], deviation[action, forced]
+    return _flow(deviation[: 2 * n, : 2 * n], *responses, growth, trace)
+
+
+def _flow(deviation: jax.Array, response: jax.Array, action, action_inputs, growth, trace) -> Flow:
+    """The pieces of equation (2) from Phi - 1 (2n, 2n) and the response of (xi, eta) to the inputs (2n, k)."""
+    n = len(deviation) // 2
+    p11, p12, p21 = jnp.eye(n) + deviation[:n, :n], deviation[:n, n:], deviation[n:, :n]
     spread = -0.5 * jnp.linalg.solve(p11, p12)
     bend = p11.T @ p21
     return Flow(
@@ -182,39 +189,120 @@ def integrate(
         spread=0.5 * (spread + spread.T),
         bend=0.5 * (bend + bend.T),
         lift=p21,
-        shift=deviation[:n, 2 * n : 2 * n + k],
-        push=deviation[n : 2 * n, 2 * n : 2 * n + k],
-        action=deviation[2 * n + k :, :n],
-        action_inputs=deviation[2 * n + k :, 2 * n : 2 * n + k],
+        shift=response[:n],
+        push=response[n:],
+        action=action,
+        action_inputs=action_inputs,
         growth=growth,
         trace=trace,
         log_volume=jnp.linalg.slogdet(p11)[1],
     )
 
 
+# The numbers of midpoint steps whose results are extrapolated, and the weights that cancel all errors but those of order 10.
+_MIDPOINTS = (2, 4, 6, 8, 10)
+_EXTRAPOLATION = tuple(
+    float(np.prod([N**2 / (N**2 - M**2) for M in _MIDPOINTS if M != N])) for N in _MIDPOINTS
+)
+
+
+def integrate_explicitly(
+    coefficients: Callable[[jax.Array], Coefficients], start: jax.Array, stop: jax.Array, substeps: int
+) -> Flow:
+    """The flow in `substeps` equal steps of Gragg's extrapolated midpoint rule (order 10): products of matrices only.
+
+    For many states, where the implicit system of `integrate` would be too large.
+    """
+    length = (stop - start) / substeps
+    n, k = jax.eval_shape(coefficients, start).offset.shape
+
+    def slope(t, value):
+        c = coefficients(t)
+        phi, response, _, _, _, _ = value
+        generator = jnp.block([[c.matrix, -2.0 * c.covariance], [c.quadratic, -c.matrix.T]])
+        forcing = jnp.vstack([c.offset, 0.5 * c.linear])
+        functional = jnp.hstack([0.5 * c.linear.T, -c.offset.T])
+        moved = generator @ jnp.hstack([phi, response])
+        return (
+            generator + moved[:, : 2 * n],
+            forcing + moved[:, 2 * n :],
+            functional[:, :n] + functional @ phi[:, :n],
+            functional @ response,
+            c.constant,
+            0.5 * jnp.trace(c.matrix),
+        )
+
+    def added(value, factor, rate):
+        return jax.tree.map(lambda a, b: a + factor * b, value, rate)
+
+    def midpoint(begin, value, first, count):
+        """Gragg's smoothed midpoint rule, as a change of `value`."""
+        h = length / count
+
+        def two(i, pair):
+            before, now = pair
+            return now, added(before, 2.0 * h, slope(begin + i * h, added(value, 1.0, now)))
+
+        zero = jax.tree.map(jnp.zeros_like, value)
+        before, last = jax.lax.fori_loop(1, count, two, (zero, added(zero, h, first)))
+        end = slope(begin + length, added(value, 1.0, last))
+        return jax.tree.map(lambda a, b, c: 0.5 * (a + b + h * c), before, last, end)
+
+    def step(value, index):
+        begin = start + index * length
+        first, value_next = slope(begin, value), value
+        for count, weight in zip(_MIDPOINTS, _EXTRAPOLATION, strict=True):
+            value_next = added(value_next, weight, midpoint(begin, value, first, count))
+        return value_next, None
+
+    zero = (
+        jnp.zeros((2 * n, 2 * n)),
+        jnp.zeros((2 * n, k)),
+        jnp.zeros((k, n)),
+        jnp.zeros((k, k)),
+        jnp.zeros(k),
+        jnp.zeros(()),
+    )
+    value, _ = jax.lax.scan(step, zero, jnp.arange(substeps))
+    return _flow(*value)
+
+
+def _integrate_one(coefficients, start, stop, argument, substeps):
+    def at(t):
+        return coefficients(t, argument)
+
+    if jax.eval_shape(at, start).matrix.shape[0] > MOST_IMPLICIT:
+        return integrate_explicitly(at, start, stop, substeps)
+    return integrate(at, start, stop, substeps)
+
+
 @partial(jax.jit, static_argnums=(0, 4))
 def _integrate_all(coefficients, starts, stops, arguments, substeps):
-    def one(start, stop, argument):
-        return integrate(lambda t: coefficients(t, argument), start, stop, substeps)
+    def one(slices):
+        return _integrate_one(coefficients, *slices, substeps)
 
-    return jax.vmap(one)(starts, stops, arguments)
+    head = jax.tree.map(lambda a: a[0], (starts, stops, arguments))
+    n = jax.eval_shape(one, head).lift.shape[0]
+    # Large matrices fill the processor by themselves; all intervals at once would only fill the memory.
+    together = jax.vmap(one) if n <= MOST_IMPLICIT else partial(jax.lax.map, one)
+    return together((starts, stops, arguments))
 
 
-def flows(
+def substeps_for(
     coefficients: Callable[[jax.Array, Any], Coefficients],
     starts: np.ndarray,
     stops: np.ndarray,
     arguments: Any,
     tolerance: float = TOLERANCE,
-) -> Flow:
-    """The flows over all intervals [starts_i, stops_i] at once, accurate to `tolerance`.
+) -> int:
+    """Into how many steps each interval is cut for flows that are accurate to `tolerance`; a number, decided outside of JAX.
 
-    `coefficients(t, argument)` gives the `Coefficients` at time t; `arguments` is a pytree with an entry for each interval.
-    The number of substeps is doubled until halving the step changes nothing on the intervals that are tried: the longest and
-    a spread of others.
+    It is doubled until halving the step changes nothing on the intervals that are tried: the longest and a spread of others.
     """
     lengths = stops - starts
-    tried = np.unique(np.r_[np.argmax(lengths), np.linspace(0, len(starts) - 1, min(len(starts), 48)).astype(int)])
+    n = jax.eval_shape(coefficients, starts[0], _first(arguments)).matrix.shape[0]
+    few = 48 if n <= MOST_IMPLICIT else 6
+    tried = np.unique(np.r_[np.argmax(lengths), np.linspace(0, len(starts) - 1, min(len(starts), few)).astype(int)])
     sample = jax.tree.map(lambda a: a[tried], arguments)
     substeps, previous, error = 1, None, np.inf
     while True:
@@ -223,9 +311,30 @@ def flows(
             last, error = error, max(_difference(a, b) for a, b in zip(previous, flow, strict=True))
             # Below 1e-11 rounding may stop the error from falling further.
             if error <= tolerance or (error <= 1e-11 and error >= 0.25 * last) or substeps >= MOST_SUBSTEPS:
-                break
+                return substeps // 2
         previous, substeps = flow, 2 * substeps
-    return _integrate_all(coefficients, starts, stops, arguments, substeps // 2)
+
+
+def flows(
+    coefficients: Callable[[jax.Array, Any], Coefficients],
+    starts: np.ndarray,
+    stops: np.ndarray,
+    arguments: Any,
+    tolerance: float = TOLERANCE,
+    substeps: int | None = None,
+) -> Flow:
+    """The flows over all intervals [starts_i, stops_i] at once, accurate to `tolerance`.
+
+    `coefficients(t, argument)` gives the `Coefficients` at time t; `arguments` is a pytree with an entry for each interval.
+    With `substeps`, the answer of `substeps_for`, this is a pure function of `arguments`, to be traced and differentiated.
+    """
+    if substeps is None:
+        substeps = substeps_for(coefficients, starts, stops, arguments, tolerance)
+    return _integrate_all(coefficients, starts, stops, arguments, substeps)
+
+
+def _first(tree: Any) -> Any:
+    return jax.tree.map(lambda a: a[0], tree)
 
 
 def _difference(a: jax.Array, b: jax.Array) -> float:
