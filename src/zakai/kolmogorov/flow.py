@@ -164,13 +164,13 @@ def integrate(
     """The flow over [start, stop] in `substeps` equal steps of Gauss' collocation method (order 16); pure."""
     length = (stop - start) / substeps
 
-    def add(carry, index):
+    def add(index, carry):
         deviation, growth, trace = carry
         step, more_growth, more_trace = _one_step(coefficients, start + index * length, length)
-        return (deviation + step + step @ deviation, growth + more_growth, trace + more_trace), None
+        return deviation + step + step @ deviation, growth + more_growth, trace + more_trace
 
     first = _one_step(coefficients, start, length)
-    (deviation, growth, trace), _ = jax.lax.scan(add, first, jnp.arange(1, substeps))
+    deviation, growth, trace = jax.lax.fori_loop(1, substeps, add, first)
     k = growth.shape[0]
     n = deviation.shape[0] // 2 - k
     forced, action = slice(2 * n, 2 * n + k), slice(2 * n + k, None)
@@ -248,12 +248,12 @@ def integrate_explicitly(
         end = slope(begin + length, added(value, 1.0, last))
         return jax.tree.map(lambda a, b, c: 0.5 * (a + b + h * c), before, last, end)
 
-    def step(value, index):
+    def step(index, value):
         begin = start + index * length
         first, value_next = slope(begin, value), value
         for count, weight in zip(_MIDPOINTS, _EXTRAPOLATION, strict=True):
             value_next = added(value_next, weight, midpoint(begin, value, first, count))
-        return value_next, None
+        return value_next
 
     zero = (
         jnp.zeros((2 * n, 2 * n)),
@@ -263,8 +263,7 @@ def integrate_explicitly(
         jnp.zeros(k),
         jnp.zeros(()),
     )
-    value, _ = jax.lax.scan(step, zero, jnp.arange(substeps))
-    return _flow(*value)
+    return _flow(*jax.lax.fori_loop(0, substeps, step, zero))
 
 
 def _integrate_one(coefficients, start, stop, argument, substeps):
@@ -276,7 +275,6 @@ def _integrate_one(coefficients, start, stop, argument, substeps):
     return integrate(at, start, stop, substeps)
 
 
-@partial(jax.jit, static_argnums=(0, 4))
 def _integrate_all(coefficients, starts, stops, arguments, substeps):
     def one(slices):
         return _integrate_one(coefficients, *slices, substeps)
@@ -286,6 +284,29 @@ def _integrate_all(coefficients, starts, stops, arguments, substeps):
     # Large matrices fill the processor by themselves; all intervals at once would only fill the memory.
     together = jax.vmap(one) if n <= MOST_IMPLICIT else partial(jax.lax.map, one)
     return together((starts, stops, arguments))
+
+
+# With a fixed number of substeps the loop over them can be differentiated; with a variable one it is compiled only once.
+_fixed = partial(jax.jit, static_argnums=(0, 4))(_integrate_all)
+_variable = partial(jax.jit, static_argnums=0)(_integrate_all)
+
+
+def _in_blocks(coefficients, starts, stops, arguments, substeps):
+    """`_integrate_all` in blocks of one size, whatever the number of intervals: one compilation."""
+    slices = (np.asarray(starts, float), np.asarray(stops, float), jax.tree.map(np.asarray, arguments))
+    count, block = len(starts), _tried(coefficients, starts, arguments)
+    parts = []
+    for first in range(0, count, block):
+        rows = np.minimum(np.arange(first, first + block), count - 1)
+        flow = _variable(coefficients, *jax.tree.map(lambda a, rows=rows: a[rows], slices), substeps)
+        parts.append(jax.tree.map(lambda a, first=first: np.asarray(a)[: count - first], flow))
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
+
+
+def _tried(coefficients, starts, arguments) -> int:
+    """How many intervals are tried, and how many are integrated together."""
+    n = jax.eval_shape(coefficients, starts[0], jax.tree.map(lambda a: a[0], arguments)).matrix.shape[0]
+    return 48 if n <= MOST_IMPLICIT else 6
 
 
 def substeps_for(
@@ -300,13 +321,13 @@ def substeps_for(
     It is doubled until halving the step changes nothing on the intervals that are tried: the longest and a spread of others.
     """
     lengths = stops - starts
-    n = jax.eval_shape(coefficients, starts[0], _first(arguments)).matrix.shape[0]
-    few = 48 if n <= MOST_IMPLICIT else 6
-    tried = np.unique(np.r_[np.argmax(lengths), np.linspace(0, len(starts) - 1, min(len(starts), few)).astype(int)])
+    few = min(len(starts), _tried(coefficients, starts, arguments))
+    # The longest takes the place of the first, so that they are one block.
+    tried = np.unique(np.r_[np.argmax(lengths), np.linspace(0, len(starts) - 1, few).astype(int)[1:]])
     sample = jax.tree.map(lambda a: a[tried], arguments)
     substeps, previous, error = 1, None, np.inf
     while True:
-        flow = _integrate_all(coefficients, starts[tried], stops[tried], sample, substeps)
+        flow = _in_blocks(coefficients, starts[tried], stops[tried], sample, substeps)
         if previous is not None:
             last, error = error, max(_difference(a, b) for a, b in zip(previous, flow, strict=True))
             # Below 1e-11 rounding may stop the error from falling further.
@@ -330,11 +351,8 @@ def flows(
     """
     if substeps is None:
         substeps = substeps_for(coefficients, starts, stops, arguments, tolerance)
-    return _integrate_all(coefficients, starts, stops, arguments, substeps)
-
-
-def _first(tree: Any) -> Any:
-    return jax.tree.map(lambda a: a[0], tree)
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments))
+    return (_fixed if traced else _in_blocks)(coefficients, starts, stops, arguments, substeps)
 
 
 def _difference(a: jax.Array, b: jax.Array) -> float:
