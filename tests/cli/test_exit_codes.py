@@ -75,9 +75,9 @@ def test_a_missing_extra_is_code_2_and_names_it_before_the_work(zakai, tmp_path,
 
 
 def test_warnings_go_to_stderr_and_the_code_is_0(zakai, monkeypatch):
-    from zakai.filters import driver
+    from zakai.filters import _run
 
-    monkeypatch.setattr(driver, "_warnings", lambda result: ["the sky is falling"])
+    monkeypatch.setattr(_run, "_warnings", lambda result: ["the sky is falling"])
     answer = zakai("filter", "model.toml", "record.csv", "-o", "result.nc")
     assert answer.code == 0 and answer.err == "warning: the sky is falling\n"
 

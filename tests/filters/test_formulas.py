@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import zakai
-from zakai.filters import driver
+from zakai.filters import _run
 
 MODEL = zakai.Model(
     state=["x"], drift=["-a*x"], diffusion=[["s"]], observation=["x"], observation_noise=[["r**2"]],
@@ -16,9 +16,9 @@ RECORD = zakai.simulate(MODEL, np.linspace(0.05, 1.0, 20), seed=1)[1]
 @pytest.mark.parametrize("method", ["limited-direct", "extended-kalman-bucy"])
 def test_other_values_of_the_parameters_compile_no_step_again(method):
     zakai.filter(MODEL, RECORD, method=method)
-    compiled = driver._scan._cache_size()
+    compiled = _run.scan._cache_size()
     other = zakai.filter(MODEL.with_parameters(a=0.51), RECORD, method=method)
-    assert driver._scan._cache_size() == compiled
+    assert _run.scan._cache_size() == compiled
     # And they count, in the prior too: the same model made from its text has nothing to share the values with.
     prior = {"kind": "density", "log_density": "-0.51*x**2"}
     alone = zakai.Model(state=["x"], drift=["-0.51*x"], observation=["x"], prior=prior)

@@ -1,0 +1,297 @@
+"""One record on its way through one method: chunk by chunk what is prepared, run by run what is filtered."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from threading import Lock
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zakai import _float64  # noqa: F401
+from zakai.algebra.conditions import Condition
+from zakai.densities import Density
+from zakai.errors import InputError
+from zakai.filters._protocol import Info, Method
+from zakai.filters.observations import Data, data_of, schedule_of
+from zakai.filters.results import FilterResult, versions
+from zakai.models.model import Model
+from zakai.models.numeric import explain_nonfinite, numpy_function
+from zakai.records import Record
+
+CHUNK = 4096  # intervals that are prepared at once, at most
+CHUNK_BYTES = 512 * 2**20  # what is prepared for them, at most
+RUN = 256  # intervals between two looks at the lattice
+TRIES = 12
+KEPT_BYTES = 512 * 2**20
+
+_PREPARED: WeakKeyDictionary[Model, OrderedDict[Any, Any]] = WeakKeyDictionary()
+_LOCK = Lock()
+
+
+def prepared_for(method: Method, model: Model, schedule: Any, options: Mapping[str, Any]) -> Any:
+    """`prepare`, remembered for the last schedules of each model."""
+    with _LOCK:
+        kept = _PREPARED.setdefault(model, OrderedDict())
+        key = (method.name, tuple(sorted(options.items())), *(np.ascontiguousarray(a).tobytes() for a in schedule))
+        if key not in kept:
+            kept[key] = method.prepare(model, schedule, **options)
+            while len(kept) > 4 or (len(kept) > 1 and sum(size_of(one.intervals) for one in kept.values()) > 2 * CHUNK_BYTES):
+                kept.popitem(last=False)
+        kept.move_to_end(key)
+        return kept[key]
+
+
+def size_of(tree: Any) -> int:
+    """The bytes of all arrays of a pytree."""
+    return sum(np.prod(np.shape(leaf), dtype=int) * 8 for leaf in jax.tree.leaves(tree))
+
+
+def scanned(one: Callable[..., Any], state: Any, slices: Any) -> tuple[Any, Any]:
+    """`lax.scan` of one(state, slice), whose first step alone may change the size of the state."""
+    head = jax.tree.map(lambda a: a[0], slices)
+    if jax.eval_shape(one, state, head)[0] == jax.eval_shape(lambda s: s, state):
+        return jax.lax.scan(one, state, slices)
+    state, first = one(state, head)
+    state, rest = jax.lax.scan(one, state, jax.tree.map(lambda a: a[1:], slices))
+    return state, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+
+
+@partial(jax.jit, static_argnums=(0, 4))
+def scan(step, state, intervals, observations, keep):
+    """All steps of a run: the last state, and of every step its Info and, with `keep`, its state."""
+
+    def one(carry, slices):
+        new, info = step(slices[0], carry, slices[1])
+        return new, (info, getattr(new, "kept", new) if keep else None)
+
+    return scanned(one, state, (intervals, observations))
+
+
+def rows_of(tree: Any, rows: slice, length: int) -> Any:
+    """Some rows of every array of a pytree, the last one repeated to `length`: one shape, one compilation."""
+
+    def cut(array):
+        part = np.asarray(array)[rows]
+        missing = length - len(part)
+        return part if missing == 0 else np.concatenate([part, np.repeat(part[-1:], missing, axis=0)])
+
+    return jax.tree.map(cut, tree)
+
+
+class Piece(NamedTuple):
+    """A chunk of the record as it was filtered: what was prepared, its data, and for each run its rows and first state."""
+
+    prepared: Any
+    data: Data
+    runs: list[tuple[slice, Any]]
+
+
+class Setting(NamedTuple):
+    """What is filtered by what: all but the record."""
+
+    model: Model
+    prior: Any
+    method: Method
+    options: Mapping[str, Any]
+
+    def prepared(self, data: Data) -> Any:
+        """What the method prepares for the intervals of some data."""
+        return prepared_for(self.method, self.model, schedule_of(data, True), self.options)
+
+    def chunks(self, data: Data, first: int, lanes: int = 1) -> Iterator[slice]:
+        """The rows that are prepared at once, from `first`, so that neither they nor `lanes` records of them fill the memory."""
+        count = len(data.stops)
+        if first == count:
+            return
+        one = size_of(self.prepared(data.part(slice(first, first + 1))).intervals)
+        length = max(1, min(CHUNK, CHUNK_BYTES // max(one, 64 * lanes * self.model.m)))
+        length = length // RUN * RUN or length
+        for begin in range(first, count, length):
+            yield slice(begin, min(begin + length, count))
+
+
+def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, ends: bool, keep: bool):
+    """One run of steps from one look at the lattice to the next, tried until its health is good.
+
+    `rows` are those of the chunk that are left; `ends` says that the record ends with them.  Gives the rows that were taken,
+    the state they began with, the state they ended with, and what `scan` tells of each.
+    """
+    run = getattr(state, "run_length", RUN)
+    count = min(run, rows.stop - rows.start)
+    # The short rest of a record is padded to a power of two: few shapes, few compilations.
+    length = run if run <= 64 or 2 * count > run else max(16, 2 ** int(np.ceil(np.log2(count))))
+    length = length if ends else count
+    part = slice(rows.start, rows.start + count)
+    intervals, given = rows_of(prepared.intervals, part, length), rows_of(observations, part, length)
+    begin = adapt(prepared, state, part, None) if adapt else state
+    for _ in range(TRIES):
+        end, told = scan(method.step, begin, intervals, given, keep)
+        info, kept = jax.tree.map(lambda a: np.asarray(a)[:count], told)
+        again = adapt(prepared, begin, part, info) if adapt else None
+        if again is None:
+            break
+        begin = again
+    return part, begin, end, info, kept
+
+
+class Run:
+    """One record on its way through one method."""
+
+    def __init__(self, setting: Setting, record: Record, keep: str | None, recorded: bool = False):
+        self.setting, self.record = setting, record
+        self.data = data_of(setting.model, record)
+        self.infos: list[Info] = []
+        self.notes: dict[str, None] = {}
+        self.states: list[tuple[int, Any, Any]] = []
+        self.keep, self.must_keep = keep != "moments", keep == "densities"
+        self.pieces: list[Piece] | None = [] if recorded else None
+        self.bytes = 0
+        self.done = 0
+
+    def all(self, progress: Callable[[int, int], None] | None) -> None:
+        """Filter the whole record, chunk by chunk."""
+        method, count = self.setting.method, len(self.record.times)
+        state = self.start()
+        for rows in self.setting.chunks(self.data, self.done):
+            data = self.data.part(rows)
+            prepared = self.setting.prepared(data)
+            observations = method.observations(prepared, data)
+            if self.pieces is not None:
+                self.pieces.append(Piece(prepared, data, []))
+            while self.done < rows.stop:
+                left = slice(self.done - rows.start, rows.stop - rows.start)
+                part, begin, state, info, kept = run_steps(
+                    method, method.adapt, scan, prepared, state, observations, left, rows.stop == count, self.keep
+                )
+                if self.pieces is not None:
+                    self.pieces[-1].runs.append((part, begin if method.adapt else None))
+                self.take(prepared, begin, info, kept)
+                if progress is not None:
+                    progress(self.done, count)
+
+    def start(self) -> Any:
+        """The first state: the prior, or the prior after a sample at the start itself."""
+        method, prior = self.setting.method, self.setting.prior
+        self.first = prepared = self.setting.prepared(self._first_interval())
+        state = method.init(prepared, prior)
+        self._keep_one(prepared, state, 0)
+        if not self.at_start:
+            return state
+        observation = method.observations(prepared, self.data.part(slice(0, 1)))
+        state, info = method.correct(prepared, prior, observation)
+        self.infos.append(jax.tree.map(lambda a: np.asarray(a)[None], info))
+        self._keep_one(prepared, state, 1)
+        self.done = 1
+        return state
+
+    @property
+    def at_start(self) -> bool:
+        """Whether the first reading is a sample at the start itself."""
+        return self.data.stops[0] == self.setting.model.start
+
+    def _first_interval(self) -> Data:
+        first = self.data.part(slice(0, 1))
+        if not self.at_start:
+            return first
+        # The interval before a sample at the start has no length, so the first one that has stands in for it.
+        return self.data.part(slice(1, 2)) if len(self.data.stops) > 1 else first._replace(stops=first.stops + 1.0)
+
+    def _keep_one(self, prepared: Any, state: Any, index: int) -> None:
+        if self.keep:
+            self.states.append((index, prepared, jax.tree.map(lambda a: np.asarray(a)[None], getattr(state, "kept", state))))
+
+    def take(self, prepared: Any, begin: Any, info: Info, kept: Any) -> None:
+        """Keep what a run of steps gave."""
+        self.notes.update(dict.fromkeys(getattr(prepared, "notes", ())))
+        self._explain(info, begin)
+        self.infos.append(info)
+        if self.keep:
+            self.states.append((self.done + 1, prepared, kept))
+            self.bytes += sum(leaf.nbytes for leaf in jax.tree.leaves(kept))
+            if self.bytes > KEPT_BYTES and not self.must_keep:
+                self.keep, self.states = False, []
+        self.done += len(info.log_likelihood_increment)
+
+    def _explain(self, info: Info, begin: Any) -> None:
+        """A number that does not exist is said with the formula and the state at which it was met."""
+        bad = ~np.isfinite(info.log_likelihood_increment)
+        if not bad.any():
+            return
+        model = self.setting.model
+        k = int(np.argmax(bad))
+        time = float(self.data.stops[self.done + k])
+        lattice = getattr(begin, "lattice", None)
+        points = np.asarray(lattice.points()).reshape(-1, model.n) if lattice is not None else info.mean[:k]
+        # Where a mean has itself overflowed, no formula is to blame.
+        points = points[np.isfinite(points).all(axis=-1)]
+        for key in ("drift", "observation"):
+            values = numpy_function(getattr(model, key), model)(points, time, model.theta())
+            wrong = ~np.isfinite(values).all(axis=-1)
+            if wrong.any():
+                said = explain_nonfinite(model, key, getattr(model, key), points[wrong][0], time)
+                raise InputError(f"{model.source}: {said}, which the density reaches")
+
+    def result(self, why: str, considered: Mapping[str, tuple[Condition, ...]]) -> FilterResult:
+        """Everything put together."""
+        model, method = self.setting.model, self.setting.method
+        first = self.density(0) if self.states else method.density(self.first, method.init(self.first, self.setting.prior))
+        joined = jax.tree.map(lambda *parts: np.concatenate(parts), *self.infos)
+        increments = np.concatenate([[0.0], joined.log_likelihood_increment])
+        health = {name: np.concatenate([[np.nan], values]) for name, values in joined.health.items()}
+        result = FilterResult(
+            times=np.concatenate([[model.start], self.record.times]),
+            mean=np.concatenate([first.mean()[None], joined.mean]),
+            cov=np.concatenate([first.cov()[None], joined.cov]),
+            log_likelihood_increments=increments,
+            health=health,
+            warnings=[],
+            method=method.name,
+            why=why,
+            model=model,
+            record=self.record,
+            conditions=considered,
+            bounds=method.bounds,
+            state=model.state,
+            attributes={"source": method.source, "exactness": method.exactness, **versions()},
+            _density=self.density if self.states else None,
+            _no_density=(
+                f"the densities of {len(self.record.times)} steps were not kept: they need more than "
+                f'{KEPT_BYTES // 2**20} MiB; keep="densities" keeps them all'
+                if self.keep is False and self.bytes
+                else 'the densities were not kept; keep="densities" keeps them'
+            ),
+        )
+        result.warnings.extend([*self.notes, *_warnings(result)])
+        return result
+
+    def density(self, index: int) -> Density:
+        """The density at an index of the result."""
+        for first, prepared, states in reversed(self.states):
+            if first <= index:
+                state = jax.tree.map(lambda a: a[index - first], states)  # noqa: B023
+                return self.setting.method.density(prepared, state)
+        raise IndexError(index)
+
+
+def _warnings(result: FilterResult) -> list[str]:
+    """A sentence for every bound that was not kept and for numbers that do not exist."""
+    said = []
+    bad = ~np.isfinite(result.log_likelihood_increments)
+    if bad.any():
+        time = result.times[np.argmax(bad)]
+        said.append(f"the density was lost at t = {time:g}; nothing after that time is to be trusted")
+    for name, (bound, what) in result.bounds.items():
+        over = result.health[name] > bound
+        if over.any():
+            worst = int(np.nanargmax(np.where(over, result.health[name], -np.inf)))
+            said.append(
+                f"{name} exceeded {bound:g} at {int(over.sum())} of {len(over) - 1} times, most at t = "
+                f"{result.times[worst]:g} ({result.health[name][worst]:.2g}): {what}"
+            )
+    return said
