@@ -28,8 +28,10 @@ EDGE = 1e-12
 EDGE_SHARPENED = 1e-9  # sharpening cuts the tails at 1e-13 of the maximum, and the cells along the cut add up
 QUADRATURE = 1e-11
 JOINT = 1.16  # standard deviation, in cells, from which the error of a sum is below QUADRATURE
-BASE = {1: 128, 2: 64}
-MOST = {1: 8192, 2: 1024}
+ROOM = 64.0  # the longest rows of a slanted lattice, in sizes of an axis
+BASE = {1: 128, 2: 64, 3: 48}
+MOST = {1: 8192, 2: 1024, 3: 256}
+FINE = {1: 2.0, 2: 2.0, 3: 1.2}  # by how much the first lattice is finer than it need be
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,8 @@ class Plan:
     """How the next steps move the density; static, so that each plan is compiled once.
 
     `banded` steps keep a window of `sizes` that moves along; the others choose a lattice of `sizes` each time. `window` and
-    `cells` say how generous the banded window and its cell are, `run` how many steps it is for.
+    `cells` say how generous the banded window and its cell are, `run` how many steps it is for, `room` the length of the
+    rows of a lattice that is slanted against the kernel.
     """
 
     banded: bool
@@ -49,6 +52,7 @@ class Plan:
     window: float = 1.08
     cells: float = CELLS
     run: int = 256
+    room: float = 2.0
 
     @property
     def needed(self) -> float:
@@ -56,9 +60,9 @@ class Plan:
         return CELLS_SHARPENED if self.sharpen else CELLS
 
 
-def rounded_up(size: float) -> int:
-    """The next number of the form 2^k (1 + j/4), from 64: few shapes, few compilations."""
-    power = 64
+def rounded_up(size: float, least: int = 64) -> int:
+    """The next number of the form 2^k (1 + j/4), from `least`: few shapes, few compilations."""
+    power = least
     while 2 * power < size:
         power *= 2
     return next(power * (4 + j) // 4 for j in range(5) if power * (4 + j) // 4 >= size or j == 4)
@@ -137,7 +141,7 @@ def first_lattice(
         if np.any((last - first < 0.7 * (high - low)) & ~point):
             low, high = first, last
             continue
-        fine = features(logs) >= 2 * CELLS
+        fine = features(logs) >= FINE[model.n] * CELLS
         if not np.all(fine | point | (size >= MOST[model.n])):
             size = np.where(fine | point, size, size * 2)
             continue
@@ -203,7 +207,7 @@ def _prior_box(model, prior):
 
 def _search(model, log_prior, axes):
     """A box around a density of which nothing is known: angles have their circle, the rest is looked for up to 10^6."""
-    count = 4001 if model.n == 1 else 401
+    count = {1: 4001, 2: 401, 3: 161}[model.n]
     angles = len(model.periodic)
     lines = [
         np.linspace(-np.pi, np.pi, count) if d < angles else np.sinh(np.linspace(-21.4, 21.4, count)) * 1e-3
@@ -260,8 +264,8 @@ def adapted(
             kernel = np.sqrt(np.max(np.einsum("id,kpij,jd->kpd", basis, np.linalg.inv(spreads), basis), axis=(0, 1)))
             roomy = (features(np.asarray(lattice.log_values)) > 3 * plan.needed) & ((2.4 * kernel < COARSEST) | plan.sharpen)
             sizes = tuple(max(s // 2, BASE[model.n]) if room else s for s, room in zip(sizes, roomy, strict=True))
-        if model.n == 2:
-            run = 64 if own and np.prod(sizes) * sizes[0] < 4e6 else 4
+        if model.n > 1:
+            run = 64 if own and np.prod(sizes) < 4e4 else 4
     angle = np.sqrt(max((spreads[:, :, i, i].max() for i in plan.angles), default=0.0))
     reach = REACH * angle / (2 * np.pi)
     images = max(0, int(np.ceil(reach - 0.5))) if plan.angles else 0
@@ -284,7 +288,10 @@ def _more(plan: Plan, info: Any) -> Plan | None:
     """A larger window or a finer cell, whichever was missing; None at the limit."""
     if not plan.banded:
         most = MOST[len(plan.sizes)]
-        need = np.nanmax(np.where(np.isfinite(info.need), info.need, 2.0), axis=0)
+        *need, taken = np.nanmax(np.where(np.isfinite(info.need), info.need, 2.0), axis=0)
+        if taken > plan.room:
+            return replace(plan, room=float(np.ceil(1.1 * taken))) if taken < ROOM else None
+        need = np.array(need)
         if np.all(info.health["resolution"] > plan.needed) and np.all(np.isfinite(info.log_likelihood_increment)):
             if plan.sharpen and not np.all(info.health["edge_mass"] < EDGE_SHARPENED):
                 # The tails that sharpening loses matter here: resolve the kernel instead.
@@ -293,10 +300,12 @@ def _more(plan: Plan, info: Any) -> Plan | None:
                 return replace(plan, sharpen=True)
         elif not plan.sharpen:
             # What a lattice that is too coarse says of the kernel may be far off; its own features come first.
-            need = np.nanmax(np.where(np.isfinite(info.need), CELLS / info.health["resolution"][:, None], 2.0), axis=0)
+            own = np.isfinite(info.need[:, :-1])
+            need = np.nanmax(np.where(own, CELLS / info.health["resolution"][:, None], 2.0), axis=0)
+        least = 32 if len(plan.sizes) == 3 else 64
         need = np.clip(1.1 * need if need.max() > 1 else np.full(len(plan.sizes), 1.5), None, 2.0)
         sizes = tuple(
-            min(most, max(s, rounded_up(s * f))) if f > 1.1 else s for s, f in zip(plan.sizes, need, strict=True)
+            min(most, max(s, rounded_up(s * f, least))) if f > 1.1 else s for s, f in zip(plan.sizes, need, strict=True)
         )
         return None if sizes == plan.sizes else replace(plan, sizes=sizes)
     finite = np.all(np.isfinite(info.log_likelihood_increment))

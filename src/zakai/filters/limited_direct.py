@@ -191,7 +191,7 @@ def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State
         "exponent": zero,
         "surprise": zero,
     }
-    return state, Info(log_mass, summary.mean, summary.cov, health, choice.CELLS / state.cells)
+    return state, Info(log_mass, summary.mean, summary.cov, health, np.append(choice.CELLS / state.cells, 1.0))
 
 
 def _start(prepared, prior, observation):
@@ -275,7 +275,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
     times = interval.start + (interval.stop - interval.start) * jnp.arange(parts + 1) / parts
     slices = (interval.flow, times[:-1], times[1:])
     zero, n = jnp.array(0.0), len(lattice.sizes)
-    worst = _Worst(zero, jnp.array(jnp.inf), jnp.ones(n), jnp.zeros(n), zero)
+    worst = _Worst(zero, jnp.array(jnp.inf), jnp.ones(n), jnp.zeros(n), zero, jnp.ones(()))
     carry = (lattice, cells, observed, zero, worst)
 
     def inner(carry, slices):
@@ -293,13 +293,14 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
     # A feature that the first look, over everything that could be reached, may have stepped over counts as unresolved.
     resolution = cells * jnp.minimum(1.0, 4.0 / worst.first_look)
     health = {
-        "edge_mass": summary.edge_mass,
+        # What found no room is lost beyond the edge.
+        "edge_mass": jnp.where(worst.room > plan.room, 1.0, summary.edge_mass),
         "resolution": jnp.min(resolution),
         "quadrature_error": 2 * jnp.exp(-2 * jnp.pi**2 * worst.joint**2),
         "exponent": worst.exponent,
         "surprise": worst.surprise,
     }
-    need = jnp.maximum(worst.need, plan.needed / resolution)
+    need = jnp.append(jnp.maximum(worst.need, plan.needed / resolution), worst.room)
     kept = observed if system.halves else None
     return State(lattice, kept, cells, summary.middle, plan), Info(log_mass, summary.mean, summary.cov, health, need)
 
@@ -312,6 +313,7 @@ class _Worst(NamedTuple):
     first_look: jax.Array
     need: jax.Array
     surprise: jax.Array
+    room: jax.Array
 
 
 def _part(system, plan, theta, observation, carry, slices, first: bool, last: bool):
@@ -336,14 +338,14 @@ def _part(system, plan, theta, observation, carry, slices, first: bool, last: bo
         before = before - _potential(system, lattice.points(), start, theta)
         exponent = jnp.maximum(exponent, lat.exponent_range(lattice.log_values, lattice.log_values + before))
     joint, need = _joint_cells(lattice, cells, flow, plan.sharpen, worst.joint, worst.need)
-    first_look, held = worst.first_look, _HELD_CUT
+    first_look, room, held = worst.first_look, worst.room, _HELD_CUT
     if plan.banded:
         lattice, spread = lat.move_banded(lattice, before, flow, observation.inputs, plan.taps)
         points = lattice.points()
         observed = observe(points)
         lattice = lattice._replace(log_values=lattice.log_values + factor(points, observed))
     else:
-        lattice, coarseness, spread = lat.move_dense(
+        lattice, coarseness, spread, taken = lat.move_dense(
             lattice,
             before,
             flow,
@@ -353,14 +355,15 @@ def _part(system, plan, theta, observation, carry, slices, first: bool, last: bo
             plan.angles,
             plan.images,
             plan.sharpen,
+            plan.room,
         )
-        first_look = jnp.maximum(first_look, coarseness)
+        first_look, room = jnp.maximum(first_look, coarseness), jnp.maximum(room, taken)
         observed = observe(lattice.points()) if system.halves and last else None
         held = _HELD_CUT if plan.sharpen else _HELD
     surprise = jnp.maximum(worst.surprise, lat.reach(lattice, spread) / held)
     summary = lat.summary(lattice, plan.angles)
     lattice = lattice._replace(log_values=lattice.log_values - summary.log_mass)
-    worst = _Worst(exponent, joint, first_look, need, surprise)
+    worst = _Worst(exponent, joint, first_look, need, surprise, room)
     return (lattice, lat.features(lattice), observed, log_mass + summary.log_mass, worst), summary
 
 

@@ -6,9 +6,10 @@ rounding in the tails too:
 
 * `move_banded` (one state): the lattice moves along the flow, so the convolution is a short filter with the same taps at
   every point; the window slides by whole cells to stay over the mass.
-* `move_dense` (one or two states): the target lattice is chosen anew each time, first over everything that the density can
+* `move_dense` (one to three states): the target lattice is chosen anew each time, first over everything that the density can
   reach and then, a second time, over what the observation has left of it.  Angles are wrapped by adding the images of the
-  source.  For two states the kernel is whitened, the source lattice made triangular, and the sum is done axis by axis.
+  source.  The kernel is whitened, the source lattice made triangular, and the sum is done axis by axis, each a product of two
+  matrices.
 
 A sum over a lattice replaces an integral with an error of 2 exp(-2 pi^2 s^2), s the standard deviation of the narrowest
 feature in cells; `features` measures it and the filters watch it.
@@ -16,8 +17,9 @@ feature in cells; `features` measures it and the filters watch it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +37,7 @@ SUPPORT = 36.0  # a point whose logarithm is lower than the maximum's by more th
 SUMMED = 1.0 / 0.75**2  # variance, in cells, from which a Gaussian may be summed on a lattice
 CUT = 1e-13  # what rounding leaves of a sharpened density
 _AT_ONCE = 2**22  # pairs of points whose kernel is held in memory at once
+_LARGEST = 700.0  # an exponent whose exponential still exists
 
 LogFunction = Callable[[jax.Array], jax.Array]
 
@@ -52,7 +55,7 @@ class Lattice(NamedTuple):
 
     def points(self) -> jax.Array:
         """The points (*sizes, n)."""
-        return self.centre + _indices(self.sizes) @ self.basis.T
+        return self.centre + _combined(_axes(self.sizes), self.basis)
 
     def log_volume(self) -> jax.Array:
         """The logarithm of the volume of a cell."""
@@ -78,15 +81,22 @@ def inverse(matrix: jax.Array) -> jax.Array:
     return jnp.linalg.inv(matrix)
 
 
-def _indices(sizes: tuple[int, ...]) -> np.ndarray:
-    axes = [np.arange(size) - size // 2 for size in sizes]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(float)
+def _axes(sizes: tuple[int, ...]) -> list[np.ndarray]:
+    """The indices along each axis, counted from the centre."""
+    return [np.arange(size, dtype=float) - size // 2 for size in sizes]
+
+
+def _combined(axes: Sequence[Array], matrix: jax.Array) -> jax.Array:
+    """`matrix` z (*sizes, n) for all z of the product of `axes`, which is never formed."""
+    n = len(axes)
+    views = [jnp.reshape(axis, [-1 if a == d else 1 for a in range(n)]) for d, axis in enumerate(axes)]
+    return jnp.stack([sum(matrix[i, d] * views[d] for d in range(n)) for i in range(n)], axis=-1)
 
 
 class Summary(NamedTuple):
     """Of a density on a lattice: `log_mass`, `mean` and `cov` (n,) and (n, n) of its points, the share of the mass in the two
-    outermost layers of cells and beside cells that hold nothing (`edge_mass`), and where the middle of its support is, as an
-    index (n,) from the centre.
+    outermost layers of cells and beside cells that hold nothing (`edge_mass`), and, for one state, where the middle of its
+    support is, as an index (n,) from the centre.
     """
 
     log_mass: jax.Array
@@ -97,36 +107,54 @@ class Summary(NamedTuple):
 
 
 def summary(lattice: Lattice, angles: tuple[int, ...] = ()) -> Summary:
-    """One pass over the values; sums are written as products of matrices, which are vectorised where plain sums are not.
+    """A pass over the values, or two; sums are written as products of matrices, which are vectorised where plain sums are not.
 
     The mean of an angle is the argument of E exp(i theta), and its deviations are wrapped.
     """
     logs = lattice.log_values
+    n = logs.ndim
     top = jnp.max(logs)
     values = jnp.exp(logs - top)
-    index = _indices(lattice.sizes).reshape(-1, logs.ndim)
-    columns = np.concatenate([np.ones((len(index), 1)), index], axis=1)
-    total, *first = values.ravel() @ columns
-    used = (logs > top - SUPPORT).astype(float).ravel() @ columns
+    axes = _axes(lattice.sizes)
+    first = _moments(values, [jnp.stack([jnp.ones(len(i)), i], axis=1) for i in axes])
+    total, mean = first[(0,) * n], jnp.stack([first[_unit(n, d)] for d in range(n)])
+    middle = jnp.zeros(n)
+    if n == 1:
+        used = (logs > top - SUPPORT).astype(float) @ np.stack([np.ones(len(logs)), axes[0]], axis=1)
+        middle = used[1:] / used[0]
     closed = closed_axes(lattice, angles)
     outer = jnp.zeros(())
-    for axis in range(logs.ndim):
+    for axis in range(n):
         two = jnp.sum(lax.slice_in_dim(values, 0, min(2, lattice.sizes[axis]), axis=axis))
         two = two + jnp.sum(lax.slice_in_dim(values, max(lattice.sizes[axis] - 2, 0), None, axis=axis))
         if lattice.sizes[axis] < 4:  # a point mass has no edge
             continue
         outer = outer + (jnp.where(closed[axis], 0.0, two) if angles else two)
-    if logs.ndim > 1 or angles:
+    if n > 1 or angles:
         outer = outer + _beside_nothing(values)
-    mean = jnp.stack(first) / total
+    mean = mean / total
     if angles:
         mean, cov = _wrapped_moments(lattice, values / total, angles)
     else:
         # Deviations are taken from the mean before they are squared: no difference of large numbers.
-        weighted = (values.ravel()[:, None] * (index - mean)) / total
-        cov = lattice.basis @ (weighted.T @ (index - mean)) @ lattice.basis.T
+        deviations = [i - mean[d] for d, i in enumerate(axes)]
+        second = _moments(values, [jnp.stack([jnp.ones(len(i)), i, i**2], axis=1) for i in deviations]) / total
+        square = jnp.stack([jnp.stack([second[_unit(n, d, e)] for e in range(n)]) for d in range(n)])
+        cov = lattice.basis @ square @ lattice.basis.T
         mean = lattice.centre + lattice.basis @ mean
-    return Summary(top + jnp.log(total) + lattice.log_volume(), mean, cov, outer / total, used[1:] / used[0])
+    return Summary(top + jnp.log(total) + lattice.log_volume(), mean, cov, outer / total, middle)
+
+
+def _moments(values: jax.Array, columns: Sequence[jax.Array]) -> jax.Array:
+    """sum_i values_i columns_0[i_0, a] columns_1[i_1, b] ..., an array (a, b, ...)."""
+    for axis in reversed(range(values.ndim)):
+        values = jnp.tensordot(values, columns[axis], axes=([axis], [0]))
+    return jnp.transpose(values)
+
+
+def _unit(n: int, *axes: int) -> tuple[int, ...]:
+    """The powers of the axes in their product."""
+    return tuple(axes.count(d) for d in range(n))
 
 
 def _beside_nothing(values: jax.Array) -> jax.Array:
@@ -176,6 +204,12 @@ def closed_axes(lattice: Lattice, angles: tuple[int, ...]) -> jax.Array:
     return jnp.concatenate([closed, jnp.zeros(len(lattice.sizes) - len(angles), bool)])
 
 
+def log(values: jax.Array) -> jax.Array:
+    """The logarithm, with -inf for zero and a gradient of zero there."""
+    positive = values > 0
+    return jnp.where(positive, jnp.log(jnp.where(positive, values, 1.0)), -jnp.inf)
+
+
 def exponent_range(log_values: jax.Array, gauged: jax.Array) -> jax.Array:
     """How far below the largest gauged value the density's own maximum lies; beyond 600 it would be lost."""
     at = jnp.argmax(log_values.ravel())
@@ -214,7 +248,7 @@ def move_banded(
         both = jnp.concatenate([weights[:0:-1], weights])
         total = jnp.maximum(jnp.convolve(values, both, mode="full")[taps : taps + size], 0.0)
     moved = motion(flow, lattice.centre, inputs)
-    offset = cell * _indices((size,))[:, 0]
+    offset = cell * _axes((size,))[0]
     spread = jnp.log(total)
     logs = (
         top
@@ -243,11 +277,13 @@ def move_dense(
     angles: tuple[int, ...] = (),
     images: int = 0,
     sharpen: bool = False,
-) -> tuple[Lattice, jax.Array, jax.Array]:
-    """One interval for one or two states by sums over all pairs of points, onto a new lattice of `sizes`.
+    room: float = 2.0,
+) -> tuple[Lattice, jax.Array, jax.Array, jax.Array]:
+    """One interval for one to three states by sums over all pairs of points, onto a new lattice of `sizes`.
 
     `after(x)` is the logarithm that multiplies the density at the end; where it leaves mass decides the second lattice. Also
-    given is how much coarser the first was, along each axis (n,), and the logarithm of what was only spread, for `reach`.
+    given is how much coarser the first was, along each axis (n,), the logarithm of what was only spread, for `reach`, and
+    how much `room` a source that is slanted against the kernel took: more than there was loses mass.
     `angles` names the states that axes 0, 1, ... of the lattice are angles of; `images` is how many turns beyond the
     nearest the kernel reaches.  Axis 0 of the lattice must then be parallel to the angle, and stays so.
 
@@ -269,14 +305,16 @@ def move_dense(
     frame, triangle = jnp.linalg.qr(jax.scipy.linalg.solve_triangular(factor, lattice.basis, lower=True))
     signs = jnp.where(jnp.diag(triangle) < 0, -1.0, 1.0)
     frame, triangle = frame * signs, triangle * signs[:, None]
-    source = _indices(lattice.sizes) @ triangle.T
+    reached = gauged > top - SUPPORT
+    source = Source(values, triangle, reached, room)
     moved = motion(flow, lattice.centre, inputs)
     to_offset = factor @ frame
     log_scale = top + jnp.linalg.slogdet(triangle)[1] - 0.5 * n * np.log(2 * np.pi) + moved.log_mass
     turns = [triangle @ jnp.linalg.solve(lattice.basis, 2 * jnp.pi * jnp.eye(n)[i]) for i in angles]
-    # A turn of the first angle is along the first axis and is wrapped there; one of a second angle moves both coordinates.
+    # A turn of the first angle is along the first axis and is wrapped there; one of another moves several coordinates.
     turn = turns[0][0] if turns else None
-    shifts = [k * turns[1] for k in range(-images - 1, images + 2)] if len(turns) > 1 else [jnp.zeros(n)]
+    counts = itertools.product(range(-images - 1, images + 2), repeat=max(len(turns) - 1, 0))
+    shifts = [sum((k * other for k, other in zip(count, turns[1:], strict=True)), jnp.zeros(n)) for count in counts]
 
     def axes(low, spacing):
         return [low[d] + spacing[d] * jnp.arange(sizes[d]) for d in range(n)]
@@ -284,13 +322,13 @@ def move_dense(
     def evaluate(low, spacing):
         """The logarithm of the density, everything included, on the target lattice of whitened coordinates."""
         target = axes(low, spacing)
-        total = sum(_sum_axes(target, source, triangle, values, shift, turn, images) for shift in shifts)
+        total = sum(source.spread([z - shift[d] for d, z in enumerate(target)], turn, images) for shift in shifts)
         if sharpen:
-            total = jnp.where(total > CUT * jnp.max(total), total, 0.0)
-        offset = jnp.stack(jnp.meshgrid(*target, indexing="ij"), axis=-1) @ to_offset.T
-        exponent = offset @ moved.tilt + jnp.einsum("...i,ij,...j->...", offset, flow.bend, offset)
-        logs = log_scale + jnp.log(total) + exponent
-        return logs + after(moved.centre + offset @ flow.map.T), jnp.log(total)
+            total = jnp.where(total > CUT * lax.stop_gradient(jnp.max(total)), total, 0.0)
+        spread = log(total)
+        offset = _combined(target, to_offset)
+        exponent = offset @ moved.tilt + jnp.sum(offset * (offset @ flow.bend), axis=-1)
+        return log_scale + spread + exponent + after(moved.centre + offset @ flow.map.T), spread
 
     def lattice_over(low, high, closed):
         """The start and the spacing of a target lattice over [low, high], or around the whole circle."""
@@ -308,9 +346,7 @@ def move_dense(
             closed,
         )
 
-    reached = gauged > top - SUPPORT
-    low = jnp.stack([jnp.min(jnp.where(reached, source[..., d], jnp.inf)) for d in range(n)]) - FAR
-    high = jnp.stack([jnp.max(jnp.where(reached, source[..., d], -jnp.inf)) for d in range(n)]) + FAR
+    low, high = source.low - FAR, source.high + FAR
     low, high, closed = limited(low, high)
     low, coarse = lattice_over(low, high, closed)
     logs, _ = evaluate(low, coarse)
@@ -327,7 +363,7 @@ def move_dense(
     half = low + fine * (jnp.array(sizes) // 2)
     basis = flow.map @ to_offset * fine
     target = Lattice(logs, moved.centre + flow.map @ to_offset @ half, basis)
-    return target, coarse / fine, spread
+    return target, coarse / fine, spread, source.taken
 
 
 def added_variance(lattice: Lattice, flow: Flow) -> jax.Array:
@@ -352,27 +388,109 @@ def _sharpened(values: jax.Array, variances: jax.Array) -> jax.Array:
     return jnp.fft.irfftn(jnp.fft.rfftn(values) * factor, values.shape)
 
 
-def _sum_axes(target, source, triangle, values, shift, turn, images):
-    """sum_i exp(-|z' - R i - shift|^2 / 2) values_i, one axis after the other; R is upper triangular."""
+class Source:
+    """What is spread: `values` at the points z = R i of whitened coordinates, R the upper `triangle`; `reached` marks those that
+    matter, `low` and `high` (n,) is the box around them.
 
-    def kernel(distance):
-        if turn is None:
-            return jnp.exp(-0.5 * distance**2)
-        nearest = distance - turn * jnp.rint(distance / turn)
-        return sum(jnp.exp(-0.5 * (nearest + k * turn) ** 2) for k in range(-images, images + 1))
+    The sum of exp(-|t - R i|^2 / 2) values_i over i is done axis after axis.  Along axis d a row of the source, given by the
+    indices of the later axes, begins at some s.  With s = R_dd k + r, k whole,
 
-    first = target[0] - shift[0]
-    if values.ndim == 1:
-        return kernel(first[:, None] - source[:, 0]) @ values
-    across = source[..., 0].T
-    if first.size * values.size <= _AT_ONCE:
-        # A kernel matrix for each row of the source, laid out so that exp runs over contiguous numbers.
-        total = jnp.einsum("kji,ik->jk", kernel(first[None, :, None] - across[:, None, :]), values)
-    else:
-        total = lax.map(lambda row: kernel(first[:, None] - row[0]) @ row[1], (across, values.T)).T
-    size = values.shape[1]
-    rows = (jnp.arange(size) - size // 2) * triangle[1, 1] + shift[1]
-    return total @ jnp.exp(-0.5 * (target[1][:, None] - rows) ** 2).T
+        exp(-(t - R_dd i - s)^2 / 2) = exp(r (t - R_dd k) - r^2 / 2) exp(-(t - R_dd (i + k))^2 / 2) exp(-r R_dd i):
+
+    rows that are shifted by whole cells, tilted, and multiplied by one matrix.  No exponential is taken of a pair of points.
+    `room` is the length of the shifted rows, in sizes of the axis, and `taken` the largest that was needed.
+    """
+
+    def __init__(self, values: jax.Array, triangle: jax.Array, reached: jax.Array, room: float):
+        self.values, self.triangle, self.room = values, triangle, room
+        n = values.ndim
+        indices = _axes(values.shape)
+        self.reached = [jnp.any(reached, axis=tuple(range(d))) if d else reached for d in range(n)]
+        self.rows: list[Any] = []
+        lows, highs, taken = [], [], [jnp.ones(())]
+        for d in range(n):
+            later = indices[d + 1 :]
+            begin = sum(
+                (triangle[d, e] * jnp.reshape(i, [-1 if a == e else 1 for a in range(d + 1, n)])
+                 for e, i in enumerate(later, d + 1)),
+                jnp.zeros((1,) * (n - d - 1)),
+            )  # fmt: skip
+            whole = lax.stop_gradient(jnp.rint(begin / triangle[d, d]))
+            begins = jnp.broadcast_to(whole, values.shape[d + 1 :])
+            used = self.reached[d]
+            cells = indices[d].reshape(-1, *[1] * (n - d - 1)) + begins
+            first = jnp.min(jnp.where(used, cells, jnp.inf))
+            last = jnp.max(jnp.where(used, cells, -jnp.inf))
+            self.rows.append((begins, jnp.broadcast_to(begin, values.shape[d + 1 :]) - triangle[d, d] * begins, first, last))
+            lows.append(triangle[d, d] * (first - 0.5))
+            highs.append(triangle[d, d] * (last + 0.5))
+            if d < n - 1:
+                taken.append((last - first + 1.0) / values.shape[d])
+        self.low, self.high, self.taken = jnp.stack(lows), jnp.stack(highs), jnp.max(jnp.stack(taken))
+        self._first: Any = None
+
+    def spread(self, target: Sequence[jax.Array], turn: Any = None, images: int = 0) -> jax.Array:
+        """The sum at the product of the axes `target`; with a `turn`, axis 0 is wrapped."""
+        n = self.values.ndim
+        if turn is not None:
+            total = self._wrapped(target[0], turn, images)
+        else:
+            if self._first is None:
+                self._first = self._shifted(self.values, 0)
+            total = self._matrix(0, target[0], self._first, 0)
+        for d in range(1, n):
+            total = self._matrix(d, target[d], self._shifted(total, d), d)
+        return total
+
+    def _shifted(self, values: jax.Array, d: int) -> Any:
+        """The rows along axis d tilted and shifted by whole cells, and the cell of the first."""
+        size, cell = values.shape[d], self.triangle[d, d]
+        whole, rest, first, last = self.rows[d]
+        index = np.arange(size) - size // 2
+        if whole.ndim == 0:
+            return values, float(index[0])
+        tilted = values * jnp.exp(-jnp.reshape(cell * index, (-1, *[1] * rest.ndim)) * rest)
+        length = int(np.ceil(self.room * size))
+        origin = jnp.floor(0.5 * (first + last)) - length // 2
+        at = jnp.arange(length).reshape(-1, *[1] * whole.ndim) + (origin - whole + size // 2).astype(int)
+        inside = (at >= 0) & (at < size)
+        at = jnp.broadcast_to(jnp.clip(at, 0, size - 1), (*values.shape[:d], *at.shape))
+        return jnp.where(inside, jnp.take_along_axis(tilted, at, axis=d), 0.0), origin
+
+    def _matrix(self, d: int, target: jax.Array, shifted: Any, axis: int) -> jax.Array:
+        rows, origin = shifted
+        cell = self.triangle[d, d]
+        whole, rest, _, _ = self.rows[d]
+        kernel = jnp.exp(-0.5 * (target[:, None] - cell * (origin + jnp.arange(rows.shape[axis]))) ** 2)
+        total = jnp.moveaxis(jnp.tensordot(kernel, rows, axes=([1], [axis])), 0, axis)
+        if whole.ndim == 0:
+            return total
+        distance = jnp.reshape(target, (-1, *[1] * rest.ndim)) - cell * whole
+        return total * jnp.exp(jnp.minimum(rest * distance - 0.5 * rest**2, _LARGEST))
+
+    def _wrapped(self, target: jax.Array, turn: jax.Array, images: int) -> jax.Array:
+        """The first axis where it is an angle: the kernel of every pair of points, with its images."""
+
+        def kernel(distance):
+            nearest = distance - turn * lax.stop_gradient(jnp.rint(distance / turn))
+            return sum(jnp.exp(-0.5 * (nearest + k * turn) ** 2) for k in range(-images, images + 1))
+
+        values, cell = self.values, self.triangle[0, 0]
+        index = _axes(values.shape)[0]
+        whole, rest, _, _ = self.rows[0]
+        begin = rest + cell * whole
+        if values.ndim == 1:
+            return kernel(target[:, None] - cell * index - begin) @ values
+        rows, begin = values.reshape(len(index), -1), begin.ravel()
+        if target.size * values.size <= _AT_ONCE:
+            # A kernel matrix for each row of the source, laid out so that exp runs over contiguous numbers.
+            distance = target[None, :, None] - cell * index[None, None, :] - begin[:, None, None]
+            total = jnp.einsum("kji,ik->jk", kernel(distance), rows)
+        else:
+            total = lax.map(
+                lambda row: kernel(target[:, None] - cell * index - row[0]) @ row[1], (begin, rows.T)
+            ).T
+        return total.reshape(target.size, *values.shape[1:])
 
 
 def _box(used, low, spacing, closed):
