@@ -6,82 +6,28 @@ Each function takes a Model and gives a tuple of `Condition`.  A theorem says wh
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 
-import numpy as np
 import sympy as sp
 
 from zakai.algebra.conditions import Condition
-from zakai.algebra.identities import all_zero, is_zero
-from zakai.algebra.yau import (
-    NoYauForm,
-    Quadratic,
-    YauForm,
-    as_quadratic,
-    inverse,
-    observation_energy,
-    q_without_observation,
-    short,
-    yau_form,
+from zakai.algebra.exact_theorems import benes, hu_yau, kalman_bucy
+from zakai.algebra.identities import all_zero
+from zakai.algebra.systems import (
+    CLY,
+    YauSystem,
+    affine_observation,
+    cached_yau_form,
+    definite_covariance,
+    determined,
+    q_parts,
+    yau_system,
 )
+from zakai.algebra.yau import YauForm, inverse, short
 from zakai.models.model import Model
-from zakai.models.numeric import numpy_function
-
-_CLY = "Chen, Luo and Yau 2017"
 
 
-@dataclass(frozen=True)
-class YauSystem:
-    """A time-varying Yau system whose transition between observations is linear-quadratic after the gauge u = e^phi v.
-
-    `bare` is -q/2 without the observation's energy h'S^-1 h and `full` with it, each None where it is not quadratic.
-    `slope` C (m, n) and `intercept` c (m, 1) are those of an affine h = C x + c, else None.
-    """
-
-    form: YauForm
-    bare: Quadratic | None
-    full: Quadratic | None
-    slope: sp.ImmutableMatrix | None
-    intercept: sp.ImmutableMatrix | None
-
-
-@lru_cache(maxsize=64)
-def cached_yau_form(model: Model) -> YauForm | NoYauForm:
-    """`yau_form`, computed once for each model."""
-    return yau_form(model)
-
-
-@lru_cache(maxsize=64)
-def _q_parts(model: Model):
-    """(-q/2 as a quadratic, whether q is one, why) without and with the observation's energy."""
-    form = cached_yau_form(model)
-    assert isinstance(form, YauForm)
-    bare = q_without_observation(model, form)
-    first = as_quadratic(bare, model.x)
-    return first, as_quadratic(bare + observation_energy(model), model.x)
-
-
-@lru_cache(maxsize=64)
-def affine_observation(model: Model) -> tuple[sp.ImmutableMatrix, sp.ImmutableMatrix] | None:
-    """C and c if h = C x + c, else None."""
-    seconds = [sp.diff(h, a, b) for h in model.observation for a in model.x for b in model.x]
-    if all_zero(seconds) is not True:
-        return None
-    origin = {symbol: 0 for symbol in model.x}
-    slope = model.observation.jacobian(model.x).subs(origin)
-    return sp.ImmutableMatrix(slope), sp.ImmutableMatrix(model.observation.subs(origin))
-
-
-def yau_system(model: Model) -> YauSystem | None:
-    """What the direct methods compute with, or None where the drift has no Yau form."""
-    form = cached_yau_form(model)
-    if not isinstance(form, YauForm):
-        return None
-    (bare, _, _), (full, _, _) = _q_parts(model)
-    slope, intercept = affine_observation(model) or (None, None)
-    return YauSystem(form, bare, full, slope, intercept)
-
+_SURVEY = "Chen and Dong, survey of direct methods"
 
 @lru_cache(maxsize=64)
 def limited_direct(model: Model) -> tuple[Condition, ...]:
@@ -92,8 +38,8 @@ def limited_direct(model: Model) -> tuple[Condition, ...]:
     conditions = [
         determined(model),
         Condition(
-            "the state has one or two coordinates, so that the density fits on a lattice",
-            model.n <= 2,
+            "the state has at most three coordinates, so that the density fits on a lattice",
+            model.n <= 3,
             f"n = {model.n}",
             "the lattice of this method",
         ),
@@ -104,14 +50,14 @@ def limited_direct(model: Model) -> tuple[Condition, ...]:
     form = cached_yau_form(model)
     statement = "f = L(t) x + l(t) + G(t) grad phi(t, x)"
     if not isinstance(form, YauForm):
-        return (*conditions, Condition(statement, form.holds, form.evidence, f"{_CLY}, (17) corrected"))
-    conditions.append(Condition(statement, True, _form_text(form), f"{_CLY}, (17) corrected"))
+        return (*conditions, Condition(statement, form.holds, form.evidence, f"{CLY}, (17) corrected"))
+    conditions.append(Condition(statement, True, _form_text(form), f"{CLY}, (17) corrected"))
     conditions.append(
         Condition(
             "L = G Omega + F' F^-1 with Omega symmetric for some square root F of G",
             True,
             "F = Fc R, Fc the Cholesky factor and R' = W R a rotation, makes it true for every L",
-            f"{_CLY}, Assumption 2",
+            f"{CLY}, Assumption 2",
         )
     )
     conditions.append(_quadratic_condition(model))
@@ -120,7 +66,7 @@ def limited_direct(model: Model) -> tuple[Condition, ...]:
 
 
 def _quadratic_condition(model: Model) -> Condition:
-    bare, full = _q_parts(model)
+    bare, full = q_parts(model)
     sampled = model.observation_kind == "samples"
     _, holds, evidence = bare if sampled else full
     statement = (
@@ -130,7 +76,7 @@ def _quadratic_condition(model: Model) -> Condition:
     )
     if sampled and bare[1]:
         evidence += " (a sample enters only at its time, so that h may be any function)"
-    return Condition(statement, holds, evidence, f"{_CLY}, Assumption 3 with 2 phi_t")
+    return Condition(statement, holds, evidence, f"{CLY}, Assumption 3 with 2 phi_t")
 
 
 def _angle_conditions(model: Model, form: YauForm):
@@ -140,7 +86,7 @@ def _angle_conditions(model: Model, form: YauForm):
         symbol = model.x[i]
         column = [form.matrix[j, i] for j in range(model.n)]
         turned = form.potential.subs(symbol, symbol + 2 * sp.pi) - form.potential
-        (bare, _, _), (full, _, _) = _q_parts(model)
+        (bare, _, _), (full, _, _) = q_parts(model)
         q = bare if model.observation_kind == "samples" else full
         parts = [*column, turned]
         if q is not None:
@@ -154,32 +100,49 @@ def _angle_conditions(model: Model, form: YauForm):
         )
 
 
-def determined(model: Model) -> Condition:
-    """No undetermined function: a model with one can be analysed and not filtered."""
+@lru_cache(maxsize=64)
+def general_direct(model: Model) -> tuple[Condition, ...]:
+    """The assumptions under which a Gaussian stays one, in gauge, between the observations of a time-varying Yau system.
+
+    Chen and Dong, Theorems 6 and 7, in their corrected form; G may be singular where the drift is affine.
+    """
+    conditions = [determined(model)]
+    if conditions[0].holds is not True:
+        return tuple(conditions)
+    form = cached_yau_form(model)
+    statement = "f = L(t) x + l(t) + G(t) grad phi(t, x)"
+    if not isinstance(form, YauForm):
+        return (*conditions, Condition(statement, form.holds, form.evidence, f"{_SURVEY}, (32) corrected"))
+    conditions.append(Condition(statement, True, _form_text(form), f"{_SURVEY}, (32) corrected"))
+    conditions.append(_quadratic_condition(model))
+    conditions.append(_few_directions(model, form))
+    conditions.extend(_angle_conditions(model, form))
+    return tuple(conditions)
+
+
+@lru_cache(maxsize=64)
+def gaussian_sum(model: Model) -> tuple[Condition, ...]:
+    """The survey's Theorems 2 and 3: the same for a system that does not depend on time."""
+    conditions = general_direct(model)
+    if conditions[0].holds is not True:
+        return conditions
+    parts = [*model.drift, *model.covariance, *model.observation, *model.observation_noise]
+    varying = [part for part in parts if model.t in part.free_symbols]
+    evidence = f"{short(str(varying[0]))} depends on t" if varying else "no coefficient depends on t"
+    return (*conditions, Condition("f, h, G and S are constant in time", not varying, evidence, f"{_SURVEY}, (14)"))
+
+
+def _few_directions(model: Model, form: YauForm) -> Condition:
+    """Quadrature is in the coordinates of a nonlinear h and of phi."""
+    bent = [] if affine_observation(model) else list(model.observation)
+    used = {name for name, symbol in zip(model.state, model.x) if any(f.has(symbol) for f in (*bent, form.potential))}
+    listed = ", ".join(name for name in model.state if name in used) or "none"
     return Condition(
-        "every function of the model is given",
-        not model.functions,
-        f"undetermined: {', '.join(model.functions)}" if model.functions else "no undetermined functions",
-        "needed to compute",
+        "a nonlinear h and phi depend on at most five coordinates, in which quadrature is done",
+        len(used) <= 5,
+        f"coordinates: {listed}",
+        "the quadrature of this method",
     )
-
-
-def definite_covariance(model: Model) -> Condition:
-    """G = g Q g' is positive definite; at the times of a record it is checked again."""
-    source = f"{_CLY}, Assumption 1"
-    statement = "G = g Q g' is positive definite"
-    determinant = sp.factor(model.covariance.det())
-    if is_zero(determinant):
-        return Condition(statement, False, "det G = 0", source)
-    evaluate = numpy_function(model.covariance, model, model.covariance.shape)
-    times = model.start + np.concatenate([[0.0], np.geomspace(1e-3, 1e2, 40)])
-    for time in times:
-        matrix = evaluate(np.zeros(model.n), time, model.theta())
-        if not np.all(np.isfinite(matrix)) or np.linalg.eigvalsh(matrix)[0] <= 0:
-            # The record may never reach this time, so that only the start refutes.
-            holds = False if time == model.start else None
-            return Condition(statement, holds, f"G is not positive definite at t = {time:g}", source)
-    return Condition(statement, True, f"det G = {short(str(determinant))}", source)
 
 
 @lru_cache(maxsize=64)
@@ -194,7 +157,12 @@ def _form_text(form: YauForm) -> str:
 
 # The theorem that says when a method holds, by the method's name.
 THEOREMS: Mapping[str, Callable[[Model], tuple[Condition, ...]]] = {
+    "kalman-bucy": kalman_bucy,
+    "benes": benes,
+    "hu-yau": hu_yau,
     "limited-direct": limited_direct,
+    "general-direct": general_direct,
+    "gaussian-sum": gaussian_sum,
     "extended-kalman-bucy": smooth_system,
 }
 
@@ -202,8 +170,13 @@ __all__ = [
     "THEOREMS",
     "YauSystem",
     "affine_observation",
+    "benes",
     "cached_yau_form",
+    "hu_yau",
+    "gaussian_sum",
+    "general_direct",
     "inverse",
+    "kalman_bucy",
     "limited_direct",
     "smooth_system",
     "yau_system",

@@ -1,0 +1,114 @@
+"""When a filter has finitely many statistics: the theorems of Kalman and Bucy, of Benes, and of Hu and Yau."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+
+import sympy as sp
+
+from zakai.algebra.conditions import Condition
+from zakai.algebra.gauges import affine_system, gauge
+from zakai.algebra.systems import affine_observation, affine_parts, cached_yau_form, definite_covariance, determined
+from zakai.algebra.yau import NoYauForm, short
+from zakai.models.model import Model
+from zakai.models.prior import DensityPrior
+
+_KALMAN = "Kalman and Bucy 1961"
+_BENES = "Benes 1981"
+_HU_YAU = "Hu and Yau 2002"
+_MOST_STATES = 3
+
+
+@lru_cache(maxsize=64)
+def kalman_bucy(model: Model) -> tuple[Condition, ...]:
+    """Affine f and h, with coefficients that may depend on time; G may be singular (Kalman and Bucy 1961)."""
+    conditions = [determined(model)]
+    if conditions[0].holds is not True:
+        return tuple(conditions)
+    return (
+        *conditions,
+        _affine("f = L(t) x + l(t)", model.drift, model, _KALMAN),
+        _affine("h = C(t) x + c(t)", model.observation, model, _KALMAN),
+        *_posterior_on_the_line(model),
+    )
+
+
+@lru_cache(maxsize=64)
+def benes(model: Model) -> tuple[Condition, ...]:
+    """f = L x + l + G grad log cosh(q.x + delta) with a quadratic q, and affine h (Benes 1981, in any dimension)."""
+    conditions = _yau_conditions(model, _BENES, "G")
+    if any(condition.holds is not True for condition in conditions):
+        return conditions
+    form = gauge(model)
+    potential = affine_system(model)[0].potential  # type: ignore[index]
+    statement = "phi = log cosh(q(t).x + delta(t))"
+    return (
+        *conditions,
+        Condition(statement, form is not None and form.is_log_cosh, f"phi = {short(str(potential))}", _BENES),
+        *_posterior_on_the_line(model),
+    )
+
+
+@lru_cache(maxsize=64)
+def hu_yau(model: Model) -> tuple[Condition, ...]:
+    """f = G grad F + l with affine l, a quadratic eta and affine h (Hu and Yau 2002, Theorems 3 to 6).
+
+    With l affine, eta is quadratic if and only if G:Hess F + grad F'G grad F + 2 l.grad F is. The theorems are stated for
+    constant coefficients; what is asked here, with 2 F_t, is what they need when coefficients vary in time.
+    """
+    conditions = _yau_conditions(model, f"{_HU_YAU}, conditions C1 to C3", "G")
+    if any(condition.holds is not True for condition in conditions):
+        return conditions
+    form = gauge(model)
+    return (
+        *conditions,
+        Condition(
+            "F depends on one or two directions, or is the logarithm of a sum of exponentials in two",
+            form is not None,
+            "more than two directions" if form is None else f"directions {short(str(form.directions.tolist()))}",
+            "the nodes of this method",
+        ),
+        *_posterior_on_the_line(model),
+    )
+
+
+def _yau_conditions(model: Model, source: str, covariance: str) -> tuple[Condition, ...]:
+    """h affine, f of Yau form, q quadratic."""
+    first = determined(model)
+    if first.holds is not True:
+        return (first,)
+    observed = _affine("h = C(t) x + c(t)", model.observation, model, source)
+    statement = f"f = L(t) x + l(t) + {covariance}(t) grad phi(t, x)"
+    if affine_parts(model.drift, model.x) is not None:
+        return first, observed, Condition(statement, True, "f is affine, phi = 0", source)
+    definite = definite_covariance(model)
+    form = cached_yau_form(model)
+    if isinstance(form, NoYauForm):
+        return first, observed, definite, Condition(statement, form.holds, form.evidence, source)
+    system = affine_system(model)
+    assert system is not None
+    _, _, holds, evidence = system
+    text = f"L = {short(str(form.matrix.tolist()))}, l = {short(str(list(form.offset)))}, phi = {short(str(form.potential))}"
+    quadratic = "2 phi_t + G:Hess phi + grad phi'G grad phi + 2 (L x + l).grad phi + 2 tr L is quadratic in x"
+    return first, observed, definite, Condition(statement, True, text, source), Condition(quadratic, holds, evidence, source)
+
+
+def _affine(statement: str, field: sp.MatrixBase, model: Model, source: str) -> Condition:
+    parts = affine_observation(model) if field is model.observation else affine_parts(field, model.x)
+    bent = next((entry for entry in field if affine_parts(sp.Matrix([entry]), model.x) is None), None)
+    evidence = "affine" if parts is not None else f"{short(str(bent))} is not affine in {', '.join(map(str, model.x))}"
+    return Condition(statement, parts is not None, evidence, source)
+
+
+def _posterior_on_the_line(model: Model) -> Iterator[Condition]:
+    """What Gaussians need of the prior and of the states."""
+    fits = not isinstance(model.prior, DensityPrior) or model.n <= _MOST_STATES
+    kind = "no prior" if model.prior is None else type(model.prior).__name__.removesuffix("Prior").lower()
+    yield Condition(
+        f"the prior is Gaussian or a mixture, or a density in at most {_MOST_STATES} states",
+        fits,
+        f"prior: {kind}, n = {model.n}",
+        "the nodes of this method",
+    )
+    yield Condition("no state is an angle", not model.periodic, f"periodic: {list(model.periodic)}", "a Gaussian is on the line")

@@ -1,0 +1,151 @@
+"""The gauge e^phi of a Yau system as the exact filters use it: a sum of exponentials, or a function of one or two directions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import sympy as sp
+
+from zakai.algebra.identities import is_zero, tidy
+from zakai.algebra.systems import affine_parts, cached_yau_form
+from zakai.algebra.yau import Quadratic, YauForm, as_quadratic, q_without_observation
+from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
+
+_MOST_TERMS = 32
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """e^phi, a function of `directions` x (k, n) alone.
+
+    Where e^phi = sum_j c_j e^{q_j.x} with positive c_j, `coefficients` c (K, 1) and `slopes` q (K, n) are given, else None.
+    """
+
+    potential: sp.Expr
+    directions: sp.ImmutableMatrix
+    coefficients: sp.ImmutableMatrix | None
+    slopes: sp.ImmutableMatrix | None
+
+    @property
+    def is_log_cosh(self) -> bool:
+        """Whether phi = log cosh(q.x + delta) + constant."""
+        if self.slopes is None or self.slopes.rows != 2:
+            return False
+        return all(is_zero(a + b) is True for a, b in zip(self.slopes.row(0), self.slopes.row(1), strict=True))
+
+
+@lru_cache(maxsize=64)
+def affine_system(model: Model) -> tuple[YauForm, Quadratic | None, bool | None, str] | None:
+    """The Yau form with -q/2 without the observation's energy, whether that q is quadratic, and why; None without a Yau form."""
+    form: object
+    parts = affine_parts(model.drift, model.x)
+    if parts is not None:
+        zero = sp.ImmutableMatrix.zeros(model.n, 1)
+        form = YauForm(*parts, sp.Integer(0), zero)
+        quadratic = Quadratic(sp.ImmutableMatrix.zeros(model.n, model.n), zero, -parts[0].trace())
+        return form, quadratic, True, "f is affine"
+    form = cached_yau_form(model)
+    if not isinstance(form, YauForm):
+        return None
+    return form, *as_quadratic(q_without_observation(model, form), model.x)
+
+
+@lru_cache(maxsize=64)
+def gauge(model: Model) -> Gauge | None:
+    """The gauge of a model with a Yau form, or None where phi depends on more than two directions."""
+    system = affine_system(model)
+    assert system is not None
+    potential, x = system[0].potential, model.x
+    if potential == 0:
+        return Gauge(potential, sp.ImmutableMatrix.zeros(0, model.n), sp.ImmutableMatrix([1]), sp.ImmutableMatrix.zeros(1, model.n))
+    terms = _exponentials(potential, x)
+    if terms is not None:
+        slopes = sp.ImmutableMatrix([list(slope) for slope in terms])
+        coefficients = sp.ImmutableMatrix(list(terms.values()))
+        if _positive(coefficients, model):
+            rows = _independent(slopes, model)
+            if len(rows) > 2:
+                return None
+            return Gauge(potential, slopes.extract(rows, range(model.n)), coefficients, slopes)
+    directions = _directions(system[0], model)
+    return None if directions is None else Gauge(potential, directions, None, None)
+
+
+def _exponentials(potential: sp.Expr, x: Sequence[sp.Symbol]) -> dict[tuple[sp.Expr, ...], sp.Expr] | None:
+    """e^phi as {slope: coefficient}, or None where it is no finite sum of exponentials of affine forms."""
+    product = {(sp.Integer(0),) * len(x): sp.Integer(1)}
+    for term in sp.Add.make_args(sp.expand(potential, log=False, power_base=False)):
+        logs = [factor for factor in sp.Mul.make_args(term) if isinstance(factor, sp.log) and factor.has(*x)]
+        factors = [_sum_of_exponentials(sp.exp(term), x)]
+        if logs:
+            count = tidy(term / logs[0])
+            if len(logs) > 1 or not count.is_Integer or not 0 < count <= _MOST_TERMS:
+                return None
+            factors = [_sum_of_exponentials(logs[0].args[0], x)] * int(count)
+        for factor in factors:
+            if factor is None or len(product) * len(factor) > 4 * _MOST_TERMS:
+                return None
+            product = _product(product, factor)
+    return product if len(product) <= _MOST_TERMS else None
+
+
+def _sum_of_exponentials(expression: sp.Expr, x: Sequence[sp.Symbol]) -> dict[tuple[sp.Expr, ...], sp.Expr] | None:
+    found: dict[tuple[sp.Expr, ...], sp.Expr] = {}
+    for term in sp.Add.make_args(sp.expand(expression.rewrite(sp.exp), power_exp=False)):
+        slope, coefficient = sp.zeros(len(x), 1), sp.Integer(1)
+        for factor in sp.Mul.make_args(term):
+            if not factor.has(*x):
+                coefficient *= factor
+                continue
+            parts = affine_parts(sp.Matrix([factor.args[0]]), x) if isinstance(factor, sp.exp) else None
+            if parts is None:
+                return None
+            slope += parts[0].T
+            coefficient *= sp.exp(parts[1][0])
+        key = tuple(sp.expand(entry) for entry in slope)
+        found[key] = found.get(key, sp.Integer(0)) + coefficient
+    return found
+
+
+def _product(a, b):
+    out: dict[tuple[sp.Expr, ...], sp.Expr] = {}
+    for p, c in a.items():
+        for q, d in b.items():
+            key = tuple(sp.expand(i + j) for i, j in zip(p, q, strict=True))
+            out[key] = out.get(key, sp.Integer(0)) + c * d
+    return out
+
+
+def _positive(coefficients: sp.MatrixBase, model: Model) -> bool:
+    """Whether all are positive, at the start and at times after it."""
+    times = model.start + np.concatenate([[0.0], np.geomspace(1e-3, 1e2, 20)])
+    with np.errstate(all="ignore"):
+        values = numpy_function(coefficients, model, coefficients.shape)(np.zeros(model.n), times, model.theta())
+    return bool(np.all(values[..., :] > 0))
+
+
+def _independent(slopes: sp.MatrixBase, model: Model) -> list[int]:
+    """The rows of a basis of the span of all slopes, at the start."""
+    values = numpy_function(slopes, model, slopes.shape)(np.zeros(model.n), model.start, model.theta())
+    rows: list[int] = []
+    for i in range(len(values)):
+        if np.linalg.matrix_rank(values[[*rows, i]]) > len(rows):
+            rows.append(i)
+    return rows
+
+
+def _directions(form: YauForm, model: Model) -> sp.ImmutableMatrix | None:
+    """One or two directions on which phi depends: a common one of its gradient, or coordinates."""
+    x = model.x
+    used = [i for i, entry in enumerate(form.gradient) if is_zero(entry) is not True]
+    first = form.gradient[used[0]]
+    ratios = [sp.simplify(entry / first) for entry in form.gradient] if model.n > 1 else [sp.Integer(1)]
+    if not any(ratio.has(*x) for ratio in ratios):
+        return sp.ImmutableMatrix([ratios])
+    if len(used) <= 2:
+        return sp.ImmutableMatrix(sp.eye(model.n).extract(used, range(model.n)))
+    return None

@@ -1,0 +1,114 @@
+"""What the theorems ask about a model: its Yau form, its q, whether h is affine, whether G is definite; each decided once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import sympy as sp
+
+from zakai.algebra.conditions import Condition
+from zakai.algebra.identities import all_zero, is_zero
+from zakai.algebra.yau import (
+    NoYauForm,
+    Quadratic,
+    YauForm,
+    as_quadratic,
+    observation_energy,
+    q_without_observation,
+    short,
+    yau_form,
+)
+from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
+
+CLY = "Chen, Luo and Yau 2017"
+
+
+@dataclass(frozen=True)
+class YauSystem:
+    """A time-varying Yau system whose transition between observations is linear-quadratic after the gauge u = e^phi v.
+
+    `bare` is -q/2 without the observation's energy h'S^-1 h and `full` with it, each None where it is not quadratic.
+    `slope` C (m, n) and `intercept` c (m, 1) are those of an affine h = C x + c, else None.
+    """
+
+    form: YauForm
+    bare: Quadratic | None
+    full: Quadratic | None
+    slope: sp.ImmutableMatrix | None
+    intercept: sp.ImmutableMatrix | None
+
+
+@lru_cache(maxsize=64)
+def cached_yau_form(model: Model) -> YauForm | NoYauForm:
+    """`yau_form`, computed once for each model."""
+    return yau_form(model)
+
+
+@lru_cache(maxsize=64)
+def q_parts(model: Model):
+    """(-q/2 as a quadratic, whether q is one, why) without and with the observation's energy."""
+    form = cached_yau_form(model)
+    assert isinstance(form, YauForm)
+    bare = q_without_observation(model, form)
+    first = as_quadratic(bare, model.x)
+    return first, as_quadratic(bare + observation_energy(model), model.x)
+
+
+@lru_cache(maxsize=64)
+def affine_observation(model: Model) -> tuple[sp.ImmutableMatrix, sp.ImmutableMatrix] | None:
+    """C and c if h = C x + c, else None."""
+    return affine_parts(model.observation, model.x)
+
+
+def affine_parts(
+    field: sp.MatrixBase, x: tuple[sp.Symbol, ...]
+) -> tuple[sp.ImmutableMatrix, sp.ImmutableMatrix] | None:
+    """C and c if the field is C x + c, else None."""
+    slope = sp.Matrix([[sp.diff(entry, symbol) if entry.has(symbol) else sp.Integer(0) for symbol in x] for entry in field])
+    # Where a derivative still contains the state it may do so in name only.
+    seconds = [sp.diff(entry, symbol) for entry in slope for symbol in entry.free_symbols & set(x)]
+    if all_zero(seconds) is not True:
+        return None
+    origin = {symbol: sp.Integer(0) for symbol in x}
+    return sp.ImmutableMatrix(slope.xreplace(origin)), sp.ImmutableMatrix(field.xreplace(origin))
+
+
+def yau_system(model: Model) -> YauSystem | None:
+    """What the direct methods compute with, or None where the drift has no Yau form."""
+    form = cached_yau_form(model)
+    if not isinstance(form, YauForm):
+        return None
+    (bare, _, _), (full, _, _) = q_parts(model)
+    slope, intercept = affine_observation(model) or (None, None)
+    return YauSystem(form, bare, full, slope, intercept)
+
+
+def determined(model: Model) -> Condition:
+    """No undetermined function: a model with one can be analysed and not filtered."""
+    return Condition(
+        "every function of the model is given",
+        not model.functions,
+        f"undetermined: {', '.join(model.functions)}" if model.functions else "no undetermined functions",
+        "needed to compute",
+    )
+
+
+def definite_covariance(model: Model) -> Condition:
+    """G = g Q g' is positive definite; at the times of a record it is checked again."""
+    source = f"{CLY}, Assumption 1"
+    statement = "G = g Q g' is positive definite"
+    determinant = sp.factor(model.covariance.det())
+    if is_zero(determinant):
+        return Condition(statement, False, "det G = 0", source)
+    evaluate = numpy_function(model.covariance, model, model.covariance.shape)
+    times = model.start + np.concatenate([[0.0], np.geomspace(1e-3, 1e2, 40)])
+    for time in times:
+        matrix = evaluate(np.zeros(model.n), time, model.theta())
+        if not np.all(np.isfinite(matrix)) or np.linalg.eigvalsh(matrix)[0] <= 0:
+            # The record may never reach this time, so that only the start refutes.
+            holds = False if time == model.start else None
+            return Condition(statement, holds, f"G is not positive definite at t = {time:g}", source)
+    return Condition(statement, True, f"det G = {short(str(determinant))}", source)

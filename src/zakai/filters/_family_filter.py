@@ -1,0 +1,205 @@
+"""The filter of a linear-quadratic system with affine observations: families of Gaussians, every step exact.
+
+Kalman-Bucy, Benes and Hu-Yau are this filter for phi = 0, phi = log cosh and any phi that leaves q quadratic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zakai import _float64  # noqa: F401
+from zakai.densities import Density, GaussianMixture
+from zakai.filters._affine_system import AffineSystem, Plan, affine_system_of
+from zakai.filters._family_prior import prior_families
+from zakai.filters._formulas import formulas
+from zakai.filters._gauge import GaugeFunctions, Posterior, Tilts, gauge_of, posterior
+from zakai.filters._protocol import Info, Schedule
+from zakai.filters.observations import Data, Factors, factors
+from zakai.kolmogorov.families import Family, log_terms, move, read
+from zakai.kolmogorov.flow import Flow
+from zakai.models.model import Model
+
+
+class State(NamedTuple):
+    """The families of v (leading axis J), normalised so that u = e^phi v has mass one, the `time`, and, for each node, the
+    logarithm of the error of the prior's representation and whether it is at the edge, (J, N)."""
+
+    families: Family
+    log_error: Any
+    edge: Any
+    time: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What is known without data, for the parameters `theta`; `plan` is what was decided for the model's own."""
+
+    model: Model
+    schedule: Schedule
+    plan: Plan
+    system: AffineSystem
+    gauge: GaugeFunctions
+    theta: Any
+    intervals: Interval
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["flow", "slope", "intercept", "tilts", "stop", "theta"],
+    meta_fields=["gauge"],
+)
+@dataclass(frozen=True)
+class Interval:
+    """One interval: its flow in parts (parts, ...), C and c and the gauge at its end, and the parameters."""
+
+    flow: Flow
+    slope: Any
+    intercept: Any
+    tilts: Tilts
+    stop: Any
+    theta: Any
+    gauge: GaugeFunctions
+
+
+def prepare(model: Model, schedule: Schedule) -> Prepared:
+    """The flow of every interval, offline."""
+    system, gauge = affine_system_of(formulas(model)), gauge_of(formulas(model))
+    plan = Plan(system, model, schedule)
+    theta = model.theta()
+    return Prepared(model, schedule, plan, system, gauge, theta, _intervals(plan, system, gauge, schedule, theta))
+
+
+def with_parameters(prepared: Prepared, theta: Any) -> Prepared:
+    """The same for other parameters, with the structure that was decided for the model's own; traced by JAX."""
+    intervals = _intervals(prepared.plan, prepared.system, prepared.gauge, prepared.schedule, theta)
+    return replace(prepared, theta=theta, intervals=intervals)
+
+
+def _intervals(plan: Plan, system: AffineSystem, gauge: GaugeFunctions, schedule: Schedule, theta: Any) -> Interval:
+    stops = jnp.asarray(schedule.stops)
+    slope, intercept = jax.vmap(system.observation, (0, None))(stops, theta)
+    tilts = jax.vmap(gauge.at, (0, None))(stops, theta)
+    tiled = jnp.tile(jnp.asarray(theta), (len(schedule.stops), 1))
+    intervals = Interval(plan.flows(theta), slope, intercept, tilts, stops, tiled, gauge)
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(intervals))
+    return intervals if traced else jax.tree.map(np.asarray, intervals)
+
+
+def observations(prepared: Prepared, data: Data) -> Factors:
+    """What `step` is given for each interval: y runs linearly inside of it, and what cannot is a factor at its end."""
+    found = factors(
+        prepared.model, data, prepared.schedule, rates=True, splitting="strang", remove=False, theta=prepared.theta
+    )
+    return found
+
+
+def init(prepared: Prepared, prior: Any) -> State:
+    """The prior as families of Gaussians."""
+    return _normalised(prepared, _families(prepared, prior))[0]
+
+
+def _families(prepared: Prepared, prior: Any) -> State:
+    model = prepared.model
+    found = prior_families(prepared.gauge, model, prior, prepared.theta)
+    return State(found.families, jnp.asarray(found.log_error), jnp.asarray(found.edge), jnp.asarray(model.start, float))
+
+
+def _normalised(prepared: Prepared, state: State) -> tuple[State, Info]:
+    start = prepared.model.start
+    tilts = prepared.gauge.at(start, prepared.theta)
+    return _looked_at(prepared.gauge, tilts, start, prepared.theta, state)
+
+
+def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State, Info]:
+    """The prior after a sample at the start itself."""
+    state = init(prepared, prior)
+    slope, intercept = prepared.system.observation(prepared.model.start, prepared.theta)
+    reading = jax.tree.map(lambda a: a[0], observation)
+    return _normalised(prepared, state._replace(families=_read(state.families, slope, intercept, reading)))
+
+
+def step(interval: Interval, state: State, observation: Factors) -> tuple[State, Info]:
+    """One interval: the flow, with the rates of y inside; readings at its end; normalise."""
+    families = state.families
+
+    def part(now, flow):
+        return jax.vmap(move, (0, None, None))(now, flow, observation.inputs), None
+
+    if interval.flow.map.shape[0] == 1:
+        families, _ = part(families, jax.tree.map(lambda a: a[0], interval.flow))
+    else:
+        families, _ = jax.lax.scan(part, families, interval.flow)
+    families = _read(families, interval.slope, interval.intercept, observation)
+    moved = state._replace(families=families, time=interval.stop)
+    return _looked_at(interval.gauge, interval.tilts, interval.stop, interval.theta, moved)
+
+
+def _read(families: Family, slope: Any, intercept: Any, reading: Factors) -> Family:
+    if reading.energy is None:
+        return families
+    one = partial(read, slope=slope, intercept=intercept, after=reading.after, energy=reading.energy, constant=reading.constant)
+    return jax.vmap(one)(families)
+
+
+def _looked_at(gauge: GaugeFunctions, tilts: Tilts, time: Any, theta: Any, state: State) -> tuple[State, Info]:
+    """The normalised state, and what it tells."""
+    found = posterior(gauge, tilts, time, theta, state.families)
+    families = state.families._replace(log_mass=state.families.log_mass - found.log_mass)
+    health = _health(state, found, families)
+    return state._replace(families=families), Info(found.log_mass, found.mean, found.cov, health)
+
+
+def _health(state: State, found: Posterior, families: Family) -> dict[str, Any]:
+    """How far the posterior is to be trusted; none of it is differentiated."""
+    found, families = jax.lax.stop_gradient((found, families))
+    variances = jnp.diagonal(found.cov)
+    zero = jnp.zeros(())
+    health = {
+        "negative_variance": jnp.maximum(0.0, -jnp.min(variances)) / jnp.maximum(jnp.max(jnp.abs(variances)), 1e-300),
+        "representation_error": zero,
+        "edge_weight": zero,
+        "gauge_error": zero,
+    }
+    if families.nodes.shape[-1] == 0:
+        return health
+    # What the posterior makes of an error of the prior's representation, wherever it was made.
+    gained = jax.vmap(log_terms)(families._replace(log_weights=jnp.zeros_like(families.log_weights)))
+    tilt = jnp.max(found.logs - jax.vmap(log_terms)(state.families)[:, :, None], axis=2)
+    tilt = jnp.where(jnp.isfinite(tilt), tilt, -jnp.inf)
+    shares = jnp.sum(jnp.exp(found.logs - found.log_mass), axis=2)
+    return health | {
+        "representation_error": jnp.sum(jnp.exp(state.log_error + gained + tilt)),
+        "edge_weight": jnp.sum(shares * state.edge),
+        "gauge_error": found.doubt,
+    }
+
+
+def density(prepared: Prepared, state: State) -> Density:
+    """The posterior: a mixture of Gaussians where e^phi is a sum of exponentials."""
+    model, gauge = prepared.model, prepared.gauge
+    families = jax.tree.map(jnp.asarray, state.families)
+    tilts = gauge.at(state.time, prepared.theta)
+    if not gauge.exact:
+        raise NotImplementedError
+    found = posterior(gauge, tilts, state.time, prepared.theta, families)
+    weights = np.asarray(found.signs * jnp.exp(found.logs - found.log_mass))
+    moved = jnp.einsum("jnk,jmk->jmn", families.response, families.nodes)
+    means = np.asarray(found.centres[:, None] + moved[:, :, None])
+    covs = np.broadcast_to(np.asarray(families.cov)[:, None, None], (*weights.shape, model.n, model.n))
+    used = weights != 0.0
+    return GaussianMixture(weights[used], means[used], covs[used], model.state, (False,) * model.n)
+
+
+BOUNDS: Mapping[str, tuple[float, str]] = {
+    "negative_variance": (1e-9, "a variance below zero, as a share of the largest: rounding has eaten the smallest"),
+    "representation_error": (1e-8, "error of the prior's nodes, as the posterior sees it"),
+    "edge_weight": (1e-8, "weight of the outermost nodes: the posterior reaches beyond the prior's nodes"),
+    "gauge_error": (1e-8, "error of the sums over the directions of the gauge"),
+}
