@@ -42,10 +42,8 @@ def filter(
         result = zakai.filter(model, record)
         result.mean[-1], result.density(-1).quantile([0.025, 0.975])
     """
-    for given, kind, how in ((model, Model, "zakai.load_model"), (record, Record, "zakai.read_record")):
-        if not isinstance(given, kind):
-            raise InputError(f"filter: expected a {kind.__name__}, got a {type(given).__name__}; {how} reads one from a file")
-    return _filter(model, record, model.prior, method, keep, progress, options)
+    prior = model.prior if isinstance(model, Model) else None
+    return _filter(model, record, prior, method, keep, progress, options)
 
 
 def filter_from(prior: Any, model: Model, record: Record, method: str = "auto", **options: Any) -> FilterResult:
@@ -59,16 +57,29 @@ def filter_from(prior: Any, model: Model, record: Record, method: str = "auto", 
 
 
 def _filter(model, record, prior, method, keep, progress, options) -> FilterResult:
-    _check(model, record, keep)
+    if keep not in (None, "densities", "moments"):
+        raise InputError(f'keep: "{keep}" is neither "densities" nor "moments"')
+    setting, why, considered = setting_of(model, record, method, options)
+    run = Run(setting._replace(prior=prior), record, keep)
+    run.all(progress)
+    return run.result(why, considered)
+
+
+def setting_of(
+    model: Model, record: Record, method: str, options: Mapping[str, Any]
+) -> tuple[Setting, str, Mapping[str, tuple[Condition, ...]]]:
+    """What a record is filtered by, all of it checked; why; and the conditions of every method that was looked at."""
+    for given, kind, how in ((model, Model, "zakai.load_model"), (record, Record, "zakai.read_record")):
+        if not isinstance(given, kind):
+            raise InputError(f"filter: expected a {kind.__name__}, got a {type(given).__name__}; {how} reads one from a file")
+    _check(model, record)
     chosen, why, considered = choose(model, method)
     unknown = set(options) - set(chosen.options)
     if unknown:
         listed = ", ".join(sorted(chosen.options)) or "none"
         raise InputError(f'{chosen.name} has no option "{sorted(unknown)[0]}"; its options are: {listed}')
     check_noise_at(model, np.concatenate([[model.start], record.times]))
-    run = Run(Setting(model, prior, chosen, {**chosen.options, **options}), record, keep)
-    run.all(progress)
-    return run.result(why, considered)
+    return Setting(model, model.prior, chosen, {**chosen.options, **options}), why, considered
 
 
 def choose(model: Model, method: str) -> tuple[Method, str, Mapping[str, tuple[Condition, ...]]]:
@@ -100,9 +111,7 @@ def _failure(conditions: tuple[Condition, ...]) -> str:
     return "nothing failed"
 
 
-def _check(model: Model, record: Record, keep: str | None) -> None:
-    if keep not in (None, "densities", "moments"):
-        raise InputError(f'keep: "{keep}" is neither "densities" nor "moments"')
+def _check(model: Model, record: Record) -> None:
     if model.prior is None:
         raise InputError(f"{model.source}: prior: the table is missing; it is needed to filter")
     if model.functions:

@@ -14,7 +14,7 @@ A Gaussian prior enters as it is, a mixture or a density by its first two moment
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -95,6 +95,7 @@ class Prepared:
     model: Model
     system: System
     schedule: Schedule
+    theta: Any
     intervals: Interval
 
 
@@ -109,7 +110,13 @@ def prepare(model: Model, schedule: Schedule, *, riccati: str = "stable", subste
         raise InputError(f"option substeps: {substeps!r} is not a whole number from 1")
     system = _system(formulas(model), riccati, substeps)
     theta = np.tile(model.theta(), (len(schedule.starts), 1))
-    return Prepared(model, system, schedule, Interval(schedule.starts, schedule.stops, theta, system))
+    return Prepared(model, system, schedule, model.theta(), Interval(schedule.starts, schedule.stops, theta, system))
+
+
+def with_parameters(prepared: Prepared, theta: Any) -> Prepared:
+    """The same intervals with other values of the parameters."""
+    intervals = replace(prepared.intervals, theta=jnp.tile(theta, (len(prepared.schedule.starts), 1)))
+    return replace(prepared, theta=theta, intervals=intervals)
 
 
 def observations(prepared: Prepared, data: Data) -> Observation:
@@ -135,14 +142,14 @@ def observations(prepared: Prepared, data: Data) -> Observation:
 
 def init(prepared: Prepared, prior: Any) -> State:
     """The prior's mean and covariance."""
-    return State(*prior_moments(prepared.model, prior))
+    return State(*prior_moments(prepared.model, prior, prepared.theta))
 
 
 def correct(prepared: Prepared, prior: Any, observation: Observation) -> tuple[State, Info]:
     """The prior after an observation at the start itself."""
     model = prepared.model
     reading = jax.tree.map(lambda a: a[0], observation.at_end)
-    state, log_factor = _update(prepared.system, init(prepared, prior), reading, 1.0, model.start, model.theta())
+    state, log_factor = _update(prepared.system, init(prepared, prior), reading, 1.0, model.start, prepared.theta)
     return state, _info(state, log_factor)
 
 
@@ -270,5 +277,6 @@ METHOD = Method(
     observations=observations,
     step=step,
     density=density,
+    with_parameters=with_parameters,
     bounds={"indefinite_cov": (1e-9, "the covariance has a negative eigenvalue (its share of the largest), or is not finite")},
 )
