@@ -10,6 +10,7 @@ and everything that a method needs of it is the affine Hamiltonian flow of each 
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,7 @@ from zakai.algebra.theorems import yau_system
 from zakai.errors import InputError
 from zakai.filters._formulas import Formulas
 from zakai.filters._protocol import Schedule
-from zakai.kolmogorov.flow import Coefficients
+from zakai.kolmogorov.flow import Coefficients, Flow, flows, substeps_for
 from zakai.models.compile import jax_field, jax_function
 from zakai.models.model import Model
 
@@ -123,3 +124,43 @@ def parts_of(system: System, model: Model, starts: np.ndarray, stops: np.ndarray
     if not np.isfinite(rate):
         raise InputError(f"{model.source}: a coefficient is not finite between t = {starts[0]:g} and {stops[-1]:g}")
     return max(1, int(np.ceil(rate / 4.0)))
+
+
+class FlowPlan(NamedTuple):
+    """How the flows of a schedule are computed, decided once: the distinct intervals, in equal `parts`, in `substeps`.
+
+    `starts`, `stops` and `inside` have a row for each part of each distinct interval, `which` (K,) says whose each interval is.
+    """
+
+    starts: np.ndarray
+    stops: np.ndarray
+    inside: np.ndarray
+    which: np.ndarray
+    parts: int
+    substeps: int
+
+
+def plan_flows(system: System, model: Model, schedule: Schedule) -> FlowPlan:
+    """The plan for the model's own parameters."""
+    which, first = distinct(system, schedule)
+    starts, stops, inside = schedule.starts[first], schedule.stops[first], schedule.inside[first].astype(float)
+    parts = parts_of(system, model, starts, stops, inside)
+    edges = starts[:, None] + (stops - starts)[:, None] * np.arange(parts + 1) / parts
+    plan = FlowPlan(edges[:, :-1].ravel(), edges[:, 1:].ravel(), np.repeat(inside, parts, axis=0), which, parts, 1)
+    if not len(starts):
+        return plan
+    argument = (np.tile(model.theta(), (len(plan.starts), 1)), plan.inside)
+    return plan._replace(substeps=substeps_for(system.coefficients, plan.starts, plan.stops, argument))
+
+
+def planned_flows(system: System, plan: FlowPlan, theta: Any) -> Flow:
+    """The flows of all intervals, (K, parts, ...), a pure function of theta: NumPy arrays where theta is one."""
+    argument = (jnp.broadcast_to(theta, (len(plan.starts), len(theta))), plan.inside)
+    flow = flows(system.coefficients, plan.starts, plan.stops, argument, substeps=plan.substeps)
+    xp = np if isinstance(theta, np.ndarray) else jnp
+
+    def shaped(array):
+        array = xp.asarray(array)
+        return array.reshape(len(plan.starts) // plan.parts, plan.parts, *array.shape[1:])[plan.which]
+
+    return jax.tree.map(shaped, flow)

@@ -1,0 +1,193 @@
+"""Which Gaussians of a sum to split and which to put together, so that a fixed number of slots is spent where it matters.
+
+Each component has a loss: how badly one Gaussian serves there, a number without unit.  Splitting a component lowers its loss;
+putting two together costs their loss as one, and what is lost of their shape.  `exchange` makes every trade that pays.
+Both operations keep the mass, the mean and the covariance of the sum.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from zakai import _float64  # noqa: F401
+
+import jax  # isort: skip
+import jax.numpy as jnp  # isort: skip
+import numpy as np
+
+from zakai.densities.components import Components, wrapped
+
+PRUNED = 1e-7
+# A split leaves about a quarter of a loss that is quadratic in the variance.
+GAINED = 0.75
+_APART = np.sqrt(1.5)
+
+
+class Exchanged(NamedTuple):
+    """What an exchange did: `pruned` weight, and the loss of what was put `together`."""
+
+    pruned: Any
+    together: Any
+
+
+def pair_costs(share: Any, means: Any, covs: Any, loss: Any, angles: tuple[int, ...] = (), xp: Any = jnp) -> Any:
+    """What putting together components i and j would cost, (K, K): nats of relative entropy, weighted.
+
+    The loss of the pair as one Gaussian, and the relative entropy of the pair's shape: for components far apart Runnalls' (2007)
+    bound, for close ones the leading cumulants (skewness^2 / 12 + kurtosis^2 / 48), whichever is smaller.
+    """
+    n = means.shape[1]
+    both = share[:, None] + share
+    alpha = share[:, None] / xp.where(both > 0, both, 1.0)
+    beta = 1.0 - alpha
+    product = xp.maximum(alpha * beta, 1e-30)
+    apart = means[:, None] - means
+    apart = wrapped(apart, angles) if angles else apart
+    if n == 1:
+        variance = covs[:, 0, 0]
+        distance = apart[..., 0] ** 2 / (alpha * variance[:, None] + beta * variance)
+        ratio = variance[:, None] / variance
+        unlike = ratio + 1.0 / ratio - 2.0
+    else:
+        scale = xp.einsum("k,kii->i", share / xp.sum(share), covs)
+        inverse = xp.linalg.inv(covs + 1e-12 * xp.eye(n) * scale)
+        one_way = xp.einsum("ija,iab,ijb->ij", apart, inverse, apart)
+        # The inverse is convex, so that this bounds the distance in the pair's own covariance.
+        distance = alpha * one_way + beta * one_way.T
+        trace = xp.einsum("iab,jba->ij", inverse, covs)
+        unlike = xp.maximum(trace + trace.T - 2.0 * n, 0.0)
+    between = product * distance
+    inside = between / (1.0 + between)
+    shape = xp.minimum(
+        0.5 * xp.log1p(between), inside**3 * ((1.0 - 2.0 * alpha) ** 2 + inside / 4.0) / (12.0 * product)
+    ) + xp.minimum(0.5 * xp.log1p(0.5 * product * unlike), 0.1875 * (product * unlike) ** 2)
+    # What the pair would lose as one, beyond what the two lose now.
+    bent = xp.maximum(loss[:, None], loss) * (1.0 + between) ** 2 - alpha * loss[:, None] - beta * loss
+    dead = (share[:, None] <= 0) | (share <= 0) | xp.eye(len(share), dtype=bool)
+    return xp.where(dead, xp.inf, both * (bent + shape))
+
+
+def exchange(
+    sum_: Components, share: jax.Array, loss: jax.Array, axis: jax.Array, tolerance: float, angles: tuple[int, ...] = ()
+) -> tuple[Components, Exchanged]:
+    """Split the components with the largest weighted loss, into empty slots or into those of pairs that are cheap to put together.
+
+    share (K,): the weights that count.  loss (K,): see above.  axis (K, n): along which to split, one standard deviation long.
+    tolerance: weighted losses below tolerance / K stay.  Decisions are not differentiated.
+    """
+    K = len(share)
+    tries = max(1, K // 4)
+    share, loss = jax.lax.stop_gradient(share), jax.lax.stop_gradient(loss)
+    alive = share > PRUNED
+    pruned = jnp.sum(jnp.where(alive, 0.0, share))
+    share = jnp.where(alive, share, 0.0)
+    index = jnp.arange(K)
+
+    gains = share * loss
+    parents = jnp.argsort(-gains)[:tries]
+    gain = gains[parents]
+    wanted = gain > tolerance / K
+    kept = jnp.zeros(K, bool).at[jnp.where(wanted, parents, K)].set(True, mode="drop")
+    costs = jax.lax.stop_gradient(pair_costs(jnp.where(kept, 0.0, share), sum_.means, sum_.covs, loss, angles))
+    nearest = jnp.argmin(costs, axis=1)
+    mutual = (nearest[nearest] == index) & (index < nearest)
+    pair_cost = jnp.where(mutual, jnp.min(costs, axis=1), jnp.inf)
+    pairs = jnp.argsort(pair_cost)[: 2 * tries]
+    free = K - jnp.sum(alive)
+    place = jnp.arange(2 * tries)
+    slot = jnp.where(place < free, 0.0, pair_cost[pairs[jnp.clip(place - free, 0, 2 * tries - 1)]])
+    price = slot[0::2] + slot[1::2]
+    # Gains fall and prices rise along the list, so that what is accepted is its beginning.
+    accepted = wanted & (GAINED * gain > price)
+    count = jnp.maximum(0, 2 * jnp.sum(accepted) - free)
+    merged, gone = _merge(sum_, pairs, nearest[pairs], place < count, angles)
+    alive = alive & ~gone
+    together = jnp.sum(jnp.where(accepted, price, 0.0))
+    empty = jnp.argsort(alive)[: 2 * tries]
+    new = merged._replace(log_weights=jnp.where(alive, merged.log_weights, -jnp.inf))
+    return _split(new, parents, axis[parents], empty, accepted), Exchanged(pruned, together)
+
+
+def _merge(sum_: Components, first: jax.Array, second: jax.Array, valid: jax.Array, angles) -> tuple[Components, jax.Array]:
+    """Pairs put together in the slot of the first, with the moments kept; and which slots that leaves empty."""
+    K = len(sum_.log_weights)
+    a, b = sum_.log_weights[first], sum_.log_weights[second]
+    a, b = jnp.where(valid, a, 0.0), jnp.where(valid, b, 0.0)
+    log_weight = jnp.logaddexp(a, b)
+    alpha = jnp.exp(a - log_weight)
+    apart = wrapped(sum_.means[first] - sum_.means[second], angles)
+    mean = sum_.means[second] + alpha[:, None] * apart
+    alpha = alpha[:, None, None]
+    between = alpha * (1.0 - alpha) * apart[:, :, None] * apart[:, None, :]
+    cov = alpha * sum_.covs[first] + (1.0 - alpha) * sum_.covs[second] + between
+    at = jnp.where(valid, first, K)
+    gone = jnp.zeros(K, bool).at[jnp.where(valid, second, K)].set(True, mode="drop")
+    return _put(sum_, at, log_weight, mean, cov), gone
+
+
+def _split(sum_: Components, parents: jax.Array, axis: jax.Array, empty: jax.Array, valid: jax.Array) -> Components:
+    """Three Gaussians of half the variance along an axis: weights 2/3, 1/6, 1/6, at 0 and +- sqrt(3/2) deviations.
+
+    This is N(0, P/2) convolved with the Gauss-Hermite rule of three nodes for N(0, P/2): moments up to the fifth are kept.
+    """
+    K = len(sum_.log_weights)
+    log_weight, mean = sum_.log_weights[parents], sum_.means[parents]
+    cov = sum_.covs[parents] - 0.5 * axis[:, :, None] * axis[:, None, :]
+    new = _put(sum_, jnp.where(valid, parents, K), log_weight + np.log(2 / 3), mean, cov)
+    for side, slots in ((1.0, empty[0::2]), (-1.0, empty[1::2])):
+        at = jnp.where(valid, slots, K)
+        new = _put(new, at, log_weight - np.log(6.0), mean + side * _APART * axis, cov)
+    return new
+
+
+def _put(sum_: Components, at: jax.Array, log_weights: jax.Array, means: jax.Array, covs: jax.Array) -> Components:
+    """Some slots replaced; an index past the end is dropped."""
+    return sum_._replace(
+        log_weights=sum_.log_weights.at[at].set(log_weights, mode="drop"),
+        means=sum_.means.at[at].set(means, mode="drop"),
+        covs=sum_.covs.at[at].set(covs, mode="drop"),
+    )
+
+
+def groups(
+    share: np.ndarray, means: np.ndarray, covs: np.ndarray, loss: np.ndarray, most: int, angles: tuple[int, ...] = ()
+) -> np.ndarray:
+    """Which of at most `most` groups each component belongs to, (N,), on the host: cheap pairs are put together, round by round."""
+    share, means, covs, loss = (np.array(a, float) for a in (share, means, covs, loss))
+    label = np.arange(len(share))
+    while (excess := int(np.sum(share > 0)) - most) > 0:
+        costs = np.asarray(pair_costs(share, means, covs, loss, angles, jnp if angles else np))
+        nearest = costs.argmin(axis=1)
+        first = np.flatnonzero((nearest[nearest] == np.arange(len(share))) & (np.arange(len(share)) < nearest) & (share > 0))
+        cost = costs[first, nearest[first]]
+        first = first[np.argsort(cost, kind="stable")][: max(1, min(excess, (len(first) + 1) // 2))]
+        second = nearest[first]
+        total = share[first] + share[second]
+        alpha = share[first] / total
+        apart = np.asarray(wrapped(jnp.asarray(means[first] - means[second]), angles))
+        means[first] = means[second] + alpha[:, None] * apart
+        alpha = alpha[:, None, None]
+        old = np.trace(covs[first] + covs[second], axis1=1, axis2=2) / 2
+        covs[first] = alpha * covs[first] + (1 - alpha) * covs[second]
+        covs[first] += alpha * (1 - alpha) * apart[:, :, None] * apart[:, None, :]
+        loss[first] = np.maximum(loss[first], loss[second]) * (np.trace(covs[first], axis1=1, axis2=2) / old) ** 2
+        share[first], share[second] = total, 0.0
+        for i, j in zip(first, second):
+            label[label == j] = i
+    return np.unique(label, return_inverse=True)[1]
+
+
+def gathered(sum_: Components, label: np.ndarray, angles: tuple[int, ...] = ()) -> Components:
+    """Each group as one Gaussian with its mass, mean and covariance; `label` (N,) from `groups`."""
+    top = jnp.max(sum_.log_weights)
+    parts = jnp.exp(sum_.log_weights - jax.lax.stop_gradient(top))
+    member = jnp.asarray(label == np.arange(label.max() + 1)[:, None], float)
+    weight = member @ parts
+    share = member * parts / jnp.where(weight > 0, weight, 1.0)[:, None]
+    origin = sum_.means[np.array([np.flatnonzero(label == g)[0] for g in range(label.max() + 1)])]
+    apart = wrapped(sum_.means[None] - origin[:, None], angles)
+    shift = jnp.einsum("gk,gki->gi", share, apart)
+    rest = apart - shift[:, None]
+    covs = jnp.einsum("gk,kij->gij", share, sum_.covs) + jnp.einsum("gk,gki,gkj->gij", share, rest, rest)
+    logs = jnp.where(weight > 0, jnp.log(jnp.where(weight > 0, weight, 1.0)) + top, -jnp.inf)
+    return Components(logs, origin + shift, covs, jnp.ones(len(logs)))

@@ -1,0 +1,130 @@
+"""The first Gaussian sum: a prior, cut into Gaussians that are narrow where it matters, and divided by the gauge.
+
+A Gaussian is cut along the directions W'x in which h bends or phi varies: N(m, P) is N(0, s^2 P) convolved with a lattice of
+points for N(m, (1 - s^2) P), exact to about 1e-5.  A density is a flat sum of narrow Gaussians, a partition of unity, times
+the density.  The narrow ones are then put together until they fit into the slots; which with which is decided once,
+for the model's own parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from zakai import _float64  # noqa: F401
+from zakai.densities.components import Components, components, regression, shares
+from zakai.densities.quadrature import refit
+from zakai.densities.reduction import PRUNED, gathered, groups
+from zakai.errors import InputError
+from zakai.filters import _lattice_choice as choice
+from zakai.models.compile import jax_field
+from zakai.models.model import Model
+from zakai.models.prior import DensityPrior, GaussianPrior
+
+# The width of a narrow Gaussian in spacings of its lattice: a flat sum of them is flat to 2 exp(-2 pi^2 0.8^2) = 7e-6.
+WIDTH = 0.8
+_REACH = 5.3
+# Nodes a direction before anything is put together.
+_FINE = {1: 64, 2: 20, 3: 8, 4: 5, 5: 4}
+
+
+def cut_prior(
+    model: Model, prior: Any, directions: np.ndarray, theta: Any, divide: Callable[[Components], Components]
+) -> Components:
+    """The prior as many narrow Gaussians; `divide` takes u to v."""
+    if isinstance(prior, DensityPrior):
+        return divide(_cut_density(model, prior, theta))
+    if isinstance(prior, GaussianPrior):
+        logs, means, covs = np.zeros(1), prior.mean[None], prior.cov[None]
+    else:
+        logs, means, covs = np.log(prior.weights), prior.means, prior.covs
+    k = directions.shape[1]
+    if k and k <= max(_FINE):
+        share = max(4, int(_FINE[k] ** k / len(logs)) ** (1 / k))
+        logs, means, covs = _cut(logs, means, covs, directions, int(share))
+    return divide(components(jnp.asarray(logs), jnp.asarray(means), jnp.asarray(covs)))
+
+
+def _cut(logs, means, covs, directions, count):
+    """Each Gaussian as `count` narrow ones in each of the directions (n, k)."""
+    k = directions.shape[1]
+    # count nodes cover +- reach deviations of what the narrow width leaves.
+    spacing = 2 * _REACH / count
+    width = min(WIDTH * spacing, 0.95)
+    left = np.sqrt(1 - width**2)
+    line = (np.arange(count) - (count - 1) / 2) * (width / WIDTH)
+    line = line[np.abs(line) <= _REACH * left + 1e-9]
+    weight = np.exp(-0.5 * (line / left) ** 2)
+    # The few nodes of many directions have the variance that they should have by scaling them.
+    line = line * left / np.sqrt((weight / weight.sum()) @ line**2) if len(line) > 1 else line
+    grid = np.stack(np.meshgrid(*[line] * k, indexing="ij"), axis=-1).reshape(-1, k)
+    weights = np.prod(np.stack(np.meshgrid(*[weight / weight.sum()] * k, indexing="ij"), axis=-1).reshape(-1, k), axis=1)
+    gain = np.asarray(regression(jnp.asarray(covs), jnp.asarray(directions)))
+    cut = covs - (1 - width**2) * np.einsum("kia,kja->kij", gain, gain)
+    new_means = means[:, None] + np.einsum("kia,qa->kqi", gain, grid)
+    return (
+        (logs[:, None] + np.log(weights)).ravel(),
+        new_means.reshape(-1, means.shape[1]),
+        np.repeat(cut, len(weights), axis=0),
+    )
+
+
+def _cut_density(model: Model, prior: DensityPrior, theta: Any) -> Components:
+    """The density on a partition of unity of narrow Gaussians."""
+    if model.n > 2:
+        raise InputError(f"{model.source}: prior: a density in {model.n} coordinates is not cut into Gaussians; give a mixture")
+    lattice, _ = choice.first_lattice(model, prior, None)
+    logs, points = np.asarray(lattice.log_values), np.asarray(lattice.points())
+    used = points[logs > logs.max() - 18.0]
+    basis = np.asarray(lattice.basis)
+    index = (used - np.asarray(lattice.centre)) @ np.linalg.inv(basis).T
+    low, high = index.min(axis=0) - 0.5, index.max(axis=0) + 0.5
+    count = _FINE[model.n]
+    # On a circle the lattice is closed.
+    turns = [np.isclose(high[a] - low[a], size) and bool(model.periodic) for a, size in enumerate(logs.shape)]
+    spacing = (high - low) / count
+    lines = [
+        low[a] + spacing[a] * (np.arange(count) + 0.5) if turns[a] else low[a] + spacing[a] * np.arange(-1, count + 2)
+        for a in range(model.n)
+    ]
+    grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, model.n)
+    means = np.asarray(lattice.centre) + grid @ basis.T
+    root = basis * (WIDTH * spacing)
+    covs = np.broadcast_to(root @ root.T, (len(means), model.n, model.n))
+    cell = np.log(abs(np.linalg.det(basis)) * np.prod(spacing))
+    density = jax_field([prior.log_density], model)
+    flat = components(jnp.full(len(means), cell), jnp.asarray(means), jnp.asarray(covs))
+
+    def log_density(x):
+        value = density(x, model.start, theta)[0]
+        return jnp.where(jnp.isnan(value), -jnp.inf, jnp.maximum(value, -1e6))
+
+    return refit(flat, log_density, np.eye(model.n), True)[0]
+
+
+def fitted(sum_: Components, own: Components, count: np.ndarray, loss: np.ndarray, slots: int, angles) -> Components:
+    """The narrow Gaussians in that many slots, normalised; `own` are those of the model's own parameters, `count` (N,) their
+    weights in u, and `loss` (N,) theirs."""
+    used = count > 0.01 * PRUNED / len(count)
+    label = np.full(len(count), -1)
+    label[used] = groups(
+        count[used], np.asarray(own.means)[used], np.asarray(own.covs)[used], loss[used], slots, angles
+    )
+    few = gathered(Components(*(jnp.asarray(a)[used] for a in sum_)), label[used], angles)
+    missing = slots - len(few.log_weights)
+    if missing > 0:
+        few = Components(
+            jnp.concatenate([few.log_weights, jnp.full(missing, -jnp.inf)]),
+            jnp.concatenate([few.means, jnp.repeat(few.means[:1], missing, axis=0)]),
+            jnp.concatenate([few.covs, jnp.repeat(few.covs[:1], missing, axis=0)]),
+            jnp.ones(slots),
+        )
+    return few
+
+
+def log_mass(sum_: Components) -> Any:
+    """The logarithm of the mass."""
+    return shares(sum_)[1]

@@ -1,0 +1,64 @@
+"""From the Gaussian sum v to the density u = e^phi v, without e^phi itself.
+
+Where e^phi is a sum of exponentials of linear forms, as for log cosh, it is exact:
+
+    e^{c + q.x} N(x; m, P) = e^{c + q.m + q'P q / 2} N(x; m + P q, P).
+
+For any other phi each component of u is the Gaussian with the moments of e^{phi(x)} N(x; m, P), by quadrature in logarithms.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import sympy as sp
+
+from zakai import _float64  # noqa: F401
+from zakai.algebra.exponential_sum import exponential_sum
+from zakai.densities.components import Components
+from zakai.densities.quadrature import refit
+from zakai.filters._directions import directions_of
+from zakai.models.compile import jax_field, jax_function
+from zakai.models.model import Model
+
+
+class SumGauge:
+    """phi of a model, compiled; `exact` says whether e^phi is a sum of exponentials, `directions` (n, k) along which phi varies."""
+
+    def __init__(self, phi: sp.Expr, model: Model):
+        self.n, self.none = model.n, phi == 0
+        self.directions = directions_of([phi], model)
+        self._potential = jax_field([phi], model)
+        terms = exponential_sum(phi, model.x)
+        self.exact = terms is not None
+        self.count = len(terms) if terms is not None else 1
+        if terms is not None:
+            flat = [entry for constant, slopes in terms for entry in (constant, *slopes)]
+            self._numbers = jax_function(flat, model, (self.count, 1 + model.n))
+
+    def potential(self, x: jax.Array, t: Any, theta: Any) -> jax.Array:
+        """phi at the points x (..., n)."""
+        return self._potential(x, t, theta)[0]
+
+    def lift(self, v: Components, t: Any, theta: Any) -> Components:
+        """The components of u = e^phi v: `count` for each of v, one after another."""
+        if self.none:
+            return v
+        if not self.exact:
+            return refit(v, lambda x: self.potential(x, t, theta), self.directions, True)[0]
+        numbers = self._numbers(jnp.zeros(self.n), t, theta)
+        constants, slopes = numbers[:, 0], numbers[:, 1:]
+        across = jnp.einsum("kij,aj->kai", v.covs, slopes)
+        logs = constants + v.means @ slopes.T + 0.5 * jnp.einsum("kai,ai->ka", across, slopes) + v.log_weights[:, None]
+        means = v.means[:, None] + across
+        return Components(
+            logs.reshape(-1), means.reshape(-1, self.n), jnp.repeat(v.covs, self.count, axis=0), jnp.repeat(v.signs, self.count)
+        )
+
+    def divide(self, u: Components, t: Any, theta: Any) -> Components:
+        """Components of v = e^-phi u, each with its moments: for the start, where u is given."""
+        if self.none:
+            return u
+        return refit(u, lambda x: -self.potential(x, t, theta), self.directions, True)[0]

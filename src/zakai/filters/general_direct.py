@@ -1,0 +1,372 @@
+"""The general direct method: a Gaussian sum for time-varying Yau systems with any h, in any dimension.
+
+The survey of Chen and Dong, Algorithm 4 (Algorithm 2 where nothing depends on time), corrected.  For f = L x + l + G grad phi
+and a quadratic q the gauge u = e^phi v makes the Kolmogorov equation linear-quadratic, and a Gaussian stays one, exactly
+(`zakai.kolmogorov.flow`).  What is approximate is the observation's factor of a nonlinear h: each component is replaced by the
+Gaussian with its moments.  Components are split where h bends over them and put together where that costs least.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zakai import _float64  # noqa: F401
+from zakai.algebra.theorems import general_direct as theorem
+from zakai.algebra.theorems import yau_system
+from zakai.densities import GaussianMixture
+from zakai.densities.components import Components, moments, shares, wrapped
+from zakai.densities.quadrature import curvature, refit
+from zakai.densities.reduction import exchange
+from zakai.errors import InputError
+from zakai.filters import _gaussian_start as start
+from zakai.filters._directions import directions_of
+from zakai.filters._formulas import Formulas, formulas
+from zakai.filters._protocol import Info, Method, Schedule
+from zakai.filters._sum_gauge import SumGauge
+from zakai.filters._yau_flow import FlowPlan, System, plan_flows, planned_flows, system_of
+from zakai.filters.observations import Data, Factors, factors, noise_at
+from zakai.kolmogorov.flow import Flow, move_gaussian
+from zakai.models.model import Model
+
+# Slots by the number of directions in which the components must be narrow.
+SLOTS = {0: 1, 1: 20, 2: 64, 3: 128}
+MOST_DIRECTIONS = 5
+TOLERANCE = 1e-3
+# How often a reading that comes all at once may make room for itself.
+ROUNDS = 6
+
+
+class Sum:
+    """What is static: the system, its gauge, and how the sum is kept."""
+
+    def __init__(self, model: Model, splitting: str, slots: int | None, reduction: str, tolerance: float):
+        yau = yau_system(model)
+        assert yau is not None
+        self.system: System = system_of(formulas(model), splitting == "strang", splitting)
+        self.gauge = SumGauge(yau.form.potential, model)
+        self.angles = tuple(model.state.index(name) for name in model.periodic)
+        self.affine = yau.slope is not None
+        self.directions = np.zeros((model.n, 0)) if self.affine else directions_of(list(model.observation), model)
+        narrow = np.hstack([self.directions, self.gauge.directions])
+        self.start_directions = _span(narrow)
+        k = self.start_directions.shape[1]
+        if max(k, self.directions.shape[1]) > MOST_DIRECTIONS:
+            raise InputError(
+                f"{model.source}: h and phi vary in {k} directions of the state; quadrature takes {MOST_DIRECTIONS} at most"
+            )
+        self.slots = SLOTS.get(k, 192) if slots is None else slots
+        self.reduction, self.tolerance = reduction, tolerance
+        self.sampled = model.observation_kind == "samples"
+
+
+def _span(directions: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of the columns' span; coordinates where they are coordinates."""
+    if directions.shape[1] == 0:
+        return directions
+    left, values, _ = np.linalg.svd(directions, full_matrices=False)
+    left = left[:, values > 1e-9]
+    used = np.flatnonzero(np.abs(left).max(axis=1) > 1e-12)
+    return np.eye(len(directions))[:, used] if len(used) == left.shape[1] else left
+
+
+@lru_cache(maxsize=32)
+def _sum(of: Formulas, splitting: str, slots: int | None, reduction: str, tolerance: float) -> Sum:
+    return Sum(of.model, splitting, slots, reduction, tolerance)
+
+
+class State(NamedTuple):
+    """The normalised Gaussian sum in gauge, at its time: u = e^phi v has mass one."""
+
+    sum: Components
+    time: Any
+
+
+@partial(
+    jax.tree_util.register_dataclass, data_fields=["start", "stop", "flow", "precision", "theta"], meta_fields=["static"]
+)
+@dataclass(frozen=True)
+class Interval:
+    """One interval: its ends, its flow in equal parts (parts, ...), the observation's S^-1 (m, m) at its end, the parameters."""
+
+    start: Any
+    stop: Any
+    flow: Flow
+    precision: Any
+    theta: Any
+    static: Sum
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Everything that is known without data; `theta` (p,) are the parameters, `intervals` has a leading axis of K."""
+
+    model: Model
+    static: Sum
+    schedule: Schedule
+    splitting: str
+    plan: FlowPlan
+    theta: Any
+    intervals: Interval
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Where the method is not exact in its class, for the warnings of a result."""
+        gaps = not self.schedule.inside.all() and not self.static.sampled
+        if self.static.system.bare or not gaps:
+            return ()
+        return (
+            "where readings are missing the transition without the observation's potential is not linear-quadratic: its "
+            "potential is kept inside and taken out again at the end, which is exact only as the intervals shrink",
+        )
+
+
+def prepare(
+    model: Model,
+    schedule: Schedule,
+    *,
+    components: int | None = None,
+    splitting: str = "strang",
+    reduction: str = "split-merge",
+    tolerance: float = TOLERANCE,
+) -> Prepared:
+    """The flow of every interval, offline.
+
+    `components` is the number of slots, `splitting` "strang" or "lie", `reduction` "split-merge", `tolerance` the loss below
+    which components are left alone.  Raises InputError for another word or number.
+    """
+    if splitting not in ("strang", "lie"):
+        raise InputError(f'option splitting: "{splitting}" is neither "strang" nor "lie"')
+    if components is not None and (isinstance(components, bool) or not isinstance(components, int) or components < 1):
+        raise InputError(f"option components: {components!r} must be a whole number from 1")
+    if not isinstance(tolerance, int | float) or not 0 < tolerance < 1:
+        raise InputError(f"option tolerance: {tolerance!r} must lie between 0 and 1")
+    static = _sum(formulas(model), splitting, components, reduction, float(tolerance))
+    plan = plan_flows(static.system, model, schedule)
+    prepared = Prepared(model, static, schedule, splitting, plan, model.theta(), None)  # type: ignore[arg-type]
+    return with_parameters(prepared, prepared.theta)
+
+
+def with_parameters(prepared: Prepared, theta: Any) -> Prepared:
+    """The same intervals for other parameters (p,); traceable."""
+    xp = np if isinstance(theta, np.ndarray) else jnp
+    schedule, count = prepared.schedule, len(prepared.schedule.starts)
+    precision = xp.linalg.inv(noise_at(prepared.model, schedule.stops, theta))
+    flow = planned_flows(prepared.static.system, prepared.plan, theta)
+    thetas = xp.broadcast_to(theta, (count, len(theta)))
+    intervals = Interval(schedule.starts, schedule.stops, flow, precision, thetas, prepared.static)
+    return replace(prepared, theta=theta, intervals=intervals)
+
+
+def observations(prepared: Prepared, data: Data) -> Factors:
+    """What `step` is given for each interval."""
+    system = prepared.static.system
+    return factors(
+        prepared.model,
+        data,
+        prepared.schedule,
+        rates=system.rates,
+        splitting=prepared.splitting,
+        remove=not system.bare,
+        theta=prepared.theta,
+    )
+
+
+def init(prepared: Prepared, prior: Any) -> State:
+    """The prior, cut into Gaussians and divided by e^phi."""
+    static, model = prepared.static, prepared.model
+    own = model.theta()
+
+    def cut(theta):
+        return start.cut_prior(
+            model, prior, static.start_directions, theta, lambda u: static.gauge.divide(u, model.start, theta)
+        )
+
+    narrow = cut(prepared.theta)
+    host = narrow if isinstance(prepared.theta, np.ndarray) else cut(own)
+    weights = _share_of_u(static, host, model.start, own)[0]
+    if static.affine and len(weights) <= static.slots or static.slots >= len(weights):
+        slots = max(static.slots if not static.affine else 0, len(weights))
+    else:
+        slots = static.slots
+    if static.directions.shape[1]:
+        precision = np.linalg.inv(noise_at(model, np.array([model.start]), own))[0]
+        loss = np.asarray(_losses(static, host, weights, precision, model.start, own)[0])
+    else:
+        loss = np.zeros(len(weights))
+    few = start.fitted(narrow, host, np.asarray(weights), loss, slots, static.angles)
+    return State(_normalised(static, few, model.start, prepared.theta)[0], jnp.asarray(model.start, float))
+
+
+def _share_of_u(static: Sum, v: Components, t: Any, theta: Any) -> tuple[jax.Array, jax.Array]:
+    """The share in u of each component of v (K,), and the logarithm of the mass of u."""
+    share, log_mass = shares(static.gauge.lift(v, t, theta))
+    return share.reshape(len(v.log_weights), -1).sum(axis=1), log_mass
+
+
+def _normalised(static: Sum, v: Components, t: Any, theta: Any) -> tuple[Components, jax.Array, Components, jax.Array]:
+    """v so that u = e^phi v has mass one; the logarithm of its mass; u, and the shares of its components."""
+    u = static.gauge.lift(v, t, theta)
+    share, log_mass = shares(u)
+    return v._replace(log_weights=v.log_weights - log_mass), log_mass, u, share
+
+
+def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State, Info]:
+    """The prior after an observation at the start itself."""
+    state = init(prepared, prior)
+    model = prepared.model
+    first = jax.tree.map(lambda a: a[0], observation)
+    precision = noise_at(model, np.array([model.start]), prepared.theta)
+    precision = jnp.linalg.inv(jnp.asarray(precision))[0]
+    return _observe(prepared.static, state.sum, first.after, first, precision, model.start, prepared.theta)
+
+
+def step(interval: Interval, state: State, observation: Factors) -> tuple[State, Info]:
+    """One interval: half factor, transition, half factor, reduction; normalise."""
+    static, theta = interval.static, interval.theta
+    v = state.sum
+    if static.system.halves:
+        v, _ = _multiply(static, v, observation.before, None, interval.start, theta)
+    v = _move(interval.flow, v, observation.inputs)
+    if static.angles:
+        v = v._replace(means=wrapped(v.means, static.angles))
+    return _observe(static, v, observation.after, observation, interval.precision, interval.stop, theta)
+
+
+def _move(flow: Flow, v: Components, inputs: jax.Array) -> Components:
+    """Every component along the flow of the interval, part by part."""
+
+    def part(v, flow):
+        mean, cov, log_mass = jax.vmap(lambda m, P: move_gaussian(flow, m, P, inputs))(v.means, v.covs)
+        return Components(v.log_weights + log_mass, mean, cov, v.signs), None
+
+    if flow.map.shape[0] == 1:
+        return part(v, jax.tree.map(lambda a: a[0], flow))[0]
+    return jax.lax.scan(part, v, flow)[0]
+
+
+def _observe(static: Sum, v: Components, after, factor: Factors, precision, t, theta) -> tuple[State, Info]:
+    """The factor at the end of an interval, and what the step tells."""
+    zero = jnp.zeros(())
+    pruned, together, nonlinearity, moved = zero, zero, zero, zero
+    at_once = static.sampled or factor.energy is not None
+    if static.directions.shape[1]:
+        if at_once:
+            # Room is made before a reading that may say much at once, by the weights that it will leave.
+            for _ in range(ROUNDS):
+                tried, _ = _multiply(static, v, after, factor, t, theta)
+                share, _ = _share_of_u(static, tried, t, theta)
+                v, done, _ = _exchange(static, v, share, precision, t, theta, 1.0)
+                pruned, together = pruned + done.pruned, together + done.together
+        v, shift = _multiply(static, v, after, factor, t, theta)
+        share, log_mass = _share_of_u(static, v, t, theta)
+        moved = jnp.sum(jnp.where(share > 0, share * shift, 0.0))
+        v, done, nonlinearity = _exchange(static, v, share, precision, t, theta, 0.0)
+        pruned, together = pruned + done.pruned, together + done.together
+    else:
+        v, _ = _multiply(static, v, after, factor, t, theta)
+        share, log_mass = _share_of_u(static, v, t, theta)
+    v, _, u, parts = _normalised(static, v, t, theta)
+    share = parts.reshape(len(v.log_weights), -1).sum(axis=1)
+    mean, cov = moments(parts, u.means, u.covs, static.angles)
+    health = {
+        "nonlinearity": nonlinearity,
+        "pruned": pruned,
+        "merged": together,
+        "components": 1.0 / jnp.sum(share**2),
+        "surprise": moved / 5.0,
+    }
+    return State(v, jnp.asarray(t, float)), Info(log_mass, mean, cov, health)
+
+
+def _losses(static: Sum, v: Components, share, precision, t, theta, reading: float = 0.0):
+    """How badly one Gaussian serves each component (K,), and along which axis it would be split."""
+    residual, linear, axis = curvature(v, lambda x: static.system.observe(x, t, theta), precision, static.directions)
+    typical = jnp.sum(jnp.where(share > 0, share * linear, 0.0))
+    return residual * (reading + 1.0 / (typical + 1e-300)), axis
+
+
+def _exchange(static: Sum, v: Components, share, precision, t, theta, reading):
+    loss, axis = _losses(static, v, share, precision, t, theta, reading)
+    v, done = exchange(v, share, loss, axis, static.tolerance, static.angles)
+    return v, done, jnp.sum(jnp.where(share > 0, share * loss, 0.0))
+
+
+def _multiply(static: Sum, v: Components, linear, factor: Factors | None, t, theta) -> tuple[Components, jax.Array]:
+    """v exp(linear.h - h'(energy) h / 2 + constant), with energy and constant of `factor`; and how far components moved (K,)."""
+    energy = None if factor is None else factor.energy
+    constant = 0.0 if factor is None else factor.constant
+    if static.affine:
+        return _multiply_affine(static, v, linear, energy, constant, t, theta), jnp.zeros(len(v.signs))
+
+    def log_factor(x):
+        h = static.system.observe(x, t, theta)
+        value = sum((linear[i] * values for i, values in enumerate(h)), start=jnp.zeros(())) + constant
+        if energy is None:
+            return value
+        return value - 0.5 * sum(energy[i, j] * a * b for i, a in enumerate(h) for j, b in enumerate(h))
+
+    return refit(v, log_factor, static.directions, energy is not None)
+
+
+def _multiply_affine(static: Sum, v: Components, linear, energy, constant, t, theta) -> Components:
+    """The same for h = C x + c, exactly."""
+    if energy is None and static.system.rates:
+        return v._replace(log_weights=v.log_weights + constant)
+    n = v.means.shape[1]
+    c = jnp.stack(static.system.observe(jnp.zeros((1, n)), t, theta), -1)[0]
+    C = jnp.stack(static.system.observe(jnp.eye(n), t, theta), 0) - c[:, None]
+    energy = jnp.zeros((len(c), len(c))) if energy is None else energy
+
+    def one(m, P):
+        centre = C @ m + c
+        slope = C.T @ (linear - energy @ centre)
+        spread = P @ C.T
+        # P (1 + C'E C P)^-1, by the smaller system in the observations.
+        inner = jnp.eye(len(c)) + energy @ C @ spread
+        gain = spread @ jnp.linalg.solve(inner, energy)
+        new = P - gain @ spread.T
+        new = 0.5 * (new + new.T)
+        shift = new @ slope
+        mass = linear @ centre - 0.5 * centre @ energy @ centre + 0.5 * slope @ shift - 0.5 * jnp.linalg.slogdet(inner)[1]
+        return m + shift, new, mass
+
+    mean, cov, mass = jax.vmap(one)(v.means, v.covs)
+    return Components(v.log_weights + mass + constant, mean, cov, v.signs)
+
+
+def density(prepared: Prepared, state: State) -> GaussianMixture:
+    """The posterior u = e^phi v as a `GaussianMixture`."""
+    model = prepared.model
+    u = prepared.static.gauge.lift(state.sum, state.time, prepared.theta)
+    share = np.asarray(shares(u)[0])
+    kept = share != 0
+    periodic = tuple(name in model.periodic for name in model.state)
+    return GaussianMixture(share[kept], np.asarray(u.means)[kept], np.asarray(u.covs)[kept], model.state, periodic)
+
+
+METHOD = Method(
+    name="general-direct",
+    source="Chen and Dong, A survey of direct methods for Yau filtering systems, Theorems 6 and 7, Algorithm 4, corrected",
+    exactness="exact between observations; a Gaussian sum of the posterior where h is nonlinear, whose error health tells",
+    theorem=theorem,
+    options={"components": None, "splitting": "strang", "reduction": "split-merge", "tolerance": TOLERANCE},
+    prepare=prepare,
+    init=init,
+    correct=correct,
+    observations=observations,
+    step=step,
+    density=density,
+    with_parameters=with_parameters,
+    bounds={
+        "nonlinearity": (0.1, "share of the observation's energy over single components that is not linear there"),
+        "pruned": (1e-3, "weight of components that were dropped in one step"),
+        "merged": (0.1, "loss by putting components together for lack of room"),
+        "surprise": (1.0, "how far the observation drives the density into the tails of single Gaussians"),
+    },
+)
