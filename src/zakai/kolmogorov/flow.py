@@ -37,7 +37,8 @@ from zakai import _float64  # noqa: F401
 STAGES = 8
 TOLERANCE = 1e-13
 MOST_SUBSTEPS = 4096
-MOST_IMPLICIT = 12  # states up to which the implicit method is the cheaper one
+MOST_IMPLICIT = 4  # states up to which the implicit method is the cheaper one
+MOST_TOGETHER = 32  # states up to which many intervals are integrated at once
 
 
 # Prepared flows are held as NumPy arrays and traced as JAX arrays.
@@ -282,7 +283,7 @@ def _integrate_all(coefficients, starts, stops, arguments, substeps):
     head = jax.tree.map(lambda a: a[0], (starts, stops, arguments))
     n = jax.eval_shape(one, head).lift.shape[0]
     # Large matrices fill the processor by themselves; all intervals at once would only fill the memory.
-    together = jax.vmap(one) if n <= MOST_IMPLICIT else partial(jax.lax.map, one)
+    together = jax.vmap(one) if n <= MOST_TOGETHER else partial(jax.lax.map, one)
     return together((starts, stops, arguments))
 
 
@@ -306,7 +307,7 @@ def _in_blocks(coefficients, starts, stops, arguments, substeps):
 def _tried(coefficients, starts, arguments) -> int:
     """How many intervals are tried, and how many are integrated together."""
     n = jax.eval_shape(coefficients, starts[0], jax.tree.map(lambda a: a[0], arguments)).matrix.shape[0]
-    return 48 if n <= MOST_IMPLICIT else 6
+    return 48 if n <= MOST_TOGETHER else 6
 
 
 def substeps_for(
