@@ -143,21 +143,24 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
 class Run:
     """One record on its way through one method."""
 
-    def __init__(self, setting: Setting, record: Record, keep: str | None, recorded: bool = False):
-        self.setting, self.record = setting, record
+    def __init__(self, setting: Setting, record: Record, keep: str | None, recorded: bool = False, most: float = KEPT_BYTES):
+        self.setting, self.record, self.most = setting, record, most
         self.data = data_of(setting.model, record)
         self.infos: list[Info] = []
         self.notes: dict[str, None] = {}
         self.states: list[tuple[int, Any, Any]] = []
         self.keep, self.must_keep = keep != "moments", keep == "densities"
         self.pieces: list[Piece] | None = [] if recorded else None
+        self.first: Any = None
+        self.state: Any = None
         self.bytes = 0
         self.done = 0
 
     def all(self, progress: Callable[[int, int], None] | None) -> None:
         """Filter the whole record, chunk by chunk."""
         method, count = self.setting.method, len(self.record.times)
-        state = self.start()
+        if self.state is None:
+            self.start()
         for rows in self.setting.chunks(self.data, self.done):
             data = self.data.part(rows)
             prepared = self.setting.prepared(data)
@@ -166,8 +169,8 @@ class Run:
                 self.pieces.append(Piece(prepared, data, []))
             while self.done < rows.stop:
                 left = slice(self.done - rows.start, rows.stop - rows.start)
-                part, begin, state, info, kept = run_steps(
-                    method, method.adapt, scan, prepared, state, observations, left, rows.stop == count, self.keep
+                part, begin, self.state, info, kept = run_steps(
+                    method, method.adapt, scan, prepared, self.state, observations, left, rows.stop == count, self.keep
                 )
                 if self.pieces is not None:
                     self.pieces[-1].runs.append((part, begin if method.adapt else None))
@@ -175,20 +178,21 @@ class Run:
                 if progress is not None:
                     progress(self.done, count)
 
-    def start(self) -> Any:
-        """The first state: the prior, or the prior after a sample at the start itself."""
+    def start(self, same: Run | None = None) -> None:
+        """The first state: that of another run with the same prior, or the prior, after a sample at the start if there is one."""
+        if same is not None:
+            self.first, self.state, self.states = same.first, same.state, list(same.states)
+            return
         method, prior = self.setting.method, self.setting.prior
         self.first = prepared = self.setting.prepared(self._first_interval())
-        state = method.init(prepared, prior)
-        self._keep_one(prepared, state, 0)
-        if not self.at_start:
-            return state
-        observation = method.observations(prepared, self.data.part(slice(0, 1)))
-        state, info = method.correct(prepared, prior, observation)
-        self.infos.append(jax.tree.map(lambda a: np.asarray(a)[None], info))
-        self._keep_one(prepared, state, 1)
-        self.done = 1
-        return state
+        self.state = method.init(prepared, prior)
+        self._keep_one(prepared, 0)
+        if self.at_start:
+            observation = method.observations(prepared, self.data.part(slice(0, 1)))
+            self.state, info = method.correct(prepared, prior, observation)
+            self.infos.append(jax.tree.map(lambda a: np.asarray(a)[None], info))
+            self._keep_one(prepared, 1)
+            self.done = 1
 
     @property
     def at_start(self) -> bool:
@@ -202,9 +206,10 @@ class Run:
         # The interval before a sample at the start has no length, so the first one that has stands in for it.
         return self.data.part(slice(1, 2)) if len(self.data.stops) > 1 else first._replace(stops=first.stops + 1.0)
 
-    def _keep_one(self, prepared: Any, state: Any, index: int) -> None:
+    def _keep_one(self, prepared: Any, index: int) -> None:
         if self.keep:
-            self.states.append((index, prepared, jax.tree.map(lambda a: np.asarray(a)[None], getattr(state, "kept", state))))
+            kept = getattr(self.state, "kept", self.state)
+            self.states.append((index, prepared, jax.tree.map(lambda a: np.asarray(a)[None], kept)))
 
     def take(self, prepared: Any, begin: Any, info: Info, kept: Any) -> None:
         """Keep what a run of steps gave."""
@@ -214,7 +219,7 @@ class Run:
         if self.keep:
             self.states.append((self.done + 1, prepared, kept))
             self.bytes += sum(leaf.nbytes for leaf in jax.tree.leaves(kept))
-            if self.bytes > KEPT_BYTES and not self.must_keep:
+            if self.bytes > self.most and not self.must_keep:
                 self.keep, self.states = False, []
         self.done += len(info.log_likelihood_increment)
 
@@ -262,7 +267,7 @@ class Run:
             _density=self.density if self.states else None,
             _no_density=(
                 f"the densities of {len(self.record.times)} steps were not kept: they need more than "
-                f'{KEPT_BYTES // 2**20} MiB; keep="densities" keeps them all'
+                f'{self.most / 2**20:.3g} MiB; keep="densities" keeps them all'
                 if self.keep is False and self.bytes
                 else 'the densities were not kept; keep="densities" keeps them'
             ),

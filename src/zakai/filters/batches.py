@@ -1,0 +1,153 @@
+"""Many records of one model at once: one compiled scan serves all that were taken at the same times with the same gaps."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from threading import Lock
+from typing import Any
+
+import jax
+import numpy as np
+
+from zakai import _float64  # noqa: F401
+from zakai.filters._run import RUN, Run, run_steps, scanned, size_of
+
+LANES = 256  # records that are filtered by one scan, at most
+LANE_BYTES = 256 * 2**20  # what they give in one run of steps, at most
+WORTH_A_CORE = 16  # records
+
+
+class _Count:
+    """How many observations are done, of all records together."""
+
+    def __init__(self, progress: Callable[[int, int], None] | None, total: int):
+        self.progress, self.total, self.done, self.lock = progress, total, 0, Lock()
+
+    def add(self, steps: int) -> None:
+        with self.lock:
+            self.done += steps
+            if self.progress is not None:
+                self.progress(self.done, self.total)
+
+    def of_one(self) -> Callable[[int, int], None]:
+        """The same as the progress of a single record, which counts from its own beginning."""
+        last = 0
+
+        def progress(done: int, _: int) -> None:
+            nonlocal last
+            self.add(done - last)
+            last = done
+
+        return progress
+
+
+def filter_all(runs: Sequence[Run], progress: Callable[[int, int], None] | None) -> None:
+    """Filter every record: those that can be together side by side, the others one by one.
+
+    Groups go to the cores of the machine; the work is in compiled code, which leaves Python to the others.
+    """
+    count = _Count(progress, sum(len(run.record.times) for run in runs))
+    groups = [group for alike in _alike(runs) for group in _groups(alike)]
+    with ThreadPoolExecutor(min(len(groups), os.cpu_count() or 1)) as pool:
+        for done in [pool.submit(_together, group, size, count) for group, size in groups]:
+            done.result()
+
+
+def _alike(runs: Sequence[Run]) -> Iterator[list[Run]]:
+    """The records that were taken at the same times with the same gaps."""
+    found: dict[Hashable, list[Run]] = {}
+    for run in runs:
+        key = (run.record.times.tobytes(), np.isnan(run.record.values).tobytes())
+        found.setdefault(key, []).append(run)
+    yield from found.values()
+
+
+def _groups(runs: list[Run]) -> Iterator[tuple[list[Run], int]]:
+    """What is filtered by one scan, and how many records that scan is made for: groups of one size are compiled once."""
+    method = runs[0].setting.method
+    starts: dict[Hashable, list[Run]] = {}
+    first = None
+    for run in runs:
+        # Without a reading at the start, one prior gives one first state.
+        run.start(first if first and not run.at_start and run.setting.prior is first.setting.prior else None)
+        first = run
+        starts.setdefault(_shape(run.state) if method.adapt is None or method.adapt_many else id(run), []).append(run)
+    for alike in starts.values():
+        n = alike[0].setting.model.n
+        each = RUN * (8 * (n * n + n + 16) + (size_of(alike[0].state) if alike[0].keep else 0))
+        most = max(1, min(LANES, LANE_BYTES // each))
+        parts = max(-(-len(alike) // most), min(os.cpu_count() or 1, len(alike) // WORTH_A_CORE))
+        size = -(-len(alike) // max(1, parts))
+        yield from ((alike[k : k + size], size) for k in range(0, len(alike), size))
+
+
+def _together(runs: list[Run], lanes: int, count: _Count) -> None:
+    """Filter a group of records; a scan that is made for more `lanes` repeats the last of them."""
+    if lanes == 1:
+        return runs[0].all(count.of_one())
+    setting, total = runs[0].setting, len(runs[0].record.times)
+    method = setting.method
+    fill = [runs[-1]] * (lanes - len(runs))
+    states = _stacked([run.state for run in [*runs, *fill]], 0)
+    for rows in setting.chunks(runs[0].data, runs[0].done, lanes):
+        prepared = setting.prepared(runs[0].data.part(rows))
+        given = [method.observations(prepared, run.data.part(rows)) for run in runs]
+        observations = _stacked([*given, *given[-1:] * len(fill)], 1)
+        while runs[0].done < rows.stop:
+            left = slice(runs[0].done - rows.start, rows.stop - rows.start)
+            part, begin, states, info, kept = run_steps(
+                method, _adapt(method), _scan_lanes, prepared, states, observations, left, rows.stop == total, runs[0].keep
+            )
+            for lane, run in enumerate(runs):
+                run.take(prepared, _lane(begin, lane, 0), _lane(info, lane, 1), _lane(kept, lane, 1))
+            count.add(len(runs) * (part.stop - part.start))
+
+
+def _adapt(method):
+    """`adapt_many`, given what the scan tells with the records in front."""
+    if method.adapt_many is None:
+        return None
+
+    def adapt(prepared, states, rows, info):
+        return method.adapt_many(prepared, states, rows, jax.tree.map(lambda a: np.swapaxes(a, 0, 1), info))
+
+    return adapt
+
+
+def _shape(tree: Any) -> Hashable:
+    return jax.tree.structure(tree), tuple(np.shape(leaf) for leaf in jax.tree.leaves(tree))
+
+
+def _stacked(trees: Sequence[Any], axis: int) -> Any:
+    return jax.tree.map(lambda *arrays: np.stack([np.asarray(a) for a in arrays], axis=axis), *trees)
+
+
+def _lane(tree: Any, lane: int, axis: int) -> Any:
+    return jax.tree.map(lambda a: np.asarray(a)[lane] if axis == 0 else a[:, lane], tree)
+
+
+@partial(jax.jit, static_argnums=(0, 4))
+def _scan(step, states, intervals, observations, keep):
+    def one(carry, slices):
+        new, info = jax.vmap(step, (None, 0, 0))(slices[0], carry, slices[1])
+        return new, (info, getattr(new, "kept", new) if keep else None)
+
+    return scanned(one, states, (intervals, observations))
+
+
+_COMPILED: set[Hashable] = set()
+_COMPILING = Lock()
+
+
+def _scan_lanes(step, states, intervals, observations, keep):
+    """`scan` of many records, with axes (steps, records, ...); two threads never compile the same."""
+    key = (step, keep, _shape((states, intervals, observations)))
+    if key in _COMPILED:
+        return _scan(step, states, intervals, observations, keep)
+    with _COMPILING:
+        result = _scan(step, states, intervals, observations, keep)
+        _COMPILED.add(key)
+    return result
