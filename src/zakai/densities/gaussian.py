@@ -11,12 +11,16 @@ from scipy.special import logsumexp, ndtr
 
 from zakai.densities._density import coordinate_numbers, generator, probabilities, wrap
 
+_AT_ONCE = 2**21  # points times components that are worked on together
+
 
 @dataclass(frozen=True)
 class GaussianMixture:
     """sum_k w_k N(m_k, P_k): `weights` (k,), `means` (k, n), `covs` (k, n, n); one component is a Gaussian.
 
-    A coordinate in `periodic` is wrapped to the circle: its density is summed over the windings that matter.
+    Weights sum to one and may be slightly negative, as those of nodes that represent a smooth density are; a density is then
+    -inf in the logarithm where rounding leaves nothing, and samples are drawn from the positive weights.  A coordinate in
+    `periodic` is wrapped to the circle: its density is summed over the windings that matter.
     """
 
     weights: np.ndarray
@@ -34,15 +38,31 @@ class GaussianMixture:
         x = np.asarray(x, float)
         if x.shape[-1:] != (len(self.names),):
             x = x[..., None] if len(self.names) == 1 else x
-        parts = []
-        for weight, mean, cov in zip(self.weights, self.means, self.covs, strict=True):
+        points = x.reshape(-1, len(self.names))
+        rows = max(1, _AT_ONCE // len(self.weights))
+        parts = [self._log_density(points[i : i + rows]) for i in range(0, len(points), rows)]
+        return np.concatenate(parts or [np.zeros(0)]).reshape(x.shape[:-1])
+
+    def _log_density(self, points: np.ndarray) -> np.ndarray:
+        logs, signs = [], []
+        for rows in self._shared():
+            cov, means, weights = self.covs[rows.start], self.means[rows], self.weights[rows]
             factor = np.linalg.cholesky(cov)
-            constant = np.log(weight) - np.sum(np.log(np.diag(factor))) - 0.5 * len(mean) * np.log(2 * np.pi)
+            with np.errstate(divide="ignore"):
+                constants = np.log(np.abs(weights)) - np.sum(np.log(np.diag(factor))) - 0.5 * len(cov) * np.log(2 * np.pi)
             for winding in self._windings(cov):
-                difference = self._difference(x, mean) + winding
-                white = solve_triangular(factor, difference.reshape(-1, len(mean)).T, lower=True)
-                parts.append(constant - 0.5 * np.sum(white**2, axis=0).reshape(x.shape[:-1]))
-        return logsumexp(np.stack(parts), axis=0)
+                difference = self._difference(points[:, None], means) + winding
+                white = solve_triangular(factor, difference.reshape(-1, len(cov)).T, lower=True)
+                logs.append(constants - 0.5 * np.sum(white**2, axis=0).reshape(len(points), len(means)))
+                signs.append(np.broadcast_to(np.sign(weights), logs[-1].shape))
+        with np.errstate(divide="ignore"):
+            value, sign = logsumexp(np.hstack(logs), axis=1, b=np.hstack(signs), return_sign=True)
+        return np.where(sign > 0, value, -np.inf)
+
+    def _shared(self) -> list[slice]:
+        """Runs of components that share a covariance."""
+        ends = np.flatnonzero(np.any(self.covs[1:] != self.covs[:-1], axis=(1, 2))) + 1
+        return [slice(a, b) for a, b in zip([0, *ends], [*ends, len(self.covs)], strict=True)]
 
     def _difference(self, x, mean):
         difference = x - mean
@@ -71,15 +91,18 @@ class GaussianMixture:
         )
 
     def mode(self) -> np.ndarray:
-        x = self.means[np.argmax(self.log_density(self.means))]
+        heaviest = np.argsort(-self.weights)[:256]
+        x = self.means[heaviest][np.argmax(self.log_density(self.means[heaviest]))]
         for _ in range(200):  # the mean-shift iteration climbs to the mode near the best component
             precisions = np.linalg.inv(self.covs)
+            with np.errstate(divide="ignore"):
+                weights = np.log(np.abs(self.weights))
             logs = (
-                np.log(self.weights)
+                weights
                 + 0.5 * np.linalg.slogdet(precisions)[1]
                 - 0.5 * np.einsum("ki,kij,kj->k", x - self.means, precisions, x - self.means)
             )
-            share = np.exp(logs - logs.max())
+            share = np.sign(self.weights) * np.exp(logs - logs.max())
             new = np.linalg.solve(
                 np.einsum("k,kij->ij", share, precisions), np.einsum("k,kij,kj->i", share, precisions, self.means)
             )
@@ -117,7 +140,8 @@ class GaussianMixture:
 
     def sample(self, key: object, count: int) -> np.ndarray:
         rng = generator(key)
-        which = rng.choice(len(self.weights), size=count, p=self.weights)
+        positive = np.maximum(self.weights, 0.0)
+        which = rng.choice(len(self.weights), size=count, p=positive / positive.sum())
         noise = rng.standard_normal((count, len(self.names)))
         x = self.means[which] + np.einsum("cij,cj->ci", np.linalg.cholesky(self.covs)[which], noise)
         return np.where(self.periodic, wrap(x), x)

@@ -148,6 +148,7 @@ def _read(families: Family, slope: Any, intercept: Any, reading: Factors) -> Fam
     return jax.vmap(one)(families)
 
 
+@partial(jax.jit, static_argnums=0)
 def _looked_at(gauge: GaugeFunctions, tilts: Tilts, time: Any, theta: Any, state: State) -> tuple[State, Info]:
     """The normalised state, and what it tells."""
     found = posterior(gauge, tilts, time, theta, state.families)

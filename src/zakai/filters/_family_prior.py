@@ -42,6 +42,12 @@ class Prior(NamedTuple):
     error: float
 
 
+def _values(functions: GaugeFunctions, model: Model, x: Any, theta: Any) -> Any:
+    """phi at x (N, n), at the start."""
+    value = functions.compiled(x, model.start, theta)[0]
+    return value if _space(value) is jnp else np.asarray(value)
+
+
 class Nodes(NamedTuple):
     """A part of v_0(z): nodes z (N, k), their covariance W (k, k), log |w|, signs, and what `Prior` holds."""
 
@@ -51,6 +57,22 @@ class Nodes(NamedTuple):
     signs: Any
     log_error: Any
     edge: Any
+
+
+def _space(*arrays: Any) -> Any:
+    """NumPy where nothing is traced: the shapes are many and not worth a compilation each."""
+    return jnp if any(isinstance(a, jax.core.Tracer) for a in jax.tree.leaves(arrays)) else np
+
+
+def _log_sum(logs: Any) -> Any:
+    """log sum exp over the last axis."""
+    xp = _space(logs)
+    top = jax.lax.stop_gradient(xp.max(logs, axis=-1)) if xp is jnp else np.max(logs, axis=-1)
+    return top + xp.log(xp.sum(xp.exp(logs - top[..., None]), axis=-1))
+
+
+def _plain(tilts: Tilts) -> Tilts:
+    return tilts if _space(tilts) is jnp else Tilts(*[None if a is None else np.asarray(a) for a in tilts])
 
 
 def prior_families(functions: GaugeFunctions, model: Model, prior: Any, theta: Any) -> Prior:
@@ -65,8 +87,8 @@ def prior_families(functions: GaugeFunctions, model: Model, prior: Any, theta: A
         made = [gaussian(mean, cov)._replace(log_mass=jnp.asarray(weight)) for weight, mean, cov in components]
         families = jax.tree.map(lambda *parts: jnp.stack(parts), *made)
         return Prior(families, np.full((len(made), 1), -np.inf), np.zeros((len(made), 1)), 0.0)
-    own = functions.at(model.start, model.theta())
-    tilts = functions.at(model.start, theta)
+    own = _plain(functions.at(model.start, model.theta()))
+    tilts = _plain(functions.at(model.start, theta))
     parts, worst = [], 0.0
     for weight, mean, cov in components:
         plan = _GaussianPlan(functions, model, np.asarray(own.directions), own, mean, cov)
@@ -205,39 +227,39 @@ class _GaussianPlan:
         def phi(z):
             x = lifted(tilts.directions, z)
             if self.functions.exact:
-                return jax.nn.logsumexp(x @ tilts.slopes.T + tilts.logs, axis=-1)
-            return self.functions.potential(x, self.model.start, theta)[0]
+                return _log_sum(x @ tilts.slopes.T + tilts.logs)
+            return _values(self.functions, self.model, x, theta)
 
         return phi
 
     def _source(self, tilts: Tilts) -> tuple[Any, Any, Any]:
         """(points, log-weights, covariance) of the Gaussians of z that the last lattice is to represent."""
         directions = tilts.directions
-        points, logs = (directions @ self.mean)[None], jnp.zeros(1)
+        points, logs = (directions @ self.mean)[None], np.zeros(1)
         cov = self.vectors.T @ (directions @ self.cov @ directions.T) @ self.vectors
         for level in self.levels:
             logs = self._weights(level, points, logs, cov)[level.near]
-            points, cov = level.points[level.near][:, None], jnp.array([[level.width**2]])
+            points, cov = level.points[level.near][:, None], np.array([[level.width**2]])
         return points, logs, cov
 
     def _weights(self, level: _Level, points: Any, logs: Any, cov: Any) -> Any:
         """The log-weights of a level's Gaussians."""
         variance = cov[0, 0] - level.width**2
         away = level.points[:, None] - points[:, 0]
-        each = logs - 0.5 * away**2 / variance - 0.5 * jnp.log(2 * jnp.pi * variance)
-        return jax.nn.logsumexp(each, axis=1) + np.log(level.cell)
+        each = logs - 0.5 * away**2 / variance - 0.5 * _space(variance).log(2 * np.pi * variance)
+        return _log_sum(each) + np.log(level.cell)
 
     def _log_u(self, z: Any, tilts: Tilts) -> Any:
         points, logs, cov = self._source(tilts)
         if not len(cov):
-            return jnp.zeros(len(z))
+            return np.zeros(len(z))
         away = (z[:, None] - points) @ self.vectors
-        each = logs - 0.5 * jnp.sum((away @ jnp.linalg.inv(cov)) * away, axis=-1)
-        return jax.nn.logsumexp(each, axis=1) - 0.5 * jnp.linalg.slogdet(2 * jnp.pi * cov)[1]
+        each = logs - 0.5 * _space(away, cov).sum((away @ _space(cov).linalg.inv(cov)) * away, axis=-1)
+        return _log_sum(each) - 0.5 * _space(cov).linalg.slogdet(2 * np.pi * cov)[1]
 
     def nodes(self, tilts: Tilts, theta: Any):
         """The parts of v_0(z) for the parameters theta."""
-        points, logs = (tilts.directions @ self.mean)[None], jnp.zeros(1)
+        points, logs = (tilts.directions @ self.mean)[None], np.zeros(1)
         cov = self.vectors.T @ (tilts.directions @ self.cov @ tilts.directions.T) @ self.vectors
         for number, level in enumerate(self.levels):
             weights = self._weights(level, points, logs, cov)
@@ -246,8 +268,8 @@ class _GaussianPlan:
                 edge[[0, 1, -2, -1]] = 1.0
             far = ~level.near
             if far.any():
-                yield self._tilted(tilts, level.points[far], weights[far], jnp.array([[level.width**2]]), edge[far])
-            points, logs, cov = level.points[level.near][:, None], weights[level.near], jnp.array([[level.width**2]])
+                yield self._tilted(tilts, level.points[far], weights[far], np.array([[level.width**2]]), edge[far])
+            points, logs, cov = level.points[level.near][:, None], weights[level.near], np.array([[level.width**2]])
         if self.lattice is None:
             yield self._tilted(tilts, points[:, 0], logs, cov, np.zeros(len(points)))
             return
@@ -292,7 +314,7 @@ def _from_density(functions: GaugeFunctions, model: Model, prior: DensityPrior, 
         return density(z, model.start, values)[0]
 
     def phi(z, values):
-        return functions.potential(z, model.start, values)[0] if not functions.trivial else jnp.zeros(z.shape[:-1])
+        return np.zeros(z.shape[:-1]) if functions.trivial else _values(functions, model, z, values)
 
     own = model.theta()
     lattice, error = resolve(

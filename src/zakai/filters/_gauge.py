@@ -35,6 +35,7 @@ class GaugeFunctions:
         self.exact = form.slopes is not None
         self.count = form.directions.rows
         self.potential = jax_field([form.potential], model)
+        self.compiled = jax.jit(self.potential)
         blocks = [form.directions]
         if form.slopes is not None and form.coefficients is not None:
             blocks += [form.slopes, form.coefficients]
@@ -63,7 +64,8 @@ def gauge_of(of: Formulas) -> GaugeFunctions:
 
 def lifted(directions: Any, z: Any) -> Any:
     """A state x (..., n) with D x = z (..., k)."""
-    return z @ jnp.linalg.solve(directions @ directions.T, directions)
+    xp = jnp if isinstance(directions, jax.core.Tracer) else np
+    return z @ xp.linalg.solve(directions @ directions.T, directions)
 
 
 class Posterior(NamedTuple):

@@ -48,14 +48,15 @@ class NodeLattice:
 
     def weights(self, values: Any) -> Any:
         """The weights (N,) of v from its values (N,) at the points; pure."""
-        shape = np.array([s for s in self.sizes])
-        array = jnp.reshape(values, shape)
+        shape = np.array(self.sizes)
+        xp = np if isinstance(values, np.ndarray) else jnp
+        array = xp.reshape(values, shape)
         for axis, size in enumerate(self.sizes):
             if size > 1:
-                array = jnp.moveaxis(jnp.tensordot(_inverse(size), array, (1, axis)), 0, axis)
+                array = xp.moveaxis(xp.tensordot(_inverse(size), array, (1, axis)), 0, axis)
         wide = self.basis[:, shape > 1]
         # The Gaussians have unit mass; the taps are those of cells.
-        return jnp.ravel(array) * np.sqrt(np.linalg.det(wide.T @ wide))
+        return xp.ravel(array) * np.sqrt(np.linalg.det(wide.T @ wide))
 
     def sums(self, weights: np.ndarray, shift: np.ndarray) -> np.ndarray:
         """sum_l w_l N(z; z_l, W) at the points shifted by `shift` (k,) cells, relative to the axes that have width."""
@@ -110,7 +111,7 @@ def representation_error(log_values, log_scale, lattice: NodeLattice) -> float:
     logs = np.asarray(log_values(points))
     top = logs.max()
     with np.errstate(all="ignore"):
-        weights = np.asarray(lattice.weights(jnp.asarray(np.exp(logs - top))))
+        weights = lattice.weights(np.exp(logs - top))
         highest = np.max(logs + np.asarray(log_scale(points)))
         worst = 0.0
         for corner in np.ndindex(*(2,) * k):
