@@ -88,7 +88,7 @@ class GridDensity:
             distance = np.arange(size) - size // 2 - index[:, axis][:, None]
             view = [-1] + [size if a == axis else 1 for a in range(len(shape))]
             if self._closed[axis]:
-                kernels.append(_dirichlet(distance, size).reshape(view))
+                kernels.append(dirichlet(distance, size).reshape(view))
                 continue
             kernels.append(np.sinc(distance).reshape(view))
             if size > 1:
@@ -211,7 +211,7 @@ class GridDensity:
         return np.where(self.periodic, wrap(x), x)
 
 
-def _dirichlet(distance: np.ndarray, size: int) -> np.ndarray:
+def dirichlet(distance: np.ndarray, size: int) -> np.ndarray:
     """The trigonometric interpolation kernel of `size` points on a circle, at a distance in cells."""
     angle = np.pi * distance / size
     with np.errstate(divide="ignore", invalid="ignore"):

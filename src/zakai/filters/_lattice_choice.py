@@ -10,11 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
 from zakai.densities import GaussianMixture
+from zakai.densities.grid import dirichlet
 from zakai.errors import InputError
 from zakai.kolmogorov.lattice import REACH, SUPPORT, Lattice
 from zakai.models.model import Model
@@ -32,6 +34,9 @@ ROOM = 64.0  # the longest rows of a slanted lattice, in sizes of an axis
 BASE = {1: 128, 2: 64, 3: 48}
 MOST = {1: 8192, 2: 1024, 3: 256}
 FINE = {1: 2.0, 2: 2.0, 3: 1.2}  # by how much the first lattice is finer than it need be
+
+
+SAME = np.zeros(2)  # the cut of a lattice that was taken as it is
 
 
 @dataclass(frozen=True)
@@ -163,6 +168,11 @@ def _order(model: Model) -> list[int]:
     return angles + [i for i in range(model.n) if i not in angles]
 
 
+def log_prior(model: Model, prior: Any) -> Callable[[np.ndarray], np.ndarray]:
+    """The logarithm of the prior, as `first_lattice` takes it."""
+    return _prior_box(model, prior)[1]
+
+
 def _prior_box(model, prior):
     """Axes (columns), the prior's logarithm, and a box in their coordinates that holds all of it; no width: a point mass."""
     n, periodic = model.n, tuple(name in model.periodic for name in model.state)
@@ -237,17 +247,18 @@ def adapted(
     spreads: np.ndarray,
     maps: np.ndarray,
     info: Any | None,
-) -> tuple[Lattice, Plan | None]:
-    """A lattice and a plan for a run of intervals with kernels of covariance `spreads` and moving by `maps` (K, parts, n, n).
+) -> tuple[Lattice, Plan | None, np.ndarray]:
+    """A lattice, a plan and how the lattice was cut out (see `cut_out`) for a run of intervals.
 
-    With the `info` of a try: a better plan, or None where the try was good or nothing better can be had.
+    The kernels have covariances `spreads` and move by `maps` (K, parts, n, n).  With the `info` of a try: a better plan, or None
+    where the try was good or nothing better can be had.
     """
     if info is not None:
         if healthy(info, plan):
-            return lattice, None
+            return lattice, None, SAME
         better = _more(plan, info)
         if better is None:
-            return lattice, None
+            return lattice, None, SAME
         plan = better
     one_line = model.n == 1 and not plan.angles and maps.shape[1] == 1
     if one_line and lattice.log_values.size > 1:
@@ -269,7 +280,7 @@ def adapted(
     angle = np.sqrt(max((spreads[:, :, i, i].max() for i in plan.angles), default=0.0))
     reach = REACH * angle / (2 * np.pi)
     images = max(0, int(np.ceil(reach - 0.5))) if plan.angles else 0
-    return lattice, replace(plan, banded=False, sizes=sizes, images=images, run=run)
+    return lattice, replace(plan, banded=False, sizes=sizes, images=images, run=run), SAME
 
 
 def healthy(info: Any, plan: Plan) -> bool:
@@ -316,7 +327,7 @@ def _more(plan: Plan, info: Any) -> Plan | None:
     return replace(plan, cells=plan.cells * (2 if coarse else 1), window=plan.window * (1.6 if narrow else 1))
 
 
-def _banded(lattice: Lattice, plan: Plan, deviation: np.ndarray, maps: np.ndarray) -> tuple[Lattice, Plan] | None:
+def _banded(lattice: Lattice, plan: Plan, deviation: np.ndarray, maps: np.ndarray) -> tuple[Lattice, Plan, np.ndarray] | None:
     """The window and the cell of a banded run, or None where summing over all pairs is cheaper."""
     logs = np.asarray(lattice.log_values)
     cell = abs(float(lattice.basis[0, 0]))
@@ -334,13 +345,39 @@ def _banded(lattice: Lattice, plan: Plan, deviation: np.ndarray, maps: np.ndarra
     pairs = max(BASE[1], rounded_up(span / (COARSEST * deviation.min())))
     if size * (12 + 0.2 * taps) > 3 * pairs**2:
         return None
-    middle = (used[0] + used[-1]) // 2
-    window = _resampled(logs, middle, new_cell / cell, size)
+    middle, ratio = int((used[0] + used[-1]) // 2), new_cell / cell
+    window = _resampled(logs, middle, ratio, size)
     centre = np.asarray(lattice.centre) + np.asarray(lattice.basis)[:, 0] * (middle - len(logs) // 2)
-    basis = np.asarray(lattice.basis) * (new_cell / cell)
-    return Lattice(jnp.asarray(window), jnp.asarray(centre), jnp.asarray(basis)), replace(
-        plan, banded=True, sizes=(size,), taps=taps
-    )
+    lattice = Lattice(jnp.asarray(window), jnp.asarray(centre), jnp.asarray(np.asarray(lattice.basis) * ratio))
+    return lattice, replace(plan, banded=True, sizes=(size,), taps=taps), np.array([middle, ratio])
+
+
+def composed(first: np.ndarray, second: np.ndarray, size: int) -> np.ndarray:
+    """The cut (middle, ratio) that does what two do one after the other; `size` is that of the lattice between them."""
+    if np.array_equal(first, SAME):
+        return second
+    return np.array([first[0] + first[1] * (second[0] - size // 2), first[1] * second[1]])
+
+
+def cut_out(lattice: Lattice, cut: np.ndarray, size: int) -> Lattice:
+    """The density at the indices middle + ratio (j - size // 2), j < `size`, of a lattice of one state; pure, for gradients.
+
+    `cut` is (middle, ratio); where densities are below 1e-11 of the maximum, logarithms are interpolated.
+    """
+    middle, ratio = cut
+    count = lattice.log_values.size
+    at = middle + ratio * (np.arange(size) - size // 2)
+    inside = (at >= 0) & (at <= count - 1)
+    top = jax.lax.stop_gradient(jnp.max(lattice.log_values))
+    value = jnp.asarray(dirichlet(at[:, None] - np.arange(count), count)) @ jnp.exp(lattice.log_values - top)
+    left = np.clip(np.floor(at), 0, count - 2).astype(int)
+    share = np.clip(at - left, 0.0, 1.0)
+    logs = jnp.maximum(lattice.log_values, top - 800.0)
+    tail = (1 - share) * logs[left] + share * logs[left + 1]
+    tail = jnp.where(tail <= top - 799.0, -jnp.inf, tail)
+    good = value > 1e-11
+    window = jnp.where(inside, jnp.where(good, jnp.log(jnp.where(good, value, 1.0)) + top, tail), -jnp.inf)
+    return Lattice(window, lattice.centre + lattice.basis[:, 0] * (middle - count // 2), lattice.basis * ratio)
 
 
 def _resampled(logs: np.ndarray, middle: int, ratio: float, size: int) -> np.ndarray:

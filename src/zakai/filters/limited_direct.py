@@ -27,21 +27,23 @@ from zakai.errors import InputError
 from zakai.filters import _lattice_choice as choice
 from zakai.filters._formulas import formulas
 from zakai.filters._protocol import Info, Method, Schedule
-from zakai.filters._yau_flow import System, distinct, parts_of, system_of
+from zakai.filters._yau_flow import FlowPlan, System, plan_flows, planned_flows, system_of
 from zakai.filters.observations import Data, Factors, factors
 from zakai.kolmogorov import lattice as lat
-from zakai.kolmogorov.flow import Flow, flows
+from zakai.kolmogorov.flow import Flow
 from zakai.kolmogorov.lattice import Lattice
 from zakai.kolmogorov.power_series import TaylorData, power_series_kernels, taylor_data
 from zakai.kolmogorov.series_flow import flow_of_kernel
+from zakai.models.compile import jax_field
 from zakai.models.model import Model
+from zakai.models.prior import DensityPrior
 
 # How deep, in units of the logarithm, the tails are kept: where they are cut at 1e-13, and where only rounding ends them.
 _HELD_CUT, _HELD = 28.0, 60.0
 
 
 @partial(
-    jax.tree_util.register_dataclass, data_fields=["lattice", "observed", "cells", "middle"], meta_fields=["plan"]
+    jax.tree_util.register_dataclass, data_fields=["lattice", "observed", "cells", "middle", "cut"], meta_fields=["plan"]
 )
 @dataclass(frozen=True)
 class State:
@@ -49,12 +51,14 @@ class State:
 
     What the last step computed and the next one needs again is carried: h at the points, `observed`, an array for each
     coordinate, the narrowest feature in `cells` (n,), and the `middle` of the support (n,), an index from the centre.
+    `cut` (2,) says how the first lattice of this run of steps was cut out of the last of the run before.
     """
 
     lattice: Lattice
     observed: Any
     cells: Any
     middle: Any
+    cut: Any
     plan: choice.Plan
 
     @property
@@ -70,13 +74,19 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Everything that is known without data: `intervals`, a pytree with a leading axis, and what is static."""
+    """Everything that is known without data: `intervals`, a pytree with a leading axis, what is static, and `theta`.
+
+    `flow_plan` says how the flows are computed again for another theta, `spread` (n, n) is the covariance of the first kernel.
+    """
 
     model: Model
     system: System
     schedule: Schedule
     splitting: str
     intervals: Interval
+    theta: Any
+    flow_plan: FlowPlan
+    spread: np.ndarray | None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -119,25 +129,38 @@ def prepare(
         raise InputError(f'option order: {order!r} must be a whole number from 1, and needs kernel="power-series"')
     # The series knows no inputs, and the papers' order of the factors has none.
     system = system_of(formulas(model), not series and splitting == "strang", splitting)
-    which, first = distinct(system, schedule)
-    starts, stops, inside = schedule.starts[first], schedule.stops[first], schedule.inside[first].astype(float)
-    parts = parts_of(system, model, starts, stops, inside)
-    edges = starts[:, None] + (stops - starts)[:, None] * np.arange(parts + 1) / parts
-    theta = np.tile(model.theta(), (len(starts) * parts, 1))
-    argument = (theta, np.repeat(inside, parts, axis=0))
-    if series:
-        flow = _series_flows(model, edges[:, :-1].ravel(), edges[:, 1:].ravel(), argument[1].min(axis=1) > 0, order)
-    else:
-        flow = flows(system.coefficients, edges[:, :-1].ravel(), edges[:, 1:].ravel(), argument)
-    flow = jax.tree.map(lambda a: np.asarray(a).reshape(len(starts), parts, *a.shape[1:])[which], flow)
-    intervals = Interval(
-        schedule.starts, schedule.stops, flow, np.tile(model.theta(), (len(which), 1)), system
+    theta = model.theta()
+    plan = plan_flows(system, model, schedule)
+    flow = _series_flows(model, plan, order) if series else planned_flows(system, plan, theta)
+    # An interval of no length, before a sample at the start itself, asks for no cell.
+    moving = np.flatnonzero(np.linalg.det(flow.spread[:, 0]) > 0)
+    return Prepared(
+        model,
+        system,
+        schedule,
+        splitting,
+        _intervals(system, schedule, flow, theta),
+        theta,
+        plan,
+        flow.spread[moving[0], 0] if len(moving) else None,
     )
-    return Prepared(model, system, schedule, splitting, intervals)
 
 
-def _series_flows(model: Model, starts: np.ndarray, stops: np.ndarray, whole: np.ndarray, order: int | None) -> Flow:
-    """The flows by the papers' power series; `whole` (K,) says where the observation's energy is inside."""
+def _intervals(system: System, schedule: Schedule, flow: Flow, theta: Any) -> Interval:
+    xp = np if isinstance(theta, np.ndarray) else jnp
+    count = len(schedule.starts)
+    return Interval(schedule.starts, schedule.stops, flow, xp.broadcast_to(theta, (count, len(theta))), system)
+
+
+def with_parameters(prepared: Prepared, theta: Any) -> Prepared:
+    """The flows for other values of the parameters, in the steps that were chosen for the model's own."""
+    flow = planned_flows(prepared.system, prepared.flow_plan, theta)
+    return replace(prepared, theta=theta, intervals=_intervals(prepared.system, prepared.schedule, flow, theta))
+
+
+def _series_flows(model: Model, plan: FlowPlan, order: int | None) -> Flow:
+    """The flows by the papers' power series; the observation's energy is inside where all coordinates are."""
+    starts, stops, whole = plan.starts, plan.stops, plan.inside.min(axis=1) > 0
     yau = yau_system(model)
     assert yau is not None
     values = dict(zip(model.parameter_symbols, model.theta(), strict=True))
@@ -158,20 +181,30 @@ def _series_flows(model: Model, starts: np.ndarray, stops: np.ndarray, whole: np
 
         parts.append((rows, flow_of_kernel(power_series_kernels(expand, starts[rows], stops[rows], order))))
     back = np.argsort(np.concatenate([rows for rows, _ in parts]))
-    return jax.tree.map(lambda *arrays: np.concatenate(arrays)[back], *[flow for _, flow in parts])
-
-
-def observations(prepared: Prepared, data: Data) -> Factors:
-    """What `step` is given for each interval."""
-    system = prepared.system
-    return factors(
-        prepared.model,
-        data,
-        prepared.schedule,
-        rates=system.rates,
-        splitting=prepared.splitting,
-        remove=not system.bare,
+    return jax.tree.map(
+        lambda *arrays: np.concatenate(arrays)[back].reshape(-1, plan.parts, *arrays[0].shape[1:])[plan.which],
+        *[flow for _, flow in parts],
     )
+
+
+def observations(prepared: Prepared, data: Data) -> Any:
+    """What `step` is given for each interval."""
+
+    def at(theta):
+        return factors(
+            prepared.model,
+            data,
+            prepared.schedule,
+            rates=prepared.system.rates,
+            splitting=prepared.splitting,
+            remove=not prepared.system.bare,
+            theta=theta,
+        )
+
+    given, theta = at(prepared.theta), prepared.model.theta()
+    # The lattice of a posterior at the start is chosen for the model's own parameters.
+    at_start = not isinstance(prepared.theta, np.ndarray) and data.stops[0] == prepared.model.start
+    return (given, at(theta)) if at_start else given
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -191,37 +224,63 @@ def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State
         "exponent": zero,
         "surprise": zero,
     }
-    return state, Info(log_mass, summary.mean, summary.cov, health, np.append(choice.CELLS / state.cells, 1.0))
+    return state, Info(log_mass, summary.mean, summary.cov, health, jnp.append(choice.CELLS / state.cells, 1.0))
 
 
 def _start(prepared, prior, observation):
+    """The first state, with an observation at the start if there is one, and the logarithm of the mass."""
     system, model = prepared.system, prepared.model
+    traced = not isinstance(prepared.theta, np.ndarray)
+    observation, own = observation if traced and observation is not None else (observation, observation)
 
-    def log_factor(x):
-        factor = jax.tree.map(lambda a: a[0], observation)
-        return np.asarray(_log_factor(system.observe(x, model.start, model.theta()), factor))
+    def log_factor(x, factor, theta):
+        factor = jax.tree.map(lambda a: a[0], factor)
+        return _log_factor(system.observe(x, model.start, theta), factor)
 
-    # An interval of no length, before a sample at the start itself, asks for no cell.
-    spreads = prepared.intervals.flow.spread
-    moving = np.flatnonzero(np.linalg.det(spreads[:, 0]) > 0)
-    spread = spreads[moving[0], 0] if len(moving) else None
-    lattice, log_mass = choice.first_lattice(model, prior, log_factor if observation is not None else None, spread)
-    if observation is not None:
+    def own_factor(x):
+        return np.asarray(log_factor(x, own, model.theta()))
+
+    with jax.ensure_compile_time_eval():
         # A density prior need not be normalised; the evidence is that of the reading alone.
-        log_mass = log_mass - choice.first_lattice(model, prior, None)[1]
-    return _looked_at(prepared, lattice, choice.first_plan(model), model.start), log_mass
+        first, before = choice.first_lattice(model, prior, None, prepared.spread if observation is None else None)
+        lattice, after = first, before
+        if observation is not None:
+            lattice, after = choice.first_lattice(model, prior, own_factor, prepared.spread)
+    if not traced:
+        return _looked_at(prepared, lattice, choice.first_plan(model), model.start), after - before
+    prior_on = partial(_prior_again, prepared, prior)
+    before = lat.summary(first._replace(log_values=prior_on(first))).log_mass
+    logs = prior_on(lattice)
+    if observation is not None:
+        logs = logs + log_factor(lattice.points(), observation, prepared.theta)
+    after = lat.summary(lattice._replace(log_values=logs)).log_mass
+    plan, own = choice.first_plan(model), lattice.log_values
+    lattice = lattice._replace(log_values=logs - after)
+    return _looked_at(prepared, lattice, plan, model.start, own=own), after - before
 
 
-def _looked_at(prepared: Prepared, lattice: Lattice, plan: choice.Plan, time: float) -> State:
-    """A state from a lattice that was chosen outside of a step."""
+def _prior_again(prepared, prior, lattice):
+    """The prior's logarithm on a lattice that was chosen for the model's own parameters, for traced ones."""
+    model = prepared.model
+    with jax.ensure_compile_time_eval():
+        points = lattice.points()
+        logs = choice.log_prior(model, prior)(np.asarray(points))
+    if not isinstance(prior, DensityPrior):
+        return jnp.asarray(logs)
+    there = np.isfinite(logs)
+    # Where there is no density a formula may not exist; a point where it does stands in.
+    safe = jnp.where(there[..., None], points, points[np.unravel_index(np.argmax(logs), logs.shape)])
+    return jnp.where(there, jax_field([prior.log_density], model)(safe, model.start, prepared.theta)[0], -jnp.inf)
+
+
+def _looked_at(
+    prepared: Prepared, lattice: Lattice, plan: choice.Plan, time: float, cut: Any = choice.SAME, own: Any = None
+) -> State:
+    """A state from a lattice that was chosen outside of a step; `own` are its values for the model's own parameters."""
     system = prepared.system
-    return State(
-        lattice,
-        _observed_at(system, lattice, time, prepared.model.theta()) if system.halves else None,
-        choice.features(np.asarray(lattice.log_values)),
-        choice.middle(np.asarray(lattice.log_values)),
-        plan,
-    )
+    logs = np.asarray(lattice.log_values if own is None else own)
+    observed = _observed_at(system, lattice, time, prepared.theta) if system.halves else None
+    return State(lattice, observed, choice.features(logs), choice.middle(logs), cut, plan)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -246,7 +305,7 @@ def _log_factor(h: Sequence[jax.Array] | None, factor: Factors) -> Any:
 
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
     """The state to begin the intervals `rows` with: the window, the cell and the way to convolve."""
-    lattice, plan = choice.adapted(
+    lattice, plan, cut = choice.adapted(
         prepared.model,
         state.lattice,
         state.plan,
@@ -256,9 +315,21 @@ def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> S
     )
     if plan is None:
         return None
+    before = choice.SAME if info is None else np.asarray(state.cut)
     if lattice is state.lattice:
-        return replace(state, plan=plan)
-    return _looked_at(prepared, lattice, plan, prepared.schedule.starts[rows.start])
+        return replace(state, plan=plan, cut=before)
+    cut = choice.composed(before, cut, state.lattice.sizes[0])
+    return _looked_at(prepared, lattice, plan, prepared.schedule.starts[rows.start], cut)
+
+
+def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State:
+    """The traced `state` on a lattice cut out of its own as that of `begin` was, with the same plan."""
+    cut = np.asarray(begin.cut)
+    if np.array_equal(cut, choice.SAME):
+        return replace(state, plan=begin.plan, cut=cut)
+    own = begin.lattice.log_values
+    lattice = choice.cut_out(state.lattice, cut, own.size)
+    return _looked_at(prepared, lattice, begin.plan, prepared.schedule.starts[rows.start], cut, own)
 
 
 def step(interval: Interval, state: State, observation: Factors) -> tuple[State, Info]:
@@ -302,7 +373,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
     }
     need = jnp.append(jnp.maximum(worst.need, plan.needed / resolution), worst.room)
     kept = observed if system.halves else None
-    return State(lattice, kept, cells, summary.middle, plan), Info(log_mass, summary.mean, summary.cov, health, need)
+    return State(lattice, kept, cells, summary.middle, state.cut, plan), Info(log_mass, summary.mean, summary.cov, health, need)
 
 
 class _Worst(NamedTuple):
@@ -320,6 +391,7 @@ def _part(system, plan, theta, observation, carry, slices, first: bool, last: bo
     """One part of an interval; the halves of the observation's factor stand at the `first` and the `last`."""
     lattice, cells, observed, log_mass, worst = carry
     flow, start, stop = slices
+    still = jax.lax.stop_gradient  # of health nothing is differentiated
     # Readings that act as rates leave nothing to multiply with at the end.
     needs_h = last and (system.halves or not system.rates or observation.energy is not None)
 
@@ -336,8 +408,9 @@ def _part(system, plan, theta, observation, carry, slices, first: bool, last: bo
     exponent = worst.exponent
     if system.gauged:
         before = before - _potential(system, lattice.points(), start, theta)
-        exponent = jnp.maximum(exponent, lat.exponent_range(lattice.log_values, lattice.log_values + before))
-    joint, need = _joint_cells(lattice, cells, flow, plan.sharpen, worst.joint, worst.need)
+        logs = still(lattice.log_values)
+        exponent = jnp.maximum(exponent, lat.exponent_range(logs, logs + still(before)))
+    joint, need = _joint_cells(*still((lattice, cells, flow)), plan.sharpen, worst.joint, worst.need)
     first_look, room, held = worst.first_look, worst.room, _HELD_CUT
     if plan.banded:
         lattice, spread = lat.move_banded(lattice, before, flow, observation.inputs, plan.taps)
@@ -357,14 +430,14 @@ def _part(system, plan, theta, observation, carry, slices, first: bool, last: bo
             plan.sharpen,
             plan.room,
         )
-        first_look, room = jnp.maximum(first_look, coarseness), jnp.maximum(room, taken)
+        first_look, room = jnp.maximum(first_look, still(coarseness)), jnp.maximum(room, still(taken))
         observed = observe(lattice.points()) if system.halves and last else None
         held = _HELD_CUT if plan.sharpen else _HELD
-    surprise = jnp.maximum(worst.surprise, lat.reach(lattice, spread) / held)
+    surprise = jnp.maximum(worst.surprise, lat.reach(*still((lattice, spread))) / held)
     summary = lat.summary(lattice, plan.angles)
     lattice = lattice._replace(log_values=lattice.log_values - summary.log_mass)
     worst = _Worst(exponent, joint, first_look, need, surprise, room)
-    return (lattice, lat.features(lattice), observed, log_mass + summary.log_mass, worst), summary
+    return (lattice, lat.features(still(lattice)), observed, log_mass + summary.log_mass, worst), summary
 
 
 def _potential(system, x, t, theta):
@@ -413,6 +486,8 @@ METHOD = Method(
     step=step,
     density=density,
     adapt=adapt,
+    with_parameters=with_parameters,
+    resume=resume,
     bounds={
         "edge_mass": (1e-9, "probability in the outermost cells of the window"),
         "quadrature_error": (1e-9, "error of a lattice sum that replaces an integral"),

@@ -113,7 +113,7 @@ def summary(lattice: Lattice, angles: tuple[int, ...] = ()) -> Summary:
     """
     logs = lattice.log_values
     n = logs.ndim
-    top = jnp.max(logs)
+    top = lax.stop_gradient(jnp.max(logs))
     values = jnp.exp(logs - top)
     axes = _axes(lattice.sizes)
     first = _moments(values, [jnp.stack([jnp.ones(len(i)), i], axis=1) for i in axes])
@@ -232,7 +232,7 @@ def move_banded(
     spread, up to a constant: `reach` needs it.
     """
     gauged = lattice.log_values + before
-    top = jnp.max(gauged)
+    top = lax.stop_gradient(jnp.max(gauged))
     size = gauged.shape[0]
     cell = lattice.basis[0, 0]
     variance = flow.spread[0, 0]
@@ -249,7 +249,7 @@ def move_banded(
         total = jnp.maximum(jnp.convolve(values, both, mode="full")[taps : taps + size], 0.0)
     moved = motion(flow, lattice.centre, inputs)
     offset = cell * _axes((size,))[0]
-    spread = jnp.log(total)
+    spread = log(total)
     logs = (
         top
         + spread
@@ -293,7 +293,7 @@ def move_dense(
     """
     n = len(sizes)
     gauged = lattice.log_values + before
-    top = jnp.max(gauged)
+    top = lax.stop_gradient(jnp.max(gauged))
     values = jnp.exp(gauged - top)
     covariance = flow.spread
     if sharpen:
