@@ -20,9 +20,29 @@ class Entry(NamedTuple):
 
 
 METHODS = {
+    "kalman-bucy": Entry(
+        "zakai.filters.kalman_bucy",
+        "exact for linear systems in any number of states, whatever the prior; singular noise is allowed",
+    ),
+    "benes": Entry(
+        "zakai.filters.benes",
+        "exact for affine h and a drift L x + l + G grad log cosh(q.x + delta), in any number of states",
+    ),
+    "hu-yau": Entry(
+        "zakai.filters.hu_yau",
+        "exact for affine h and a drift L x + l + G grad F whose eta is quadratic, whatever the prior",
+    ),
     "limited-direct": Entry(
         "zakai.filters.limited_direct",
         "exact between observations for time-varying Yau systems whose q is quadratic, in one or two dimensions",
+    ),
+    "general-direct": Entry(
+        "zakai.filters.general_direct",
+        "a Gaussian sum for time-varying Yau systems of any dimension; exact where h is affine and v0 a Gaussian sum",
+    ),
+    "gaussian-sum": Entry(
+        "zakai.filters.gaussian_sum",
+        "the same for systems that do not depend on time (the survey's Algorithm 2); only when it is asked for",
     ),
     "extended-kalman-bucy": Entry(
         "zakai.filters.extended_kalman_bucy",
@@ -30,7 +50,7 @@ METHODS = {
     ),
 }
 # What "auto" tries, most exact and cheapest first.
-AUTO = ("limited-direct",)
+AUTO = ("kalman-bucy", "benes", "hu-yau", "limited-direct")
 
 
 def load(name: str) -> Any:

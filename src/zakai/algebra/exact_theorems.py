@@ -61,12 +61,16 @@ def hu_yau(model: Model) -> tuple[Condition, ...]:
     if any(condition.holds is not True for condition in conditions):
         return conditions
     form = gauge(model)
+    words = "more than two directions"
+    if form is not None:
+        kind = "no finite sum of exponentials" if form.slopes is None else "a sum of exponentials"
+        words = f"e^F is {kind}, directions {short(str(form.directions.tolist()))}, n = {model.n}"
     return (
         *conditions,
         Condition(
-            "F depends on one or two directions, or is the logarithm of a sum of exponentials in two",
-            form is not None,
-            "more than two directions" if form is None else f"directions {short(str(form.directions.tolist()))}",
+            "e^F is a sum of exponentials in one or two directions, or n is at most two",
+            form is not None and (form.slopes is not None or model.n <= 2),
+            words,
             "the nodes of this method",
         ),
         *_posterior_on_the_line(model),

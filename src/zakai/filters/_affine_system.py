@@ -70,14 +70,15 @@ class AffineSystem:
         slope, intercept = affine_observation(model)  # type: ignore[misc]
         constant = sp.Matrix([bare.constant])
         own = [form.matrix, form.offset, model.covariance, bare.matrix, bare.linear, constant]
-        self._matrices = Matrices([*own, slope, intercept, model.observation_noise], model)
+        self.matrices = Matrices([*own, slope, intercept, model.observation_noise], model)
         self._observation = Matrices([slope, intercept], model)
-        self.varying = self._matrices.varying
+        self.varying = self.matrices.varying
+        self.outputs = model.m
 
     def coefficients(self, t: Any, argument: tuple[Any, Any]) -> Coefficients:
         """The coefficients of the flow at time t; `argument` is (theta, inside), `inside` (m,) what acts as a rate."""
         theta, inside = argument
-        L, l, G, Q, p, r, C, c, S = self._matrices(t, theta)
+        L, l, G, Q, p, r, C, c, S = self.matrices(t, theta)
         # The precision of those coordinates alone, with zeros elsewhere.
         both = inside[:, None] * inside
         precision = both * jnp.linalg.inv(both * S + jnp.diag(1.0 - inside))
@@ -86,6 +87,10 @@ class AffineSystem:
         constant = jnp.concatenate([r[:, 0] - 0.5 * (c.T @ precision @ c)[:, 0], (precision @ c)[:, 0]])
         offset = jnp.hstack([l, jnp.zeros((len(l), len(inside)))])
         return Coefficients(L, offset, G, Q - 0.5 * gain @ C, linear, constant)
+
+    def quadratic(self, t: Any, theta: Any) -> Any:
+        """S, where the equation is that of e^S v; None, for it is that of v."""
+        return None
 
     def observation(self, t: Any, theta: Any) -> tuple[Any, Any]:
         """C (m, n) and c (m,) at time t."""

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
-from zakai.densities import Density, GaussianMixture
+from zakai.densities import Density, GaussianMixture, GridDensity
+from zakai.errors import InputError
 from zakai.filters._affine_system import AffineSystem, Plan, affine_system_of
 from zakai.filters._family_prior import prior_families
 from zakai.filters._formulas import formulas
@@ -28,7 +29,7 @@ from zakai.models.model import Model
 
 
 class State(NamedTuple):
-    """The families of v (leading axis J), normalised so that u = e^phi v has mass one, the `time`, and, for each node, the
+    """The families of v, or of e^S v (leading axis J), normalised so that u = e^phi v has mass one, the `time`, and, for each node, the
     logarithm of the error of the prior's representation and whether it is at the edge, (J, N)."""
 
     families: Family
@@ -49,28 +50,48 @@ class Prepared:
     theta: Any
     intervals: Interval
 
+class Quadratic(NamedTuple):
+    """S = -x'K x / 2 - k.x where the families are those of e^S v: `matrix` K (n, n), `slope` k (n,)."""
+
+    matrix: Any
+    slope: Any
+
+    def times(self, families: Family, sign: float) -> Family:
+        """The families times e^{sign S}."""
+        n = len(self.slope)
+        one = partial(
+            read,
+            slope=jnp.eye(n),
+            intercept=jnp.zeros(n),
+            after=-sign * self.slope,
+            energy=sign * self.matrix,
+            constant=jnp.zeros(()),
+        )
+        return jax.vmap(one)(families)
+
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["flow", "slope", "intercept", "tilts", "stop", "theta"],
+    data_fields=["flow", "slope", "intercept", "tilts", "quadratic", "stop", "theta"],
     meta_fields=["gauge"],
 )
 @dataclass(frozen=True)
 class Interval:
-    """One interval: its flow in parts (parts, ...), C and c and the gauge at its end, and the parameters."""
+    """One interval: its flow in parts (parts, ...), C and c, the gauge, and S if there is one, at its end, the parameters."""
 
     flow: Flow
     slope: Any
     intercept: Any
     tilts: Tilts
+    quadratic: Quadratic | None
     stop: Any
     theta: Any
     gauge: GaugeFunctions
 
 
-def prepare(model: Model, schedule: Schedule) -> Prepared:
-    """The flow of every interval, offline."""
-    system, gauge = affine_system_of(formulas(model)), gauge_of(formulas(model))
+def prepare(model: Model, schedule: Schedule, system: AffineSystem | None = None) -> Prepared:
+    """The flow of every interval, offline; `system` is the equation of v by default."""
+    system, gauge = system or affine_system_of(formulas(model)), gauge_of(formulas(model))
     plan = Plan(system, model, schedule)
     theta = model.theta()
     return Prepared(model, schedule, plan, system, gauge, theta, _intervals(plan, system, gauge, schedule, theta))
@@ -86,8 +107,9 @@ def _intervals(plan: Plan, system: AffineSystem, gauge: GaugeFunctions, schedule
     stops = jnp.asarray(schedule.stops)
     slope, intercept = jax.vmap(system.observation, (0, None))(stops, theta)
     tilts = jax.vmap(gauge.at, (0, None))(stops, theta)
+    quadratic = jax.vmap(system.quadratic, (0, None))(stops, theta)
     tiled = jnp.tile(jnp.asarray(theta), (len(schedule.stops), 1))
-    intervals = Interval(plan.flows(theta), slope, intercept, tilts, stops, tiled, gauge)
+    intervals = Interval(plan.flows(theta), slope, intercept, tilts, quadratic, stops, tiled, gauge)
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(intervals))
     return intervals if traced else jax.tree.map(np.asarray, intervals)
 
@@ -108,13 +130,27 @@ def init(prepared: Prepared, prior: Any) -> State:
 def _families(prepared: Prepared, prior: Any) -> State:
     model = prepared.model
     found = prior_families(prepared.gauge, model, prior, prepared.theta)
-    return State(found.families, jnp.asarray(found.log_error), jnp.asarray(found.edge), jnp.asarray(model.start, float))
+    quadratic = prepared.system.quadratic(model.start, prepared.theta)
+    families = found.families if quadratic is None else quadratic.times(found.families, 1.0)
+    if quadratic is not None:
+        check_normalisable(model, families.cov)
+    return State(families, jnp.asarray(found.log_error), jnp.asarray(found.edge), jnp.asarray(model.start, float))
 
 
 def _normalised(prepared: Prepared, state: State) -> tuple[State, Info]:
     start = prepared.model.start
     tilts = prepared.gauge.at(start, prepared.theta)
-    return _looked_at(prepared.gauge, tilts, start, prepared.theta, state)
+    quadratic = prepared.system.quadratic(start, prepared.theta)
+    return _looked_at(prepared.gauge, tilts, quadratic, start, prepared.theta, state)
+
+
+def check_normalisable(model: Model, covs: Any) -> None:
+    """Refuse an e^S that outgrows the prior."""
+    if not isinstance(covs, jax.core.Tracer) and not np.all(np.linalg.eigvalsh(np.asarray(covs)) >= 0):
+        raise InputError(
+            f'{model.source}: option choice: with "theorem-6" e^S outgrows the prior, so that e^S v is no density; '
+            'take choice="theorem-4" or a narrower prior'
+        )
 
 
 def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State, Info]:
@@ -138,7 +174,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
         families, _ = jax.lax.scan(part, families, interval.flow)
     families = _read(families, interval.slope, interval.intercept, observation)
     moved = state._replace(families=families, time=interval.stop)
-    return _looked_at(interval.gauge, interval.tilts, interval.stop, interval.theta, moved)
+    return _looked_at(interval.gauge, interval.tilts, interval.quadratic, interval.stop, interval.theta, moved)
 
 
 def _read(families: Family, slope: Any, intercept: Any, reading: Factors) -> Family:
@@ -149,17 +185,21 @@ def _read(families: Family, slope: Any, intercept: Any, reading: Factors) -> Fam
 
 
 @partial(jax.jit, static_argnums=0)
-def _looked_at(gauge: GaugeFunctions, tilts: Tilts, time: Any, theta: Any, state: State) -> tuple[State, Info]:
+def _looked_at(
+    gauge: GaugeFunctions, tilts: Tilts, quadratic: Quadratic | None, time: Any, theta: Any, state: State
+) -> tuple[State, Info]:
     """The normalised state, and what it tells."""
-    found = posterior(gauge, tilts, time, theta, state.families)
+    bare = state.families if quadratic is None else quadratic.times(state.families, -1.0)
+    found = posterior(gauge, tilts, time, theta, bare)
     families = state.families._replace(log_mass=state.families.log_mass - found.log_mass)
-    health = _health(state, found, families)
+    health = health_of(state._replace(families=bare), found)
     return state._replace(families=families), Info(found.log_mass, found.mean, found.cov, health)
 
 
-def _health(state: State, found: Posterior, families: Family) -> dict[str, Any]:
-    """How far the posterior is to be trusted; none of it is differentiated."""
-    found, families = jax.lax.stop_gradient((found, families))
+def health_of(state: State, found: Posterior) -> dict[str, Any]:
+    """How far the posterior of a state that is not yet normalised is to be trusted; none of it is differentiated."""
+    state, found = jax.lax.stop_gradient((state, found))
+    families = state.families._replace(log_mass=state.families.log_mass - found.log_mass)
     variances = jnp.diagonal(found.cov)
     zero = jnp.zeros(())
     health = {
@@ -183,19 +223,44 @@ def _health(state: State, found: Posterior, families: Family) -> dict[str, Any]:
 
 
 def density(prepared: Prepared, state: State) -> Density:
-    """The posterior: a mixture of Gaussians where e^phi is a sum of exponentials."""
-    model, gauge = prepared.model, prepared.gauge
+    """The posterior: a mixture of Gaussians where e^phi is a sum of exponentials, else its values on a lattice."""
     families = jax.tree.map(jnp.asarray, state.families)
-    tilts = gauge.at(state.time, prepared.theta)
+    quadratic = prepared.system.quadratic(state.time, prepared.theta)
+    families = families if quadratic is None else quadratic.times(families, -1.0)
+    return density_of(prepared.model, prepared.gauge, prepared.theta, state.time, families)
+
+
+def density_of(model: Model, gauge: GaugeFunctions, theta: Any, time: Any, families: Family) -> Density:
+    """e^phi times the families, normalised."""
+    tilts = gauge.at(time, theta)
+    found = posterior(gauge, tilts, time, theta, families)
     if not gauge.exact:
-        raise NotImplementedError
-    found = posterior(gauge, tilts, state.time, prepared.theta, families)
+        return _on_lattice(model, gauge, theta, time, families, found)
     weights = np.asarray(found.signs * jnp.exp(found.logs - found.log_mass))
     moved = jnp.einsum("jnk,jmk->jmn", families.response, families.nodes)
     means = np.asarray(found.centres[:, None] + moved[:, :, None])
     covs = np.broadcast_to(np.asarray(families.cov)[:, None, None], (*weights.shape, model.n, model.n))
     used = weights != 0.0
     return GaussianMixture(weights[used], means[used], covs[used], model.state, (False,) * model.n)
+
+
+def _on_lattice(model: Model, gauge: GaugeFunctions, theta: Any, time: Any, families: Family, found: Posterior) -> GridDensity:
+    """phi + log v on a lattice that holds the mass."""
+    half, reach = {1: 200, 2: 64}[model.n], {1: 10.0, 2: 9.0}[model.n]
+    values, vectors = np.linalg.eigh(np.asarray(found.cov))
+    basis = vectors * np.sqrt(values) * reach / half
+    index = np.stack(np.meshgrid(*[np.arange(-half, half + 1.0)] * model.n, indexing="ij"), axis=-1)
+    x = np.asarray(found.mean) + index @ basis.T
+    logs = np.asarray(jax.vmap(log_terms)(families))
+    weights = np.asarray(families.signs) * np.exp(logs - logs.max())
+    means = np.asarray(families.mean[:, None] + jnp.einsum("jnk,jmk->jmn", families.response, families.nodes))
+    covs = np.broadcast_to(np.asarray(families.cov)[:, None], (*weights.shape, model.n, model.n))
+    used, mass = weights != 0.0, weights.sum()
+    bare = GaussianMixture(weights[used] / mass, means[used], covs[used], model.state, (False,) * model.n)
+    potential = np.asarray(gauge.compiled(jnp.asarray(x), time, theta)[0])
+    log_values = bare.log_density(x) + potential
+    total = log_values.max() + np.log(np.exp(log_values - log_values.max()).sum() * abs(np.linalg.det(basis)))
+    return GridDensity(log_values - total, np.asarray(found.mean), basis, model.state, (False,) * model.n)
 
 
 BOUNDS: Mapping[str, tuple[float, str]] = {

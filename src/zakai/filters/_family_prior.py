@@ -102,8 +102,8 @@ def _conditional(directions: Any, mean: Any, cov: Any, nodes: Nodes, centre: np.
     """The family of sum_i w_i N(z; z_i, W) N(x | z), x given z being that of N(mean, cov)."""
     across = cov @ directions.T
     inner = directions @ across
-    known = np.asarray(jax.lax.stop_gradient(jnp.diagonal(inner))) if not isinstance(inner, jax.core.Tracer) else None
-    gain = across @ (jnp.linalg.inv(inner) if known is None or np.linalg.matrix_rank(inner) == len(known) else jnp.linalg.pinv(inner))
+    singular = not isinstance(inner, jax.core.Tracer) and np.linalg.matrix_rank(inner) < len(inner)
+    gain = across @ (np.linalg.pinv(inner) if singular else jnp.linalg.inv(inner))
     k = len(centre)
     narrowed = cov - gain @ (inner - nodes.cov) @ gain.T
     return Family(

@@ -1,6 +1,9 @@
 """The gauge of a model as numbers, and what a family of Gaussians becomes under it: u = e^phi v, with its moments.
 
-If e^phi = sum_j c_j e^{q_j.x} every Gaussian becomes a sum of tilted ones, e^{q.x} N(x; m, P) = e^{q.m + q'P q/2} N(x; m + P q, P).
+If e^phi = sum_j c_j e^{q_j.x} every Gaussian becomes a sum of tilted ones,
+
+    e^{q.x} N(x; m, P) = e^{q.m + q'P q/2} N(x; m + P q, P).
+
 Else phi depends on one or two directions z = D x, and the integrals over z are sums over equidistant points.
 """
 
