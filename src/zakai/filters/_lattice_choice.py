@@ -36,6 +36,7 @@ MOST = {1: 8192, 2: 1024, 3: 256}
 FINE = {1: 2.0, 2: 2.0, 3: 1.2}  # by how much the first lattice is finer than it need be
 
 
+ARRAYS = 24  # arrays of the size of the lattice that a step and what it keeps hold at once
 SAME = np.zeros(2)  # the cut of a lattice that was taken as it is
 
 
@@ -74,24 +75,34 @@ def rounded_up(size: float, least: int = 64) -> int:
 
 
 def features(logs: np.ndarray) -> np.ndarray:
-    """The standard deviation, in cells, of the narrowest feature along each axis."""
+    """The standard deviation, in cells, of the narrowest feature along each axis (records, n), of logs (records, *sizes)."""
     out = []
-    for axis in range(logs.ndim):
-        moved = np.moveaxis(logs, axis, 0)
-        if len(moved) < 3:
-            out.append(np.inf)
+    matters = logs > _top(logs) - 14.0
+    for axis in range(1, logs.ndim):
+        if logs.shape[axis] < 3:
+            out.append(np.full(len(logs), np.inf))
             continue
+        moved, used = np.moveaxis(logs, axis, 1), np.moveaxis(matters, axis, 1)[:, 1:-1]
         with np.errstate(invalid="ignore"):
-            curvature = 2 * moved[1:-1] - moved[:-2] - moved[2:]
-        used = (moved[1:-1] > logs.max() - 14.0) & np.isfinite(curvature)
-        out.append(1 / np.sqrt(max(curvature[used].max(initial=0.0), 1e-12)))
-    return np.array(out)
+            curvature = 2 * moved[:, 1:-1] - moved[:, :-2] - moved[:, 2:]
+        curvature = np.where(used & np.isfinite(curvature), curvature, 0.0).reshape(len(logs), -1)
+        out.append(1 / np.sqrt(np.maximum(curvature.max(axis=1), 1e-12)))
+    return np.stack(out, axis=1)
 
 
 def middle(logs: np.ndarray) -> np.ndarray:
-    """Where the middle of the support is, as an index (n,) from the centre."""
-    used = np.argwhere(logs > logs.max() - SUPPORT)
-    return used.mean(axis=0) - np.array(logs.shape) // 2
+    """Where the middle of the support is, as an index (records, n) from the centre."""
+    used = logs > _top(logs) - SUPPORT
+    out = []
+    for axis in range(1, logs.ndim):
+        line = used.sum(axis=tuple(a for a in range(1, logs.ndim) if a != axis))
+        index = np.arange(logs.shape[axis]) - logs.shape[axis] // 2
+        out.append(line @ index / line.sum(axis=1))
+    return np.stack(out, axis=1)
+
+
+def _top(logs: np.ndarray) -> np.ndarray:
+    return logs.max(axis=tuple(range(1, logs.ndim)), keepdims=True)
 
 
 def first_plan(model: Model) -> Plan:
@@ -146,7 +157,7 @@ def first_lattice(
         if np.any((last - first < 0.7 * (high - low)) & ~point):
             low, high = first, last
             continue
-        fine = features(logs) >= FINE[model.n] * CELLS
+        fine = features(logs[None])[0] >= FINE[model.n] * CELLS
         if not np.all(fine | point | (size >= MOST[model.n])):
             size = np.where(fine | point, size, size * 2)
             continue
@@ -241,46 +252,67 @@ def _search(model, log_prior, axes):
 
 
 def adapted(
-    model: Model,
-    lattice: Lattice,
-    plan: Plan,
-    spreads: np.ndarray,
-    maps: np.ndarray,
-    info: Any | None,
-) -> tuple[Lattice, Plan | None, np.ndarray]:
-    """A lattice, a plan and how the lattice was cut out (see `cut_out`) for a run of intervals.
+    model: Model, lattice: Lattice, plan: Plan, spreads: np.ndarray, maps: np.ndarray, info: Any, budget: int
+) -> tuple[Lattice | None, Plan | None, np.ndarray]:
+    """A plan for a run of intervals of several records, their lattices if they change, and how these were cut out (records, 2).
 
-    The kernels have covariances `spreads` and move by `maps` (K, parts, n, n).  With the `info` of a try: a better plan, or None
-    where the try was good or nothing better can be had.
+    The arrays of `lattice` and `info` have a leading axis of records.  The kernels have covariances `spreads` and move by `maps`
+    (K, parts, n, n).  With the `info` of a try: a better plan, or None where the try was good or nothing better can be had.
+
+    Raises InputError if a lattice needs more than `budget` bytes.
     """
+    records = len(lattice.centre)
+    same = np.tile(SAME, (records, 1))
     if info is not None:
-        if healthy(info, plan):
-            return lattice, None, SAME
-        better = _more(plan, info)
+        better = None if healthy(info, plan) else _more(plan, info)
         if better is None:
-            return lattice, None, SAME
+            return None, None, same
         plan = better
     one_line = model.n == 1 and not plan.angles and maps.shape[1] == 1
-    if one_line and lattice.log_values.size > 1:
+    if one_line and lattice.log_values[0].size > 1:
         banded = _banded(lattice, plan, np.sqrt(spreads[:, 0, 0, 0]), np.abs(maps[:, 0, 0, 0]))
         if banded is not None:
             return banded
     sizes = plan.sizes if not plan.banded else (BASE[1],)
     run = plan.run
     if info is None:
-        own = lattice.log_values.shape == sizes
+        own = lattice.log_values.shape[1:] == sizes
         # Only a lattice of the plan's own sizes tells whether they were more than enough.
         if own:
-            basis = np.asarray(lattice.basis)
-            kernel = np.sqrt(np.max(np.einsum("id,kpij,jd->kpd", basis, np.linalg.inv(spreads), basis), axis=(0, 1)))
-            roomy = (features(np.asarray(lattice.log_values)) > 3 * plan.needed) & ((2.4 * kernel < COARSEST) | plan.sharpen)
+            kernel = np.linalg.inv(spreads)
+            kernel = np.einsum("rid,kpij,rjd->rkpd", lattice.basis, kernel, lattice.basis, optimize=True).max(axis=(0, 1, 2))
+            roomy = features(lattice.log_values).min(axis=0) > 3 * plan.needed
+            roomy &= (2.4 * np.sqrt(kernel) < COARSEST) | plan.sharpen
             sizes = tuple(max(s // 2, BASE[model.n]) if room else s for s, room in zip(sizes, roomy, strict=True))
         if model.n > 1:
             run = 64 if own and np.prod(sizes) < 4e4 else 4
     angle = np.sqrt(max((spreads[:, :, i, i].max() for i in plan.angles), default=0.0))
     reach = REACH * angle / (2 * np.pi)
     images = max(0, int(np.ceil(reach - 0.5))) if plan.angles else 0
-    return lattice, replace(plan, banded=False, sizes=sizes, images=images, run=run), SAME
+    check_memory(model, sizes, plan.room, records, budget)
+    return None, replace(plan, banded=False, sizes=sizes, images=images, run=run), same
+
+
+def check_memory(model: Model, sizes: tuple[int, ...], room: float, records: int, budget: int) -> None:
+    """Raise InputError if a step on lattices of these sizes, one a record, needs more than `budget` bytes."""
+    # The density, its points, h, the rows that are spread, and what a run of steps keeps.
+    needed = 8.0 * records * np.prod(sizes, dtype=float) * (ARRAYS + 2 * model.m + 6 * room)
+    if len(sizes) > 1 and needed > budget:
+        lattice = " x ".join(map(str, sizes))
+        raise InputError(
+            f"option memory: {model.source} needs a lattice of {lattice} points, {needed / 2**20:.0f} MiB, and has "
+            f"{budget / 2**20:.0f}; set memory to more MiB, take shorter intervals, or name another method (general-direct)"
+        )
+
+
+def free_memory() -> int:
+    """Half of the bytes that the machine has free."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as lines:
+            free = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+        return free * 512
+    except (OSError, StopIteration, ValueError):
+        return 2**31
 
 
 def healthy(info: Any, plan: Plan) -> bool:
@@ -297,6 +329,7 @@ def healthy(info: Any, plan: Plan) -> bool:
 
 def _more(plan: Plan, info: Any) -> Plan | None:
     """A larger window or a finer cell, whichever was missing; None at the limit."""
+    info = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), info)
     if not plan.banded:
         most = MOST[len(plan.sizes)]
         *need, taken = np.nanmax(np.where(np.isfinite(info.need), info.need, 2.0), axis=0)
@@ -327,36 +360,40 @@ def _more(plan: Plan, info: Any) -> Plan | None:
     return replace(plan, cells=plan.cells * (2 if coarse else 1), window=plan.window * (1.6 if narrow else 1))
 
 
-def _banded(lattice: Lattice, plan: Plan, deviation: np.ndarray, maps: np.ndarray) -> tuple[Lattice, Plan, np.ndarray] | None:
-    """The window and the cell of a banded run, or None where summing over all pairs is cheaper."""
-    logs = np.asarray(lattice.log_values)
-    cell = abs(float(lattice.basis[0, 0]))
+def _banded(
+    lattice: Lattice, plan: Plan, deviation: np.ndarray, maps: np.ndarray
+) -> tuple[Lattice, Plan, np.ndarray] | None:
+    """The windows and the cells of a banded run, or None where summing over all pairs is cheaper."""
+    logs = lattice.log_values
+    count = logs.shape[1]
+    cell = np.abs(lattice.basis[:, 0, 0])
     growth = np.concatenate([[1.0], np.cumprod(maps)])[: len(deviation)] / deviation
-    widest = min(COARSEST / growth.max(), features(logs)[0] * cell / plan.cells)
-    new_cell = cell if 0.8 * widest <= cell <= widest else 0.97 * widest
+    widest = np.minimum(COARSEST / growth.max(), features(logs)[:, 0] * cell / plan.cells)
+    new_cell = np.where((0.8 * widest <= cell) & (cell <= widest), cell, 0.97 * widest)
     taps = 16
-    while taps * new_cell * growth.min() < REACH:
+    while taps * new_cell.min() * growth.min() < REACH:
         taps *= 2
-    used = np.flatnonzero(logs > logs.max() + np.log(0.1 * EDGE))
-    span = (used[-1] - used[0] + 1) * cell
-    size = rounded_up(plan.window * span / new_cell + 8)
+    used = logs > _top(logs) + np.log(0.1 * EDGE)
+    first, last = used.argmax(axis=1), count - 1 - used[:, ::-1].argmax(axis=1)
+    span = (last - first + 1) * cell
+    size = rounded_up(plan.window * (span / new_cell).max() + 8)
     if plan.banded and plan.sizes[0] >= size >= 0.6 * plan.sizes[0]:
         size = plan.sizes[0]
-    pairs = max(BASE[1], rounded_up(span / (COARSEST * deviation.min())))
+    pairs = max(BASE[1], rounded_up(span.max() / (COARSEST * deviation.min())))
     if size * (12 + 0.2 * taps) > 3 * pairs**2:
         return None
-    middle, ratio = int((used[0] + used[-1]) // 2), new_cell / cell
-    window = _resampled(logs, middle, ratio, size)
-    centre = np.asarray(lattice.centre) + np.asarray(lattice.basis)[:, 0] * (middle - len(logs) // 2)
-    lattice = Lattice(jnp.asarray(window), jnp.asarray(centre), jnp.asarray(np.asarray(lattice.basis) * ratio))
-    return lattice, replace(plan, banded=True, sizes=(size,), taps=taps), np.array([middle, ratio])
+    cuts = np.stack([(first + last) // 2, new_cell / cell], axis=1)
+    window = _resampled(logs, cuts[:, 0], cuts[:, 1], size)
+    centre = lattice.centre + lattice.basis[:, :, 0] * (cuts[:, :1] - count // 2)
+    lattice = Lattice(window, centre, lattice.basis * cuts[:, 1, None, None])
+    return lattice, replace(plan, banded=True, sizes=(size,), taps=taps), cuts
 
 
 def composed(first: np.ndarray, second: np.ndarray, size: int) -> np.ndarray:
-    """The cut (middle, ratio) that does what two do one after the other; `size` is that of the lattice between them."""
-    if np.array_equal(first, SAME):
-        return second
-    return np.array([first[0] + first[1] * (second[0] - size // 2), first[1] * second[1]])
+    """The cuts (records, 2) that do what two do one after the other; `size` is that of the lattice between them."""
+    middle, ratio = first.T
+    both = np.stack([middle + ratio * (second[:, 0] - size // 2), ratio * second[:, 1]], axis=1)
+    return np.where(ratio[:, None] == 0, second, np.where(second[:, 1:] == 0, first, both))
 
 
 def cut_out(lattice: Lattice, cut: np.ndarray, size: int) -> Lattice:
@@ -380,31 +417,35 @@ def cut_out(lattice: Lattice, cut: np.ndarray, size: int) -> Lattice:
     return Lattice(window, lattice.centre + lattice.basis[:, 0] * (middle - count // 2), lattice.basis * ratio)
 
 
-def _resampled(logs: np.ndarray, middle: int, ratio: float, size: int) -> np.ndarray:
-    """The density at the indices middle + ratio (j - size // 2), j < size.
+def _resampled(logs: np.ndarray, middle: np.ndarray, ratio: np.ndarray, size: int) -> np.ndarray:
+    """The densities (records, count) at the indices middle + ratio (j - size // 2), j < size.
 
     Trigonometric interpolation is exact where the density is resolved; its rounding would drown the far tails, which are
     interpolated in the logarithm.
     """
-    at = middle + ratio * (np.arange(size) - size // 2)
-    inside = (at >= 0) & (at <= len(logs) - 1)
-    if ratio == 1.0:
-        window = np.full(size, -np.inf)
-        window[inside] = logs[at[inside].astype(int)]
-        return window
-    top = logs.max()
-    value = _trigonometric(np.exp(logs - top), middle, ratio, size)
-    tail = np.interp(at, np.arange(len(logs)), np.maximum(logs, top - 800.0))
-    tail = np.where(tail <= top - 799.0, -np.inf, tail)
-    good = value > 1e-11
-    return np.where(inside, np.where(good, np.log(np.where(good, value, 1.0)) + top, tail), -np.inf)
+    count = logs.shape[1]
+    at = middle[:, None] + ratio[:, None] * (np.arange(size) - size // 2)
+    inside = (at >= 0) & (at <= count - 1)
+    left = np.clip(np.floor(at), 0, count - 2).astype(int)
+    share = np.clip(at - left, 0.0, 1.0)
+    top = _top(logs)
+    held = np.maximum(logs, top - 800.0)
+    window = (1 - share) * np.take_along_axis(held, left, axis=1) + share * np.take_along_axis(held, left + 1, axis=1)
+    window = np.where(window <= top - 799.0, -np.inf, window)
+    rows = np.flatnonzero(ratio != 1.0)
+    if len(rows):
+        value = _trigonometric(np.exp(logs[rows] - top[rows]), middle[rows, None], ratio[rows, None], size)
+        good = value > 1e-11
+        window[rows] = np.where(good, np.log(np.where(good, value, 1.0)) + top[rows], window[rows])
+    return np.where(inside, window, -np.inf)
 
 
-def _trigonometric(values: np.ndarray, middle: int, ratio: float, size: int) -> np.ndarray:
-    """The trigonometric interpolant at the indices middle + ratio (j - size // 2), by Bluestein's chirp transform."""
-    count = len(values)
+def _trigonometric(values: np.ndarray, middle: np.ndarray, ratio: np.ndarray, size: int) -> np.ndarray:
+    """The trigonometric interpolants at the indices middle + ratio (j - size // 2), by Bluestein's chirp transform."""
+    count = values.shape[1]
     frequency = np.fft.fftfreq(count) * count
-    spectrum = np.fft.fftshift(np.fft.fft(values) * np.exp(2j * np.pi * frequency * middle / count)) / count
+    spectrum = np.fft.fft(values) * np.exp(2j * np.pi * frequency * middle / count)
+    spectrum = np.fft.fftshift(spectrum, axes=1) / count
     k = np.sort(frequency)
     j = np.arange(size) - size // 2
     angle = np.pi * ratio / count
@@ -414,5 +455,5 @@ def _trigonometric(values: np.ndarray, middle: int, ratio: float, size: int) -> 
     product = np.fft.fft(spectrum * np.exp(1j * angle * k**2), length) * np.fft.fft(
         np.exp(-1j * angle * distance**2), length
     )
-    convolved = np.fft.ifft(product)[count - 1 : count - 1 + size]
+    convolved = np.fft.ifft(product)[:, count - 1 : count - 1 + size]
     return np.real(convolved * np.exp(1j * angle * j**2))

@@ -76,7 +76,8 @@ class State:
 class Prepared:
     """Everything that is known without data: `intervals`, a pytree with a leading axis, what is static, and `theta`.
 
-    `flow_plan` says how the flows are computed again for another theta, `spread` (n, n) is the covariance of the first kernel.
+    `flow_plan` says how the flows are computed again for another theta, `spread` (n, n) is the covariance of the first kernel,
+    `memory` what lattices may take, in bytes.
     """
 
     model: Model
@@ -87,6 +88,7 @@ class Prepared:
     theta: Any
     flow_plan: FlowPlan
     spread: np.ndarray | None
+    memory: int
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -113,12 +115,19 @@ class Interval:
 
 
 def prepare(
-    model: Model, schedule: Schedule, *, kernel: str = "flow", splitting: str = "strang", order: int | None = None
+    model: Model,
+    schedule: Schedule,
+    *,
+    kernel: str = "flow",
+    splitting: str = "strang",
+    order: int | None = None,
+    memory: float | None = None,
 ) -> Prepared:
     """The flow of every interval, offline.
 
     `kernel` is "flow" or "power-series" (the papers' series in z-coordinates, of the given `order` or chosen
-    automatically); `splitting` is "strang" or "lie".  Raises InputError for another word.
+    automatically); `splitting` is "strang" or "lie"; `memory` is how many MiB lattices of two and three states may
+    take, by default half of what the machine has free.  Raises InputError for another word.
     """
     if kernel not in ("flow", "power-series"):
         raise InputError(f'option kernel: "{kernel}" is neither "flow" nor "power-series"')
@@ -127,6 +136,8 @@ def prepare(
     series = kernel == "power-series"
     if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1 or not series):
         raise InputError(f'option order: {order!r} must be a whole number from 1, and needs kernel="power-series"')
+    if memory is not None and not (isinstance(memory, (int, float)) and not isinstance(memory, bool) and 0 < memory < np.inf):
+        raise InputError(f"option memory: {memory!r} must be a positive number of MiB")
     # The series knows no inputs, and the papers' order of the factors has none.
     system = system_of(formulas(model), not series and splitting == "strang", splitting)
     theta = model.theta()
@@ -143,6 +154,7 @@ def prepare(
         theta,
         plan,
         flow.spread[moving[0], 0] if len(moving) else None,
+        choice.free_memory() if memory is None else int(memory * 2**20),
     )
 
 
@@ -247,7 +259,8 @@ def _start(prepared, prior, observation):
         if observation is not None:
             lattice, after = choice.first_lattice(model, prior, own_factor, prepared.spread)
     if not traced:
-        return _looked_at(prepared, lattice, choice.first_plan(model), model.start), after - before
+        state = _looked_at_one(prepared, lattice, choice.first_plan(model), model.start, choice.SAME, lattice.log_values)
+        return state, after - before
     prior_on = partial(_prior_again, prepared, prior)
     before = lat.summary(first._replace(log_values=prior_on(first))).log_mass
     logs = prior_on(lattice)
@@ -256,7 +269,7 @@ def _start(prepared, prior, observation):
     after = lat.summary(lattice._replace(log_values=logs)).log_mass
     plan, own = choice.first_plan(model), lattice.log_values
     lattice = lattice._replace(log_values=logs - after)
-    return _looked_at(prepared, lattice, plan, model.start, own=own), after - before
+    return _looked_at_one(prepared, lattice, plan, model.start, choice.SAME, own), after - before
 
 
 def _prior_again(prepared, prior, lattice):
@@ -273,19 +286,25 @@ def _prior_again(prepared, prior, lattice):
     return jnp.where(there, jax_field([prior.log_density], model)(safe, model.start, prepared.theta)[0], -jnp.inf)
 
 
-def _looked_at(
-    prepared: Prepared, lattice: Lattice, plan: choice.Plan, time: float, cut: Any = choice.SAME, own: Any = None
-) -> State:
-    """A state from a lattice that was chosen outside of a step; `own` are its values for the model's own parameters."""
+def _looked_at(prepared: Prepared, lattice: Lattice, plan: choice.Plan, time: float, cut: Any, own: Any = None) -> State:
+    """States from lattices, one a record, that were chosen outside of a step.
+
+    `own` are the values for the model's own parameters.
+    """
     system = prepared.system
     logs = np.asarray(lattice.log_values if own is None else own)
     observed = _observed_at(system, lattice, time, prepared.theta) if system.halves else None
     return State(lattice, observed, choice.features(logs), choice.middle(logs), cut, plan)
 
 
+def _looked_at_one(prepared: Prepared, lattice: Lattice, plan: choice.Plan, time: float, cut: Any, own: Any) -> State:
+    one = jax.tree.map(lambda a: a[None], (lattice, cut, np.asarray(own)))
+    return jax.tree.map(lambda a: a[0], _looked_at(prepared, one[0], plan, time, *one[1:]))
+
+
 @partial(jax.jit, static_argnums=0)
 def _observed_at(system, lattice, time, theta):
-    return system.observe(lattice.points(), time, theta)
+    return jax.vmap(lambda one: system.observe(one.points(), time, theta))(lattice)
 
 
 def _linear(weights: Any, h: Sequence[jax.Array]) -> Any:
@@ -305,20 +324,24 @@ def _log_factor(h: Sequence[jax.Array] | None, factor: Factors) -> Any:
 
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
     """The state to begin the intervals `rows` with: the window, the cell and the way to convolve."""
+    one = jax.tree.map(lambda a: np.asarray(a)[None], (state, info))
+    many = adapt_many(prepared, one[0], rows, one[1])
+    return None if many is None else jax.tree.map(lambda a: a[0], many)
+
+
+def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None) -> State | None:
+    """`adapt` of states with a leading axis of records: one plan for all, the largest that any of them needs."""
+    flow = prepared.intervals.flow
+    own = jax.tree.map(np.asarray, states.lattice)
     lattice, plan, cut = choice.adapted(
-        prepared.model,
-        state.lattice,
-        state.plan,
-        prepared.intervals.flow.spread[rows],
-        prepared.intervals.flow.map[rows],
-        info,
+        prepared.model, own, states.plan, flow.spread[rows], flow.map[rows], info, prepared.memory
     )
     if plan is None:
         return None
-    before = choice.SAME if info is None else np.asarray(state.cut)
-    if lattice is state.lattice:
-        return replace(state, plan=plan, cut=before)
-    cut = choice.composed(before, cut, state.lattice.sizes[0])
+    if info is not None:
+        cut = choice.composed(np.asarray(states.cut), cut, own.log_values.shape[1])
+    if lattice is None:
+        return replace(states, plan=plan, cut=cut)
     return _looked_at(prepared, lattice, plan, prepared.schedule.starts[rows.start], cut)
 
 
@@ -329,7 +352,7 @@ def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State
         return replace(state, plan=begin.plan, cut=cut)
     own = begin.lattice.log_values
     lattice = choice.cut_out(state.lattice, cut, own.size)
-    return _looked_at(prepared, lattice, begin.plan, prepared.schedule.starts[rows.start], cut, own)
+    return _looked_at_one(prepared, lattice, begin.plan, prepared.schedule.starts[rows.start], cut, own)
 
 
 def step(interval: Interval, state: State, observation: Factors) -> tuple[State, Info]:
@@ -478,7 +501,7 @@ METHOD = Method(
     exactness="exact between observations for every h in the class; for increments of nonlinear h, second order in the "
     "interval for smooth paths (Strang splitting)",
     theorem=theorem,
-    options={"kernel": "flow", "splitting": "strang", "order": None},
+    options={"kernel": "flow", "splitting": "strang", "order": None, "memory": None},
     prepare=prepare,
     init=init,
     correct=correct,
@@ -488,6 +511,7 @@ METHOD = Method(
     adapt=adapt,
     with_parameters=with_parameters,
     resume=resume,
+    adapt_many=adapt_many,
     bounds={
         "edge_mass": (1e-9, "probability in the outermost cells of the window"),
         "quadrature_error": (1e-9, "error of a lattice sum that replaces an integral"),
