@@ -61,7 +61,8 @@ def gauge(model: Model) -> Gauge | None:
     assert system is not None
     potential, x = system[0].potential, model.x
     if potential == 0:
-        return Gauge(potential, sp.ImmutableMatrix.zeros(0, model.n), sp.ImmutableMatrix([1]), sp.ImmutableMatrix.zeros(1, model.n))
+        none, flat = sp.ImmutableMatrix.zeros(0, model.n), sp.ImmutableMatrix.zeros(1, model.n)
+        return Gauge(potential, none, sp.ImmutableMatrix([1]), flat)
     terms = _exponentials(potential, x)
     if terms is not None:
         slopes = sp.ImmutableMatrix([list(slope) for slope in terms])

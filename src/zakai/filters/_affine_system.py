@@ -66,8 +66,10 @@ class AffineSystem:
     """The coefficients of the equation above, and of the observation alone, as functions of time and the parameters."""
 
     def __init__(self, model: Model):
-        form, bare, _, _ = affine_system(model)  # type: ignore[misc]
-        slope, intercept = affine_observation(model)  # type: ignore[misc]
+        found, observed = affine_system(model), affine_observation(model)
+        assert found is not None and observed is not None
+        (form, bare, _, _), (slope, intercept) = found, observed
+        assert bare is not None
         constant = sp.Matrix([bare.constant])
         own = [form.matrix, form.offset, model.covariance, bare.matrix, bare.linear, constant]
         self.matrices = Matrices([*own, slope, intercept, model.observation_noise], model)

@@ -29,8 +29,11 @@ from zakai.models.model import Model
 
 
 class State(NamedTuple):
-    """The families of v, or of e^S v (leading axis J), normalised so that u = e^phi v has mass one, the `time`, and, for each node, the
-    logarithm of the error of the prior's representation and whether it is at the edge, (J, N)."""
+    """The families of v, or of e^S v (leading axis J), normalised so that u = e^phi v has mass one.
+
+    With them the `time`, and for each node the logarithm of the error of the prior's representation and whether it is at
+    the edge, (J, N).
+    """
 
     families: Family
     log_error: Any

@@ -175,7 +175,7 @@ class _GaussianPlan:
                 self.tilted, self.lattice, self.error = (0 if high <= self.bend[0] else 1), None, 0.0
                 return
         if functions.count == 1:
-            sizes = (49 if wide.any() else 1,)
+            sizes: tuple[int, ...] = (49 if wide.any() else 1,)
             basis = np.array([[(high - low) / (sizes[0] - 1)]]) if wide.any() else np.ones((1, 1))
             origin = np.array([low]) if wide.any() else self.centre
         else:

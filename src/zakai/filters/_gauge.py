@@ -9,7 +9,7 @@ Else phi depends on one or two directions z = D x, and the integrals over z are 
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -84,6 +84,7 @@ class Posterior(NamedTuple):
     doubt: Any
 
 
+@partial(jax.jit, static_argnums=0)
 def posterior(functions: GaugeFunctions, tilts: Tilts, t: Any, theta: Any, families: Family) -> Posterior:
     """e^phi times the families (leading axis J), with its first two moments."""
     logs = jax.vmap(log_terms)(families)
