@@ -75,7 +75,7 @@ def fit(
 
     model: what the system is, with a prior; its values are where the search starts unless `start` gives others. record: K
     observations. parameters: the names to estimate, by default all. method, options: as of `filter`. bounds: (lowest,
-    highest) by name, None where there is none; a noise that is no noise is never tried, with or without bounds.
+    highest) by name, None where there is none; a noise that is no noise is never accepted, with or without bounds.
 
     The likelihood and its gradient are those of `log_likelihood`, maximised by L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995) and
     Newton's steps; what the filter decides by itself is decided again at the maximum until the two agree. Look at
