@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from zakai.densities._density import coordinate_numbers, generator, probabilities, wrap
 
@@ -67,8 +69,9 @@ class GridDensity:
             x = x[..., None]
         offset = x - self.centre
         index = (np.where(self.periodic, wrap(offset), offset) @ np.linalg.inv(self.basis).T).reshape(-1, n)
-        block = max(1, _BLOCK // self.log_values.size)
-        parts = [self._interpolate(index[i : i + block]) for i in range(0, len(index), block)]
+        interpolate = self._interpolate if n < 3 else self._interpolate_three
+        block = max(1, _BLOCK // (self.log_values.size if n < 3 else self.log_values[0].size))
+        parts = [interpolate(index[i : i + block]) for i in range(0, len(index), block)]
         return (np.concatenate(parts) if parts else np.empty(0)).reshape(x.shape[:-1]) - self._log_scale
 
     def _interpolate(self, index: np.ndarray) -> np.ndarray:
@@ -106,6 +109,30 @@ class GridDensity:
             result = level + np.log(np.where(total > 0, total, np.nan))
         result = np.where(np.isfinite(result), result, level)
         return np.where(inside & (level > floor), result, -np.inf)
+
+    def _interpolate_three(self, index: np.ndarray) -> np.ndarray:
+        """The sinc interpolant for three axes, one after the other; below 1e-10 of the maximum, linear in the logarithm."""
+        shape = np.array(self.log_values.shape)
+        inside = np.all((index > -0.5 - shape // 2) & (index < shape - shape // 2 - 0.5) | np.array(self._closed), axis=1)
+        index = np.where(inside[:, None], index, 0.0)
+        kernels = []
+        for axis, size in enumerate(shape):
+            distance = np.arange(size) - size // 2 - index[:, axis][:, None]
+            kernels.append(dirichlet(distance, size) if self._closed[axis] else np.sinc(distance))
+        top = np.max(self.log_values)
+        values = np.exp(self.log_values - top).reshape(shape[0], -1)
+        plane = (kernels[0] @ values).reshape(-1, *shape[1:])
+        total = np.einsum("pij,pj,pi->p", plane, kernels[2], kernels[1], optimize=True)
+        # Rounding of the largest term matters only far below it.
+        high = total > 1e-10
+        logs = np.empty(len(index))
+        logs[high] = np.log(total[high]) + top
+        floor = top - 700.0
+        if not high.all():
+            modes = ["grid-wrap" if closed else "nearest" for closed in self._closed]
+            at = (index[~high] + shape // 2).T
+            logs[~high] = map_coordinates(np.maximum(self.log_values, floor), at, order=1, mode=modes)
+        return np.where(inside & (logs > floor), logs, -np.inf)
 
     def mean(self) -> np.ndarray:
         flat = self.points.reshape(-1, len(self.names))
@@ -156,42 +183,57 @@ class GridDensity:
 
     def marginal(self, coordinates) -> GridDensity:
         keep = coordinate_numbers(self.names, coordinates)
-        if keep == list(range(len(self.names))):
+        count = len(self.names)
+        if keep == list(range(count)):
             return self
-        if keep != [keep[0]] or len(self.names) != 2:
-            flipped = GridDensity(
-                np.moveaxis(self.log_values, 0, -1),
-                self.centre[keep],
-                self.basis[np.ix_(keep, keep)],
-                tuple(self.names[i] for i in keep),
-                tuple(self.periodic[i] for i in keep),
-            )
-            return flipped
-        return self._line(keep[0])
-
-    def _line(self, i: int) -> GridDensity:
-        """The marginal of coordinate i of two: the sheared lattice is summed along its other axis by Fourier's shift."""
-        # Lattice points with equal x_i lie on slanted lines.  A sum over a slanted line of a band-limited function equals
-        # the sum after each row was shifted by a fraction of a cell, which a Fourier transform does exactly.
-        along = int(np.argmax(np.abs(self.basis[i]) * self._spread_along))
-        values = self.weights if along == 0 else self.weights.T
-        pitch, slant = self.basis[i, along], self.basis[i, 1 - along]
-        rows = np.arange(values.shape[1]) - values.shape[1] // 2
-        shift = rows * slant / pitch
-        pad = int(np.ceil(np.max(np.abs(shift)))) + 2
-        closed = self._closed[along] and abs(slant) < 1e-12
-        padded = values if closed else np.pad(values, ((pad, pad), (0, 0)))
-        frequency = np.fft.rfftfreq(padded.shape[0])
-        spectrum = np.fft.rfft(padded, axis=0) * np.exp(-2j * np.pi * frequency[:, None] * shift)
-        line = np.maximum(np.fft.irfft(spectrum.sum(axis=1), padded.shape[0]), 0.0)
+        names, periodic = tuple(self.names[i] for i in keep), tuple(self.periodic[i] for i in keep)
+        if len(keep) == count:
+            # The same coordinates in another order, on the same lattice; angles have the first axes.
+            axes = keep if any(self.periodic) else list(range(count))
+            basis = self.basis[np.ix_(keep, axes)]
+            return GridDensity(np.transpose(self.log_values, axes), self.centre[keep], basis, names, periodic)
+        values, centre, basis = self._projected(keep)
         with np.errstate(divide="ignore"):
-            logs = np.log(line / abs(pitch))
-        size = len(line)
-        origin = self.centre[i] + pitch * (size // 2 - (values.shape[0] // 2 + (0 if closed else pad)))
-        if pitch < 0:
-            logs, pitch = logs[::-1], -pitch
-            origin = origin + pitch * (size - 1 - 2 * (size // 2)) * -1.0
-        return GridDensity(logs, np.array([origin]), np.array([[pitch]]), (self.names[i],), (self.periodic[i],))
+            logs = np.log(np.maximum(values, 0.0) / abs(np.linalg.det(basis)))
+        if len(keep) == 1 and basis[0, 0] < 0:
+            # An axis of even length has its centre right of the middle.
+            centre = centre + basis[:, 0] * (len(logs) - 1 - 2 * (len(logs) // 2))
+            logs, basis = logs[::-1], -basis
+        return GridDensity(logs, centre, basis, names, periodic)
+
+    def _projected(self, keep: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The weights, centre and basis of the marginal of some coordinates: the slanted lattice is summed along its other axes.
+
+        Lattice points with equal coordinates lie on slanted planes.  A sum over one of them of a band-limited function equals
+        the sum after each row was shifted by a fraction of a cell, which a Fourier transform does exactly.
+        """
+        count = self.log_values.ndim
+        spreads = self._spread_along
+        choices = list(itertools.combinations(range(count), len(keep)))
+        volume = [abs(np.linalg.det((self.basis[keep] * spreads)[:, list(axes)])) for axes in choices]
+        along = list(choices[int(np.argmax(volume))])
+        across = [a for a in range(count) if a not in along]
+        basis = self.basis[np.ix_(keep, along)]
+        slant = np.linalg.solve(basis, self.basis[np.ix_(keep, across)])
+        slant = np.where(np.abs(slant) < 1e-12, 0.0, slant)
+        values = np.moveaxis(self.weights, along, range(len(along)))
+        rows = np.stack(
+            np.meshgrid(*[np.arange(s) - s // 2 for s in values.shape[len(along) :]], indexing="ij"), axis=-1
+        ).reshape(-1, len(across))
+        shift = rows @ slant.T
+        # A circle shifts into itself; elsewhere there must be room.
+        room = np.where([self._closed[a] for a in along], 0, np.ceil(np.abs(shift).max(axis=0)) + 2).astype(int)
+        room = np.where(np.any(slant != 0, axis=1), room, 0)
+        values = values.reshape(*values.shape[: len(along)], -1)
+        values = np.pad(values, [*((r, r) for r in room), (0, 0)])
+        spectrum = np.fft.fftn(values, axes=range(len(along)))
+        for d, size in enumerate(values.shape[:-1]):
+            phase = np.exp(-2j * np.pi * np.fft.fftfreq(size)[:, None] * shift[:, d])
+            spectrum = spectrum * phase.reshape(*[size if a == d else 1 for a in range(len(along))], -1)
+        values = np.real(np.fft.ifftn(spectrum.sum(axis=-1)))
+        sizes = np.array(self.log_values.shape)[along]
+        centre = self.centre[keep] + basis @ (np.array(values.shape) // 2 - (sizes // 2 + room))
+        return values, centre, basis
 
     @cached_property
     def _spread_along(self) -> np.ndarray:

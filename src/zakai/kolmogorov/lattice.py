@@ -45,9 +45,9 @@ LogFunction = Callable[[jax.Array], jax.Array]
 class Lattice(NamedTuple):
     """The logarithm of a density, `log_values` (sizes), at `centre` (n,) + `basis` (n, n) (index - sizes // 2)."""
 
-    log_values: jax.Array
-    centre: jax.Array
-    basis: jax.Array
+    log_values: Array
+    centre: Array
+    basis: Array
 
     @property
     def sizes(self) -> tuple[int, ...]:
