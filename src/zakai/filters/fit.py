@@ -259,14 +259,14 @@ def _maximum(function, values: np.ndarray, box: np.ndarray, names: tuple[str, ..
 
 
 def _information(objective: _Objective, u: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """The Hessian of the negative log-likelihood, by steps of a hundredth of a standard error, once that is known."""
+    """The Hessian of the negative log-likelihood, by steps of a thousandth of a standard error, once that is known."""
     for size in (1e-4, 1e-6, 1e-8):
         steps = np.full(len(u), size)
         first = np.diag(objective.hessian(u, steps))
         if np.isfinite(first[free]).all():
             break
     with np.errstate(invalid="ignore", divide="ignore"):
-        better = np.where(free & (first > 0), 1e-2 / np.sqrt(first), steps)
+        better = np.where(free & (first > 0), 1e-3 / np.sqrt(first), steps)
     return objective.hessian(u, np.clip(np.where(np.isfinite(better), better, steps), 1e-7, 1e-1))
 
 
