@@ -13,8 +13,8 @@ def test_many_records_agree_with_the_records_one_by_one(name):
     model = zakai.load_model(f"gallery:{name}")
     times = np.arange(1, 41) / 50
     records = [zakai.simulate(model, times, seed=seed)[1] for seed in range(6)]
-    for record in records[3:]:
-        record.values[7:9] = np.nan
+    gaps = np.where(np.isin(np.arange(40), [7, 8])[:, None], np.nan, 0.0)
+    records[3:] = [zakai.Record(times, record.values + gaps, record.kind) for record in records[3:]]
     together = zakai.filter(model, records, "limited-direct", keep="moments")
     for record, many in zip(records, together, strict=True):
         one = zakai.filter(model, record, "limited-direct", keep="moments")

@@ -122,7 +122,7 @@ def test_a_lattice_that_does_not_fit_says_how_much_memory_it_needs():
         prior={"kind": "gaussian", "mean": [0.0] * 3, "cov": [1.0] * 3},
     )
     record = zakai.Record([0.1], [[0.1, 0.2, 0.3]], "increments")
-    with pytest.raises(InputError, match=r"option memory: .* 48 x 48 x 48 points, \d+ MiB, and has 5; .* general-direct"):
+    with pytest.raises(InputError, match=r"option memory: .* 48 x 48 x 48 points, \d+ MiB, and has 5; .*general-direct"):
         zakai.filter(model, record, "limited-direct", memory=5)
     with pytest.raises(InputError, match="option memory: -1 must be a positive number of MiB"):
         zakai.filter(model, record, "limited-direct", memory=-1)

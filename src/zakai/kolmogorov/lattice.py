@@ -89,6 +89,8 @@ def _axes(sizes: tuple[int, ...]) -> list[np.ndarray]:
 def _combined(axes: Sequence[Array], matrix: jax.Array) -> jax.Array:
     """`matrix` z (*sizes, n) for all z of the product of `axes`, which is never formed."""
     n = len(axes)
+    if n == 1:
+        return matrix[0, 0] * jnp.asarray(axes[0])[:, None]
     views = [jnp.reshape(axis, [-1 if a == d else 1 for a in range(n)]) for d, axis in enumerate(axes)]
     return jnp.stack([sum(matrix[i, d] * views[d] for d in range(n)) for i in range(n)], axis=-1)
 
@@ -138,8 +140,11 @@ def summary(lattice: Lattice, angles: tuple[int, ...] = ()) -> Summary:
     else:
         # Deviations are taken from the mean before they are squared: no difference of large numbers.
         deviations = [i - mean[d] for d, i in enumerate(axes)]
-        second = _moments(values, [jnp.stack([jnp.ones(len(i)), i, i**2], axis=1) for i in deviations]) / total
-        square = jnp.stack([jnp.stack([second[_unit(n, d, e)] for e in range(n)]) for d in range(n)])
+        if n == 1:
+            square = (_sum(values * deviations[0] ** 2) / total).reshape(1, 1)
+        else:
+            second = _moments(values, [jnp.stack([jnp.ones(len(i)), i, i**2], axis=1) for i in deviations]) / total
+            square = jnp.stack([jnp.stack([second[_unit(n, d, e)] for e in range(n)]) for d in range(n)])
         cov = lattice.basis @ square @ lattice.basis.T
         mean = lattice.centre + lattice.basis @ mean
     return Summary(top + jnp.log(total) + lattice.log_volume(), mean, cov, outer / total, middle)
@@ -204,10 +209,22 @@ def closed_axes(lattice: Lattice, angles: tuple[int, ...]) -> jax.Array:
     return jnp.concatenate([closed, jnp.zeros(len(lattice.sizes) - len(angles), bool)])
 
 
+@jax.custom_jvp
 def log(values: jax.Array) -> jax.Array:
-    """The logarithm, with -inf for zero and a gradient of zero there."""
+    """The logarithm, with a gradient of zero where it is -inf."""
+    return jnp.log(values)
+
+
+@log.defjvp
+def _log_jvp(primals, tangents):
+    (values,), (tangent,) = primals, tangents
     positive = values > 0
-    return jnp.where(positive, jnp.log(jnp.where(positive, values, 1.0)), -jnp.inf)
+    return jnp.log(values), jnp.where(positive, tangent / jnp.where(positive, values, 1.0), 0.0)
+
+
+def _sum(values: jax.Array) -> jax.Array:
+    """The sum as a product with a constant: vectorised, for many records too."""
+    return values.ravel() @ np.ones(values.size)
 
 
 def exponent_range(log_values: jax.Array, gauged: jax.Array) -> jax.Array:
@@ -264,7 +281,7 @@ def reach(lattice: Lattice, spread: jax.Array) -> jax.Array:
     """How deep in the tails of what was only spread, in units of the logarithm, the mass lies now, on average."""
     values = jnp.exp(lattice.log_values - jnp.max(lattice.log_values))
     depth = jnp.where(values > 0, jnp.max(spread) - spread, 0.0)
-    return (depth.ravel() @ values.ravel()) / jnp.sum(values)
+    return _sum(depth * values) / _sum(values)
 
 
 def move_dense(
