@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -76,7 +75,7 @@ def gauge(model: Model) -> Gauge | None:
     return None if directions is None else Gauge(potential, directions, None, None)
 
 
-def _exponentials(potential: sp.Expr, x: Sequence[sp.Symbol]) -> dict[tuple[sp.Expr, ...], sp.Expr] | None:
+def _exponentials(potential: sp.Expr, x: tuple[sp.Symbol, ...]) -> dict[tuple[sp.Expr, ...], sp.Expr] | None:
     """e^phi as {slope: coefficient}, or None where it is no finite sum of exponentials of affine forms."""
     product = {(sp.Integer(0),) * len(x): sp.Integer(1)}
     for term in sp.Add.make_args(sp.expand(potential, log=False, power_base=False)):
@@ -94,7 +93,7 @@ def _exponentials(potential: sp.Expr, x: Sequence[sp.Symbol]) -> dict[tuple[sp.E
     return product if len(product) <= _MOST_TERMS else None
 
 
-def _sum_of_exponentials(expression: sp.Expr, x: Sequence[sp.Symbol]) -> dict[tuple[sp.Expr, ...], sp.Expr] | None:
+def _sum_of_exponentials(expression: sp.Expr, x: tuple[sp.Symbol, ...]) -> dict[tuple[sp.Expr, ...], sp.Expr] | None:
     found: dict[tuple[sp.Expr, ...], sp.Expr] = {}
     for term in sp.Add.make_args(sp.expand(expression.rewrite(sp.exp), power_exp=False)):
         slope, coefficient = sp.zeros(len(x), 1), sp.Integer(1)

@@ -306,7 +306,7 @@ def _from_density(functions: GaugeFunctions, model: Model, prior: DensityPrior, 
     basis, sizes = np.asarray(found.basis), np.array(logs.shape)
     origin = np.asarray(found.centre) - basis @ (sizes // 2)
     # As many cells as the narrowest feature asks for.
-    finer = np.clip(np.minimum(features(logs), 1e3) / 2.5, 0.1, 1e3)
+    finer = np.clip(np.minimum(features(logs[None])[0], 1e3) / 2.5, 0.1, 1e3)
     cells = np.maximum(np.ceil((sizes - 1) / finer), 8).astype(int)
     lattice = NodeLattice(origin, basis * ((sizes - 1) / cells), tuple(int(c) + 1 for c in cells))
 
