@@ -13,6 +13,7 @@ from zakai import _float64  # noqa: F401
 
 import jax  # isort: skip
 import jax.numpy as jnp  # isort: skip
+import numpy as np
 
 
 class Components(NamedTuple):
@@ -52,11 +53,13 @@ def moments(share: jax.Array, means: jax.Array, covs: jax.Array, angles: tuple[i
     return mean, cov
 
 
-def wrapped(difference: jax.Array, angles: tuple[int, ...]) -> jax.Array:
-    """Differences (..., n) whose angles are taken in (-pi, pi]."""
-    for i in angles:
-        difference = difference.at[..., i].set(jnp.pi - jnp.mod(jnp.pi - difference[..., i], 2 * jnp.pi))
-    return difference
+def wrapped(difference: Any, angles: tuple[int, ...]) -> Any:
+    """Differences (..., n) whose angles are taken in (-pi, pi]; NumPy's or JAX'."""
+    if not angles:
+        return difference
+    turning = np.isin(np.arange(difference.shape[-1]), angles)
+    turns = (np.pi - difference) // (2 * np.pi)
+    return difference + 2 * np.pi * turning * jax.lax.stop_gradient(turns)
 
 
 def regression(covs: jax.Array, directions: jax.Array) -> jax.Array:

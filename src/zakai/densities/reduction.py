@@ -30,15 +30,18 @@ class Exchanged(NamedTuple):
     together: Any
 
 
-def pair_costs(share: Any, means: Any, covs: Any, loss: Any, angles: tuple[int, ...] = (), xp: Any = jnp) -> Any:
+def pair_costs(
+    share: Any, means: Any, covs: Any, loss: Any, angles: tuple[int, ...] = (), xp: Any = jnp, even: bool = False
+) -> Any:
     """What putting together components i and j would cost, (K, K): nats of relative entropy, weighted.
 
     The loss of the pair as one Gaussian, and the relative entropy of the pair's shape: for components far apart Runnalls' (2007)
-    bound, for close ones the leading cumulants (skewness^2 / 12 + kurtosis^2 / 48), whichever is smaller.
+    bound, for close ones the leading cumulants (skewness^2 / 12 + kurtosis^2 / 48), whichever is smaller.  even: the shares are
+    not the weights of the sum, so that pairs count as equal parts.
     """
     n = means.shape[1]
     both = share[:, None] + share
-    alpha = share[:, None] / xp.where(both > 0, both, 1.0)
+    alpha = xp.full(both.shape, 0.5) if even else share[:, None] / xp.where(both > 0, both, 1.0)
     beta = 1.0 - alpha
     product = xp.maximum(alpha * beta, 1e-30)
     apart = means[:, None] - means
@@ -68,12 +71,13 @@ def pair_costs(share: Any, means: Any, covs: Any, loss: Any, angles: tuple[int, 
 
 
 def exchange(
-    sum_: Components, share: jax.Array, loss: jax.Array, axis: jax.Array, tolerance: float, angles: tuple[int, ...] = ()
+    sum_: Components, share: jax.Array, loss: jax.Array, axis: jax.Array, tolerance: float, angles: tuple[int, ...] = (),
+    even: bool = False,
 ) -> tuple[Components, Exchanged]:
-    """Split the components with the largest weighted loss, into empty slots or into those of pairs that are cheap to put together.
+    """Split the components with the largest weighted loss, into empty slots or into those of pairs that cost little as one.
 
     share (K,): the weights that count.  loss (K,): see above.  axis (K, n): along which to split, one standard deviation long.
-    tolerance: weighted losses below tolerance / K stay.  Decisions are not differentiated.
+    tolerance: weighted losses below tolerance / K stay.  even: see `pair_costs`.  Decisions are not differentiated.
     """
     K = len(share)
     tries = max(1, K // 4)
@@ -88,7 +92,7 @@ def exchange(
     gain = gains[parents]
     wanted = gain > tolerance / K
     kept = jnp.zeros(K, bool).at[jnp.where(wanted, parents, K)].set(True, mode="drop")
-    costs = jax.lax.stop_gradient(pair_costs(jnp.where(kept, 0.0, share), sum_.means, sum_.covs, loss, angles))
+    costs = jax.lax.stop_gradient(pair_costs(jnp.where(kept, 0.0, share), sum_.means, sum_.covs, loss, angles, jnp, even))
     nearest = jnp.argmin(costs, axis=1)
     mutual = (nearest[nearest] == index) & (index < nearest)
     pair_cost = jnp.where(mutual, jnp.min(costs, axis=1), jnp.inf)
@@ -152,11 +156,11 @@ def _put(sum_: Components, at: jax.Array, log_weights: jax.Array, means: jax.Arr
 def groups(
     share: np.ndarray, means: np.ndarray, covs: np.ndarray, loss: np.ndarray, most: int, angles: tuple[int, ...] = ()
 ) -> np.ndarray:
-    """Which of at most `most` groups each component belongs to, (N,), on the host: cheap pairs are put together, round by round."""
+    """Which of at most `most` groups each component belongs to, (N,), on the host: cheap pairs first, round by round."""
     share, means, covs, loss = (np.array(a, float) for a in (share, means, covs, loss))
     label = np.arange(len(share))
     while (excess := int(np.sum(share > 0)) - most) > 0:
-        costs = np.asarray(pair_costs(share, means, covs, loss, angles, jnp if angles else np))
+        costs = np.asarray(pair_costs(share, means, covs, loss, angles, np))
         nearest = costs.argmin(axis=1)
         first = np.flatnonzero((nearest[nearest] == np.arange(len(share))) & (np.arange(len(share)) < nearest) & (share > 0))
         cost = costs[first, nearest[first]]

@@ -26,7 +26,8 @@ def directions_of(functions: Sequence[sp.Expr], model: Model) -> np.ndarray:
     rng = np.random.default_rng(0)
     x = rng.standard_normal((POINTS, n)) * np.geomspace(0.1, 10.0, POINTS)[:, None]
     times = model.start + rng.uniform(0.0, 3.0, POINTS)
-    theta = model.theta() * rng.uniform(0.7, 1.4, (POINTS, len(model.theta()))) + rng.uniform(0, 1e-2, (POINTS, len(model.theta())))
+    own = model.theta()
+    theta = own * rng.uniform(0.7, 1.4, (POINTS, len(own))) + rng.uniform(0, 1e-2, (POINTS, len(own)))
     gradients = []
     for row in range(POINTS):
         values = numpy_function(jacobian, model, jacobian.shape)(x[row], times[row], theta[row])

@@ -25,7 +25,7 @@ from zakai.models.model import Model
 
 
 class SumGauge:
-    """phi of a model, compiled; `exact` says whether e^phi is a sum of exponentials, `directions` (n, k) along which phi varies."""
+    """phi of a model, compiled: `exact` where e^phi is a sum of exponentials, `directions` (n, k) along which phi varies."""
 
     def __init__(self, phi: sp.Expr, model: Model):
         self.n, self.none = model.n, phi == 0

@@ -21,8 +21,9 @@ from zakai.algebra.theorems import general_direct as theorem
 from zakai.algebra.theorems import yau_system
 from zakai.densities import GaussianMixture
 from zakai.densities.components import Components, moments, shares, wrapped
+from zakai.densities.peaks import fit_dictionary, fit_peaks
 from zakai.densities.quadrature import curvature, refit
-from zakai.densities.reduction import exchange
+from zakai.densities.reduction import Exchanged, exchange
 from zakai.errors import InputError
 from zakai.filters import _gaussian_start as start
 from zakai.filters._directions import directions_of
@@ -33,6 +34,7 @@ from zakai.filters._yau_flow import FlowPlan, System, plan_flows, planned_flows,
 from zakai.filters.observations import Data, Factors, factors, noise_at
 from zakai.kolmogorov.flow import Flow, move_gaussian
 from zakai.models.model import Model
+from zakai.models.prior import GaussianPrior, MixturePrior
 
 # Slots by the number of directions in which the components must be narrow.
 SLOTS = {0: 1, 1: 20, 2: 64, 3: 128}
@@ -40,12 +42,18 @@ MOST_DIRECTIONS = 5
 TOLERANCE = 1e-3
 # How often a reading that comes all at once may make room for itself.
 ROUNDS = 6
+# The loss that a component is meant to have at most; a transition that widens it beyond needs more than one round.
+_FINE = 0.1
+# The ways to keep the sum small, and up to which n.
+_REDUCTIONS: dict[str, float] = {"split-merge": np.inf, "nnls": 2, "algorithm-1": 1}
 
 
 class Sum:
     """What is static: the system, its gauge, and how the sum is kept."""
 
-    def __init__(self, model: Model, splitting: str, slots: int | None, reduction: str, tolerance: float):
+    def __init__(
+        self, model: Model, splitting: str, slots: int | None, reduction: str, tolerance: float, alpha: float, rounds: int
+    ):
         yau = yau_system(model)
         assert yau is not None
         self.system: System = system_of(formulas(model), splitting == "strang", splitting)
@@ -61,7 +69,8 @@ class Sum:
                 f"{model.source}: h and phi vary in {k} directions of the state; quadrature takes {MOST_DIRECTIONS} at most"
             )
         self.slots = SLOTS.get(k, 192) if slots is None else slots
-        self.reduction, self.tolerance = reduction, tolerance
+        self.reduction, self.tolerance, self.alpha = reduction, tolerance, alpha
+        self.rounds = rounds
         self.sampled = model.observation_kind == "samples"
 
 
@@ -76,8 +85,8 @@ def _span(directions: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=32)
-def _sum(of: Formulas, splitting: str, slots: int | None, reduction: str, tolerance: float) -> Sum:
-    return Sum(of.model, splitting, slots, reduction, tolerance)
+def _sum(of: Formulas, splitting: str, slots: int | None, reduction: str, tolerance: float, alpha: float, rounds: int) -> Sum:
+    return Sum(of.model, splitting, slots, reduction, tolerance, alpha, rounds)
 
 
 class State(NamedTuple):
@@ -134,22 +143,52 @@ def prepare(
     splitting: str = "strang",
     reduction: str = "split-merge",
     tolerance: float = TOLERANCE,
+    alpha: float = 0.01,
 ) -> Prepared:
     """The flow of every interval, offline.
 
-    `components` is the number of slots, `splitting` "strang" or "lie", `reduction` "split-merge", `tolerance` the loss below
-    which components are left alone.  Raises InputError for another word or number.
+    `components` is the number of slots, `splitting` "strang" or "lie", `reduction` "split-merge", "nnls" or "algorithm-1",
+    `tolerance` the loss below which components are left alone, `alpha` the threshold of Algorithm 1.  Raises InputError for
+    another word or number.
     """
+    if reduction not in _REDUCTIONS:
+        listed = ", ".join(f'"{name}"' for name in _REDUCTIONS)
+        raise InputError(f'option reduction: "{reduction}" is none of {listed}')
+    if model.n > _REDUCTIONS[reduction]:
+        most = _REDUCTIONS[reduction]
+        raise InputError(f'option reduction: "{reduction}" is for n <= {most}, here n = {model.n}; use "split-merge"')
+    if reduction != "split-merge" and model.periodic:
+        raise InputError(f'option reduction: "{reduction}" knows no angles; use "split-merge"')
+    if isinstance(alpha, bool) or not isinstance(alpha, int | float) or not 0 < alpha < 1:
+        raise InputError(f"option alpha: {alpha!r} must lie between 0 and 1")
     if splitting not in ("strang", "lie"):
         raise InputError(f'option splitting: "{splitting}" is neither "strang" nor "lie"')
     if components is not None and (isinstance(components, bool) or not isinstance(components, int) or components < 1):
         raise InputError(f"option components: {components!r} must be a whole number from 1")
     if not isinstance(tolerance, int | float) or not 0 < tolerance < 1:
         raise InputError(f"option tolerance: {tolerance!r} must lie between 0 and 1")
-    static = _sum(formulas(model), splitting, components, reduction, float(tolerance))
+    arguments = (formulas(model), splitting, components, reduction, float(tolerance), float(alpha))
+    static = _sum(*arguments, 1)
     plan = plan_flows(static.system, model, schedule)
+    if static.directions.shape[1]:
+        static = _sum(*arguments, _rounds(static, model, planned_flows(static.system, plan, model.theta())))
     prepared = Prepared(model, static, schedule, splitting, plan, model.theta(), None)  # type: ignore[arg-type]
     return with_parameters(prepared, prepared.theta)
+
+
+def _rounds(static: Sum, model: Model, flow: Flow) -> int:
+    """How many rounds of splitting an interval asks for: four for each halving that its own spread makes necessary."""
+    prior = model.prior
+    known = isinstance(prior, GaussianPrior | MixturePrior)
+    mean, cov = (prior.mean, prior.cov) if known else (np.zeros(model.n), np.eye(model.n))  # type: ignore[union-attr]
+    probes = np.random.default_rng(0).multivariate_normal(mean, cov, 32, method="eigh")
+    spreads = np.einsum("kpij,kpjl,kpml->kpim", flow.map, flow.spread, flow.map).sum(axis=1)
+    widest = spreads[np.argmax(np.trace(spreads, axis1=1, axis2=2))]
+    precision = np.linalg.inv(noise_at(model, np.array([model.start]), model.theta()))[0]
+    sum_ = Components(jnp.zeros(32), jnp.asarray(probes), jnp.broadcast_to(widest, (32, *widest.shape)), jnp.ones(32))
+    loss = _losses(static, sum_, jnp.full(32, 1 / 32), precision, model.start, model.theta())[0]
+    typical = float(jnp.mean(loss))
+    return int(np.clip(round(4 * np.log2(1 + typical / _FINE)), 1, 12)) if np.isfinite(typical) else 1
 
 
 def with_parameters(prepared: Prepared, theta: Any) -> Prepared:
@@ -256,18 +295,33 @@ def _observe(static: Sum, v: Components, after, factor: Factors, precision, t, t
     pruned, together, nonlinearity, moved = zero, zero, zero, zero
     at_once = static.sampled or factor.energy is not None
     if static.directions.shape[1]:
-        if at_once:
+        if at_once and static.reduction == "split-merge":
             # Room is made before a reading that may say much at once, by the weights that it will leave.
-            for _ in range(ROUNDS):
+            def make_room(v, _):
                 tried, _ = _multiply(static, v, after, factor, t, theta)
                 share, _ = _share_of_u(static, tried, t, theta)
                 v, done, _ = _exchange(static, v, share, precision, t, theta, 1.0)
-                pruned, together = pruned + done.pruned, together + done.together
+                return v, done
+
+            v, done = jax.lax.scan(make_room, v, None, length=max(ROUNDS, static.rounds))
+            pruned, together = jnp.sum(done.pruned), jnp.sum(done.together)
         v, shift = _multiply(static, v, after, factor, t, theta)
         share, log_mass = _share_of_u(static, v, t, theta)
         moved = jnp.sum(jnp.where(share > 0, share * shift, 0.0))
-        v, done, nonlinearity = _exchange(static, v, share, precision, t, theta, 0.0)
-        pruned, together = pruned + done.pruned, together + done.together
+
+        def trade(v, share):
+            v, done, nonlinearity = _exchange(static, v, share, precision, t, theta, 0.0)
+            return v, (done, nonlinearity)
+
+        if static.rounds == 1 or static.reduction != "split-merge":
+            v, (done, nonlinearity) = trade(v, share)
+            pruned, together = pruned + done.pruned, together + done.together
+        else:
+            v, (done, each) = jax.lax.scan(
+                lambda v, _: trade(v, _share_of_u(static, v, t, theta)[0]), v, None, length=static.rounds
+            )
+            pruned, together = pruned + jnp.sum(done.pruned), together + jnp.sum(done.together)
+            nonlinearity = each[-1]
     else:
         v, _ = _multiply(static, v, after, factor, t, theta)
         share, log_mass = _share_of_u(static, v, t, theta)
@@ -293,7 +347,12 @@ def _losses(static: Sum, v: Components, share, precision, t, theta, reading: flo
 
 def _exchange(static: Sum, v: Components, share, precision, t, theta, reading):
     loss, axis = _losses(static, v, share, precision, t, theta, reading)
-    v, done = exchange(v, share, loss, axis, static.tolerance, static.angles)
+    if static.reduction != "split-merge":
+        nothing = Exchanged(jnp.zeros(()), jnp.zeros(()))
+        # Both fit v, of which u = e^phi v; neither says what it loses.
+        new = fit_peaks(v, static.alpha) if static.reduction == "algorithm-1" else fit_dictionary(v, share)
+        return new, nothing, jnp.sum(share * loss)
+    v, done = exchange(v, share, loss, axis, static.tolerance, static.angles, reading > 0)
     return v, done, jnp.sum(jnp.where(share > 0, share * loss, 0.0))
 
 
@@ -355,7 +414,7 @@ METHOD = Method(
     source="Chen and Dong, A survey of direct methods for Yau filtering systems, Theorems 6 and 7, Algorithm 4, corrected",
     exactness="exact between observations; a Gaussian sum of the posterior where h is nonlinear, whose error health tells",
     theorem=theorem,
-    options={"components": None, "splitting": "strang", "reduction": "split-merge", "tolerance": TOLERANCE},
+    options={"components": None, "splitting": "strang", "reduction": "split-merge", "tolerance": TOLERANCE, "alpha": 0.01},
     prepare=prepare,
     init=init,
     correct=correct,
@@ -364,7 +423,7 @@ METHOD = Method(
     density=density,
     with_parameters=with_parameters,
     bounds={
-        "nonlinearity": (0.1, "share of the observation's energy over single components that is not linear there"),
+        "nonlinearity": (1.0, "energy of the observation over single components that is not linear there, against that which is"),
         "pruned": (1e-3, "weight of components that were dropped in one step"),
         "merged": (0.1, "loss by putting components together for lack of room"),
         "surprise": (1.0, "how far the observation drives the density into the tails of single Gaussians"),

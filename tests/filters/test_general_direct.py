@@ -1,0 +1,131 @@
+"""The Gaussian sum against the exact methods, which share with it nothing but the flow, and what must hold of any filter."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+import zakai
+from references.systems import scalar
+from zakai.errors import ConditionError, InputError
+
+
+def encoder(**changes):
+    keys = {
+        "state": ["x", "v"],
+        "drift": ["v", "-x/5 - v/5"],
+        "diffusion": [["0.1", "0"], ["0", "1"]],
+        "observation": ["sin(x)", "cos(x)"],
+        "observation_noise": [["0.04", "0"], ["0", "0.04"]],
+        "observation_kind": "samples",
+        "prior": {"kind": "gaussian", "mean": [0.5, 0], "cov": [1.0, 1.0]},
+    }
+    return zakai.Model(**(keys | changes))
+
+
+def errors(result, exact):
+    """The largest error of a mean, in standard deviations of the exact posterior, and the error of the log-likelihood."""
+    away = np.abs(result.mean - exact.mean) / np.sqrt(exact.variance)
+    return away.max(), abs(result.log_likelihood - exact.log_likelihood)
+
+
+def test_a_time_varying_system_with_a_log_cosh_gauge_agrees_with_the_exact_density():
+    system = scalar()
+    model = zakai.Model(**system.keys())
+    record = zakai.Record(system.times, system.increments, "increments")
+    exact = zakai.filter(model, record, "limited-direct")
+    mean, evidence = errors(zakai.filter(model, record, "general-direct"), exact)
+    assert mean <= 5e-3 and evidence <= 5e-3
+    finer, _ = errors(zakai.filter(model, record, "general-direct", components=60), exact)
+    assert mean <= 5e-3 and finer <= 5e-3
+
+
+def test_sine_and_cosine_samples_of_two_states_agree_with_the_exact_density():
+    model = encoder()
+    _, record = zakai.simulate(model, np.arange(1, 31) * 0.1, seed=3)
+    result = zakai.filter(model, record, "general-direct")
+    mean, evidence = errors(result, zakai.filter(model, record, "limited-direct"))
+    assert mean <= 0.05 and evidence <= 0.05 and not result.warnings
+
+
+def test_a_mirrored_mode_is_kept_and_the_sum_stays_symmetric():
+    model = zakai.Model(
+        state=["x"], drift=["-x/5"], observation=["x**2"], observation_noise=[["0.05"]], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
+    )
+    _, record = zakai.simulate(model, np.arange(1, 41) * 0.1, seed=3)
+    exact = zakai.filter(model, record, "limited-direct")
+    result = zakai.filter(model, record, "general-direct")
+    assert errors(result, exact)[0] <= 0.05
+    assert np.abs(result.variance / exact.variance - 1)[1:].max() <= 0.05
+
+
+def test_a_linear_system_gives_the_kalman_bucy_filter_exactly_and_singular_noise_is_allowed():
+    model = zakai.load_model("gallery:falling-body")
+    _, record = zakai.simulate(model, np.arange(1, 41) * 0.05, seed=1)
+    exact = zakai.filter(model, record, "kalman-bucy")
+    result = zakai.filter(model, record, "general-direct")
+    assert np.abs(result.mean - exact.mean).max() <= 1e-9 and np.abs(result.cov - exact.cov).max() <= 1e-9
+    assert abs(result.log_likelihood - exact.log_likelihood) <= 1e-9
+
+
+def test_an_affine_observation_of_the_benes_system_is_exact_once_the_start_is_cut():
+    model = zakai.load_model("gallery:benes")
+    _, record = zakai.simulate(model, np.arange(1, 41) * 0.1, seed=3)
+    exact = zakai.filter(model, record, "benes")
+    result = zakai.filter(model, record, "general-direct", components=40)
+    assert max(errors(result, exact)) <= 1e-3
+
+
+@pytest.mark.parametrize(("variance", "step"), [(1e-8, 1e-6), (1e8, 0.1), (1.0, 10.0)])
+def test_extreme_variances_and_steps_give_numbers_and_positive_variances(variance, step):
+    model = zakai.Model(
+        state=["x"], drift=["t/40 * x"], observation=["x*sin(x)", "x*cos(x)"], observation_kind="increments",
+        prior={"kind": "gaussian", "mean": [0.1], "cov": [[variance]]},
+    )
+    values = np.array([[0.3, -0.2], [0.1, 0.4], [-0.2, 0.1]]) * np.sqrt(min(step, 1.0))
+    record = zakai.Record(step * np.arange(1, 4), values, "increments")
+    result = zakai.filter(model, record, "general-direct")
+    assert np.isfinite(result.mean).all() and np.isfinite(result.log_likelihood) and (result.variance > 0).all()
+
+
+def test_a_row_without_readings_is_a_prediction_and_the_density_is_the_state_that_is_reported():
+    model = encoder()
+    times = np.arange(1, 11) * 0.1
+    _, record = zakai.simulate(model, times, seed=5)
+    values = record.values.copy()
+    values[4], values[6, 0] = np.nan, np.nan
+    record = zakai.Record(times, values, "samples")
+    result = zakai.filter(model, record, "general-direct")
+    mean, _ = errors(result, zakai.filter(model, record, "limited-direct"))
+    assert mean <= 0.05 and result.log_likelihood_increments[5] == pytest.approx(0.0, abs=1e-12)
+    density = result.density(-1)
+    assert np.allclose(density.mean(), result.mean[-1]) and np.allclose(density.cov(), result.cov[-1])
+
+
+def test_the_gradient_of_the_log_likelihood_is_its_slope():
+    from zakai.filters.likelihood import log_likelihood
+
+    model = encoder(observation_noise=[["r**2", "0"], ["0", "r**2"]], parameters={"r": 0.2})
+    _, record = zakai.simulate(model, np.arange(1, 9) * 0.1, seed=3)
+    value = log_likelihood(model, record, "general-direct")
+    slope = jax.grad(value)(model.theta())
+    step = 1e-6
+    expected = (value(model.theta() + step) - value(model.theta() - step)) / (2 * step)
+    assert slope == pytest.approx(np.array([expected]), rel=1e-4)
+
+
+def test_wrong_options_and_systems_outside_the_class_are_refused_in_one_line():
+    model = encoder()
+    record = zakai.Record(np.array([0.1]), np.zeros((1, 2)), "samples")
+    for options, word in (({"reduction": "none"}, "reduction"), ({"components": 0}, "components"), ({"tolerance": 2}, "toler")):
+        with pytest.raises(InputError, match=word):
+            zakai.filter(model, record, "general-direct", **options)
+    with pytest.raises(InputError, match="n <= 1"):
+        zakai.filter(model, record, "general-direct", reduction="algorithm-1")
+    cubic, spiral = zakai.load_model("gallery:cubic-sensor"), zakai.load_model("gallery:spiral-sensor")
+    with pytest.raises(ConditionError, match="quadratic"):
+        zakai.filter(cubic, zakai.Record(np.array([0.1]), np.zeros((1, 1)), "increments"), "general-direct")
+    with pytest.raises(ConditionError, match="depends on t"):
+        zakai.filter(spiral, zakai.Record(np.array([0.1]), np.zeros((1, 2)), "increments"), "gaussian-sum")
