@@ -50,7 +50,7 @@ METHODS = {
     ),
 }
 # What "auto" tries, most exact and cheapest first.
-AUTO = ("kalman-bucy", "benes", "hu-yau", "limited-direct")
+AUTO = ("kalman-bucy", "benes", "hu-yau", "limited-direct", "general-direct")
 
 
 def load(name: str) -> Any:
