@@ -41,7 +41,9 @@ def main() -> None:
     for name, options in WAYS.items():
         results[name] = [zakai.filter(model, record, "general-direct", **options) for record in records]
         figures[name] = squared_error(results[name], states)
-        print(f"{name:28s} {figures[name]:.4f}  ({100 * (figures[name] / figures['exact'] - 1):+.2f} %)", flush=True)
+        away = np.sqrt(squared_error(results[name], np.stack([result.mean[:, 0] for result in exact])))
+        percent = 100 * (figures[name] / figures["exact"] - 1)
+        print(f"{name:28s} {figures[name]:.4f}  ({percent:+.2f} %), {away:.3f} from the exact mean (rms)", flush=True)
     print(json.dumps(figures))
     if given.picture:
         draw(given.picture, exact, results["algorithm-1, alpha = 0.1"], states)
