@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from scipy.optimize import minimize
 
+from zakai import _float64  # noqa: F401
 from zakai.errors import InputError
 from zakai.filters.driver import filter as run_filter
 from zakai.filters.likelihood import chosen_parameters, replayed

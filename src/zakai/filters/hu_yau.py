@@ -17,6 +17,7 @@ from typing import Any
 import jax.numpy as jnp
 import sympy as sp
 
+from zakai import _float64  # noqa: F401
 from zakai.algebra.exact_theorems import hu_yau as theorem
 from zakai.algebra.gauges import affine_system
 from zakai.algebra.identities import all_zero

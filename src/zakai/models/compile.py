@@ -13,6 +13,7 @@ import jax  # isort: skip
 import jax.numpy as jnp  # isort: skip
 import numpy as np
 
+from zakai.models import _trigonometry
 from zakai.models._program import operations
 from zakai.models.numeric import flattened, program_of
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from zakai.models.model import Model
 
 JaxFunction = Callable[[Any, Any, Any], jax.Array]
-_JAX = operations(jnp, jax.scipy.special.erf)
+_JAX = operations(jnp, jax.scipy.special.erf, sin=_trigonometry.sin, cos=_trigonometry.cos)
 
 
 def jax_function(expressions: Any, model: Model, shape: Sequence[int] | None = None) -> JaxFunction:
