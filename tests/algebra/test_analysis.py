@@ -26,7 +26,7 @@ def test_eta_of_benes_is_quadratic_whatever_the_functions():
     (x,) = analysis.model.x
     assert analysis.eta == x**2 + 1 == analysis.q  # tanh^2 + sech^2 + x^2
     assert analysis.yau_form.potential == sp.log(sp.cosh(x))
-    assert analysis.recommended == "limited-direct"
+    assert analysis.recommended == "benes"
 
 
 def test_a_singular_covariance_leaves_omega_and_eta_undefined_and_says_so():
@@ -82,5 +82,5 @@ def test_a_model_without_prior_or_with_undetermined_functions_is_analysed():
 
 def test_a_recommendation_for_a_model_without_prior_says_what_is_missing():
     analysis = zakai.analyze(zakai.Model(state=["x"], drift=["-x"], observation=["x"]))
-    assert analysis.recommended == "limited-direct"
+    assert analysis.recommended == "kalman-bucy"
     assert "needs a prior" in str(analysis)

@@ -72,7 +72,7 @@ def test_methods_lists_every_method_and_says_which_hold(zakai):
     assert all(name in zakai("methods").out for name in (*_registry.METHODS, *_registry.AUTO))
     answer = zakai("methods", "gallery:cubic-sensor").out
     assert "fails: " in answer and "x**6" in answer and "auto takes: none" in answer
-    assert "auto takes: limited-direct" in zakai("methods", "gallery:benes").out
+    assert "auto takes: benes" in zakai("methods", "gallery:benes").out
 
 
 def test_gallery_lists_every_model_and_prints_one(zakai, tmp_path):

@@ -122,3 +122,5 @@ def test_every_link_inside_the_repository_leads_somewhere(name):
 def test_every_misprint_of_the_errata_has_its_test():
     tests = set(re.findall(r"^def (test_\w+)", (ROOT / "tests/errata/test_printed_formulas.py").read_text(), re.MULTILINE))
     assert {row[3] for row in table("docs/limited-direct.md", "where")} == tests
+    later = set(re.findall(r"^def (test_\w+)", (ROOT / "tests/errata/test_hu_yau_printed.py").read_text(), re.MULTILINE))
+    assert {row[3] for row in table("docs/kalman-bucy-benes-hu-yau.md", "where")} <= later

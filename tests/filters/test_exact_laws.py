@@ -53,7 +53,7 @@ def test_one_state_with_two_sensors_gaps_and_irregular_times_is_kalman_and_bucy(
     )
     times = np.array([0.05, 0.11, 0.2, 0.22, 0.4, 0.47])
     dy = np.array([[0.3, -0.1], [np.nan, 0.2], [0.1, 0.4], [np.nan, np.nan], [0.2, np.nan], [-0.3, 0.1]])
-    result = zakai.filter(model, zakai.Record(times, dy, "increments"))
+    result = zakai.filter(model, zakai.Record(times, dy, "increments"), "limited-direct")
     expected = kalman_bucy(
         times,
         dy,
@@ -73,7 +73,7 @@ def test_two_states_are_kalman_and_bucy():
     model = zakai.load_model("gallery:kalman-bucy-2d")
     times = 0.05 * np.arange(1, 9)
     dy = 0.1 * np.cos(np.arange(8))[:, None]
-    result = zakai.filter(model, zakai.Record(times, dy, "increments"))
+    result = zakai.filter(model, zakai.Record(times, dy, "increments"), "limited-direct")
     omega, zeta = 1.5, 0.1
     expected = kalman_bucy(
         times,
@@ -92,14 +92,14 @@ def test_two_states_are_kalman_and_bucy():
 
 def test_an_observation_far_beyond_the_prediction_is_said():
     model = zakai.load_model("gallery:kalman-bucy-1d")
-    result = zakai.filter(model, zakai.Record([0.01, 0.02], [[1e6], [0.0]], "increments"))
+    result = zakai.filter(model, zakai.Record([0.01, 0.02], [[1e6], [0.0]], "increments"), "limited-direct")
     assert any("surprise" in warning and "t = 0.01" in warning for warning in result.warnings)
 
 
 def test_a_long_interval_is_taken_in_parts_and_agrees_with_many_short_ones():
     model = zakai.load_model("gallery:kalman-bucy-1d")
-    long = zakai.filter(model, zakai.Record([40.0], [[0.0]], "increments"))
-    short = zakai.filter(model, zakai.Record(np.arange(1.0, 41.0), np.zeros((40, 1)), "increments"))
+    long = zakai.filter(model, zakai.Record([40.0], [[0.0]], "increments"), "limited-direct")
+    short = zakai.filter(model, zakai.Record(np.arange(1.0, 41.0), np.zeros((40, 1)), "increments"), "limited-direct")
     assert long.mean[-1] == pytest.approx(short.mean[-1], abs=1e-10)
     assert long.cov[-1] == pytest.approx(short.cov[-1], abs=1e-10)
     assert long.log_likelihood == pytest.approx(short.log_likelihood, abs=1e-8)
