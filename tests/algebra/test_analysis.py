@@ -33,7 +33,7 @@ def test_a_singular_covariance_leaves_omega_and_eta_undefined_and_says_so():
     analysis = zakai.analyze(zakai.load_model("gallery:falling-body"))
     assert analysis.omega is None and analysis.eta is None
     assert "singular" in str(analysis)
-    assert analysis.recommended is None
+    assert analysis.recommended == "kalman-bucy"
 
 
 @pytest.mark.parametrize(
