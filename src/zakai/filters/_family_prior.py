@@ -170,8 +170,11 @@ class _GaussianPlan:
         self.tilted: int | None = None
         low, high = (self.centre[0] - _REACH * np.sqrt(spread[0, 0]), self.centre[0] + _REACH * np.sqrt(spread[0, 0]))
         if self.bend is not None and wide.any():
+            ends = (low, high)
             low, high = self._split(float(self.centre[0]), float(np.sqrt(spread[0, 0])))
-            if not self.bend[0] < high or not low < self.bend[1]:
+            if not self.levels and low < self.bend[1] and high > self.bend[0]:
+                low, high = ends
+            elif not self.bend[0] < high or not low < self.bend[1]:
                 self.tilted, self.lattice, self.error = (0 if high <= self.bend[0] else 1), None, 0.0
                 return
         if functions.count == 1:
@@ -212,16 +215,22 @@ class _GaussianPlan:
 
     def _split(self, mean: float, width: float) -> tuple[float, float]:
         """The levels of a component that is wide against the bend, and the ends of what is left to the last lattice."""
-        low, high = mean - _REACH * width, mean + _REACH * width
+        low, high = mean - self._margin(width), mean + self._margin(width)
         assert self.bend is not None
         while width * self.gap > 8.0 and low < self.bend[1] and high > self.bend[0]:
             before, width = width, width / _NARROWER
             cell = _CELL * before
-            points = np.arange(np.floor(low / cell), np.ceil(high / cell) + 1) * cell
-            near = (points + _REACH * width > self.bend[0]) & (points - _REACH * width < self.bend[1])
+            reach = (mean - _REACH * before, mean + _REACH * before) if not self.levels else (low, high)
+            points = np.arange(np.floor(reach[0] / cell), np.ceil(reach[1] / cell) + 1) * cell
+            near = (points + self._margin(width) > self.bend[0]) & (points - self._margin(width) < self.bend[1])
             self.levels.append(_Level(points, cell, width, near))
             low, high = points[near][0] - _REACH * width, points[near][-1] + _REACH * width
+            low, high = min(low, self.bend[0]), max(high, self.bend[1])
         return low, high
+
+    def _margin(self, width: float) -> float:
+        """How far from the bend a Gaussian must be for one exponential to be all of e^phi in it, tilted by the others too."""
+        return max(_REACH * width, 0.5 * self.gap * width**2)
 
     def _potential(self, tilts: Tilts, theta: Any) -> Callable[[Any], Any]:
         def phi(z):
