@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 import sympy
-from sympy import Function, Matrix, Symbol, diff, exp, symbols
+from sympy import Function, Matrix, Symbol, symbols
 
 import zakai
 from zakai.filters import _one_shot

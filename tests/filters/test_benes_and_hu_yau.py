@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from references.dmz import dmz
-from references.kolmogorov import Box
 
 import zakai
+from references.dmz import dmz
+from references.kolmogorov import Box
 from zakai.errors import InputError
 
 G = np.array([[1.0, 0.3], [0.3, 0.6]])

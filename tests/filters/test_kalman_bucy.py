@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
-from filters.test_exact_laws import assert_agrees, kalman_bucy
 
 import zakai
+from filters.test_exact_laws import assert_agrees, kalman_bucy
 
 
 def linear_model(n, m, rng, rank, prior):
