@@ -157,7 +157,8 @@ def test_options_that_do_not_fit_are_refused(options, words):
 
 
 def test_theorem_6_needs_a_symmetric_matrix():
-    model = zakai.Model(state=["x", "y"], drift=["y", "-x/2"], observation=["x"], prior={"kind": "gaussian", "mean": [0, 0], "cov": [1, 1]})
+    prior = {"kind": "gaussian", "mean": [0, 0], "cov": [1, 1]}
+    model = zakai.Model(state=["x", "y"], drift=["y", "-x/2"], observation=["x"], prior=prior)
     with pytest.raises(InputError, match="symmetric"):
         zakai.filter(model, zakai.Record([0.1], [[0.0]], "increments"), "hu-yau", choice="theorem-6")
 
