@@ -29,7 +29,8 @@ def test_a_simulated_record_is_filtered_into_a_result_and_a_report(zakai, tmp_pa
 
 
 def test_the_command_and_the_function_give_the_same_numbers(zakai):
-    assert zakai("filter", "model.toml", "record.csv", "-o", "r.nc", "--method", "limited-direct", "--option", "splitting=strang").code == 0
+    options = ("--method", "limited-direct", "--option", "splitting=strang")
+    assert zakai("filter", "model.toml", "record.csv", "-o", "r.nc", *options).code == 0
     model = package.load_model("model.toml")
     direct = package.filter(model, package.read_record("record.csv", model), "limited-direct")
     np.testing.assert_array_equal(package.load_result("r.nc").mean, direct.mean)

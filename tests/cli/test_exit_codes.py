@@ -54,7 +54,8 @@ def test_wrong_usage_is_one_line_and_code_2(zakai, tmp_path, arguments):
 
 
 def test_an_unknown_option_is_answered_with_those_that_there_are(zakai):
-    error = zakai("filter", "model.toml", "record.csv", "-o", "result.nc", "--method", "limited-direct", "--option", "kernal=1").err
+    command = ("filter", "model.toml", "record.csv", "-o", "result.nc", "--method", "limited-direct", "--option", "kernal=1")
+    error = zakai(*command).err
     assert all(word in error for word in ("kernal", "kernel", "splitting", "order"))
 
 
