@@ -26,7 +26,6 @@ from zakai.algebra.systems import (
 from zakai.algebra.yau import YauForm, inverse, short
 from zakai.models.model import Model
 
-
 _SURVEY = "Chen and Dong, survey of direct methods"
 
 @lru_cache(maxsize=64)
