@@ -48,12 +48,13 @@ class GaussianMixture:
         for rows in self._shared():
             cov, means, weights = self.covs[rows.start], self.means[rows], self.weights[rows]
             factor = np.linalg.cholesky(cov)
+            whiten = solve_triangular(factor, np.eye(len(cov)), lower=True)  # once, for many points
             with np.errstate(divide="ignore"):
                 constants = np.log(np.abs(weights)) - np.sum(np.log(np.diag(factor))) - 0.5 * len(cov) * np.log(2 * np.pi)
             for winding in self._windings(cov):
                 difference = self._difference(points[:, None], means) + winding
-                white = solve_triangular(factor, difference.reshape(-1, len(cov)).T, lower=True)
-                logs.append(constants - 0.5 * np.sum(white**2, axis=0).reshape(len(points), len(means)))
+                white = difference @ whiten.T
+                logs.append(constants - 0.5 * np.sum(white**2, axis=-1))
                 signs.append(np.broadcast_to(np.sign(weights), logs[-1].shape))
         with np.errstate(divide="ignore"):
             value, sign = logsumexp(np.hstack(logs), axis=1, b=np.hstack(signs), return_sign=True)
