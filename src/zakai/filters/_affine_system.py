@@ -26,17 +26,20 @@ from zakai.errors import InputError
 from zakai.filters._formulas import Formulas
 from zakai.filters._protocol import Schedule
 from zakai.kolmogorov.flow import MOST_IMPLICIT, Coefficients, Flow, flows, substeps_for
+from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 from zakai.models.compile import jax_function
 from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
 
 # No flow may grow by more than about e^4, lest it lose digits.
 _GROWTH = 4.0
 
 
 class Matrices:
-    """Matrices of time and parameters as one JAX function: few functions of t, each times a table of numbers.
+    """Matrices of time and parameters as one function: few functions of t, each times a table of numbers.
 
-    A system of a hundred states has ten thousand entries, but seldom more than some functions of time.
+    A system of a hundred states has ten thousand entries, but seldom more than some functions of time.  It is NumPy for NumPy
+    arguments, of which t may be an array (...), and JAX for JAX arguments, of which t is a scalar.
     """
 
     def __init__(self, blocks: Sequence[sp.MatrixBase], model: Model):
@@ -53,13 +56,15 @@ class Matrices:
         self.table = np.zeros((max(len(found), 1), len(entries)))
         np.add.at(self.table, (columns, places), numbers)
         self.varying = any(model.t in function.free_symbols for function in found)
-        self._functions = jax_function(list(found) or [sp.Integer(0)], model)
+        functions = list(found) or [sp.Integer(0)]
+        self._functions = {jnp: jax_function(functions, model), np: numpy_function(functions, model)}
         self._origin = np.zeros(model.n)
 
-    def __call__(self, t: Any, theta: Any) -> list[jax.Array]:
-        flat = self._functions(self._origin, t, theta) @ self.table
-        sizes = np.cumsum([rows * columns for rows, columns in self.shapes])
-        return [part.reshape(shape) for part, shape in zip(jnp.split(flat, sizes[:-1]), self.shapes, strict=True)]
+    def __call__(self, t: Any, theta: Any) -> list[Any]:
+        xp = numpy_or_jax(t, theta)
+        flat = self._functions[xp](self._origin, t, theta) @ self.table
+        parts = xp.split(flat, np.cumsum([rows * columns for rows, columns in self.shapes])[:-1], axis=-1)
+        return [part.reshape(*flat.shape[:-1], *shape) for part, shape in zip(parts, self.shapes, strict=True)]
 
 
 class AffineSystem:
@@ -95,9 +100,9 @@ class AffineSystem:
         return None
 
     def observation(self, t: Any, theta: Any) -> tuple[Any, Any]:
-        """C (m, n) and c (m,) at time t."""
+        """C (m, n) and c (m,) at time t; NumPy for NumPy arguments, of which t may be an array."""
         slope, intercept = self._observation(t, theta)
-        return slope, intercept[:, 0]
+        return slope, intercept[..., 0]
 
 
 @lru_cache(maxsize=32)

@@ -260,7 +260,7 @@ def _on_lattice(model: Model, gauge: GaugeFunctions, theta: Any, time: Any, fami
     covs = np.broadcast_to(np.asarray(families.cov)[:, None], (*weights.shape, model.n, model.n))
     used, mass = weights != 0.0, weights.sum()
     bare = GaussianMixture(weights[used] / mass, means[used], covs[used], model.state, (False,) * model.n)
-    potential = np.asarray(gauge.compiled(jnp.asarray(x), time, theta)[0])
+    potential = np.asarray(gauge.potential(x, time, theta))
     log_values = bare.log_density(x) + potential
     total = log_values.max() + np.log(np.exp(log_values - log_values.max()).sum() * abs(np.linalg.det(basis)))
     return GridDensity(log_values - total, np.asarray(found.mean), basis, model.state, (False,) * model.n)

@@ -7,7 +7,7 @@ written as a sum of narrower ones, level by level: their weights, themselves Gau
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -21,8 +21,10 @@ from zakai.filters._gauge import GaugeFunctions, Tilts, lifted
 from zakai.filters._lattice_choice import features, first_lattice
 from zakai.kolmogorov.families import Family, gaussian
 from zakai.kolmogorov.nodes import NodeLattice, resolve, signed_logs
+from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 from zakai.models.compile import jax_field
 from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior, GaussianPrior
 
 TOLERANCE = 1e-12
@@ -42,12 +44,6 @@ class Prior(NamedTuple):
     error: float
 
 
-def _values(functions: GaugeFunctions, model: Model, x: Any, theta: Any) -> Any:
-    """phi at x (N, n), at the start."""
-    value = functions.compiled(x, model.start, theta)[0]
-    return value if _space(value) is jnp else np.asarray(value)
-
-
 class Nodes(NamedTuple):
     """A part of v_0(z): nodes z (N, k), their covariance W (k, k), log |w|, signs, and what `Prior` holds."""
 
@@ -59,20 +55,11 @@ class Nodes(NamedTuple):
     edge: Any
 
 
-def _space(*arrays: Any) -> Any:
-    """NumPy where nothing is traced: the shapes are many and not worth a compilation each."""
-    return jnp if any(isinstance(a, jax.core.Tracer) for a in jax.tree.leaves(arrays)) else np
-
-
 def _log_sum(logs: Any) -> Any:
     """log sum exp over the last axis."""
-    xp = _space(logs)
+    xp = numpy_or_jax(logs)
     top = jax.lax.stop_gradient(xp.max(logs, axis=-1)) if xp is jnp else np.max(logs, axis=-1)
     return top + xp.log(xp.sum(xp.exp(logs - top[..., None]), axis=-1))
-
-
-def _plain(tilts: Tilts) -> Tilts:
-    return tilts if _space(tilts) is jnp else Tilts(*[None if a is None else np.asarray(a) for a in tilts])
 
 
 def prior_families(functions: GaugeFunctions, model: Model, prior: Any, theta: Any) -> Prior:
@@ -84,38 +71,43 @@ def prior_families(functions: GaugeFunctions, model: Model, prior: Any, theta: A
     else:
         components = list(zip(np.log(prior.weights), prior.means, prior.covs, strict=True))
     if functions.trivial:
-        made = [gaussian(mean, cov)._replace(log_mass=jnp.asarray(weight)) for weight, mean, cov in components]
-        families = jax.tree.map(lambda *parts: jnp.stack(parts), *made)
+        made = [gaussian(mean, cov)._replace(log_mass=np.asarray(weight)) for weight, mean, cov in components]
+        families = jax.tree.map(lambda *parts: np.stack(parts), *made)
         return Prior(families, np.full((len(made), 1), -np.inf), np.zeros((len(made), 1)), 0.0)
-    own = _plain(functions.at(model.start, model.theta()))
-    tilts = _plain(functions.at(model.start, theta))
+    own, tilts = functions.at(model.start, model.theta()), functions.at(model.start, theta)
+    tilts = tilts._replace(directions=_like(own.directions, tilts.directions))
     parts, worst = [], 0.0
     for weight, mean, cov in components:
-        plan = _GaussianPlan(functions, model, np.asarray(own.directions), own, mean, cov)
+        plan = _GaussianPlan(functions, model, own, mean, cov)
         worst = max(worst, plan.error)
         for nodes in plan.nodes(tilts, theta):
-            parts.append((_conditional(tilts.directions, mean, cov, nodes, plan.centre, weight), nodes))
+            parts.append((_conditional(plan, tilts.directions, nodes, weight), nodes))
     return _joined(parts, worst)
 
 
-def _conditional(directions: Any, mean: Any, cov: Any, nodes: Nodes, centre: np.ndarray, log_mass: Any) -> Family:
+def _like(own: np.ndarray, directions: Any) -> Any:
+    """Directions that span the same as `directions`, along which a state moves like along `own`."""
+    if numpy_or_jax(directions) is np:
+        return directions
+    return jnp.linalg.solve(directions @ np.linalg.pinv(own), directions)
+
+
+def _conditional(plan: _GaussianPlan, directions: Any, nodes: Nodes, log_mass: Any) -> Family:
     """The family of sum_i w_i N(z; z_i, W) N(x | z), x given z being that of N(mean, cov)."""
-    across = cov @ directions.T
-    inner = directions @ across
-    singular = not isinstance(inner, jax.core.Tracer) and np.linalg.matrix_rank(inner) < len(inner)
-    gain = across @ (np.linalg.pinv(inner) if singular else jnp.linalg.inv(inner))
+    gain = plan.gain(directions)
+    centre = directions @ plan.mean
+    narrowed = plan.cov - gain @ (directions @ plan.cov @ directions.T - nodes.cov) @ gain.T
     k = len(centre)
-    narrowed = cov - gain @ (inner - nodes.cov) @ gain.T
     return Family(
         nodes.points - centre,
         nodes.log_weights,
         nodes.signs,
-        mean + gain @ (centre - directions @ mean),
+        plan.mean,
         0.5 * (narrowed + narrowed.T),
         gain,
-        jnp.zeros(k),
-        jnp.zeros((k, k)),
-        jnp.asarray(log_mass, float),
+        np.zeros(k),
+        np.zeros((k, k)),
+        np.asarray(log_mass, float),
     )
 
 
@@ -124,18 +116,20 @@ def _joined(parts: list[tuple[Family, Nodes]], error: float) -> Prior:
     most = max(len(family.log_weights) for family, _ in parts)
 
     def padded(array, value):
-        return jnp.concatenate([jnp.asarray(array), jnp.full((most - len(array), *jnp.shape(array)[1:]), value)])
+        return numpy_or_jax(array).concatenate([array, np.full((most - len(array), *np.shape(array)[1:]), value)])
+
+    def stack(*arrays):
+        return numpy_or_jax(*arrays).stack(arrays)
 
     families = [
         family._replace(
-            nodes=padded(family.nodes, 0.0), log_weights=padded(family.log_weights, -jnp.inf), signs=padded(family.signs, 1.0)
+            nodes=padded(family.nodes, 0.0), log_weights=padded(family.log_weights, -np.inf), signs=padded(family.signs, 1.0)
         )
         for family, _ in parts
     ]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf, float) for leaf in leaves]), *families)
-    log_error = jnp.stack([padded(nodes.log_error, -jnp.inf) for _, nodes in parts])
-    edge = jnp.stack([padded(nodes.edge, 0.0) for _, nodes in parts])
-    return Prior(stacked, log_error, edge, error)
+    log_error = stack(*[padded(nodes.log_error, -np.inf) for _, nodes in parts])
+    edge = stack(*[padded(nodes.edge, 0.0) for _, nodes in parts])
+    return Prior(jax.tree.map(stack, *families), log_error, edge, error)
 
 
 def _edge(sizes: tuple[int, ...]) -> np.ndarray:
@@ -156,10 +150,11 @@ class _Level:
 
 
 class _GaussianPlan:
-    """Where the nodes of one Gaussian component are, decided for the model's own parameters."""
+    """Where the nodes of one Gaussian component are, decided for the model's own parameters; they move with D mean."""
 
-    def __init__(self, functions: GaugeFunctions, model: Model, directions: np.ndarray, tilts: Tilts, mean, cov):
+    def __init__(self, functions: GaugeFunctions, model: Model, tilts: Tilts, mean: np.ndarray, cov: np.ndarray):
         self.functions, self.model, self.mean, self.cov = functions, model, mean, cov
+        directions = tilts.directions
         self.centre = directions @ mean
         spread = directions @ cov @ directions.T
         values, vectors = np.linalg.eigh(spread)
@@ -187,8 +182,8 @@ class _GaussianPlan:
             origin = self.centre - basis @ np.where(wide, 20.0, 0.0)
         scale = self._potential(tilts, model.theta())
         self.lattice, self.error = resolve(
-            lambda z: np.asarray(self._log_u(z, tilts) - scale(z)),
-            lambda z: np.asarray(scale(z)),
+            lambda z: self._log_u(z, tilts) - scale(z),
+            scale,
             NodeLattice(origin, basis, sizes),
             TOLERANCE,
             _MOST_NODES[functions.count],
@@ -198,8 +193,7 @@ class _GaussianPlan:
 
     def _bend(self, tilts: Tilts) -> tuple[float, float]:
         """Outside of these z one exponential is all of e^phi, to 1e-16."""
-        along = np.asarray(tilts.slopes @ tilts.directions[0] / (tilts.directions[0] @ tilts.directions[0]))
-        logs = np.asarray(tilts.logs)
+        along, logs = _along(tilts), tilts.logs
         self.order = np.argsort(along)
         high = low = 0.0
         for side in (0, -1):
@@ -232,12 +226,25 @@ class _GaussianPlan:
         """How far from the bend a Gaussian must be for one exponential to be all of e^phi in it, tilted by the others too."""
         return max(_REACH * width, 0.5 * self.gap * width**2)
 
+    def gain(self, directions: Any) -> Any:
+        """What x follows z by, (n, k): P D'V (V'D P D'V)^-1 V', where V spans what has width."""
+        across = self.cov @ directions.T @ self.vectors
+        return across @ numpy_or_jax(across).linalg.inv(self.vectors.T @ directions @ across) @ self.vectors.T
+
+    def _shift(self, tilts: Tilts) -> Any:
+        """By how much the nodes are elsewhere than for the model's own parameters."""
+        return tilts.directions @ self.mean - self.centre
+
     def _potential(self, tilts: Tilts, theta: Any) -> Callable[[Any], Any]:
         def phi(z):
+            if self.vectors.shape[1] < len(z[0]):
+                # Where z has no width there may be no x; that of the mean is meant.
+                centre = tilts.directions @ self.mean
+                z = centre + (z - centre) @ self.gain(tilts.directions).T @ tilts.directions.T
             x = lifted(tilts.directions, z)
             if self.functions.exact:
                 return _log_sum(x @ tilts.slopes.T + tilts.logs)
-            return _values(self.functions, self.model, x, theta)
+            return self.functions.potential(x, self.model.start, theta)
 
         return phi
 
@@ -247,102 +254,102 @@ class _GaussianPlan:
         points, logs = (directions @ self.mean)[None], np.zeros(1)
         cov = self.vectors.T @ (directions @ self.cov @ directions.T) @ self.vectors
         for level in self.levels:
-            logs = self._weights(level, points, logs, cov)[level.near]
-            points, cov = level.points[level.near][:, None], np.array([[level.width**2]])
+            logs = self._weights(level, self._shift(tilts), points, logs, cov)[level.near]
+            points, cov = level.points[level.near][:, None] + self._shift(tilts), np.array([[level.width**2]])
         return points, logs, cov
 
-    def _weights(self, level: _Level, points: Any, logs: Any, cov: Any) -> Any:
-        """The log-weights of a level's Gaussians."""
+    def _weights(self, level: _Level, shift: Any, points: Any, logs: Any, cov: Any) -> Any:
+        """The log-weights of a level's Gaussians, of those at `points` that they make up."""
         variance = cov[0, 0] - level.width**2
-        away = level.points[:, None] - points[:, 0]
-        each = logs - 0.5 * away**2 / variance - 0.5 * _space(variance).log(2 * np.pi * variance)
+        away = (level.points + shift)[:, None] - points[:, 0]
+        each = logs - 0.5 * away**2 / variance - 0.5 * numpy_or_jax(variance).log(2 * np.pi * variance)
         return _log_sum(each) + np.log(level.cell)
 
     def _log_u(self, z: Any, tilts: Tilts) -> Any:
         points, logs, cov = self._source(tilts)
         if not len(cov):
             return np.zeros(len(z))
+        linalg = numpy_or_jax(cov).linalg
         away = (z[:, None] - points) @ self.vectors
-        each = logs - 0.5 * _space(away, cov).sum((away @ _space(cov).linalg.inv(cov)) * away, axis=-1)
-        return _log_sum(each) - 0.5 * _space(cov).linalg.slogdet(2 * np.pi * cov)[1]
+        each = logs - 0.5 * ((away @ linalg.inv(cov)) * away).sum(axis=-1)
+        return _log_sum(each) - 0.5 * linalg.slogdet(2 * np.pi * cov)[1]
 
-    def nodes(self, tilts: Tilts, theta: Any):
+    def nodes(self, tilts: Tilts, theta: Any) -> Iterator[Nodes]:
         """The parts of v_0(z) for the parameters theta."""
+        shift = self._shift(tilts)
         points, logs = (tilts.directions @ self.mean)[None], np.zeros(1)
         cov = self.vectors.T @ (tilts.directions @ self.cov @ tilts.directions.T) @ self.vectors
         for number, level in enumerate(self.levels):
-            weights = self._weights(level, points, logs, cov)
+            weights = self._weights(level, shift, points, logs, cov)
+            points, logs, cov = (level.points + shift)[:, None], weights, np.array([[level.width**2]])
             edge = np.zeros(len(level.points))
             if number == 0:
                 edge[[0, 1, -2, -1]] = 1.0
             far = ~level.near
             if far.any():
-                yield self._tilted(tilts, level.points[far], weights[far], np.array([[level.width**2]]), edge[far])
-            points, logs, cov = level.points[level.near][:, None], weights[level.near], np.array([[level.width**2]])
+                left = level.points[far] < 0.5 * sum(self.bend)
+                which = np.where(left, self.order[0], self.order[-1])
+                yield self._tilted(tilts, points[far], logs[far], cov, which, edge[far])
+            points, logs = points[level.near], logs[level.near]
         if self.lattice is None:
-            yield self._tilted(tilts, points[:, 0], logs, cov, np.zeros(len(points)))
+            which = self.order[[0 if self.tilted == 0 else -1]]
+            yield self._tilted(tilts, points, logs, cov, which, np.zeros(1))
             return
-        z = self.lattice.points()
+        z = self.lattice.points() + shift
         phi = self._potential(tilts, theta)(z)
         log_u = self._log_u(z, tilts)
-        logs = log_u - phi
-        top = jax.lax.stop_gradient(jnp.max(logs))
-        log_weights, signs = signed_logs(self.lattice.weights(jnp.exp(logs - top)))
-        cell = np.log(np.abs(np.linalg.det(self.lattice.basis)))
-        log_error = np.log(max(self.error, 1e-16)) + jnp.max(log_u) - phi + cell
         edge = _edge(self.lattice.sizes) * (not self.levels)
-        yield Nodes(z, self.lattice.covariance, log_weights + top, signs, log_error, edge)
+        yield _represented(self.lattice, z, log_u, phi, self.error, edge)
 
-    def _tilted(self, tilts: Tilts, points: Any, log_weights: Any, cov: Any, edge: np.ndarray) -> Nodes:
-        """Gaussians that lie where one exponential is all of e^phi: e^{-q z} N(z; s, W) / c."""
-        assert self.bend is not None
-        left = np.asarray(jax.lax.stop_gradient(self.lattice is None and self.tilted == 0 and not self.levels))
-        if self.levels and len(edge) != 1:
-            left = np.asarray(points) < 0.5 * (self.bend[0] + self.bend[1])
-        which = np.where(np.broadcast_to(left, (len(edge),)), self.order[0], self.order[-1])
-        along = (tilts.slopes @ tilts.directions[0] / (tilts.directions[0] @ tilts.directions[0]))[which]
-        variance = cov[0, 0]
-        logs = log_weights - along * points + 0.5 * along**2 * variance - tilts.logs[which]
+    def _tilted(self, tilts: Tilts, points: Any, log_weights: Any, cov: Any, which: np.ndarray, edge: np.ndarray) -> Nodes:
+        """Gaussians that lie where one exponential, `which`, is all of e^phi: e^{-q z} N(z; s, W) / c."""
+        along, variance = _along(tilts)[which], cov[0, 0]
+        logs = log_weights - along * points[:, 0] + 0.5 * along**2 * variance - tilts.logs[which]
         nothing = np.full(len(edge), -np.inf)
-        return Nodes((points - along * variance)[:, None], cov, logs, np.ones(len(edge)), nothing, edge)
+        return Nodes(points - (along * variance)[:, None], cov, logs, np.ones(len(edge)), nothing, edge)
+
+
+def _along(tilts: Tilts) -> Any:
+    """The slopes (K,) in z, of one direction."""
+    return tilts.slopes @ tilts.directions[0] / (tilts.directions[0] @ tilts.directions[0])
+
+
+def _represented(lattice: NodeLattice, z: Any, log_u: Any, phi: Any, error: float, edge: np.ndarray) -> Nodes:
+    """The nodes of u e^-phi from both at the points z of a lattice."""
+    logs = log_u - phi
+    xp = numpy_or_jax(logs)
+    top = jax.lax.stop_gradient(xp.max(logs)) if xp is jnp else np.max(logs)
+    log_weights, signs = signed_logs(lattice.weights(xp.exp(logs - top)))
+    cell = np.log(np.abs(np.linalg.det(lattice.basis)))
+    log_error = np.log(max(error, 1e-16)) + xp.max(log_u) - phi + cell
+    return Nodes(z, lattice.covariance, log_weights + top, signs, log_error, edge)
 
 
 def _from_density(functions: GaugeFunctions, model: Model, prior: DensityPrior, theta: Any) -> Prior:
     """Nodes in all coordinates."""
-    density = jax_field([prior.log_density], model)
-    found, _ = first_lattice(model, prior, None)
-    logs = np.asarray(found.log_values)
-    basis, sizes = np.asarray(found.basis), np.array(logs.shape)
-    origin = np.asarray(found.centre) - basis @ (sizes // 2)
+    with jax.ensure_compile_time_eval():
+        found, _ = first_lattice(model, prior, None)
+        logs, basis, centre = (np.asarray(array) for array in (found.log_values, found.basis, found.centre))
+    sizes = np.array(logs.shape)
     # As many cells as the narrowest feature asks for.
     finer = np.clip(np.minimum(features(logs[None])[0], 1e3) / 2.5, 0.1, 1e3)
     cells = np.maximum(np.ceil((sizes - 1) / finer), 8).astype(int)
-    lattice = NodeLattice(origin, basis * ((sizes - 1) / cells), tuple(int(c) + 1 for c in cells))
+    lattice = NodeLattice(centre - basis @ (sizes // 2), basis * ((sizes - 1) / cells), tuple(int(c) + 1 for c in cells))
+    field, function = jax_field([prior.log_density], model), numpy_function(prior.log_density, model)
 
     def log_u(z, values):
-        return density(z, model.start, values)[0]
+        return function(z, model.start, values) if numpy_or_jax(values) is np else field(z, model.start, values)[0]
 
     def phi(z, values):
-        return np.zeros(z.shape[:-1]) if functions.trivial else _values(functions, model, z, values)
+        return np.zeros(z.shape[:-1]) if functions.trivial else functions.potential(z, model.start, values)
 
     own = model.theta()
     lattice, error = resolve(
-        lambda z: np.asarray(log_u(z, own) - phi(z, own)),
-        lambda z: np.asarray(phi(z, own)),
-        lattice,
-        TOLERANCE,
-        _MOST_NODES[model.n],
+        lambda z: log_u(z, own) - phi(z, own), lambda z: phi(z, own), lattice, TOLERANCE, _MOST_NODES[model.n]
     )
     z = lattice.points()
-    logs = log_u(z, theta) - phi(z, theta)
-    top = jax.lax.stop_gradient(jnp.max(logs))
-    log_weights, signs = signed_logs(lattice.weights(jnp.exp(logs - top)))
-    cell = np.log(np.abs(np.linalg.det(lattice.basis)))
-    log_error = np.log(max(error, 1e-16)) + jnp.max(log_u(z, theta)) - phi(z, theta) + cell
-    n = model.n
-    centre = z[len(z) // 2]
-    family = Family(
-        z - centre, log_weights, signs, centre, lattice.covariance, jnp.eye(n), jnp.zeros(n), jnp.zeros((n, n)), top
-    )
-    nodes = Nodes(z, lattice.covariance, log_weights, signs, log_error - top, _edge(lattice.sizes))
+    nodes = _represented(lattice, z, log_u(z, theta), phi(z, theta), error, _edge(lattice.sizes))
+    n, centre = model.n, z[len(z) // 2]
+    still = np.zeros(n), np.zeros((n, n)), np.zeros(())
+    family = Family(z - centre, nodes.log_weights, nodes.signs, centre, lattice.covariance, np.eye(n), *still)
     return _joined([(family, nodes)], error)

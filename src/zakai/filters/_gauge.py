@@ -21,15 +21,20 @@ from zakai.algebra.gauges import gauge
 from zakai.filters._affine_system import Matrices
 from zakai.filters._formulas import Formulas
 from zakai.kolmogorov.families import Family, log_terms
+from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 from zakai.models.compile import jax_field
 from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
 
 # Standard deviations to each side, and points, of the sums over a direction of a general gauge.
 _REACH, _POINTS = 9.0, {1: 145, 2: 49}
 
 
 class GaugeFunctions:
-    """phi and its exponentials as JAX functions of time and parameters; `exact` where e^phi is a sum of exponentials."""
+    """phi and its exponentials as functions of time and parameters; `exact` where e^phi is a sum of exponentials.
+
+    They are NumPy for NumPy arguments, and JAX for JAX arguments.
+    """
 
     def __init__(self, model: Model):
         form = gauge(model)
@@ -37,18 +42,22 @@ class GaugeFunctions:
         self.trivial = form.potential == 0
         self.exact = form.slopes is not None
         self.count = form.directions.rows
-        self.potential = jax_field([form.potential], model)
-        self.compiled = jax.jit(self.potential)
+        self._field, self._function = jax_field([form.potential], model), numpy_function(form.potential, model)
         blocks = [form.directions]
         if form.slopes is not None and form.coefficients is not None:
             blocks += [form.slopes, form.coefficients]
         self._matrices = Matrices(blocks, model)
 
+    def potential(self, x: Any, t: Any, theta: Any) -> Any:
+        """phi (...) at x (..., n)."""
+        return self._function(x, t, theta) if numpy_or_jax(x, t, theta) is np else self._field(x, t, theta)[0]
+
     def at(self, t: Any, theta: Any) -> Tilts:
         """The directions, slopes and coefficients at time t."""
         blocks = self._matrices(t, theta)
         slopes, coefficients = blocks[1:] if self.exact else (None, None)
-        return Tilts(blocks[0], slopes, None if coefficients is None else jnp.log(coefficients[:, 0]))
+        logs = None if coefficients is None else numpy_or_jax(coefficients).log(coefficients[..., 0])
+        return Tilts(blocks[0], slopes, logs)
 
 
 class Tilts(NamedTuple):
@@ -67,8 +76,7 @@ def gauge_of(of: Formulas) -> GaugeFunctions:
 
 def lifted(directions: Any, z: Any) -> Any:
     """A state x (..., n) with D x = z (..., k)."""
-    xp = jnp if isinstance(directions, jax.core.Tracer) else np
-    return z @ xp.linalg.solve(directions @ directions.T, directions)
+    return z @ numpy_or_jax(directions).linalg.solve(directions @ directions.T, directions)
 
 
 class Posterior(NamedTuple):
@@ -153,7 +161,6 @@ def _summed(functions: GaugeFunctions, tilts: Tilts, t: Any, theta: Any, familie
         along = jax.lax.linalg.triangular_solve(factor, across, left_side=False, lower=True, transpose_a=True)
         moved = points @ along.T
         x = family.mean + (family.nodes @ family.response.T)[:, None] + moved
-        (value,) = functions.potential(x, t, theta)
-        return family.mean + moved, family.cov - along @ along.T, value + log_weights
+        return family.mean + moved, family.cov - along @ along.T, functions.potential(x, t, theta) + log_weights
 
     return jax.vmap(one)(families)

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from zakai import _float64  # noqa: F401
 from zakai.kolmogorov.flow import Flow, motion
@@ -41,11 +42,8 @@ class Family(NamedTuple):
 def gaussian(mean: Array, cov: Array) -> Family:
     """The family of one node at N(mean, cov), which may be singular."""
     n = mean.shape[-1]
-    empty = jnp.zeros((n, 0))
-    zero = jnp.zeros(())
-    return Family(
-        jnp.zeros((1, 0)), jnp.zeros(1), jnp.ones(1), jnp.asarray(mean), jnp.asarray(cov), empty, empty[0], empty[:0], zero
-    )
+    empty = np.zeros((n, 0))
+    return Family(np.zeros((1, 0)), np.zeros(1), np.ones(1), mean, cov, empty, empty[0], empty[:0], np.zeros(()))
 
 
 def _solved(matrix: Array, right: Array) -> tuple[Array, Array]:

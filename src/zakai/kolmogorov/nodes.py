@@ -13,11 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from zakai import _float64  # noqa: F401
+from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 
 WIDTH = 1.25  # the standard deviation of a node, in cells: the sum of nodes of equal weight is flat to 1e-13
 
@@ -49,7 +47,7 @@ class NodeLattice:
     def weights(self, values: Any) -> Any:
         """The weights (N,) of v from its values (N,) at the points; pure."""
         shape = np.array(self.sizes)
-        xp = np if isinstance(values, np.ndarray) else jnp
+        xp = numpy_or_jax(values)
         array = xp.reshape(values, shape)
         for axis, size in enumerate(self.sizes):
             if size > 1:
@@ -126,7 +124,8 @@ def representation_error(log_values, log_scale, lattice: NodeLattice) -> float:
     return worst
 
 
-def signed_logs(weights: Any) -> tuple[jax.Array, jax.Array]:
+def signed_logs(weights: Any) -> tuple[Any, Any]:
     """log |w| and the sign of w; a weight of zero has the logarithm -inf, and no gradient."""
+    xp = numpy_or_jax(weights)
     zero = weights == 0
-    return jnp.where(zero, -jnp.inf, jnp.log(jnp.abs(jnp.where(zero, 1.0, weights)))), jnp.where(weights < 0, -1.0, 1.0)
+    return xp.where(zero, -xp.inf, xp.log(xp.abs(xp.where(zero, 1.0, weights)))), xp.where(weights < 0, -1.0, 1.0)

@@ -1,0 +1,95 @@
+"""The prior under a gauge: the mass of v_0 = e^-phi sigma_0 and its derivatives, against quadrature in plain NumPy."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import erf
+
+import zakai
+from zakai.filters._family_prior import prior_families
+from zakai.filters._formulas import formulas
+from zakai.filters._gauge import gauge_of
+from zakai.kolmogorov.families import log_terms
+
+LINE = ["a*tanh(a*x + b)"], lambda x, a, b: np.logaddexp(a * x[..., 0] + b, -a * x[..., 0] - b) - np.log(2)
+BENT = ["a*(2/sqrt(pi))*exp(-a**2*x**2)/(1 + b + erf(a*x))"], lambda x, a, b: np.log(1 + b + erf(a * x[..., 0]))
+TURNED = (
+    ["a*tanh(a*x + b*y)", "b*tanh(a*x + b*y)"],
+    lambda x, a, b: np.logaddexp(x @ [a, b], -x @ [a, b]) - np.log(2),
+)
+
+
+def gaussian(mean, cov):
+    return {"kind": "gaussian", "mean": mean, "cov": cov}
+
+
+MIXTURE = {"kind": "mixture", "weights": [0.6, 0.4], "means": [[-1.0], [1.2]], "covs": [[[0.16]], [[0.25]]]}
+DENSITY = {"kind": "density", "log_density": "-(x**2 - 1)**2"}
+
+
+def normal(x, mean, cov):
+    away = x - np.asarray(mean)
+    cov = np.asarray(cov)
+    return np.exp(-0.5 * np.einsum("...i,ij,...j", away, np.linalg.inv(cov), away)) / np.sqrt(np.linalg.det(2 * np.pi * cov))
+
+
+def mixture(x):
+    return 0.6 * normal(x, [-1.0], [[0.16]]) + 0.4 * normal(x, [1.2], [[0.25]])
+
+
+def line(half, count):
+    points = np.linspace(-half, half, count)
+    return points[:, None], points[1] - points[0]
+
+
+def plane():
+    points, cell = line(9.0, 361)
+    return np.stack(np.meshgrid(points[:, 0], points[:, 0], indexing="ij"), axis=-1).reshape(-1, 2), cell**2
+
+
+OBLIQUE = [[0.5, 0.2], [0.2, 0.4]]
+THIN = np.outer([0.6, -0.3], [0.6, -0.3])
+
+
+def thin():
+    """A covariance of rank one: points along it, and the mass of each."""
+    s, cell = line(9.0, 2001)
+    return np.array([0.3, -0.2]) + s * np.array([0.6, -0.3]), np.exp(-0.5 * s[:, 0] ** 2) / np.sqrt(2 * np.pi) * cell
+
+
+CASES = {
+    "benes, narrow": (LINE, gaussian([0.4], [[0.01]]), line(3.0, 20001), lambda x: normal(x, [0.4], [[0.01]])),
+    "benes, wide": (LINE, gaussian([0.4], [[400.0]]), line(180.0, 200001), lambda x: normal(x, [0.4], [[400.0]])),
+    "benes, mixture": (LINE, MIXTURE, line(6.0, 4001), mixture),
+    "benes, density": (LINE, DENSITY, line(6.0, 4001), lambda x: np.exp(-((x[..., 0] ** 2 - 1) ** 2))),
+    "erf": (BENT, MIXTURE, line(6.0, 4001), mixture),
+    "turned": (TURNED, gaussian([0.3, -0.2], OBLIQUE), plane(), lambda x: normal(x, [0.3, -0.2], OBLIQUE)),
+    "turned, thin": (TURNED, gaussian([0.3, -0.2], THIN.tolist()), thin(), lambda x: 1.0),
+    "turned, a point": (TURNED, gaussian([0.3, -0.2], [0.0, 0.0]), (np.array([[0.3, -0.2]]), 1.0), lambda x: 1.0),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_mass_under_the_gauge_and_its_gradient_are_those_of_quadrature(case):
+    (drift, phi), prior, (x, cell), sigma = CASES[case]
+    state = ["x", "y"][: len(drift)]
+    model = zakai.Model(state=state, drift=drift, observation=["x"], parameters={"a": 0.8, "b": 0.3}, prior=prior)
+    gauge, theta = gauge_of(formulas(model)), model.theta()
+
+    def mass(values):
+        families = jax.tree.map(jnp.asarray, prior_families(gauge, model, model.prior, values).families)
+        return jnp.sum(families.signs * jnp.exp(jax.vmap(log_terms)(families)))
+
+    def expected(a, b):
+        return np.sum(sigma(x) * np.exp(-phi(x, a, b)) * cell)
+
+    a, b = theta
+    found, gradient = jax.jit(jax.value_and_grad(mass))(theta)
+    assert mass(theta) == pytest.approx(expected(a, b), rel=1e-11)
+    assert found == pytest.approx(expected(a, b), rel=1e-11)
+    step = 1e-4
+    wanted = np.array([expected(a + step, b) - expected(a - step, b), expected(a, b + step) - expected(a, b - step)]) / (2 * step)
+    assert np.asarray(gradient) == pytest.approx(wanted, rel=1e-6, abs=1e-9)
