@@ -111,7 +111,9 @@ def _sum_of_exponentials(expression: sp.Expr, x: tuple[sp.Symbol, ...]) -> dict[
     return found
 
 
-def _product(a, b):
+def _product(
+    a: dict[tuple[sp.Expr, ...], sp.Expr], b: dict[tuple[sp.Expr, ...], sp.Expr]
+) -> dict[tuple[sp.Expr, ...], sp.Expr]:
     out: dict[tuple[sp.Expr, ...], sp.Expr] = {}
     for p, c in a.items():
         for q, d in b.items():
