@@ -10,7 +10,7 @@ every interval is prepared without data.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -57,7 +57,10 @@ class Matrices:
         np.add.at(self.table, (columns, places), numbers)
         self.varying = any(model.t in function.free_symbols for function in found)
         functions = list(found) or [sp.Integer(0)]
-        self._functions = {jnp: jax_function(functions, model), np: numpy_function(functions, model)}
+        self._functions: dict[Any, Callable[..., Any]] = {
+            jnp: jax_function(functions, model),
+            np: numpy_function(functions, model),
+        }
         self._origin = np.zeros(model.n)
 
     def __call__(self, t: Any, theta: Any) -> list[Any]:

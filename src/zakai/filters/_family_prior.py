@@ -287,6 +287,7 @@ class _GaussianPlan:
                 edge[[0, 1, -2, -1]] = 1.0
             far = ~level.near
             if far.any():
+                assert self.bend is not None
                 left = level.points[far] < 0.5 * sum(self.bend)
                 which = np.where(left, self.order[0], self.order[-1])
                 yield self._tilted(tilts, points[far], logs[far], cov, which, edge[far])
