@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from zakai.cli import looking
+from zakai.cli import _interrupt, looking
 
 USAGE = {
     "unknown command": ["filtre", "model.toml"],
@@ -103,6 +103,16 @@ def test_an_interruption_is_code_130_and_leaves_nothing(zakai, tmp_path, monkeyp
     assert sorted(tmp_path.iterdir()) == before
 
 
+def test_an_interruption_that_a_library_drops_is_seen_at_the_next_step(zakai, tmp_path, monkeypatch):
+    monkeypatch.setattr(_interrupt, "_asked", False)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(KeyboardInterrupt):  # and dropped here
+        _interrupt._note()
+    answer = zakai("filter", "model.toml", "record.csv", "-o", "result.nc")
+    assert answer.code == 130 and answer.err.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
 def process(*arguments: str, **more):
     return subprocess.Popen(
         [sys.executable, "-c", "import sys; from zakai.cli import main; sys.exit(main())", *arguments],
@@ -117,7 +127,7 @@ def test_control_c_is_code_130(tmp_path):
     running = process("filter", "gallery:encoder", "record.csv", "-o", "result.nc", cwd=tmp_path)
     time.sleep(3.0)
     running.send_signal(signal.SIGINT)
-    error = running.communicate(timeout=60)[1]
+    error = running.communicate(timeout=120)[1]
     assert running.returncode == 130, error
     assert error.count(b"\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["record.csv"]

@@ -6,6 +6,8 @@ import os
 import sys
 from collections.abc import Sequence
 
+from zakai.cli import _interrupt
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default those of the process; the exit code.
@@ -13,6 +15,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 done; 2 the input is wrong; 3 no method holds, or not the one that was asked for; 130 interrupted.  A bug of ours is
     any other exception, and leaves with its traceback (1).
     """
+    if arguments is None:
+        _interrupt.watch()
     try:
         return _run(arguments)
     except KeyboardInterrupt:

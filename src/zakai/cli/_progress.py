@@ -6,12 +6,14 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from zakai.cli import _interrupt
+
 
 @contextmanager
-def progress(what: str) -> Iterator[Callable[[int, int], None] | None]:
-    """A function of (done, total) that draws on stderr, or None where nobody looks."""
+def progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A function of (done, total), to be called at every step of long work: it draws on stderr where somebody looks."""
     if not sys.stderr.isatty():
-        yield None
+        yield lambda done, total: _interrupt.check()
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -19,4 +21,9 @@ def progress(what: str) -> Iterator[Callable[[int, int], None] | None]:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+        def advance(done: int, total: int) -> None:
+            _interrupt.check()
+            bar.update(task, completed=done, total=total)
+
+        yield advance
