@@ -1,0 +1,356 @@
+"""Formulas into the operator ring: which functions become generators, and that these are algebraically independent.
+
+    tanh      t = tanh(u):  d_i t = (1 - t^2) d_i u       (alone; beside exponentials, a rational function of exp(u))
+    exp, ...  e = exp(u):   d_i e = e d_i u
+    sin, cos  s, c:         d_i s = c d_i u, d_i c = -s d_i u, c^2 = 1 - s^2
+    log       l = log(p):   d_i l = d_i p / p
+    1/q       v = 1/Q, Q the product of all denominators' factors:  d_i v = -v^2 d_i Q,  v Q = 1
+              (and a constant 1/P for the factors that are constant)
+    gamma     an undetermined function: one generator for each partial derivative up to a highest, its jets
+
+The independence of exponentials is decided in `arguments.py`; logarithms of multiplicatively independent polynomials are
+independent (Ostrowski 1946); an undetermined function is one whose derivatives satisfy no algebraic equation.  Whatever is
+not covered is refused with a reason, never approximated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from itertools import product
+from typing import Any
+
+import sympy as sp
+from flint import fmpq, fmpq_mat
+from sympy.core.function import AppliedUndef
+
+from zakai.algebra.arguments import Unreadable, argument_basis
+from zakai.algebra.operators import OperatorRing, Symbol
+
+Fraction = tuple[Symbol, Symbol]
+PI = sp.Symbol("pi", positive=True)  # transcendental, so a constant like any other
+INVERSE = sp.Dummy("inverse")  # 1/P
+HYPERBOLIC = (sp.exp, sp.sinh, sp.cosh, sp.tanh)
+CIRCULAR = (sp.sin, sp.cos, sp.tan)
+
+
+class Reader:
+    """The ring that holds given formulas, and the way into and out of it.
+
+    `expressions` are all formulas that will be read (or whose sums, products and derivatives in the ring will be needed),
+    `x` the state, `constants` the symbols that stay symbols, `jets` the highest derivative of undetermined functions.
+    Raises Unreadable.
+    """
+
+    def __init__(self, expressions: Iterable[sp.Expr], x: Sequence[sp.Symbol], constants: Sequence[sp.Symbol], jets: int = 6):
+        self._x, self._constants = tuple(x), (*constants, PI, INVERSE)
+        expressions = [e.xreplace({sp.pi: PI}) for e in expressions]
+        atoms = sorted({a for e in expressions for a in _functions(e, set(x))}, key=str)
+        self._plans: list[tuple[sp.Expr, Callable[[], list[Symbol] | None]]] = []  # what a generator is, its derivatives
+        self._values: dict[sp.Expr, Callable[[], Fraction]] = {}
+        self._inverse = self._plan(sp.Dummy("unused"), lambda: None)
+        self._circles: list[tuple[int, int]] = []
+        self._hyperbolic([a for a in atoms if isinstance(a, HYPERBOLIC)])
+        self._circular([a for a in atoms if isinstance(a, CIRCULAR)])
+        logarithms = [a for a in atoms if isinstance(a, sp.log)]
+        for atom in logarithms:
+            self._logarithm(atom)
+        for atom in [a for a in atoms if isinstance(a, AppliedUndef)]:
+            self._jets(atom, jets)
+        self.ring = OperatorRing(len(self._x), len(self._plans), len(self._constants))
+        self._symbols = dict(zip((*self._x, *self._constants), (*self.ring.x, *self.ring.c), strict=True))
+        self._known: dict[sp.Expr, Fraction] = {}
+        self._relate_circles()
+        arguments = [self._fraction(a.args[0]) for a in logarithms]
+        _refuse_dependent_logarithms(arguments, self.ring)
+        self._log_arguments = [part for fraction in arguments for part in fraction]
+        self._invert([self._fraction(e)[1] for e in expressions] + self._log_arguments)
+        self._declare()
+
+    def read(self, expression: sp.Expr) -> Symbol:
+        """The element of the ring that an expression is."""
+        return self._polynomial(self._fraction(expression.xreplace({sp.pi: PI})))
+
+    def expression(self, p: Symbol) -> sp.Expr:
+        """An element without xi as a SymPy expression."""
+        functions = (*(e for e, _ in self._plans), *self._x, *self._constants)
+        terms = []
+        for monomial, c in p.to_dict().items():
+            powers = [self._named(base) ** k for base, k in zip(functions, monomial[self.ring.n :]) if k]
+            terms.append(sp.Mul(sp.Rational(int(c.p), int(c.q)), *powers))
+        return sp.Add(*terms)
+
+    def _named(self, function: sp.Expr) -> sp.Expr:
+        if function is INVERSE:
+            return 1 / self.expression(self.constant_denominator)
+        return function.xreplace({PI: sp.pi})
+
+    def is_smooth(self) -> bool:
+        """Whether every formula is smooth on all of R^n, as far as the signs of coefficients show.
+
+        A denominator, or the argument of a logarithm, is positive if it is a sum of positive multiples of even powers of
+        states and any powers of exponentials, among them a number.
+        """
+        exponentials = [isinstance(function, sp.exp) for function, _ in self._plans]
+        return all(self._is_positive(p, exponentials) for p in (self._Q, *self._log_arguments))
+
+    def _is_positive(self, p: Symbol, exponentials: list[bool]) -> bool:
+        for monomial, c in p.to_dict().items():
+            _, u, x, constants = self.ring.split(monomial)
+            if c <= 0 or any(constants) or any(k % 2 for k in x) or any(k and not e for k, e in zip(u, exponentials)):
+                return False
+        return not any(p.monoms()[-1])
+
+    # ---- generators
+
+    def _plan(self, function: sp.Expr, derivatives: Callable[[], list[Symbol] | None]) -> int:
+        self._plans.append((function, derivatives))
+        return len(self._plans) - 1
+
+    def _slopes(self, argument: sp.Expr) -> list[Symbol]:
+        p = self._polynomial(self._fraction(argument))
+        return [self.ring.total_derivative(p, i) for i in range(self.ring.n)]
+
+    def _hyperbolic(self, atoms: list[sp.Expr]) -> None:
+        basis, coordinates = argument_basis([a.args[0] for a in atoms], self._x, "exp, sinh, cosh and tanh")
+        generators = []
+        for j, u in enumerate(basis):
+            users = [(a, row) for a, row in zip(atoms, coordinates) if row[j]]
+            alone = all(isinstance(a, sp.tanh) and sum(map(abs, row)) == 1 for a, row in users)
+            function = sp.tanh(u) if alone else sp.exp(u)
+            k = len(self._plans)
+            generators.append((k, alone))
+            self._plan(function, partial(self._hyperbolic_derivatives, k, u, alone))
+        for atom, row in zip(atoms, coordinates):
+            self._values[atom] = partial(self._hyperbolic_value, atom, row, generators)
+
+    def _hyperbolic_derivatives(self, k: int, u: sp.Expr, alone: bool) -> list[Symbol]:
+        own = self.ring.u[k]
+        return [(1 - own**2 if alone else own) * slope for slope in self._slopes(u)]
+
+    def _hyperbolic_value(self, atom: sp.Expr, row: list[int], generators: list[tuple[int, bool]]) -> Fraction:
+        u, one = self.ring.u, self.ring.one
+        used = [(k, times, alone) for (k, alone), times in zip(generators, row) if times]
+        if len(used) == 1 and used[0][2]:
+            return used[0][1] * u[used[0][0]], one
+        up = sp.prod([u[k] ** times for k, times, _ in used if times > 0], start=one)
+        down = sp.prod([u[k] ** -times for k, times, _ in used if times < 0], start=one)
+        return {
+            sp.exp: (up, down),
+            sp.sinh: (up**2 - down**2, 2 * up * down),
+            sp.cosh: (up**2 + down**2, 2 * up * down),
+            sp.tanh: (up**2 - down**2, up**2 + down**2),
+        }[atom.func]
+
+    def _circular(self, atoms: list[sp.Expr]) -> None:
+        basis, coordinates = argument_basis([a.args[0] for a in atoms], self._x, "sin, cos and tan")
+        generators = []
+        for u in basis:
+            # The cosine first, for what comes first is rewritten.
+            c = len(self._plans)
+            self._plan(sp.cos(u), partial(self._circular_derivatives, c + 1, -1, u))
+            self._plan(sp.sin(u), partial(self._circular_derivatives, c, 1, u))
+            self._circles.append((c, c + 1))
+            generators.append(c)
+        for atom, row in zip(atoms, coordinates):
+            self._values[atom] = partial(self._circular_value, atom, row, generators)
+
+    def _circular_derivatives(self, other: int, sign: int, u: sp.Expr) -> list[Symbol]:
+        return [sign * self.ring.u[other] * slope for slope in self._slopes(u)]
+
+    def _circular_value(self, atom: sp.Expr, row: list[int], generators: list[int]) -> Fraction:
+        cosine, sine = self.ring.one, self.ring.zero
+        for k, times in zip(generators, row):
+            c, s = self.ring.u[k], self.ring.u[k + 1] * (1 if times > 0 else -1)
+            for _ in range(abs(times)):
+                cosine, sine = cosine * c - sine * s, cosine * s + sine * c
+        cosine, sine = self.ring.normal(cosine), self.ring.normal(sine)
+        return {sp.cos: (cosine, self.ring.one), sp.sin: (sine, self.ring.one), sp.tan: (sine, cosine)}[atom.func]
+
+    def _logarithm(self, atom: sp.Expr) -> None:
+        k = self._plan(atom, lambda: [self._polynomial((d, self.ring.one)) for d in self._log_slopes(atom.args[0])])
+        self._values[atom] = lambda: (self.ring.u[k], self.ring.one)
+
+    def _log_slopes(self, argument: sp.Expr) -> list[Symbol]:
+        numerator, denominator = self._fraction(argument)
+        up, down = self._polynomial((self.ring.one, numerator)), self._polynomial((self.ring.one, denominator))
+        ring = self.ring
+        return [
+            ring.normal(ring.total_derivative(numerator, i) * up - ring.total_derivative(denominator, i) * down)
+            for i in range(ring.n)
+        ]
+
+    def _jets(self, atom: sp.Expr, highest: int) -> None:
+        count = len(atom.args)
+        highest = highest if count == 1 else max(2, highest - count)
+        orders = sorted((o for o in product(range(highest + 1), repeat=count) if sum(o) <= highest), key=lambda o: (sum(o), o))
+        first = len(self._plans)
+        where = {order: first + j for j, order in enumerate(orders)}
+
+        def derivatives(order: tuple[int, ...]) -> list[Symbol] | None:
+            if sum(order) == highest:
+                return None
+            total = [self.ring.zero] * self.ring.n
+            for j, argument in enumerate(atom.args):
+                following = self.ring.u[where[tuple(o + (i == j) for i, o in enumerate(order))]]
+                total = [t + slope * following for t, slope in zip(total, self._slopes(argument))]
+            return total
+
+        for order in orders:
+            self._plan(_jet(atom, order), partial(derivatives, order))
+        self._values[atom] = lambda: (self.ring.u[first], self.ring.one)
+
+    # ---- relations
+
+    def _relate_circles(self) -> None:
+        self.ring.relations = [self.ring.u[c] ** 2 + self.ring.u[s] ** 2 - 1 for c, s in self._circles]
+
+    def _invert(self, denominators: list[Symbol]) -> None:
+        """v = 1/Q, Q the product of the different factors of the denominators."""
+        ring = self.ring
+        factors: dict[str, Symbol] = {}
+        for denominator in denominators:
+            for factor, _ in denominator.factor()[1]:
+                factors.setdefault(str(factor), factor)
+        moving = [f for f in factors.values() if any(f.degrees()[: -len(ring.c)])]
+        self._Q = sp.prod(moving, start=ring.one)
+        self.constant_denominator = sp.prod([f for f in factors.values() if f not in moving], start=ring.one)
+        if not self.constant_denominator.is_constant():
+            ring.relations.append(ring.c[-1] * self.constant_denominator - 1)
+        if not moving:
+            return
+        v = ring.u[self._inverse]
+        if any(self._Q.monoms()[0][-len(ring.c) :]):
+            raise Unreadable("the leading coefficient of a denominator depends on a parameter")
+        self._plans[self._inverse] = (1 / self.expression(self._Q), lambda: None)
+        ring.relations.append(v * self._Q - 1)
+        if any(self._Q.degrees()[ring.n + k] for circle in self._circles for k in circle):
+            self._complete()
+        # The derivatives of the other generators come first; they may contain v, but not its derivative.
+        self._declare()
+        slopes = [ring.total_derivative(self._Q, i) for i in range(ring.n)]
+        ring.derivatives[self._inverse] = [ring.normal(-(v**2) * slope) for slope in slopes]
+
+    def _declare(self) -> None:
+        for k, (_, derivatives) in enumerate(self._plans):
+            if k != self._inverse:
+                self.ring.derivatives[k] = derivatives()
+
+    def _complete(self) -> None:
+        """A Groebner basis, where the leading monomials of the relations have common factors."""
+        names = [sp.Symbol(name) for name in self.ring.context.names()]
+        relations = [sp.Poly(str(r).replace("^", "**"), *names) for r in self.ring.relations]
+        basis = sp.groebner(relations, *names, order="lex")
+        self.ring.relations = [self.ring.context.from_dict({m: _flint(c) for m, c in p.terms()}) for p in basis.polys]
+
+    # ---- formulas
+
+    def _polynomial(self, fraction: Fraction) -> Symbol:
+        """The fraction with v for the denominators."""
+        ring = self.ring
+        numerator, denominator = fraction
+        if denominator.is_constant():
+            return ring.normal(numerator / denominator.leading_coefficient())
+        every = self._Q * self.constant_denominator
+        inverse = (ring.one if self._Q.is_constant() else ring.u[self._inverse]) * (
+            ring.one if self.constant_denominator.is_constant() else ring.c[-1]
+        )
+        power = every
+        for k in range(1, sum(denominator.degrees()) + 1):
+            quotient, remainder = divmod(power, denominator)
+            if remainder.is_zero():
+                return ring.normal(numerator * quotient * inverse**k)
+            power = power * every
+        raise Unreadable("a denominator is not a product of those of the formulas")
+
+    def _fraction(self, e: sp.Expr) -> Fraction:
+        if e not in self._known:
+            self._known[e] = self._convert(e)
+        return self._known[e]
+
+    def _convert(self, e: sp.Expr) -> Fraction:
+        ring = self.ring
+        if e.is_Rational:
+            return ring.number(_flint(e)), ring.one
+        if e in self._symbols:
+            return self._symbols[e], ring.one
+        if isinstance(e, sp.Add):
+            return self._sum([self._fraction(a) for a in e.args])
+        if isinstance(e, sp.Mul):
+            parts = [self._fraction(a) for a in e.args]
+            numerator = sp.prod([p for p, _ in parts], start=ring.one)
+            denominator = sp.prod([q for _, q in parts], start=ring.one)
+            return self._lowest(numerator, denominator)
+        if isinstance(e, sp.Pow) and e.exp.is_Integer:
+            numerator, denominator = self._fraction(e.base)
+            k = int(e.exp)
+            if k < 0:
+                numerator, denominator = denominator, numerator
+                if denominator.is_zero():
+                    raise Unreadable(f"{e} divides by zero")
+            return self._lowest(numerator ** abs(k), denominator ** abs(k))
+        if e in self._values:
+            return self._values[e]()
+        raise Unreadable(f"{e} is not in the operator ring")
+
+    def _sum(self, parts: list[Fraction]) -> Fraction:
+        numerator, denominator = self.ring.zero, self.ring.one
+        for p, q in parts:
+            if q == denominator:
+                numerator = numerator + p
+            else:
+                numerator, denominator = numerator * q + p * denominator, denominator * q
+        return self._lowest(numerator, denominator)
+
+    def _lowest(self, numerator: Symbol, denominator: Symbol) -> Fraction:
+        ring = self.ring
+        numerator, denominator = ring.normal(numerator), ring.normal(denominator)
+        if denominator.is_constant():
+            return numerator / denominator.leading_coefficient(), ring.one
+        common = numerator.gcd(denominator)
+        return divmod(numerator, common)[0], divmod(denominator, common)[0]
+
+
+def _functions(e: sp.Expr, x: set[sp.Symbol]) -> Iterable[sp.Expr]:
+    """The functions in a formula that become generators; raises Unreadable at anything else."""
+    for part in sp.preorder_traversal(e):
+        if isinstance(part, sp.Pow) and not part.exp.is_Integer:
+            raise Unreadable(f"{part} is not in the operator ring")
+        if isinstance(part, sp.Function):
+            if not part.free_symbols & x:
+                raise Unreadable(f"{part} is an irrational constant")
+            if not isinstance(part, (*HYPERBOLIC, *CIRCULAR, sp.log, AppliedUndef)):
+                raise Unreadable(f"{part.func.__name__} is not in the operator ring")
+            if any(isinstance(inside, sp.Function) for a in part.args for inside in sp.preorder_traversal(a)):
+                raise Unreadable(f"{part} is a function of a function")
+            yield part
+        elif isinstance(part, sp.NumberSymbol):
+            raise Unreadable(f"{part} is an irrational constant")
+
+
+def _refuse_dependent_logarithms(arguments: list[Fraction], ring: OperatorRing) -> None:
+    """Logarithms are independent if the exponents of the irreducible factors of their arguments are."""
+    exponents: list[dict[str, int]] = []
+    for numerator, denominator in arguments:
+        found: dict[str, int] = {}
+        for p, sign in ((numerator, 1), (denominator, -1)):
+            for factor, k in p.factor()[1]:
+                if any(factor.degrees()[: -len(ring.c)]):
+                    found[str(factor)] = found.get(str(factor), 0) + sign * k
+        exponents.append(found)
+    names = sorted({name for row in exponents for name in row})
+    if arguments and fmpq_mat([[row.get(name, 0) for name in names] for row in exponents]).rank() < len(arguments):
+        raise Unreadable("the logarithms of the formulas are not independent")
+
+
+def _jet(atom: sp.Expr, order: tuple[int, ...]) -> sp.Expr:
+    """The partial derivative of an undetermined function, at its arguments."""
+    if not any(order):
+        return atom
+    places = [sp.Dummy(f"z{j + 1}", real=True) for j in range(len(order))]
+    derivative = sp.Derivative(atom.func(*places), *[(z, k) for z, k in zip(places, order) if k])
+    return sp.Subs(derivative, tuple(places), tuple(atom.args))
+
+
+def _flint(number: Any) -> Any:
+    return fmpq(int(number.p), int(number.q))
