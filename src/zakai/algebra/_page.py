@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import sympy as sp
@@ -13,6 +13,7 @@ from zakai.models.model import Model
 
 if TYPE_CHECKING:
     from zakai.algebra.analysis import Analysis
+    from zakai.algebra.estimation_algebra import EstimationAlgebra
 
 WIDTH = 110
 _WORDS = {True: "holds", False: "fails", None: "undecided"}
@@ -90,10 +91,26 @@ def _yau_form(analysis: Analysis) -> Iterator[str]:
 
 
 def _algebra(analysis: Analysis) -> Iterator[str]:
-    algebra = analysis.algebra
-    yield f"  {algebra.verdict}: {algebra.note}"
+    algebra, proof = analysis.algebra, analysis.algebra.certificate
+    size = "" if algebra.dimension is None else f" of dimension {algebra.dimension}"
+    yield from _wrapped("  ", f"{algebra.verdict}{size}: {algebra.note}", 4)
+    if algebra.parameters:
+        yield from _wrapped("  ", algebra.parameters, 4)
+    if algebra.basis:
+        yield from _wrapped("  basis: ", ", ".join(map(str, algebra.basis)), 9)
+        named = "D_i = d_i - g_i" if analysis.omega is not None else "D_i = d_i"
+        yield f"  with L0 = (D'G D - eta)/2, {named}" if analysis.omega is not None else f"  with {named}"
+    for (i, j), bracket in algebra.brackets.items():
+        if bracket != 0:
+            yield from _wrapped("  ", f"[{algebra.basis[i]}, {algebra.basis[j]}] = {bracket}", 6)
+    if algebra.basis and algebra.brackets:
+        yield "  all other brackets are 0" if any(algebra.brackets.values()) else "  all brackets are 0"
     if algebra.linear_rank is not None:
-        yield f"  h is affine in x; the rank of its gradients is {algebra.linear_rank}"
+        found = "" if algebra.verdict == "finite" else " (of what was explored)"
+        yield f"  linear rank {algebra.linear_rank}{found}"
+    if proof is not None:
+        yield from _wrapped(f"  {proof.code}  ", f"{proof.statement} [{proof.source}]", 4)
+        yield from _wrapped("    witness: ", proof.witness, 6)
 
 
 def _conditions(conditions: tuple[Condition, ...]) -> Iterator[str]:
@@ -102,9 +119,9 @@ def _conditions(conditions: tuple[Condition, ...]) -> Iterator[str]:
         yield from _wrapped(" " * 13, f"{condition.evidence}  [{condition.source}]")
 
 
-def _wrapped(head: str, body: str) -> list[str]:
+def _wrapped(head: str, body: str, indent: int = 13) -> list[str]:
     return textwrap.wrap(
-        body, WIDTH, initial_indent=head, subsequent_indent=" " * 13, break_long_words=False, break_on_hyphens=False
+        body, WIDTH, initial_indent=head, subsequent_indent=" " * indent, break_long_words=False, break_on_hyphens=False
     )
 
 
@@ -154,5 +171,16 @@ def latex(analysis: Analysis) -> str:
     if form is not None:
         lines.append(rf"L &= {tex(form.matrix)}, & l &= {tex(form.offset)}")
         lines.append(rf"\phi &= {tex(form.potential)}, & q &= {tex(analysis.q)}")
+    lines.extend(_algebra_in_tex(analysis.algebra, tex))
     body = " \\\\\n".join(lines)
     return f"\\begin{{align*}}\n{body}\n\\end{{align*}}"
+
+
+def _algebra_in_tex(algebra: EstimationAlgebra, tex: Callable[[sp.Basic], str]) -> Iterator[str]:
+    if algebra.verdict == "infinite" and algebra.certificate is not None:
+        yield rf"\dim E &= \infty & &\text{{({algebra.certificate.code})}}"
+    if algebra.basis:
+        yield rf"E &= \left\langle {', '.join(map(tex, algebra.basis))} \right\rangle, & \dim E &= {algebra.dimension}"
+    for (i, j), bracket in algebra.brackets.items():
+        if bracket != 0:
+            yield rf"\left[{tex(algebra.basis[i])}, {tex(algebra.basis[j])}\right] &= {tex(bracket)}"

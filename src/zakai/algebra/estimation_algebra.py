@@ -17,8 +17,10 @@ from zakai.algebra.certificates import CLOSED, Certificate, affine_functions, ce
 from zakai.algebra.closure import NO_JETS, Budget, Closure, close
 from zakai.algebra.dmz_operators import DmzOperators
 from zakai.algebra.generators import Unreadable
+from zakai.algebra.identities import tidy
 from zakai.algebra.normal_form import Basis, basis_of
 from zakai.algebra.operators import JetTowerEnds
+from zakai.algebra.systems import affine_observation
 from zakai.models.model import Model
 
 MOST_SYMBOLS = 6  # parameters that stay symbols; more are tried at random rationals
@@ -33,7 +35,7 @@ class EstimationAlgebra:
     `verdict` is "finite", "infinite" or "undecided".  For a finite one, `dimension`; `basis` in L0, D_i = d_i - g_i (d_i
     where G is singular) and the state; `brackets`, {(i, j): [E_i, E_j]} for i < j, numbered from 0; `structure_constants`,
     {(i, j): the coordinates of [E_i, E_j]}.  `linear_rank` is the number of affine functions in E with independent
-    gradients, for an algebra that is not closed of those that were found, and None where the algebra was not explored.
+    gradients; where E is not closed, of those that were found, and where it was not explored, of the h_i, if these are affine.
     `certificate` proves the verdict; `note` says how it came about, `parameters` for which values it holds.
     """
 
@@ -69,12 +71,13 @@ def estimation_algebra(model: Model) -> EstimationAlgebra:
     (L0, D1, x, 1)
     """
     if model.observation_kind == "samples":
-        return EstimationAlgebra(note="the estimation algebra belongs to observations in continuous time, and these are samples")
+        note = "the estimation algebra belongs to observations in continuous time, and these are samples"
+        return EstimationAlgebra(linear_rank=_rank_of_observations(model), note=note)
     own = dict(zip(model.parameter_symbols, model.parameters.values(), strict=True))
     try:
         explored = _explore(model, own)
     except Unreadable as reason:
-        return EstimationAlgebra(note=f"not explored: {reason}")
+        return EstimationAlgebra(linear_rank=_rank_of_observations(model), note=f"not explored: {reason}")
     basis, words = _at_other_values(model, explored)
     shown = basis or explored.basis
     return EstimationAlgebra(
@@ -160,6 +163,11 @@ def _at_other_values(model: Model, explored: _Exploration) -> tuple[Basis | None
     same = outcomes == {explored.outcome}
     tried = f"at the model's values of {listed}, and {{}} at {TRIALS} random rationals"
     return None, tried.format("the same" if same else "another verdict")
+
+
+def _rank_of_observations(model: Model) -> int | None:
+    affine = affine_observation(model)
+    return None if affine is None else int(affine[0].applyfunc(tidy).rank())
 
 
 def _said(exploration: _Exploration) -> str:

@@ -1,0 +1,254 @@
+"""Certificates checked again, by a plain path that shares no code with the engine that found them.
+
+Operators are tables {alpha: coefficient} of SymPy expressions, multiplied by Leibniz' rule with SymPy's derivatives; there is
+no ring of symbols, no generator, no echelon form.  Polynomials are compared exactly.  Other expressions are compared in
+fifty digits at random points, with concrete functions in the place of undetermined ones; that refutes exactly, and what a
+certificate of infinite dimension needs most is a refutation: a derivative that is not zero.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import sympy as sp
+from sympy.core.function import AppliedUndef
+
+from zakai.algebra.certificates import CLOSED, OCONE, OMEGA, RANK, SYMBOL, Certificate
+from zakai.models.model import Model
+
+Operator = Mapping[tuple[int, ...], Any]
+DIGITS = 50
+
+
+def verify(certificate: Certificate) -> bool:
+    """Whether the witness of a certificate meets the assumption of its statement, computed anew from the model."""
+    check: dict[str, Callable[[_Plain, Certificate], bool]] = {
+        CLOSED: _is_closed,
+        OCONE: lambda plain, c: plain.order(c.elements[0]) == 0 and not plain.is_polynomial(plain.function(c.elements[0]), 2),
+        OMEGA: lambda plain, c: (
+            plain.is_smooth() and plain.omega_is_constant() and not plain.is_polynomial(plain.function(c.elements[0]), 1)
+        ),
+        RANK: _has_maximal_rank,
+        SYMBOL: _has_a_symbol_that_is_not_polynomial,
+    }
+    return check[certificate.code](_Plain(certificate.model), certificate)
+
+
+class _Plain:
+    """The operators of a model, with its parameters at their values."""
+
+    def __init__(self, model: Model):
+        values = dict(zip(model.parameter_symbols, model.parameters.values(), strict=True))
+        f, h, G, S = (
+            matrix.xreplace(values) for matrix in (model.drift, model.observation, model.covariance, model.observation_noise)
+        )
+        self.x, self.n = model.x, model.n
+        self.drift, self.h, self.G = f, h, G
+        energy = (h.T * S.LUsolve(h))[0, 0]
+        zero = (0,) * self.n
+        L0: dict[tuple[int, ...], sp.Expr] = {}
+        for i, j in itertools.product(range(self.n), repeat=2):
+            _accumulate(L0, _plus(_plus(zero, i), j), G[i, j] / 2)
+        for i in range(self.n):
+            _accumulate(L0, _plus(zero, i), -f[i])
+        _accumulate(L0, zero, -sum(sp.diff(f[i], s) for i, s in enumerate(self.x)) - energy / 2)
+        self.energy = energy
+        self.generators = [self._prepared(L0)] + [self._prepared({zero: entry}) for entry in h]
+        self.word = lru_cache(maxsize=None)(self._word)
+
+    def _prepared(self, operator: Operator) -> Operator:
+        return {alpha: sp.expand(c) for alpha, c in operator.items() if sp.expand(c) != 0}
+
+    def _word(self, word: tuple[int, ...]) -> Operator:
+        if len(word) == 1:
+            return self.generators[word[0]]
+        return self.bracket(self.generators[word[0]], self.word(word[1:]))
+
+    def compose(self, a: Operator, b: Operator) -> dict[tuple[int, ...], Any]:
+        """sum_alpha sum_beta a_alpha (alpha over gamma) (d^gamma b_beta) d^(alpha - gamma + beta)."""
+        result: dict[tuple[int, ...], Any] = {}
+        for alpha, left in a.items():
+            for gamma in itertools.product(*(range(k + 1) for k in alpha)):
+                times = math.prod(map(math.comb, alpha, gamma))
+                for beta, right in b.items():
+                    for symbol, k in zip(self.x, gamma):
+                        for _ in range(k):
+                            right = sp.diff(right, symbol)
+                    if right != 0:
+                        _accumulate(result, tuple(i - j + k for i, j, k in zip(alpha, gamma, beta)), times * left * right)
+        return result
+
+    def bracket(self, a: Operator, b: Operator) -> Operator:
+        result = self.compose(a, b)
+        for alpha, c in self.compose(b, a).items():
+            _accumulate(result, alpha, -c)
+        return self._prepared(result)
+
+    def combination(self, words: Mapping[tuple[int, ...], sp.Expr]) -> Operator:
+        total: dict[tuple[int, ...], Any] = {}
+        for word, number in words.items():
+            for alpha, c in self.word(word).items():
+                _accumulate(total, alpha, number * c)
+        return {alpha: sp.expand(c) for alpha, c in total.items() if not self.is_zero(c)}
+
+    def order(self, words: Mapping) -> int:
+        return max((sum(alpha) for alpha in self.combination(words)), default=-1)
+
+    def function(self, words: Mapping) -> sp.Expr:
+        return self.combination(words).get((0,) * self.n, sp.Integer(0))
+
+    def is_zero(self, e: sp.Expr) -> bool:
+        e = sp.expand(e)
+        if e.is_polynomial(*self.x):
+            return bool(e == 0)
+        return all(abs(value) < sp.Float(10) ** (-DIGITS // 2) for value in _values(e, self.x))
+
+    def is_polynomial(self, e: sp.Expr, degree: int) -> bool:
+        """Whether a function is a polynomial of at most this degree."""
+        e = sp.expand(e)
+        if e.is_polynomial(*self.x):
+            return sp.Poly(e, *self.x).total_degree() <= degree
+        return _differences_vanish(e, self.x, degree + 1)
+
+    def precision_times_drift(self) -> sp.MatrixBase:
+        return self.G.LUsolve(self.drift)
+
+    def omega_is_constant(self) -> bool:
+        g = self.precision_times_drift()
+        pairs = itertools.combinations(range(self.n), 2)
+        return all(self.is_polynomial(sp.diff(g[j], self.x[i]) - sp.diff(g[i], self.x[j]), 0) for i, j in pairs)
+
+    def eta(self) -> sp.Expr:
+        divergence = sum(sp.diff(entry, symbol) for entry, symbol in zip(self.drift, self.x))
+        return (self.drift.T * self.precision_times_drift())[0, 0] + divergence + self.energy
+
+    def is_smooth(self) -> bool:
+        """No formula divides by what may vanish, takes a logarithm, or a tangent."""
+        for part in sp.preorder_traversal(sp.Tuple(*self.drift, *self.h)):
+            if isinstance(part, sp.tan):
+                return False
+            denominator = part.base if isinstance(part, sp.Pow) and part.exp.is_negative else None
+            argument = part.args[0] if isinstance(part, sp.log) else denominator
+            if argument is not None and not argument.is_positive and not sp.expand(argument).is_positive:
+                return False
+        return True
+
+
+def _is_closed(plain: _Plain, certificate: Certificate) -> bool:
+    """The generators are in the span, every bracket is the combination that is claimed, and the basis is independent."""
+    assert certificate.constants is not None
+    basis = [plain.combination(words) for words in certificate.elements]
+    for (i, j), row in certificate.constants.items():
+        rest = dict(plain.bracket(basis[i], basis[j]))
+        for c, element in zip(row, basis):
+            for alpha, value in element.items():
+                _accumulate(rest, alpha, -c * value)
+        if not all(plain.is_zero(c) for c in rest.values()):
+            return False
+    present = [generator for generator in plain.generators if generator]
+    return _rank(basis, plain) == len(basis) == _rank([*basis, *present], plain)
+
+
+def _rank(operators: Sequence[Operator], plain: _Plain) -> int:
+    """The dimension of the span of some operators, from their values at random points."""
+    orders = sorted({alpha for operator in operators for alpha in operator})
+    columns = [sp.expand(operator.get(alpha, sp.Integer(0))) for operator in operators for alpha in orders]
+    if all(c.is_polynomial(*plain.x) for c in columns):
+        return _rank_of_polynomials(operators, orders, plain)
+    count = 2 * len(operators)
+    values = [list(_values(c, plain.x, count)) for c in columns]
+    if min(map(len, values)) < count:
+        raise ArithmeticError("the operators have no values at random points")
+    rows = [sum(values[k * len(orders) : (k + 1) * len(orders)], []) for k in range(len(operators))]
+    return sp.Matrix(rows).rank(iszerofunc=lambda v: abs(v) < sp.Float(10) ** (-DIGITS // 2))
+
+
+def _rank_of_polynomials(operators: Sequence[Operator], orders: Sequence[tuple[int, ...]], plain: _Plain) -> int:
+    rows = []
+    for operator in operators:
+        rows.append({(alpha, m): c for alpha, e in operator.items() for m, c in sp.Poly(e, *plain.x).terms() if alpha in orders})
+    monomials = sorted({key for row in rows for key in row})
+    return int(sp.Matrix([[row.get(key, sp.Integer(0)) for key in monomials] for row in rows]).rank())
+
+
+def _has_maximal_rank(plain: _Plain, certificate: Certificate) -> bool:
+    functions = [plain.function(words) for words in certificate.elements]
+    if any(plain.order(words) != 0 for words in certificate.elements) or not plain.is_smooth():
+        return False
+    if not all(plain.is_polynomial(function, 1) for function in functions):
+        return False
+    gradients = sp.Matrix(functions).jacobian(plain.x)
+    return gradients.rank() == plain.n and not (plain.omega_is_constant() and plain.is_polynomial(plain.eta(), 2))
+
+
+def _has_a_symbol_that_is_not_polynomial(plain: _Plain, certificate: Certificate) -> bool:
+    operator = plain.combination(certificate.elements[0])
+    order = max((sum(alpha) for alpha in operator), default=0)
+    top = [c for alpha, c in operator.items() if sum(alpha) == order]
+    return order >= 1 and not all(_is_a_polynomial(c, plain) for c in top)
+
+
+def _is_a_polynomial(e: sp.Expr, plain: _Plain) -> bool:
+    """Whether a function is a polynomial of any degree; one of which high differences do not vanish is not taken for one."""
+    e = sp.expand(e)
+    return e.is_polynomial(*plain.x) or _differences_vanish(e, plain.x, 24)
+
+
+def _differences_vanish(e: sp.Expr, x: Sequence[sp.Symbol], order: int) -> bool:
+    """Whether the differences of this order along random lines are zero, as those of polynomials of lower degree are."""
+    e, rng = _concrete(e), random.Random(1730)
+    for _ in range(3):
+        start = [sp.Rational(rng.randint(1, 3000), 1009) for _ in x]
+        step = [sp.Rational(rng.randint(1, 300), 1009) for _ in x]
+        points = [{s: a + k * b for s, a, b in zip(x, start, step)} for k in range(order + 1)]
+        values = [_value(e, point) for point in points]
+        if any(value is None for value in values):
+            continue
+        terms = [(-1) ** k * math.comb(order, k) * value for k, value in enumerate(values)]
+        if abs(sum(terms)) > sp.Float(10) ** (-DIGITS // 2) * (1 + sum(map(abs, terms))):
+            return False
+    return True
+
+
+def _values(e: sp.Expr, x: Sequence[sp.Symbol], count: int = 4) -> list[sp.Expr]:
+    """The expression in many digits at random points where it has a value; constants such as pi are what they are."""
+    e = _concrete(e)
+    rng = random.Random(1730)
+    found: list[sp.Expr] = []
+    for _ in range(20 * count):
+        point = {symbol: sp.Rational(rng.randint(1, 3000), 1009) for symbol in x}
+        value = _value(e, point)
+        if value is not None:
+            found.append(value)
+        if len(found) == count:
+            break
+    return found
+
+
+def _value(e: sp.Expr, point: Mapping[sp.Symbol, sp.Rational]) -> sp.Expr | None:
+    value = e.xreplace(point).doit().evalf(DIGITS, maxn=4 * DIGITS)
+    return value if value.is_Float or value.is_Rational else None
+
+
+def _concrete(e: sp.Expr) -> sp.Expr:
+    """Every undetermined function replaced by one that satisfies no equation of low order."""
+    names = sorted({part.func.__name__ for part in e.atoms(AppliedUndef)})
+    for k, name in enumerate(names, 2):
+        e = e.replace(
+            lambda part, name=name: isinstance(part, AppliedUndef) and part.func.__name__ == name,
+            lambda part, k=k: sp.exp(sp.sin(sum((j + k) * argument for j, argument in enumerate(part.args)) / k)),
+        )
+    return e.doit()
+
+
+def _plus(alpha: tuple[int, ...], i: int) -> tuple[int, ...]:
+    return (*alpha[:i], alpha[i] + 1, *alpha[i + 1 :])
+
+
+def _accumulate(table: dict, key: tuple[int, ...], value: Any) -> None:
+    table[key] = table.get(key, sp.Integer(0)) + value
