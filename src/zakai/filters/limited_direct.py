@@ -11,7 +11,7 @@ factor, the transition with -h'S^-1 h / 2 inside, the other half.  Samples: exac
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -89,6 +89,7 @@ class Prepared:
     flow_plan: FlowPlan
     spread: np.ndarray | None
     memory: int
+    first: dict[int, tuple[Any, State]] = field(init=False, default_factory=dict)  # of the last prior, which many records share
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -221,7 +222,14 @@ def observations(prepared: Prepared, data: Data) -> Any:
 
 def init(prepared: Prepared, prior: Any) -> State:
     """The prior on a lattice that fits it and the first interval."""
-    return _start(prepared, prior, None)[0]
+    if not isinstance(prepared.theta, np.ndarray):
+        return _start(prepared, prior, None)[0]
+    known, state = prepared.first.get(id(prior), (None, None))
+    if known is not prior or state is None:
+        state = _start(prepared, prior, None)[0]
+        prepared.first.clear()
+        prepared.first[id(prior)] = prior, state
+    return state
 
 
 def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State, Info]:
