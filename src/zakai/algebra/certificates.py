@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import sympy as sp
 
-from zakai.algebra.closure import Closure
+from zakai.algebra.closure import Closure, Row
 from zakai.algebra.dmz_operators import DmzOperators
+from zakai.algebra.leading_monomials import growing_pair
 from zakai.algebra.linear_span import Word
 from zakai.models.model import Model
 
-CLOSED, OCONE, OMEGA, RANK, SYMBOL = "FIN-closed", "INF-OCONE", "INF-THM2", "INF-MAXRANK", "INF-SYM1"
+CLOSED, OCONE, OMEGA, RANK, SYMBOL, GROWTH = "FIN-closed", "INF-OCONE", "INF-THM2", "INF-MAXRANK", "INF-SYM1", "INF-SYM2"
 
 STATEMENTS: Mapping[str, tuple[str, str]] = {
     CLOSED: (
@@ -40,6 +42,11 @@ STATEMENTS: Mapping[str, tuple[str, str]] = {
         "If E is finite dimensional, the principal symbol of every element is a polynomial in x.",
         "proved in the documents",
     ),
+    GROWTH: (
+        "If the leading monomials of A and B, for suitable weights, never cancel in [A, [A, ... [A, B]]], these brackets are "
+        "infinitely many independent elements.",
+        "proved in the documents",
+    ),
 }
 
 Combination = Mapping[Word, sp.Expr]
@@ -51,7 +58,8 @@ class Certificate:
 
     `elements` are the elements of E that the witness speaks of, as combinations of bracket words of the model's operators
     (0 for L_0, i for h_i; a word (1, 0) is [h_1, L_0]), with the parameters at the model's values; `constants` the
-    structure constants of a closed algebra.  `zakai.algebra.verification.verify` checks all that without this engine.
+    structure constants of a closed algebra, `weights` those of the leading monomials, of x and then of xi.
+    `zakai.algebra.verification.verify` checks all that without this engine.
     """
 
     code: str
@@ -61,14 +69,15 @@ class Certificate:
     model: Model
     elements: tuple[Combination, ...] = ()
     constants: Mapping[tuple[int, int], tuple[sp.Expr, ...]] | None = None
+    weights: tuple[int, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.code}: {self.statement} [{self.source}] Witness: {self.witness}"
 
 
-def certificate(code: str, witness: str, model: Model, elements: tuple = (), constants: Mapping | None = None) -> Certificate:
+def certificate(code: str, witness: str, model: Model, elements: tuple, **more: Any) -> Certificate:
     """The certificate of a code, with its statement and source."""
-    return Certificate(code, *STATEMENTS[code], witness, model, elements, constants)
+    return Certificate(code, *STATEMENTS[code], witness, model, elements, **more)
 
 
 def spoken(word: Word) -> str:
@@ -78,29 +87,38 @@ def spoken(word: Word) -> str:
 
 
 def infinite(operators: DmzOperators, closure: Closure) -> Certificate | None:
-    """A certificate that the algebra is infinite dimensional, from the elements found so far."""
+    """A certificate that the algebra is infinite dimensional, from the elements found so far.
+
+    Where the budget is spent leading monomials are tried; the theorems before that do not depend on coordinates.
+    """
+    rows = closure.rows()
+    if closure.limit:
+        return _infinite_by_theorems(operators, closure, rows) or _leading_monomials_grow(operators, closure, rows)
+    return _infinite_by_theorems(operators, closure, rows)
+
+
+def _infinite_by_theorems(operators: DmzOperators, closure: Closure, rows: list[Row]) -> Certificate | None:
     if operators.g is None:
         return None
-    rows = closure.elements()
     return (
-        _a_function_is_not_quadratic(operators, closure, rows)
+        _a_function_is_not_quadratic(operators, rows)
         or (_theorem_2(operators) if closure.length == 1 else None)
-        or _maximal_rank(operators, closure, rows)
-        or _a_symbol_is_not_polynomial(operators, closure, rows)
+        or _maximal_rank(operators, rows)
+        or _a_symbol_is_not_polynomial(operators, rows)
     )
 
 
-def affine_functions(operators: DmzOperators, rows: list) -> list:
+def affine_functions(rows: list[Row]) -> list[Row]:
     """The rows that are affine in x and not constant: their gradients are independent."""
-    ring = operators.ring
-    return [(p, words) for p, words in rows if ring.order(p) == 0 and not ring.has_generators(p) and ring.degree(p) == 1]
+    return [row for row in rows if row.order == 0 and row.is_polynomial(1) and row.degree == 1]
 
 
-def _a_function_is_not_quadratic(operators: DmzOperators, closure: Closure, rows: list) -> Certificate | None:
-    for p, words in rows:
-        if operators.ring.order(p) == 0 and not operators.is_polynomial(p, 2):
-            what = f"{_combination(words, operators)} is the function {_function(closure, words, operators)}"
-            return certificate(OCONE, what, operators.model, (_numbers(words, operators),))
+def _a_function_is_not_quadratic(operators: DmzOperators, rows: list[Row]) -> Certificate | None:
+    for row in rows:
+        if row.order == 0 and not row.is_polynomial(2):
+            function = _short(operators.numbers.expression_of(row.vector))
+            what = f"{_combination(row, operators)} is the function {function}"
+            return certificate(OCONE, what, operators.model, (_numbers(row, operators),))
     return None
 
 
@@ -114,8 +132,8 @@ def _theorem_2(operators: DmzOperators) -> Certificate | None:
     return None
 
 
-def _maximal_rank(operators: DmzOperators, closure: Closure, rows: list) -> Certificate | None:
-    affine = affine_functions(operators, rows)
+def _maximal_rank(operators: DmzOperators, rows: list[Row]) -> Certificate | None:
+    affine = affine_functions(rows)
     if len(affine) < operators.ring.n or not operators.reader.is_smooth():
         return None
     assert operators.eta is not None
@@ -126,18 +144,31 @@ def _maximal_rank(operators: DmzOperators, closure: Closure, rows: list) -> Cert
         why = f"eta = {_short(operators.reader.expression(operators.eta))} is not quadratic"
     else:
         return None
-    functions = ", ".join(_short(operators.reader.expression(p)) for p, _ in affine)
-    elements = tuple(_numbers(words, operators) for _, words in affine)
+    functions = ", ".join(_short(operators.numbers.expression_of(row.vector)) for row in affine)
+    elements = tuple(_numbers(row, operators) for row in affine)
     return certificate(RANK, f"E contains {functions}, and {why}", operators.model, elements)
 
 
-def _a_symbol_is_not_polynomial(operators: DmzOperators, closure: Closure, rows: list) -> Certificate | None:
-    ring = operators.ring
-    for p, words in rows:
-        order = ring.order(p)
-        if order >= 1 and ring.has_generators(ring.principal(p)):
-            what = f"{_combination(words, operators)} has order {order} and coefficients that are not polynomials"
-            return certificate(SYMBOL, what, operators.model, (_numbers(words, operators),))
+def _a_symbol_is_not_polynomial(operators: DmzOperators, rows: list[Row]) -> Certificate | None:
+    for row in rows:
+        if row.order >= 1 and not row.principal_is_polynomial():
+            what = f"{_combination(row, operators)} has order {row.order} and coefficients that are not polynomials"
+            return certificate(SYMBOL, what, operators.model, (_numbers(row, operators),))
+    return None
+
+
+def _leading_monomials_grow(operators: DmzOperators, closure: Closure, rows: list[Row]) -> Certificate | None:
+    """Among the words, which are short to check, or else among the rows."""
+    numbers = operators.numbers
+    words = [Row(numbers.vector(p), {word: numbers.one}) for word, p in closure.words.items()]
+    for elements in (words, rows):
+        polynomial = [row for row in elements if row.is_polynomial()]
+        pair = growing_pair([numbers.support(row.vector) for row in polynomial], operators.ring.n)
+        if pair is not None:
+            left, right = polynomial[pair.left], polynomial[pair.right]
+            what = f"A = {_combination(left, operators)}, B = {_combination(right, operators)}, weights {pair.weights}"
+            chosen = (_numbers(left, operators), _numbers(right, operators))
+            return certificate(GROWTH, what, operators.model, chosen, weights=pair.weights)
     return None
 
 
@@ -145,12 +176,12 @@ def _omega_is_constant(operators: DmzOperators) -> bool:
     return all(operators.is_polynomial(entry, 0) for entry in operators.omega.values())
 
 
-def _numbers(words: Mapping, operators: DmzOperators) -> Combination:
-    return {word: operators.numbers.expression(c) for word, c in words.items()}
+def _numbers(row: Row, operators: DmzOperators) -> Combination:
+    return {word: operators.numbers.expression(c) for word, c in row.words.items()}
 
 
-def _combination(words: Mapping, operators: DmzOperators) -> str:
-    numbers = _numbers(words, operators)
+def _combination(row: Row, operators: DmzOperators) -> str:
+    numbers = _numbers(row, operators)
     terms = []
     for word, c in sorted(numbers.items(), key=lambda item: (len(item[0]), item[0]), reverse=True):
         factor = "" if abs(c) == 1 else f"{abs(c)}*" if abs(c).is_Rational else f"({c})*"
@@ -158,18 +189,6 @@ def _combination(words: Mapping, operators: DmzOperators) -> str:
         terms.append(f"{sign} {factor}{spoken(word)}")
     text = " ".join(terms).removeprefix("+ ")
     return f"-{text[2:]}" if text.startswith("- ") else text
-
-
-def _function(closure: Closure, words: Mapping, operators: DmzOperators) -> str:
-    terms = [operators.numbers.expression(c) * _word_function(closure, word, operators) for word, c in words.items()]
-    return _short(sp.expand(sp.Add(*terms)))
-
-
-def _word_function(closure: Closure, word: Word, operators: DmzOperators) -> sp.Expr:
-    """The part of order zero of a word; what is of higher order cancels in a combination that is a function."""
-    ring = operators.ring
-    p = closure.words[word]
-    return operators.reader.expression(ring.context.from_dict({m: c for m, c in p.to_dict().items() if not any(m[: ring.n])}))
 
 
 def _short(expression: sp.Expr) -> str:

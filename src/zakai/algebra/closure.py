@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
-from zakai.algebra.linear_span import Numbers, Span, Word
+from zakai.algebra.linear_span import Numbers, Span, Vector, Word
 from zakai.algebra.operators import JetTowerEnds, OperatorRing, Symbol
 
 NO_JETS = "higher derivatives of an undetermined function are needed than are kept"
@@ -22,12 +23,38 @@ class Budget:
 
     elements: int
     order: int = 8
-    terms: int = 20_000
+    terms: int = 5_000
 
     @classmethod
     def of(cls, states: int) -> Budget:
         """6 n + 20 elements: an estimation algebra of maximal rank has 2 n + 2."""
         return cls(elements=6 * states + 20)
+
+
+class Row(NamedTuple):
+    """An element as a vector, and as a combination of words."""
+
+    vector: Vector
+    words: Vector
+
+    @property
+    def order(self) -> int:
+        """The order of the operator; 0 for a function."""
+        return max(key[0] for key in self.vector)
+
+    @property
+    def degree(self) -> int:
+        """The degree in x."""
+        return max(key[2] for key in self.vector)
+
+    def is_polynomial(self, degree: int | None = None) -> bool:
+        """Whether all coefficients are polynomials, of at most a degree."""
+        return not any(key[1] for key in self.vector) and (degree is None or self.degree <= degree)
+
+    def principal_is_polynomial(self) -> bool:
+        """Whether the coefficients of highest order are polynomials."""
+        order = self.order
+        return not any(key[1] for key in self.vector if key[0] == order)
 
 
 @dataclass
@@ -48,17 +75,14 @@ class Closure:
         """The number of generators in the longest word."""
         return max(map(len, self.words), default=0)
 
-    def elements(self) -> list[tuple[Symbol, dict[Word, object]]]:
-        """The rows of the echelon form, highest pivot first, each with its combination of words."""
-        return [(self.symbol(row), words) for _, (row, words) in sorted(self.span.rows.items(), reverse=True)]
+    @property
+    def highest_order(self) -> int:
+        """The order of the words of highest order."""
+        return max((pivot[0] for pivot in self.span.rows), default=-1)
 
-    def symbol(self, row: dict) -> Symbol:
-        """A row with rational numbers as an element of the ring."""
-        padding = (0,) * self.ring.constants
-        if self.numbers.symbolic:
-            # Only which monomials occur is asked of such a row.
-            return self.ring.context.from_dict({(*key[3], *padding): 1 for key in row})
-        return self.ring.context.from_dict({(*key[3], *padding): c for key, c in row.items()})
+    def rows(self) -> list[Row]:
+        """The rows of the echelon form, highest pivot first."""
+        return [Row(row, words) for _, (row, words) in sorted(self.span.rows.items(), reverse=True)]
 
 
 def close(
@@ -108,6 +132,6 @@ def _longer(found: Closure, fresh: list[Word], budget: Budget) -> list[Word]:
             new.append((k, *word))
     if len(found.span) > budget.elements:
         found.limit = f"more than {budget.elements} independent elements"
-    elif max(map(found.ring.order, found.words.values())) > budget.order:
+    elif found.highest_order > budget.order:
         found.limit = f"an element has an order above {budget.order}"
     return new

@@ -116,11 +116,11 @@ def _explored(operators: DmzOperators) -> _Exploration:
         return proof is not None
 
     closure = close(operators.ring, operators.numbers, [operators.L0, *operators.h], Budget.of(model.n), conclude)
-    rank = len(affine_functions(operators, closure.elements()))
+    rank = len(affine_functions(closure.rows()))
     if found:
         return _Exploration("infinite", rank, None, found[0], f"found among the words of up to {closure.longest} generators")
     if not closure.closed:
-        order = max(map(operators.ring.order, closure.words.values()))
+        order = closure.highest_order
         reason = f"{closure.limit}, and no certificate was found" + (
             "; G is singular, so that the theorems on infinite dimension do not apply" if operators.g is None else ""
         )
@@ -132,7 +132,7 @@ def _explored(operators: DmzOperators) -> _Exploration:
         f"a basis of {len(basis.elements)} elements, words of up to {closure.longest} generators",
         model,
         basis.words,
-        basis.constants,
+        constants=basis.constants,
     )
     return _Exploration("finite", rank, basis, proof, "closed under brackets, in exact arithmetic")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import sympy as sp
 from flint import fmpq_mpoly_ctx
 
@@ -67,6 +68,15 @@ class Numbers:
         n, exponents = self._ring.n, key[3]
         padded = (*[0] * n, *exponents[n:], *[0] * self._count)
         return exponents[:n], self._reader.expression(self._ring.context.from_dict({padded: 1}))
+
+    def support(self, vector: Vector) -> np.ndarray:
+        """The exponents of x and then of xi of a vector without generators, a row each."""
+        n = self._ring.n
+        return np.array([(*key[3][-n:], *key[3][:n]) for key in vector], dtype=int)
+
+    def expression_of(self, vector: Vector) -> sp.Expr:
+        """A vector that is a function, in SymPy."""
+        return sp.Add(*[self.expression(c) * self.monomial(key)[1] for key, c in vector.items()])
 
     def _key(self, m: tuple[int, ...]) -> tuple[int, int, int, tuple[int, ...]]:
         xi, u, x, _ = self._ring.split(m)

@@ -18,7 +18,7 @@ from typing import Any
 import sympy as sp
 from sympy.core.function import AppliedUndef
 
-from zakai.algebra.certificates import CLOSED, OCONE, OMEGA, RANK, SYMBOL, Certificate
+from zakai.algebra.certificates import CLOSED, GROWTH, OCONE, OMEGA, RANK, SYMBOL, Certificate
 from zakai.models.model import Model
 
 Operator = Mapping[tuple[int, ...], Any]
@@ -35,6 +35,7 @@ def verify(certificate: Certificate) -> bool:
         ),
         RANK: _has_maximal_rank,
         SYMBOL: _has_a_symbol_that_is_not_polynomial,
+        GROWTH: _grows,
     }
     return check[certificate.code](_Plain(certificate.model), certificate)
 
@@ -48,6 +49,9 @@ class _Plain:
             matrix.xreplace(values) for matrix in (model.drift, model.observation, model.covariance, model.observation_noise)
         )
         self.x, self.n = model.x, model.n
+        entries = [*f, *h, *G, *S]
+        exact = all(e.is_polynomial(*model.x) and all(c.is_Rational for c in sp.Poly(e, *model.x).coeffs()) for e in entries)
+        self.ring = sp.ring(model.x, sp.QQ)[0] if exact else None
         self.drift, self.h, self.G = f, h, G
         energy = (h.T * S.LUsolve(h))[0, 0]
         zero = (0,) * self.n
@@ -58,11 +62,16 @@ class _Plain:
             _accumulate(L0, _plus(zero, i), -f[i])
         _accumulate(L0, zero, -sum(sp.diff(f[i], s) for i, s in enumerate(self.x)) - energy / 2)
         self.energy = energy
-        self.generators = [self._prepared(L0)] + [self._prepared({zero: entry}) for entry in h]
+        self.generators = [self.prepared(L0)] + [self.prepared({zero: entry}) for entry in h]
         self.word = lru_cache(maxsize=None)(self._word)
 
-    def _prepared(self, operator: Operator) -> Operator:
-        return {alpha: sp.expand(c) for alpha, c in operator.items() if sp.expand(c) != 0}
+    def prepared(self, operator: Operator) -> Operator:
+        """Coefficients as SymPy's sparse polynomials where all are polynomials, or else expanded."""
+        ring = self.ring
+        if ring is None:
+            return {alpha: e for alpha, c in operator.items() if (e := sp.expand(c)) != 0}
+        made = {alpha: ring.from_expr(sp.expand(c)) if isinstance(c, sp.Expr) else c for alpha, c in operator.items()}
+        return {alpha: c for alpha, c in made.items() if c}
 
     def _word(self, word: tuple[int, ...]) -> Operator:
         if len(word) == 1:
@@ -78,7 +87,7 @@ class _Plain:
                 for beta, right in b.items():
                     for symbol, k in zip(self.x, gamma):
                         for _ in range(k):
-                            right = sp.diff(right, symbol)
+                            right = sp.diff(right, symbol) if self.ring is None else right.diff(self.ring.from_expr(symbol))
                     if right != 0:
                         _accumulate(result, tuple(i - j + k for i, j, k in zip(alpha, gamma, beta)), times * left * right)
         return result
@@ -87,14 +96,18 @@ class _Plain:
         result = self.compose(a, b)
         for alpha, c in self.compose(b, a).items():
             _accumulate(result, alpha, -c)
-        return self._prepared(result)
+        return self.prepared(result)
 
     def combination(self, words: Mapping[tuple[int, ...], sp.Expr]) -> Operator:
+        """A combination of words, with SymPy expressions for coefficients."""
         total: dict[tuple[int, ...], Any] = {}
         for word, number in words.items():
-            for alpha, c in self.word(word).items():
-                _accumulate(total, alpha, number * c)
-        return {alpha: sp.expand(c) for alpha, c in total.items() if not self.is_zero(c)}
+            for alpha, c in self.expressions(self.word(word)).items():
+                _accumulate(total, alpha, c * number)
+        return {alpha: e for alpha, c in total.items() if not self.is_zero(e := sp.expand(c))}
+
+    def expressions(self, operator: Operator) -> dict[tuple[int, ...], Any]:
+        return {alpha: c if self.ring is None else c.as_expr() for alpha, c in operator.items()}
 
     def order(self, words: Mapping) -> int:
         return max((sum(alpha) for alpha in self.combination(words)), default=-1)
@@ -143,14 +156,15 @@ def _is_closed(plain: _Plain, certificate: Certificate) -> bool:
     """The generators are in the span, every bracket is the combination that is claimed, and the basis is independent."""
     assert certificate.constants is not None
     basis = [plain.combination(words) for words in certificate.elements]
+    prepared = [plain.prepared(operator) for operator in basis]
     for (i, j), row in certificate.constants.items():
-        rest = dict(plain.bracket(basis[i], basis[j]))
+        rest = plain.expressions(plain.bracket(prepared[i], prepared[j]))
         for c, element in zip(row, basis):
             for alpha, value in element.items():
                 _accumulate(rest, alpha, -c * value)
         if not all(plain.is_zero(c) for c in rest.values()):
             return False
-    present = [generator for generator in plain.generators if generator]
+    present = [plain.expressions(generator) for generator in plain.generators if generator]
     return _rank(basis, plain) == len(basis) == _rank([*basis, *present], plain)
 
 
@@ -193,6 +207,29 @@ def _has_a_symbol_that_is_not_polynomial(plain: _Plain, certificate: Certificate
     return order >= 1 and not all(_is_a_polynomial(c, plain) for c in top)
 
 
+def _grows(plain: _Plain, certificate: Certificate) -> bool:
+    """The coefficients of the leading monomials of ad_A^m B, one after the other, are not zero."""
+    n, weights = plain.n, certificate.weights
+    sums = [weights[j] + weights[n + j] for j in range(n)]
+    i = sums.index(min(sums))
+    if min(sums) <= 0 or sums.count(min(sums)) > 1:
+        return False
+    monomials = []
+    for words in certificate.elements:
+        support = [(*m, *alpha) for alpha, c in plain.combination(words).items() for m in sp.Poly(c, *plain.x).monoms()]
+        heaviest = max(sum(w * k for w, k in zip(weights, m)) for m in support)
+        leading = [m for m in support if sum(w * k for w, k in zip(weights, m)) == heaviest]
+        if len(leading) > 1:
+            return False
+        monomials += leading
+    A, B = monomials
+    unit = [int(j in (i, n + i)) for j in range(2 * n)]
+    m = sp.Symbol("m", integer=True, nonnegative=True)
+    c, d = B[i] + m * (A[i] - 1), B[n + i] + m * (A[n + i] - 1)
+    zeros = sp.solveset(sp.expand(A[n + i] * c - A[i] * d), m, sp.S.Naturals0)
+    return list(A) != unit and zeros == sp.S.EmptySet
+
+
 def _is_a_polynomial(e: sp.Expr, plain: _Plain) -> bool:
     """Whether a function is a polynomial of any degree; one of which high differences do not vanish is not taken for one."""
     e = sp.expand(e)
@@ -204,7 +241,7 @@ def _differences_vanish(e: sp.Expr, x: Sequence[sp.Symbol], order: int) -> bool:
     e, rng = _concrete(e), random.Random(1730)
     for _ in range(3):
         start = [sp.Rational(rng.randint(1, 3000), 1009) for _ in x]
-        step = [sp.Rational(rng.randint(1, 300), 1009) for _ in x]
+        step = [sp.Rational(rng.randint(700, 2000), 1009) for _ in x]
         points = [{s: a + k * b for s, a, b in zip(x, start, step)} for k in range(order + 1)]
         values = [_value(e, point) for point in points]
         if any(value is None for value in values):
@@ -251,4 +288,4 @@ def _plus(alpha: tuple[int, ...], i: int) -> tuple[int, ...]:
 
 
 def _accumulate(table: dict, key: tuple[int, ...], value: Any) -> None:
-    table[key] = table.get(key, sp.Integer(0)) + value
+    table[key] = table[key] + value if key in table else value
