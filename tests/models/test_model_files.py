@@ -170,7 +170,9 @@ def test_every_model_of_the_gallery_loads_and_survives_being_written(name):
 
 def test_the_gallery_holds_the_promised_models():
     promised = {"spiral-sensor", "falling-body", "kalman-bucy-1d", "kalman-bucy-2d", "benes", "cubic-sensor",
-                "encoder", "wind-vane", "wind-vane-rate"}  # fmt: skip
+                "encoder", "wind-vane", "wind-vane-rate", "wong", "dong-chen-yau-3-4", "dong-chen-yau-3-5",
+                "dong-chen-yau-3-6", "passive-drift", "benes-2d", "unobserved-double-well", "silent-double-well",
+                "lorenz"}  # fmt: skip
     assert promised <= set(gallery.names())
     with pytest.raises(InputError, match="did you mean 'spiral-sensor'"):
         load_model("gallery:spiral-senor")

@@ -14,8 +14,9 @@ def linear(kind, **keys):
     return Model(**{**settings, "observation_kind": kind, "prior": prior, **keys})
 
 
-@pytest.mark.parametrize("name", gallery.names())
-def test_every_gallery_model_can_be_simulated_and_repeated(name):
+# Models without a prior are for analysis: some explode, one has an undetermined function.
+@pytest.mark.parametrize("name", [name for name in gallery.names() if gallery.load(name).prior is not None])
+def test_every_gallery_model_with_a_prior_can_be_simulated_and_repeated(name):
     model = load_model(f"gallery:{name}")
     truth, record = simulate(model, np.arange(1, 31) * 0.05, seed=3)
     again = simulate(model, np.arange(1, 31) * 0.05, seed=3)
