@@ -26,6 +26,7 @@ from zakai.errors import InputError
 from zakai.filters._formulas import Formulas
 from zakai.filters._protocol import Schedule
 from zakai.kolmogorov.flow import MOST_IMPLICIT, Coefficients, Flow, flows, substeps_for
+from zakai.kolmogorov.linear_solve import inverse
 from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 from zakai.models.compile import jax_function
 from zakai.models.model import Model
@@ -91,7 +92,7 @@ class AffineSystem:
         L, l, G, Q, p, r, C, c, S = self.matrices(t, theta)
         # The precision of those coordinates alone, with zeros elsewhere.
         both = inside[:, None] * inside
-        precision = both * jnp.linalg.inv(both * S + jnp.diag(1.0 - inside))
+        precision = both * inverse(both * S + jnp.diag(1.0 - inside))
         gain = C.T @ precision
         linear = jnp.hstack([p - gain @ c, gain])
         constant = jnp.concatenate([r[:, 0] - 0.5 * (c.T @ precision @ c)[:, 0], (precision @ c)[:, 0]])

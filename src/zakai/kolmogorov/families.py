@@ -14,12 +14,12 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
 from zakai.kolmogorov.flow import Flow, motion
+from zakai.kolmogorov.linear_solve import solve
 
 Array = Any
 
@@ -46,14 +46,6 @@ def gaussian(mean: Array, cov: Array) -> Family:
     return Family(np.zeros((1, 0)), np.zeros(1), np.ones(1), mean, cov, empty, empty[0], empty[:0], np.zeros(()))
 
 
-def _solved(matrix: Array, right: Array) -> tuple[Array, Array]:
-    """(matrix^-1 right, log |det matrix|) from one factorisation."""
-    lu, _, permutation = jax.lax.linalg.lu(matrix)
-    log_volume = jnp.sum(jnp.log(jnp.abs(jnp.diagonal(lu))))
-    lower = jax.lax.linalg.triangular_solve(lu, right[permutation], left_side=True, lower=True, unit_diagonal=True)
-    return jax.lax.linalg.triangular_solve(lu, lower, left_side=True, lower=False), log_volume
-
-
 def _symmetric(matrix: Array) -> Array:
     return 0.5 * (matrix + matrix.T)
 
@@ -67,7 +59,7 @@ def move(family: Family, flow: Flow, inputs: Array) -> Family:
     n = family.mean.shape[0]
     moved = motion(flow, family.mean, inputs)
     spread = family.cov + flow.spread
-    both, log_volume = _solved(jnp.eye(n) - 2.0 * spread @ flow.bend, jnp.hstack([spread, family.response]))
+    both, log_volume = solve(jnp.eye(n) - 2.0 * spread @ flow.bend, jnp.hstack([spread, family.response]))
     inner, response = _symmetric(both[:, :n]), both[:, n:]
     offset = inner @ moved.tilt
     log_mass = moved.log_mass + 0.5 * moved.tilt @ offset - 0.5 * log_volume + flow.log_volume
@@ -95,7 +87,7 @@ def read(family: Family, slope: Array, intercept: Array, after: Array, energy: A
     at_mean = slope @ family.mean + intercept
     pull = slope.T @ (after - energy @ at_mean)
     system = jnp.eye(n) + family.cov @ information
-    both, log_volume = _solved(system, jnp.hstack([family.cov, family.response]))
+    both, log_volume = solve(system, jnp.hstack([family.cov, family.response]))
     cov, response = _symmetric(both[:, :n]), both[:, n:]
     step = cov @ pull
     log_mass = after @ at_mean - 0.5 * at_mean @ energy @ at_mean + constant + 0.5 * pull @ step - 0.5 * log_volume

@@ -33,6 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
+from zakai.kolmogorov.linear_solve import solve
 
 STAGES = 8
 TOLERANCE = 1e-13
@@ -183,8 +184,8 @@ def _flow(deviation: jax.Array, response: jax.Array, action, action_inputs, grow
     """The pieces of equation (2) from Phi - 1 (2n, 2n) and the response of (xi, eta) to the inputs (2n, k)."""
     n = len(deviation) // 2
     p11, p12, p21 = jnp.eye(n) + deviation[:n, :n], deviation[:n, n:], deviation[n:, :n]
-    spread = -0.5 * jnp.linalg.solve(p11, p12)
-    bend = p11.T @ p21
+    solved, log_volume = solve(p11, p12)
+    spread, bend = -0.5 * solved, p11.T @ p21
     return Flow(
         map=p11,
         spread=0.5 * (spread + spread.T),
@@ -196,7 +197,7 @@ def _flow(deviation: jax.Array, response: jax.Array, action, action_inputs, grow
         action_inputs=action_inputs,
         growth=growth,
         trace=trace,
-        log_volume=jnp.linalg.slogdet(p11)[1],
+        log_volume=log_volume,
     )
 
 
