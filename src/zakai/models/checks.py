@@ -50,21 +50,27 @@ def check_constant_noise(model: Model) -> None:
 
 def _problem(model: Model, key: str, times: np.ndarray) -> tuple[int, tuple[str, str]] | None:
     """The first time at which the matrix is not what it must be, and the words before and after that time."""
-    matrices = numpy_function(getattr(model, key), model, getattr(model, key).shape)(np.zeros(model.n), times, model.theta())
-    finite = np.isfinite(matrices).all(axis=(-2, -1))
+    matrix, theta = getattr(model, key), model.theta()
+    times = times if matrix.has(model.t) else times[:1]
+    if key != "diffusion" and matrix.is_diagonal():
+        # Each entry is a matrix of its own: independent noises of a hundred states at a thousand times need no eigenvalues.
+        matrices = numpy_function(list(matrix.diagonal()), model)(np.zeros(model.n), times, theta)[..., None, None]
+    else:
+        matrices = numpy_function(matrix, model, matrix.shape)(np.zeros(model.n), times, theta)[:, None]
+    finite = np.isfinite(matrices).all(axis=(-3, -2, -1))
     if not finite.all():
         return int(np.argmin(finite)), ("is not finite", "")
     if key == "diffusion":
         return None
-    symmetric = is_symmetric(matrices)
+    symmetric = is_symmetric(matrices).all(axis=-1)
     if not symmetric.all():
         return int(np.argmin(symmetric)), ("is not symmetric", "")
-    smallest = smallest_eigenvalue(matrices)
+    smallest = smallest_eigenvalue(matrices).min(axis=-1)
     if key == "observation_noise":
         good = smallest > ROUNDING * model.m
         words = ("is not positive definite", "; every direction of the observation needs noise of its own")
     else:
-        good = smallest >= -ROUNDING * len(matrices[0])
+        good = smallest >= -ROUNDING * matrix.shape[0]
         words = ("is not positive semidefinite", "; a covariance has no negative direction")
     return None if good.all() else (int(np.argmin(good)), words)
 
