@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-WEIGHTS_FOR_EACH_COORDINATE = 24
+WEIGHTS_FOR_EACH_COORDINATE = 100
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,14 @@ class Growth:
 def growing_pair(supports: Sequence[np.ndarray], n: int) -> Growth | None:
     """The earliest pair that grows, for some of a fixed choice of weights; a support has rows (exponents of x, of xi)."""
     found: Growth | None = None
-    for weights in _weights(n):
-        leading = [_leading(support, weights) for support in supports]
-        known = [k for k, monomial in enumerate(leading) if monomial is not None]
+    table = _weights(n)
+    leading = [_leading(support, table) for support in supports]
+    for column, weights in enumerate(table.T):
+        known = [k for k, (single, _) in enumerate(leading) if single[column]]
         if not known:
             continue
         i = int(np.argmin(weights[:n] + weights[n:]))
-        monomials = np.array([leading[k] for k in known])
+        monomials = np.array([supports[k][leading[k][1][column]] for k in known])
         a, b = monomials[:, i], monomials[:, n + i]
         factor = np.outer(b, a) - np.outer(a, b)
         step = (a - b)[:, None]
@@ -54,18 +55,19 @@ def growing_pair(supports: Sequence[np.ndarray], n: int) -> Growth | None:
     return found
 
 
-def _leading(support: np.ndarray, weights: np.ndarray) -> np.ndarray | None:
-    """The heaviest monomial, if there is only one."""
-    weighed = support @ weights
-    heaviest = np.flatnonzero(weighed == weighed.max())
-    return support[heaviest[0]] if len(heaviest) == 1 else None
+def _leading(support: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For each column of weights, whether there is a single heaviest monomial, and which it is."""
+    weighed = support @ table
+    return np.sum(weighed == weighed.max(axis=0), axis=0) == 1, weighed.argmax(axis=0)
 
 
-def _weights(n: int):
-    """Fixed pseudo-random weights, in turn for each coordinate to be the lightest."""
+def _weights(n: int) -> np.ndarray:
+    """Fixed pseudo-random weights, a column each, in turn for each coordinate to be the lightest."""
     rng = random.Random(1919)
+    columns = []
     for _ in range(WEIGHTS_FOR_EACH_COORDINATE):
         for i in range(n):
             x = [rng.randint(-60, 60) for _ in range(n)]
             sums = [rng.randint(2, 90) if j != i else 1 for j in range(n)]
-            yield np.array([*x, *(total - w for total, w in zip(sums, x))])
+            columns.append([*x, *(total - w for total, w in zip(sums, x))])
+    return np.array(columns).T
