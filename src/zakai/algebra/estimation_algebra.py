@@ -20,6 +20,7 @@ from zakai.algebra.generators import Unreadable
 from zakai.algebra.identities import tidy
 from zakai.algebra.normal_form import Basis, basis_of
 from zakai.algebra.operators import JetTowerEnds
+from zakai.algebra.ratios import TooLarge
 from zakai.algebra.systems import affine_observation
 from zakai.models.model import Model
 
@@ -76,7 +77,7 @@ def estimation_algebra(model: Model) -> EstimationAlgebra:
     own = dict(zip(model.parameter_symbols, model.parameters.values(), strict=True))
     try:
         explored = _explore(model, own)
-    except Unreadable as reason:
+    except (Unreadable, TooLarge) as reason:
         return EstimationAlgebra(linear_rank=_rank_of_observations(model), note=f"not explored: {reason}")
     basis, words = _at_other_values(model, explored)
     shown = basis or explored.basis
@@ -150,7 +151,7 @@ def _at_other_values(model: Model, explored: _Exploration) -> tuple[Basis | None
                 return general.basis, f"the same for general values of {listed}, kept as symbols"
             if general.verdict != "undecided":
                 return None, f"at the model's values of {listed}; for general values, kept as symbols, it is {_said(general)}"
-        except Unreadable:
+        except (Unreadable, TooLarge):
             pass
     rng = random.Random(1987)
     outcomes = set()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -60,14 +61,29 @@ class Numbers:
         return sp.factor(self._in_constants(number.numerator) / self._in_constants(number.denominator))
 
     def _in_constants(self, p: Any) -> sp.Expr:
+        return self._reader.expression(self._in_ring(p))
+
+    def _in_ring(self, p: Any) -> Symbol:
         padding = (0,) * (self._ring.n + self._ring.generators + self._ring.n)
-        return self._reader.expression(self._ring.context.from_dict({(*padding, *m): c for m, c in p.to_dict().items()}))
+        return self._ring.context.from_dict({(*padding, *m): c for m, c in p.to_dict().items()})
 
     def monomial(self, key: Any) -> tuple[tuple[int, ...], sp.Expr]:
         """The exponents of xi and the function in SymPy that a key stands for."""
         n, exponents = self._ring.n, key[3]
         padded = (*[0] * n, *exponents[n:], *[0] * self._count)
         return exponents[:n], self._reader.expression(self._ring.context.from_dict({padded: 1}))
+
+    def combination(self, numbers: Vector, elements: Mapping[Any, Symbol]) -> tuple[Symbol, Any]:
+        """(p, d): sum_k numbers[k] elements[k] = p / d with p in the ring."""
+        if not self.symbolic:
+            return sum((elements[key] * c for key, c in numbers.items()), self._ring.zero), self.one
+        common = self._context.constant(1)
+        for c in numbers.values():
+            common = common * divmod(c.denominator, common.gcd(c.denominator))[0]
+        total = self._ring.zero
+        for key, c in numbers.items():
+            total = total + elements[key] * self._in_ring(c.numerator * divmod(common, c.denominator)[0])
+        return total, Ratio(common, self._context.constant(1))
 
     def support(self, vector: Vector) -> np.ndarray:
         """The exponents of x and then of xi of a vector without generators, a row each."""

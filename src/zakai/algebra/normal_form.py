@@ -35,28 +35,18 @@ class Basis:
 
 def basis_of(operators: DmzOperators, closure: Closure) -> Basis:
     """The reduced echelon basis in D and x, highest order first, with L_0 itself in the place of its leading row."""
-    numbers, one = operators.numbers, operators.numbers.one
-    span = Span(one)
+    numbers = operators.numbers
+    span = Span(numbers.one)
     for word, symbol in closure.words.items():
         span.add(numbers.vector(operators.in_D(symbol)), word)
     leading = max(numbers.vector(operators.in_D(operators.L0)))
-    combinations: list[Vector] = [{(0,): one}]
+    combinations: list[Vector] = [{(0,): numbers.one}]
     elements: list[sp.Expr] = [L0]
     for pivot, (row, words) in sorted(span.rows.items(), key=_place):
         if pivot != leading:
             combinations.append(words)
             elements.append(_expression(row, operators))
-    coordinates = Span(one)
-    for k, combination in enumerate(combinations):
-        coordinates.add(combination, k)
-    table = _word_brackets(operators, closure)
-    constants = {}
-    for i, left in enumerate(combinations):
-        for j, right in enumerate(combinations[i + 1 :], i + 1):
-            found = coordinates.reduce(_bilinear(left, right, table))[1]
-            constants[i, j] = tuple(
-                numbers.expression(found[k]) if k in found else sp.Integer(0) for k in range(len(combinations))
-            )
+    constants = _structure_constants(combinations, operators, closure)
     in_words = tuple({word: numbers.expression(c) for word, c in combination.items()} for combination in combinations)
     return Basis(tuple(elements), in_words, constants)
 
@@ -67,30 +57,26 @@ def _place(item: tuple[Any, Any]) -> tuple:
     return -order, -generators, -degree, tuple(-k for k in monomial)
 
 
-def _word_brackets(operators: DmzOperators, closure: Closure) -> dict[tuple[Word, Word], Vector]:
-    words = list(closure.words)
-    table = {}
-    for i, left in enumerate(words):
-        for right in words[i + 1 :]:
-            bracket = operators.ring.bracket(closure.words[left], closure.words[right])
-            rest, taken = closure.span.reduce(operators.numbers.vector(bracket))
+def _structure_constants(
+    combinations: list[Vector], operators: DmzOperators, closure: Closure
+) -> dict[tuple[int, int], tuple[sp.Expr, ...]]:
+    """The coordinates of the brackets; every element is multiplied by a common denominator to be in the ring."""
+    numbers = operators.numbers
+    span = Span(numbers.one)
+    multiples = []
+    for k, combination in enumerate(combinations):
+        symbol, denominator = numbers.combination(combination, closure.words)
+        multiples.append((symbol, denominator))
+        span.add({key: c / denominator for key, c in numbers.vector(symbol).items()}, k)
+    constants = {}
+    for i, (left, p) in enumerate(multiples):
+        for j, (right, q) in enumerate(multiples[i + 1 :], i + 1):
+            rest, found = span.reduce(numbers.vector(operators.ring.bracket(left, right)))
             assert not rest, "the span is closed"
-            table[left, right] = taken
-    return table
-
-
-def _bilinear(left: Vector, right: Vector, table: Mapping[tuple[Word, Word], Vector]) -> Vector:
-    total: Vector = {}
-    for a, x in left.items():
-        for b, y in right.items():
-            known, factor = (table[a, b], x * y) if (a, b) in table else (table.get((b, a), {}), -(x * y))
-            for word, c in known.items():
-                value = total[word] + factor * c if word in total else factor * c
-                if value:
-                    total[word] = value
-                else:
-                    total.pop(word)
-    return total
+            scale = numbers.one / (p * q)
+            row = [numbers.expression(scale * found[k]) if k in found else sp.Integer(0) for k in range(len(multiples))]
+            constants[i, j] = tuple(row)
+    return constants
 
 
 def _expression(row: Vector, operators: DmzOperators) -> sp.Expr:

@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+MOST_TERMS = 200
+
+
+class TooLarge(Exception):
+    """A numerator or denominator has more than MOST_TERMS terms: symbols for the constants are not feasible."""
+
 
 class Ratio:
     """`numerator` / `denominator` in lowest terms, two flint polynomials of one context; the denominator is monic."""
@@ -15,6 +21,8 @@ class Ratio:
             common = numerator.gcd(denominator)
             if not common.is_constant():
                 numerator, denominator = divmod(numerator, common)[0], divmod(denominator, common)[0]
+        if max(len(numerator), len(denominator)) > MOST_TERMS:
+            raise TooLarge("polynomials in the constants grow too large")
         leading = denominator.leading_coefficient()
         self.numerator, self.denominator = numerator / leading, denominator / leading
 

@@ -154,7 +154,9 @@ class _Plain:
 
 def _is_closed(plain: _Plain, certificate: Certificate) -> bool:
     """The generators are in the span, every bracket is the combination that is claimed, and the basis is independent."""
-    assert certificate.constants is not None
+    pairs = set(itertools.combinations(range(len(certificate.elements)), 2))
+    if certificate.constants is None or set(certificate.constants) != pairs:
+        return False
     basis = [plain.combination(words) for words in certificate.elements]
     prepared = [plain.prepared(operator) for operator in basis]
     for (i, j), row in certificate.constants.items():
