@@ -87,16 +87,20 @@ class AffineSystem:
         self.outputs = model.m
 
     def coefficients(self, t: Any, argument: tuple[Any, Any]) -> Coefficients:
-        """The coefficients of the flow at time t; `argument` is (theta, inside), `inside` (m,) what acts as a rate."""
+        """The coefficients of the flow at time t; `argument` is (theta, inside), `inside` (m,) what acts as a rate.
+
+        They are NumPy for NumPy arguments.
+        """
         theta, inside = argument
         L, l, G, Q, p, r, C, c, S = self.matrices(t, theta)
         # The precision of those coordinates alone, with zeros elsewhere.
+        xp = numpy_or_jax(L)
         both = inside[:, None] * inside
-        precision = both * inverse(both * S + jnp.diag(1.0 - inside))
+        precision = both * inverse(both * S + xp.diag(1.0 - inside))
         gain = C.T @ precision
-        linear = jnp.hstack([p - gain @ c, gain])
-        constant = jnp.concatenate([r[:, 0] - 0.5 * (c.T @ precision @ c)[:, 0], (precision @ c)[:, 0]])
-        offset = jnp.hstack([l, jnp.zeros((len(l), len(inside)))])
+        linear = xp.hstack([p - gain @ c, gain])
+        constant = xp.concatenate([r[:, 0] - 0.5 * (c.T @ precision @ c)[:, 0], (precision @ c)[:, 0]])
+        offset = xp.hstack([l, np.zeros((len(l), len(inside)))])
         return Coefficients(L, offset, G, Q - 0.5 * gain @ C, linear, constant)
 
     def quadratic(self, t: Any, theta: Any) -> Any:
@@ -160,11 +164,12 @@ def _parts(system: AffineSystem, model: Model, starts: np.ndarray, stops: np.nda
     """Into how many equal parts the intervals are cut."""
     few = 64 if model.n <= MOST_IMPLICIT else 4
     tried = np.unique(np.r_[np.argmax(stops - starts), np.linspace(0, len(starts) - 1, few).astype(int)])
-    theta, rate = np.tile(model.theta(), (len(tried), 1)), 0.0
+    rate = 0.0
     for times in (starts[tried], stops[tried]):
-        c = jax.jit(jax.vmap(system.coefficients))(times, (theta, inside[tried]))
+        each = [system.coefficients(t, (model.theta(), inside[k])) for t, k in zip(times, tried, strict=True)]
+        c = jax.tree.map(lambda *arrays: np.stack(arrays), *each)
         if not all(np.all(np.isfinite(array)) for array in c):
             raise InputError(f"{model.source}: a coefficient is not finite between t = {starts[0]:g} and {stops[-1]:g}")
-        waves = np.linalg.norm(np.asarray(c.covariance @ c.quadratic), ord=2, axis=(1, 2))
-        rate = max(rate, float(np.max(np.linalg.norm(np.asarray(c.matrix), ord=2, axis=(1, 2)) + np.sqrt(2 * waves))))
+        waves = np.linalg.norm(c.covariance @ c.quadratic, ord=2, axis=(1, 2))
+        rate = max(rate, float(np.max(np.linalg.norm(c.matrix, ord=2, axis=(1, 2)) + np.sqrt(2 * waves))))
     return max(1, int(np.ceil(rate * np.max(stops - starts) / _GROWTH)))

@@ -25,6 +25,7 @@ from zakai.filters._protocol import Info, Schedule
 from zakai.filters.observations import Data, Factors, factors
 from zakai.kolmogorov.families import Family, log_terms, move, read
 from zakai.kolmogorov.flow import Flow
+from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 from zakai.models.model import Model
 
 
@@ -52,6 +53,7 @@ class Prepared:
     gauge: GaugeFunctions
     theta: Any
     intervals: Interval
+
 
 class Quadratic(NamedTuple):
     """S = -x'K x / 2 - k.x where the families are those of e^S v: `matrix` K (n, n), `slope` k (n,)."""
@@ -107,14 +109,18 @@ def with_parameters(prepared: Prepared, theta: Any) -> Prepared:
 
 
 def _intervals(plan: Plan, system: AffineSystem, gauge: GaugeFunctions, schedule: Schedule, theta: Any) -> Interval:
-    stops = jnp.asarray(schedule.stops)
-    slope, intercept = jax.vmap(system.observation, (0, None))(stops, theta)
-    tilts = jax.vmap(gauge.at, (0, None))(stops, theta)
-    quadratic = jax.vmap(system.quadratic, (0, None))(stops, theta)
-    tiled = jnp.tile(jnp.asarray(theta), (len(schedule.stops), 1))
-    intervals = Interval(plan.flows(theta), slope, intercept, tilts, quadratic, stops, tiled, gauge)
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(intervals))
-    return intervals if traced else jax.tree.map(np.asarray, intervals)
+    xp, stops = numpy_or_jax(theta), schedule.stops
+
+    def at_stops(function):
+        return function(stops, theta) if xp is np else jax.vmap(function, (0, None))(jnp.asarray(stops), theta)
+
+    def repeated(array):
+        return xp.broadcast_to(array, (len(stops), *np.shape(array)))
+
+    slope, intercept = at_stops(system.observation)
+    # S is there for constant coefficients only.
+    quadratic = jax.tree.map(repeated, system.quadratic(schedule.starts[0], theta))
+    return Interval(plan.flows(theta), slope, intercept, at_stops(gauge.at), quadratic, stops, repeated(theta), gauge)
 
 
 def observations(prepared: Prepared, data: Data) -> Factors:
@@ -127,7 +133,11 @@ def observations(prepared: Prepared, data: Data) -> Factors:
 
 def init(prepared: Prepared, prior: Any) -> State:
     """The prior as families of Gaussians."""
-    return _normalised(prepared, _families(prepared, prior))[0]
+    state, start, theta = _families(prepared, prior), prepared.model.start, prepared.theta
+    quadratic, families = prepared.system.quadratic(start, theta), state.families
+    bare = families if quadratic is None else quadratic.times(families, -1.0)
+    found = posterior(prepared.gauge, prepared.gauge.at(start, theta), state.time, theta, bare)
+    return state._replace(families=families._replace(log_mass=families.log_mass - found.log_mass))
 
 
 def _families(prepared: Prepared, prior: Any) -> State:
@@ -137,14 +147,7 @@ def _families(prepared: Prepared, prior: Any) -> State:
     families = found.families if quadratic is None else quadratic.times(found.families, 1.0)
     if quadratic is not None:
         check_normalisable(model, families.cov)
-    return State(families, jnp.asarray(found.log_error), jnp.asarray(found.edge), jnp.asarray(model.start, float))
-
-
-def _normalised(prepared: Prepared, state: State) -> tuple[State, Info]:
-    start = prepared.model.start
-    tilts = prepared.gauge.at(start, prepared.theta)
-    quadratic = prepared.system.quadratic(start, prepared.theta)
-    return _looked_at(prepared.gauge, tilts, quadratic, start, prepared.theta, state)
+    return State(families, found.log_error, found.edge, np.asarray(model.start, float))
 
 
 def check_normalisable(model: Model, covs: Any) -> None:
@@ -159,9 +162,12 @@ def check_normalisable(model: Model, covs: Any) -> None:
 def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State, Info]:
     """The prior after a sample at the start itself."""
     state = init(prepared, prior)
-    slope, intercept = prepared.system.observation(prepared.model.start, prepared.theta)
+    start, theta = prepared.model.start, prepared.theta
+    slope, intercept = prepared.system.observation(start, theta)
     reading = jax.tree.map(lambda a: a[0], observation)
-    return _normalised(prepared, state._replace(families=_read(state.families, slope, intercept, reading)))
+    read_state = state._replace(families=_read(state.families, slope, intercept, reading))
+    tilts, quadratic = prepared.gauge.at(start, theta), prepared.system.quadratic(start, theta)
+    return _looked_at(prepared.gauge, tilts, quadratic, start, theta, read_state)
 
 
 def step(interval: Interval, state: State, observation: Factors) -> tuple[State, Info]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-import jax.numpy as jnp
+import numpy as np
 import sympy as sp
 
 from zakai import _float64  # noqa: F401
@@ -28,6 +28,7 @@ from zakai.filters._affine_system import AffineSystem, affine_system_of
 from zakai.filters._formulas import Formulas, formulas
 from zakai.filters._protocol import Method, Schedule
 from zakai.kolmogorov.flow import Coefficients
+from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 from zakai.models.model import Model
 
 CHOICES = ("theorem-4", "theorem-5", "theorem-6", "survey-1")
@@ -38,25 +39,27 @@ class WithoutDrift(AffineSystem):
 
     def coefficients(self, t: Any, argument: tuple[Any, Any]) -> Coefficients:
         c = super().coefficients(t, argument)
-        matrix, offset = c.matrix, c.offset[:, :1]
-        solved = jnp.linalg.solve(c.covariance, jnp.hstack([matrix, offset]))
-        n = len(matrix)
-        linear = c.linear.at[:, 0].add(-(matrix.T @ solved[:, n]))
-        constant = c.constant.at[0].add(0.5 * jnp.trace(matrix) - 0.5 * offset[:, 0] @ solved[:, n])
+        matrix, offset = c.matrix, c.offset[:, 0]
+        slope = self._slope(c)
+        n, first = len(matrix), np.arange(len(c.constant)) == 0
         return Coefficients(
-            jnp.zeros_like(matrix),
-            jnp.zeros_like(c.offset),
+            0.0 * matrix,
+            0.0 * c.offset,
             c.covariance,
-            c.quadratic - 0.5 * matrix.T @ solved[:, :n],
-            linear,
-            constant,
+            c.quadratic - 0.5 * matrix.T @ slope[:, :n],
+            c.linear - (matrix.T @ slope[:, n])[:, None] * first,
+            c.constant + 0.5 * (matrix.trace() - offset @ slope[:, n]) * first,
         )
 
+    def _slope(self, c: Coefficients) -> Any:
+        """G^-1 (L, l), (n, n + 1)."""
+        xp = numpy_or_jax(c.matrix)
+        return xp.linalg.solve(c.covariance, xp.hstack([c.matrix, c.offset[:, :1]]))
+
     def quadratic(self, t: Any, theta: Any) -> families.Quadratic:
-        c = super().coefficients(t, (theta, jnp.zeros(self.outputs)))
-        solved = jnp.linalg.solve(c.covariance, jnp.hstack([c.matrix, c.offset[:, :1]]))
-        n = len(solved)
-        return families.Quadratic(0.5 * (solved[:, :n] + solved[:, :n].T), solved[:, n])
+        slope = self._slope(super().coefficients(t, (theta, np.zeros(self.outputs))))
+        n = len(slope)
+        return families.Quadratic(0.5 * (slope[:, :n] + slope[:, :n].T), slope[:, n])
 
 
 @lru_cache(maxsize=32)

@@ -208,6 +208,26 @@ _EXTRAPOLATION = tuple(
 )
 
 
+class _Stage(NamedTuple):
+    """An evaluation of the midpoint rule: where, how long its steps are, and, after the last of them, the weight of its result
+    and how long the next ones are; lengths in those of the whole step."""
+
+    place: Array
+    part: Array
+    weight: Array
+    next_part: Array
+
+
+def _stages() -> _Stage:
+    rows = []
+    for count, weight, following in zip(_MIDPOINTS, _EXTRAPOLATION, (*_MIDPOINTS[1:], 1), strict=True):
+        rows += [(i / count, 1.0 / count, weight * (i == count), 1.0 / following) for i in range(1, count + 1)]
+    return _Stage(*np.array(rows).T)
+
+
+_STAGES = _stages()
+
+
 def integrate_explicitly(
     coefficients: Callable[[jax.Array], Coefficients], start: jax.Array, stop: jax.Array, substeps: int
 ) -> Flow:
@@ -237,25 +257,27 @@ def integrate_explicitly(
     def added(value, factor, rate):
         return jax.tree.map(lambda a, b: a + factor * b, value, rate)
 
-    def midpoint(begin, value, first, count):
-        """Gragg's smoothed midpoint rule, as a change of `value`."""
-        h = length / count
-
-        def two(i, pair):
-            before, now = pair
-            return now, added(before, 2.0 * h, slope(begin + i * h, added(value, 1.0, now)))
-
-        zero = jax.tree.map(jnp.zeros_like, value)
-        before, last = jax.lax.fori_loop(1, count, two, (zero, added(zero, h, first)))
-        end = slope(begin + length, added(value, 1.0, last))
-        return jax.tree.map(lambda a, b, c: 0.5 * (a + b + h * c), before, last, end)
-
     def step(index, value):
+        """Gragg's smoothed midpoint rule for every number of steps, as changes of `value`, one evaluation after another."""
         begin = start + index * length
-        first, value_next = slope(begin, value), value
-        for count, weight in zip(_MIDPOINTS, _EXTRAPOLATION, strict=True):
-            value_next = added(value_next, weight, midpoint(begin, value, first, count))
-        return value_next
+        first = slope(begin, value)
+        still = jax.tree.map(jnp.zeros_like, value)
+
+        def evaluation(carry, stage):
+            total, before, now = carry
+            rate = slope(begin + stage.place * length, added(value, 1.0, now))
+
+            def on(_):
+                return total, now, added(before, 2.0 * stage.part * length, rate)
+
+            def last(_):
+                end = jax.tree.map(lambda a, b, c: 0.5 * (a + b + stage.part * length * c), before, now, rate)
+                return added(total, stage.weight, end), still, added(still, stage.next_part * length, first)
+
+            return jax.lax.cond(stage.weight == 0.0, on, last, None), None
+
+        begun = added(still, length / _MIDPOINTS[0], first)
+        return jax.lax.scan(evaluation, (value, still, begun), _STAGES)[0][0]
 
     zero = (
         jnp.zeros((2 * n, 2 * n)),
@@ -357,6 +379,7 @@ def flows(
     return (_fixed if traced else _in_blocks)(coefficients, starts, stops, arguments, substeps)
 
 
-def _difference(a: jax.Array, b: jax.Array) -> float:
-    difference = float(jnp.max(jnp.abs(a - b), initial=0.0)) / (1.0 + float(jnp.max(jnp.abs(b), initial=0.0)))
-    return difference if np.isfinite(difference) else np.inf
+def _difference(a: np.ndarray, b: np.ndarray) -> float:
+    with np.errstate(all="ignore"):
+        difference = np.max(np.abs(a - b), initial=0.0) / (1.0 + np.max(np.abs(b), initial=0.0))
+    return float(difference) if np.isfinite(difference) else np.inf

@@ -14,8 +14,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from zakai import _float64  # noqa: F401
+from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 
 _BLOCK = 16  # up to this size substitution is the cheaper way, and no library starts a thread
 
@@ -34,7 +36,9 @@ def solve(matrix: Any, right: Any) -> tuple[Any, Any]:
 
 
 def inverse(matrix: Any) -> Any:
-    """matrix^-1 (n, n)."""
+    """matrix^-1 (n, n); NumPy for a NumPy matrix."""
+    if numpy_or_jax(matrix) is np:
+        return np.linalg.inv(matrix)
     return solve(matrix, jnp.eye(len(matrix)))[0]
 
 
