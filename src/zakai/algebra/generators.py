@@ -18,16 +18,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import product
-from typing import Any
 
 import sympy as sp
-from flint import fmpq, fmpq_mat
+from flint import fmpq_mat
 from sympy.core.function import AppliedUndef
 
 from zakai.algebra.arguments import Unreadable, argument_basis
 from zakai.algebra.operators import OperatorRing, Symbol
+from zakai.algebra.quotients import Fraction, Fractions
 
-Fraction = tuple[Symbol, Symbol]
 PI = sp.Symbol("pi", positive=True)  # transcendental, so a constant like any other
 INVERSE = sp.Dummy("inverse")  # 1/P
 HYPERBOLIC = (sp.exp, sp.sinh, sp.cosh, sp.tanh)
@@ -48,7 +47,7 @@ class Reader:
         atoms = sorted({a for e in expressions for a in _functions(e, set(x))}, key=str)
         self._plans: list[tuple[sp.Expr, Callable[[], list[Symbol] | None]]] = []  # what a generator is, its derivatives
         self._values: dict[sp.Expr, Callable[[], Fraction]] = {}
-        self._inverse = self._plan(sp.Dummy("unused"), lambda: None)
+        self._inverse = self._plan(sp.Dummy("inverse of Q"), lambda: None)
         self._circles: list[tuple[int, int]] = []
         self._hyperbolic([a for a in atoms if isinstance(a, HYPERBOLIC)])
         self._circular([a for a in atoms if isinstance(a, CIRCULAR)])
@@ -58,18 +57,26 @@ class Reader:
         for atom in [a for a in atoms if isinstance(a, AppliedUndef)]:
             self._jets(atom, jets)
         self.ring = OperatorRing(len(self._x), len(self._plans), len(self._constants))
-        self._symbols = dict(zip((*self._x, *self._constants), (*self.ring.x, *self.ring.c), strict=True))
-        self._known: dict[sp.Expr, Fraction] = {}
-        self._relate_circles()
+        symbols = dict(zip((*self._x, *self._constants), (*self.ring.x, *self.ring.c), strict=True))
+        self._fractions = Fractions(self.ring, symbols, self._values, self._inverse)
+        self.ring.relations = [self.ring.u[c] ** 2 + self.ring.u[s] ** 2 - 1 for c, s in self._circles]
         arguments = [self._fraction(a.args[0]) for a in logarithms]
         _refuse_dependent_logarithms(arguments, self.ring)
         self._log_arguments = [part for fraction in arguments for part in fraction]
-        self._invert([self._fraction(e)[1] for e in expressions] + self._log_arguments)
-        self._declare()
+        self._fractions.relate([self._fraction(e)[1] for e in expressions] + self._log_arguments)
+        for k, (_, derivatives) in enumerate(self._plans):
+            self.ring.derivatives[k] = derivatives()
+        # The other generators' derivatives may contain v, but not its derivative.
+        self._fractions.declare()
+
+    @property
+    def constant_denominator(self) -> Symbol:
+        """P, whose inverse is the last constant of the ring."""
+        return self._fractions.P
 
     def read(self, expression: sp.Expr) -> Symbol:
         """The element of the ring that an expression is."""
-        return self._polynomial(self._fraction(expression.xreplace({sp.pi: PI})))
+        return self._fractions.polynomial(self._fraction(expression.xreplace({sp.pi: PI})))
 
     def expression(self, p: Symbol) -> sp.Expr:
         """An element without xi as a SymPy expression."""
@@ -81,25 +88,25 @@ class Reader:
         return sp.Add(*terms)
 
     def _named(self, function: sp.Expr) -> sp.Expr:
-        if function is INVERSE:
-            return 1 / self.expression(self.constant_denominator)
+        if function in (INVERSE, self._plans[self._inverse][0]):
+            return 1 / self.expression(self._fractions.P if function is INVERSE else self._fractions.Q)
         return function.xreplace({PI: sp.pi})
 
     def is_smooth(self) -> bool:
         """Whether every formula is smooth on all of R^n, as far as the signs of coefficients show.
 
         A denominator, or the argument of a logarithm, is positive if it is a sum of positive multiples of even powers of
-        states and any powers of exponentials, among them a number.
+        states and any powers of exponentials, one of them without a state.
         """
         exponentials = [isinstance(function, sp.exp) for function, _ in self._plans]
-        return all(self._is_positive(p, exponentials) for p in (self._Q, *self._log_arguments))
+        return all(self._is_positive(p, exponentials) for p in (self._fractions.Q, *self._log_arguments))
 
     def _is_positive(self, p: Symbol, exponentials: list[bool]) -> bool:
         for monomial, c in p.to_dict().items():
             _, u, x, constants = self.ring.split(monomial)
             if c <= 0 or any(constants) or any(k % 2 for k in x) or any(k and not e for k, e in zip(u, exponentials)):
                 return False
-        return not any(p.monoms()[-1])
+        return any(not any(self.ring.split(monomial)[2]) for monomial in p.monoms())
 
     # ---- generators
 
@@ -107,8 +114,11 @@ class Reader:
         self._plans.append((function, derivatives))
         return len(self._plans) - 1
 
+    def _fraction(self, e: sp.Expr) -> Fraction:
+        return self._fractions.of(e)
+
     def _slopes(self, argument: sp.Expr) -> list[Symbol]:
-        p = self._polynomial(self._fraction(argument))
+        p = self._fractions.polynomial(self._fraction(argument))
         return [self.ring.total_derivative(p, i) for i in range(self.ring.n)]
 
     def _hyperbolic(self, atoms: list[sp.Expr]) -> None:
@@ -168,12 +178,15 @@ class Reader:
         return {sp.cos: (cosine, self.ring.one), sp.sin: (sine, self.ring.one), sp.tan: (sine, cosine)}[atom.func]
 
     def _logarithm(self, atom: sp.Expr) -> None:
-        k = self._plan(atom, lambda: [self._polynomial((d, self.ring.one)) for d in self._log_slopes(atom.args[0])])
+        k = self._plan(atom, lambda: [self._fractions.polynomial((d, self.ring.one)) for d in self._log_slopes(atom.args[0])])
         self._values[atom] = lambda: (self.ring.u[k], self.ring.one)
 
     def _log_slopes(self, argument: sp.Expr) -> list[Symbol]:
         numerator, denominator = self._fraction(argument)
-        up, down = self._polynomial((self.ring.one, numerator)), self._polynomial((self.ring.one, denominator))
+        up, down = (
+            self._fractions.polynomial((self.ring.one, numerator)),
+            self._fractions.polynomial((self.ring.one, denominator)),
+        )
         ring = self.ring
         return [
             ring.normal(ring.total_derivative(numerator, i) * up - ring.total_derivative(denominator, i) * down)
@@ -199,116 +212,6 @@ class Reader:
         for order in orders:
             self._plan(_jet(atom, order), partial(derivatives, order))
         self._values[atom] = lambda: (self.ring.u[first], self.ring.one)
-
-    # ---- relations
-
-    def _relate_circles(self) -> None:
-        self.ring.relations = [self.ring.u[c] ** 2 + self.ring.u[s] ** 2 - 1 for c, s in self._circles]
-
-    def _invert(self, denominators: list[Symbol]) -> None:
-        """v = 1/Q, Q the product of the different factors of the denominators."""
-        ring = self.ring
-        factors: dict[str, Symbol] = {}
-        for denominator in denominators:
-            for factor, _ in denominator.factor()[1]:
-                factors.setdefault(str(factor), factor)
-        moving = [f for f in factors.values() if any(f.degrees()[: -len(ring.c)])]
-        self._Q = sp.prod(moving, start=ring.one)
-        self.constant_denominator = sp.prod([f for f in factors.values() if f not in moving], start=ring.one)
-        if not self.constant_denominator.is_constant():
-            ring.relations.append(ring.c[-1] * self.constant_denominator - 1)
-        if not moving:
-            return
-        v = ring.u[self._inverse]
-        if any(self._Q.monoms()[0][-len(ring.c) :]):
-            raise Unreadable("the leading coefficient of a denominator depends on a parameter")
-        self._plans[self._inverse] = (1 / self.expression(self._Q), lambda: None)
-        ring.relations.append(v * self._Q - 1)
-        if any(self._Q.degrees()[ring.n + k] for circle in self._circles for k in circle):
-            self._complete()
-        # The derivatives of the other generators come first; they may contain v, but not its derivative.
-        self._declare()
-        slopes = [ring.total_derivative(self._Q, i) for i in range(ring.n)]
-        ring.derivatives[self._inverse] = [ring.normal(-(v**2) * slope) for slope in slopes]
-
-    def _declare(self) -> None:
-        for k, (_, derivatives) in enumerate(self._plans):
-            if k != self._inverse:
-                self.ring.derivatives[k] = derivatives()
-
-    def _complete(self) -> None:
-        """A Groebner basis, where the leading monomials of the relations have common factors."""
-        names = [sp.Symbol(name) for name in self.ring.context.names()]
-        relations = [sp.Poly(str(r).replace("^", "**"), *names) for r in self.ring.relations]
-        basis = sp.groebner(relations, *names, order="lex")
-        self.ring.relations = [self.ring.context.from_dict({m: _flint(c) for m, c in p.terms()}) for p in basis.polys]
-
-    # ---- formulas
-
-    def _polynomial(self, fraction: Fraction) -> Symbol:
-        """The fraction with v for the denominators."""
-        ring = self.ring
-        numerator, denominator = fraction
-        if denominator.is_constant():
-            return ring.normal(numerator / denominator.leading_coefficient())
-        every = self._Q * self.constant_denominator
-        inverse = (ring.one if self._Q.is_constant() else ring.u[self._inverse]) * (
-            ring.one if self.constant_denominator.is_constant() else ring.c[-1]
-        )
-        power = every
-        for k in range(1, sum(denominator.degrees()) + 1):
-            quotient, remainder = divmod(power, denominator)
-            if remainder.is_zero():
-                return ring.normal(numerator * quotient * inverse**k)
-            power = power * every
-        raise Unreadable("a denominator is not a product of those of the formulas")
-
-    def _fraction(self, e: sp.Expr) -> Fraction:
-        if e not in self._known:
-            self._known[e] = self._convert(e)
-        return self._known[e]
-
-    def _convert(self, e: sp.Expr) -> Fraction:
-        ring = self.ring
-        if e.is_Rational:
-            return ring.number(_flint(e)), ring.one
-        if e in self._symbols:
-            return self._symbols[e], ring.one
-        if isinstance(e, sp.Add):
-            return self._sum([self._fraction(a) for a in e.args])
-        if isinstance(e, sp.Mul):
-            parts = [self._fraction(a) for a in e.args]
-            numerator = sp.prod([p for p, _ in parts], start=ring.one)
-            denominator = sp.prod([q for _, q in parts], start=ring.one)
-            return self._lowest(numerator, denominator)
-        if isinstance(e, sp.Pow) and e.exp.is_Integer:
-            numerator, denominator = self._fraction(e.base)
-            k = int(e.exp)
-            if k < 0:
-                numerator, denominator = denominator, numerator
-                if denominator.is_zero():
-                    raise Unreadable(f"{e} divides by zero")
-            return self._lowest(numerator ** abs(k), denominator ** abs(k))
-        if e in self._values:
-            return self._values[e]()
-        raise Unreadable(f"{e} is not in the operator ring")
-
-    def _sum(self, parts: list[Fraction]) -> Fraction:
-        numerator, denominator = self.ring.zero, self.ring.one
-        for p, q in parts:
-            if q == denominator:
-                numerator = numerator + p
-            else:
-                numerator, denominator = numerator * q + p * denominator, denominator * q
-        return self._lowest(numerator, denominator)
-
-    def _lowest(self, numerator: Symbol, denominator: Symbol) -> Fraction:
-        ring = self.ring
-        numerator, denominator = ring.normal(numerator), ring.normal(denominator)
-        if denominator.is_constant():
-            return numerator / denominator.leading_coefficient(), ring.one
-        common = numerator.gcd(denominator)
-        return divmod(numerator, common)[0], divmod(denominator, common)[0]
 
 
 def _functions(e: sp.Expr, x: set[sp.Symbol]) -> Iterable[sp.Expr]:
@@ -350,7 +253,3 @@ def _jet(atom: sp.Expr, order: tuple[int, ...]) -> sp.Expr:
     places = [sp.Dummy(f"z{j + 1}", real=True) for j in range(len(order))]
     derivative = sp.Derivative(atom.func(*places), *[(z, k) for z, k in zip(places, order) if k])
     return sp.Subs(derivative, tuple(places), tuple(atom.args))
-
-
-def _flint(number: Any) -> Any:
-    return fmpq(int(number.p), int(number.q))
