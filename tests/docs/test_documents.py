@@ -124,3 +124,6 @@ def test_every_misprint_of_the_errata_has_its_test():
     assert {row[3] for row in table("docs/limited-direct.md", "where")} == tests
     later = set(re.findall(r"^def (test_\w+)", (ROOT / "tests/errata/test_hu_yau_printed.py").read_text(), re.MULTILINE))
     assert {row[3] for row in table("docs/kalman-bucy-benes-hu-yau.md", "where")} <= later
+    text = (ROOT / "tests/errata/test_estimation_algebras_printed.py").read_text()
+    printed = set(re.findall(r"^def (test_\w+)", text, re.MULTILINE))
+    assert {row[3] for row in table("docs/estimation-algebras.md", "where")} <= printed
