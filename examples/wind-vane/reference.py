@@ -118,14 +118,32 @@ def log_length_density(r: float) -> float:
     return float(np.log(kappa * i0e(kappa)))
 
 
-def log_length_density_gaussian(predicted: np.ndarray, spread: np.ndarray, points: int = 1440) -> np.ndarray:
-    """The same for readings that are predicted to be N(predicted (K, 2), spread (K, 2, 2)): its integral over the unit circle."""
+def log_length_density_gaussian(variance: np.ndarray, r: np.ndarray, points: int = 720) -> np.ndarray:
+    """The same for the extended Kalman filter, whose angle has `variance` before the reading; all of one shape.
+
+    Its prediction of the reading is a Gaussian about a point of the unit circle, of variance r^2 across the circle and
+    variance + r^2 along it; this is the integral of its density over the circle, wherever the point is.
+    """
     angle = 2 * np.pi * np.arange(points) / points
-    residual = np.stack([np.cos(angle), np.sin(angle)], axis=-1) - predicted[:, None]
-    exponent = -0.5 * np.einsum("kpi,kij,kpj->kp", residual, np.linalg.inv(spread), residual)
-    top = exponent.max(axis=1)
-    total = np.exp(exponent - top[:, None]).sum(axis=1) * 2 * np.pi / points
-    return np.log(total) + top - np.log(2 * np.pi) - 0.5 * np.log(np.linalg.det(spread))
+    across, along = np.asarray(r) ** 2, np.asarray(variance) + np.asarray(r) ** 2
+    exponent = -0.5 * ((np.cos(angle) - 1) ** 2 / across[..., None] + np.sin(angle) ** 2 / along[..., None])
+    total = np.exp(exponent).sum(axis=-1) * 2 * np.pi / points  # the largest exponent is 0, at the point
+    return np.log(total) - np.log(2 * np.pi) - 0.5 * np.log(across * along)
+
+
+def extended_kalman_scores(times: np.ndarray, readings: np.ndarray, sigma: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """The log density of all the directions under the extended Kalman filter, (P,), for many sigma (P,) and r (P,) at once."""
+    mean, variance, total = np.zeros(len(sigma)), np.full(len(sigma), np.pi**2 / 3), np.zeros(len(sigma))
+    for length, z in zip(np.diff(times, prepend=0.0), readings, strict=True):
+        variance = variance + sigma**2 * length
+        if not np.isnan(z).any():
+            cos, sin = np.cos(mean), np.sin(mean)
+            across, along = z[0] * cos + z[1] * sin - 1, z[1] * cos - z[0] * sin
+            spread = variance + r**2
+            total += -0.5 * (across**2 / r**2 + along**2 / spread) - np.log(2 * np.pi) - 0.5 * np.log(r**2 * spread)
+            total -= log_length_density_gaussian(variance, r, points=240)
+            mean, variance = mean + variance / spread * along, variance * r**2 / spread
+    return total
 
 
 def grid_filter_with_rate(times: np.ndarray, readings: np.ndarray, model: dict[str, float], angles: int = 96, rates: int = 112):
