@@ -30,6 +30,17 @@ def components(log_weights: Any, means: Any, covs: Any) -> Components:
     return Components(log_weights, means, covs, jnp.ones(len(log_weights)))
 
 
+def padded(sum_: Components, slots: int) -> Components:
+    """The same sum with empty slots after it, `slots` in all."""
+    missing = slots - len(sum_.log_weights)
+    return Components(
+        jnp.concatenate([sum_.log_weights, jnp.full(missing, -jnp.inf)]),
+        jnp.concatenate([sum_.means, jnp.repeat(sum_.means[:1], missing, axis=0)]),
+        jnp.concatenate([sum_.covs, jnp.repeat(sum_.covs[:1], missing, axis=0)]),
+        jnp.concatenate([sum_.signs, jnp.ones(missing)]),
+    )
+
+
 def shares(sum_: Components) -> tuple[jax.Array, jax.Array]:
     """The signed share (K,) of each component, adding up to one, and the logarithm of the mass; a negative mass is nan."""
     top = jax.lax.stop_gradient(jnp.max(sum_.log_weights))

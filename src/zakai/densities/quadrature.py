@@ -3,7 +3,8 @@
     N(x; m, P) e^{g(x)}  ->  e^{a} N(x; m', P')
 
 The function depends on x through W'x alone.  Given W'x the rest of x stays Gaussian, so that quadrature is in k directions only
-and any n will do; the integrals are Gauss-Hermite sums, in logarithms.
+and any n will do; the integrals are sums in logarithms: over Gauss-Hermite nodes, or, where the function may be much narrower
+than a component or have several peaks, over a lattice that is laid again where the product was found.
 """
 
 from __future__ import annotations
@@ -21,16 +22,33 @@ import numpy as np
 
 from zakai.densities.components import Components, regression
 
-# Nodes a direction, by the number of directions.
+# Gauss-Hermite nodes a direction, by the number of directions.
 NODES = {0: 1, 1: 9, 2: 6, 3: 5, 4: 4, 5: 4}
+# Nodes of a lattice a direction and their spacing in standard deviations; a sum over it is as good as exp(-2 pi^2 / spacing^2).
+LATTICE = {1: (33, 0.375), 2: (13, 1.0), 3: (9, 1.1), 4: (5, 1.3), 5: (4, 1.5)}
+# A lattice is laid so often, each time wider by this factor than the product that was found on the one before.
+_LAID = 3
+_STRETCH = 1.25
 
 
 class Rule(NamedTuple):
-    """The tensor Gauss-Hermite rule for N(0, 1) in k directions: `nodes` (Q, k), `weights` (Q,), `size` a direction."""
+    """A tensor rule for N(0, 1) in k directions: `nodes` (Q, k), `weights` (Q,), `size` and `spacing` a direction."""
 
     nodes: np.ndarray
     weights: np.ndarray
     size: int
+    spacing: float = 0.0
+
+
+class Refitted(NamedTuple):
+    """The new sum, and of each component (K,): how far it `moved`, in its own standard deviations; the `loss`, the relative
+    entropy of the product from the Gaussian that is kept of it; and the `doubt` of the quadrature, the logarithm of the ratio
+    of its masses by two rules."""
+
+    sum: Components
+    moved: Any
+    loss: Any
+    doubt: Any
 
 
 @lru_cache(maxsize=16)
@@ -38,10 +56,21 @@ def gauss_hermite(directions: int) -> Rule:
     """The rule for that many directions; exact for polynomials of degree 2 size - 1 in each."""
     size = NODES[directions]
     node, weight = np.polynomial.hermite_e.hermegauss(size)
-    weight = weight / weight.sum()
+    return _tensor(node, weight / weight.sum(), directions)
+
+
+@lru_cache(maxsize=16)
+def lattice(directions: int) -> Rule:
+    """Equal steps in each of that many directions."""
+    size, spacing = LATTICE[directions]
+    node = spacing * (np.arange(size) - (size - 1) / 2)
+    return _tensor(node, spacing * np.exp(-0.5 * node**2) / np.sqrt(2 * np.pi), directions)._replace(spacing=spacing)
+
+
+def _tensor(node: np.ndarray, weight: np.ndarray, directions: int) -> Rule:
     nodes = np.array(list(product(node, repeat=directions))).reshape(-1, directions)
     weights = np.array([np.prod(w) for w in product(weight, repeat=directions)])
-    return Rule(nodes, weights, size)
+    return Rule(nodes, weights, len(node))
 
 
 def points(sum_: Components, gain: jax.Array, nodes: jax.Array) -> jax.Array:
@@ -51,37 +80,48 @@ def points(sum_: Components, gain: jax.Array, nodes: jax.Array) -> jax.Array:
 
 def refit(
     sum_: Components, log_factor: Callable[[jax.Array], jax.Array], directions: np.ndarray, sharp: bool
-) -> tuple[Components, jax.Array]:
-    """The sum times exp(log_factor); and how far each component moved, in its own standard deviations (K,).
+) -> Refitted:
+    """The sum times exp(log_factor), which takes (K, Q, n) and gives (K, Q).
 
-    log_factor: takes (K, Q, n), gives (K, Q).  sharp: the factor may be much narrower than a component, as that of a sample
-    may; the nodes are then moved to where the product is, twice, by the factor's quadratic part.
+    sharp: the factor may be much narrower than a component, as that of a sample may, and have several peaks there.
     """
     k = directions.shape[1]
+    zero = jnp.zeros(len(sum_.signs))
     if k == 0:
-        return sum_._replace(log_weights=sum_.log_weights + log_factor(sum_.means[:, None])[:, 0]), jnp.zeros(len(sum_.signs))
-    rule = gauss_hermite(k)
+        heavier = sum_._replace(log_weights=sum_.log_weights + log_factor(sum_.means[:, None])[:, 0])
+        return Refitted(heavier, zero, zero, zero)
+    rule = lattice(k) if sharp else gauss_hermite(k)
     gain = regression(sum_.covs, jnp.asarray(directions))
     nodes, log_weights = jnp.asarray(rule.nodes), jnp.log(rule.weights)
-    values = log_factor(points(sum_, gain, nodes))
-    if not sharp:
-        z = jnp.broadcast_to(nodes, (*values.shape, k))
-        logs = values + log_weights
-    else:
-        centre, width = _proposal(values, rule)
-        for _ in range(2):
-            z = centre[:, None] + jnp.einsum("kab,qb->kqa", width, nodes)
-            values = log_factor(points(sum_, gain, z))
-            volume = jnp.sum(jnp.log(jnp.diagonal(width, axis1=1, axis2=2)), axis=1)
-            logs = values + log_weights - 0.5 * jnp.sum(z**2, -1) + 0.5 * jnp.sum(nodes**2, -1) + volume[:, None]
-            centre, cov = _weighted(logs, z)[1:]
-            width = jax.lax.stop_gradient(_square_root(cov))
-            centre = jax.lax.stop_gradient(centre)
+    z = jnp.broadcast_to(nodes, (len(zero), *nodes.shape))
+    values = log_factor(points(sum_, gain, z))
+    logs = values + log_weights
+    doubt, width = zero, jnp.broadcast_to(jnp.eye(k), (len(zero), k, k))
+    for _ in range(_LAID - 1 if sharp else 0):
+        before, centre, cov = jax.lax.stop_gradient(_weighted(logs, z))
+        # What is narrower than the spacing lies between nodes, and is looked for there.
+        between = (0.3 * rule.spacing) ** 2 * jnp.einsum("kab,kcb->kac", width, width)
+        width = _STRETCH * _square_root(cov + between)
+        z = centre[:, None] + jnp.einsum("kab,qb->kqa", width, nodes)
+        values = log_factor(points(sum_, gain, z))
+        volume = jnp.sum(jnp.log(jnp.diagonal(width, axis1=1, axis2=2)), axis=1)
+        logs = values + log_weights - 0.5 * jnp.sum(z**2, -1) + 0.5 * jnp.sum(nodes**2, -1) + volume[:, None]
+        doubt = jnp.abs(jax.lax.stop_gradient(_weighted(logs, z)[0]) - before)
     log_mass, shift, cov = _weighted(logs, z)
     means = sum_.means + jnp.einsum("kia,ka->ki", gain, shift)
     covs = sum_.covs + jnp.einsum("kia,kab,kjb->kij", gain, cov - jnp.eye(k), gain)
+    new = Components(sum_.log_weights + log_mass, means, 0.5 * (covs + jnp.swapaxes(covs, 1, 2)), sum_.signs)
     moved = jnp.sqrt(jax.lax.stop_gradient(jnp.sum(shift**2, -1)))
-    return Components(sum_.log_weights + log_mass, means, 0.5 * (covs + jnp.swapaxes(covs, 1, 2)), sum_.signs), moved
+    return Refitted(new, moved, jax.lax.stop_gradient(_divergence(logs, values, z, log_mass, cov)), doubt)
+
+
+def _divergence(logs: jax.Array, values: jax.Array, z: jax.Array, log_mass: jax.Array, cov: jax.Array) -> jax.Array:
+    """The relative entropy (K,) of N(z; 0, 1) e^values, normalised, from the Gaussian with its moments."""
+    weight = jax.nn.softmax(logs, axis=1)
+    level = jnp.where(weight > 0, values - 0.5 * jnp.sum(z**2, -1), 0.0)
+    k = z.shape[-1]
+    entropy = jnp.log(jnp.maximum(cov[:, 0, 0], 1e-300)) if k == 1 else jnp.linalg.slogdet(cov)[1]
+    return jnp.maximum(jnp.sum(weight * level, axis=1) - log_mass + 0.5 * (k + entropy), 0.0)
 
 
 def _weighted(logs: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -94,21 +134,6 @@ def _weighted(logs: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array, jax.
     mean = jnp.einsum("kq,kqa->ka", weight, z)
     rest = z - mean[:, None]
     return jnp.log(mass) + top, mean, jnp.einsum("kq,kqa,kqb->kab", weight, rest, rest)
-
-
-def _proposal(values: jax.Array, rule: Rule) -> tuple[jax.Array, jax.Array]:
-    """Where the product with N(0, 1) lies, by the quadratic part of the function: centre (K, k) and width (K, k, k)."""
-    nodes, weights = rule.nodes, rule.weights
-    k = nodes.shape[1]
-    slope = jax.lax.stop_gradient(jnp.einsum("q,kq,qa->ka", weights, values, nodes))
-    square = nodes[:, :, None] * nodes[:, None, :] - np.eye(k)
-    bend = jax.lax.stop_gradient(jnp.einsum("q,kq,qab->kab", weights, values, square))
-    if k == 1:
-        cov = 1.0 / jnp.maximum(1.0 - bend, 0.5)
-        return jnp.clip((cov @ slope[..., None])[..., 0], -6.0, 6.0), jnp.sqrt(cov)
-    size, frame = jnp.linalg.eigh(jnp.eye(k) - bend)
-    cov = jnp.einsum("kab,kb,kcb->kac", frame, 1.0 / jnp.maximum(size, 0.5), frame)
-    return jnp.clip((cov @ slope[..., None])[..., 0], -6.0, 6.0), _square_root(cov)
 
 
 def _square_root(cov: jax.Array) -> jax.Array:

@@ -20,7 +20,6 @@ from zakai.densities.components import Components, wrapped
 PRUNED = 1e-7
 # A split leaves about a quarter of a loss that is quadratic in the variance.
 GAINED = 0.75
-_APART = np.sqrt(1.5)
 
 
 class Exchanged(NamedTuple):
@@ -30,18 +29,15 @@ class Exchanged(NamedTuple):
     together: Any
 
 
-def pair_costs(
-    share: Any, means: Any, covs: Any, loss: Any, angles: tuple[int, ...] = (), xp: Any = jnp, even: bool = False
-) -> Any:
+def pair_costs(share: Any, means: Any, covs: Any, loss: Any, angles: tuple[int, ...] = (), xp: Any = jnp) -> Any:
     """What putting together components i and j would cost, (K, K): nats of relative entropy, weighted.
 
     The loss of the pair as one Gaussian, and the relative entropy of the pair's shape: for components far apart Runnalls' (2007)
-    bound, for close ones the leading cumulants (skewness^2 / 12 + kurtosis^2 / 48), whichever is smaller.  even: the shares are
-    not the weights of the sum, so that pairs count as equal parts.
+    bound, for close ones the leading cumulants (skewness^2 / 12 + kurtosis^2 / 48), whichever is smaller.
     """
     n = means.shape[1]
     both = share[:, None] + share
-    alpha = xp.full(both.shape, 0.5) if even else share[:, None] / xp.where(both > 0, both, 1.0)
+    alpha = share[:, None] / xp.where(both > 0, both, 1.0)
     beta = 1.0 - alpha
     product = xp.maximum(alpha * beta, 1e-30)
     apart = means[:, None] - means
@@ -71,13 +67,14 @@ def pair_costs(
 
 
 def exchange(
-    sum_: Components, share: jax.Array, loss: jax.Array, axis: jax.Array, tolerance: float, angles: tuple[int, ...] = (),
-    even: bool = False,
+    sum_: Components, share: jax.Array, loss: jax.Array, axis: jax.Array, tolerance: float, most: Any,
+    angles: tuple[int, ...] = (),
 ) -> tuple[Components, Exchanged]:
     """Split the components with the largest weighted loss, into empty slots or into those of pairs that cost little as one.
 
     share (K,): the weights that count.  loss (K,): see above.  axis (K, n): along which to split, one standard deviation long.
-    tolerance: weighted losses below tolerance / K stay.  even: see `pair_costs`.  Decisions are not differentiated.
+    tolerance: weighted losses below tolerance / K stay.  most: how many of the K slots may be used.
+    Decisions are not differentiated.
     """
     K = len(share)
     tries = max(1, K // 4)
@@ -92,12 +89,12 @@ def exchange(
     gain = gains[parents]
     wanted = gain > tolerance / K
     kept = jnp.zeros(K, bool).at[jnp.where(wanted, parents, K)].set(True, mode="drop")
-    costs = jax.lax.stop_gradient(pair_costs(jnp.where(kept, 0.0, share), sum_.means, sum_.covs, loss, angles, jnp, even))
+    costs = jax.lax.stop_gradient(pair_costs(jnp.where(kept, 0.0, share), sum_.means, sum_.covs, loss, angles))
     nearest = jnp.argmin(costs, axis=1)
     mutual = (nearest[nearest] == index) & (index < nearest)
     pair_cost = jnp.where(mutual, jnp.min(costs, axis=1), jnp.inf)
     pairs = jnp.argsort(pair_cost)[: 2 * tries]
-    free = K - jnp.sum(alive)
+    free = most - jnp.sum(alive)
     place = jnp.arange(2 * tries)
     slot = jnp.where(place < free, 0.0, pair_cost[pairs[jnp.clip(place - free, 0, 2 * tries - 1)]])
     price = slot[0::2] + slot[1::2]
@@ -110,6 +107,69 @@ def exchange(
     empty = jnp.argsort(alive)[: 2 * tries]
     new = merged._replace(log_weights=jnp.where(alive, merged.log_weights, -jnp.inf))
     return _split(new, parents, axis[parents], empty, accepted), Exchanged(pruned, together)
+
+
+def make_room(
+    sum_: Components, share: jax.Array, loss: jax.Array, axis: jax.Array, tolerance: float, most: Any
+) -> tuple[Components, jax.Array]:
+    """Split the components with the largest weighted loss as long as slots are empty; and the weight that was dropped.
+
+    Each becomes five of half the variance along its axis, whose relative entropy from it is 2e-6: the Gauss-Hermite rule of five
+    nodes, moments up to the ninth.  Arguments are those of `exchange`; what a loss below 1e-5 would gain is not worth a split.
+    """
+    K = len(share)
+    tries = max(1, K // 8)
+    share, loss = jax.lax.stop_gradient(share), jax.lax.stop_gradient(loss)
+    alive = share > PRUNED
+    pruned = jnp.sum(jnp.where(alive, 0.0, share))
+    gain = jnp.where(alive & (loss > 1e-5), share * loss, 0.0)
+    parents = jnp.argsort(-gain)[:tries]
+    spare = _FIVE.size - 1
+    accepted = (gain[parents] > tolerance / K) & (spare * (jnp.arange(tries) + 1) <= most - jnp.sum(alive))
+    empty = jnp.argsort(alive)[: spare * tries]
+    alone = sum_._replace(log_weights=jnp.where(alive, sum_.log_weights, -jnp.inf))
+    return _split(alone, parents, axis[parents], empty, accepted, _FIVE), pruned
+
+
+def condensed(
+    sum_: Components, share: jax.Array, most: Any, slots: int, angles: tuple[int, ...] = ()
+) -> tuple[Components, jax.Array]:
+    """The components put together in at most `most` of `slots` slots, the cheapest pairs first; and what that cost.
+
+    Which with which is decided round by round and not differentiated; mass, mean and covariance are kept.
+    """
+    share, means, covs = (jax.lax.stop_gradient(a) for a in (share, sum_.means, sum_.covs))
+    share = jnp.where(share > PRUNED, share, 0.0)
+    index = jnp.arange(len(share))
+    none = jnp.zeros(len(share))
+
+    def together(carry):
+        share, means, covs, label, cost = carry
+        costs = pair_costs(share, means, covs, none, angles)
+        nearest = jnp.argmin(costs, axis=1)
+        least = jnp.min(costs, axis=1)
+        first = (nearest[nearest] == index) & (index < nearest) & jnp.isfinite(least)
+        excess = jnp.sum(share > 0) - most
+        # Half of the pairs at most: the dear ones wait for what the others become.
+        rank = jnp.argsort(jnp.argsort(jnp.where(first, least, jnp.inf)))
+        first = first & (rank < jnp.minimum(excess, (jnp.sum(first) + 1) // 2))
+        second = jnp.zeros_like(first).at[jnp.where(first, nearest, len(share))].set(True, mode="drop")
+        total = jnp.where(first, share + share[nearest], 1.0)
+        alpha = jnp.where(first, share / total, 1.0)
+        apart = wrapped(means - means[nearest], angles)
+        mean = jnp.where(first[:, None], means[nearest] + alpha[:, None] * apart, means)
+        a = alpha[:, None, None]
+        between = a * (1 - a) * apart[:, :, None] * apart[:, None, :]
+        cov = jnp.where(first[:, None, None], a * covs + (1 - a) * covs[nearest] + between, covs)
+        label = jnp.where(second[label], nearest[label], label)
+        share = jnp.where(first, total, jnp.where(second, 0.0, share))
+        return share, mean, cov, label, cost + jnp.sum(jnp.where(first, least, 0.0))
+
+    start = (share, means, covs, index, jnp.zeros(()))
+    share, _, _, label, cost = jax.lax.while_loop(lambda carry: jnp.sum(carry[0] > 0) > most, together, start)
+    leaders = jnp.argsort(share <= 0)[:slots]
+    member = (label == leaders[:, None]) & (share[leaders] > 0)[:, None]
+    return _gathered(sum_, member, sum_.means[leaders], angles), cost
 
 
 def _merge(sum_: Components, first: jax.Array, second: jax.Array, valid: jax.Array, angles) -> tuple[Components, jax.Array]:
@@ -129,18 +189,41 @@ def _merge(sum_: Components, first: jax.Array, second: jax.Array, valid: jax.Arr
     return _put(sum_, at, log_weight, mean, cov), gone
 
 
-def _split(sum_: Components, parents: jax.Array, axis: jax.Array, empty: jax.Array, valid: jax.Array) -> Components:
-    """Three Gaussians of half the variance along an axis: weights 2/3, 1/6, 1/6, at 0 and +- sqrt(3/2) deviations.
+class _Rule(NamedTuple):
+    """A Gaussian as `size` of half the variance: the places in deviations of what is left, the first 0, and the weights."""
 
-    This is N(0, P/2) convolved with the Gauss-Hermite rule of three nodes for N(0, P/2): moments up to the fifth are kept.
+    places: tuple[float, ...]
+    weights: tuple[float, ...]
+
+    @property
+    def size(self) -> int:
+        return len(self.places)
+
+
+def _rule(size: int) -> _Rule:
+    node, weight = np.polynomial.hermite_e.hermegauss(size)
+    order = np.argsort(np.abs(node))
+    return _Rule(tuple(node[order] * np.sqrt(0.5)), tuple(weight[order] / weight.sum()))
+
+
+_THREE, _FIVE = _rule(3), _rule(5)
+
+
+def _split(
+    sum_: Components, parents: jax.Array, axis: jax.Array, empty: jax.Array, valid: jax.Array, rule: _Rule = _THREE
+) -> Components:
+    """Gaussians of half the variance along an axis: N(0, P/2) convolved with the Gauss-Hermite rule for N(0, P/2).
+
+    With three nodes the weights are 2/3, 1/6, 1/6 at 0 and +- sqrt(3/2) deviations, and moments up to the fifth are kept.
     """
     K = len(sum_.log_weights)
     log_weight, mean = sum_.log_weights[parents], sum_.means[parents]
     cov = sum_.covs[parents] - 0.5 * axis[:, :, None] * axis[:, None, :]
-    new = _put(sum_, jnp.where(valid, parents, K), log_weight + np.log(2 / 3), mean, cov)
-    for side, slots in ((1.0, empty[0::2]), (-1.0, empty[1::2])):
-        at = jnp.where(valid, slots, K)
-        new = _put(new, at, log_weight - np.log(6.0), mean + side * _APART * axis, cov)
+    new = _put(sum_, jnp.where(valid, parents, K), log_weight + np.log(rule.weights[0]), mean, cov)
+    spare = rule.size - 1
+    for i, (place, weight) in enumerate(zip(rule.places[1:], rule.weights[1:])):
+        at = jnp.where(valid, empty[i::spare], K)
+        new = _put(new, at, log_weight + np.log(weight), mean + place * axis, cov)
     return new
 
 
@@ -183,15 +266,21 @@ def groups(
 
 def gathered(sum_: Components, label: np.ndarray, angles: tuple[int, ...] = ()) -> Components:
     """Each group as one Gaussian with its mass, mean and covariance; `label` (N,) from `groups`."""
-    top = jnp.max(sum_.log_weights)
-    parts = jnp.exp(sum_.log_weights - jax.lax.stop_gradient(top))
-    member = jnp.asarray(label == np.arange(label.max() + 1)[:, None], float)
-    weight = member @ parts
-    share = member * parts / jnp.where(weight > 0, weight, 1.0)[:, None]
-    origin = sum_.means[np.array([np.flatnonzero(label == g)[0] for g in range(label.max() + 1)])]
+    leaders = np.array([np.flatnonzero(label == g)[0] for g in range(label.max() + 1)])
+    return _gathered(sum_, jnp.asarray(label == np.arange(label.max() + 1)[:, None]), sum_.means[leaders], angles)
+
+
+def _gathered(sum_: Components, member: jax.Array, origin: jax.Array, angles: tuple[int, ...]) -> Components:
+    """Groups (G, K) of components, each as one Gaussian; `origin` (G, n) is a mean of each group."""
+    top = jax.lax.stop_gradient(jnp.max(sum_.log_weights))
+    parts = member * jnp.exp(sum_.log_weights - top)
+    weight = jnp.sum(parts, axis=1)
+    share = parts / jnp.where(weight > 0, weight, 1.0)[:, None]
     apart = wrapped(sum_.means[None] - origin[:, None], angles)
     shift = jnp.einsum("gk,gki->gi", share, apart)
     rest = apart - shift[:, None]
     covs = jnp.einsum("gk,kij->gij", share, sum_.covs) + jnp.einsum("gk,gki,gkj->gij", share, rest, rest)
+    # An empty group keeps a Gaussian that is one.
+    covs = jnp.where((weight > 0)[:, None, None], covs, sum_.covs[0])
     logs = jnp.where(weight > 0, jnp.log(jnp.where(weight > 0, weight, 1.0)) + top, -jnp.inf)
     return Components(logs, origin + shift, covs, jnp.ones(len(logs)))

@@ -11,11 +11,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
-from zakai.densities.components import Components, components, regression, shares
+from zakai.densities.components import Components, components, padded, regression
 from zakai.densities.quadrature import refit
 from zakai.densities.reduction import PRUNED, gathered, groups
 from zakai.errors import InputError
@@ -62,7 +63,7 @@ def _cut(logs, means, covs, directions, count):
     line = line * left / np.sqrt((weight / weight.sum()) @ line**2) if len(line) > 1 else line
     grid = np.stack(np.meshgrid(*[line] * k, indexing="ij"), axis=-1).reshape(-1, k)
     weights = np.prod(np.stack(np.meshgrid(*[weight / weight.sum()] * k, indexing="ij"), axis=-1).reshape(-1, k), axis=1)
-    gain = np.asarray(regression(jnp.asarray(covs), jnp.asarray(directions)))
+    gain = _regression(covs, directions)
     cut = covs - (1 - width**2) * np.einsum("kia,kja->kij", gain, gain)
     new_means = means[:, None] + np.einsum("kia,qa->kqi", gain, grid)
     return (
@@ -70,6 +71,12 @@ def _cut(logs, means, covs, directions, count):
         new_means.reshape(-1, means.shape[1]),
         np.repeat(cut, len(weights), axis=0),
     )
+
+
+def _regression(covs: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """`regression` on the host: a trace must not reach what decides how many Gaussians there are."""
+    with jax.ensure_compile_time_eval():
+        return np.asarray(regression(jnp.asarray(covs), jnp.asarray(directions)))
 
 
 def _cut_density(model: Model, prior: DensityPrior, theta: Any) -> Components:
@@ -102,29 +109,19 @@ def _cut_density(model: Model, prior: DensityPrior, theta: Any) -> Components:
         value = density(x, model.start, theta)[0]
         return jnp.where(jnp.isnan(value), -jnp.inf, jnp.maximum(value, -1e6))
 
-    return refit(flat, log_density, np.eye(model.n), True)[0]
+    return refit(flat, log_density, np.eye(model.n), True).sum
 
 
-def fitted(sum_: Components, own: Components, count: np.ndarray, loss: np.ndarray, slots: int, angles) -> Components:
-    """The narrow Gaussians in that many slots, normalised; `own` are those of the model's own parameters, `count` (N,) their
-    weights in u, and `loss` (N,) theirs."""
+def fitted(
+    sum_: Components, own: Components, count: np.ndarray, loss: np.ndarray, most: int, slots: int, angles: tuple[int, ...]
+) -> Components:
+    """The narrow Gaussians put together to at most `most`, in that many slots; `own` are those of the model's own parameters,
+    `count` (N,) their weights in u, and `loss` (N,) theirs."""
     used = count > 0.01 * PRUNED / len(count)
     label = np.full(len(count), -1)
-    label[used] = groups(
-        count[used], np.asarray(own.means)[used], np.asarray(own.covs)[used], loss[used], slots, angles
-    )
-    few = gathered(Components(*(jnp.asarray(a)[used] for a in sum_)), label[used], angles)
-    missing = slots - len(few.log_weights)
-    if missing > 0:
-        few = Components(
-            jnp.concatenate([few.log_weights, jnp.full(missing, -jnp.inf)]),
-            jnp.concatenate([few.means, jnp.repeat(few.means[:1], missing, axis=0)]),
-            jnp.concatenate([few.covs, jnp.repeat(few.covs[:1], missing, axis=0)]),
-            jnp.ones(slots),
+    with jax.ensure_compile_time_eval():
+        label[used] = groups(
+            count[used], np.asarray(own.means)[used], np.asarray(own.covs)[used], loss[used], most, angles
         )
-    return few
-
-
-def log_mass(sum_: Components) -> Any:
-    """The logarithm of the mass."""
-    return shares(sum_)[1]
+    few = gathered(Components(*(jnp.asarray(a)[used] for a in sum_)), label[used], angles)
+    return padded(few, slots)

@@ -47,7 +47,7 @@ class SumGauge:
         if self.none:
             return v
         if not self.exact:
-            return refit(v, lambda x: self.potential(x, t, theta), self.directions, True)[0]
+            return refit(v, lambda x: self.potential(x, t, theta), self.directions, True).sum
         numbers = self._numbers(jnp.zeros(self.n), t, theta)
         constants, slopes = numbers[:, 0], numbers[:, 1:]
         across = jnp.einsum("kij,aj->kai", v.covs, slopes)
@@ -61,4 +61,4 @@ class SumGauge:
         """Components of v = e^-phi u, each with its moments: for the start, where u is given."""
         if self.none:
             return u
-        return refit(u, lambda x: -self.potential(x, t, theta), self.directions, True)[0]
+        return refit(u, lambda x: -self.potential(x, t, theta), self.directions, True).sum

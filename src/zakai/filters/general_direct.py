@@ -20,10 +20,10 @@ from zakai import _float64  # noqa: F401
 from zakai.algebra.theorems import general_direct as theorem
 from zakai.algebra.theorems import yau_system
 from zakai.densities import GaussianMixture
-from zakai.densities.components import Components, moments, shares, wrapped
+from zakai.densities.components import Components, moments, padded, shares, wrapped
 from zakai.densities.peaks import fit_dictionary, fit_peaks
-from zakai.densities.quadrature import curvature, refit
-from zakai.densities.reduction import Exchanged, exchange
+from zakai.densities.quadrature import Refitted, curvature, refit
+from zakai.densities.reduction import Exchanged, condensed, exchange, make_room
 from zakai.errors import InputError
 from zakai.filters import _gaussian_start as start
 from zakai.filters._directions import directions_of
@@ -40,8 +40,9 @@ from zakai.models.prior import GaussianPrior, MixturePrior
 SLOTS = {0: 1, 1: 20, 2: 64, 3: 128}
 MOST_DIRECTIONS = 5
 TOLERANCE = 1e-3
-# How often a reading that comes all at once may make room for itself.
-ROUNDS = 6
+# How often components are split for a reading that comes all at once, and how many slots more there are while it does.
+ROUNDS = 5
+_EXTRA = 2
 # The loss that a component is meant to have at most; a transition that widens it beyond needs more than one round.
 _FINE = 0.1
 # The ways to keep the sum small, and up to which n.
@@ -72,6 +73,17 @@ class Sum:
         self.reduction, self.tolerance, self.alpha = reduction, tolerance, alpha
         self.rounds = rounds
         self.sampled = model.observation_kind == "samples"
+        # Whether components are split before each reading rather than after it.
+        self.roomy = self.sampled and bool(self.directions.shape[1]) and reduction == "split-merge"
+
+    def limits(self, count: int) -> tuple[int, int]:
+        """How many slots the sum and its companion may use, for a prior that was cut into `count` Gaussians."""
+        used = min(self.slots, count) if self.affine else self.slots
+        if not self.start_directions.shape[1]:
+            # Nothing is put together.
+            used = count if self.affine else self.slots
+            return used, used
+        return used, round(0.7 * used) if used >= 8 else used + 4
 
 
 def _span(directions: np.ndarray) -> np.ndarray:
@@ -89,11 +101,28 @@ def _sum(of: Formulas, splitting: str, slots: int | None, reduction: str, tolera
     return Sum(of.model, splitting, slots, reduction, tolerance, alpha, rounds)
 
 
-class State(NamedTuple):
-    """The normalised Gaussian sum in gauge, at its time: u = e^phi v has mass one."""
+class Kept(NamedTuple):
+    """What a density is made of: the normalised Gaussian sum in gauge, at its time; u = e^phi v has mass one."""
 
     sum: Components
     time: Any
+
+
+class State(NamedTuple):
+    """Two normalised sums side by side (2, K, ...), the slots (2,) they may use, and the difference of their log-likelihoods.
+
+    The first is the result; the second has another number of slots, and how far it stands from the first tells how far the
+    first may stand from the density.
+    """
+
+    pair: Components
+    slots: Any
+    apart: Any
+    time: Any
+
+    @property
+    def kept(self) -> Kept:
+        return Kept(jax.tree.map(lambda a: a[0], self.pair), self.time)
 
 
 @partial(
@@ -227,19 +256,22 @@ def init(prepared: Prepared, prior: Any) -> State:
         )
 
     narrow = cut(prepared.theta)
-    host = narrow if isinstance(prepared.theta, np.ndarray) else cut(own)
-    weights = _share_of_u(static, host, model.start, own)[0]
-    if static.affine and len(weights) <= static.slots or static.slots >= len(weights):
-        slots = max(static.slots if not static.affine else 0, len(weights))
-    else:
-        slots = static.slots
-    if static.directions.shape[1]:
-        precision = np.linalg.inv(noise_at(model, np.array([model.start]), own))[0]
-        loss = np.asarray(_losses(static, host, weights, precision, model.start, own)[0])
-    else:
+    with jax.ensure_compile_time_eval():
+        host = narrow if isinstance(prepared.theta, np.ndarray) else cut(own)
+        weights = np.asarray(_share_of_u(static, host, model.start, own)[0])
         loss = np.zeros(len(weights))
-    few = start.fitted(narrow, host, np.asarray(weights), loss, slots, static.angles)
-    return State(_normalised(static, few, model.start, prepared.theta)[0], jnp.asarray(model.start, float))
+        if static.directions.shape[1]:
+            precision = np.linalg.inv(noise_at(model, np.array([model.start]), own))[0]
+            loss = np.asarray(_losses(static, host, weights, precision, model.start, own)[0])
+    used, second = static.limits(len(weights))
+    # Before the first reading there is as much room as while one comes.
+    more = 1 + _EXTRA if static.roomy else 1
+    pair = [
+        start.fitted(narrow, host, weights, loss, more * most, more * max(used, second), static.angles) for most in (used, second)
+    ]
+    both = jax.tree.map(lambda *a: jnp.stack(a), *pair)
+    both = jax.vmap(lambda v: _normalised(static, v, model.start, prepared.theta)[0])(both)
+    return State(both, jnp.array([used, second]), jnp.zeros(()), jnp.asarray(model.start, float))
 
 
 def _share_of_u(static: Sum, v: Components, t: Any, theta: Any) -> tuple[jax.Array, jax.Array]:
@@ -262,19 +294,40 @@ def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State
     first = jax.tree.map(lambda a: a[0], observation)
     precision = noise_at(model, np.array([model.start]), prepared.theta)
     precision = jnp.linalg.inv(jnp.asarray(precision))[0]
-    return _observe(prepared.static, state.sum, first.after, first, precision, model.start, prepared.theta)
+    static, theta = prepared.static, prepared.theta
+    told = jax.vmap(lambda v, slots: _observe(static, v, slots, first.after, first, precision, model.start, theta))
+    return _told(static, state, told(state.pair, state.slots), model.start)
 
 
 def step(interval: Interval, state: State, observation: Factors) -> tuple[State, Info]:
-    """One interval: half factor, transition, half factor, reduction; normalise."""
+    """One interval of both sums: half factor, transition, half factor, reduction; normalise."""
     static, theta = interval.static, interval.theta
-    v = state.sum
-    if static.system.halves:
-        v, _ = _multiply(static, v, observation.before, None, interval.start, theta)
-    v = _move(interval.flow, v, observation.inputs)
-    if static.angles:
-        v = v._replace(means=wrapped(v.means, static.angles))
-    return _observe(static, v, observation.after, observation, interval.precision, interval.stop, theta)
+
+    def one(v, slots):
+        if static.system.halves:
+            v = _multiply(static, v, observation.before, None, interval.start, theta).sum
+        v = _move(interval.flow, v, observation.inputs)
+        if static.angles:
+            v = v._replace(means=wrapped(v.means, static.angles))
+        return _observe(static, v, slots, observation.after, observation, interval.precision, interval.stop, theta)
+
+    return _told(static, state, jax.vmap(one)(state.pair, state.slots), interval.stop)
+
+
+def _told(static: Sum, state: State, observed: tuple[Components, Info], t: Any) -> tuple[State, Info]:
+    """The next state, and what the first of the two sums says, with its distance from the second."""
+    pair, both = observed
+    info, other = jax.tree.map(lambda a: a[0], both), jax.tree.map(lambda a: a[1], both)
+    apart = state.apart + jax.lax.stop_gradient(info.log_likelihood_increment - other.log_likelihood_increment)
+    deviation, second = (jnp.sqrt(jnp.maximum(jnp.diagonal(one.cov), 1e-300)) for one in (info, other))
+    distance = jnp.abs(wrapped(info.mean - other.mean, static.angles)) / deviation
+    known = static.reduction == "split-merge"
+    info.health.update(
+        mean_error=jnp.max(distance) if known else jnp.nan * apart,
+        deviation_error=jnp.max(jnp.abs(second / deviation - 1.0)) if known else jnp.nan * apart,
+        evidence_error=jnp.abs(apart) if known else jnp.nan * apart,
+    )
+    return State(pair, state.slots, apart, jnp.asarray(t, float)), info
 
 
 def _move(flow: Flow, v: Components, inputs: jax.Array) -> Components:
@@ -289,79 +342,76 @@ def _move(flow: Flow, v: Components, inputs: jax.Array) -> Components:
     return jax.lax.scan(part, v, flow)[0]
 
 
-def _observe(static: Sum, v: Components, after, factor: Factors, precision, t, theta) -> tuple[State, Info]:
+def _observe(static: Sum, v: Components, slots, after, factor: Factors, precision, t, theta) -> tuple[Components, Info]:
     """The factor at the end of an interval, and what the step tells."""
     zero = jnp.zeros(())
-    pruned, together, nonlinearity, moved = zero, zero, zero, zero
+    pruned, together = zero, zero
+    bent = bool(static.directions.shape[1])
     at_once = static.sampled or factor.energy is not None
-    if static.directions.shape[1]:
-        if at_once and static.reduction == "split-merge":
-            # Room is made before a reading that may say much at once, by the weights that it will leave.
-            def make_room(v, _):
-                tried, _ = _multiply(static, v, after, factor, t, theta)
-                share, _ = _share_of_u(static, tried, t, theta)
-                v, done, _ = _exchange(static, v, share, precision, t, theta, 1.0)
-                return v, done
+    room = bent and at_once and static.reduction == "split-merge"
+    size = max(static.limits(len(v.log_weights)))
+    if room:
+        # A reading that may say much at once finds a longer sum, split by what would be left of it that is no Gaussian.
+        def split(v, _):
+            tried = _multiply(static, v, after, factor, t, theta)
+            share, _ = _share_of_u(static, tried.sum, t, theta)
+            axis = _losses(static, v, share, precision, t, theta)[1]
+            return make_room(v, share, tried.loss, axis, static.tolerance**2, (1 + _EXTRA) * slots)
 
-            v, done = jax.lax.scan(make_room, v, None, length=max(ROUNDS, static.rounds))
-            pruned, together = jnp.sum(done.pruned), jnp.sum(done.together)
-        v, shift = _multiply(static, v, after, factor, t, theta)
-        share, log_mass = _share_of_u(static, v, t, theta)
-        moved = jnp.sum(jnp.where(share > 0, share * shift, 0.0))
+        v, dropped = jax.lax.scan(split, padded(v, (1 + _EXTRA) * size), None, length=ROUNDS)
+        pruned = jnp.sum(dropped)
+    product = _multiply(static, v, after, factor, t, theta)
+    v = product.sum
+    share, log_mass = _share_of_u(static, v, t, theta)
+    moved, nonlinearity, doubt = (jnp.sum(jnp.where(share > 0, share * a, 0.0)) for a in product[1:])
+    if room:
+        v, together = condensed(v, share, slots, size, static.angles)
+    if bent and not static.roomy:
 
-        def trade(v, share):
-            v, done, nonlinearity = _exchange(static, v, share, precision, t, theta, 0.0)
-            return v, (done, nonlinearity)
+        def trade(v, _):
+            share = _share_of_u(static, v, t, theta)[0]
+            return _exchange(static, v, share, slots, precision, t, theta)
 
-        if static.rounds == 1 or static.reduction != "split-merge":
-            v, (done, nonlinearity) = trade(v, share)
-            pruned, together = pruned + done.pruned, together + done.together
-        else:
-            v, (done, each) = jax.lax.scan(
-                lambda v, _: trade(v, _share_of_u(static, v, t, theta)[0]), v, None, length=static.rounds
-            )
-            pruned, together = pruned + jnp.sum(done.pruned), together + jnp.sum(done.together)
-            nonlinearity = each[-1]
-    else:
-        v, _ = _multiply(static, v, after, factor, t, theta)
-        share, log_mass = _share_of_u(static, v, t, theta)
+        v, done = jax.lax.scan(trade, v, None, length=static.rounds if static.reduction == "split-merge" else 1)
+        pruned, together = pruned + jnp.sum(done.pruned), together + jnp.sum(done.together)
     v, _, u, parts = _normalised(static, v, t, theta)
     share = parts.reshape(len(v.log_weights), -1).sum(axis=1)
     mean, cov = moments(parts, u.means, u.covs, static.angles)
     health = {
         "nonlinearity": nonlinearity,
+        "quadrature": doubt,
         "pruned": pruned,
         "merged": together,
         "components": 1.0 / jnp.sum(share**2),
         "surprise": moved / 5.0,
     }
-    return State(v, jnp.asarray(t, float)), Info(log_mass, mean, cov, health)
+    return v, Info(log_mass, mean, cov, health)
 
 
-def _losses(static: Sum, v: Components, share, precision, t, theta, reading: float = 0.0):
+def _losses(static: Sum, v: Components, share, precision, t, theta):
     """How badly one Gaussian serves each component (K,), and along which axis it would be split."""
     residual, linear, axis = curvature(v, lambda x: static.system.observe(x, t, theta), precision, static.directions)
     typical = jnp.sum(jnp.where(share > 0, share * linear, 0.0))
-    return residual * (reading + 1.0 / (typical + 1e-300)), axis
+    return residual / (typical + 1e-300), axis
 
 
-def _exchange(static: Sum, v: Components, share, precision, t, theta, reading):
-    loss, axis = _losses(static, v, share, precision, t, theta, reading)
+def _exchange(static: Sum, v: Components, share, slots, precision, t, theta):
+    """One round of trades between readings that say little each."""
     if static.reduction != "split-merge":
         nothing = Exchanged(jnp.zeros(()), jnp.zeros(()))
         # Both fit v, of which u = e^phi v; neither says what it loses.
-        new = fit_peaks(v, static.alpha) if static.reduction == "algorithm-1" else fit_dictionary(v, share)
-        return new, nothing, jnp.sum(share * loss)
-    v, done = exchange(v, share, loss, axis, static.tolerance, static.angles, reading > 0)
-    return v, done, jnp.sum(jnp.where(share > 0, share * loss, 0.0))
+        return fit_peaks(v, static.alpha) if static.reduction == "algorithm-1" else fit_dictionary(v, share), nothing
+    loss, axis = _losses(static, v, share, precision, t, theta)
+    return exchange(v, share, loss, axis, static.tolerance, slots, static.angles)
 
 
-def _multiply(static: Sum, v: Components, linear, factor: Factors | None, t, theta) -> tuple[Components, jax.Array]:
-    """v exp(linear.h - h'(energy) h / 2 + constant), with energy and constant of `factor`; and how far components moved (K,)."""
+def _multiply(static: Sum, v: Components, linear, factor: Factors | None, t, theta) -> Refitted:
+    """v exp(linear.h - h'(energy) h / 2 + constant), with energy and constant of `factor`."""
     energy = None if factor is None else factor.energy
     constant = 0.0 if factor is None else factor.constant
     if static.affine:
-        return _multiply_affine(static, v, linear, energy, constant, t, theta), jnp.zeros(len(v.signs))
+        zero = jnp.zeros(len(v.signs))
+        return Refitted(_multiply_affine(static, v, linear, energy, constant, t, theta), zero, zero, zero)
 
     def log_factor(x):
         h = static.system.observe(x, t, theta)
@@ -399,9 +449,10 @@ def _multiply_affine(static: Sum, v: Components, linear, energy, constant, t, th
     return Components(v.log_weights + mass + constant, mean, cov, v.signs)
 
 
-def density(prepared: Prepared, state: State) -> GaussianMixture:
+def density(prepared: Prepared, state: State | Kept) -> GaussianMixture:
     """The posterior u = e^phi v as a `GaussianMixture`."""
     model = prepared.model
+    state = state.kept if isinstance(state, State) else state
     u = prepared.static.gauge.lift(state.sum, state.time, prepared.theta)
     share = np.asarray(shares(u)[0])
     kept = share != 0
@@ -423,7 +474,11 @@ METHOD = Method(
     density=density,
     with_parameters=with_parameters,
     bounds={
-        "nonlinearity": (1.0, "energy of the observation over single components that is not linear there, against that which is"),
+        "mean_error": (0.05, "distance of the mean from that of a second sum with other slots, in standard deviations"),
+        "deviation_error": (0.1, "relative distance of a standard deviation from that of the second sum"),
+        "evidence_error": (0.1, "distance of the log-likelihood so far from that of the second sum"),
+        "nonlinearity": (0.1, "relative entropy lost in one step by keeping one Gaussian where an observation made none"),
+        "quadrature": (1e-2, "relative error of the masses of components, by two rules of quadrature"),
         "pruned": (1e-3, "weight of components that were dropped in one step"),
         "merged": (0.1, "loss by putting components together for lack of room"),
         "surprise": (1.0, "how far the observation drives the density into the tails of single Gaussians"),
