@@ -221,7 +221,8 @@ def _functions(e: sp.Expr, x: set[sp.Symbol]) -> Iterable[sp.Expr]:
             raise Unreadable(f"{part} is not in the operator ring")
         if isinstance(part, sp.Function):
             if not part.free_symbols & x:
-                raise Unreadable(f"{part} is an irrational constant")
+                kind = "undetermined" if isinstance(part, AppliedUndef) else "irrational"
+                raise Unreadable(f"{part} is an {kind} constant")
             if not isinstance(part, (*HYPERBOLIC, *CIRCULAR, sp.log, AppliedUndef)):
                 raise Unreadable(f"{part.func.__name__} is not in the operator ring")
             if any(isinstance(inside, sp.Function) for a in part.args for inside in sp.preorder_traversal(a)):
