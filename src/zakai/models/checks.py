@@ -52,9 +52,11 @@ def _problem(model: Model, key: str, times: np.ndarray) -> tuple[int, tuple[str,
     """The first time at which the matrix is not what it must be, and the words before and after that time."""
     matrix, theta = getattr(model, key), model.theta()
     times = times if matrix.has(model.t) else times[:1]
-    if key != "diffusion" and matrix.is_diagonal():
+    entries = matrix.todok()
+    if key == "diffusion" or all(row == column for row, column in entries):
         # Each entry is a matrix of its own: independent noises of a hundred states at a thousand times need no eigenvalues.
-        matrices = numpy_function(list(matrix.diagonal()), model)(np.zeros(model.n), times, theta)[..., None, None]
+        each = list(entries.values() if key == "diffusion" else matrix.diagonal())
+        matrices = numpy_function(each, model)(np.zeros(model.n), times, theta)[..., None, None]
     else:
         matrices = numpy_function(matrix, model, matrix.shape)(np.zeros(model.n), times, theta)[:, None]
     finite = np.isfinite(matrices).all(axis=(-3, -2, -1))
