@@ -19,7 +19,7 @@ import numpy as np
 from zakai import _float64  # noqa: F401
 from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 
-_BLOCK = 16  # up to this size substitution is the cheaper way, and no library starts a thread
+_BLOCK = 25  # up to this size substitution is the cheaper way, and no library starts a thread
 
 
 def solve(matrix: Any, right: Any) -> tuple[Any, Any]:
@@ -48,7 +48,7 @@ def _inverses(lower: Any) -> Any:
     count = 1
     while count * _BLOCK < n:
         count *= 2
-    size = _BLOCK
+    size = -(-n // count)
     more = count * size - n
     whole = jnp.pad(lower, ((0, 0), (0, more), (0, more))) + jnp.diag(jnp.arange(n + more) >= n)
     identity = jnp.broadcast_to(jnp.eye(size), (k, count, size, size))
