@@ -45,5 +45,5 @@ slow: .venv/.dev
 	$(BIN)/python -m pytest -q -n auto -m slow || [ $$? -eq 5 ]
 
 clean:
-	rm -rf .venv build dist $(EXAMPLE)/out .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist $(EXAMPLE)/out .pytest_cache .mypy_cache .ruff_cache .jax_cache .hypothesis
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +

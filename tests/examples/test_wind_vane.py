@@ -92,7 +92,6 @@ def test_over_the_year_particles_agree_within_their_own_scatter(monkeypatch):
     monkeypatch.setattr(compare, "PARTICLES", 10_000)
     best = RESULTS["extended_kalman"]["sigma"], RESULTS["extended_kalman"]["r"]
     found = compare.against_particles(compare.Year(), *best)
-    for hours in ("year", "probable"):
-        assert abs(found[hours]["evidence_difference"]) < 4 * found[hours]["evidence_error"]
-    # Hours in which most runs find no particle near the reading have no scatter to go by.
+    # In hours in which most runs find no particle near the reading, all of them are too low, and their scatter does not tell.
+    assert abs(found["probable"]["evidence_difference"]) < 4 * found["probable"]["evidence_error"]
     assert 0.8 < found["probable"]["mean_difference"] / found["probable"]["mean_error"] < 1.25
