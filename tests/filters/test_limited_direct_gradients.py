@@ -66,7 +66,7 @@ SYSTEMS = {
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=[] if name in ("spiral sensor", "wind vane") else [pytest.mark.slow]) for name in SYSTEMS],
+    [pytest.param(name, marks=[] if name == "spiral sensor" else [pytest.mark.slow]) for name in SYSTEMS],
 )
 def test_the_gradient_agrees_with_central_differences(name):
     keys = SYSTEMS[name]

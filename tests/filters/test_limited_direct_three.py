@@ -18,6 +18,7 @@ def linear(matrix, row):
     return " + ".join(f"({c})*{name}" for c, name in zip(matrix[row], STATE, strict=True))
 
 
+@pytest.mark.slow
 def test_a_linear_system_of_three_states_follows_the_equations_of_kalman_and_bucy():
     L = np.array([[-0.5, -1.0, 0.2], [1.0, -0.3, 0.1], [0.0, -0.2, -0.4]])
     H = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.0]])
