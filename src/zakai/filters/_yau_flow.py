@@ -105,8 +105,8 @@ def distinct(system: System, schedule: Schedule) -> tuple[np.ndarray, np.ndarray
     # A uniform clock is uniform to rounding of the times only.
     unit = 1e-9 * np.min(schedule.stops - schedule.starts) + 4 * np.spacing(np.abs(schedule.stops).max())
     length = np.rint((schedule.stops - schedule.starts) / unit)
-    pattern = schedule.inside @ (2.0 ** np.arange(schedule.inside.shape[1]))
-    _, first, which = np.unique(np.stack([length, pattern]), axis=1, return_index=True, return_inverse=True)
+    kinds = np.column_stack([length, schedule.inside])
+    _, first, which = np.unique(kinds, axis=0, return_index=True, return_inverse=True)
     return which.ravel(), first
 
 
