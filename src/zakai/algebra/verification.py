@@ -102,8 +102,11 @@ class _Plain:
         """A combination of words, with SymPy expressions for coefficients."""
         total: dict[tuple[int, ...], Any] = {}
         for word, number in words.items():
-            for alpha, c in self.expressions(self.word(word)).items():
-                _accumulate(total, alpha, c * number)
+            factor = number if self.ring is None else sp.QQ.from_sympy(number)
+            for alpha, c in self.word(word).items():
+                _accumulate(total, alpha, c * factor)
+        if self.ring is not None:
+            return self.expressions({alpha: c for alpha, c in total.items() if c})
         return {alpha: e for alpha, c in total.items() if not self.is_zero(e := sp.expand(c))}
 
     def expressions(self, operator: Operator) -> dict[tuple[int, ...], Any]:
