@@ -81,11 +81,12 @@ class DmzOperators:
                 c = ring.context.from_dict(
                     {(*[0] * ring.n, *m[ring.n :]): c for m, c in top.to_dict().items() if m[: ring.n] == monomial}
                 )
-                p = p - c * self._power_of_D(monomial)
+                p = p - c * self.power_of_D(monomial)
             p = ring.normal(p)
         return result + p
 
-    def _power_of_D(self, exponents: Sequence[int]) -> Symbol:
+    def power_of_D(self, exponents: Sequence[int]) -> Symbol:
+        """D_1^a1 ... D_n^an; needs a regular G."""
         assert self.g is not None
         power = self.ring.one
         for i in reversed(range(self.ring.n)):
