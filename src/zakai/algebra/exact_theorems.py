@@ -42,7 +42,7 @@ def benes(model: Model) -> tuple[Condition, ...]:
         return conditions
     form = gauge(model)
     potential = affine_system(model)[0].potential  # type: ignore[index]
-    statement = "phi = log cosh(q(t).x + delta(t))"
+    statement = "phi = log cosh(q(t).x + delta(t)) but for an affine function, which is part of l"
     return (
         *conditions,
         Condition(statement, form is not None and form.is_log_cosh, f"phi = {short(str(potential))}", _BENES),

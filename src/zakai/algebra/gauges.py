@@ -31,10 +31,8 @@ class Gauge:
 
     @property
     def is_log_cosh(self) -> bool:
-        """Whether phi = log cosh(q.x + delta) + constant."""
-        if self.slopes is None or self.slopes.rows != 2:
-            return False
-        return all(is_zero(a + b) is True for a, b in zip(self.slopes.row(0), self.slopes.row(1), strict=True))
+        """Whether phi = log cosh(q.x + delta) but for an affine function, which may as well be part of l: two exponentials."""
+        return self.slopes is not None and self.slopes.rows == 2
 
 
 @lru_cache(maxsize=64)
@@ -75,26 +73,52 @@ def gauge(model: Model) -> Gauge | None:
     return None if directions is None else Gauge(potential, directions, None, None)
 
 
-def _exponentials(potential: sp.Expr, x: tuple[sp.Symbol, ...]) -> dict[tuple[sp.Expr, ...], sp.Expr] | None:
+Terms = dict[tuple[sp.Expr, ...], sp.Expr]
+
+
+def _exponentials(potential: sp.Expr, x: tuple[sp.Symbol, ...]) -> Terms | None:
     """e^phi as {slope: coefficient}, or None where it is no finite sum of exponentials of affine forms."""
-    product = {(sp.Integer(0),) * len(x): sp.Integer(1)}
+    product: Terms = {(sp.Integer(0),) * len(x): sp.Integer(1)}
+    powers: list[tuple[Terms, sp.Expr]] = []
     for term in sp.Add.make_args(sp.expand(potential, log=False, power_base=False)):
         logs = [factor for factor in sp.Mul.make_args(term) if isinstance(factor, sp.log) and factor.has(*x)]
-        factors = [_sum_of_exponentials(sp.exp(term), x)]
+        factor = _sum_of_exponentials(logs[0].args[0] if logs else sp.exp(term), x)
+        count = tidy(term / logs[0]) if logs else sp.Integer(1)
+        if factor is None or len(logs) > 1 or count.has(*x):
+            return None
         if logs:
-            count = tidy(term / logs[0])
-            if len(logs) > 1 or not count.is_Integer or not 0 < count <= _MOST_TERMS:
-                return None
-            factors = [_sum_of_exponentials(logs[0].args[0], x)] * int(count)
-        for factor in factors:
-            if factor is None or len(product) * len(factor) > 4 * _MOST_TERMS:
+            factor = _gathered(powers, factor, count)
+        product = _product(product, factor)
+    for factor, count in powers:
+        if not count.is_Integer or not 0 <= count <= _MOST_TERMS:
+            return None
+        for _ in range(int(count)):
+            if len(product) * len(factor) > 4 * _MOST_TERMS:
                 return None
             product = _product(product, factor)
     return product if len(product) <= _MOST_TERMS else None
 
 
-def _sum_of_exponentials(expression: sp.Expr, x: tuple[sp.Symbol, ...]) -> dict[tuple[sp.Expr, ...], sp.Expr] | None:
-    found: dict[tuple[sp.Expr, ...], sp.Expr] = {}
+def _gathered(powers: list[tuple[Terms, sp.Expr]], terms: Terms, count: sp.Expr) -> Terms:
+    """Count `terms`^count with the powers of the same sum but for one exponential; that exponential's power is given back.
+
+    An integral of a quotient of exponentials comes as log(1 + e^-2x)/2 + log(1 + e^2x)/2, which is log(1 + e^2x) - x.
+    """
+    first = next(iter(terms))
+    for index, (known, before) in enumerate(powers):
+        for key in known if len(known) == len(terms) else ():
+            shift = [a - b for a, b in zip(key, first, strict=True)]
+            moved = {tuple(sp.expand(a + b) for a, b in zip(slope, shift, strict=True)): c for slope, c in terms.items()}
+            ratio = terms[first] / known[key]
+            if moved.keys() == known.keys() and all(is_zero(moved[slope] - ratio * known[slope]) is True for slope in known):
+                powers[index] = known, tidy(before + count)
+                return {tuple(sp.expand(-count * entry) for entry in shift): ratio**count}
+    powers.append((terms, count))
+    return {(sp.Integer(0),) * len(first): sp.Integer(1)}
+
+
+def _sum_of_exponentials(expression: sp.Expr, x: tuple[sp.Symbol, ...]) -> Terms | None:
+    found: Terms = {}
     for term in sp.Add.make_args(sp.expand(expression.rewrite(sp.exp), power_exp=False)):
         slope, coefficient = sp.zeros(len(x), 1), sp.Integer(1)
         for factor in sp.Mul.make_args(term):
@@ -111,10 +135,8 @@ def _sum_of_exponentials(expression: sp.Expr, x: tuple[sp.Symbol, ...]) -> dict[
     return found
 
 
-def _product(
-    a: dict[tuple[sp.Expr, ...], sp.Expr], b: dict[tuple[sp.Expr, ...], sp.Expr]
-) -> dict[tuple[sp.Expr, ...], sp.Expr]:
-    out: dict[tuple[sp.Expr, ...], sp.Expr] = {}
+def _product(a: Terms, b: Terms) -> Terms:
+    out: Terms = {}
     for p, c in a.items():
         for q, d in b.items():
             key = tuple(sp.expand(i + j) for i, j in zip(p, q, strict=True))
