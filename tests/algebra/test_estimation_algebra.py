@@ -251,3 +251,10 @@ def test_the_analysis_explores_the_algebra_only_when_it_is_asked_for(monkeypatch
 def test_the_analysis_of_an_algebra_does_not_load_jax():
     code = "import sys, zakai; print(zakai.analyze(zakai.load_model('gallery:wong')).algebra.dimension, 'jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "4 False\n"
+
+
+def test_derivatives_of_undetermined_functions_are_written_with_primes_and_numbers():
+    page = str(zakai.analyze(zakai.load_model("gallery:wong")))
+    assert "omega_1,2 = -gamma'(x1 + x2 + x3)" in page
+    page = str(zakai.analyze(system(["0", "gamma(x1, x1 + x2)"], ["x1"], functions=["gamma"])))
+    assert "omega_1,2 = gamma_1(x1, x1 + x2) + gamma_2(x1, x1 + x2)" in page

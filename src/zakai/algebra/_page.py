@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import sympy as sp
 
+from zakai.algebra._readable import readable
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.models.model import Model
 
@@ -33,7 +34,7 @@ def text(analysis: Analysis) -> str:
     blocks = [
         [title, "=" * len(title), *_equations(model)],
         ["Omega_ij = d_i g_j - d_j g_i  with g = G^-1 f", *_omega(analysis)],
-        ["eta = f'G^-1 f + div f + h'S^-1 h", f"  {_SINGULAR}" if analysis.eta is None else f"  eta = {analysis.eta}"],
+        ["eta = f'G^-1 f + div f + h'S^-1 h", f"  {_SINGULAR}" if analysis.eta is None else f"  eta = {readable(analysis.eta)}"],
         ["Yau form  f = L x + l + G grad phi", *_yau_form(analysis)],
         ["Estimation algebra", *_algebra(analysis)],
     ]
@@ -74,7 +75,7 @@ def _omega(analysis: Analysis) -> Iterator[str]:
         yield "  Omega = 0" + ("" if n > 1 else "  (as for every system with one state)")
     else:
         for i in range(n):
-            yield from (f"  omega_{i + 1},{j + 1} = {omega[i, j]}" for j in range(i + 1, n) if omega[i, j] != 0)
+            yield from (f"  omega_{i + 1},{j + 1} = {readable(omega[i, j])}" for j in range(i + 1, n) if omega[i, j] != 0)
 
 
 def _yau_form(analysis: Analysis) -> Iterator[str]:
@@ -97,12 +98,12 @@ def _algebra(analysis: Analysis) -> Iterator[str]:
     if algebra.parameters:
         yield from _wrapped("  ", algebra.parameters, 4)
     if algebra.basis:
-        yield from _wrapped("  basis: ", ", ".join(map(str, algebra.basis)), 9)
+        yield from _wrapped("  basis: ", ", ".join(str(readable(e)) for e in algebra.basis), 9)
         named = "D_i = d_i - g_i" if analysis.omega is not None else "D_i = d_i"
         yield f"  with L0 = (D'G D - eta)/2, {named}" if analysis.omega is not None else f"  with {named}"
     for (i, j), bracket in algebra.brackets.items():
         if bracket != 0:
-            yield from _wrapped("  ", f"[{algebra.basis[i]}, {algebra.basis[j]}] = {bracket}", 6)
+            yield from _wrapped("  ", f"[{readable(algebra.basis[i])}, {readable(algebra.basis[j])}] = {readable(bracket)}", 6)
     if algebra.basis and algebra.brackets:
         yield "  all other brackets are 0" if any(algebra.brackets.values()) else "  all brackets are 0"
     if algebra.linear_rank is not None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import sympy as sp
 
+from zakai.algebra._readable import readable
 from zakai.algebra.closure import Closure, Row
 from zakai.algebra.dmz_operators import DmzOperators
 from zakai.algebra.leading_monomials import growing_pair
@@ -192,5 +193,5 @@ def _combination(row: Row, operators: DmzOperators) -> str:
 
 
 def _short(expression: sp.Expr) -> str:
-    text = str(expression)
+    text = str(readable(expression))
     return text if len(text) <= 200 else f"{text[:200]} ..."
