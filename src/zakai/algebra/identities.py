@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 
 import mpmath
 import sympy as sp
+from sympy.core.function import AppliedUndef
 
 DIGITS = 60
 POINTS = 12
@@ -40,15 +41,29 @@ def is_zero(expression: sp.Expr) -> bool | None:
     if expression.is_number and expression.is_Rational:
         return bool(expression == 0)
     symbols = sorted(expression.free_symbols, key=lambda s: s.name)
+    sample = _determined(expression)
     vanished = 0
     for point in _points(symbols):
-        answer = _vanishes(expression, point)
+        answer = _vanishes(sample, point)
         if answer is False:
             return False
         vanished += answer is True
     if expression.count_ops() <= SHORT and _provably_zero(expression):
         return True
     return True if vanished >= POINTS and _is_analytic(expression) else None
+
+
+def _determined(expression: sp.Expr) -> sp.Expr:
+    """With a particular smooth function for each undetermined one: what is not zero for these is not identically zero."""
+    if not expression.has(AppliedUndef):
+        return expression
+    names = sorted({part.func.__name__ for part in expression.atoms(AppliedUndef)})
+    for k, name in enumerate(names, 2):
+        expression = expression.replace(
+            lambda part, name=name: isinstance(part, AppliedUndef) and part.func.__name__ == name,
+            lambda part, k=k: sp.sin(sp.Add(*[(j + k) * z for j, z in enumerate(part.args)])) * sp.exp(part.args[0] / k),
+        )
+    return expression.doit()
 
 
 def all_zero(expressions: Sequence[sp.Expr]) -> bool | None:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import sympy as sp
 
+from zakai.algebra._readable import readable
 from zakai.algebra.identities import grouped, is_quadratic, is_zero, normal_form, tidy
 from zakai.models.model import Model
 
@@ -95,7 +96,7 @@ def yau_form(model: Model) -> YauForm | NoYauForm:
             for symbol in x:
                 answer = is_zero(sp.diff(omega[i, j], symbol))
                 if answer is not True:
-                    what = f"omega_{i + 1}{j + 1} = {omega[i, j]} depends on {symbol}"
+                    what = f"omega_{i + 1}{j + 1} = {readable(omega[i, j])} depends on {symbol}"
                     return NoYauForm(answer, what if answer is False else f"it is not decided whether {what}")
     # A constant curl belongs to L: f contains -G omega x / 2.
     matrix = matrix - covariance * omega / 2
