@@ -17,7 +17,9 @@ PLANE = dict(
 LINE = dict(state=["x"], drift=["-x"], observation=["sin(x)"], prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]})
 
 
-@pytest.mark.parametrize(("keys", "method"), [pytest.param(PLANE, "limited-direct", marks=pytest.mark.slow), (LINE, "extended-kalman-bucy")])
+@pytest.mark.parametrize(
+    ("keys", "method"), [pytest.param(PLANE, "limited-direct", marks=pytest.mark.slow), (LINE, "extended-kalman-bucy")]
+)
 def test_the_length_of_a_chunk_changes_no_estimate(keys, method, monkeypatch):
     model = zakai.Model(**keys)
     _, record = zakai.simulate(model, 0.1 * np.arange(1, 31), seed=1)
