@@ -121,6 +121,13 @@ def test_linear_systems_of_many_states_have_2_n_plus_2_elements(n):
     assert (algebra.verdict, algebra.dimension, algebra.linear_rank) == ("finite", 2 * n + 2, n)
 
 
+def test_more_states_than_are_explored_are_decided_by_a_theorem():
+    algebra = estimation_algebra(linear(25))
+    assert (algebra.verdict, algebra.dimension, algebra.certificate.code) == ("finite", None, "FIN-THM4i")
+    assert "not listed" in algebra.note and verify(algebra.certificate)
+    assert not verify(dataclasses.replace(algebra.certificate, model=INFINITE["double well"][0]))
+
+
 def named(algebra) -> dict[str, str]:
     """The brackets that are not zero, as text."""
     names = [str(e) for e in algebra.basis]

@@ -19,12 +19,17 @@ from zakai.algebra.leading_monomials import growing_pair
 from zakai.algebra.linear_span import Word
 from zakai.models.model import Model
 
-CLOSED, OCONE, OMEGA, RANK, SYMBOL, GROWTH = "FIN-closed", "INF-OCONE", "INF-THM2", "INF-MAXRANK", "INF-SYM1", "INF-SYM2"
+CLOSED, QUADRATIC = "FIN-closed", "FIN-THM4i"
+OCONE, OMEGA, RANK, SYMBOL, GROWTH = "INF-OCONE", "INF-THM2", "INF-MAXRANK", "INF-SYM1", "INF-SYM2"
 
 STATEMENTS: Mapping[str, tuple[str, str]] = {
     CLOSED: (
         "The brackets of L_0 and the h_i with the elements of a finite basis are combinations of that basis.",
         "exact computation",
+    ),
+    QUADRATIC: (
+        "If Omega is constant, every h_i affine and eta a polynomial of degree two at most, E is finite dimensional.",
+        "Yau 1993, Theorem 4 (i)",
     ),
     OCONE: (
         "If E is finite dimensional, every function in E is a polynomial of degree two at most.",
@@ -85,6 +90,16 @@ def spoken(word: Word) -> str:
     """A word as nested brackets: (0, 1) is [L0, h1]."""
     names = [f"h{k}" if k else "L0" for k in word]
     return "".join(f"[{name}, " for name in names[:-1]) + names[-1] + "]" * (len(names) - 1)
+
+
+def finite_by_theorem(operators: DmzOperators) -> Certificate | None:
+    """A certificate that the algebra is finite dimensional, without a basis."""
+    if operators.eta is None or not _omega_is_constant(operators) or not operators.is_polynomial(operators.eta, 2):
+        return None
+    if not all(operators.is_polynomial(h, 1) for h in operators.h):
+        return None
+    what = "Omega is constant, h is affine and eta a polynomial of degree two"
+    return certificate(QUADRATIC, what, operators.model, ())
 
 
 def infinite(operators: DmzOperators, closure: Closure) -> Certificate | None:

@@ -27,8 +27,8 @@ class Budget:
 
     @classmethod
     def of(cls, states: int) -> Budget:
-        """6 n + 20 elements: an estimation algebra of maximal rank has 2 n + 2."""
-        return cls(elements=6 * states + 20)
+        """6 n + 20 elements, for an estimation algebra of maximal rank has 2 n + 2; and 50 at most."""
+        return cls(elements=min(6 * states + 20, 50))
 
 
 class Row(NamedTuple):
