@@ -26,6 +26,7 @@ from zakai.filters.observations import Data, Factors, factors
 from zakai.kolmogorov.families import Family, log_terms, move, read
 from zakai.kolmogorov.flow import Flow
 from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
+from zakai.models._definite import smallest_eigenvalue
 from zakai.models.model import Model
 
 
@@ -243,12 +244,13 @@ def density_of(model: Model, gauge: GaugeFunctions, theta: Any, time: Any, famil
     """e^phi times the families, normalised."""
     tilts = gauge.at(time, theta)
     found = posterior(gauge, tilts, time, theta, families)
-    if not gauge.exact:
+    # What has no width in some direction, as a start that is known, is on no lattice.
+    if not gauge.exact and np.all(smallest_eigenvalue(np.asarray(families.cov)) > 1e-14):
         return _on_lattice(model, gauge, theta, time, families, found)
     weights = np.asarray(found.signs * jnp.exp(found.logs - found.log_mass))
     moved = jnp.einsum("jnk,jmk->jmn", families.response, families.nodes)
     means = np.asarray(found.centres[:, None] + moved[:, :, None])
-    covs = np.broadcast_to(np.asarray(families.cov)[:, None, None], (*weights.shape, model.n, model.n))
+    covs = np.broadcast_to(np.asarray(found.covs)[:, None, None], (*weights.shape, model.n, model.n))
     used = weights != 0.0
     return GaussianMixture(weights[used], means[used], covs[used], model.state, (False,) * model.n)
 

@@ -81,7 +81,7 @@ def lifted(directions: Any, z: Any) -> Any:
 
 class Posterior(NamedTuple):
     """u as Gaussians: the log-mass of u, its `mean` and `cov`; `logs` and `signs` (J, N, E) are the weights of
-    N(centres (J, E) + Gamma (J) s (J, N), cov (J)), and `doubt` an estimate of the relative error of the sums over z."""
+    N(centres (J, E) + Gamma (J) s (J, N), covs (J)), and `doubt` an estimate of the relative error of the sums over z."""
 
     log_mass: Any
     mean: Any
@@ -89,6 +89,7 @@ class Posterior(NamedTuple):
     logs: Any
     signs: Any
     centres: Any
+    covs: Any
     doubt: Any
 
 
@@ -126,7 +127,7 @@ def posterior(functions: GaugeFunctions, tilts: Tilts, t: Any, theta: Any, famil
         + jnp.einsum("jnk,jkl,jml->nm", families.response, second, families.response)
         + jnp.einsum("je,jnm->nm", zeroth, covs)
     )
-    return Posterior(top + jnp.log(total), mean, 0.5 * (cov + cov.T), logs, signs, centres, doubt)
+    return Posterior(top + jnp.log(total), mean, 0.5 * (cov + cov.T), logs, signs, centres, covs, doubt)
 
 
 def _exponential(tilts: Tilts, families: Family):
@@ -157,7 +158,10 @@ def _summed(functions: GaugeFunctions, tilts: Tilts, t: Any, theta: Any, familie
 
     def one(family: Family):
         across = family.cov @ directions.T
-        factor = jnp.linalg.cholesky(directions @ across)
+        inner = directions @ across
+        # Where z has no width there is nothing to sum over, and the rest of the covariance is all of it.
+        least = 1e-14 * jnp.trace(inner) * (len(inner) > 1) + 1e-300
+        factor = jnp.linalg.cholesky(inner + least * jnp.eye(len(inner)))
         along = jax.lax.linalg.triangular_solve(factor, across, left_side=False, lower=True, transpose_a=True)
         moved = points @ along.T
         x = family.mean + (family.nodes @ family.response.T)[:, None] + moved
