@@ -83,6 +83,37 @@ def test_the_index_of_the_matrix_in_24_and_in_the_survey_21_matters():
     assert residual(corrected, transposed=True).has(*X)
 
 
+def test_the_bilinear_term_of_25_is_that_of_the_drift_at_the_moved_point():
+    """(25) is what l(x + b)'G^-1 b' has of b: sum G^ij d_jl b_l b_i', and not d_ji b_i b_i' as printed."""
+    D, d, inverse = Matrix(2, 2, symbols("d11 d12 d21 d22")), Matrix(symbols("d1 d2")), Matrix([[3, 1], [1, 2]])
+    b, b_rate = of_t("b"), of_t("b").diff(t)
+    both = range(2)
+    right = sum(inverse[i, j] * D[j, l] * b[l] * b_rate[i] for i in both for j in both for l in both)
+    printed_25 = sum(inverse[i, j] * D[j, i] * b[i] * b_rate[i] for i in both for j in both)
+    wanted = dot(D * (X + b) + d, inverse * b_rate) - dot(D * X + d, inverse * b_rate)
+    assert sympy.expand(wanted - right) == 0
+    assert sympy.expand(wanted - printed_25) != 0
+
+
+def test_the_double_bracket_of_lemma_1_is_a_function_and_has_no_operator_in_it():
+    G = Matrix([[2, 1], [1, 3]])
+    f, h = ([Function(f"{name}{i}")(*X) for i in (1, 2)] for name in "fh")
+    u = Function("u")(*X)
+
+    def generator(v):
+        second = sum(G[k, l] * v.diff(X[k], X[l]) for k in range(2) for l in range(2)) / 2
+        return second - sum((f[k] * v).diff(X[k]) for k in range(2)) - (h[0] ** 2 + h[1] ** 2) * v / 2
+
+    def bracket(operator, function):
+        return lambda v: operator(function * v) - function * operator(v)
+
+    double = bracket(bracket(generator, h[0]), h[1])(u).doit()
+    right = sum(G[k, l] * h[0].diff(X[k]) * h[1].diff(X[l]) for k in range(2) for l in range(2))
+    assert sympy.expand(double - right * u) == 0
+    # The line that is printed runs on into the next sentence, "L0 + sum y_i [L0, L_i]".
+    assert sympy.expand(double - right * generator(u).doit()) != 0
+
+
 def test_the_running_code_has_the_wrong_evidence_with_14_as_printed(monkeypatch):
     model = zakai.Model(
         state=["x"],
