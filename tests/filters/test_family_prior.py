@@ -70,9 +70,11 @@ CASES = {
     "turned, thin": (TURNED, gaussian([0.3, -0.2], THIN.tolist()), thin(), lambda x: 1.0),
     "turned, a point": (TURNED, gaussian([0.3, -0.2], [0.0, 0.0]), (np.array([[0.3, -0.2]]), 1.0), lambda x: 1.0),
 }
+# The same code as that of others.
+SLOW = ("benes, narrow", "benes, mixture", "turned, a point")
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [pytest.param(case, marks=pytest.mark.slow) if case in SLOW else case for case in CASES])
 def test_the_mass_under_the_gauge_and_its_gradient_are_those_of_quadrature(case):
     (drift, phi), prior, (x, cell), sigma = CASES[case]
     state = ["x", "y"][: len(drift)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 import pytest
 
@@ -32,7 +31,7 @@ def linear_model(n, m, rng, rank, prior):
     return model, lambda t: A + np.cos(t) * B, lambda t: b * np.sin(t), lambda t: g @ g.T, C, S
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 10])
+@pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow), 10])
 def test_it_agrees_with_the_equations_of_kalman_and_bucy(n):
     rng = np.random.default_rng(n)
     root = rng.standard_normal((n, n))
@@ -118,7 +117,7 @@ def test_a_mixture_is_filtered_component_by_component():
     assert model.n == 2
 
 
-@pytest.mark.parametrize("kind", ["increments", "path", "samples"])
+@pytest.mark.parametrize("kind", ["increments", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("path", "samples"))])
 def test_a_prior_density_and_every_kind_of_record_agree_with_the_lattice(kind):
     model = zakai.Model(
         state=["x"],
@@ -143,6 +142,7 @@ def test_a_prior_density_and_every_kind_of_record_agree_with_the_lattice(kind):
     assert np.exp(exact.density(-1).log_density(x)) == pytest.approx(np.exp(lattice.density(-1).log_density(x)), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_prior_that_no_nodes_resolve_is_said():
     model = zakai.Model(
         state=["x"],
@@ -152,25 +152,3 @@ def test_a_prior_that_no_nodes_resolve_is_said():
     )
     result = zakai.filter(model, zakai.Record([0.1], [[0.0]], "increments"))
     assert result.method != "kalman-bucy" or any("representation_error" in warning for warning in result.warnings)
-
-
-def test_its_gradient_is_that_of_differences():
-    from zakai.filters import _family_filter as families
-    from zakai.filters.observations import data_of, schedule_of
-
-    model = zakai.load_model("gallery:kalman-bucy-2d")
-    record = zakai.Record(0.2 * np.arange(1, 6), 0.1 * np.cos(np.arange(5))[:, None], "increments")
-    data = data_of(model, record)
-    prepared = families.prepare(model, schedule_of(data, True))
-
-    def log_likelihood(theta):
-        other = families.with_parameters(prepared, theta)
-        state, given = families.init(other, model.prior), families.observations(other, data)
-        return jax.lax.scan(lambda s, row: families.step(row[0], s, row[1]), state, (other.intervals, given))[1][0].sum()
-
-    theta = np.asarray(model.theta())
-    found = jax.grad(log_likelihood)(jax.numpy.asarray(theta))
-    for i in range(len(theta)):
-        step = 1e-4 * np.eye(len(theta))[i]
-        wanted = (log_likelihood(jax.numpy.asarray(theta + step)) - log_likelihood(jax.numpy.asarray(theta - step))) / 2e-4
-        assert float(found[i]) == pytest.approx(float(wanted), rel=1e-6, abs=1e-9)
