@@ -33,7 +33,7 @@ STATEMENTS: Mapping[str, tuple[str, str]] = {
     ),
     OCONE: (
         "If E is finite dimensional, every function in E is a polynomial of degree two at most.",
-        "Ocone 1980; proved in the documents from INF-SYM1",
+        "Ocone 1980; proved in docs/estimation-algebras.md",
     ),
     OMEGA: (
         "If E is finite dimensional and Omega is constant, every h_i is affine.",
@@ -46,12 +46,12 @@ STATEMENTS: Mapping[str, tuple[str, str]] = {
     ),
     SYMBOL: (
         "If E is finite dimensional, the principal symbol of every element is a polynomial in x.",
-        "proved in the documents",
+        "proved in docs/estimation-algebras.md",
     ),
     GROWTH: (
         "If the leading monomials of A and B, for suitable weights, never cancel in [A, [A, ... [A, B]]], these brackets are "
         "infinitely many independent elements.",
-        "proved in the documents",
+        "proved in docs/estimation-algebras.md",
     ),
 }
 
