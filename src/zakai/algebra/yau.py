@@ -48,9 +48,11 @@ class Quadratic:
 
 
 def inverse(matrix: sp.MatrixBase) -> sp.MatrixBase:
-    """The inverse by cofactors, with tidied entries."""
+    """The inverse, by cofactors and with tidied entries where they are not numbers."""
     if matrix.is_diagonal():
         return sp.diag(*[1 / entry for entry in matrix.diagonal()])
+    if all(entry.is_Rational for entry in matrix):
+        return matrix.inv()
     return matrix.inv(method="ADJ").applyfunc(tidy)
 
 
