@@ -30,6 +30,7 @@ def errors(result, exact):
     return away.max(), abs(result.log_likelihood - exact.log_likelihood)
 
 
+@pytest.mark.slow
 def test_a_time_varying_system_with_a_log_cosh_gauge_agrees_with_the_exact_density():
     system = scalar()
     model = zakai.Model(**system.keys())
@@ -41,6 +42,7 @@ def test_a_time_varying_system_with_a_log_cosh_gauge_agrees_with_the_exact_densi
     assert finer <= 5e-3
 
 
+@pytest.mark.slow
 def test_sine_and_cosine_samples_of_two_states_agree_with_the_exact_density():
     model = encoder()
     _, record = zakai.simulate(model, np.arange(1, 31) * 0.1, seed=3)
@@ -49,6 +51,7 @@ def test_sine_and_cosine_samples_of_two_states_agree_with_the_exact_density():
     assert mean <= 0.05 and evidence <= 0.05 and not result.warnings
 
 
+@pytest.mark.slow
 def test_a_mirrored_mode_is_kept_and_the_sum_stays_symmetric():
     model = zakai.Model(
         state=["x"], drift=["-x/5"], observation=["x**2"], observation_noise=[["0.05"]], observation_kind="samples",
@@ -90,6 +93,7 @@ def test_extreme_variances_and_steps_give_numbers_and_positive_variances(varianc
     assert np.isfinite(result.mean).all() and np.isfinite(result.log_likelihood) and (result.variance > 0).all()
 
 
+@pytest.mark.slow
 def test_a_row_without_readings_is_a_prediction_and_the_density_is_the_state_that_is_reported():
     model = encoder()
     times = np.arange(1, 11) * 0.1

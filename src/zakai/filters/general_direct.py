@@ -474,9 +474,9 @@ METHOD = Method(
     density=density,
     with_parameters=with_parameters,
     bounds={
-        "mean_error": (0.05, "distance of the mean from that of a second sum with other slots, in standard deviations"),
+        "mean_error": (0.04, "distance of the mean from that of a second sum with other slots, in standard deviations"),
         "deviation_error": (0.1, "relative distance of a standard deviation from that of the second sum"),
-        "evidence_error": (0.1, "distance of the log-likelihood so far from that of the second sum"),
+        "evidence_error": (0.04, "distance of the log-likelihood so far from that of the second sum"),
         "nonlinearity": (0.1, "relative entropy lost in one step by keeping one Gaussian where an observation made none"),
         "quadrature": (1e-2, "relative error of the masses of components, by two rules of quadrature"),
         "pruned": (1e-3, "weight of components that were dropped in one step"),
