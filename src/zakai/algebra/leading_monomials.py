@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-WEIGHTS_FOR_EACH_COORDINATE = 100
+WEIGHTS_FOR_EACH_COORDINATE = 300
 
 
 @dataclass(frozen=True)
