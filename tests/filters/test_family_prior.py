@@ -95,3 +95,36 @@ def test_the_mass_under_the_gauge_and_its_gradient_are_those_of_quadrature(case)
     step = 1e-4
     wanted = np.array([expected(a + step, b) - expected(a - step, b), expected(a, b + step) - expected(a, b - step)]) / (2 * step)
     assert np.asarray(gradient) == pytest.approx(wanted, rel=1e-6, abs=1e-9)
+
+
+KINDS = {
+    "mixture": MIXTURE,
+    "density": DENSITY,
+    "wide": gaussian([0.4], [[400.0]]),
+}
+DRIFTS = {
+    "benes": ("benes", ["a*tanh(a*x + b)"], {"a": 0.8, "b": 0.3}),
+    "erf": ("hu-yau", ["x + (2/sqrt(pi))*exp(-x**2)/(a + erf(x))"], {"a": 1.5}),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "drift"), [(kind, drift) for kind in KINDS for drift in DRIFTS if (kind, drift) != ("wide", "erf")]
+)
+def test_the_log_likelihood_has_the_gradient_of_differences_for_every_kind_of_prior(kind, drift):
+    method, field, parameters = DRIFTS[drift]
+    model = zakai.Model(
+        state=["x"], drift=field, observation=["c*x"], parameters={**parameters, "c": 1.2}, prior=KINDS[kind]
+    )
+    record = zakai.Record([0.1, 0.15, 0.4], [[0.2], [np.nan], [0.3]], "increments")
+    likelihood, theta = zakai.log_likelihood(model, record, method), model.theta()
+    value, gradient = jax.value_and_grad(likelihood)(theta)
+    assert value == pytest.approx(zakai.filter(model, record, method).log_likelihood, abs=1e-10)
+
+    def at(**changed):
+        return zakai.filter(model.with_parameters(**changed), record, method).log_likelihood
+
+    for index, name in enumerate(model.parameters):
+        above, below = (at(**{name: theta[index] + shift}) for shift in (1e-4, -1e-4))
+        assert gradient[index] == pytest.approx((above - below) / 2e-4, rel=1e-6, abs=1e-8)
