@@ -108,6 +108,7 @@ def test_a_row_without_readings_is_a_prediction_and_the_density_is_the_state_tha
     assert np.allclose(density.mean(), result.mean[-1]) and np.allclose(density.cov(), result.cov[-1])
 
 
+@pytest.mark.slow
 def test_the_gradient_of_the_log_likelihood_is_its_slope():
     from zakai.filters.likelihood import log_likelihood
 
