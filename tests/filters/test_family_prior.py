@@ -71,7 +71,7 @@ CASES = {
     "turned, a point": (TURNED, gaussian([0.3, -0.2], [0.0, 0.0]), (np.array([[0.3, -0.2]]), 1.0), lambda x: 1.0),
 }
 # The same code as that of others.
-SLOW = ("benes, narrow", "benes, mixture", "turned, a point")
+SLOW = ("benes, narrow", "erf", "benes, mixture", "turned, a point")
 
 
 @pytest.mark.parametrize("case", [pytest.param(case, marks=pytest.mark.slow) if case in SLOW else case for case in CASES])
