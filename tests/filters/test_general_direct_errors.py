@@ -86,19 +86,6 @@ def test_a_sum_of_too_few_components_says_so(name, components):
     assert (mean <= 0.05 and evidence <= 0.1) or said(result)
 
 
-@pytest.mark.slow
-def test_the_error_falls_with_the_slots():
-    model = sensor("mirror")
-    errors = []
-    for seed in (3, 4, 5):
-        _, record = zakai.simulate(model, np.arange(1, 41) * 0.1, seed=seed)
-        exact = on_a_line("mirror", record)
-        slots = (5, 10, 20, 60)
-        errors.append([distance(zakai.filter(model, record, "general-direct", components=k), *exact)[0] for k in slots])
-    few, some, more, many = np.sqrt(np.mean(np.square(errors), axis=0))
-    assert few > some > more > many and many < few / 10
-
-
 def paths(record, count=20000, turns=(-1, 0, 1)):
     """The same three for samples of sin(x), cos(x), x' = v, v' = a, a' = -a/2 with noise, exact in law: the path is Gaussian, and
     is sampled about its most probable value on each of the windings."""
