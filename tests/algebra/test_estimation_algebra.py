@@ -194,6 +194,16 @@ def test_a_system_with_singular_noise_is_never_infinite_by_a_theorem_that_needs_
     assert algebra.verdict == "undecided" and "G is singular" in algebra.note
 
 
+def test_theorems_on_smooth_functions_are_not_used_for_a_drift_that_is_singular_somewhere():
+    algebra = estimation_algebra(system(["2/x"], ["x"]))
+    assert algebra.certificate.code == OCONE and verify(algebra.certificate)
+    beside = estimation_algebra(system(["1/x1", "0"], ["x2**2"])).certificate
+    assert beside is None or beside.code != OMEGA
+    smooth = estimation_algebra(system(["2*x/(1 + x**2)"], ["x"]))
+    assert smooth.certificate.code == RANK and verify(smooth.certificate)
+    assert not verify(dataclasses.replace(smooth.certificate, model=system(["2/x"], ["x"])))
+
+
 def test_a_parameter_may_change_the_verdict_and_the_report_says_so():
     algebra = estimation_algebra(system(["x - a*x**3"], ["x"], parameters={"a": 0}))
     assert (algebra.verdict, algebra.dimension) == ("finite", 4)

@@ -130,6 +130,20 @@ def test_what_is_algebraically_dependent_is_written_in_one_generator(one, other)
     assert reader.read(one) != reader.read(other) + reader.ring.one
 
 
+def test_an_undetermined_function_of_equal_arguments_is_one_function():
+    one, other = GAMMA(X[0] * (X[0] + X[1])), GAMMA(X[0] ** 2 + X[0] * X[1])
+    assert one != other
+    reader = Reader([one, other, GAMMA(X[0])], X, ())
+    assert reader.read(one) == reader.read(other) != reader.read(GAMMA(X[0]))
+
+
+def test_relations_that_overlap_are_completed():
+    # From v c = 1 and c^2 + s^2 = 1 follows v s^2 = v - c.
+    reader = Reader([1 / sp.cos(X[0]), sp.sin(X[0])], X, ())
+    v, c, s = (reader.read(e) for e in (1 / sp.cos(X[0]), sp.cos(X[0]), sp.sin(X[0])))
+    assert reader.ring.normal(v * s**2) == reader.ring.normal(v - c)
+
+
 def test_independent_functions_stay_apart():
     functions = [sp.exp(X[0]), sp.exp(X[0] ** 2), sp.sin(X[0]), sp.cos(X[0]), sp.log(X[0]), sp.exp(X[1]), sp.tanh(X[0] + X[1])]
     reader = Reader(functions, X, ())

@@ -43,7 +43,7 @@ class Reader:
 
     def __init__(self, expressions: Iterable[sp.Expr], x: Sequence[sp.Symbol], constants: Sequence[sp.Symbol], jets: int = 6):
         self._x, self._constants = tuple(x), (*constants, PI, INVERSE)
-        expressions = [e.xreplace({sp.pi: PI}) for e in expressions]
+        expressions = [_canonical(e) for e in expressions]
         atoms = sorted({a for e in expressions for a in _functions(e, set(x))}, key=str)
         self._plans: list[tuple[sp.Expr, Callable[[], list[Symbol] | None]]] = []  # what a generator is, its derivatives
         self._values: dict[sp.Expr, Callable[[], Fraction]] = {}
@@ -76,7 +76,7 @@ class Reader:
 
     def read(self, expression: sp.Expr) -> Symbol:
         """The element of the ring that an expression is."""
-        return self._fractions.polynomial(self._fraction(expression.xreplace({sp.pi: PI})))
+        return self._fractions.polynomial(self._fraction(_canonical(expression)))
 
     def expression(self, p: Symbol) -> sp.Expr:
         """An element without xi as a SymPy expression."""
@@ -212,6 +212,14 @@ class Reader:
         for order in orders:
             self._plan(_jet(atom, order), partial(derivatives, order))
         self._values[atom] = lambda: (self.ring.u[first], self.ring.one)
+
+
+def _canonical(e: sp.Expr) -> sp.Expr:
+    """With pi as a symbol, and the arguments of undetermined functions in one form: equal ones are the same function."""
+    e = e.xreplace({sp.pi: PI})
+    if not e.has(AppliedUndef):
+        return e
+    return e.replace(lambda part: isinstance(part, AppliedUndef), lambda part: part.func(*map(sp.cancel, part.args)))
 
 
 def _functions(e: sp.Expr, x: set[sp.Symbol]) -> Iterable[sp.Expr]:
