@@ -116,7 +116,7 @@ def test_where_nothing_is_read_the_evidence_does_not_change(method, name):
 
 
 @on_every_system
-@pytest.mark.parametrize("prior", PRIORS)
+@pytest.mark.parametrize("prior", [pytest.param("mixture", marks=pytest.mark.slow), "density"])
 def test_one_prior_said_in_two_ways_gives_one_posterior(method, name, prior):
     record = readings(name, "increments")
     other, expected = zakai.filter(system(name, prior=prior), record, method), zakai.filter(system(name), record, method)
