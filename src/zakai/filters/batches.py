@@ -131,9 +131,12 @@ def _lane(tree: Any, lane: int, axis: int) -> Any:
 
 @partial(jax.jit, static_argnums=(0, 4))
 def _scan(step, states, intervals, observations, keep):
-    def one(carry, slices):
-        new, info = jax.vmap(step, (None, 0, 0))(slices[0], carry, slices[1])
+    def one_record(interval, state, observation):
+        new, info = step(interval, state, observation)
         return new, (info, getattr(new, "kept", new) if keep else None)
+
+    def one(carry, slices):
+        return jax.vmap(one_record, (None, 0, 0))(slices[0], carry, slices[1])
 
     return scanned(one, states, (intervals, observations))
 
