@@ -68,6 +68,7 @@ FINITE = {
     "an eigenvector": (system(["x1 + x2", "x1 - x2 + 1"], ["x1"]), 1, "L0, D1, x1, 1"),
     "constant observation": (zakai.load_model("gallery:unobserved-double-well"), 0, "L0, 1"),
     "no observation": (zakai.load_model("gallery:silent-double-well"), 0, "L0"),
+    "nothing": (system(["0"], ["0"], diffusion=[["0"]]), 0, ""),
     "affine observation": (system(["-x"], ["2*x + 3", "5"]), 1, "L0, D1, x, 1"),
     "singular noise": (zakai.load_model("gallery:falling-body"), 2, "L0, D1, D2, position, speed, 1"),
 }

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 import sympy as sp
 
-from zakai.algebra._readable import readable
+from zakai.algebra._readable import readable, times
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.models.model import Model
 
 if TYPE_CHECKING:
     from zakai.algebra.analysis import Analysis
     from zakai.algebra.estimation_algebra import EstimationAlgebra
+    from zakai.algebra.wei_norman import WeiNorman
 
 WIDTH = 110
 _WORDS = {True: "holds", False: "fails", None: "undecided"}
@@ -38,6 +39,8 @@ def text(analysis: Analysis) -> str:
         ["Yau form  f = L x + l + G grad phi", *_yau_form(analysis)],
         ["Estimation algebra", *_algebra(analysis)],
     ]
+    if analysis.algebra.verdict == "finite":
+        blocks.append(["Wei-Norman equations, from r = 0 and y = 0", *_wei_norman(analysis.algebra)])
     for name, conditions in analysis.methods.items():
         blocks.append([f"Method {name}: {_WORDS[all_hold(conditions)]}", *_conditions(conditions)])
     blocks.append([_recommendation(analysis)])
@@ -47,8 +50,8 @@ def text(analysis: Analysis) -> str:
 def _equations(model: Model) -> Iterator[str]:
     noises = model.diffusion.cols
     for i, name in enumerate(model.state):
-        terms = [_times(model.drift[i], "dt")]
-        terms += [_times(model.diffusion[i, j], f"dv{j + 1}" if noises > 1 else "dv") for j in range(noises)]
+        terms = [times(model.drift[i], "dt")]
+        terms += [times(model.diffusion[i, j], f"dv{j + 1}" if noises > 1 else "dv") for j in range(noises)]
         angle = "   (an angle)" if name in model.periodic else ""
         yield f"  d{name} = {' + '.join(term for term in terms if term) or '0'}{angle}"
     yield f"  E dv dv' = Q dt,  Q = {_flat(model.process_noise)},  G = g Q g' = {_flat(model.covariance)}"
@@ -58,7 +61,7 @@ def _equations(model: Model) -> Iterator[str]:
         if samples:
             yield f"  z{number} = {model.observation[j]} + r{number}"
         else:
-            yield f"  dy{number} = {_times(model.observation[j], 'dt') or '0'} + dw{number}"
+            yield f"  dy{number} = {times(model.observation[j], 'dt') or '0'} + dw{number}"
     law = "r ~ N(0, S)" if samples else "E dw dw' = S dt"
     yield f"  {law},  S = {_flat(model.observation_noise)};  {_MEANING[model.observation_kind]}"
     if model.parameters:
@@ -114,6 +117,14 @@ def _algebra(analysis: Analysis) -> Iterator[str]:
         yield from _wrapped("    witness: ", proof.witness, 6)
 
 
+def _wei_norman(algebra: EstimationAlgebra) -> Iterator[str]:
+    equations = algebra.wei_norman
+    for line in [f"none: {algebra.no_wei_norman}"] if equations is None else equations.lines():
+        body = line.lstrip()
+        margin = 2 + len(line) - len(body)
+        yield from _wrapped(" " * margin, body, margin + 4)
+
+
 def _conditions(conditions: tuple[Condition, ...]) -> Iterator[str]:
     for condition in conditions:
         yield from _wrapped(f"  {_WORDS[condition.holds]:<9}  ", condition.statement)
@@ -137,13 +148,6 @@ def _recommendation(analysis: Analysis) -> str:
 
 def _flat(matrix: sp.MatrixBase) -> str:
     return str(matrix[0, 0]) if matrix.shape == (1, 1) else str(matrix.tolist())
-
-
-def _times(factor: sp.Expr, noise: str) -> str:
-    if factor == 0:
-        return ""
-    short = factor.is_Symbol or factor.is_Integer or factor.is_Function
-    return noise if factor == 1 else f"{factor} {noise}" if short else f"({factor}) {noise}"
 
 
 def latex(analysis: Analysis) -> str:
@@ -185,3 +189,19 @@ def _algebra_in_tex(algebra: EstimationAlgebra, tex: Callable[[sp.Basic], str]) 
     for (i, j), bracket in algebra.brackets.items():
         if bracket != 0:
             yield rf"\left[{tex(algebra.basis[i])}, {tex(algebra.basis[j])}\right] &= {tex(bracket)}"
+    if algebra.wei_norman is not None:
+        yield from _wei_norman_in_tex(algebra.wei_norman, tex)
+
+
+def _wei_norman_in_tex(equations: WeiNorman, tex: Callable[[sp.Basic], str]) -> Iterator[str]:
+    powers = [_power_in_tex(r, e, tex) for r, e in zip(equations.statistics, equations.basis[1:], strict=True)]
+    product = r"\,".join(f"e^{{{power}}}" for power in [*reversed(powers), "t L_{0}"]) + r"\,\sigma_0"
+    for left, rates in ((r"e^{-h^\top S^{-1} y}\,\sigma", equations.robust), (r"\sigma", equations.stratonovich)):
+        yield rf"{left} &= {product}, & r(0) &= 0"
+        yield from (rf"\dot{{{tex(r)}}} &= {tex(rate)}" for r, rate in rates.items())
+
+
+def _power_in_tex(r: sp.Symbol, element: sp.Expr, tex: Callable[[sp.Basic], str]) -> str:
+    if element == 1:
+        return tex(r)
+    return rf"{tex(r)} \left({tex(element)}\right)" if element.is_Add else f"{tex(r)} {tex(element)}"

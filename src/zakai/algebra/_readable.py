@@ -1,4 +1,4 @@
-"""Derivatives of undetermined functions as one writes them: gamma'(x1 + x2), and gamma_13 for d_1 d_3 gamma."""
+"""Formulas as one writes them: gamma'(x1 + x2), gamma_13 for d_1 d_3 gamma, and 3 dt for three times dt."""
 
 from __future__ import annotations
 
@@ -30,3 +30,11 @@ def _named(derivative: sp.Expr, values: dict[sp.Symbol, sp.Expr]) -> sp.Expr | N
     else:
         name += "_" + "".join(str(j + 1) * k for j, k in enumerate(orders))
     return sp.Function(name, real=True)(*[argument.xreplace(values) for argument in function.args])
+
+
+def times(factor: sp.Expr, noise: str) -> str:
+    """A factor before dt or the differential of a noise; empty for zero."""
+    if factor == 0:
+        return ""
+    short = factor.is_Symbol or factor.is_Integer or factor.is_Function
+    return noise if factor == 1 else f"{factor} {noise}" if short else f"({factor}) {noise}"

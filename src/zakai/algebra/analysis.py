@@ -101,8 +101,22 @@ class Analysis:
             "certificate": None
             if proof is None
             else {key: getattr(proof, key) for key in ("code", "statement", "source", "witness")},
+            "wei_norman": self._wei_norman_for_json(),
             "note": algebra.note,
             "parameters": algebra.parameters,
+        }
+
+    def _wei_norman_for_json(self) -> dict[str, object] | None:
+        equations = self.algebra.wei_norman
+        if equations is None:
+            return None
+        return {
+            "product": equations.product,
+            "statistics": [str(r) for r in equations.statistics],
+            "path": [str(y) for y in equations.path],
+            "rates": [str(z) for z in equations.rates],
+            "robust": {str(r): str(rate) for r, rate in equations.robust.items()},
+            "stratonovich": {str(r): str(rate) for r, rate in equations.stratonovich.items()},
         }
 
 

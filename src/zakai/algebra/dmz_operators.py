@@ -21,7 +21,7 @@ from zakai.models.model import Model
 
 
 class DmzOperators:
-    """`L0`, `h` (m), `g` (n) or None, `eta` or None and `omega` of a model as elements of `ring`.
+    """`L0`, `h` (m), `driven` (m), which is S^-1 h, `g` (n) or None, `eta` or None and `omega` of a model as elements of `ring`.
 
     `values` are numbers for parameters, the others stay symbols; raises Unreadable.
     """
@@ -43,7 +43,8 @@ class DmzOperators:
         f = [reader.read(entry) for entry in drift]
         self.h = [reader.read(entry) for entry in h]
         covariance = _rows(G, reader)
-        energy = _form(self.h, _rows(S_inverse, reader), self.h)
+        self.driven = [ring.normal(_form([ring.one], [row], self.h)) for row in _rows(S_inverse, reader)]
+        energy = sum((a * b for a, b in zip(self.h, self.driven)), ring.zero)
         divergence = sum((ring.total_derivative(f_i, i) for i, f_i in enumerate(f)), ring.zero)
         transport = sum((f_i * xi for f_i, xi in zip(f, ring.xi)), ring.zero)
         self.L0 = ring.normal(_form(ring.xi, covariance, ring.xi) / 2 - transport - divergence - energy / 2)

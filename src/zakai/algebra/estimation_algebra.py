@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import sympy as sp
 
@@ -22,6 +22,7 @@ from zakai.algebra.normal_form import Basis, basis_of
 from zakai.algebra.operators import JetTowerEnds
 from zakai.algebra.ratios import TooLarge
 from zakai.algebra.systems import affine_observation
+from zakai.algebra.wei_norman import NoFactorisation, WeiNorman, wei_norman
 from zakai.models.model import Model
 
 MOST_SYMBOLS = 6  # parameters that stay symbols; more are tried at random rationals
@@ -35,9 +36,10 @@ class EstimationAlgebra:
 
     `verdict` is "finite", "infinite" or "undecided".  For a finite one of not too many states, `dimension`; `basis` in L0,
     D_i = d_i - g_i (d_i where G is singular) and the state; `brackets`, {(i, j): [E_i, E_j]} for i < j, numbered from 0;
-    `structure_constants`, {(i, j): the coordinates of [E_i, E_j]}.  `linear_rank` is the number of affine functions in E with
-    independent gradients; where E is not closed, of those that were found, and where it was not explored, of the h_i, if these
-    are affine.  `certificate` proves the verdict; `note` says how it came about, `parameters` for which values it holds.
+    `structure_constants`, {(i, j): the coordinates of [E_i, E_j]}; `observation`, those of the (S^-1 h)_j; and `wei_norman`, the
+    equations of the filter, or None, and then `no_wei_norman` says why.  `linear_rank` is the number of affine functions in E
+    with independent gradients; where E is not closed, of those that were found, and where it was not explored, of the h_i, if
+    these are affine.  `certificate` proves the verdict; `note` says how it came about, `parameters` for which values it holds.
     """
 
     verdict: str = "undecided"
@@ -45,10 +47,30 @@ class EstimationAlgebra:
     basis: tuple[sp.Expr, ...] = ()
     brackets: Mapping[tuple[int, int], sp.Expr] = field(default_factory=dict)
     structure_constants: Mapping[tuple[int, int], tuple[sp.Expr, ...]] = field(default_factory=dict)
+    observation: tuple[tuple[sp.Expr, ...], ...] = ()
     linear_rank: int | None = None
     certificate: Certificate | None = None
     note: str = ""
     parameters: str = ""
+
+    @property
+    def wei_norman(self) -> WeiNorman | None:
+        """The equations of Wei and Norman, if a basis is known and gives them; found when first asked for."""
+        return None if isinstance(self._factorisation, str) else self._factorisation
+
+    @property
+    def no_wei_norman(self) -> str:
+        """Why there are no such equations, or an empty string."""
+        return self._factorisation if isinstance(self._factorisation, str) else ""
+
+    @cached_property
+    def _factorisation(self) -> WeiNorman | str:
+        if not self.basis:
+            return "no basis is known" if self.dimension is None else "L_0 and h are zero"
+        try:
+            return wei_norman(self.basis, self.structure_constants, self.observation)
+        except NoFactorisation as reason:
+            return str(reason)
 
 
 @dataclass(frozen=True)
@@ -87,6 +109,7 @@ def estimation_algebra(model: Model) -> EstimationAlgebra:
         basis=() if shown is None else shown.elements,
         brackets={} if shown is None else shown.brackets(),
         structure_constants={} if shown is None else shown.constants,
+        observation=() if shown is None else shown.observation,
         linear_rank=explored.rank,
         certificate=explored.certificate,
         note=explored.note,

@@ -11,6 +11,7 @@ import sympy as sp
 from zakai.algebra.closure import Closure
 from zakai.algebra.dmz_operators import DmzOperators
 from zakai.algebra.linear_span import Span, Vector, Word
+from zakai.algebra.operators import Symbol
 
 L0 = sp.Symbol("L0", commutative=False)
 
@@ -22,11 +23,15 @@ def D(i: int) -> sp.Symbol:
 
 @dataclass(frozen=True)
 class Basis:
-    """`elements` in L0, D_i and the state; each as a combination of `words`; [E_i, E_j] = sum_k constants[i, j][k] E_k."""
+    """`elements` E_k in L0, D_i and the state; each as a combination of `words`; [E_i, E_j] = sum_k constants[i, j][k] E_k.
+
+    (S^-1 h)_j = sum_k observation[j][k] E_k.
+    """
 
     elements: tuple[sp.Expr, ...]
     words: tuple[Mapping[Word, sp.Expr], ...]
     constants: Mapping[tuple[int, int], tuple[sp.Expr, ...]]
+    observation: tuple[tuple[sp.Expr, ...], ...]
 
     def brackets(self) -> dict[tuple[int, int], sp.Expr]:
         """[E_i, E_j] for i < j, in the terms of the basis."""
@@ -36,6 +41,8 @@ class Basis:
 def basis_of(operators: DmzOperators, closure: Closure) -> Basis:
     """The reduced echelon basis in D and x, highest order first, with L_0 itself in the place of its leading row."""
     numbers = operators.numbers
+    if not closure.words:  # L_0 = 0 and h = 0
+        return Basis((), (), {}, ((),) * len(operators.driven))
     span = Span(numbers.one)
     for word, symbol in closure.words.items():
         span.add(numbers.vector(operators.in_D(symbol)), word)
@@ -46,9 +53,9 @@ def basis_of(operators: DmzOperators, closure: Closure) -> Basis:
         if pivot != leading:
             combinations.append(words)
             elements.append(_expression(row, operators))
-    constants = _structure_constants(combinations, operators, closure)
+    constants, observation = _coordinates(combinations, operators, closure)
     in_words = tuple({word: numbers.expression(c) for word, c in combination.items()} for combination in combinations)
-    return Basis(tuple(elements), in_words, constants)
+    return Basis(tuple(elements), in_words, constants, observation)
 
 
 def _place(item: tuple[Any, Any]) -> tuple:
@@ -57,10 +64,10 @@ def _place(item: tuple[Any, Any]) -> tuple:
     return -order, -generators, -degree, tuple(-k for k in monomial)
 
 
-def _structure_constants(
+def _coordinates(
     combinations: list[Vector], operators: DmzOperators, closure: Closure
-) -> dict[tuple[int, int], tuple[sp.Expr, ...]]:
-    """The coordinates of the brackets; every element is multiplied by a common denominator to be in the ring."""
+) -> tuple[dict[tuple[int, int], tuple[sp.Expr, ...]], tuple[tuple[sp.Expr, ...], ...]]:
+    """The coordinates of the brackets and of S^-1 h; every element is multiplied by a common denominator to be in the ring."""
     numbers = operators.numbers
     span = Span(numbers.one)
     multiples = []
@@ -68,15 +75,17 @@ def _structure_constants(
         symbol, denominator = numbers.combination(combination, closure.words)
         multiples.append((symbol, denominator))
         span.add({key: c / denominator for key, c in numbers.vector(symbol).items()}, k)
+
+    def coordinates(symbol: Symbol, scale: Any) -> tuple[sp.Expr, ...]:
+        rest, found = span.reduce(numbers.vector(symbol))
+        assert not rest, "the span is closed"
+        return tuple(numbers.expression(scale * found[k]) if k in found else sp.Integer(0) for k in range(len(multiples)))
+
     constants = {}
     for i, (left, p) in enumerate(multiples):
         for j, (right, q) in enumerate(multiples[i + 1 :], i + 1):
-            rest, found = span.reduce(numbers.vector(operators.ring.bracket(left, right)))
-            assert not rest, "the span is closed"
-            scale = numbers.one / (p * q)
-            row = [numbers.expression(scale * found[k]) if k in found else sp.Integer(0) for k in range(len(multiples))]
-            constants[i, j] = tuple(row)
-    return constants
+            constants[i, j] = coordinates(operators.ring.bracket(left, right), numbers.one / (p * q))
+    return constants, tuple(coordinates(symbol, numbers.one) for symbol in operators.driven)
 
 
 def _expression(row: Vector, operators: DmzOperators) -> sp.Expr:
