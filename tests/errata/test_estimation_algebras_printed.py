@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import sympy as sp
 
 import zakai
+from references.wei_norman import residuals
 from zakai.algebra.estimation_algebra import estimation_algebra
 from zakai.algebra.verification import verify
 
@@ -100,3 +103,77 @@ def test_a_finite_algebra_without_maximal_rank_may_have_an_eta_that_is_not_quadr
     model = system(["x1", "x2 - x2**3"], ["x1"])
     assert estimation_algebra(model).dimension == 4
     assert sp.Poly(zakai.analyze(model).eta, *model.x).total_degree() == 6
+
+
+def solves(model, found, robust) -> bool:
+    """Whether the robust form with these right sides solves its equation."""
+    changed = dataclasses.replace(found, robust=dict(zip(found.statistics, robust, strict=True)))
+    return max(map(abs, residuals(model, changed, True))) < 1e-40
+
+
+def test_53_has_4_plus_c_squared():
+    model = zakai.load_model("gallery:dong-chen-yau-3-4")
+    (c,), found = model.parameter_symbols, estimation_algebra(model).wei_norman
+    (r2, r1, _), (y,) = found.statistics, found.path
+
+    def of(a2):
+        return [r1 + c * y, a2 * r2, r1**2 / 2 + a2 * r2**2 / 2 + c * y * r1 + c**2 * y**2 / 2]
+
+    assert solves(model, found, of(4 + c**2))
+    assert not solves(model, found, of(4))
+
+
+def test_the_last_sum_of_47_and_of_table_2_is_that_of_34():
+    model = system(["x1 + x2", "x1 - x2"], ["2*x1", "3*x1"])
+    found, c = estimation_algebra(model).wei_norman, (2, 3)
+    (r2, r1, _), y = found.statistics, found.path
+    a2 = zakai.analyze(model).eta.coeff(model.x[0], 2)
+    drive = c[0] * y[0] + c[1] * y[1]
+
+    def of(last):
+        return [r1 + drive, a2 * r2, r1**2 / 2 + drive * r1 + a2 * r2**2 / 2 + last / 2]
+
+    # c_ij c_j1 y_i y_j, where c_ij is the coefficient of x_j in h_i: zero for j = 2.
+    assert solves(model, found, of(drive**2))
+    assert not solves(model, found, of((c[0] * y[0] + c[1] * y[1]) * c[0] * y[0]))
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        system(["tanh(x1)"], ["2*x1"]),
+        system(["x1 + 3*x2", "-x1 - 2*x2"], ["x1", "x1 + x2"]),
+    ],
+)
+def test_r_of_theorem_6_has_no_factor_one_half(model):
+    n, found = model.n, estimation_algebra(model).wei_norman
+    s, right = sp.Matrix(found.statistics[:n]), list(found.robust.values())
+    a = sp.hessian(zakai.analyze(model).eta, model.x) / 2  # eta = sum a_ij x_i x_j + ...
+    assert solves(model, found, [*right[:n], *(a * s), right[-1]])
+    assert not solves(model, found, [*right[:n], *(a * s / 2), right[-1]])
+
+
+@pytest.mark.parametrize("hessian", [True, False])
+def test_7_of_theorem_6_is_wrong_in_either_meaning_of_a(hessian):
+    model = system(["x1 + 3*x2 + 1", "-x1 - 2*x2"], ["x1 + x2", "2*x2"])
+    n, found = 2, estimation_algebra(model).wei_norman
+    right, analysis = list(found.robust.values()), zakai.analyze(model)
+    c, two = analysis.omega, range(n)
+    a = sp.hessian(analysis.eta, model.x) / (1 if hessian else 2)
+    b = [analysis.eta.diff(x).subs(dict.fromkeys(model.x, 0)) for x in model.x]
+    s, r, h = found.statistics[:n], found.statistics[n : 2 * n], model.observation.jacobian(model.x)
+    drive = h.T * sp.Matrix(found.path)
+    ds = [r[i] + sum(s[j] * c[j, i] for j in two) + drive[i] for i in two]  # (5), which is right
+    known = sum(s[i] * b[i] for i in two) / 2 + drive.dot(drive) / 2
+    # eta = x'a x / 2 + ..., or x'a x + ...
+    half = sp.Rational(1, 2) if hessian else 1
+    common = -sum(s[i] ** 2 * (sum(c[i, j] ** 2 for j in two) - half * a[i, i]) for i in two) / 2
+    common += s[0] * s[1] * (sum(c[0, j] * c[j, 1] for j in two) + half * a[0, 1])
+    corrected = common + known - sum(r[i] ** 2 for i in two) / 2 + sum(r[i] * ds[i] for i in two)
+    corrected += -sum(s[i] * r[j] * c[i, j] for i in two for j in two) - ds[0] * s[1] * c[0, 1]
+    printed = -sum(s[i] ** 2 * (sum(c[i, j] ** 2 for j in two) - a[i, i] / 2) for i in two) / 2
+    printed += s[0] * s[1] * (sum(c[0, j] * c[j, 1] for j in two) + a[0, 1] / 2)
+    printed += known + sum(r[i] ** 2 for i in two) / 2 - sum(s[i] * s[j] * c[i, j] for i in two for j in two)
+    printed += sum(r) - sum(s[1] * c[i, 1] for i in two)
+    assert solves(model, found, [*ds, *right[n:-1], corrected])
+    assert not solves(model, found, [*ds, *right[n:-1], printed])
