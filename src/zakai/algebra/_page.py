@@ -15,6 +15,7 @@ from zakai.models.model import Model
 if TYPE_CHECKING:
     from zakai.algebra.analysis import Analysis
     from zakai.algebra.estimation_algebra import EstimationAlgebra
+    from zakai.algebra.observed_block import ObservedBlock
     from zakai.algebra.wei_norman import WeiNorman
 
 WIDTH = 110
@@ -41,6 +42,9 @@ def text(analysis: Analysis) -> str:
     ]
     if analysis.algebra.verdict == "finite":
         blocks.append(["Wei-Norman equations, from r = 0 and y = 0", *_wei_norman(analysis.algebra)])
+    if analysis.observed_block is not None and len(analysis.observed_block.symbols) < model.n:
+        values = ", at the parameters' values" if model.parameters else ""
+        blocks.append([f"Observed block, which moves by itself{values}", *_observed_block(analysis.observed_block)])
     for name, conditions in analysis.methods.items():
         blocks.append([f"Method {name}: {_WORDS[all_hold(conditions)]}", *_conditions(conditions)])
     blocks.append([_recommendation(analysis)])
@@ -125,6 +129,20 @@ def _wei_norman(algebra: EstimationAlgebra) -> Iterator[str]:
         yield from _wrapped(" " * margin, body, margin + 4)
 
 
+def _observed_block(block: ObservedBlock) -> Iterator[str]:
+    if not block.symbols:
+        yield "  nothing of the state is observed"
+        return
+    for z, coordinate in zip(block.symbols, block.coordinates, strict=True):
+        yield f"  {z} = {coordinate}"
+    for k, (z, drift) in enumerate(zip(block.symbols, block.drift, strict=True), 1):
+        noise = f"dn{k}" if len(block.symbols) > 1 else "dn"
+        yield f"  d{z} = {' + '.join(term for term in (times(readable(drift), 'dt'), noise) if term)}"
+    yield f"  E dn dn' = {_flat(block.covariance)} dt,  h = {[*block.observation]}"
+    if block.linear:
+        yield "  it is linear: for a normal prior its filter is that of Kalman and Bucy, whatever the rest of the state does"
+
+
 def _conditions(conditions: tuple[Condition, ...]) -> Iterator[str]:
     for condition in conditions:
         yield from _wrapped(f"  {_WORDS[condition.holds]:<9}  ", condition.statement)
@@ -176,6 +194,10 @@ def latex(analysis: Analysis) -> str:
     if form is not None:
         lines.append(rf"L &= {tex(form.matrix)}, & l &= {tex(form.offset)}")
         lines.append(rf"\phi &= {tex(form.potential)}, & q &= {tex(analysis.q)}")
+    block = analysis.observed_block
+    if block is not None and 0 < len(block.symbols) < model.n:
+        z, b = (tex(sp.Matrix(part)) for part in (block.coordinates, block.drift))
+        lines.append(rf"z &= {z}, & dz &= {b}\,dt + dn,\quad \mathrm E\,dn\,dn^\top = {tex(block.covariance)}\,dt")
     lines.extend(_algebra_in_tex(analysis.algebra, tex))
     body = " \\\\\n".join(lines)
     return f"\\begin{{align*}}\n{body}\n\\end{{align*}}"

@@ -21,7 +21,7 @@ from zakai.models.model import Model
 
 
 class DmzOperators:
-    """`L0`, `h` (m), `driven` (m), which is S^-1 h, `g` (n) or None, `eta` or None and `omega` of a model as elements of `ring`.
+    """`L0`, `f` (n), `h` and `driven` = S^-1 h (m), `g` (n) or None, `eta` or None and `omega` of a model as elements of `ring`.
 
     `values` are numbers for parameters, the others stay symbols; raises Unreadable.
     """
@@ -40,7 +40,7 @@ class DmzOperators:
         self.reader = reader = Reader([entry for matrix in matrices for entry in matrix], model.x, constants, jets)
         self.ring = ring = reader.ring
         self.numbers = Numbers(ring, bool(constants) or drift.has(sp.pi) or h.has(sp.pi) or G.has(sp.pi) or S.has(sp.pi), reader)
-        f = [reader.read(entry) for entry in drift]
+        self.f = f = [reader.read(entry) for entry in drift]
         self.h = [reader.read(entry) for entry in h]
         covariance = _rows(G, reader)
         self.driven = [ring.normal(_form([ring.one], [row], self.h)) for row in _rows(S_inverse, reader)]
