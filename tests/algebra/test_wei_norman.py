@@ -12,6 +12,7 @@ import sympy as sp
 from scipy.integrate import solve_ivp
 
 import zakai
+from algebra.random_systems import conjugated, polynomial_system
 from references.dmz import dmz
 from references.kolmogorov import Box
 from references.wei_norman import residuals
@@ -161,6 +162,14 @@ def test_the_product_solves_the_equation(name, robust):
     kept = "kept as symbols" in estimation_algebra(model).parameters
     values = {} if kept else dict(zip(model.parameter_symbols, model.parameters.values(), strict=True))
     assert max(map(abs, residuals(model, equations(model), robust, values))) < 1e-40
+
+
+@pytest.mark.parametrize("seed", [seed if seed < 6 else pytest.param(seed, marks=pytest.mark.slow) for seed in range(60)])
+def test_the_product_solves_the_equation_of_a_random_system_in_random_coordinates(seed):
+    model = conjugated(polynomial_system(seed), seed)
+    if estimation_algebra(model).verdict == "finite":
+        for robust in (True, False):
+            assert max(map(abs, residuals(model, equations(model), robust))) < 1e-40
 
 
 @pytest.mark.parametrize("robust", [True, False])
