@@ -97,3 +97,24 @@ def test_the_page_and_the_json_show_the_block():
     assert r"dz &= \left[\begin{matrix}z_{1} + z_{2}" in analysis.to_latex()
     assert "Observed block" not in str(zakai.analyze(zakai.load_model("gallery:benes")))
     assert "nothing of the state is observed" in str(zakai.analyze(zakai.load_model("gallery:silent-double-well")))
+
+
+@pytest.mark.slow
+def test_the_filter_of_the_block_is_that_of_the_whole():
+    drift, noise = ["x1 + x2", "x1 - 2*x2", "3*x3 + 2*x1 - x2"], [["1", "0.3", "0.2"], ["0.3", "2", "0.5"], ["0.2", "0.5", "1"]]
+    cov = [[1.0, 0.2, 0.1], [0.2, 0.5, 0.3], [0.1, 0.3, 2.0]]
+    prior = {"kind": "gaussian", "mean": [0.5, -1.0, 2.0], "cov": cov}
+    whole = system(drift, ["2*x1 + 1"], process_noise=noise, prior=prior)
+    block = zakai.analyze(whole).observed_block
+    assert str(block.coordinates) == "(x1, x2)" and block.linear
+    part = zakai.Model(
+        state=[z.name for z in block.symbols],
+        drift=list(block.drift),
+        observation=list(block.observation),
+        process_noise=block.covariance.tolist(),
+        prior={"kind": "gaussian", "mean": [0.5, -1.0], "cov": [row[:2] for row in cov[:2]]},
+    )
+    record = zakai.Record([0.1, 0.3, 0.4], [[0.3], [-0.2], [0.5]], "increments")
+    a, b = (zakai.filter(model, record, method="kalman-bucy") for model in (whole, part))
+    assert abs(a.mean[:, :2] - b.mean).max() < 1e-10 and abs(a.cov[:, :2, :2] - b.cov).max() < 1e-10
+    assert abs(a.log_likelihood - b.log_likelihood) < 1e-10
