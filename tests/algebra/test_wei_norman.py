@@ -173,6 +173,34 @@ def test_the_product_solves_the_equation_of_a_random_system_in_random_coordinate
 
 
 @pytest.mark.parametrize("robust", [True, False])
+def test_the_product_of_matrices_solves_its_equation_where_the_order_of_factors_matters(robust):
+    def unit(i, j):
+        return sp.Matrix(4, 4, lambda a, b: int((a, b) == (i, j)))
+
+    # [E_3, [E_2, E_1]] is not zero, so that the exponentials do not commute on E_1.
+    places = [(0, 1), (1, 2), (2, 3), (0, 2), (1, 3), (0, 3)]
+    L0 = sp.diag(1, 3, 4, 9) + 2 * unit(0, 1) - unit(1, 3)
+    elements = [L0, *(unit(*place) for place in places)]
+
+    def coordinates(matrix):
+        return tuple(sp.Integer(0) if place is None else matrix[place] for place in [None, *places])
+
+    def bracket(a, b):
+        return a * b - b * a
+
+    constants = {(i, j): coordinates(bracket(elements[i], elements[j])) for i in range(7) for j in range(i + 1, 7)}
+    h = unit(0, 1) + 2 * unit(1, 2) - unit(2, 3)
+    found = wei_norman(sp.symbols("L0 E1:7", commutative=False), constants, [coordinates(h)])
+    (y,), (rate,) = found.path, found.rates
+    product = sp.eye(4)
+    for r, element in zip(found.statistics, elements[1:], strict=True):
+        product = (r * element).exp() * product
+    form, generator = (found.robust, (-y * h).exp() * L0 * (y * h).exp()) if robust else (found.stratonovich, L0 + rate * h)
+    left = sum((rate_k * product.diff(r) for r, rate_k in form.items()), sp.zeros(4)) + product * L0
+    assert (left - generator * product).expand().is_zero_matrix
+
+
+@pytest.mark.parametrize("robust", [True, False])
 def test_a_product_with_one_wrong_coefficient_does_not_solve_it(robust):
     model = SOLVED["linear, 2"]
     right = equations(model)
