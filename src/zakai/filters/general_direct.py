@@ -420,7 +420,12 @@ def _multiply(static: Sum, v: Components, linear, factor: Factors | None, t, the
             return value
         return value - 0.5 * sum(energy[i, j] * a * b for i, a in enumerate(h) for j, b in enumerate(h))
 
-    return refit(v, log_factor, static.directions, energy is not None)
+    told = refit(v, log_factor, static.directions, energy is not None)
+    # Where nothing was read, nothing is summed again.
+    zero = jnp.zeros(len(v.signs))
+    same = Refitted(v._replace(log_weights=v.log_weights + constant), zero, zero, zero)
+    read = jnp.any(linear != 0) if energy is None else jnp.any(linear != 0) | jnp.any(energy != 0)
+    return jax.tree.map(lambda a, b: jnp.where(read, a, b), told, same)
 
 
 def _multiply_affine(static: Sum, v: Components, linear, energy, constant, t, theta) -> Components:
