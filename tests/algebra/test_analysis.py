@@ -78,3 +78,8 @@ def test_a_recommendation_for_a_model_without_prior_says_what_is_missing():
     analysis = zakai.analyze(zakai.Model(state=["x"], drift=["-x"], observation=["x"]))
     assert analysis.recommended == "kalman-bucy"
     assert "needs a prior" in str(analysis)
+
+
+def test_a_sum_before_dt_stands_in_parentheses():
+    latex = zakai.analyze(zakai.Model(state=["x"], drift=["1 - x"], observation=["x + 2"])).to_latex()
+    assert r"dx &= \left(1 - x\right)\,dt + dv" in latex and r"dy &= \left(x + 2\right)\,dt + dw" in latex

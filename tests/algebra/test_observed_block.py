@@ -94,7 +94,8 @@ def test_the_page_and_the_json_show_the_block():
     page, read = str(analysis), json.loads(analysis.to_json())["observed_block"]
     assert "  z2 = x2 + x3\n  dz1 = (z1 + z2) dt + dn1" in page and "E dn dn' = [[1, 0], [0, 2]] dt,  h = [2*z1]" in page
     assert read["coordinates"] == ["x1", "x2 + x3"] and read["linear"] is True and read["covariance"] == [["1", "0"], ["0", "2"]]
-    assert r"dz &= \left[\begin{matrix}z_{1} + z_{2}" in analysis.to_latex()
+    assert r"d\left[\begin{matrix}z_{1}\\z_{2}\end{matrix}\right] &= \left[\begin{matrix}z_{1} + z_{2}\\" in analysis.to_latex()
+    assert r"z_{1} &= x_{2} - x_{3}, & dz_{1} &= - z_{1}\,dt + dn" in zakai.analyze(zakai.load_model("gallery:wong")).to_latex()
     assert "Observed block" not in str(zakai.analyze(zakai.load_model("gallery:benes")))
     assert "nothing of the state is observed" in str(zakai.analyze(zakai.load_model("gallery:silent-double-well")))
 

@@ -178,16 +178,20 @@ def latex(analysis: Analysis) -> str:
         scalar = isinstance(value, sp.MatrixBase) and value.shape == (1, 1)
         return sp.latex(value[0, 0] if scalar else value, symbol_names=names)
 
+    def in_dt(field: sp.MatrixBase) -> str:
+        sums = field.shape == (1, 1) and field[0, 0].is_Add
+        return rf"\left({tex(field)}\right)\,dt" if sums else rf"{tex(field)}\,dt"
+
     noise = "" if model.diffusion == sp.ones(1, 1) else rf"{tex(model.diffusion)}\,"
     lines = [
-        rf"d{tex(sp.Matrix(model.x))} &= {tex(model.drift)}\,dt + {noise}dv,"
+        rf"d{tex(sp.Matrix(model.x))} &= {in_dt(model.drift)} + {noise}dv,"
         rf" & \mathrm E\,dv\,dv^\top &= {tex(model.process_noise)}\,dt",
     ]
-    h, S = tex(model.observation), tex(model.observation_noise)
+    S = tex(model.observation_noise)
     if model.observation_kind == "samples":
-        lines.append(rf"z_k &= {h} + r_k, & r_k &\sim N\left(0, {S}\right)")
+        lines.append(rf"z_k &= {tex(model.observation)} + r_k, & r_k &\sim N\left(0, {S}\right)")
     else:
-        lines.append(rf"dy &= {h}\,dt + dw, & \mathrm E\,dw\,dw^\top &= {S}\,dt")
+        lines.append(rf"dy &= {in_dt(model.observation)} + dw, & \mathrm E\,dw\,dw^\top &= {S}\,dt")
     if analysis.omega is not None:
         lines.append(rf"\Omega &= {tex(analysis.omega)}, & \eta &= {tex(analysis.eta)}")
     form = analysis.yau_form
@@ -196,8 +200,9 @@ def latex(analysis: Analysis) -> str:
         lines.append(rf"\phi &= {tex(form.potential)}, & q &= {tex(analysis.q)}")
     block = analysis.observed_block
     if block is not None and 0 < len(block.symbols) < model.n:
-        z, b = (tex(sp.Matrix(part)) for part in (block.coordinates, block.drift))
-        lines.append(rf"z &= {z}, & dz &= {b}\,dt + dn,\quad \mathrm E\,dn\,dn^\top = {tex(block.covariance)}\,dt")
+        z, coordinates = tex(sp.Matrix(block.symbols)), tex(sp.Matrix(block.coordinates))
+        moves = rf"{in_dt(sp.Matrix(block.drift))} + dn,\quad \mathrm E\,dn\,dn^\top = {tex(block.covariance)}\,dt"
+        lines.append(rf"{z} &= {coordinates}, & d{z} &= {moves}")
     lines.extend(_algebra_in_tex(analysis.algebra, tex))
     body = " \\\\\n".join(lines)
     return f"\\begin{{align*}}\n{body}\n\\end{{align*}}"
