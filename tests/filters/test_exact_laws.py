@@ -103,3 +103,25 @@ def test_a_long_interval_is_taken_in_parts_and_agrees_with_many_short_ones():
     assert long.mean[-1] == pytest.approx(short.mean[-1], abs=1e-10)
     assert long.cov[-1] == pytest.approx(short.cov[-1], abs=1e-10)
     assert long.log_likelihood == pytest.approx(short.log_likelihood, abs=1e-8)
+
+
+def test_a_path_that_is_read_after_a_gap_is_said_to_be_an_approximation():
+    model = zakai.Model(
+        state=["x"], drift=["-x"], observation=["x", "x/2"], observation_kind="path",
+        prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
+    )  # fmt: skip
+    times, values = [0.1, 0.2, 0.4], np.array([[0.1, 0.2], [0.2, np.nan], [0.3, 0.1]])
+    for method in ("kalman-bucy", "limited-direct"):
+        assert "1 of 3 times" in zakai.filter(model, zakai.Record(times, values, "path"), method).warnings[0]
+    # A coordinate that is never read leaves no gap behind.
+    values[:, 1] = np.nan
+    assert zakai.filter(model, zakai.Record(times, values, "path"), "kalman-bucy").warnings == []
+
+
+def test_one_state_too_says_how_much_memory_a_lattice_would_need():
+    model = zakai.Model(
+        state=["x"], drift=["tanh(x)"], observation=["x"], prior={"kind": "gaussian", "mean": [0.0], "cov": [[1e8]]}
+    )
+    record = zakai.Record(1e-6 * np.arange(1, 9), np.zeros((8, 1)), "increments")
+    with pytest.raises(zakai.InputError, match="needs a lattice of [0-9]+ points"):
+        zakai.filter(model, record, "limited-direct", memory=1024)

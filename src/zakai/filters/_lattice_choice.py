@@ -270,7 +270,11 @@ def adapted(
         plan = better
     one_line = model.n == 1 and not plan.angles and maps.shape[1] == 1
     if one_line and lattice.log_values[0].size > 1:
-        banded = _banded(lattice, plan, np.sqrt(spreads[:, 0, 0, 0]), np.abs(maps[:, 0, 0, 0]))
+
+        def check(size: int) -> None:
+            check_memory(model, (size,), plan.room, records, budget)
+
+        banded = _banded(lattice, plan, np.sqrt(spreads[:, 0, 0, 0]), np.abs(maps[:, 0, 0, 0]), check)
         if banded is not None:
             return banded
     sizes = plan.sizes if not plan.banded else (BASE[1],)
@@ -297,7 +301,7 @@ def check_memory(model: Model, sizes: tuple[int, ...], room: float, records: int
     """Raise InputError if a step on lattices of these sizes, one a record, needs more than `budget` bytes."""
     # The density, its points, h, the rows that are spread, and what a run of steps keeps.
     needed = 8.0 * records * np.prod(sizes, dtype=float) * (ARRAYS + 2 * model.m + 6 * room)
-    if len(sizes) > 1 and needed > budget:
+    if needed > budget:
         lattice = " x ".join(map(str, sizes))
         raise InputError(
             f"option memory: {model.source} needs a lattice of {lattice} points, {needed / 2**20:.0f} MiB, and has "
@@ -361,9 +365,9 @@ def _more(plan: Plan, info: Any) -> Plan | None:
 
 
 def _banded(
-    lattice: Lattice, plan: Plan, deviation: np.ndarray, maps: np.ndarray
+    lattice: Lattice, plan: Plan, deviation: np.ndarray, maps: np.ndarray, check: Callable[[int], None]
 ) -> tuple[Lattice, Plan, np.ndarray] | None:
-    """The windows and the cells of a banded run, or None where summing over all pairs is cheaper."""
+    """The windows and the cells of a banded run, or None where summing over all pairs is cheaper; `check` may refuse a size."""
     logs = lattice.log_values
     count = logs.shape[1]
     cell = np.abs(lattice.basis[:, 0, 0])
@@ -382,6 +386,7 @@ def _banded(
     pairs = max(BASE[1], rounded_up(span.max() / (COARSEST * deviation.min())))
     if size * (12 + 0.2 * taps) > 3 * pairs**2:
         return None
+    check(size)
     cuts = np.stack([(first + last) // 2, new_cell / cell], axis=1)
     window = _resampled(logs, cuts[:, 0], cuts[:, 1], size)
     centre = lattice.centre + lattice.basis[:, :, 0] * (cuts[:, :1] - count // 2)

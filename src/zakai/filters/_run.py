@@ -147,7 +147,7 @@ class Run:
         self.setting, self.record, self.most = setting, record, most
         self.data = data_of(setting.model, record)
         self.infos: list[Info] = []
-        self.notes: dict[str, None] = {}
+        self.notes: dict[str, None] = dict.fromkeys(_after_gaps(self.data))
         self.states: list[tuple[int, Any, Any]] = []
         self.keep, self.must_keep = keep != "moments", keep == "densities"
         self.pieces: list[Piece] | None = [] if recorded else None
@@ -282,6 +282,18 @@ class Run:
                 state = jax.tree.map(lambda a: a[index - first], states)  # noqa: B023
                 return self.setting.method.density(prepared, state)
         raise IndexError(index)
+
+
+def _after_gaps(data: Data) -> list[str]:
+    """A sentence where an increment was gathered over more than its interval."""
+    late = np.any(data.elapsed > (1 + 1e-9) * (data.stops - data.starts)[:, None], axis=1)
+    if not late.any():
+        return []
+    return [
+        f"at {int(late.sum())} of {len(late)} times a path is read after a gap: the increment since the last reading of that "
+        "coordinate acts as one factor at its end, which is exact only as the gaps shrink, and leaves aside what noise it has in "
+        "common with other coordinates that were read in between"
+    ]
 
 
 def _warnings(result: FilterResult) -> list[str]:
