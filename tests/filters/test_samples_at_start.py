@@ -29,3 +29,11 @@ def test_the_first_density_is_found_again_when_only_moments_are_kept():
     moments = zakai.filter(UNNORMALISED, record, keep="moments")
     np.testing.assert_allclose(moments.mean, kept.mean, atol=1e-10)
     np.testing.assert_allclose(moments.cov, kept.cov, atol=1e-10)
+
+
+def test_a_prior_with_a_kink_is_said_to_be_known_less_well():
+    keys = {"state": ["x"], "drift": ["-x"], "observation": ["x"], "observation_kind": "samples"}
+    record = zakai.Record([0.0, 0.5], [[0.7], [0.2]], "samples")
+    for log_density, said in (("-abs(x)", 1), ("-x**4 + x**2", 0)):
+        model = zakai.Model(**keys, prior={"kind": "density", "log_density": log_density})
+        assert len(zakai.filter(model, record, "limited-direct").warnings) == said

@@ -186,6 +186,7 @@ class Run:
         method, prior = self.setting.method, self.setting.prior
         self.first = prepared = self.setting.prepared(self._first_interval())
         self.state = method.init(prepared, prior)
+        self.notes.update(dict.fromkeys(getattr(prepared, "notes", ())))
         self._keep_one(prepared, 0)
         if self.at_start:
             observation = method.observations(prepared, self.data.part(slice(0, 1)))
