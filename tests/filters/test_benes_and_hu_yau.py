@@ -117,6 +117,50 @@ def test_the_density_solves_the_dmz_equation(case):
     assert zakai.filter(model, record).method == methods[0]
 
 
+def modes_far_apart(variance):
+    """e^F = e^(x^2/2) (2 + erf x), two modes at -10 and 10 where erf is flat, readings that say next to nothing."""
+    return zakai.Model(
+        state=["x"],
+        drift=["x + exp(-x**2)*2/sqrt(pi)/(2 + erf(x))"],
+        observation=["x"],
+        observation_noise=[["1000"]],
+        observation_kind="samples",
+        prior={"kind": "mixture", "weights": [0.3, 0.7], "means": [[-10.0], [10.0]], "covs": [[[variance]]] * 2},
+    )
+
+
+def test_modes_that_are_narrow_and_far_apart_keep_their_shares():
+    """Each mode is a Kalman filter of dx = x dt + dw; both explain a reading of zero equally well."""
+    result = zakai.filter(modes_far_apart(0.0025), zakai.Record([0.0005, 0.001], [[0.0], [0.0]], "samples"), "hu-yau")
+    assert not result.warnings
+    at, variance, share = 10.0, 0.0025, np.array([0.3, 0.7])
+    for k in range(3):
+        if k:
+            at, variance = at * np.exp(0.0005), variance * np.exp(0.001) + np.expm1(0.001) / 2
+            at, variance = at * 1000 / (1000 + variance), variance * 1000 / (1000 + variance)
+        density = result.density(k)
+        for mean, cov in ((result.mean[k], result.cov[k]), (density.mean(), density.cov())):
+            assert mean[0] == pytest.approx(0.4 * at, abs=1e-9)
+            assert cov[0, 0] == pytest.approx(variance + 0.84 * at**2, abs=1e-8)
+        deviation = np.sqrt(variance)
+        x = np.linspace(-4, 4, 17)
+        for side, weight in zip((-1, 1), share, strict=True):
+            wanted = np.log(weight) - x**2 / 2 - np.log(deviation * np.sqrt(2 * np.pi))
+            assert density.log_density(side * at + deviation * x) == pytest.approx(wanted, abs=1e-8)
+        # 0.15 is the middle of the first mode, 0.3 + 0.35 that of the second.
+        assert density.quantile([0.15, 0.65])[:, 0] == pytest.approx([-at, at], abs=1e-4)
+        assert np.mean(density.sample(3, 4000)[:, 0] > 0) == pytest.approx(0.7, abs=0.03)
+
+
+def test_a_lattice_that_cannot_resolve_a_density_says_so_and_the_density_does_not_need_it():
+    result = zakai.filter(modes_far_apart(1e-6), zakai.Record([1e-9], [[0.0]], "samples"), "hu-yau")
+    density = result.density(0)
+    assert density.mean()[0] == pytest.approx(4.0, abs=1e-9)
+    assert density.log_density(np.array([10.0])) == pytest.approx(np.log(0.7e3 / np.sqrt(2 * np.pi)), abs=1e-8)
+    with pytest.warns(UserWarning, match="do not resolve"):
+        density.quantile([0.5])
+
+
 def model_of(make, **more):
     return zakai.Model(**{"state": ["x"], **make()[0], **more})
 

@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
-from zakai.densities import Density, GaussianMixture, GridDensity
+from zakai.densities import Density, GaussianMixture
 from zakai.errors import InputError
 from zakai.filters._affine_system import AffineSystem, Plan, affine_system_of
 from zakai.filters._family_prior import prior_families
 from zakai.filters._formulas import formulas
 from zakai.filters._gauge import GaugeFunctions, Posterior, Tilts, gauge_of, posterior
+from zakai.filters._gauged_density import GaugedDensity
 from zakai.filters._protocol import Info, Schedule
 from zakai.filters.observations import Data, Factors, factors
 from zakai.kolmogorov.families import Family, log_terms, move, read
@@ -233,7 +234,7 @@ def health_of(state: State, found: Posterior) -> dict[str, Any]:
 
 
 def density(prepared: Prepared, state: State) -> Density:
-    """The posterior: a mixture of Gaussians where e^phi is a sum of exponentials, else its values on a lattice."""
+    """The posterior: a mixture of Gaussians where e^phi is a sum of exponentials, else by its formula."""
     families = jax.tree.map(jnp.asarray, state.families)
     quadratic = prepared.system.quadratic(state.time, prepared.theta)
     families = families if quadratic is None else quadratic.times(families, -1.0)
@@ -244,34 +245,40 @@ def density_of(model: Model, gauge: GaugeFunctions, theta: Any, time: Any, famil
     """e^phi times the families, normalised."""
     tilts = gauge.at(time, theta)
     found = posterior(gauge, tilts, time, theta, families)
-    # What has no width in some direction, as a start that is known, is on no lattice.
-    if not gauge.exact and np.all(smallest_eigenvalue(np.asarray(families.cov)) > 1e-14):
-        return _on_lattice(model, gauge, theta, time, families, found)
     weights = np.asarray(found.signs * jnp.exp(found.logs - found.log_mass))
     moved = jnp.einsum("jnk,jmk->jmn", families.response, families.nodes)
     means = np.asarray(found.centres[:, None] + moved[:, :, None])
+    # What has no width in some direction, as a start that is known, is on no lattice.
+    if not gauge.exact and np.all(smallest_eigenvalue(np.asarray(families.cov)) > 1e-14):
+        return _gauged(model, gauge, theta, time, families, found, np.abs(weights), means)
     covs = np.broadcast_to(np.asarray(found.covs)[:, None, None], (*weights.shape, model.n, model.n))
     used = weights != 0.0
     return GaussianMixture(weights[used], means[used], covs[used], model.state, (False,) * model.n)
 
 
-def _on_lattice(model: Model, gauge: GaugeFunctions, theta: Any, time: Any, families: Family, found: Posterior) -> GridDensity:
-    """phi + log v on a lattice that holds the mass."""
-    half, reach = {1: 200, 2: 64}[model.n], {1: 10.0, 2: 9.0}[model.n]
-    values, vectors = np.linalg.eigh(np.asarray(found.cov))
-    basis = vectors * np.sqrt(values) * reach / half
-    index = np.stack(np.meshgrid(*[np.arange(-half, half + 1.0)] * model.n, indexing="ij"), axis=-1)
-    x = np.asarray(found.mean) + index @ basis.T
+def _gauged(
+    model: Model, gauge: GaugeFunctions, theta: Any, time: Any, families: Family, found: Posterior, shares: Any, points: Any
+) -> GaugedDensity:
+    """e^phi v by its formula; `shares` (J, N, E) at `points` (J, N, E, n) are where its mass is."""
     logs = np.asarray(jax.vmap(log_terms)(families))
     weights = np.asarray(families.signs) * np.exp(logs - logs.max())
     means = np.asarray(families.mean[:, None] + jnp.einsum("jnk,jmk->jmn", families.response, families.nodes))
     covs = np.broadcast_to(np.asarray(families.cov)[:, None], (*weights.shape, model.n, model.n))
     used, mass = weights != 0.0, weights.sum()
     bare = GaussianMixture(weights[used] / mass, means[used], covs[used], model.state, (False,) * model.n)
-    potential = np.asarray(gauge.potential(x, time, theta))
-    log_values = bare.log_density(x) + potential
-    total = log_values.max() + np.log(np.exp(log_values - log_values.max()).sum() * abs(np.linalg.det(basis)))
-    return GridDensity(log_values - total, np.asarray(found.mean), basis, model.state, (False,) * model.n)
+    scale = logs.max() + np.log(mass) - float(found.log_mass)
+    # A Gaussian is followed to ten deviations, where it is e^-50 of its maximum: its points end at nine.
+    rest, own = (np.sqrt(np.maximum(np.diagonal(c, axis1=1, axis2=2), 0.0)) for c in (found.covs, families.cov))
+    margins = np.broadcast_to((10.0 * rest + own)[:, None, None], points.shape)
+    near = shares >= np.exp(-50.0) * shares.max()
+    return GaugedDensity(
+        bare,
+        lambda x: np.asarray(gauge.potential(x, time, theta)) + scale,
+        np.asarray(found.mean),
+        np.asarray(found.cov),
+        points[near],
+        margins[near],
+    )
 
 
 BOUNDS: Mapping[str, tuple[float, str]] = {
