@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 import sympy as sp
+from sympy.functions.elementary.hyperbolic import HyperbolicFunction
 
 from zakai.algebra.identities import is_zero, tidy
 from zakai.algebra.systems import affine_parts, cached_yau_form
@@ -21,12 +22,12 @@ _MOST_TERMS = 32
 class Gauge:
     """e^phi, a function of `directions` x (k, n) alone.
 
-    Where e^phi = sum_j c_j e^{q_j.x} with positive c_j, `coefficients` c (K, 1) and `slopes` q (K, n) are given, else None.
+    Where e^phi = sum_j e^{c_j + q_j.x}, `logs` c (K, 1) and `slopes` q (K, n) are given, else None.
     """
 
     potential: sp.Expr
     directions: sp.ImmutableMatrix
-    coefficients: sp.ImmutableMatrix | None
+    logs: sp.ImmutableMatrix | None
     slopes: sp.ImmutableMatrix | None
 
     @property
@@ -59,16 +60,17 @@ def gauge(model: Model) -> Gauge | None:
     potential, x = system[0].potential, model.x
     if potential == 0:
         none, flat = sp.ImmutableMatrix.zeros(0, model.n), sp.ImmutableMatrix.zeros(1, model.n)
-        return Gauge(potential, none, sp.ImmutableMatrix([1]), flat)
+        return Gauge(potential, none, sp.ImmutableMatrix([0]), flat)
     terms = _exponentials(potential, x)
     if terms is not None:
         slopes = sp.ImmutableMatrix([list(slope) for slope in terms])
-        coefficients = sp.ImmutableMatrix(list(terms.values()))
-        if _positive(coefficients, model):
+        factors = [_without_exponential(coefficient) for coefficient in terms.values()]
+        if _positive(sp.ImmutableMatrix([number for number, _ in factors]), model):
             rows = _independent(slopes, model)
             if len(rows) > 2:
                 return None
-            return Gauge(potential, slopes.extract(rows, range(model.n)), coefficients, slopes)
+            logs = sp.ImmutableMatrix([sp.log(number) + exponent for number, exponent in factors])
+            return Gauge(potential, slopes.extract(rows, range(model.n)), logs, slopes)
     directions = _directions(system[0], model)
     return None if directions is None else Gauge(potential, directions, None, None)
 
@@ -119,7 +121,9 @@ def _gathered(powers: list[tuple[Terms, sp.Expr]], terms: Terms, count: sp.Expr)
 
 def _sum_of_exponentials(expression: sp.Expr, x: tuple[sp.Symbol, ...]) -> Terms | None:
     found: Terms = {}
-    for term in sp.Add.make_args(sp.expand(expression.rewrite(sp.exp), power_exp=False)):
+    # Only what contains x: a sine of t would become complex exponentials.
+    plain = expression.replace(lambda e: isinstance(e, HyperbolicFunction) and e.has(*x), lambda e: e.rewrite(sp.exp, deep=False))
+    for term in sp.Add.make_args(sp.expand(plain, power_exp=False)):
         slope, coefficient = sp.zeros(len(x), 1), sp.Integer(1)
         for factor in sp.Mul.make_args(term):
             if not factor.has(*x):
@@ -142,6 +146,19 @@ def _product(a: Terms, b: Terms) -> Terms:
             key = tuple(sp.expand(i + j) for i, j in zip(p, q, strict=True))
             out[key] = out.get(key, sp.Integer(0)) + c * d
     return out
+
+
+def _without_exponential(coefficient: sp.Expr) -> tuple[sp.Expr, sp.Expr]:
+    """The coefficient as number e^exponent, lest an exponential of time be evaluated where it over- or underflows."""
+    split = []
+    for term in sp.Add.make_args(sp.expand(coefficient)):
+        number, exponent = sp.Integer(1), sp.Integer(0)
+        for factor in sp.Mul.make_args(term):
+            base, power = factor.as_base_exp()
+            number, exponent = (number, exponent + power) if base == sp.E else (number * factor, exponent)
+        split.append((number, exponent))
+    first = split[0][1]
+    return sp.Add(*[number * sp.exp(sp.expand(exponent - first)) for number, exponent in split]), first
 
 
 def _positive(coefficients: sp.MatrixBase, model: Model) -> bool:

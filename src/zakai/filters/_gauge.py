@@ -1,6 +1,6 @@
 """The gauge of a model as numbers, and what a family of Gaussians becomes under it: u = e^phi v, with its moments.
 
-If e^phi = sum_j c_j e^{q_j.x} every Gaussian becomes a sum of tilted ones,
+If e^phi = sum_j e^{c_j + q_j.x} every Gaussian becomes a sum of tilted ones,
 
     e^{q.x} N(x; m, P) = e^{q.m + q'P q/2} N(x; m + P q, P).
 
@@ -44,8 +44,8 @@ class GaugeFunctions:
         self.count = form.directions.rows
         self._field, self._function = jax_field([form.potential], model), numpy_function(form.potential, model)
         blocks = [form.directions]
-        if form.slopes is not None and form.coefficients is not None:
-            blocks += [form.slopes, form.coefficients]
+        if form.slopes is not None and form.logs is not None:
+            blocks += [form.slopes, form.logs]
         self._matrices = Matrices(blocks, model)
 
     def potential(self, x: Any, t: Any, theta: Any) -> Any:
@@ -53,15 +53,14 @@ class GaugeFunctions:
         return self._function(x, t, theta) if numpy_or_jax(x, t, theta) is np else self._field(x, t, theta)[0]
 
     def at(self, t: Any, theta: Any) -> Tilts:
-        """The directions, slopes and coefficients at time t."""
+        """The directions, slopes and logarithms of the coefficients at time t."""
         blocks = self._matrices(t, theta)
-        slopes, coefficients = blocks[1:] if self.exact else (None, None)
-        logs = None if coefficients is None else numpy_or_jax(coefficients).log(coefficients[..., 0])
-        return Tilts(blocks[0], slopes, logs)
+        slopes, logs = blocks[1:] if self.exact else (None, None)
+        return Tilts(blocks[0], slopes, None if logs is None else logs[..., 0])
 
 
 class Tilts(NamedTuple):
-    """`directions` D (k, n); where e^phi is a sum of exponentials `slopes` q (K, n) and `logs` log c (K,), else None."""
+    """`directions` D (k, n); where e^phi is a sum of exponentials `slopes` q (K, n) and `logs` c (K,), else None."""
 
     directions: Any
     slopes: Any
