@@ -30,6 +30,7 @@ from zakai.filters._protocol import Method, Schedule
 from zakai.kolmogorov.flow import Coefficients
 from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
 
 CHOICES = ("theorem-4", "theorem-5", "theorem-6", "survey-1")
 
@@ -93,6 +94,9 @@ def _check_choice(model: Model, choice: str) -> None:
     if choice == "survey-1" and all_zero(list(G - sp.eye(model.n))) is not True:
         raise InputError(f'{model.source}: option choice: "survey-1" is stated for G = I, but G = {G.tolist()}; take "theorem-5"')
     if choice == "theorem-6":
+        entries = numpy_function(G, model, G.shape)(np.zeros(model.n), model.start, model.theta())
+        if np.linalg.matrix_rank(entries) < model.n:
+            raise InputError(f'{model.source}: option choice: "theorem-6" needs a G that has an inverse; take "theorem-4"')
         # G^-1 D is symmetric if and only if D G is.
         product = matrix * G
         varying = any(entry.has(model.t) for entry in (*G, *matrix, *affine_system(model)[0].offset))  # type: ignore[index]
