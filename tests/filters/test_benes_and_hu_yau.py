@@ -187,6 +187,25 @@ def test_one_shot_refuses_when_its_digits_are_lost_and_stepwise_does_not():
         zakai.filter(model, record, "hu-yau", form="one-shot")
 
 
+@pytest.mark.parametrize(("size", "said"), [(0.0, False), (1000.0, True)])
+def test_one_shot_says_what_a_large_observation_costs_it(size, said):
+    """The evidence of h = x + c is that of h = x but for what c itself explains, so that the error grows with c."""
+    model = zakai.Model(
+        state=["x"],
+        drift=["tanh(x)"],
+        observation=[f"x + {size}"],
+        observation_noise=[["1/2"]],
+        prior={"kind": "gaussian", "mean": [0.3], "cov": [[0.5]]},
+    )
+    dy = 0.1 * size + 0.22 * np.random.default_rng(0).standard_normal((50, 1))
+    record = zakai.Record(0.1 * np.arange(1, 51), dy, "increments")
+    stepwise, other = (zakai.filter(model, record, "hu-yau", form=form) for form in ("stepwise", "one-shot"))
+    error = np.abs(np.cumsum(other.log_likelihood_increments - stepwise.log_likelihood_increments))[1:]
+    assert not stepwise.warnings
+    assert [("lost_digits" in warning) for warning in other.warnings] == [True] * said
+    assert (error.max() > 1e-6) == said and error.max() <= np.nanmax(other.health["lost_digits"])
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

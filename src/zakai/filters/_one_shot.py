@@ -7,7 +7,8 @@ With S = I (h and y are whitened first), P = x'M x/2 + m.x + k, eta = x'N x + e.
     sigma(t, x) = exp(F(x) - S(x - b) - a~.x + c_h.y - c + a.b) u~(t, x - b)
 
 (Hu and Yau 2002, Theorem 3).  u~ knows no data.  (b, a~) obey a Hamiltonian system and grow like e^{mu t}; what they multiply
-cancels, and with it the digits of the mean, like eps e^{mu t}, and of the evidence, like eps e^{2 mu t}.
+cancels, and with it the digits of the mean, like eps e^{mu t}, and of the evidence, like eps e^{2 mu t}, both relative to the
+size of the statistics.  That size is known with the data only: `lost_digits` is what it makes of the evidence's, in nats.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class Interval:
 
 
 class State(NamedTuple):
-    """u~ as families, and the statistics; `log_mass` is that of sigma."""
+    """u~ as families, and the statistics; `log_mass` is that of sigma, `steps` counts the intervals."""
 
     data_free: base.State
     b: Any
@@ -100,6 +101,7 @@ class State(NamedTuple):
     y: Any
     c: Any
     log_mass: Any
+    steps: Any
 
 
 def prepare(model: Model, schedule: Schedule, system: AffineSystem, tolerance: float) -> Prepared:
@@ -112,9 +114,10 @@ def prepare(model: Model, schedule: Schedule, system: AffineSystem, tolerance: f
     if system.varying or any(entry.has(model.t) for entry in model.drift):
         raise InputError(f'{model.source}: option form: "one-shot" needs constant coefficients; take form="stepwise"')
     plain = affine_system_of(formulas(model))
-    found = jax.tree.map(np.asarray, constants(plain, model, model.theta()))
-    if not np.all(np.isfinite(found.inverse)):
+    covariance = plain.matrices(model.start, model.theta())[2]
+    if np.linalg.matrix_rank(covariance) < model.n:
         raise InputError(f'{model.source}: option form: "one-shot" needs a G that has an inverse; take form="stepwise"')
+    found = jax.tree.map(np.asarray, constants(plain, model, model.theta()))
     rate = float(np.max(np.linalg.eigvals(found.hamiltonian).real, initial=0.0))
     time = float(schedule.stops[-1] - model.start)
     with np.errstate(over="ignore"):
@@ -154,7 +157,7 @@ def observations(prepared: Prepared, data: Data) -> Factors:
 def init(prepared: Prepared, prior: Any) -> State:
     """The prior, and statistics that are zero."""
     zero = jnp.zeros(prepared.model.n)
-    return State(base.init(prepared.base, prior), zero, zero, jnp.zeros(prepared.model.m), jnp.zeros(()), jnp.zeros(()))
+    return State(base.init(prepared.base, prior), zero, zero, jnp.zeros(prepared.model.m), *jnp.zeros((3,)))
 
 
 def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State, Info]:
@@ -188,12 +191,18 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
     c = state.c + interval.length * (_WEIGHTS @ jax.vmap(growth)(inside[:-1], jnp.asarray(_NODES)))
     b, a, y = inside[-1, :n], inside[-1, n:], state.y + interval.length * rate
     moved = state.data_free._replace(families=families, time=interval.base.stop)
-    new = State(moved, b, a, y, c, state.log_mass)
+    new = State(moved, b, a, y, c, state.log_mass, state.steps + 1.0)
     sigma = _sigma(interval.base.quadratic, k, new)
     found = posterior(interval.base.gauge, interval.base.tilts, interval.base.stop, interval.base.theta, sigma)
-    health = base.health_of(moved._replace(families=sigma), found)
+    health = base.health_of(moved._replace(families=sigma), found) | {"lost_digits": jax.lax.stop_gradient(_rounding(k, new))}
     increment = found.log_mass - state.log_mass
     return new._replace(log_mass=found.log_mass), Info(increment, found.mean, found.cov, health)
+
+
+def _rounding(k: Constants, state: State) -> Any:
+    """The rounding, in nats, of what cancels in the evidence: that of every interval grows along with the statistics."""
+    terms = k.intercept @ state.y, state.c, (jnp.abs(state.a) + jnp.abs(k.slope.T @ state.y)) @ jnp.abs(state.b)
+    return state.steps * np.finfo(float).eps * sum(jnp.abs(term) for term in terms)
 
 
 def _sigma(quadratic: base.Quadratic | None, k: Constants, state: State) -> Family:

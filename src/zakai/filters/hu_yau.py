@@ -14,6 +14,7 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import sympy as sp
 
@@ -26,7 +27,7 @@ from zakai.filters import _family_filter as families
 from zakai.filters import _one_shot
 from zakai.filters._affine_system import AffineSystem, affine_system_of
 from zakai.filters._formulas import Formulas, formulas
-from zakai.filters._protocol import Method, Schedule
+from zakai.filters._protocol import Info, Method, Schedule
 from zakai.kolmogorov.flow import Coefficients
 from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 from zakai.models.model import Model
@@ -73,8 +74,9 @@ def prepare(
 ) -> Any:
     """The flow of every interval, offline.
 
-    form: "stepwise", or "one-shot" from the start on, which is refused once eps exp(2 mu t) passes `tolerance`, mu being the
-    largest growth rate of the statistics. choice: which theorem's S, H and P. Raises InputError where an option does not fit.
+    form: "stepwise", or "one-shot" from the start on, which is refused once eps exp(2 mu t), its error relative to the size of
+    the statistics, passes `tolerance`, mu being their largest growth rate; the error in nats is `health["lost_digits"]`.
+    choice: which theorem's S, H and P. Raises InputError where an option does not fit.
     """
     if form not in ("stepwise", "one-shot"):
         raise InputError(f'option form: "{form}" is neither "stepwise" nor "one-shot"')
@@ -117,6 +119,18 @@ def _by_form(name: str) -> Any:
     return part
 
 
+def _step(interval: Any, state: Any, observation: Any) -> tuple[Any, Info]:
+    """One interval; nothing cancels in the stepwise form."""
+    state, info = _by_form("step")(interval, state, observation)
+    return state, info._replace(health={"lost_digits": jnp.zeros(()), **info.health})
+
+
+def _correct(prepared: Any, prior: Any, observation: Any) -> tuple[Any, Info]:
+    """A sample at the start."""
+    state, info = _by_form("correct")(prepared, prior, observation)
+    return state, info._replace(health={"lost_digits": jnp.zeros(()), **info.health})
+
+
 METHOD = Method(
     name="hu-yau",
     source="Hu and Yau 2002, Theorems 3 to 6, corrected; any prior: Makowski 1986",
@@ -125,10 +139,13 @@ METHOD = Method(
     options={"form": "stepwise", "choice": "theorem-4", "tolerance": 1e-6},
     prepare=prepare,
     init=_by_form("init"),
-    correct=_by_form("correct"),
+    correct=_correct,
     observations=_by_form("observations"),
-    step=_by_form("step"),
+    step=_step,
     density=_by_form("density"),
     with_parameters=_by_form("with_parameters"),
-    bounds=families.BOUNDS,
+    bounds={
+        **families.BOUNDS,
+        "lost_digits": (1e-6, 'rounding of the evidence in nats, as the statistics of one shot cancel; take form="stepwise"'),
+    },
 )
