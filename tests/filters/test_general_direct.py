@@ -134,28 +134,3 @@ def test_wrong_options_and_systems_outside_the_class_are_refused_in_one_line():
         zakai.filter(cubic, zakai.Record(np.array([0.1]), np.zeros((1, 1)), "increments"), "general-direct")
     with pytest.raises(ConditionError, match="depends on t"):
         zakai.filter(spiral, zakai.Record(np.array([0.1]), np.zeros((1, 2)), "increments"), "gaussian-sum")
-
-
-@pytest.mark.parametrize("variance", [pytest.param(1e-2, marks=pytest.mark.slow), 10.0, 1e4])
-def test_a_prior_of_any_width_over_the_bend_of_the_gauge_is_divided_well(variance):
-    model = zakai.Model(
-        state=["x"], drift=["tanh(x)"], observation=["x"], observation_noise=[["0.5"]],
-        prior={"kind": "gaussian", "mean": [0.3], "cov": [[variance]]},
-    )  # fmt: skip
-    values = np.array([[0.21], [0.14], [0.26], [0.17]])
-    record = zakai.Record(np.arange(1, 5) * 0.01, values, "increments")
-    exact, result = zakai.filter(model, record, "benes"), zakai.filter(model, record, "general-direct")
-    assert max(errors(result, exact)) <= 1e-4 and not result.warnings
-    assert np.abs(result.variance / exact.variance - 1).max() <= 1e-4
-    assert result.variance[0, 0] == pytest.approx(variance, rel=1e-5)
-    if variance == 1e4:
-        few = zakai.filter(model, record, "general-direct", components=6)
-        assert any(line.startswith("start_error") for line in few.warnings)
-
-
-@pytest.mark.parametrize("reduction", ["algorithm-1", "nnls"])
-def test_a_reduction_without_error_figures_says_that_it_has_none(reduction):
-    model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]})
-    record = zakai.Record(np.array([0.1]), np.array([[0.05]]), "increments")
-    (line,) = zakai.filter(model, record, "general-direct", reduction=reduction).warnings
-    assert reduction in line and "no error figures" in line

@@ -9,7 +9,6 @@ For any other phi each component of u is the Gaussian with the moments of e^{phi
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -43,7 +42,6 @@ class SumGauge:
         """phi at the points x (..., n)."""
         return self._potential(x, t, theta)[0]
 
-    @partial(jax.jit, static_argnums=0)
     def lift(self, v: Components, t: Any, theta: Any) -> Components:
         """The components of u = e^phi v: `count` for each of v, one after another."""
         if self.none:
@@ -59,50 +57,8 @@ class SumGauge:
             logs.reshape(-1), means.reshape(-1, self.n), jnp.repeat(v.covs, self.count, axis=0), jnp.repeat(v.signs, self.count)
         )
 
-    @partial(jax.jit, static_argnums=0)
     def divide(self, u: Components, t: Any, theta: Any) -> Components:
-        """Components of v = e^-phi u, each with its moments: for the start, where u is given.
-
-        Of a sum of exponentials the largest at the mean is divided out exactly, and quadrature is left with what differs from
-        it: far from a bend that is nothing, however far the division moves the component.
-        """
+        """Components of v = e^-phi u, each with its moments: for the start, where u is given."""
         if self.none:
             return u
-        if not self.exact:
-            return refit(u, lambda x: -self.potential(x, t, theta), self.directions, True).sum
-        numbers = self._numbers(jnp.zeros(self.n), t, theta)
-        largest = jnp.argmax(numbers[:, 0] + u.means @ numbers[:, 1:].T, axis=1)
-        constant, slope = numbers[largest, 0], numbers[largest, 1:]
-        across = jnp.einsum("kij,kj->ki", u.covs, slope)
-        logs = u.log_weights - constant - jnp.sum(slope * (u.means - 0.5 * across), axis=1)
-
-        def rest(x):
-            one = constant[:, None] + jnp.einsum("kqi,ki->kq", x, slope)
-            return one - jax.nn.logsumexp(x @ numbers[:, 1:].T + numbers[:, 0], axis=-1)
-
-        return refit(u._replace(log_weights=logs, means=u.means - across), rest, self.directions, True).sum
-
-    @partial(jax.jit, static_argnums=0)
-    def doubt(self, u: Components, t: Any, theta: Any) -> jax.Array:
-        """By how much each component (K,) comes back another one when it is divided and lifted.
-
-        The largest error of its mass, and along phi's directions of its mean, in deviations, and of its variance; not a number
-        counts as infinite, and an empty slot has none.
-        """
-        used = jnp.isfinite(u.log_weights)
-        u = u._replace(log_weights=jnp.where(used, u.log_weights, 0.0))
-        back = self.lift(self.divide(u, t, theta), t, theta)
-        shape = (len(u.log_weights), -1)
-        logs = back.log_weights.reshape(shape) - u.log_weights[:, None]
-        mass = jnp.exp(jax.nn.logsumexp(logs, axis=1))
-        share = jax.nn.softmax(logs, axis=1)
-        along = jnp.asarray(self.directions)
-        variance = jnp.einsum("ia,kij,ja->ka", along, u.covs, along)
-        scale = jnp.where(variance > 0, variance, 1.0)
-        away = (back.means.reshape(*shape, self.n) - u.means[:, None]) @ along / jnp.sqrt(scale)[:, None]
-        inside = jnp.einsum("ia,kij,ja->ka", along, back.covs, along).reshape(*shape, along.shape[1]) / scale[:, None]
-        mean = jnp.einsum("kc,kca->ka", share, away)
-        second = jnp.einsum("kc,kca->ka", share, inside + away**2) - mean**2
-        wrong = jnp.where(variance > 0, jnp.maximum(jnp.abs(mean), jnp.abs(second - 1.0)), 0.0)
-        worst = jnp.maximum(jnp.abs(mass - 1.0), jnp.max(wrong, axis=1, initial=0.0))
-        return jnp.where(used, jnp.where(jnp.isnan(worst), jnp.inf, worst), 0.0)
+        return refit(u, lambda x: -self.potential(x, t, theta), self.directions, True).sum

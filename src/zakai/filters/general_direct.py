@@ -34,7 +34,7 @@ from zakai.filters._yau_flow import FlowPlan, System, plan_flows, planned_flows,
 from zakai.filters.observations import Data, Factors, factors, noise_at
 from zakai.kolmogorov.flow import Flow, move_gaussian
 from zakai.models.model import Model
-from zakai.models.prior import DensityPrior, GaussianPrior, MixturePrior
+from zakai.models.prior import GaussianPrior, MixturePrior
 
 # Slots by the number of directions in which the components must be narrow.
 SLOTS = {0: 1, 1: 20, 2: 64, 3: 128}
@@ -69,19 +69,21 @@ class Sum:
             raise InputError(
                 f"{model.source}: h and phi vary in {k} directions of the state; quadrature takes {MOST_DIRECTIONS} at most"
             )
-        self.asked, self.slots = slots, SLOTS.get(k, 192) if slots is None else slots
-        self.reduction, self.tolerance, self.alpha, self.rounds = reduction, tolerance, alpha, rounds
+        self.slots = SLOTS.get(k, 192) if slots is None else slots
+        self.reduction, self.tolerance, self.alpha = reduction, tolerance, alpha
+        self.rounds = rounds
         self.sampled = model.observation_kind == "samples"
         # Whether components are split before each reading rather than after it.
         self.roomy = self.sampled and bool(self.directions.shape[1]) and reduction == "split-merge"
 
     def limits(self, count: int) -> tuple[int, int]:
         """How many slots the sum and its companion may use, for a prior that was cut into `count` Gaussians."""
-        if self.affine and (self.asked is None or not self.start_directions.shape[1]):
-            # Nothing is put together.
-            return count, count
         used = min(self.slots, count) if self.affine else self.slots
-        return (used, used) if not self.start_directions.shape[1] else (used, round(0.7 * used) if used >= 8 else used + 4)
+        if not self.start_directions.shape[1]:
+            # Nothing is put together.
+            used = count if self.affine else self.slots
+            return used, used
+        return used, round(0.7 * used) if used >= 8 else used + 4
 
 
 def _span(directions: np.ndarray) -> np.ndarray:
@@ -107,8 +109,7 @@ class Kept(NamedTuple):
 
 
 class State(NamedTuple):
-    """Two normalised sums side by side (2, K, ...), the slots (2,) they may use, the difference of their log-likelihoods, and
-    how far the start is from the prior, until the first step has told it.
+    """Two normalised sums side by side (2, K, ...), the slots (2,) they may use, and the difference of their log-likelihoods.
 
     The first is the result; the second has another number of slots, and how far it stands from the first tells how far the
     first may stand from the density.
@@ -117,7 +118,6 @@ class State(NamedTuple):
     pair: Components
     slots: Any
     apart: Any
-    doubt: Any
     time: Any
 
     @property
@@ -156,10 +156,9 @@ class Prepared:
     def notes(self) -> tuple[str, ...]:
         """Where the method is not exact in its class, for the warnings of a result."""
         gaps = not self.schedule.inside.all() and not self.static.sampled
-        plain = self.static.reduction
-        blind = () if plain == "split-merge" else (f'the reduction "{plain}" has no error figures: its errors are not known',)
-        return blind if self.static.system.bare or not gaps else (
-            *blind,
+        if self.static.system.bare or not gaps:
+            return ()
+        return (
             "where readings are missing the transition without the observation's potential is not linear-quadratic: its "
             "potential is kept inside and taken out again at the end, which is exact only as the intervals shrink",
         )
@@ -248,16 +247,17 @@ def observations(prepared: Prepared, data: Data) -> Factors:
 
 def init(prepared: Prepared, prior: Any) -> State:
     """The prior, cut into Gaussians and divided by e^phi."""
-    static, model, t, theta = prepared.static, prepared.model, prepared.model.start, prepared.theta
+    static, model = prepared.static, prepared.model
     own = model.theta()
-    doubt = None if static.gauge.none else lambda u: static.gauge.doubt(u, t, own)
-    given = start.prior_sum(model, prior, theta)
-    u = given if isinstance(prior, DensityPrior) else start.cut(given, static.start_directions, doubt)
-    narrow = static.gauge.divide(u, t, theta)
+
+    def cut(theta):
+        return start.cut_prior(
+            model, prior, static.start_directions, theta, lambda u: static.gauge.divide(u, model.start, theta)
+        )
+
+    narrow = cut(prepared.theta)
     with jax.ensure_compile_time_eval():
-        host = narrow
-        if not isinstance(theta, np.ndarray):
-            host = static.gauge.divide(start.prior_sum(model, prior, own) if isinstance(prior, DensityPrior) else u, t, own)
+        host = narrow if isinstance(prepared.theta, np.ndarray) else cut(own)
         weights = np.asarray(_share_of_u(static, host, model.start, own)[0])
         loss = np.zeros(len(weights))
         if static.directions.shape[1]:
@@ -270,21 +270,16 @@ def init(prepared: Prepared, prior: Any) -> State:
         start.fitted(narrow, host, weights, loss, more * most, more * max(used, second), static.angles) for most in (used, second)
     ]
     both = jax.tree.map(lambda *a: jnp.stack(a), *pair)
-    wrong = start.difference(static.gauge.lift(pair[0], t, theta), given, static.angles)
-    if not static.gauge.none:
-        wrong = jnp.maximum(wrong, jax.lax.stop_gradient(jnp.max(static.gauge.doubt(u, t, theta))))
-    both = jax.vmap(lambda v: _normalised(static, v, t, theta)[0])(both)
-    return State(both, jnp.array([used, second]), jnp.zeros(()), wrong, jnp.asarray(t, float))
+    both = jax.vmap(lambda v: _normalised(static, v, model.start, prepared.theta)[0])(both)
+    return State(both, jnp.array([used, second]), jnp.zeros(()), jnp.asarray(model.start, float))
 
 
-@partial(jax.jit, static_argnums=0)
 def _share_of_u(static: Sum, v: Components, t: Any, theta: Any) -> tuple[jax.Array, jax.Array]:
     """The share in u of each component of v (K,), and the logarithm of the mass of u."""
     share, log_mass = shares(static.gauge.lift(v, t, theta))
     return share.reshape(len(v.log_weights), -1).sum(axis=1), log_mass
 
 
-@partial(jax.jit, static_argnums=0)
 def _normalised(static: Sum, v: Components, t: Any, theta: Any) -> tuple[Components, jax.Array, Components, jax.Array]:
     """v so that u = e^phi v has mass one; the logarithm of its mass; u, and the shares of its components."""
     u = static.gauge.lift(v, t, theta)
@@ -331,9 +326,8 @@ def _told(static: Sum, state: State, observed: tuple[Components, Info], t: Any) 
         mean_error=jnp.max(distance) if known else jnp.nan * apart,
         deviation_error=jnp.max(jnp.abs(second / deviation - 1.0)) if known else jnp.nan * apart,
         evidence_error=jnp.abs(apart) if known else jnp.nan * apart,
-        start_error=state.doubt,
     )
-    return State(pair, state.slots, apart, jnp.zeros(()), jnp.asarray(t, float)), info
+    return State(pair, state.slots, apart, jnp.asarray(t, float)), info
 
 
 def _move(flow: Flow, v: Components, inputs: jax.Array) -> Components:
@@ -488,7 +482,6 @@ METHOD = Method(
         "mean_error": (0.04, "distance of the mean from that of a second sum with other slots, in standard deviations"),
         "deviation_error": (0.1, "relative distance of a standard deviation from that of the second sum"),
         "evidence_error": (0.04, "distance of the log-likelihood so far from that of the second sum"),
-        "start_error": (1e-2, "distance of the start from the prior in mass, mean or variance, or of a part of it"),
         "nonlinearity": (0.1, "relative entropy lost in one step by keeping one Gaussian where an observation made none"),
         "quadrature": (1e-2, "relative error of the masses of components, by two rules of quadrature"),
         "pruned": (1e-3, "weight of components that were dropped in one step"),
