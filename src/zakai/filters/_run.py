@@ -182,6 +182,7 @@ class Run:
         """The first state: that of another run with the same prior, or the prior, after a sample at the start if there is one."""
         if same is not None:
             self.first, self.state, self.states = same.first, same.state, list(same.states)
+            self.notes.update(dict.fromkeys(getattr(same.first, "notes", ())))
             return
         method, prior = self.setting.method, self.setting.prior
         self.first = prepared = self.setting.prepared(self._first_interval())

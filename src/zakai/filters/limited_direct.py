@@ -236,7 +236,9 @@ def init(prepared: Prepared, prior: Any) -> State:
     if known is not prior or state is None:
         state = _start(prepared, prior, None)[0]
         prepared.first.clear()
-        prepared.first[id(prior)] = prior, state, _roughness(np.asarray(state.lattice.log_values))
+        prepared.first[id(prior)] = prior, state, (
+            _roughness(np.asarray(state.lattice.log_values)) if isinstance(prior, DensityPrior) else 0.0
+        )
     return state
 
 
@@ -244,7 +246,7 @@ def _roughness(logs: np.ndarray) -> float:
     """How much of the mass differs on every second point: of a smooth density nothing, of kinks three errors."""
     values = np.exp(logs - logs.max())
     every = values[tuple(slice(None) if size < 4 else slice(size // 2 % 2, None, 2) for size in logs.shape)]
-    return abs(every.mean() / values.mean() - 1.0)
+    return abs(every.sum() * 2 ** sum(size >= 4 for size in logs.shape) / values.sum() - 1.0)
 
 
 def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State, Info]:
