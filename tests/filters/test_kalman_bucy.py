@@ -133,7 +133,9 @@ def test_a_prior_density_and_every_kind_of_record_agree_with_the_lattice(kind):
         times = times - 0.05
     record = zakai.Record(times, values, kind)
     exact, lattice = (zakai.filter(model, record, method) for method in ("auto", "limited-direct"))
-    assert exact.method == "kalman-bucy" and not exact.warnings
+    assert exact.method == "kalman-bucy"
+    # A path's increment across a gap acts as one fact in both methods, and both say so; nothing else is to be said.
+    assert ["read after a gap" in text for text in exact.warnings] == ([True] if kind == "path" else [])
     assert exact.mean == pytest.approx(lattice.mean, abs=1e-9)
     assert exact.cov == pytest.approx(lattice.cov, abs=1e-9)
     assert exact.log_likelihood == pytest.approx(lattice.log_likelihood, abs=1e-9)
