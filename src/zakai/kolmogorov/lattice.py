@@ -37,6 +37,7 @@ SUPPORT = 36.0  # a point whose logarithm is lower than the maximum's by more th
 SUMMED = 1.0 / 0.75**2  # variance, in cells, from which a Gaussian may be summed on a lattice
 CUT = 1e-13  # what rounding leaves of a sharpened density
 _AT_ONCE = 2**22  # pairs of points whose kernel is held in memory at once
+FUSED = 16  # taps of a filter that are added in one round
 _LARGEST = 700.0  # an exponent whose exponential still exists
 
 LogFunction = Callable[[jax.Array], jax.Array]
@@ -240,6 +241,30 @@ def slid(values: jax.Array, shift: jax.Array, fill: float) -> jax.Array:
     return lax.dynamic_slice(padded, (size // 4 + shift,), (size,))
 
 
+def _filtered(values: jax.Array, weights: jax.Array) -> jax.Array:
+    """sum_j weights[|j|] values[i - j] over |j| <= taps, for `weights` (taps + 1,).
+
+    A sum of shifted slices becomes one fused, vectorised loop, for many records at once too, where a convolution of the
+    library does not; what is positive stays so.
+    """
+    size, taps = values.shape[0], weights.shape[0] - 1
+    padded = jnp.pad(values, taps)
+
+    def add(total: jax.Array, first: Any, count: int) -> jax.Array:
+        for j in range(count):
+            left, right = (lax.dynamic_slice(padded, (start,), (size,)) for start in (taps - first - j, taps + first + j))
+            total = total + weights[first + j] * (left + right)
+        return total
+
+    # Short filters are one loop; longer ones go in rounds, which keeps the program small.
+    rounds, rest = divmod(taps, FUSED) if taps > 2 * FUSED else (0, taps)
+    total = add(weights[0] * values, 1, rest)
+    if rounds == 0:
+        return total
+    starts = 1 + rest + FUSED * jnp.arange(rounds)
+    return lax.scan(lambda total, start: (add(total, start, FUSED), None), total, starts)[0]
+
+
 def move_banded(
     lattice: Lattice, before: jax.Array, flow: Flow, inputs: Array, taps: int
 ) -> tuple[Lattice, jax.Array]:
@@ -255,15 +280,7 @@ def move_banded(
     variance = flow.spread[0, 0]
     weights = jnp.exp(-0.5 * (jnp.arange(taps + 1) * cell) ** 2 / variance)
     values = jnp.exp(gauged - top)
-    if taps <= 48:  # a sum of shifted slices becomes one fused, vectorised loop
-        padded = jnp.pad(values, taps)
-        total = values
-        for j in range(1, taps + 1):
-            pair = lax.slice(padded, (taps - j,), (taps - j + size,)) + lax.slice(padded, (taps + j,), (taps + j + size,))
-            total = total + weights[j] * pair
-    else:
-        both = jnp.concatenate([weights[:0:-1], weights])
-        total = jnp.maximum(jnp.convolve(values, both, mode="full")[taps : taps + size], 0.0)
+    total = _filtered(values, weights)
     moved = motion(flow, lattice.centre, inputs)
     offset = cell * _axes((size,))[0]
     spread = log(total)
