@@ -15,7 +15,7 @@ import numpy as np
 from zakai import _float64  # noqa: F401
 from zakai.filters._run import RUN, Run, run_steps, scanned, size_of
 
-LANES = 256  # records that are filtered by one scan, at most
+LANES = 32  # records that are filtered by one scan, at most: one that asks for a large lattice slows no more than these
 LANE_BYTES = 256 * 2**20  # what they give in one run of steps, at most
 WORTH_A_CORE = 16  # records
 
