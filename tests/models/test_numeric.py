@@ -79,6 +79,7 @@ def test_jax_functions_work_under_jit_vmap_and_grad(everything):
 def test_numpy_functions_broadcast_states_and_times(everything):
     function = numpy_function(everything.observation, everything)
     assert function(np.ones((4, 1, 2)), np.linspace(0, 1, 5), everything.theta()).shape == (4, 5, len(EVERYTHING))
+    assert numpy_function(everything.x[0] ** 2, everything)(np.full(2, 3.0), 0.0, everything.theta()) == 9.0
 
 
 def test_log_cosh_and_its_slope_do_not_overflow():

@@ -63,7 +63,7 @@ def numpy_function(expressions: Any, model: Model, shape: Sequence[int] | None =
         result = np.empty((*batch, len(flat)))
         for column, slot in enumerate(program.outputs):
             result[..., column] = values[slot]
-        return result.reshape(*batch, *shape)
+        return result.reshape((*batch, *shape))
 
     return function
 
