@@ -35,6 +35,7 @@ def text(analysis: Analysis) -> str:
     title = "".join(character if character.isprintable() else " " for character in model.name)
     blocks = [
         [title, "=" * len(title), *_equations(model)],
+        *([["Explosion", *_wrapped("  ", str(analysis.explosion), 4)]] if analysis.explosion is not None else []),
         ["Omega_ij = d_i g_j - d_j g_i  with g = G^-1 f", *_omega(analysis)],
         ["eta = f'G^-1 f + div f + h'S^-1 h", f"  {_SINGULAR}" if analysis.eta is None else f"  eta = {readable(analysis.eta)}"],
         ["Yau form  f = L x + l + G grad phi", *_yau_form(analysis)],

@@ -16,6 +16,7 @@ from zakai._registry import AUTO
 from zakai.algebra import _page
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
+from zakai.algebra.explosion import Explosion, explosion
 from zakai.algebra.observed_block import ObservedBlock, observed_block
 from zakai.algebra.theorems import THEOREMS, cached_yau_form
 from zakai.algebra.yau import (
@@ -42,7 +43,8 @@ class Analysis:
 
     `omega` (n, n) and `eta` are None where G is singular, `yau_form` and `q` where the drift has no Yau form; for samples
     `q` is without h'S^-1 h, for they do not act between their times.  `algebra` is an `EstimationAlgebra` and `observed_block` an
-    `ObservedBlock`, or None where it is not known, each explored when it is first asked for.  `methods` are the conditions of
+    `ObservedBlock`, or None where it is not known; `explosion` is an `Explosion`, or None where none was seen; each is looked for
+    when it is first asked for.  `methods` are the conditions of
     every method by its name, `recommended` the method that "auto" takes, or None.  `print` shows a page.
     """
 
@@ -65,6 +67,11 @@ class Analysis:
         """An autonomous W x, as small as possible, that h is a function of."""
         block = observed_block(self.model)
         return block if isinstance(block, ObservedBlock) else None
+
+    @cached_property
+    def explosion(self) -> Explosion | None:
+        """A state that the drift takes to infinity in a finite time."""
+        return explosion(self.model)
 
     def __str__(self) -> str:
         return _page.text(self)
@@ -89,6 +96,7 @@ class Analysis:
             "q": None if self.q is None else str(self.q),
             "algebra": self._algebra_for_json(),
             "observed_block": self._block_for_json(),
+            "explosion": None if self.explosion is None else {"start": self.explosion.start, "time": self.explosion.time},
             "methods": {
                 name: {"holds": all_hold(conditions), "conditions": [vars(c) for c in conditions]}
                 for name, conditions in self.methods.items()
