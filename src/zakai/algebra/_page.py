@@ -46,6 +46,8 @@ def text(analysis: Analysis) -> str:
     if analysis.observed_block is not None and len(analysis.observed_block.symbols) < model.n:
         values = ", at the parameters' values" if model.parameters else ""
         blocks.append([f"Observed block, which moves by itself{values}", *_observed_block(analysis.observed_block)])
+    if analysis.by_blocks:
+        blocks.append(["Blocks that have nothing to do with each other", *_parts(analysis)])
     for name, conditions in analysis.methods.items():
         blocks.append([f"Method {name}: {_WORDS[all_hold(conditions)]}", *_conditions(conditions)])
     blocks.append([_recommendation(analysis)])
@@ -142,6 +144,21 @@ def _observed_block(block: ObservedBlock) -> Iterator[str]:
     yield f"  E dn dn' = {_flat(block.covariance)} dt,  h = {[*block.observation]}"
     if block.linear:
         yield "  it is linear: for a normal prior its filter is that of Kalman and Bucy, whatever the rest of the state does"
+
+
+def _parts(analysis: Analysis) -> Iterator[str]:
+    for part in analysis.by_blocks:
+        algebra = part.algebra
+        size = "" if algebra.dimension is None else f" of dimension {algebra.dimension}"
+        rank = "" if algebra.linear_rank is None else f", linear rank {algebra.linear_rank}"
+        proof = "" if algebra.certificate is None else f" ({algebra.certificate.code})"
+        best = "no method that auto tries holds" if part.recommended is None else f"auto takes {part.recommended}"
+        yield from _wrapped(f"  {', '.join(part.model.state)}: ", f"{algebra.verdict}{size}{rank}{proof}; {best}", 4)
+    verdicts = {part.algebra.verdict for part in analysis.by_blocks}
+    if "infinite" in verdicts:
+        yield "  E is infinite dimensional, for that of a block is"
+    elif verdicts == {"finite"}:
+        yield "  E is finite dimensional, for those of all blocks are"
 
 
 def _conditions(conditions: tuple[Condition, ...]) -> Iterator[str]:

@@ -14,6 +14,7 @@ import sympy as sp
 
 from zakai._registry import AUTO
 from zakai.algebra import _page
+from zakai.algebra.blocks import Block, blocks
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
 from zakai.algebra.explosion import Explosion, explosion
@@ -43,8 +44,8 @@ class Analysis:
 
     `omega` (n, n) and `eta` are None where G is singular, `yau_form` and `q` where the drift has no Yau form; for samples
     `q` is without h'S^-1 h, for they do not act between their times.  `algebra` is an `EstimationAlgebra` and `observed_block` an
-    `ObservedBlock`, or None where it is not known; `explosion` is an `Explosion`, or None where none was seen; each is looked for
-    when it is first asked for.  `methods` are the conditions of
+    `ObservedBlock`, or None where it is not known; `explosion` is an `Explosion`, or None where none was seen; `blocks` are
+    the `Block`s that the system falls into; each is looked for when it is first asked for.  `methods` are the conditions of
     every method by its name, `recommended` the method that "auto" takes, or None.  `print` shows a page.
     """
 
@@ -67,6 +68,16 @@ class Analysis:
         """An autonomous W x, as small as possible, that h is a function of."""
         block = observed_block(self.model)
         return block if isinstance(block, ObservedBlock) else None
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """The parts that have nothing to do with each other, if only the whole."""
+        return blocks(self.model)
+
+    @cached_property
+    def by_blocks(self) -> tuple[Analysis, ...]:
+        """The analysis of each block, if there are several."""
+        return tuple(analyze(block.model) for block in self.blocks) if len(self.blocks) > 1 else ()
 
     @cached_property
     def explosion(self) -> Explosion | None:
@@ -96,6 +107,7 @@ class Analysis:
             "q": None if self.q is None else str(self.q),
             "algebra": self._algebra_for_json(),
             "observed_block": self._block_for_json(),
+            "blocks": [self._part_for_json(block, part) for block, part in zip(self.blocks, self.by_blocks)],
             "explosion": None if self.explosion is None else {"start": self.explosion.start, "time": self.explosion.time},
             "methods": {
                 name: {"holds": all_hold(conditions), "conditions": [vars(c) for c in conditions]}
@@ -128,6 +140,15 @@ class Analysis:
             return None
         lists = {key: [str(e) for e in getattr(block, key)] for key in ("coordinates", "symbols", "drift", "observation")}
         return {**lists, "covariance": _strings(block.covariance), "linear": block.linear}
+
+    @staticmethod
+    def _part_for_json(block: Block, part: Analysis) -> dict[str, object]:
+        return {
+            "state": block.model.state,
+            "observations": block.observations,
+            "algebra": part._algebra_for_json(),
+            "recommended": part.recommended,
+        }
 
     def _wei_norman_for_json(self) -> dict[str, object] | None:
         equations = self.algebra.wei_norman
