@@ -25,7 +25,7 @@ def test_what_is_connected_stays_together():
     assert names(model) == [("a", "f"), ("b", "e"), ("c", "d"), ("g",)]
     first, second, third, last = blocks(model)
     assert first.observations == (0, 1) and first.model.observation_noise == model.observation_noise[:2, :2]
-    assert second.model.covariance.tolist() == [[1.25, 0.5], [0.5, 1]]
+    assert np.array(second.model.covariance, float).tolist() == [[1.25, 0.5], [0.5, 1]]
     assert third.observations == (2,) and last.observations == () and last.model.observation[0] == 0
     whole = zakai.load_model("gallery:spiral-sensor")
     assert blocks(whole)[0].model is whole
