@@ -14,6 +14,7 @@ QUOTIENTS = {
     "(exp(2*x) - 1)/(exp(2*x) + 1)": lambda x: np.log(np.cosh(x)),
     "1 - 2/(1 + exp(2*x))": lambda x: np.log(np.cosh(x)),
     "(2*exp(x) - 3*exp(-x))/(2*exp(x) + 3*exp(-x))": lambda x: np.log(2 * np.exp(x) + 3 * np.exp(-x)),
+    "sinh(2*x)/(1 + cosh(2*x))": lambda x: np.log(np.cosh(x)),
     "(a*exp(a*x) - a*exp(-a*x))/(exp(a*x) + exp(-a*x))": lambda x: np.log(np.cosh(0.7 * x)),
 }
 

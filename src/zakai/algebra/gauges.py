@@ -92,6 +92,8 @@ def _exponentials(potential: sp.Expr, x: tuple[sp.Symbol, ...]) -> Terms | None:
             factor = _gathered(powers, factor, count)
         product = _product(product, factor)
     for factor, count in powers:
+        while not count.is_Integer and (root := _square_root(factor)) is not None:
+            factor, count = root, tidy(2 * count)
         if not count.is_Integer or not 0 <= count <= _MOST_TERMS:
             return None
         for _ in range(int(count)):
@@ -99,6 +101,16 @@ def _exponentials(potential: sp.Expr, x: tuple[sp.Symbol, ...]) -> Terms | None:
                 return None
             product = _product(product, factor)
     return product if len(product) <= _MOST_TERMS else None
+
+
+def _square_root(terms: Terms) -> Terms | None:
+    """a e^{u.x} + b e^{v.x} with a, b > 0, if its square is given, as 1 + cosh(2 x) is that of sqrt(2) cosh(x)."""
+    for slope, middle in terms.items() if len(terms) == 3 else ():
+        (one, first), (two, second) = ((other, c) for other, c in terms.items() if other != slope)
+        between = all(is_zero(a + b - 2 * s) is True for a, b, s in zip(one, two, slope, strict=True))
+        if between and is_zero(middle - 2 * sp.sqrt(first) * sp.sqrt(second)) is True:
+            return {tuple(e / 2 for e in outer): sp.sqrt(c) for outer, c in ((one, first), (two, second))}
+    return None
 
 
 def _gathered(powers: list[tuple[Terms, sp.Expr]], terms: Terms, count: sp.Expr) -> Terms:
