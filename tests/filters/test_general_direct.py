@@ -134,3 +134,39 @@ def test_wrong_options_and_systems_outside_the_class_are_refused_in_one_line():
         zakai.filter(cubic, zakai.Record(np.array([0.1]), np.zeros((1, 1)), "increments"), "general-direct")
     with pytest.raises(ConditionError, match="depends on t"):
         zakai.filter(spiral, zakai.Record(np.array([0.1]), np.zeros((1, 2)), "increments"), "gaussian-sum")
+
+
+def benes(variance, **changes):
+    keys = {
+        "state": ["x"], "drift": ["tanh(x)"], "observation": ["x"], "observation_noise": [["0.5"]],
+        "prior": {"kind": "gaussian", "mean": [0.3], "cov": [[variance]]},
+    }  # fmt: skip
+    return zakai.Model(**(keys | changes))
+
+
+PRIORS = {
+    "gaussian": {"kind": "gaussian", "mean": [0.3], "cov": [[1e4]]},
+    "mixture": {"kind": "mixture", "weights": [0.4, 0.6], "means": [[0.1], [0.5]], "covs": [[[1e4]], [[2e4]]]},
+    "density": {"kind": "density", "log_density": "-x**2/20000"},
+}
+
+
+@pytest.mark.parametrize(
+    ("prior", "reduction"),
+    [("gaussian", "split-merge"), ("mixture", "split-merge"), ("density", "split-merge"), ("mixture", "nnls"),
+     ("gaussian", "algorithm-1")],
+)  # fmt: skip
+def test_a_start_that_is_not_the_prior_is_said(prior, reduction):
+    record = zakai.Record(np.array([0.01, 0.02]), np.array([[0.21], [0.14]]), "increments")
+    few = {"reduction": reduction, "components": 6}
+    wide = zakai.filter(benes(1.0, prior=PRIORS[prior]), record, "general-direct", **few)
+    assert any(line.startswith("start_error") for line in wide.warnings)
+    if prior == "gaussian":
+        narrow = zakai.filter(benes(0.01), record, "general-direct", **few)
+        assert np.all(narrow.health["start_error"][1:] <= 0.01)
+
+
+def test_an_angle_that_is_cut_is_the_prior_still():
+    model = zakai.load_model("gallery:encoder")
+    _, record = zakai.simulate(model, model.start + np.array([0.1, 0.2]), seed=1)
+    assert zakai.filter(model, record, "general-direct").health["start_error"][1] <= 1e-3

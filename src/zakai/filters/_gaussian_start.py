@@ -8,7 +8,7 @@ for the model's own parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
-from zakai.densities.components import Components, components, padded, regression
+from zakai.densities.components import Components, components, moments, padded, regression, shares
 from zakai.densities.quadrature import refit
 from zakai.densities.reduction import PRUNED, gathered, groups
 from zakai.errors import InputError
@@ -32,21 +32,16 @@ _REACH = 5.3
 _FINE = {1: 64, 2: 20, 3: 8, 4: 5, 5: 4}
 
 
-def cut_prior(
-    model: Model, prior: Any, directions: np.ndarray, theta: Any, divide: Callable[[Components], Components]
-) -> Components:
-    """The prior as many narrow Gaussians; `divide` takes u to v."""
+def cut_prior(model: Model, prior: Any, directions: np.ndarray, theta: Any) -> Components:
+    """The prior as many narrow Gaussians."""
     if isinstance(prior, DensityPrior):
-        return divide(_cut_density(model, prior, theta))
-    if isinstance(prior, GaussianPrior):
-        logs, means, covs = np.zeros(1), prior.mean[None], prior.cov[None]
-    else:
-        logs, means, covs = np.log(prior.weights), prior.means, prior.covs
+        return _cut_density(model, prior, theta)
+    logs, means, covs, _ = given(model, prior)
     k = directions.shape[1]
     if k and k <= max(_FINE):
         share = max(4, int(_FINE[k] ** k / len(logs)) ** (1 / k))
         logs, means, covs = _cut(logs, means, covs, directions, int(share))
-    return divide(components(jnp.asarray(logs), jnp.asarray(means), jnp.asarray(covs)))
+    return components(jnp.asarray(logs), jnp.asarray(means), jnp.asarray(covs))
 
 
 def _cut(logs, means, covs, directions, count):
@@ -125,3 +120,45 @@ def fitted(
         )
     few = gathered(Components(*(jnp.asarray(a)[used] for a in sum_)), label[used], angles)
     return padded(few, slots)
+
+
+def given(model: Model, prior: Any) -> Components:
+    """The prior as it is given, for the model's own parameters and on the host; a density as the points of a lattice."""
+    if isinstance(prior, DensityPrior):
+        with jax.ensure_compile_time_eval():
+            lattice, log_mass = choice.first_lattice(model, prior, None)
+            logs, means = np.asarray(lattice.log_values).ravel(), np.asarray(lattice.points()).reshape(-1, model.n)
+            cell = np.log(abs(np.linalg.det(np.asarray(lattice.basis))))
+        logs, covs = logs + cell + log_mass, np.zeros((len(means), model.n, model.n))
+    elif isinstance(prior, GaussianPrior):
+        logs, means, covs = np.zeros(1), prior.mean[None], prior.cov[None]
+    else:
+        logs, means, covs = np.log(prior.weights), prior.means, prior.covs
+    return Components(logs, means, covs, np.ones(len(logs)))
+
+
+@partial(jax.jit, static_argnums=2)
+def difference(start: Components, prior: Components, angles: tuple[int, ...]) -> jax.Array:
+    """How far a start stands from the prior: the largest error of its mass, of a mean in deviations, and of a variance.
+
+    Of an angle a the mean of e^{ia} is compared, which is the same however it is cut: 1 - |E e^{ia}|^2 is its variance.
+    """
+    start = jax.lax.stop_gradient(start)
+    (share, log_mass), (wanted, unit) = shares(start), shares(prior)
+    mean, cov = moments(share, start.means, start.covs)
+    centre, spread = moments(wanted, jnp.asarray(prior.means), prior.covs)
+    variance = jnp.diagonal(spread)
+    shift, excess = mean - centre, jnp.diagonal(cov) - variance
+    for i in angles:
+        own, other = (
+            jnp.sum(p * jnp.exp(1j * s.means[:, i] - 0.5 * s.covs[:, i, i])) for p, s in ((share, start), (wanted, prior))
+        )
+        length = jnp.abs(other)
+        turned = own * jnp.where(length > 1e-9, jnp.conj(other) / length, 1.0)
+        shift, excess = shift.at[i].set(turned.imag), excess.at[i].set(2.0 * (turned.real - length))
+        # What is narrower than this is lost in the rounding of 1.
+        variance = variance.at[i].set(jnp.maximum(1.0 - length**2, 1e-12))
+    scale = jnp.where(variance > 0, variance, 1.0)
+    wrong = jnp.where(variance > 0, jnp.maximum(jnp.abs(shift) / jnp.sqrt(scale), jnp.abs(excess) / scale), 0.0)
+    worst = jnp.maximum(jnp.abs(jnp.expm1(log_mass - unit)), jnp.max(wrong))
+    return jnp.where(jnp.isnan(worst), jnp.inf, worst)

@@ -62,3 +62,25 @@ class SumGauge:
         if self.none:
             return u
         return refit(u, lambda x: -self.potential(x, t, theta), self.directions, True).sum
+
+    def doubt(self, u: Components, v: Components, t: Any, theta: Any) -> jax.Array:
+        """By how much each component (K,) of u is another one when its quotient in v is lifted again.
+
+        The largest error of its mass, and along the directions of phi of its mean, in deviations, and of its variance; what is
+        not a number counts as infinite.
+        """
+        u, v = jax.lax.stop_gradient((u, v))
+        back = self.lift(v, t, theta)
+        shape = (len(u.log_weights), -1)
+        logs = back.log_weights.reshape(shape) - u.log_weights[:, None]
+        share, along = jax.nn.softmax(logs, axis=1), jnp.asarray(self.directions)
+        variance = jnp.einsum("ia,kij,ja->ka", along, u.covs, along)
+        scale = jnp.where(variance > 0, variance, 1.0)[:, None]
+        away = (back.means.reshape(*shape, self.n) - u.means[:, None]) @ along / jnp.sqrt(scale)
+        inside = jnp.einsum("ia,kij,ja->ka", along, back.covs, along).reshape(*shape, along.shape[1]) / scale
+        mean = jnp.einsum("kc,kca->ka", share, away)
+        second = jnp.einsum("kc,kca->ka", share, inside + away**2) - mean**2
+        wrong = jnp.where(variance > 0, jnp.maximum(jnp.abs(mean), jnp.abs(second - 1.0)), 0.0)
+        mass = jnp.abs(jnp.expm1(jax.nn.logsumexp(logs, axis=1)))
+        worst = jnp.maximum(mass, jnp.max(wrong, axis=1, initial=0.0))
+        return jnp.where(jnp.isnan(worst), jnp.inf, worst)

@@ -109,7 +109,8 @@ class Kept(NamedTuple):
 
 
 class State(NamedTuple):
-    """Two normalised sums side by side (2, K, ...), the slots (2,) they may use, and the difference of their log-likelihoods.
+    """Two normalised sums side by side (2, K, ...), the slots (2,) they may use, how far the first was from the prior at the
+    start, and the difference of their log-likelihoods.
 
     The first is the result; the second has another number of slots, and how far it stands from the first tells how far the
     first may stand from the density.
@@ -117,6 +118,7 @@ class State(NamedTuple):
 
     pair: Components
     slots: Any
+    off: Any
     apart: Any
     time: Any
 
@@ -248,16 +250,15 @@ def observations(prepared: Prepared, data: Data) -> Factors:
 def init(prepared: Prepared, prior: Any) -> State:
     """The prior, cut into Gaussians and divided by e^phi."""
     static, model = prepared.static, prepared.model
-    own = model.theta()
+    own, t = model.theta(), model.start
 
-    def cut(theta):
-        return start.cut_prior(
-            model, prior, static.start_directions, theta, lambda u: static.gauge.divide(u, model.start, theta)
-        )
+    def divided(theta):
+        u = start.cut_prior(model, prior, static.start_directions, theta)
+        return u, static.gauge.divide(u, t, theta)
 
-    narrow = cut(prepared.theta)
+    u, narrow = divided(prepared.theta)
     with jax.ensure_compile_time_eval():
-        host = narrow if isinstance(prepared.theta, np.ndarray) else cut(own)
+        host = narrow if isinstance(prepared.theta, np.ndarray) else divided(own)[1]
         weights = np.asarray(_share_of_u(static, host, model.start, own)[0])
         loss = np.zeros(len(weights))
         if static.directions.shape[1]:
@@ -270,8 +271,11 @@ def init(prepared: Prepared, prior: Any) -> State:
         start.fitted(narrow, host, weights, loss, more * most, more * max(used, second), static.angles) for most in (used, second)
     ]
     both = jax.tree.map(lambda *a: jnp.stack(a), *pair)
-    both = jax.vmap(lambda v: _normalised(static, v, model.start, prepared.theta)[0])(both)
-    return State(both, jnp.array([used, second]), jnp.zeros(()), jnp.asarray(model.start, float))
+    off = start.difference(static.gauge.lift(pair[0], t, prepared.theta), start.given(model, prior), static.angles)
+    if not static.gauge.none:
+        off = jnp.maximum(off, jnp.max(static.gauge.doubt(u, narrow, t, prepared.theta)))
+    both = jax.vmap(lambda v: _normalised(static, v, t, prepared.theta)[0])(both)
+    return State(both, jnp.array([used, second]), off, jnp.zeros(()), jnp.asarray(t, float))
 
 
 def _share_of_u(static: Sum, v: Components, t: Any, theta: Any) -> tuple[jax.Array, jax.Array]:
@@ -326,8 +330,9 @@ def _told(static: Sum, state: State, observed: tuple[Components, Info], t: Any) 
         mean_error=jnp.max(distance) if known else jnp.nan * apart,
         deviation_error=jnp.max(jnp.abs(second / deviation - 1.0)) if known else jnp.nan * apart,
         evidence_error=jnp.abs(apart) if known else jnp.nan * apart,
+        start_error=state.off,
     )
-    return State(pair, state.slots, apart, jnp.asarray(t, float)), info
+    return State(pair, state.slots, state.off, apart, jnp.asarray(t, float)), info
 
 
 def _move(flow: Flow, v: Components, inputs: jax.Array) -> Components:
@@ -482,6 +487,7 @@ METHOD = Method(
         "mean_error": (0.04, "distance of the mean from that of a second sum with other slots, in standard deviations"),
         "deviation_error": (0.1, "relative distance of a standard deviation from that of the second sum"),
         "evidence_error": (0.04, "distance of the log-likelihood so far from that of the second sum"),
+        "start_error": (0.01, "distance of the first sum, or of a part of it, from the prior in mass, mean or variance"),
         "nonlinearity": (0.1, "relative entropy lost in one step by keeping one Gaussian where an observation made none"),
         "quadrature": (1e-2, "relative error of the masses of components, by two rules of quadrature"),
         "pruned": (1e-3, "weight of components that were dropped in one step"),
