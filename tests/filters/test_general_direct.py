@@ -158,15 +158,50 @@ PRIORS = {
 )  # fmt: skip
 def test_a_start_that_is_not_the_prior_is_said(prior, reduction):
     record = zakai.Record(np.array([0.01, 0.02]), np.array([[0.21], [0.14]]), "increments")
-    few = {"reduction": reduction, "components": 6}
-    wide = zakai.filter(benes(1.0, prior=PRIORS[prior]), record, "general-direct", **few)
+    wide = zakai.filter(benes(1.0, prior=PRIORS[prior]), record, "general-direct", reduction=reduction, components=6)
     assert any(line.startswith("start_error") for line in wide.warnings)
     if prior == "gaussian":
-        narrow = zakai.filter(benes(0.01), record, "general-direct", **few)
-        assert np.all(narrow.health["start_error"][1:] <= 0.01)
+        narrow = zakai.filter(benes(0.01), record, "general-direct", reduction=reduction)
+        assert np.all(narrow.health["start_error"][1:] <= 1e-4)
 
 
 def test_an_angle_that_is_cut_is_the_prior_still():
     model = zakai.load_model("gallery:encoder")
     _, record = zakai.simulate(model, model.start + np.array([0.1, 0.2]), seed=1)
     assert zakai.filter(model, record, "general-direct").health["start_error"][1] <= 1e-3
+
+
+def readings(step):
+    """Eight increments: small ones over a step of 1e-6 say that x is far out in the tails."""
+    return zakai.Record(step * np.arange(1, 9), np.random.default_rng(2).normal(size=(8, 1)) * 0.1 + 0.2, "increments")
+
+
+VARIANCES = [1e-8, 1e-4, 1e-2, 1.0, 10.0, 1e2, 1e4, 1e6, 1e8]
+
+
+@pytest.mark.parametrize(
+    ("variance", "step"),
+    [(1e4, 0.01), (1e4, 1e-6)]
+    + [pytest.param(v, h, marks=pytest.mark.slow) for v in VARIANCES for h in (1e-6, 0.01, 10.0) if v != 1e4 or h > 1],
+)
+def test_a_prior_of_any_width_over_the_bend_of_the_gauge_is_right_or_warned_of(variance, step):
+    model, record = benes(variance), readings(step)
+    exact, result = zakai.filter(model, record, "benes"), zakai.filter(model, record, "general-direct")
+    assert np.isfinite(result.mean).all() and np.isfinite(result.log_likelihood) and (result.variance > 0).all()
+    assert result.variance[0, 0] == pytest.approx(variance, rel=1e-3)
+    if not result.warnings:
+        mean, evidence = errors(result, exact)
+        assert mean <= 0.01 and evidence <= 0.01 and np.abs(result.variance / exact.variance - 1).max() <= 0.01
+    # Only what lies beyond 8.6 deviations of the prior is not there.
+    assert (not result.warnings) if step > 1e-6 else all(line.startswith("edge_weight") for line in result.warnings)
+
+
+@pytest.mark.slow
+def test_the_gradient_under_a_gauge_with_a_wide_prior_is_the_slope():
+    from zakai.filters.likelihood import log_likelihood
+
+    model = benes(1e3, drift=["a*tanh(a*x)"], observation=["c*x"], parameters={"a": 0.8, "c": 1.2})
+    value = log_likelihood(model, readings(0.1), "general-direct")
+    slope, step = jax.grad(value)(model.theta()), 1e-5 * np.eye(2)
+    expected = [(value(model.theta() + e) - value(model.theta() - e)) / 2e-5 for e in step]
+    assert np.allclose(slope, expected, rtol=1e-4, atol=1e-6)

@@ -115,6 +115,26 @@ def refit(
     return Refitted(new, moved, jax.lax.stop_gradient(_divergence(logs, values, z, log_mass, cov)), doubt)
 
 
+def refit_affine(sum_: Components, C: jax.Array, c: jax.Array, linear: jax.Array, energy: jax.Array) -> Components:
+    """The sum times exp(linear.h - h'(energy) h / 2), exactly, for h = C x + c with C (m, n) and c (m,)."""
+
+    def one(m, P):
+        centre = C @ m + c
+        slope = C.T @ (linear - energy @ centre)
+        spread = P @ C.T
+        # P (1 + C'E C P)^-1, by the smaller system in the observations.
+        inner = jnp.eye(len(c)) + energy @ C @ spread
+        gain = spread @ jnp.linalg.solve(inner, energy)
+        new = P - gain @ spread.T
+        new = 0.5 * (new + new.T)
+        shift = new @ slope
+        mass = linear @ centre - 0.5 * centre @ energy @ centre + 0.5 * slope @ shift - 0.5 * jnp.linalg.slogdet(inner)[1]
+        return m + shift, new, mass
+
+    mean, cov, mass = jax.vmap(one)(sum_.means, sum_.covs)
+    return Components(sum_.log_weights + mass, mean, cov, sum_.signs)
+
+
 def _divergence(logs: jax.Array, values: jax.Array, z: jax.Array, log_mass: jax.Array, cov: jax.Array) -> jax.Array:
     """The relative entropy (K,) of N(z; 0, 1) e^values, normalised, from the Gaussian with its moments."""
     weight = jax.nn.softmax(logs, axis=1)

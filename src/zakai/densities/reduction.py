@@ -272,8 +272,11 @@ def gathered(sum_: Components, label: np.ndarray, angles: tuple[int, ...] = ()) 
 
 def _gathered(sum_: Components, member: jax.Array, origin: jax.Array, angles: tuple[int, ...]) -> Components:
     """Groups (G, K) of components, each as one Gaussian; `origin` (G, n) is a mean of each group."""
-    top = jax.lax.stop_gradient(jnp.max(sum_.log_weights))
-    parts = member * jnp.exp(sum_.log_weights - top)
+    logs = jnp.where(member, sum_.log_weights, -jnp.inf)
+    # Each group has a scale of its own: the weights of two may be further apart than numbers go.
+    top = jax.lax.stop_gradient(jnp.max(logs, axis=1))
+    top = jnp.where(jnp.isfinite(top), top, 0.0)
+    parts = jnp.exp(logs - top[:, None])
     weight = jnp.sum(parts, axis=1)
     share = parts / jnp.where(weight > 0, weight, 1.0)[:, None]
     apart = wrapped(sum_.means[None] - origin[:, None], angles)

@@ -9,6 +9,7 @@ For any other phi each component of u is the Gaussian with the moments of e^{phi
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -42,6 +43,7 @@ class SumGauge:
         """phi at the points x (..., n)."""
         return self._potential(x, t, theta)[0]
 
+    @partial(jax.jit, static_argnums=0)
     def lift(self, v: Components, t: Any, theta: Any) -> Components:
         """The components of u = e^phi v: `count` for each of v, one after another."""
         if self.none:
@@ -57,20 +59,39 @@ class SumGauge:
             logs.reshape(-1), means.reshape(-1, self.n), jnp.repeat(v.covs, self.count, axis=0), jnp.repeat(v.signs, self.count)
         )
 
+    @partial(jax.jit, static_argnums=0)
     def divide(self, u: Components, t: Any, theta: Any) -> Components:
-        """Components of v = e^-phi u, each with its moments: for the start, where u is given."""
+        """Components of v = e^-phi u, each with its moments: for the start, where u is given.
+
+        Of a sum of exponentials the largest at the mean is divided out exactly, and quadrature is left with what differs from
+        it: far from a bend that is nothing, however far the division moves the component.
+        """
         if self.none:
             return u
-        return refit(u, lambda x: -self.potential(x, t, theta), self.directions, True).sum
+        if not self.exact:
+            return refit(u, lambda x: -self.potential(x, t, theta), self.directions, True).sum
+        numbers = self._numbers(jnp.zeros(self.n), t, theta)
+        largest = jnp.argmax(numbers[:, 0] + u.means @ numbers[:, 1:].T, axis=1)
+        constant, slope = numbers[largest, 0], numbers[largest, 1:]
+        across = jnp.einsum("kij,kj->ki", u.covs, slope)
+        logs = u.log_weights - constant - jnp.sum(slope * (u.means - 0.5 * across), axis=1)
 
-    def doubt(self, u: Components, v: Components, t: Any, theta: Any) -> jax.Array:
-        """By how much each component (K,) of u is another one when its quotient in v is lifted again.
+        def rest(x):
+            one = constant[:, None] + jnp.einsum("kqi,ki->kq", x, slope)
+            return one - jax.nn.logsumexp(x @ numbers[:, 1:].T + numbers[:, 0], axis=-1)
+
+        return refit(u._replace(log_weights=logs, means=u.means - across), rest, self.directions, True).sum
+
+    @partial(jax.jit, static_argnums=0)
+    def doubt(self, u: Components, t: Any, theta: Any) -> jax.Array:
+        """By how much each component (K,) of u is another one when it is divided and lifted again; an empty slot by nothing.
 
         The largest error of its mass, and along the directions of phi of its mean, in deviations, and of its variance; what is
         not a number counts as infinite.
         """
-        u, v = jax.lax.stop_gradient((u, v))
-        back = self.lift(v, t, theta)
+        used = jnp.isfinite(u.log_weights)
+        u = jax.lax.stop_gradient(u._replace(log_weights=jnp.where(used, u.log_weights, 0.0)))
+        back = jax.lax.stop_gradient(self.lift(self.divide(u, t, theta), t, theta))
         shape = (len(u.log_weights), -1)
         logs = back.log_weights.reshape(shape) - u.log_weights[:, None]
         share, along = jax.nn.softmax(logs, axis=1), jnp.asarray(self.directions)
@@ -83,4 +104,4 @@ class SumGauge:
         wrong = jnp.where(variance > 0, jnp.maximum(jnp.abs(mean), jnp.abs(second - 1.0)), 0.0)
         mass = jnp.abs(jnp.expm1(jax.nn.logsumexp(logs, axis=1)))
         worst = jnp.maximum(mass, jnp.max(wrong, axis=1, initial=0.0))
-        return jnp.where(jnp.isnan(worst), jnp.inf, worst)
+        return jnp.where(used, jnp.where(jnp.isnan(worst), jnp.inf, worst), 0.0)

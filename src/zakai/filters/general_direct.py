@@ -22,7 +22,7 @@ from zakai.algebra.theorems import yau_system
 from zakai.densities import GaussianMixture
 from zakai.densities.components import Components, moments, padded, shares, wrapped
 from zakai.densities.peaks import fit_dictionary, fit_peaks
-from zakai.densities.quadrature import Refitted, curvature, refit
+from zakai.densities.quadrature import Refitted, curvature, refit, refit_affine
 from zakai.densities.reduction import Exchanged, condensed, exchange, make_room
 from zakai.errors import InputError
 from zakai.filters import _gaussian_start as start
@@ -39,6 +39,8 @@ from zakai.models.prior import GaussianPrior, MixturePrior
 # Slots by the number of directions in which the components must be narrow.
 SLOTS = {0: 1, 1: 20, 2: 64, 3: 128}
 MOST_DIRECTIONS = 5
+# Up to so many directions the start of an affine h, which is exact from there on, stays as it was cut.
+MOST_WHOLE = 2
 TOLERANCE = 1e-3
 # How often components are split for a reading that comes all at once, and how many slots more there are while it does.
 ROUNDS = 5
@@ -69,7 +71,7 @@ class Sum:
             raise InputError(
                 f"{model.source}: h and phi vary in {k} directions of the state; quadrature takes {MOST_DIRECTIONS} at most"
             )
-        self.slots = SLOTS.get(k, 192) if slots is None else slots
+        self.asked, self.slots = slots, SLOTS.get(k, 192) if slots is None else slots
         self.reduction, self.tolerance, self.alpha = reduction, tolerance, alpha
         self.rounds = rounds
         self.sampled = model.observation_kind == "samples"
@@ -78,11 +80,12 @@ class Sum:
 
     def limits(self, count: int) -> tuple[int, int]:
         """How many slots the sum and its companion may use, for a prior that was cut into `count` Gaussians."""
-        used = min(self.slots, count) if self.affine else self.slots
-        if not self.start_directions.shape[1]:
+        k = self.start_directions.shape[1]
+        if k == 0 or self.affine and self.asked is None and k <= MOST_WHOLE:
             # Nothing is put together.
             used = count if self.affine else self.slots
             return used, used
+        used = min(self.slots, count) if self.affine else self.slots
         return used, round(0.7 * used) if used >= 8 else used + 4
 
 
@@ -109,8 +112,8 @@ class Kept(NamedTuple):
 
 
 class State(NamedTuple):
-    """Two normalised sums side by side (2, K, ...), the slots (2,) they may use, how far the first was from the prior at the
-    start, and the difference of their log-likelihoods.
+    """Two normalised sums side by side (2, K, ...), the slots (2,) they may use, which (K,) are the outermost of the start,
+    how far the first was from the prior there, and the difference of their log-likelihoods.
 
     The first is the result; the second has another number of slots, and how far it stands from the first tells how far the
     first may stand from the density.
@@ -118,6 +121,7 @@ class State(NamedTuple):
 
     pair: Components
     slots: Any
+    edge: Any
     off: Any
     apart: Any
     time: Any
@@ -252,13 +256,15 @@ def init(prepared: Prepared, prior: Any) -> State:
     static, model = prepared.static, prepared.model
     own, t = model.theta(), model.start
 
-    def divided(theta):
-        u = start.cut_prior(model, prior, static.start_directions, theta)
-        return u, static.gauge.divide(u, t, theta)
+    def cut(theta):
+        doubt = None if static.gauge.none else lambda u: static.gauge.doubt(u, t, own)
+        far = static.affine and static.asked is None
+        u, edge = start.cut_prior(model, prior, static.start_directions, theta, doubt, far)
+        return u, static.gauge.divide(u, t, theta), edge
 
-    u, narrow = divided(prepared.theta)
+    u, narrow, edge = cut(prepared.theta)
     with jax.ensure_compile_time_eval():
-        host = narrow if isinstance(prepared.theta, np.ndarray) else divided(own)[1]
+        host = narrow if isinstance(prepared.theta, np.ndarray) else cut(own)[1]
         weights = np.asarray(_share_of_u(static, host, model.start, own)[0])
         loss = np.zeros(len(weights))
         if static.directions.shape[1]:
@@ -273,17 +279,21 @@ def init(prepared: Prepared, prior: Any) -> State:
     both = jax.tree.map(lambda *a: jnp.stack(a), *pair)
     off = start.difference(static.gauge.lift(pair[0], t, prepared.theta), start.given(model, prior), static.angles)
     if not static.gauge.none:
-        off = jnp.maximum(off, jnp.max(static.gauge.doubt(u, narrow, t, prepared.theta)))
+        off = jnp.maximum(off, jnp.max(static.gauge.doubt(u, t, prepared.theta)))
     both = jax.vmap(lambda v: _normalised(static, v, t, prepared.theta)[0])(both)
-    return State(both, jnp.array([used, second]), off, jnp.zeros(()), jnp.asarray(t, float))
+    # Once components are traded or put together, none of them is the outermost for good.
+    edge = jnp.asarray(edge if static.affine and len(edge) <= used else np.zeros(both.log_weights.shape[1]))
+    return State(both, jnp.array([used, second]), edge, off, jnp.zeros(()), jnp.asarray(t, float))
 
 
+@partial(jax.jit, static_argnums=0)
 def _share_of_u(static: Sum, v: Components, t: Any, theta: Any) -> tuple[jax.Array, jax.Array]:
     """The share in u of each component of v (K,), and the logarithm of the mass of u."""
     share, log_mass = shares(static.gauge.lift(v, t, theta))
     return share.reshape(len(v.log_weights), -1).sum(axis=1), log_mass
 
 
+@partial(jax.jit, static_argnums=0)
 def _normalised(static: Sum, v: Components, t: Any, theta: Any) -> tuple[Components, jax.Array, Components, jax.Array]:
     """v so that u = e^phi v has mass one; the logarithm of its mass; u, and the shares of its components."""
     u = static.gauge.lift(v, t, theta)
@@ -299,7 +309,7 @@ def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State
     precision = noise_at(model, np.array([model.start]), prepared.theta)
     precision = jnp.linalg.inv(jnp.asarray(precision))[0]
     static, theta = prepared.static, prepared.theta
-    told = jax.vmap(lambda v, slots: _observe(static, v, slots, first.after, first, precision, model.start, theta))
+    told = jax.vmap(lambda v, slots: _observe(static, v, slots, state.edge, first.after, first, precision, model.start, theta))
     return _told(static, state, told(state.pair, state.slots), model.start)
 
 
@@ -313,7 +323,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
         v = _move(interval.flow, v, observation.inputs)
         if static.angles:
             v = v._replace(means=wrapped(v.means, static.angles))
-        return _observe(static, v, slots, observation.after, observation, interval.precision, interval.stop, theta)
+        return _observe(static, v, slots, state.edge, observation.after, observation, interval.precision, interval.stop, theta)
 
     return _told(static, state, jax.vmap(one)(state.pair, state.slots), interval.stop)
 
@@ -332,7 +342,7 @@ def _told(static: Sum, state: State, observed: tuple[Components, Info], t: Any) 
         evidence_error=jnp.abs(apart) if known else jnp.nan * apart,
         start_error=state.off,
     )
-    return State(pair, state.slots, state.off, apart, jnp.asarray(t, float)), info
+    return State(pair, state.slots, state.edge, state.off, apart, jnp.asarray(t, float)), info
 
 
 def _move(flow: Flow, v: Components, inputs: jax.Array) -> Components:
@@ -347,7 +357,7 @@ def _move(flow: Flow, v: Components, inputs: jax.Array) -> Components:
     return jax.lax.scan(part, v, flow)[0]
 
 
-def _observe(static: Sum, v: Components, slots, after, factor: Factors, precision, t, theta) -> tuple[Components, Info]:
+def _observe(static: Sum, v: Components, slots, edge, after, factor: Factors, precision, t, theta) -> tuple[Components, Info]:
     """The factor at the end of an interval, and what the step tells."""
     zero = jnp.zeros(())
     pruned, together = zero, zero
@@ -389,6 +399,7 @@ def _observe(static: Sum, v: Components, slots, after, factor: Factors, precisio
         "merged": together,
         "components": 1.0 / jnp.sum(share**2),
         "surprise": moved / 5.0,
+        "edge_weight": jnp.sum(share * edge) if static.affine else jnp.zeros(()),
     }
     return v, Info(log_mass, mean, cov, health)
 
@@ -440,23 +451,8 @@ def _multiply_affine(static: Sum, v: Components, linear, energy, constant, t, th
     n = v.means.shape[1]
     c = jnp.stack(static.system.observe(jnp.zeros((1, n)), t, theta), -1)[0]
     C = jnp.stack(static.system.observe(jnp.eye(n), t, theta), 0) - c[:, None]
-    energy = jnp.zeros((len(c), len(c))) if energy is None else energy
-
-    def one(m, P):
-        centre = C @ m + c
-        slope = C.T @ (linear - energy @ centre)
-        spread = P @ C.T
-        # P (1 + C'E C P)^-1, by the smaller system in the observations.
-        inner = jnp.eye(len(c)) + energy @ C @ spread
-        gain = spread @ jnp.linalg.solve(inner, energy)
-        new = P - gain @ spread.T
-        new = 0.5 * (new + new.T)
-        shift = new @ slope
-        mass = linear @ centre - 0.5 * centre @ energy @ centre + 0.5 * slope @ shift - 0.5 * jnp.linalg.slogdet(inner)[1]
-        return m + shift, new, mass
-
-    mean, cov, mass = jax.vmap(one)(v.means, v.covs)
-    return Components(v.log_weights + mass + constant, mean, cov, v.signs)
+    told = refit_affine(v, C, c, linear, jnp.zeros((len(c), len(c))) if energy is None else energy)
+    return told._replace(log_weights=told.log_weights + constant)
 
 
 def density(prepared: Prepared, state: State | Kept) -> GaussianMixture:
@@ -492,6 +488,7 @@ METHOD = Method(
         "quadrature": (1e-2, "relative error of the masses of components, by two rules of quadrature"),
         "pruned": (1e-3, "weight of components that were dropped in one step"),
         "merged": (0.1, "loss by putting components together for lack of room"),
+        "edge_weight": (1e-6, "weight of the outermost Gaussians of the start: the posterior is in tails that it has not"),
         "surprise": (1.0, "how far the observation drives the density into the tails of single Gaussians"),
     },
 )
