@@ -75,7 +75,7 @@ def all_zero(expressions: Sequence[sp.Expr]) -> bool | None:
 def is_quadratic(q: sp.Expr, x: Sequence[sp.Symbol]) -> bool | None:
     """Whether q is a polynomial of degree two at most in x, its coefficients being any functions of the other symbols.
 
-    Its third differences along random lines refute; a zero third derivative proves.
+    Its third differences along random lines refute; a zero third derivative proves, if q is the same formula everywhere.
     """
     others = sorted(q.free_symbols - set(x), key=lambda s: s.name)
     vanished = 0
@@ -92,7 +92,7 @@ def is_quadratic(q: sp.Expr, x: Sequence[sp.Symbol]) -> bool | None:
         vanished += 1
     if q.count_ops() <= SHORT:
         thirds = [sp.diff(q, a, b, c) for i, a in enumerate(x) for j, b in enumerate(x[i:], i) for c in x[j:]]
-        if all(_provably_zero(third) for third in thirds):
+        if is_in_one_piece(q, x) and all(_provably_zero(third) for third in thirds):
             return True
     return True if vanished >= POINTS and _is_analytic(q) else None
 
@@ -153,15 +153,44 @@ def _vanishes(expression: sp.Expr, point: Mapping[sp.Symbol, mpmath.mpf]) -> boo
 
 
 def _is_analytic(expression: sp.Expr) -> bool:
-    """Whether the expression is analytic for all real values of its symbols, as far as its form shows."""
+    """Whether the expression, as far as its form shows, is analytic on the real line but for isolated points that a path through
+    the complex plane goes around, so that what holds somewhere holds everywhere."""
     for e in sp.preorder_traversal(expression):
         if isinstance(e, sp.Function):
             inside = isinstance(e, sp.log) and isinstance(e.args[0], sp.cosh)
-            if not (isinstance(e, _ENTIRE) or inside):
+            if not (isinstance(e, _ENTIRE) or inside) or isinstance(e, sp.atan | sp.log) and _has_poles(e.args[0]):
                 return False
         elif isinstance(e, sp.Pow) and not (e.exp.is_Integer or not e.base.free_symbols):
             return False
     return True
+
+
+def is_in_one_piece(expression: sp.Expr, x: Sequence[sp.Symbol]) -> bool:
+    """Whether what the expression is, as a function of x, on an interval, as far as its form shows, it is wherever it exists.
+
+    asin(sin(x)), atan(tan(x)), atan(1/x) and sqrt(x**2) have different formulas in different places, each as smooth as can be.
+    """
+    for e in sp.preorder_traversal(expression):
+        if not e.has(*x):
+            continue
+        if isinstance(e, sp.Abs | sp.sign | sp.asin | sp.acos):
+            return False
+        if isinstance(e, sp.atan) and _has_poles(e.args[0]):
+            return False
+        root = e.base if isinstance(e, sp.Pow) and not e.exp.is_Integer else e.args[0] if isinstance(e, sp.log) else None
+        # A domain that is a half-space or everything is connected.
+        if root is not None and not root.is_positive and any(sp.diff(root, s).has(*x) for s in x):
+            return False
+    return True
+
+
+def _has_poles(expression: sp.Expr) -> bool:
+    """Whether the expression may have no value at some real point, as far as its form shows."""
+    return any(
+        isinstance(e, sp.tan | sp.cot | sp.sec | sp.csc | sp.coth | sp.csch)
+        or (isinstance(e, sp.Pow) and e.exp.is_negative is not False and not (e.base.is_positive or e.base.is_negative))
+        for e in sp.preorder_traversal(expression)
+    )
 
 
 def _provably_zero(expression: sp.Expr) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 import sympy as sp
 
 from zakai.algebra.conditions import Condition
-from zakai.algebra.identities import all_zero, is_zero
+from zakai.algebra.identities import all_zero, is_in_one_piece, is_zero
 from zakai.algebra.yau import (
     NoYauForm,
     Quadratic,
@@ -66,14 +66,19 @@ def affine_observation(model: Model) -> tuple[sp.ImmutableMatrix, sp.ImmutableMa
 def affine_parts(
     field: sp.MatrixBase, x: tuple[sp.Symbol, ...]
 ) -> tuple[sp.ImmutableMatrix, sp.ImmutableMatrix] | None:
-    """C and c if the field is C x + c, else None."""
+    """C and c if the field is C x + c for all x, else None."""
     slope = sp.Matrix([[sp.diff(entry, symbol) if entry.has(symbol) else sp.Integer(0) for symbol in x] for entry in field])
     # Where a derivative still contains the state it may do so in name only.
     seconds = [sp.diff(entry, symbol) for entry in slope for symbol in entry.free_symbols & set(x)]
     if all_zero(seconds) is not True:
         return None
     origin = {symbol: sp.Integer(0) for symbol in x}
-    return sp.ImmutableMatrix(slope.xreplace(origin)), sp.ImmutableMatrix(field.xreplace(origin))
+    slope, intercept = slope.xreplace(origin), field.xreplace(origin)
+    # The slope of asin(sin(x)) is constant in each of its pieces, and not the same in all.
+    if not all(is_in_one_piece(entry, x) for entry in field):
+        if all_zero(list(field - slope * sp.Matrix(x) - intercept)) is not True:
+            return None
+    return sp.ImmutableMatrix(slope), sp.ImmutableMatrix(intercept)
 
 
 def yau_system(model: Model) -> YauSystem | None:
