@@ -109,3 +109,10 @@ def test_an_array_and_a_dataset_of_xarray_give_the_same_record():
         Record.from_xarray(array.expand_dims("other"), "samples")
     with pytest.raises(InputError, match="takes a DataArray or a Dataset"):
         Record.from_xarray([1.0], "samples")
+
+
+def test_a_masked_cell_was_not_observed():
+    values = np.ma.array([[1.0], [9.0]], mask=[[False], [True]])
+    assert np.isnan(Record([1.0, 2.0], values, "samples").values[1, 0])
+    whole = np.ma.array([[1], [9]], mask=[[False], [True]])
+    assert np.isnan(Record([1.0, 2.0], whole, "samples").values[1, 0])

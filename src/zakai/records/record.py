@@ -26,8 +26,8 @@ class Record:
 
     Arguments:
         times: (K,), in the model's unit of time, strictly increasing, at least one.
-        values: (K, m), in the model's units; nan is "this coordinate was not observed here". (K,) is taken as
-            (K, 1).
+        values: (K, m), in the model's units; nan, or a masked cell, is "this coordinate was not observed here". (K,) is taken
+            as (K, 1).
         kind: "increments", "path", "rates" or "samples".
 
     Both arrays are copied to float64 and cannot be written to.
@@ -185,8 +185,10 @@ def early(first: float, kind: str, start: float) -> str | None:
 
 
 def _numbers(array: Any, name: str) -> np.ndarray:
-    """A fresh float64 copy; text, dates, durations and complex numbers are refused."""
+    """A fresh float64 copy, nan where it is masked; text, dates, durations and complex numbers are refused."""
     try:
+        if isinstance(array, np.ma.MaskedArray) and array.dtype.kind in "biuf":
+            array = array.astype(np.float64).filled(np.nan)
         array = np.asarray(array)
         texts = array.dtype.kind == "O" and any(isinstance(item, str | bytes) for item in array.flat)
         if texts or array.dtype.kind not in "biufO":
