@@ -44,6 +44,10 @@ METHODS = {
         "zakai.filters.gaussian_sum",
         "the same for systems that do not depend on time (the survey's Algorithm 2); only when it is asked for",
     ),
+    "wei-norman": Entry(
+        "zakai.filters.wei_norman",
+        "for finite estimation algebras in one to three states, exp(t L0) on a lattice; only when it is asked for",
+    ),
     "extended-kalman-bucy": Entry(
         "zakai.filters.extended_kalman_bucy",
         "approximate for any smooth system: linearised at the mean, one Gaussian; only when it is asked for",

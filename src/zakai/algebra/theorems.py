@@ -12,6 +12,7 @@ import sympy as sp
 
 from zakai.algebra.conditions import Condition
 from zakai.algebra.exact_theorems import benes, hu_yau, kalman_bucy
+from zakai.algebra.exponentials import wei_norman_filter
 from zakai.algebra.identities import all_zero
 from zakai.algebra.systems import (
     CLY,
@@ -162,6 +163,7 @@ THEOREMS: Mapping[str, Callable[[Model], tuple[Condition, ...]]] = {
     "limited-direct": limited_direct,
     "general-direct": general_direct,
     "gaussian-sum": gaussian_sum,
+    "wei-norman": wei_norman_filter,
     "extended-kalman-bucy": smooth_system,
 }
 
@@ -178,5 +180,6 @@ __all__ = [
     "kalman_bucy",
     "limited_direct",
     "smooth_system",
+    "wei_norman_filter",
     "yau_system",
 ]
