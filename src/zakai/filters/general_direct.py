@@ -162,9 +162,12 @@ class Prepared:
     def notes(self) -> tuple[str, ...]:
         """Where the method is not exact in its class, for the warnings of a result."""
         gaps = not self.schedule.inside.all() and not self.static.sampled
+        plain = self.static.reduction
+        blind = () if plain == "split-merge" else (f'the reduction "{plain}" has no error figures: its error is not known',)
         if self.static.system.bare or not gaps:
-            return ()
+            return blind
         return (
+            *blind,
             "where readings are missing the transition without the observation's potential is not linear-quadratic: its "
             "potential is kept inside and taken out again at the end, which is exact only as the intervals shrink",
         )
