@@ -166,8 +166,11 @@ def test_a_start_that_is_not_the_prior_is_said(prior, reduction):
 
 
 def test_an_angle_that_is_cut_is_the_prior_still():
-    model = zakai.load_model("gallery:encoder")
-    _, record = zakai.simulate(model, model.start + np.array([0.1, 0.2]), seed=1)
+    model = zakai.Model(
+        state=["a"], drift=["0"], observation=["sin(a)", "cos(a)"], periodic=["a"],
+        prior={"kind": "gaussian", "mean": [0.5], "cov": [[1.0]]},
+    )  # fmt: skip
+    record = zakai.Record(np.array([0.1]), np.array([[0.1, 0.05]]), "increments")
     assert zakai.filter(model, record, "general-direct").health["start_error"][1] <= 1e-3
 
 
@@ -205,3 +208,31 @@ def test_the_gradient_under_a_gauge_with_a_wide_prior_is_the_slope():
     slope, step = jax.grad(value)(model.theta()), 1e-5 * np.eye(2)
     expected = [(value(model.theta() + e) - value(model.theta() - e)) / 2e-5 for e in step]
     assert np.allclose(slope, expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("reduction", ["algorithm-1", "nnls"])
+def test_a_reduction_without_error_figures_says_that_it_has_none(reduction):
+    model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]})
+    record = zakai.Record(np.array([0.1]), np.array([[0.05]]), "increments")
+    (line,) = zakai.filter(model, record, "general-direct", reduction=reduction).warnings
+    assert reduction in line and "no error figures" in line
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_points_of_no_variance_are_put_together_without_a_division_by_zero():
+    points = {"kind": "mixture", "weights": [0.3, 0.3, 0.4], "means": [[0.0], [0.1], [2.0]], "covs": [[[0.0]], [[0.0]], [[1.0]]]}
+    record = zakai.Record(np.array([0.01]), np.array([[0.1]]), "increments")
+    result = zakai.filter(benes(1.0, prior=points), record, "general-direct", components=10)
+    assert np.isfinite(result.mean).all() and result.mean[0, 0] == pytest.approx(0.83, abs=0.01)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("n", [1, 2])
+def test_groups_of_what_is_no_number_and_of_equal_points_are_found_in_the_end(n):
+    from zakai.densities.reduction import groups
+
+    for means in (np.zeros((5, n)), np.arange(5.0)[:, None] * np.ones(n), np.full((5, n), np.nan)):
+        label = groups(np.full(5, 0.2), means, np.zeros((5, n, n)), np.zeros(5), 2)
+        assert len(label) == 5 and label.max() <= 1
+    label = groups(np.full(3, 1 / 3), np.array([[0.0], [1e-3], [9.0]]) * np.ones(n), np.zeros((3, n, n)), np.zeros(3), 2)
+    assert label[0] == label[1] != label[2]

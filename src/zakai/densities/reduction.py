@@ -18,6 +18,8 @@ import numpy as np
 from zakai.densities.components import Components, wrapped
 
 PRUNED = 1e-7
+# A component of no variance counts as one of this share of the others'; what is further apart than _FAR is just far.
+_POINT, _TINY, _FAR = 1e-12, 1e-100, 1e100
 # A split leaves about a quarter of a loss that is quadratic in the variance.
 GAINED = 0.75
 
@@ -43,19 +45,19 @@ def pair_costs(share: Any, means: Any, covs: Any, loss: Any, angles: tuple[int, 
     apart = means[:, None] - means
     apart = wrapped(apart, angles) if angles else apart
     if n == 1:
-        variance = covs[:, 0, 0]
+        variance = xp.maximum(covs[:, 0, 0], _POINT * (share @ covs[:, 0, 0]) + _TINY)
         distance = apart[..., 0] ** 2 / (alpha * variance[:, None] + beta * variance)
         ratio = variance[:, None] / variance
         unlike = ratio + 1.0 / ratio - 2.0
     else:
         scale = xp.einsum("k,kii->i", share / xp.sum(share), covs)
-        inverse = xp.linalg.inv(covs + 1e-12 * xp.eye(n) * scale)
+        inverse = xp.linalg.inv(covs + xp.eye(n) * (_POINT * scale + _TINY))
         one_way = xp.einsum("ija,iab,ijb->ij", apart, inverse, apart)
         # The inverse is convex, so that this bounds the distance in the pair's own covariance.
         distance = alpha * one_way + beta * one_way.T
         trace = xp.einsum("iab,jba->ij", inverse, covs)
         unlike = xp.maximum(trace + trace.T - 2.0 * n, 0.0)
-    between = product * distance
+    between = xp.minimum(product * distance, _FAR)
     inside = between / (1.0 + between)
     shape = xp.minimum(
         0.5 * xp.log1p(between), inside**3 * ((1.0 - 2.0 * alpha) ** 2 + inside / 4.0) / (12.0 * product)
@@ -63,7 +65,9 @@ def pair_costs(share: Any, means: Any, covs: Any, loss: Any, angles: tuple[int, 
     # What the pair would lose as one, beyond what the two lose now.
     bent = xp.maximum(loss[:, None], loss) * (1.0 + between) ** 2 - alpha * loss[:, None] - beta * loss
     dead = (share[:, None] <= 0) | (share <= 0) | xp.eye(len(share), dtype=bool)
-    return xp.where(dead, xp.inf, both * (bent + shape))
+    cost = both * (bent + shape)
+    # Two whose cost does not exist are the last that are put together, and not the first.
+    return xp.where(dead, xp.inf, xp.where(xp.isnan(cost), _FAR, cost))
 
 
 def exchange(
@@ -163,10 +167,15 @@ def condensed(
         cov = jnp.where(first[:, None, None], a * covs + (1 - a) * covs[nearest] + between, covs)
         label = jnp.where(second[label], nearest[label], label)
         share = jnp.where(first, total, jnp.where(second, 0.0, share))
-        return share, mean, cov, label, cost + jnp.sum(jnp.where(first, least, 0.0))
+        # Where no two are each other's nearest the rest is lost, and that is said.
+        cost = jnp.where(jnp.any(first), cost + jnp.sum(jnp.where(first, least, 0.0)), jnp.inf)
+        return share, mean, cov, label, cost
+
+    def more(carry):
+        return (jnp.sum(carry[0] > 0) > most) & jnp.isfinite(carry[4])
 
     start = (share, means, covs, index, jnp.zeros(()))
-    share, _, _, label, cost = jax.lax.while_loop(lambda carry: jnp.sum(carry[0] > 0) > most, together, start)
+    share, _, _, label, cost = jax.lax.while_loop(more, together, start)
     leaders = jnp.argsort(share <= 0)[:slots]
     member = (label == leaders[:, None]) & (share[leaders] > 0)[:, None]
     return _gathered(sum_, member, sum_.means[leaders], angles), cost
@@ -246,6 +255,10 @@ def groups(
         costs = np.asarray(pair_costs(share, means, covs, loss, angles, np))
         nearest = costs.argmin(axis=1)
         first = np.flatnonzero((nearest[nearest] == np.arange(len(share))) & (np.arange(len(share)) < nearest) & (share > 0))
+        if not len(first):
+            # No two are each other's nearest: the one that weighs least goes to its own.
+            least = int(np.argmin(np.where(share > 0, share, np.inf)))
+            first, nearest[nearest[least]] = np.array([nearest[least]]), least
         cost = costs[first, nearest[first]]
         first = first[np.argsort(cost, kind="stable")][: max(1, min(excess, (len(first) + 1) // 2))]
         second = nearest[first]
@@ -254,10 +267,12 @@ def groups(
         apart = np.asarray(wrapped(jnp.asarray(means[first] - means[second]), angles))
         means[first] = means[second] + alpha[:, None] * apart
         alpha = alpha[:, None, None]
-        old = np.trace(covs[first] + covs[second], axis1=1, axis2=2) / 2
+        old = np.trace(covs[first] + covs[second], axis1=1, axis2=2) / 2 + _TINY
         covs[first] = alpha * covs[first] + (1 - alpha) * covs[second]
         covs[first] += alpha * (1 - alpha) * apart[:, :, None] * apart[:, None, :]
-        loss[first] = np.maximum(loss[first], loss[second]) * (np.trace(covs[first], axis1=1, axis2=2) / old) ** 2
+        loss[first] = np.maximum(loss[first], loss[second]) * np.minimum(
+            np.trace(covs[first], axis1=1, axis2=2) / old, 1 / _POINT
+        ) ** 2
         share[first], share[second] = total, 0.0
         for i, j in zip(first, second):
             label[label == j] = i
