@@ -165,6 +165,39 @@ def test_three_states_with_a_passive_drift_are_as_the_equation_says():
     as_the_equation_says(model, record, box, drift, divergence, lambda x, t: 2 * x[..., :1], np.eye(1), 1e-8)
 
 
+@pytest.mark.slow
+def test_the_observed_block_of_three_states_is_kalman_and_bucys():
+    model = zakai.load_model("gallery:passive-drift")
+    record = record_of(model, np.arange(1, 9) * 0.05, seed=2)
+    result = zakai.filter(model, record, "wei-norman")
+    # x1 and x2 + x3 are a linear system by themselves.
+    block = zakai.Model(
+        state=["a", "s"],
+        drift=["a + s", "2*a - s + 0.1"],
+        diffusion=[["1", "0"], ["0", "sqrt(2)"]],
+        observation=["2*a"],
+        prior={"kind": "gaussian", "mean": [0, 0], "cov": [0.1, 0.2]},
+    )
+    exact = zakai.filter(block, record, "kalman-bucy")
+    seen = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]])
+    assert np.allclose(result.mean @ seen.T, exact.mean, rtol=0, atol=1e-6)
+    assert np.allclose(seen @ result.cov @ seen.T, exact.cov, rtol=0, atol=5e-6)
+    assert np.allclose(result.log_likelihood_increments, exact.log_likelihood_increments, rtol=0, atol=1e-6)
+    assert result.warnings == []
+
+
+@pytest.mark.slow
+def test_what_it_cannot_resolve_is_said():
+    slanted = zakai.Model(
+        state=["a", "b"],
+        drift=["-a", "b - a"],
+        observation=["a", "b"],
+        prior={"kind": "gaussian", "mean": [0, 0], "cov": [[1, 0.99], [0.99, 1]]},
+    )
+    result = zakai.filter(slanted, zakai.Record([0.05], [[0.1, 0.1]], "increments"), "wei-norman")
+    assert any("aliasing" in said for said in result.warnings)
+
+
 @pytest.mark.parametrize("variance", [pytest.param(1e-6, marks=pytest.mark.slow), 1e-2, 1e4])
 def test_a_narrow_or_wide_prior_is_kalman_and_bucys(variance):
     model = line("1 - x/2", {"kind": "gaussian", "mean": [2.0], "cov": [[variance]]})
