@@ -118,6 +118,7 @@ def test_two_linear_states_with_readings_missing_are_kalman_and_bucys(kind):
     record = record_of(model, np.arange(1, 17) * 0.05, missing=[(3, 0), (4, 0), (7, 1), (9, 0), (9, 1)])
     result, exact = zakai.filter(model, record, "wei-norman"), zakai.filter(model, record, "kalman-bucy")
     same(result, exact, 1e-8)
+    assert result.warnings == exact.warnings
 
 
 def test_a_passive_state_that_is_not_linear_is_as_the_equation_says():

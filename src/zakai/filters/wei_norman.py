@@ -194,7 +194,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
         r = jnp.where(interval.whole, system.advanced(coefficients, state.statistics, rates, tau), state.statistics)
         state = replace(state, field=field, statistics=r, log_scale=state.log_scale + scale - level * tau)
         shift, logs = system.product(directions, r, points, theta)
-        exponent, density = _reach(field.values, logs)
+        ranging, exponent, density = _reach(field.values, logs)
         state = _driven(state, generator, density, shift, tau)
         far = jnp.max(jnp.abs(shift) / (field.cell * np.array(field.values.shape))) > _SHIFT
         health = _Health(
@@ -204,7 +204,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
             jnp.maximum(health.surprise, jnp.max(jnp.abs(state.driven))),
             health.parts + 1,
         )
-        again = (exponent > _RESTART) | far
+        again = (ranging > _RESTART) | far
         state = jax.tree.map(partial(jnp.where, again), _as_one(state, shift, logs), state)
         return state, left - tau, health, jnp.where(again, 0.0, shift), jnp.where(again, 0.0, logs)
 
@@ -263,10 +263,14 @@ def _driven(state, generator, density, shift, tau):
 
 
 def _reach(values, logs):
-    """Over how much the logarithm of a multiplier ranges where the density matters; and that density."""
-    density = values * jnp.exp(logs - lax.stop_gradient(jnp.max(logs)))
-    matters = density > _MATTERS * jnp.max(density)
-    return jnp.max(jnp.where(matters, logs, -jnp.inf)) - jnp.min(jnp.where(matters, logs, jnp.inf)), density
+    """Over how much the logarithm of a multiplier ranges where the density matters; by how much it amplifies what rounding left
+    of the tails, relative to the density's maximum; and that density, but for a factor."""
+    top = lax.stop_gradient(jnp.max(jnp.where(values > 0, logs, -jnp.inf)))
+    density = values * jnp.exp(jnp.minimum(logs - top, 0.0))
+    highest = jnp.max(density)
+    matters = density > _MATTERS * highest
+    ranging = jnp.max(jnp.where(matters, logs, -jnp.inf)) - jnp.min(jnp.where(matters, logs, jnp.inf))
+    return ranging, -jnp.log(highest), density
 
 
 def _formed(state: State) -> State:
@@ -287,10 +291,17 @@ def _read(state: State, observation: Factors, health: _Health) -> tuple[State, _
     h = state.system.observed(state.field.points(), 0.0, state.theta)
     logs = sum((observation.after[i] * a for i, a in enumerate(h)), start=jnp.zeros(state.field.values.shape))
     logs = logs - 0.5 * sum(observation.energy[i, j] * a * b for i, a in enumerate(h) for j, b in enumerate(h))
-    exponent, density = _reach(state.field.values, logs)
+    _, exponent, density = _reach(state.field.values, logs)
+    _, before, cov = lax.stop_gradient(spectral.moments(state.field))
     state = _as_one(state, jnp.zeros(state.field.low.shape), logs + observation.constant)
-    worst = jnp.maximum(health.aliasing, spectral.aliasing(density))
-    return state, health._replace(aliasing=worst, exponent=jnp.maximum(health.exponent, exponent))
+    mean = lax.stop_gradient(spectral.moments(state.field)[1])
+    driven = state.driven + (mean - before) / jnp.sqrt(jnp.diagonal(cov))
+    health = health._replace(
+        aliasing=jnp.maximum(health.aliasing, spectral.aliasing(density)),
+        exponent=jnp.maximum(health.exponent, exponent),
+        surprise=jnp.maximum(health.surprise, jnp.max(jnp.abs(driven))),
+    )
+    return replace(state, mean=mean, driven=driven), health
 
 
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
