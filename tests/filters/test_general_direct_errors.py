@@ -213,3 +213,17 @@ def test_four_states_with_a_nonlinear_observation_of_two_run_and_report_their_er
     assert np.isfinite(result.mean).all() and np.isfinite(result.log_likelihood) and (result.variance > 0).all()
     assert np.nanmax(result.health["mean_error"]) < 0.2
     assert np.all(np.abs(result.mean[1:] - truth.values[1:]) <= 5 * np.sqrt(result.variance[1:]))
+
+
+@pytest.mark.slow
+def test_the_error_falls_with_the_number_of_slots():
+    model = zakai.load_model("gallery:spiral-sensor")
+    records = [zakai.simulate(model, np.arange(1, 201) * 0.01, seed=seed)[1] for seed in range(1, 10)]
+    exact = zakai.filter(model, records, "limited-direct", keep="moments")
+    errors = []
+    for slots in (10, 20, 40):
+        results = zakai.filter(model, records, "general-direct", components=slots, keep="moments")
+        away = [np.sqrt(np.mean((one.mean - other.mean) ** 2 / other.variance)) for one, other in zip(results, exact)]
+        # A mode that was dropped decides about a single path.
+        errors.append(np.median(away))
+    assert errors[0] >= 1.5 * errors[1] >= 2.25 * errors[2]
