@@ -105,7 +105,9 @@ def definite_covariance(model: Model) -> Condition:
     """G = g Q g' is positive definite; at the times of a record it is checked again."""
     source = f"{CLY}, Assumption 1"
     statement = "G = g Q g' is positive definite"
-    determinant = sp.factor(model.covariance.det())
+    determinant = model.covariance.det()
+    if determinant.is_polynomial(*determinant.free_symbols):  # a factor exp(-1000 t) would be one of degree 1000
+        determinant = sp.factor(determinant)
     if is_zero(determinant):
         return Condition(statement, False, "det G = 0", source)
     evaluate = numpy_function(model.covariance, model, model.covariance.shape)

@@ -131,7 +131,8 @@ class Plan:
         edges = starts[first, None] + (stops - starts)[first, None] * np.arange(self.parts + 1) / self.parts
         self.starts, self.stops = edges[:, :-1].ravel(), edges[:, 1:].ravel()
         self.repeated = np.repeat(self.inside, self.parts, axis=0)
-        self.substeps = substeps_for(system.coefficients, self.starts, self.stops, self._argument(model.theta()))
+        argument = self._argument(model.theta())
+        self.substeps = substeps_for(system.coefficients, self.starts, self.stops, argument, varying=system.varying)
 
     def _argument(self, theta: Any) -> tuple[Any, Any]:
         tile = jnp.tile if isinstance(theta, jax.Array) else np.tile
@@ -140,7 +141,7 @@ class Plan:
     def flows(self, theta: Any) -> Flow:
         """The flow of every interval of the schedule, (K, parts, ...)."""
         flow = flows(
-            self.system.coefficients, self.starts, self.stops, self._argument(theta), substeps=self.substeps
+            self.system.coefficients, self.starts, self.stops, self._argument(theta), substeps=self.substeps.steps
         )
         # NumPy arrays where nothing is traced: a run takes many slices of them.
         plain = (lambda a: a) if isinstance(theta, jax.core.Tracer) else np.asarray

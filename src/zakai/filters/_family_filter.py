@@ -56,6 +56,11 @@ class Prepared:
     theta: Any
     intervals: Interval
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is to be said of the flows, for the warnings of a result."""
+        return self.plan.substeps.notes
+
 
 class Quadratic(NamedTuple):
     """S = -x'K x / 2 - k.x where the families are those of e^S v: `matrix` K (n, n), `slope` k (n,)."""

@@ -22,7 +22,7 @@ from zakai.algebra.theorems import yau_system
 from zakai.errors import InputError
 from zakai.filters._formulas import Formulas
 from zakai.filters._protocol import Schedule
-from zakai.kolmogorov.flow import Coefficients, Flow, flows, substeps_for
+from zakai.kolmogorov.flow import Coefficients, Flow, Substeps, flows, substeps_for
 from zakai.models.compile import jax_field, jax_function
 from zakai.models.model import Model
 
@@ -137,7 +137,7 @@ class FlowPlan(NamedTuple):
     inside: np.ndarray
     which: np.ndarray
     parts: int
-    substeps: int
+    substeps: Substeps
 
 
 def plan_flows(system: System, model: Model, schedule: Schedule) -> FlowPlan:
@@ -146,17 +146,18 @@ def plan_flows(system: System, model: Model, schedule: Schedule) -> FlowPlan:
     starts, stops, inside = schedule.starts[first], schedule.stops[first], schedule.inside[first].astype(float)
     parts = parts_of(system, model, starts, stops, inside)
     edges = starts[:, None] + (stops - starts)[:, None] * np.arange(parts + 1) / parts
-    plan = FlowPlan(edges[:, :-1].ravel(), edges[:, 1:].ravel(), np.repeat(inside, parts, axis=0), which, parts, 1)
+    plan = FlowPlan(edges[:, :-1].ravel(), edges[:, 1:].ravel(), np.repeat(inside, parts, axis=0), which, parts, Substeps(1, 0.0))
     if not len(starts):
         return plan
     argument = (np.tile(model.theta(), (len(plan.starts), 1)), plan.inside)
-    return plan._replace(substeps=substeps_for(system.coefficients, plan.starts, plan.stops, argument))
+    substeps = substeps_for(system.coefficients, plan.starts, plan.stops, argument, varying=system.varying)
+    return plan._replace(substeps=substeps)
 
 
 def planned_flows(system: System, plan: FlowPlan, theta: Any) -> Flow:
     """The flows of all intervals, (K, parts, ...), a pure function of theta: NumPy arrays where theta is one."""
     argument = (jnp.broadcast_to(theta, (len(plan.starts), len(theta))), plan.inside)
-    flow = flows(system.coefficients, plan.starts, plan.stops, argument, substeps=plan.substeps)
+    flow = flows(system.coefficients, plan.starts, plan.stops, argument, substeps=plan.substeps.steps)
     xp = np if isinstance(theta, np.ndarray) else jnp
 
     def shaped(array):

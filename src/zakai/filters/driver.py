@@ -16,7 +16,7 @@ from zakai.filters._run import KEPT_BYTES, Run, Setting
 from zakai.filters.batches import filter_all
 from zakai.filters.results import FilterResult
 from zakai.models._errors import named
-from zakai.models.checks import check_noise_at
+from zakai.models.checks import check_noise_at, check_noise_within
 from zakai.models.model import Model
 from zakai.records import Record
 
@@ -118,7 +118,9 @@ def setting_of(
     if unknown:
         listed = ", ".join(sorted(chosen.options)) or "none"
         raise InputError(f'{chosen.name} has no option "{sorted(unknown)[0]}"; its options are: {listed}')
-    check_noise_at(model, np.unique(np.concatenate([[model.start], *times.values()])))
+    together = np.unique(np.concatenate([[model.start], *times.values()]))
+    check_noise_at(model, together)
+    check_noise_within(model, together)
     return Setting(model, model.prior, chosen, {**chosen.options, **options}), why, considered
 
 

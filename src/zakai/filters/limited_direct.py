@@ -96,7 +96,8 @@ class Prepared:
     @property
     def notes(self) -> tuple[str, ...]:
         """Where the method is not exact in its class, for the warnings of a result."""
-        said = [
+        said = [*self.flow_plan.substeps.notes]
+        said += [
             f"prior: the density has kinks or jumps, and sums on its lattice are off by about {error:.1g}"
             for _, _, error in self.first.values()
             if error > _SMOOTH

@@ -38,6 +38,9 @@ from zakai.kolmogorov.linear_solve import solve
 STAGES = 8
 TOLERANCE = 1e-13
 MOST_SUBSTEPS = 4096
+PROBES = 4096  # times at which coefficients are looked at, before it is believed that they vary slowly
+MANY = 32  # substeps from which a short block is worth a compilation of its own
+KNOWN = 1e-9  # what a flow must be known to
 MOST_IMPLICIT = 4  # states up to which the implicit method is the cheaper one
 MOST_TOGETHER = 32  # states up to which many intervals are integrated at once
 
@@ -316,9 +319,11 @@ _variable = partial(jax.jit, static_argnums=0)(_integrate_all)
 
 
 def _in_blocks(coefficients, starts, stops, arguments, substeps):
-    """`_integrate_all` in blocks of one size, whatever the number of intervals: one compilation."""
+    """`_integrate_all` in blocks of one size, whatever the number of intervals: one compilation, unless there is much to do."""
     slices = (np.asarray(starts, float), np.asarray(stops, float), jax.tree.map(np.asarray, arguments))
     count, block = len(starts), _tried(coefficients, starts, arguments)
+    if substeps > MANY:
+        block = min(block, 2 ** int(np.ceil(np.log2(count))))
     parts = []
     for first in range(0, count, block):
         rows = np.minimum(np.arange(first, first + block), count - 1)
@@ -333,31 +338,80 @@ def _tried(coefficients, starts, arguments) -> int:
     return 48 if n <= MOST_TOGETHER else 6
 
 
+class Substeps(NamedTuple):
+    """Into how many steps each interval is cut, and what the flows are then known to."""
+
+    steps: int
+    error: float
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A sentence where the steps do not suffice."""
+        if self.error <= KNOWN:
+            return ()
+        known = f"known to {self.error:.1g} only" if self.error < 1 else "not known"
+        return (f"the coefficients vary so fast within an interval that its flow is {known}; give shorter intervals",)
+
+
 def substeps_for(
     coefficients: Callable[[jax.Array, Any], Coefficients],
     starts: np.ndarray,
     stops: np.ndarray,
     arguments: Any,
     tolerance: float = TOLERANCE,
-) -> int:
-    """Into how many steps each interval is cut for flows that are accurate to `tolerance`; a number, decided outside of JAX.
+    varying: bool = True,
+) -> Substeps:
+    """Into how many steps each interval is cut for flows that are accurate to `tolerance`, decided outside of JAX.
 
-    It is doubled until halving the step changes nothing on the intervals that are tried: the longest and a spread of others.
+    It is doubled until halving the step changes nothing on the intervals that are tried: the longest and a spread of others;
+    where coefficients are `varying`, from a step in which they can change in some part only.
     """
     lengths = stops - starts
     few = min(len(starts), _tried(coefficients, starts, arguments))
     # The longest takes the place of the first, so that they are one block.
-    tried = np.unique(np.r_[np.argmax(lengths), np.linspace(0, len(starts) - 1, few).astype(int)[1:]])
+    tried = np.r_[np.argmax(lengths), np.linspace(0, len(starts) - 1, few).astype(int)[1:]]
+    needed = 1.0
+    if varying:
+        fastest, needed = _fastest(coefficients, starts, stops, arguments)
+        tried[-1] = fastest if len(tried) > 1 else tried[-1]
+    tried = np.unique(tried)
     sample = jax.tree.map(lambda a: a[tried], arguments)
-    substeps, previous, error = 1, None, np.inf
+    substeps, previous, error = int(min(2 ** np.ceil(np.log2(max(needed, 1.0))), MOST_SUBSTEPS // 2)), None, np.inf
     while True:
         flow = _in_blocks(coefficients, starts[tried], stops[tried], sample, substeps)
         if previous is not None:
             last, error = error, max(_difference(a, b) for a, b in zip(previous, flow, strict=True))
             # Below 1e-11 rounding may stop the error from falling further.
             if error <= tolerance or (error <= 1e-11 and error >= 0.25 * last) or substeps >= MOST_SUBSTEPS:
-                return substeps // 2
+                return Substeps(substeps // 2, max(error, np.inf if needed > STAGES * MOST_SUBSTEPS else 0.0))
         previous, substeps = flow, 2 * substeps
+
+
+def _fastest(coefficients, starts, stops, arguments) -> tuple[int, float]:
+    """The interval in which the coefficients vary fastest for its length, and the steps that this takes.
+
+    A step is half of the time in which a coefficient could go through all its values at its greatest speed: that of a short
+    pulse is about its width.  Seen are pulses that a few thousand times spread over all intervals do not miss.
+    """
+    n = jax.eval_shape(coefficients, starts[0], jax.tree.map(lambda a: a[0], arguments)).matrix.shape[0]
+    budget = min(PROBES, int(1e6 / (n * n)))
+    chosen = np.unique(np.linspace(0, len(starts) - 1, max(1, budget // 4)).astype(int))
+    shares = (np.arange(max(4, budget // len(chosen))) + 0.5) / max(4, budget // len(chosen))
+    # Not at equal distances: what has a period is seen at all its phases.
+    shares = shares + 0.4 / len(shares) * np.sin(7.0 * np.arange(len(shares)))
+    times = starts[chosen, None] + (stops - starts)[chosen, None] * shares
+    given = jax.tree.map(lambda a: np.asarray(a)[chosen], arguments)
+    values = jax.jit(jax.vmap(jax.vmap(coefficients, (0, None))))(times, given)
+    needed = np.zeros(len(chosen))
+    for array in values:
+        entries = np.asarray(array).reshape(*times.shape, -1)
+        bottom, top = entries.min(axis=(0, 1)), entries.max(axis=(0, 1))
+        span = np.where(top - bottom > 1e-12 * np.maximum(abs(top), abs(bottom)), top - bottom, np.inf)
+        with np.errstate(invalid="ignore"):
+            speed = np.max(abs(np.diff(entries, axis=1)) / np.diff(times, axis=1)[..., None] / span, axis=(1, 2))
+        needed = np.maximum(needed, 2 * speed * (stops - starts)[chosen])
+    worst = int(np.argmax(needed))
+    return int(chosen[worst]), float(needed[worst]) if np.isfinite(needed[worst]) else np.inf
 
 
 def flows(
@@ -371,10 +425,10 @@ def flows(
     """The flows over all intervals [starts_i, stops_i] at once, accurate to `tolerance`.
 
     `coefficients(t, argument)` gives the `Coefficients` at time t; `arguments` is a pytree with an entry for each interval.
-    With `substeps`, the answer of `substeps_for`, this is a pure function of `arguments`, to be traced and differentiated.
+    With `substeps`, the steps of `substeps_for`, this is a pure function of `arguments`, to be traced and differentiated.
     """
     if substeps is None:
-        substeps = substeps_for(coefficients, starts, stops, arguments, tolerance)
+        substeps = substeps_for(coefficients, starts, stops, arguments, tolerance).steps
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments))
     return (_fixed if traced else _in_blocks)(coefficients, starts, stops, arguments, substeps)
 

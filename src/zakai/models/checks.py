@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,10 +18,11 @@ if TYPE_CHECKING:
     from zakai.models.model import Model
 
 COEFFICIENTS = ("diffusion", "process_noise", "observation_noise")
+WITHIN = 1024  # times inside of intervals at which noise is looked at
 
 
-def check_noise_at(model: Model, times: Any) -> None:
-    """Check that the noise of a model is noise at every given time.
+def check_noise_at(model: Model, times: Any, keys: Sequence[str] = COEFFICIENTS) -> None:
+    """Check that the noise of a model (or that of some `keys`) is noise at every given time.
 
     S(t) must be positive definite, Q(t) positive semidefinite, and g(t), Q(t), S(t) finite.
 
@@ -30,12 +32,25 @@ def check_noise_at(model: Model, times: Any) -> None:
         >>> from zakai.models import load_model
         >>> check_noise_at(load_model("gallery:spiral-sensor"), [0.0, 10.0])
     """
-    for key in COEFFICIENTS:
+    for key in keys:
         problem = _problem(model, key, np.atleast_1d(np.asarray(times, dtype=float)))
         if problem:
             index, words = problem
             when = f" at t = {np.atleast_1d(times)[index]:.12g}" if getattr(model, key).has(model.t) else ""
             raise InputError(f"{model.source}: {key}: {words[0]}{when}{words[1]}")
+
+
+def check_noise_within(model: Model, times: np.ndarray) -> None:
+    """`check_noise_at` some times inside of every interval between the model's start and the times (K,).
+
+    The noise of samples need only be one when they are taken.
+    """
+    edges = np.unique(np.concatenate([[model.start], times]))
+    keys = COEFFICIENTS[:-1] if model.observation_kind == "samples" else COEFFICIENTS
+    if len(edges) > 1 and any(getattr(model, key).has(model.t) for key in keys):
+        count = max(1, WITHIN // (len(edges) - 1))
+        shares = (np.arange(count) + 0.5 + 0.4 * np.sin(7.0 * np.arange(count))) / count
+        check_noise_at(model, (edges[:-1, None] + np.diff(edges)[:, None] * shares).ravel(), keys)
 
 
 def check_constant_noise(model: Model) -> None:

@@ -188,7 +188,7 @@ def _numbers(array: Any, name: str) -> np.ndarray:
     """A fresh float64 copy, nan where it is masked; text, dates, durations and complex numbers are refused."""
     try:
         if isinstance(array, np.ma.MaskedArray) and array.dtype.kind in "biuf":
-            array = array.astype(np.float64).filled(np.nan)
+            array = np.ma.filled(array.astype(np.float64), np.nan)
         array = np.asarray(array)
         texts = array.dtype.kind == "O" and any(isinstance(item, str | bytes) for item in array.flat)
         if texts or array.dtype.kind not in "biufO":
