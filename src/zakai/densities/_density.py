@@ -52,7 +52,26 @@ def coordinate_numbers(names: tuple[str, ...], coordinates: int | str | Sequence
             if not 0 <= int(one) < len(names):
                 raise InputError(f"marginal: there is no state number {one}; numbers run from 0 to {len(names) - 1}")
             numbers.append(int(one))
+    if not numbers or len(set(numbers)) < len(numbers):
+        raise InputError("marginal: expected one state or several different ones")
     return numbers
+
+
+def as_states(x: object, n: int) -> np.ndarray:
+    """Points (..., n), or of one coordinate (...) too."""
+    points = np.asarray(x, float)
+    if n == 1 and points.shape[-1:] != (1,):
+        points = points[..., None]
+    if points.shape[-1:] != (n,):
+        raise InputError(f"log_density: x has shape {points.shape}; expected (..., {n}), a coordinate for each state")
+    return points
+
+
+def sample_size(count: object) -> int:
+    """How many draws are asked for, checked."""
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 0:
+        raise InputError(f"sample: count is {count!r}; expected a whole number from 0")
+    return int(count)
 
 
 def generator(key: object) -> np.random.Generator:

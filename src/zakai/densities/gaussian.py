@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp, ndtr
 
-from zakai.densities._density import coordinate_numbers, generator, probabilities, wrap
+from zakai.densities._density import as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 
 _AT_ONCE = 2**21  # points times components that are worked on together
 
@@ -35,9 +35,7 @@ class GaussianMixture:
         return cls(np.ones(1), np.asarray(mean)[None], np.asarray(cov)[None], names, periodic)
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
-        x = np.asarray(x, float)
-        if x.shape[-1:] != (len(self.names),):
-            x = x[..., None] if len(self.names) == 1 else x
+        x = as_states(x, len(self.names))
         points = x.reshape(-1, len(self.names))
         rows = max(1, _AT_ONCE // len(self.weights))
         parts = [self._log_density(points[i : i + rows]) for i in range(0, len(points), rows)]
@@ -140,7 +138,7 @@ class GaussianMixture:
         )
 
     def sample(self, key: object, count: int) -> np.ndarray:
-        rng = generator(key)
+        rng, count = generator(key), sample_size(count)
         positive = np.maximum(self.weights, 0.0)
         which = rng.choice(len(self.weights), size=count, p=positive / positive.sum())
         noise = rng.standard_normal((count, len(self.names)))

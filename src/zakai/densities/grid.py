@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from zakai.densities._density import coordinate_numbers, generator, probabilities, wrap
+from zakai.densities._density import as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 
 _BLOCK = 4_000_000  # numbers held at once while a density is interpolated
 
@@ -63,10 +63,8 @@ class GridDensity:
         )
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
-        x = np.asarray(x, float)
         n = len(self.names)
-        if n == 1 and x.shape[-1:] != (1,):
-            x = x[..., None]
+        x = as_states(x, n)
         offset = x - self.centre
         index = (np.where(self.periodic, wrap(offset), offset) @ np.linalg.inv(self.basis).T).reshape(-1, n)
         interpolate = self._interpolate if n < 3 else self._interpolate_three
@@ -246,7 +244,7 @@ class GridDensity:
         return np.array(out)
 
     def sample(self, key: object, count: int) -> np.ndarray:
-        rng = generator(key)
+        rng, count = generator(key), sample_size(count)
         which = rng.choice(self.weights.size, size=count, p=self.weights.ravel())
         x = self.points.reshape(-1, len(self.names))[which]
         x = x + (rng.random((count, len(self.names))) - 0.5) @ self.basis.T

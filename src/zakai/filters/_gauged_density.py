@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from zakai.densities import GaussianMixture, GridDensity
+from zakai.densities._density import as_states
 
 # Half the points along an axis of the first lattice and of the last one, by the number of states.
 _HALVES = {1: (200, 12_800), 2: (64, 256)}
@@ -48,10 +49,8 @@ class GaugedDensity:
         return self.bare.periodic
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
-        x = np.asarray(x, float)
         n = len(self.names)
-        if n == 1 and x.shape[-1:] != (1,):
-            x = x[..., None]
+        x = as_states(x, n)
         flat = x.reshape(-1, n)
         return (self.bare.log_density(flat) + self.potential(flat)).reshape(x.shape[:-1])
 
