@@ -128,3 +128,13 @@ def test_the_log_likelihood_has_the_gradient_of_differences_for_every_kind_of_pr
     for index, name in enumerate(model.parameters):
         above, below = (at(**{name: theta[index] + shift}) for shift in (1e-4, -1e-4))
         assert gradient[index] == pytest.approx((above - below) / 2e-4, rel=1e-6, abs=1e-8)
+
+
+@pytest.mark.parametrize("variance", [1e4, 1e8])
+def test_a_posterior_beyond_the_nodes_of_a_split_prior_is_warned_of(variance):
+    # The readings say x = 20 to 30 deviations of the prior.
+    x = 25 * np.sqrt(variance)
+    prior = {"kind": "gaussian", "mean": [0.3], "cov": [[variance]]}
+    system = zakai.Model(state=["x"], drift=["tanh(x)"], observation=["x"], observation_noise=[[1e-8]], prior=prior)
+    result = zakai.filter(system, zakai.Record([1e-6], [[1e-6 * x]], "increments"), "benes")
+    assert any("edge_weight" in said for said in result.warnings)

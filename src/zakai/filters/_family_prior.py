@@ -279,12 +279,14 @@ class _GaussianPlan:
         shift = self._shift(tilts)
         points, logs = (tilts.directions @ self.mean)[None], np.zeros(1)
         cov = self.vectors.T @ (tilts.directions @ self.cov @ tilts.directions.T) @ self.vectors
-        for number, level in enumerate(self.levels):
+        # The outermost Gaussians are those of the first level, or what they are written as.
+        ends = np.array([True, True])
+        for level in self.levels:
             weights = self._weights(level, shift, points, logs, cov)
             points, logs, cov = (level.points + shift)[:, None], weights, np.array([[level.width**2]])
             edge = np.zeros(len(level.points))
-            if number == 0:
-                edge[[0, 1, -2, -1]] = 1.0
+            edge[:2], edge[-2:] = ends
+            ends = ends & level.near[[0, -1]]
             far = ~level.near
             if far.any():
                 assert self.bend is not None
@@ -299,7 +301,9 @@ class _GaussianPlan:
         z = self.lattice.points() + shift
         phi = self._potential(tilts, theta)(z)
         log_u = self._log_u(z, tilts)
-        edge = _edge(self.lattice.sizes) * (not self.levels)
+        edge = _edge(self.lattice.sizes)
+        if self.levels:
+            edge[:2], edge[-2:] = ends
         yield _represented(self.lattice, z, log_u, phi, self.error, edge)
 
     def _tilted(self, tilts: Tilts, points: Any, log_weights: Any, cov: Any, which: np.ndarray, edge: np.ndarray) -> Nodes:

@@ -163,11 +163,13 @@ class Prepared:
         """Where the method is not exact in its class, for the warnings of a result."""
         gaps = not self.schedule.inside.all() and not self.static.sampled
         plain = self.static.reduction
-        blind = () if plain == "split-merge" else (f'the reduction "{plain}" has no error figures: its error is not known',)
+        said = self.plan.substeps.notes
+        if plain != "split-merge":
+            said = (*said, f'the reduction "{plain}" has no error figures: its error is not known')
         if self.static.system.bare or not gaps:
-            return blind
+            return said
         return (
-            *blind,
+            *said,
             "where readings are missing the transition without the observation's potential is not linear-quadratic: its "
             "potential is kept inside and taken out again at the end, which is exact only as the intervals shrink",
         )
