@@ -51,6 +51,7 @@ def test_two_weeks_of_wind_agree_with_bayes_rule_on_the_circle():
     assert angle_between(direction, result.mean[1:, 0])[1:].max() < 1e-8
 
 
+@pytest.mark.slow
 def test_an_angle_and_a_rate_agree_with_bayes_rule_on_a_grid_of_both():
     model = zakai.load_model("gallery:wind-vane-rate")
     record = first_hours(model, 30)

@@ -33,6 +33,7 @@ SYSTEMS = {
 # A Gaussian sum has few components: it stands near the density, and how near says its own test. On the spiral system two starts
 # that differ in rounding come to differ by as much as each is off; on the other system both sums are exact but for the cut prior.
 NEAR = {"general-direct": 2e-2, "gaussian-sum": 5e-4}
+LONG_TO_COMPILE = ("general-direct", "gaussian-sum", "wei-norman", "limited-direct")
 TIMES = np.cumsum([0.1, 0.05, 0.2, 0.1, 0.1, 0.15, 0.05, 0.1, 0.3, 0.1])
 
 
@@ -51,20 +52,21 @@ def readings(name: str, kind: str, gaps: bool = False, seed: int = 0) -> zakai.R
     return zakai.Record(record.times, values, kind)
 
 
-def case(method: str, name: str) -> object:
-    """The pair as a case of a test: skipped where the theorem says no, slow but for the first system for which it says yes."""
+def case(method: str, name: str, costly: bool) -> object:
+    """The pair as a case of a test: skipped where the theorem says no, slow but for the last system for which it says yes, and
+    slow there too for methods that take long to compile, if the test is `costly`."""
     holds = [one for one in SYSTEMS if all_hold(_registry.load(method).theorem(system(one))) is True]
     marks = []
     if name not in holds:
         marks.append(pytest.mark.skip(reason=f"the theorem of {method} does not hold for the {name} system"))
-    elif name != holds[-1]:
+    elif name != holds[-1] or (costly and method in LONG_TO_COMPILE):
         marks.append(pytest.mark.slow)
     return pytest.param(method, name, marks=marks, id=f"{method}-{name}")
 
 
-on_every_system = pytest.mark.parametrize(
-    ("method", "name"), [case(method, name) for method in _registry.METHODS for name in SYSTEMS]
-)
+def on_every_system(costly: bool):
+    cases = [case(method, name, costly) for method in _registry.METHODS for name in SYSTEMS]
+    return pytest.mark.parametrize(("method", "name"), cases)
 
 
 def same(a: zakai.FilterResult, b: zakai.FilterResult, tolerance: float = 1e-9) -> None:
@@ -84,7 +86,7 @@ def test_a_method_says_what_it_is(name):
         assert method.resume is None and method.adapt_many is None
 
 
-@on_every_system
+@on_every_system(costly=False)
 def test_a_result_is_whole(method, name):
     model, record = system(name), readings(name, "increments", gaps=True)
     result = zakai.filter(model, record, method)
@@ -100,7 +102,7 @@ def test_a_result_is_whole(method, name):
     assert np.isclose(np.exp(last.log_density(x[:, None])).sum() * (x[1] - x[0]), 1.0, rtol=0, atol=NEAR.get(method, 1e-5))
 
 
-@on_every_system
+@on_every_system(costly=True)
 def test_increments_paths_and_rates_say_the_same(method, name):
     record = readings(name, "increments")
     expected = zakai.filter(system(name), record, method)
@@ -113,7 +115,7 @@ def holds(method: str, name: str, kind: str) -> bool:
     return all_hold(_registry.load(method).theorem(system(name, kind))) is True
 
 
-@on_every_system
+@on_every_system(costly=True)
 def test_where_nothing_is_read_the_evidence_does_not_change(method, name):
     for kind in ("increments", "samples"):
         if not holds(method, name, kind):
@@ -124,7 +126,7 @@ def test_where_nothing_is_read_the_evidence_does_not_change(method, name):
         assert abs(result.log_likelihood_increments[4]) < (1e-9 if name != "spiral" or kind == "samples" else 1e-2)
 
 
-@on_every_system
+@on_every_system(costly=True)
 @pytest.mark.parametrize("prior", [pytest.param("mixture", marks=pytest.mark.slow), "density"])
 def test_one_prior_said_in_two_ways_gives_one_posterior(method, name, prior):
     record = readings(name, "increments")
@@ -132,7 +134,7 @@ def test_one_prior_said_in_two_ways_gives_one_posterior(method, name, prior):
     same(other, expected, NEAR.get(method, 1e-7))
 
 
-@on_every_system
+@on_every_system(costly=True)
 def test_many_records_give_what_each_gives_alone(method, name):
     model = system(name)
     records = [readings(name, "increments", gaps=seed == 2, seed=seed) for seed in range(5)]
@@ -143,7 +145,7 @@ def test_many_records_give_what_each_gives_alone(method, name):
         assert np.allclose(many.density(4).mean(), alone.density(4).mean(), rtol=0, atol=1e-9)
 
 
-@on_every_system
+@on_every_system(costly=True)
 @pytest.mark.parametrize("kind", ["increments", pytest.param("samples", marks=pytest.mark.slow)])
 def test_the_gradient_is_that_of_differences(method, name, kind):
     if not holds(method, name, kind):

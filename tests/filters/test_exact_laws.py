@@ -69,6 +69,7 @@ def test_one_state_with_two_sensors_gaps_and_irregular_times_is_kalman_and_bucy(
     assert_agrees(result, expected, 1e-9)
 
 
+@pytest.mark.slow
 def test_two_states_are_kalman_and_bucy():
     model = zakai.load_model("gallery:kalman-bucy-2d")
     times = 0.05 * np.arange(1, 9)
@@ -96,6 +97,7 @@ def test_an_observation_far_beyond_the_prediction_is_said():
     assert any("surprise" in warning and "t = 0.01" in warning for warning in result.warnings)
 
 
+@pytest.mark.slow
 def test_a_long_interval_is_taken_in_parts_and_agrees_with_many_short_ones():
     model = zakai.load_model("gallery:kalman-bucy-1d")
     long = zakai.filter(model, zakai.Record([40.0], [[0.0]], "increments"), "limited-direct")

@@ -54,6 +54,7 @@ def test_the_maximum_is_that_of_a_plain_scan(line, fitted):
     assert np.allclose(np.linalg.inv(fitted.covariance).diagonal(), -np.array(hessian), rtol=0.01)
 
 
+@pytest.mark.slow
 def test_the_covariance_is_the_inverse_of_the_hessian(line, fitted):
     likelihood = zakai.log_likelihood(*line, "kalman-bucy", ["a", "s"])
     hessian = jax.hessian(likelihood)(np.array([fitted.estimates["a"], fitted.estimates["s"]]))

@@ -73,6 +73,7 @@ def test_a_linear_system_gives_the_kalman_bucy_filter_exactly_and_singular_noise
     assert abs(result.log_likelihood - exact.log_likelihood) <= 1e-9
 
 
+@pytest.mark.slow
 def test_an_affine_observation_of_the_benes_system_is_exact_once_the_start_is_cut():
     model = zakai.load_model("gallery:benes")
     _, record = zakai.simulate(model, np.arange(1, 41) * 0.1, seed=3)
@@ -153,9 +154,13 @@ PRIORS = {
 
 @pytest.mark.parametrize(
     ("prior", "reduction"),
-    [("gaussian", "split-merge"), ("mixture", "split-merge"), ("density", "split-merge"), ("mixture", "nnls"),
-     ("gaussian", "algorithm-1")],
-)  # fmt: skip
+    [
+        *[pytest.param(prior, "split-merge", marks=pytest.mark.slow) for prior in ("gaussian", "mixture")],
+        ("density", "split-merge"),
+        ("mixture", "nnls"),
+        ("gaussian", "algorithm-1"),
+    ],
+)
 def test_a_start_that_is_not_the_prior_is_said(prior, reduction):
     record = zakai.Record(np.array([0.01, 0.02]), np.array([[0.21], [0.14]]), "increments")
     wide = zakai.filter(benes(1.0, prior=PRIORS[prior]), record, "general-direct", reduction=reduction, components=6)

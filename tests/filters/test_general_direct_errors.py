@@ -61,7 +61,7 @@ def said(result):
 
 @pytest.mark.parametrize(
     ("name", "seed"),
-    [("mirror", 3), ("cubic", 3)]
+    [("cubic", 3), pytest.param("mirror", 3, marks=pytest.mark.slow)]
     + [pytest.param(name, seed, marks=pytest.mark.slow) for name in SENSORS for seed in (4, 5)],
 )
 def test_a_sum_is_near_the_density_or_says_that_it_is_not(name, seed):
@@ -156,6 +156,7 @@ def test_sine_and_cosine_samples_of_three_states_are_near_the_density():
         assert mean <= 0.02 and evidence <= 0.05
 
 
+@pytest.mark.slow
 def test_a_mirrored_system_gives_the_mirrored_density_and_a_batch_what_each_gives():
     model = sensor("sine", observation=["sin(x) + x/4"])
     mirrored = sensor("sine", observation=["sin(-x) - x/4"], prior={"kind": "gaussian", "mean": [-0.5], "cov": [[1.0]]})

@@ -35,7 +35,8 @@ def test_the_density_of_one_state_agrees_with_the_kolmogorov_equation(one_state,
         assert relative_error(result, reference[k - 1][1], box, k) <= 1e-10
 
 
-@pytest.mark.parametrize("kernel", ["flow", pytest.param("power-series", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kernel", ["flow", "power-series"])
 def test_the_density_of_two_states_agrees_with_the_kolmogorov_equation(kernel):
     system = planar()
     box = Box(7.0, 96, (0.0, 0.0))

@@ -102,9 +102,8 @@ def test_statistics_grow_over_many_readings_and_begin_anew_before_they_are_large
     assert np.diff(beginnings).max() > 5 and np.abs(statistics).max() > 0.2
 
 
-@pytest.mark.parametrize(
-    "kind", ["increments", pytest.param("path", marks=pytest.mark.slow), pytest.param("rates", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["increments", "path", "rates"])
 def test_two_linear_states_with_readings_missing_are_kalman_and_bucys(kind):
     model = zakai.Model(
         state=["x", "v"],
@@ -226,6 +225,7 @@ def test_a_lattice_that_is_too_coarse_is_said_to_be():
     assert any("aliasing" in said for said in coarse.warnings)
 
 
+@pytest.mark.slow
 def test_a_drift_that_explodes_is_not_silent():
     model = zakai.Model(state=["x"], drift=["x**3"], observation=["1"], prior=MIXTURE)
     record = record_of(zakai.Model(state=["x"], drift=["-x"], observation=["1"], prior=MIXTURE), np.arange(1, 5) * 0.25)
