@@ -34,6 +34,7 @@ import numpy as np
 
 from zakai import _float64  # noqa: F401
 from zakai.kolmogorov.linear_solve import solve
+from zakai.models.checks import irregular
 
 STAGES = 8
 TOLERANCE = 1e-13
@@ -396,9 +397,7 @@ def _fastest(coefficients, starts, stops, arguments) -> tuple[int, float]:
     n = jax.eval_shape(coefficients, starts[0], jax.tree.map(lambda a: a[0], arguments)).matrix.shape[0]
     budget = min(PROBES, int(1e6 / (n * n)))
     chosen = np.unique(np.linspace(0, len(starts) - 1, max(1, budget // 4)).astype(int))
-    shares = (np.arange(max(4, budget // len(chosen))) + 0.5) / max(4, budget // len(chosen))
-    # Not at equal distances: what has a period is seen at all its phases.
-    shares = shares + 0.4 / len(shares) * np.sin(7.0 * np.arange(len(shares)))
+    shares = irregular(max(4, budget // len(chosen)))
     times = starts[chosen, None] + (stops - starts)[chosen, None] * shares
     given = jax.tree.map(lambda a: np.asarray(a)[chosen], arguments)
     values = jax.jit(jax.vmap(jax.vmap(coefficients, (0, None))))(times, given)

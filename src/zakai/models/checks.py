@@ -49,8 +49,13 @@ def check_noise_within(model: Model, times: np.ndarray) -> None:
     keys = COEFFICIENTS[:-1] if model.observation_kind == "samples" else COEFFICIENTS
     if len(edges) > 1 and any(getattr(model, key).has(model.t) for key in keys):
         count = max(1, WITHIN // (len(edges) - 1))
-        shares = (np.arange(count) + 0.5 + 0.4 * np.sin(7.0 * np.arange(count))) / count
-        check_noise_at(model, (edges[:-1, None] + np.diff(edges)[:, None] * shares).ravel(), keys)
+        check_noise_at(model, (edges[:-1, None] + np.diff(edges)[:, None] * irregular(count)).ravel(), keys)
+
+
+def irregular(count: int) -> np.ndarray:
+    """Places (count,) in (0, 1), increasing and not at equal distances: what has a period is seen at all its phases."""
+    places = np.arange(count)
+    return (places + 0.5 + 0.4 * np.sin(7.0 * places)) / count
 
 
 def check_constant_noise(model: Model) -> None:
