@@ -34,7 +34,7 @@ FAULTS = [
     ("state", None, "missing"),
     ("drift", None, "missing"),
     ("observation", None, "missing"),
-    ("state", "[]", "1 to 256 names"),
+    ("state", "[]", "1 to 1024 names"),
     ("state", '"x"', "a list of names, got the text 'x'"),
     ("state", '["x", "x"]', "given twice"),
     ("state", '["x", 1]', "a name in quotes"),

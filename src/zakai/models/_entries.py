@@ -123,10 +123,11 @@ def vector_of_formulas(value: Any, length: int | None, expected: str) -> list[st
     """A list of formulas; a SymPy column is one too."""
     if isinstance(value, sympy.MatrixBase) and 1 in value.shape:
         value = list(value)
-    texts = []
-    for index, entry in enumerate(items(value, length, expected)):
-        with named(f"[{index}]"):
-            texts.append(formula(entry))
+    texts = items(value, length, expected)
+    for index, entry in enumerate(texts):
+        if not isinstance(entry, str):
+            with named(f"[{index}]"):
+                texts[index] = formula(entry)
     return texts
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from decimal import Context, Decimal, Inexact
+from functools import lru_cache
 from typing import Any
 
 import sympy
@@ -43,12 +44,17 @@ def to_toml(keys: Mapping[str, Any]) -> str:
 
 def _value(value: Any) -> str:
     if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        return _text(value)
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_value(entry) for entry in value) + "]"
     if isinstance(value, sympy.Rational):
         return _rational(value)
     return repr(float(value))
+
+
+@lru_cache(maxsize=256)
+def _text(value: str) -> str:
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _rational(value: sympy.Rational) -> str:

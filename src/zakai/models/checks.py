@@ -128,9 +128,8 @@ def check_periodic(model: Model) -> None:
 def check_independent_of_state(matrix: sympy.MatrixBase, x: tuple[sympy.Symbol, ...]) -> None:
     """Raise InputError at the first entry that depends on the state."""
     state = set(x)
-    for index, expr in enumerate(matrix):
+    for (row, column), expr in sorted(matrix.todok().items()):
         found = expr.free_symbols & state
         if found:
-            row, column = divmod(index, matrix.shape[1])
             name = min(str(symbol) for symbol in found)
             raise InputError(f"[{row}][{column}]: depends on the state {name!r}; it may depend on t and on parameters only")

@@ -32,7 +32,7 @@ KEYS = (
     "parameters",
     "prior",
 )
-MOST_STATES = 256  # of states, sensors and noises: a default identity matrix has this many squared entries
+MOST_STATES = 1024  # of states, sensors and noises: a default identity matrix has this many squared entries
 OBSERVATION_KINDS = ("increments", "path", "rates", "samples")
 
 
@@ -79,7 +79,6 @@ class Model:
     periodic: tuple[str, ...]
     functions: tuple[str, ...]
     prior: Prior | None
-    text: str
     source: str
 
     def __init__(self, /, **keys: Any):
@@ -107,7 +106,8 @@ class Model:
             vars(self)["prior"], canonical["prior"] = prior, table
         checks.check_constant_noise(self)
         checks.check_periodic(self)
-        vars(self)["text"] = self.to_toml() if text is None else text
+        if text is not None:
+            vars(self)["text"] = text
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError("a Model is immutable; make another one, or use with_parameters")
@@ -193,8 +193,13 @@ class Model:
             vars(self)[key] = sympy.ImmutableMatrix(column)
         for key in checks.COEFFICIENTS:
             with named(key):
-                table = [[read(text, f"[{i}][{j}]") for j, text in enumerate(row)] for i, row in enumerate(canonical[key])]
-                vars(self)[key] = sympy.ImmutableMatrix(table)
+                entries = {
+                    (i, j): read(text, f"[{i}][{j}]")
+                    for i, row in enumerate(canonical[key])
+                    for j, text in enumerate(row)
+                    if text != "0"
+                }
+                vars(self)[key] = _matrix(len(canonical[key]), len(canonical[key][0]), entries)
                 checks.check_independent_of_state(vars(self)[key], self.x)
 
     def _reader(self, in_time: bool = True) -> Callable[..., sympy.Expr]:
@@ -216,6 +221,11 @@ class Model:
     def covariance(self) -> sympy.ImmutableMatrix:
         """G = g Q g', the covariance of the state's noise per unit time, of shape (n, n)."""
         return sympy.ImmutableMatrix(self.diffusion * self.process_noise * self.diffusion.T)
+
+    @cached_property
+    def text(self) -> str:
+        """The model file, as it was read or as `to_toml` writes it."""
+        return self.to_toml()
 
     def theta(self) -> np.ndarray:
         """The values of the parameters in their order, of shape (p,), in double precision."""
@@ -239,10 +249,10 @@ class Model:
                     raise InputError(f"unknown parameter {name!r}{did_you_mean(name, self.parameters)} {known}")
             parameters = {**self.parameters, **_read_parameters(values)}
         other = object.__new__(Model)
-        vars(other).update({**vars(self), "parameters": parameters, "_keys": {**self._keys, "parameters": parameters}})
+        kept = {key: value for key, value in vars(self).items() if key != "text"}
+        vars(other).update({**kept, "parameters": parameters, "_keys": {**self._keys, "parameters": parameters}})
         with named(self.source):
             checks.check_constant_noise(other)
-        vars(other)["text"] = other.to_toml()
         return other
 
     def to_toml(self) -> str:
@@ -252,6 +262,11 @@ class Model:
     @property
     def _keys(self) -> dict[str, Any]:
         return vars(self)["_keys"]
+
+
+def _matrix(rows: int, columns: int, entries: Mapping[tuple[int, int], sympy.Expr]) -> sympy.ImmutableMatrix:
+    """The matrix with these entries and zeros; noises of a thousand states are a million zeros, which SymPy need not see."""
+    return sympy.ImmutableDenseMatrix._fromrep(sympy.SparseMatrix(rows, columns, entries)._rep)
 
 
 def _identity(size: int) -> list[list[str]]:
