@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -33,32 +34,62 @@ def blocks(model: Model) -> tuple[Block, ...]:
         >>> [block.model.state for block in blocks(system)]
         [('x',), ('y',)]
     """
-    n, G, S = model.n, model.covariance.applyfunc(tidy), model.observation_noise.applyfunc(tidy)
-    place = {symbol: i for i, symbol in enumerate(model.x)}
-    # Nodes are the states and, after them, the observations.
-    group = list(range(n + model.m))
+    return tuple(Block(states, rows, part_of(model, states, rows)) for states, rows in connected(model))
 
-    def join(i: int, j: int) -> None:
-        old, new = group[j], group[i]
-        group[:] = [new if g == old else g for g in group]
 
+class Groups:
+    """States, and after them observations, that hang together; at first each by itself."""
+
+    def __init__(self, model: Model):
+        self.n = model.n
+        self._parent = list(range(model.n + model.m))
+
+    def root(self, i: int) -> int:
+        """The one that stands for the group of i."""
+        while self._parent[i] != i:
+            self._parent[i] = i = self._parent[self._parent[i]]
+        return i
+
+    def join(self, nodes: Iterable[int]) -> None:
+        """Put the groups of the nodes together; the smallest one stands for all."""
+        roots = {self.root(node) for node in nodes}
+        for root in roots:
+            self._parent[root] = min(roots)
+
+    def parts(self) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+        """The states and the observations of each group, in the order of their first states."""
+        found: dict[int, tuple[list[int], list[int]]] = {}
+        for node in range(len(self._parent)):
+            # States come first, and an observation without one counts to the first state's group.
+            root = self.root(node)
+            states, rows = found.setdefault(root if root < self.n else 0, ([], []))
+            if node < self.n:
+                states.append(node)
+            else:
+                rows.append(node - self.n)
+        return [(tuple(states), tuple(rows)) for states, rows in found.values()]
+
+
+def connected(model: Model, more: Callable[[Groups], None] | None = None) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """The places of the states and of the observations of each connected part; `more` may join some."""
+    groups, place = Groups(model), {symbol: i for i, symbol in enumerate(model.x)}
     for i, formula in enumerate([*model.drift, *model.observation]):
-        for symbol in formula.free_symbols & place.keys():
-            join(place[symbol], i)
-    for matrix, first in ((G, 0), (S, n)):
-        for i in range(matrix.rows):
-            for j in range(i):
-                if matrix[i, j] != 0:
-                    join(first + j, first + i)
-    parts = sorted({tuple(i for i in range(n + model.m) if group[i] == g) for g in group})
-    with_states = [part for part in parts if part[0] < n]
-    with_states[0] += tuple(i for part in parts if part[0] >= n for i in part)
-    return tuple(_block(model, tuple(i for i in part if i < n), tuple(i - n for i in part if i >= n)) for part in with_states)
+        used = [place[symbol] for symbol in formula.free_symbols if symbol in place]
+        if used:
+            groups.join([i, *used])
+    for matrix, first in ((model.covariance, 0), (model.observation_noise, model.n)):
+        for (i, j), entry in matrix.todok().items():
+            if i < j and tidy(entry) != 0:
+                groups.join((first + i, first + j))
+    if more is not None:
+        more(groups)
+    return groups.parts()
 
 
-def _block(model: Model, states: tuple[int, ...], rows: tuple[int, ...]) -> Block:
-    if len(states) == model.n:
-        return Block(states, rows, model)
+def part_of(model: Model, states: tuple[int, ...], rows: tuple[int, ...], prior: Any = None) -> Model:
+    """The part of a model with these states and observations, and a prior for them."""
+    if len(states) == model.n and prior is None:
+        return model
     names = tuple(model.state[i] for i in states)
     observed = [model.observation[i] for i in rows] or [sp.Integer(0)]
     keys: dict[str, Any] = {
@@ -73,5 +104,6 @@ def _block(model: Model, states: tuple[int, ...], rows: tuple[int, ...]) -> Bloc
         "periodic": [name for name in model.periodic if name in names],
         "parameters": model.parameters,
         "functions": model.functions,
+        "prior": prior,
     }
-    return Block(states, rows, Model(**keys))
+    return Model._from_file(keys, f"{model.source}: block {', '.join(names)}", None)

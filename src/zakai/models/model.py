@@ -85,7 +85,7 @@ class Model:
         self._read(keys, source="<python>", text=None)
 
     @classmethod
-    def _from_file(cls, keys: Mapping[str, Any], source: str, text: str) -> Model:
+    def _from_file(cls, keys: Mapping[str, Any], source: str, text: str | None) -> Model:
         model = object.__new__(cls)
         model._read(keys, source, text)
         return model
