@@ -12,9 +12,9 @@ from functools import cached_property
 
 import sympy as sp
 
-from zakai._registry import AUTO
 from zakai.algebra import _page
 from zakai.algebra.blocks import Block, blocks
+from zakai.algebra.choice import recommended
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
 from zakai.algebra.explosion import Explosion, explosion
@@ -186,7 +186,7 @@ def analyze(model: Model) -> Analysis:
         no_yau_form=form.evidence if isinstance(form, NoYauForm) else "",
         q=None if isinstance(form, NoYauForm) else _q(model, form),
         methods=methods,
-        recommended=next((name for name in AUTO if all_hold(methods[name]) is True), None),
+        recommended=recommended(model),
     )
 
 

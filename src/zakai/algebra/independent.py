@@ -23,7 +23,7 @@ class IndependentBlock:
 
     `states` and `observations` are its places in the whole, `names` those of its states, and `prior` is what the prior of the
     whole says of them.  Blocks with the same equations share one `model`, whose states have the names of the first of them
-    and whose prior is the first one's, of the same kind.
+    and whose prior is that of all of them, put together if they differ.
     """
 
     states: tuple[int, ...]
@@ -52,28 +52,32 @@ def independent_blocks(model: Model, prior: Any, by_value: bool = True) -> tuple
             for term in _terms(model, groups, prior.log_density):
                 groups.join(_places(model, term))
 
-    values = model.parameters if by_value else {}
-    renamed = {symbol: values[symbol.name] for symbol in model.parameter_symbols if symbol.name in values}
-    models: dict[Hashable, Model] = {}
-    priors: dict[Hashable, Any] = {}
     parts = connected(model, join)
     if len(parts) == 1:
         return (IndependentBlock(*parts[0], model.state, model, prior),)
     whole = Groups(model)
     for states, _ in parts:
         whole.join(states)
-    own_priors = _split_prior(model, prior, whole, [states for states, _ in parts])
-    found = []
-    for (states, rows), own in zip(parts, own_priors, strict=True):
-        own = priors.setdefault(_identity(own), own)
-        key = _formulas(model, states, rows, own, renamed)
-        if key not in models:
-            models[key] = part_of(model, states, rows, own)
-        if isinstance(own, DensityPrior):
-            own = models[key].prior  # in the names of the states of the shared model
-        names = tuple(model.state[i] for i in states)
-        found.append(IndependentBlock(states, rows, names, models[key], own))
-    return tuple(found)
+    values = model.parameters if by_value else {}
+    renamed = {symbol: values[symbol.name] for symbol in model.parameter_symbols if symbol.name in values}
+    same: dict[Hashable, list[int]] = {}
+    known: dict[Hashable, Any] = {}
+    priors = []
+    for number, (states, rows) in enumerate(parts):
+        own = _part_of_prior(model, prior, whole, states)
+        priors.append(known.setdefault(_identity(own), own))
+        same.setdefault(_formulas(model, states, rows, own, renamed), []).append(number)
+    models: dict[int, Model] = {}
+    for numbers in same.values():
+        shared = part_of(model, *parts[numbers[0]], _pooled([priors[number] for number in numbers]))
+        for number in numbers:
+            models[number] = shared
+            if isinstance(prior, DensityPrior):
+                priors[number] = shared.prior  # in the names of the states of the shared model
+    return tuple(
+        IndependentBlock(states, rows, tuple(model.state[i] for i in states), models[number], priors[number])
+        for number, (states, rows) in enumerate(parts)
+    )
 
 
 def _join_correlated(groups: Groups, cov: np.ndarray) -> None:
@@ -125,20 +129,32 @@ def _terms(model: Model, groups: Groups, expression: sp.Expr) -> list[sp.Expr]:
     return terms
 
 
-def _split_prior(model: Model, prior: Any, groups: Groups, parts: list[tuple[int, ...]]) -> list[Any]:
-    """The prior of each part."""
-    if prior is None:
-        return [None] * len(parts)
+def _part_of_prior(model: Model, prior: Any, groups: Groups, states: tuple[int, ...]) -> Any:
+    """What a prior that couples no two groups says of one of them."""
     if isinstance(prior, GaussianPrior):
-        return [GaussianPrior(prior.mean[list(states)], prior.cov[np.ix_(states, states)]) for states in parts]
+        return GaussianPrior(prior.mean[list(states)], prior.cov[np.ix_(states, states)])
     if isinstance(prior, MixturePrior):
-        return [_part_of_mixture(prior, states) for states in parts]
-    sums: dict[int, list[sp.Expr]] = {groups.root(states[0]): [] for states in parts}
-    for term in _terms(model, groups, prior.log_density):
-        places = _places(model, term)
-        if places:  # what is constant normalises nothing
-            sums[groups.root(places[0])].append(term)
-    return [DensityPrior(sp.Add(*sums[groups.root(states[0])])) for states in parts]
+        return _part_of_mixture(prior, states)
+    if prior is None:
+        return None
+    root = groups.root(states[0])
+    # A term that is constant normalises nothing.
+    places = {term: _places(model, term) for term in _terms(model, groups, prior.log_density)}
+    return DensityPrior(sp.Add(*(term for term, used in places.items() if used and groups.root(used[0]) == root)))
+
+
+def _pooled(priors: Sequence[Any]) -> Any:
+    """One prior for all: their own if it is one, or else a Gaussian with the moments of their mixture.
+
+    What is decided offline, such as how finely to divide, is then decided for all of them.
+    """
+    different = list(dict.fromkeys(priors))
+    if len(different) == 1 or isinstance(different[0], DensityPrior):
+        return different[0]
+    means = np.array([prior.mean for prior in different])
+    deviations = means - means.mean(axis=0)
+    cov = np.mean([prior.cov for prior in different], axis=0) + deviations.T @ deviations / len(different)
+    return GaussianPrior(means.mean(axis=0), cov)
 
 
 def _part_of_mixture(prior: MixturePrior, states: tuple[int, ...]) -> GaussianPrior | MixturePrior:

@@ -1,7 +1,8 @@
-"""What a belief is: Gaussian mixtures and densities on a lattice, behind one protocol."""
+"""What a belief is: Gaussian mixtures, densities on a lattice and products of independent blocks, behind one protocol."""
 
 from zakai.densities._density import Density
 from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
+from zakai.densities.product import ProductDensity
 
-__all__ = ["Density", "GaussianMixture", "GridDensity"]
+__all__ = ["Density", "GaussianMixture", "GridDensity", "ProductDensity"]

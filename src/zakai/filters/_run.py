@@ -244,17 +244,29 @@ class Run:
                 said = explain_nonfinite(model, key, getattr(model, key), points[wrong][0], time)
                 raise InputError(f"{model.source}: {said}, which the density reaches")
 
-    def result(self, why: str, considered: Mapping[str, tuple[Condition, ...]]) -> FilterResult:
-        """Everything put together."""
-        model, method = self.setting.model, self.setting.method
+    def prior_moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """The mean (n,) and the covariance (n, n) at the start."""
+        method = self.setting.method
         first = self.density(0) if self.states else method.density(self.first, method.init(self.first, self.setting.prior))
+        return first.mean(), first.cov()
+
+    def result(
+        self,
+        why: str,
+        considered: Mapping[str, tuple[Condition, ...]],
+        prior_moments: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> FilterResult:
+        """Everything put together; the moments of a prior that many runs share need be found but once."""
+        model, method = self.setting.model, self.setting.method
+        first_mean, first_cov = self.prior_moments() if prior_moments is None else prior_moments
         joined = jax.tree.map(lambda *parts: np.concatenate(parts), *self.infos)
         increments = np.concatenate([[0.0], joined.log_likelihood_increment])
         health = {name: np.concatenate([[np.nan], values]) for name, values in joined.health.items()}
+        cov = np.concatenate([first_cov[None], joined.cov])
         result = FilterResult(
             times=np.concatenate([[model.start], self.record.times]),
-            mean=np.concatenate([first.mean()[None], joined.mean]),
-            cov=np.concatenate([first.cov()[None], joined.cov]),
+            mean=np.concatenate([first_mean[None], joined.mean]),
+            variance=np.diagonal(cov, axis1=1, axis2=2),
             log_likelihood_increments=increments,
             health=health,
             warnings=[],
@@ -266,6 +278,7 @@ class Run:
             bounds=method.bounds,
             state=model.state,
             attributes={"source": method.source, "exactness": method.exactness, **versions()},
+            _cov=cov,
             _density=self.density if self.states else None,
             _no_density=(
                 f"the densities of {len(self.record.times)} steps were not kept: they need more than "

@@ -1,4 +1,4 @@
-"""Many records of one model at once: one compiled scan serves all that were taken at the same times with the same gaps."""
+"""Many records at once: one compiled scan serves all of one model that were taken at the same times with the same gaps."""
 
 from __future__ import annotations
 
@@ -57,10 +57,11 @@ def filter_all(runs: Sequence[Run], progress: Callable[[int, int], None] | None)
 
 
 def _alike(runs: Sequence[Run]) -> Iterator[list[Run]]:
-    """The records that were taken at the same times with the same gaps."""
+    """The records of one system, filtered by one method, that were taken at the same times with the same gaps."""
     found: dict[Hashable, list[Run]] = {}
     for run in runs:
-        key = (run.record.times.tobytes(), np.isnan(run.record.values).tobytes())
+        what = id(run.setting.model), run.setting.method.name
+        key = (*what, run.record.times.tobytes(), np.isnan(run.record.values).tobytes())
         found.setdefault(key, []).append(run)
     yield from found.values()
 

@@ -8,11 +8,9 @@ from typing import Any, overload
 
 import numpy as np
 
-from zakai import _registry
-from zakai.algebra.conditions import Condition, all_hold
-from zakai.errors import ConditionError, InputError
-from zakai.filters._protocol import Method
-from zakai.filters._run import KEPT_BYTES, Run, Setting
+from zakai.errors import InputError
+from zakai.filters._plan import Plan, plan_of
+from zakai.filters._run import KEPT_BYTES
 from zakai.filters.batches import filter_all
 from zakai.filters.results import FilterResult
 from zakai.models._errors import named
@@ -46,7 +44,8 @@ def filter(model, record, method="auto", *, keep=None, progress=None, **options)
 
     model: what the system is, with a prior. record: K observations of its kind, or a list of records, each of which is
     filtered by itself; those with the same times and gaps are then filtered side by side, in less time than one by one.
-    method: a method's name, or "auto", the first that holds for this system. keep: "densities", "moments", or None: densities
+    method: a method's name, or "auto", the first that holds for this system; a system that falls into independent blocks is
+    filtered block by block, each by the best method for it. keep: "densities", "moments", or None: densities
     up to 512 MiB in all. progress: called with the number of observations done and K. options: those of the method.
 
     Gives a FilterResult, or a list of them for a list. Raises InputError for a wrong record or option, ConditionError if the
@@ -83,74 +82,56 @@ def filter_from(prior, model, record, method="auto", **options):
 def _filter(model, record, prior, method, keep, progress, options):
     if keep not in (None, "densities", "moments"):
         raise InputError(f'keep: "{keep}" is neither "densities" nor "moments"')
-    if not isinstance(record, list | tuple):
-        setting, why, considered = setting_of(model, record, method, options)
-        run = Run(setting if prior is None else setting._replace(prior=prior), record, keep)
-        run.all(progress)
-        return run.result(why, considered)
-    if not record:
+    many = isinstance(record, list | tuple)
+    if many and not record:
         return []
-    priors = [prior] * len(record) if not isinstance(prior, list | tuple) else prior
-    if len(priors) != len(record):
-        raise InputError(f"filter_from: {len(priors)} priors do not go with {len(record)} records; give one for each")
-    setting, why, considered = setting_of(model, record, method, options)
-    settings = [setting if own is None else setting._replace(prior=own) for own in priors]
-    runs = [Run(own, one, keep, most=KEPT_BYTES / len(record)) for own, one in zip(settings, record)]
-    filter_all(runs, progress)
-    return [run.result(why, considered) for run in runs]
+    records = list(record) if many else [record]
+    priors = list(prior) if many and isinstance(prior, list | tuple) else [prior] * len(records)
+    if len(priors) != len(records):
+        raise InputError(f"filter_from: {len(priors)} priors do not go with {len(records)} records; give one for each")
+    check_records(model, record)
+    plans = {id(own): planned(model, records, own, method, options) for own in {id(own): own for own in priors}.values()}
+    chosen = [plans[id(own)] for own in priors]
+    runs = [plan.runs(one, keep, most=KEPT_BYTES / len(records)) for plan, one in zip(chosen, records, strict=True)]
+    flat = [run for of_one in runs for run in of_one]
+    if len(flat) == 1:
+        flat[0].all(progress)
+    else:
+        filter_all(flat, None if progress is None else _per_record(progress, sum(map(len, records)), len(flat) / len(records)))
+    results = []
+    for plan, one, of_one in zip(chosen, records, runs, strict=True):
+        results.append(plan.result(of_one))
+        results[-1].record = one
+    return results if many else results[0]
 
 
-def setting_of(
-    model: Model, record: Record | Sequence[Record], method: str, options: Mapping[str, Any]
-) -> tuple[Setting, str, Mapping[str, tuple[Condition, ...]]]:
-    """What records are filtered by, all of it checked; why; and the conditions of every method that was looked at."""
+def _per_record(progress: Callable[[int, int], None], total: int, blocks: float) -> Callable[[int, int], None]:
+    """Progress that counts an observation once, not once for each block."""
+    return lambda done, _: progress(min(total, int(done / blocks + 1e-6)), total)
+
+
+def planned(
+    model: Model, records: Sequence[Record], prior: Any, method: str, options: Mapping[str, Any], by_value: bool = True
+) -> Plan:
+    """How some records, which were checked, are filtered, with the noise checked at their times; None is the model's prior."""
+    plan = plan_of(model, model.prior if prior is None else prior, method, options, by_value)
+    times = {one.times.tobytes(): one.times for one in records}
+    together = np.unique(np.concatenate([[model.start], *times.values()]))
+    for part in {id(setting.model): setting.model for setting in plan.settings}.values():
+        check_noise_at(part, together)
+        check_noise_within(part, together)
+    return plan
+
+
+def check_records(model: Model, record: Record | Sequence[Record]) -> None:
+    """Raise InputError unless the model and the record, or every record of a list, are such and go together."""
     records: list[Any] = list(record) if isinstance(record, list | tuple) else [record]
-    times: dict[bytes, np.ndarray] = {}
     for index, one in enumerate(records):
         for given, kind, how in ((model, Model, "zakai.load_model"), (one, Record, "zakai.read_record")):
             if not isinstance(given, kind):
                 raise InputError(f"filter: expected a {kind.__name__}, got a {type(given).__name__}; {how} reads one from a file")
         with named(f"records[{index}]") if isinstance(record, list | tuple) else nullcontext():
             _check(model, one)
-        times[one.times.tobytes()] = one.times
-    chosen, why, considered = choose(model, method)
-    unknown = set(options) - set(chosen.options)
-    if unknown:
-        listed = ", ".join(sorted(chosen.options)) or "none"
-        raise InputError(f'{chosen.name} has no option "{sorted(unknown)[0]}"; its options are: {listed}')
-    together = np.unique(np.concatenate([[model.start], *times.values()]))
-    check_noise_at(model, together)
-    check_noise_within(model, together)
-    return Setting(model, model.prior, chosen, {**chosen.options, **options}), why, considered
-
-
-def choose(model: Model, method: str) -> tuple[Method, str, Mapping[str, tuple[Condition, ...]]]:
-    """The method of that name, or the first that holds; why; and the conditions of every method that was looked at."""
-    if method != "auto":
-        chosen = _registry.load(method)
-        conditions = chosen.theorem(model)
-        if all_hold(conditions) is not True:
-            raise ConditionError(f"{model.source}: {chosen.name} does not hold: {_failure(conditions)}")
-        return chosen, "asked for by name, and every assumption of its theorem holds", {method: conditions}
-    considered: dict[str, tuple[Condition, ...]] = {}
-    for name in _registry.AUTO:
-        candidate = _registry.load(name)
-        considered[name] = candidate.theorem(model)
-        if all_hold(considered[name]) is True:
-            return candidate, "the first method whose every assumption holds for this system", considered
-    reasons = "; ".join(f"{name}: {_failure(conditions)}" for name, conditions in considered.items())
-    raise ConditionError(
-        f"{model.source}: no method holds for this system ({reasons}); "
-        "`extended-kalman-bucy` approximates it if it is named"
-    )
-
-
-def _failure(conditions: tuple[Condition, ...]) -> str:
-    for condition in sorted(conditions, key=lambda c: c.holds is None):
-        if condition.holds is not True:
-            verb = "it fails that" if condition.holds is False else "it is undecided whether"
-            return f"{verb} {condition.statement} ({condition.evidence}) [{condition.source}]"
-    return "nothing failed"
 
 
 def _check(model: Model, record: Record) -> None:

@@ -19,7 +19,7 @@ from zakai import _float64  # noqa: F401
 from zakai.errors import ConditionError, InputError
 from zakai.filters._protocol import Method
 from zakai.filters._run import Piece, Run, Setting, scanned
-from zakai.filters.driver import setting_of
+from zakai.filters.driver import check_records, planned
 from zakai.filters.results import FilterResult
 from zakai.models._definite import ROUNDING
 from zakai.models._errors import did_you_mean, listing
@@ -76,21 +76,29 @@ def replayed(
     model: Model, record: Record, method: str, names: tuple[str, ...], options: dict[str, Any]
 ) -> tuple[Callable[[Any], jax.Array], FilterResult]:
     """The function of `log_likelihood`, and the result of the ordinary run that it repeats."""
-    setting, why, considered = setting_of(model, record, method, options)
-    chosen = setting.method
-    if chosen.with_parameters is None or (chosen.adapt and chosen.resume is None):
-        raise ConditionError(f"{model.source}: {chosen.name} has no gradient with respect to parameters; name another method")
-    run = Run(setting, record, "moments", recorded=True)
-    run.all(None)
-    replay = _Replay(setting, run)
+    check_records(model, record)
+    plan = planned(model, [record], None, method, options, by_value=False)
+    for setting in plan.settings:
+        chosen = setting.method
+        if chosen.with_parameters is None or (chosen.adapt and chosen.resume is None):
+            source = setting.model.source
+            raise ConditionError(f"{source}: {chosen.name} has no gradient with respect to parameters; name another method")
+    runs = plan.runs(record, "moments", recorded=True)
+    for run in runs:
+        run.all(None)
+    # Of independent blocks the evidence is the product.
+    replays = [_Replay(run.setting, run) for run in runs]
     where = np.array([list(model.parameters).index(name) for name in names])
     own, noise = model.theta(), _noise_is_noise(model, names, np.concatenate([[model.start], record.times]))
 
     def function(values: Any) -> jax.Array:
         theta = jnp.asarray(own).at[where].set(jnp.asarray(values, dtype=jnp.float64))
-        return jnp.where(noise(jax.lax.stop_gradient(theta)), replay(theta), jnp.nan)
+        total = sum((replay(theta) for replay in replays), start=jnp.zeros(()))
+        return jnp.where(noise(jax.lax.stop_gradient(theta)), total, jnp.nan)
 
-    return function, run.result(why, considered)
+    result = plan.result(runs)
+    result.record = record
+    return function, result
 
 
 class _Replay:

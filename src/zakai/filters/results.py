@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import xarray
 
 _LARGEST_COV = 32
+_MOST_ASSEMBLED = 4 * 2**30  # bytes of the covariances of independent blocks, when they are put together
 
 
 @dataclass(eq=False, repr=False)
@@ -30,12 +31,13 @@ class FilterResult:
     Index 0 is the prior at the model's start; index k is after observation k has been used. `times` (K+1,), `mean` and
     `variance` (K+1, n), `cov` (K+1, n, n), `log_likelihood_increments` (K+1,) with entry 0 zero, and `health`, figures of each
     step (K+1,). `warnings` are sentences; none means that every bound was kept. `method` and `why` say which filter ran
-    and on what grounds, `conditions` those of every method that was considered.
+    and on what grounds, `conditions` those of every method that was considered. Of a system that was filtered block by block
+    `blocks` are the results of the blocks; `health` is the worst of theirs, and `cov` is put together when it is asked for.
     """
 
     times: np.ndarray
     mean: np.ndarray
-    cov: np.ndarray
+    variance: np.ndarray
     log_likelihood_increments: np.ndarray
     health: dict[str, np.ndarray]
     warnings: list[str]
@@ -47,19 +49,44 @@ class FilterResult:
     bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)
     state: tuple[str, ...] = ()
     attributes: dict[str, str] = field(default_factory=dict)
+    blocks: tuple[FilterResult, ...] = ()
+    _cov: np.ndarray | None = None
     _density: Callable[[int], Density] | None = None
     _no_density: str = "the densities were not kept"
 
     def __repr__(self) -> str:
+        names = self.state if len(self.state) <= 8 else (*self.state[:6], "...", self.state[-1])
         return (
-            f"FilterResult({self.method}, {len(self.times) - 1} observations of {', '.join(self.state)}, "
+            f"FilterResult({self.method}, {len(self.times) - 1} observations of {', '.join(names)}, "
             f"log-likelihood {self.log_likelihood:.6g}, {len(self.warnings)} warnings)"
         )
 
     @property
-    def variance(self) -> np.ndarray:
-        """The variances of the coordinates (K+1, n)."""
-        return np.diagonal(self.cov, axis1=1, axis2=2)
+    def cov(self) -> np.ndarray:
+        """The covariances (K+1, n, n).
+
+        Raises InputError where they were not stored, or those of many blocks would fill the memory.
+        """
+        if self._cov is None:
+            self._cov = self._assembled()
+        return self._cov
+
+    def _assembled(self) -> np.ndarray:
+        """The covariances of independent blocks as those of the whole."""
+        count, n = self.mean.shape
+        if not self.blocks:
+            raise InputError(f"cov: the covariances of {n} states were not stored, only their variances; see `variance`")
+        size = 8 * count * n * n
+        if size > _MOST_ASSEMBLED:
+            raise InputError(
+                f"cov: the covariances of {n} states at {count} times take {size / 2**30:.3g} GiB, nearly all of them zeros; "
+                "see `variance`, `density(k).cov()`, or the `cov` of each of `blocks`"
+            )
+        whole, place = np.zeros((count, n, n)), {name: i for i, name in enumerate(self.state)}
+        for block in self.blocks:
+            places = np.array([place[name] for name in block.state])
+            whole[:, places[:, None], places] = block.cov
+        return whole
 
     @property
     def log_likelihood(self) -> float:
@@ -123,13 +150,11 @@ def load_result(path: str | os.PathLike[str]) -> FilterResult:
     data = load_dataset(path)
     known = {"mean", "variance", "cov", "log_likelihood_increment"}
     mean = data["mean"].values
-    variance = data["variance"].values
-    cov = data["cov"].values if "cov" in data else np.einsum("ki,ij->kij", variance, np.eye(mean.shape[1]))
     text = str(data.attrs.get("model", ""))
     return FilterResult(
         times=data["time"].values,
         mean=mean,
-        cov=cov,
+        variance=data["variance"].values,
         log_likelihood_increments=data["log_likelihood_increment"].values,
         health={str(name): data[name].values for name in data.data_vars if name not in known},
         warnings=[line for line in str(data.attrs.get("warnings", "")).split("\n") if line],
@@ -137,6 +162,7 @@ def load_result(path: str | os.PathLike[str]) -> FilterResult:
         why=str(data.attrs.get("why", "")),
         model=read_model(text, str(path)) if text else None,
         state=tuple(str(name) for name in data["state"].values),
+        _cov=data["cov"].values if "cov" in data else None,
         _no_density=f"{path}: a stored result has no densities; filter again to have them",
     )
 

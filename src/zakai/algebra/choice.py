@@ -1,0 +1,125 @@
+"""Which method is taken for a system, and whether for the whole of it or block by block."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from zakai._registry import AUTO
+from zakai.algebra.conditions import Condition, all_hold
+from zakai.algebra.independent import IndependentBlock, independent_blocks
+from zakai.algebra.theorems import THEOREMS
+from zakai.errors import ConditionError
+from zakai.models.model import Model
+from zakai.models.prior import GaussianPrior
+
+Conditions = tuple[Condition, ...]
+# A linear system of so few states is one Kalman-Bucy filter, though it may fall into blocks.
+FEW = 8
+# Beyond so many states a system that falls into blocks is not looked at as a whole.
+MANY = 32
+_SHOWN = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Division:
+    """A system block by block: of each shared model the name of its method, and the conditions of all that were looked at."""
+
+    blocks: tuple[IndependentBlock, ...]
+    methods: Mapping[Model, str]
+    conditions: Mapping[Model, Mapping[str, Conditions]]
+    by_name: bool
+
+    @property
+    def method(self) -> str:
+        """As in "blocks: 3 x limited-direct, kalman-bucy"."""
+        counts = Counter(self.methods[block.model] for block in self.blocks)
+        return "blocks: " + ", ".join(name if count == 1 else f"{count} x {name}" for name, count in counts.items())
+
+    @property
+    def why(self) -> str:
+        """On what grounds, in a sentence."""
+        by_method: dict[str, list[IndependentBlock]] = {}
+        for block in self.blocks:
+            by_method.setdefault(self.methods[block.model], []).append(block)
+        named = "; ".join(f"{listed_blocks(blocks)} by {name}" for name, blocks in by_method.items())
+        how = "the method asked for holds for each of them" if self.by_name else "each has the first method that holds for it"
+        return f"the system falls into {len(self.blocks)} independent blocks, and {how}: {named}"
+
+
+def chosen(model: Model, method: str) -> tuple[str, str, Mapping[str, Conditions]]:
+    """The method of that name, or for "auto" the first that holds; why; and the conditions of all that were looked at.
+
+    Raises ConditionError, with what fails, if it does not hold, or none does.
+    """
+    if method != "auto":
+        conditions = THEOREMS[method](model)
+        if all_hold(conditions) is not True:
+            raise ConditionError(f"{model.source}: {method} does not hold: {failure(conditions)}")
+        return method, "asked for by name, and every assumption of its theorem holds", {method: conditions}
+    considered: dict[str, Conditions] = {}
+    for name in AUTO:
+        considered[name] = THEOREMS[name](model)
+        if all_hold(considered[name]) is True:
+            return name, "the first method whose every assumption holds for this system", considered
+    reasons = "; ".join(f"{name}: {failure(conditions)}" for name, conditions in considered.items())
+    raise ConditionError(
+        f"{model.source}: no method holds for this system ({reasons}); "
+        "`extended-kalman-bucy` approximates it if it is named"
+    )
+
+
+def divided(model: Model, prior: Any, method: str = "auto", by_value: bool = True) -> Division | None:
+    """The blocks of a system with their methods, or None where it is better filtered as a whole.
+
+    "auto" takes blocks wherever there are several, but for linear systems of at most `FEW` states with a Gaussian prior; a
+    method that is named is taken block by block if it does not hold for the whole, or there are more than `MANY` states.
+
+    Raises ConditionError, with what fails, if a block has no method.
+    """
+    blocks = independent_blocks(model, prior, by_value)
+    if len(blocks) == 1:
+        return None
+    if method == "auto":
+        plain = model.n <= FEW and isinstance(prior, GaussianPrior | None)
+        if plain and all_hold(THEOREMS["kalman-bucy"](model)) is True:
+            return None
+    elif model.n <= MANY and all_hold(THEOREMS[method](model)) is True:
+        return None
+    methods, conditions = {}, {}
+    for part in dict.fromkeys(block.model for block in blocks):
+        try:
+            methods[part], _, conditions[part] = chosen(part, method)
+        except ConditionError as error:
+            if method == "auto" or model.n > MANY:
+                raise
+            whole = failure(THEOREMS[method](model))
+            raise ConditionError(f"{model.source}: {method} does not hold: {whole}; nor block by block: {error}") from None
+    return Division(blocks, methods, conditions, method != "auto")
+
+
+def recommended(model: Model) -> str | None:
+    """What "auto" takes, a method's name or as `Division.method`; None where nothing holds."""
+    try:
+        division = divided(model, model.prior)
+        return chosen(model, "auto")[0] if division is None else division.method
+    except ConditionError:
+        return None
+
+
+def listed_blocks(blocks: Sequence[IndependentBlock]) -> str:
+    """Some blocks by the names of their states: x1, (x2, x3), x4 and 7 more."""
+    names = [block.names[0] if len(block.names) == 1 else f"({', '.join(block.names)})" for block in blocks]
+    shown = ", ".join(names[:_SHOWN])
+    return shown if len(names) <= _SHOWN else f"{shown} and {len(names) - _SHOWN} more"
+
+
+def failure(conditions: Conditions) -> str:
+    """The first assumption that fails, or else that is undecided, in words."""
+    for condition in sorted(conditions, key=lambda c: c.holds is None):
+        if condition.holds is not True:
+            verb = "it fails that" if condition.holds is False else "it is undecided whether"
+            return f"{verb} {condition.statement} ({condition.evidence}) [{condition.source}]"
+    return "nothing failed"
