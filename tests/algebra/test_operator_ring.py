@@ -176,3 +176,10 @@ def test_a_tower_of_derivatives_that_runs_out_raises():
     p = reader.ring.total_derivative(reader.ring.total_derivative(p, 0), 0)
     with pytest.raises(JetTowerEnds):
         reader.ring.total_derivative(p, 0)
+
+
+def test_more_arguments_than_there_may_be_are_refused_and_many_are_quick():
+    x = sp.symbols("x1:41", real=True)
+    assert Reader([GAMMA(*x[:16])], x[:16], ()).ring.generators == 1 + 153  # one inverse, and (18 over 2) derivatives
+    with pytest.raises(Unreadable, match="more than 16 arguments"):
+        Reader([GAMMA(*x)], x, ())

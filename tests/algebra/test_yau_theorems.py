@@ -38,6 +38,11 @@ MODELS = {
     "passive": gallery.load("passive-drift"),
     "correlated": gallery.load("kalman-bucy-2d"),
     "silent": gallery.load("silent-double-well"),
+    "two observations without noise": system(["0"], ["x1", "1"], diffusion=[["0"]]),
+    "noise in one of two": system(["x2", "-x1"], ["x1"], diffusion=[["0"], ["1"]]),
+    "in time": system(["-t*x1"], ["x1"]),
+    "not in the ring": system(["sqrt(1 + x1**2)"], ["x1"]),
+    "undetermined": gallery.load("wong"),
 }
 
 
@@ -48,6 +53,7 @@ def test_a_theorem_whose_assumptions_hold_has_its_conclusion(theorem, model):
     if check.applies:
         assert check.conclusion.holds is True, str(check)
     assert all(c.evidence for c in check.assumptions)
+    assert "Subs(" not in str(check)
 
 
 @pytest.mark.parametrize(
@@ -71,6 +77,10 @@ def test_a_theorem_whose_assumptions_hold_has_its_conclusion(theorem, model):
         (theorems.lemma_3_3, "passive", True, True),
         (theorems.lemma_3_3, "cube", True, True),
         (theorems.lemma_3_3, "partly observed", False, False),
+        (theorems.lemma_3_3, "noise in one of two", False, False),
+        (theorems.theorem_7, "two observations without noise", False, False),  # L_0, x, 1
+        (theorems.theorem_8, "noise in one of two", False, True),
+        (theorems.theorem_4_i, "in time", None, None),
     ],
 )
 def test_assumptions_and_conclusions_are_told_apart(theorem, name, applies, concludes):
@@ -105,6 +115,22 @@ def test_lemma_2_5_gives_brackets_to_leading_order(i, j):
     model = system(["x2*sin(x1)", "x1**2 - x2"], ["x1"])
     check = theorems.lemma_2_5(model, X[0] * X[1] ** 2, i, sp.sin(X[0]) * X[1], j)
     assert check.applies and check.conclusion.holds, str(check)
+
+
+@pytest.mark.parametrize(
+    ("name", "function", "words"),
+    [
+        ("noise in one of two", X[0], "G is singular"),
+        ("in time", X[0], "depend on time"),
+        ("linear", sp.sqrt(X[0]), "not in the operator ring"),
+    ],
+)
+def test_lemma_2_5_says_in_one_line_what_it_cannot_read(name, function, words):
+    model = MODELS[name]
+    i = (1,) + (0,) * (model.n - 1)
+    with pytest.raises(zakai.InputError, match=words) as error:
+        theorems.lemma_2_5(model, function, i, X[0], i)
+    assert "\n" not in str(error.value)
 
 
 def test_lemma_2_5_says_nothing_of_two_functions():

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from itertools import product
+from itertools import combinations_with_replacement
 
 import sympy as sp
 from flint import fmpq_mat
@@ -29,6 +29,7 @@ from zakai.algebra.quotients import Fraction, Fractions
 
 PI = sp.Symbol("pi", positive=True)  # transcendental, so a constant like any other
 INVERSE = sp.Dummy("inverse")  # 1/P
+MOST_ARGUMENTS = 16  # of an undetermined function
 HYPERBOLIC = (sp.exp, sp.sinh, sp.cosh, sp.tanh)
 CIRCULAR = (sp.sin, sp.cos, sp.tan)
 
@@ -196,7 +197,10 @@ class Reader:
     def _jets(self, atom: sp.Expr, highest: int) -> None:
         count = len(atom.args)
         highest = highest if count == 1 else max(2, highest - count)
-        orders = sorted((o for o in product(range(highest + 1), repeat=count) if sum(o) <= highest), key=lambda o: (sum(o), o))
+        if count > MOST_ARGUMENTS:
+            raise Unreadable(f"{atom.func.__name__} has more than {MOST_ARGUMENTS} arguments, and so too many derivatives")
+        chosen = (c for k in range(highest + 1) for c in combinations_with_replacement(range(count), k))
+        orders = sorted((tuple(c.count(j) for j in range(count)) for c in chosen), key=lambda o: (sum(o), o))
         first = len(self._plans)
         where = {order: first + j for j, order in enumerate(orders)}
 

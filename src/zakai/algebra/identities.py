@@ -10,7 +10,7 @@ dozen random points is taken to be zero.  Everything else is undecided, and said
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import mpmath
 import sympy as sp
@@ -66,10 +66,15 @@ def _determined(expression: sp.Expr) -> sp.Expr:
     return expression.doit()
 
 
-def all_zero(expressions: Sequence[sp.Expr]) -> bool | None:
+def all_zero(expressions: Iterable[sp.Expr]) -> bool | None:
     """`is_zero` for several expressions at once: False wins over None, None over True."""
-    answers = [is_zero(expression) for expression in expressions]
-    return False if False in answers else None if None in answers else True
+    every: bool | None = True
+    for expression in expressions:
+        answer = is_zero(expression)
+        if answer is False:
+            return False
+        every = every if answer else None
+    return every
 
 
 def is_quadratic(q: sp.Expr, x: Sequence[sp.Symbol]) -> bool | None:
@@ -91,7 +96,7 @@ def is_quadratic(q: sp.Expr, x: Sequence[sp.Symbol]) -> bool | None:
                 return False
         vanished += 1
     if q.count_ops() <= SHORT:
-        thirds = [sp.diff(q, a, b, c) for i, a in enumerate(x) for j, b in enumerate(x[i:], i) for c in x[j:]]
+        thirds = (sp.diff(q, a, b, c) for i, a in enumerate(x) for j, b in enumerate(x[i:], i) for c in x[j:])
         if is_in_one_piece(q, x) and all(_provably_zero(third) for third in thirds):
             return True
     return True if vanished >= POINTS and _is_analytic(q) else None

@@ -69,7 +69,7 @@ def affine_parts(
     """C and c if the field is C x + c for all x, else None."""
     slope = sp.Matrix([[sp.diff(entry, symbol) if entry.has(symbol) else sp.Integer(0) for symbol in x] for entry in field])
     # Where a derivative still contains the state it may do so in name only.
-    seconds = [sp.diff(entry, symbol) for entry in slope for symbol in entry.free_symbols & set(x)]
+    seconds = (sp.diff(entry, symbol) for entry in slope for symbol in entry.free_symbols & set(x))
     if all_zero(seconds) is not True:
         return None
     origin = {symbol: sp.Integer(0) for symbol in x}

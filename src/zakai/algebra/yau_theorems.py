@@ -9,15 +9,19 @@ Numbers are those of Yau's report (1993), and of Dong, Chen and Yau (2021) for t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import sympy as sp
 
+from zakai.algebra._readable import readable
+from zakai.algebra.arguments import Unreadable
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.dmz_operators import DmzOperators
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
-from zakai.algebra.systems import affine_observation, cached_yau_form
+from zakai.algebra.operators import Symbol
+from zakai.algebra.systems import affine_observation, cached_yau_form, definite_covariance
 from zakai.algebra.yau import YauForm, short
+from zakai.errors import InputError
 from zakai.models.model import Model
 
 YAU = "Yau 1993"
@@ -122,31 +126,37 @@ def theorem_5(model: Model) -> TheoremCheck:
 
 
 def theorem_7(model: Model) -> TheoremCheck:
-    """If n = 1 and E is finite, its dimension is 4, 2 or 1."""
+    """If n = 1, G > 0 and E is finite, its dimension is 4, 2 or 1."""
     one = Condition("n = 1", model.n == 1, f"n = {model.n}", YAU)
+    assumptions = (one, _is_regular(model), _is_finite(model))
     conclusion = _has_dimension(estimation_algebra(model), (4, 2, 1))
-    return TheoremCheck(
-        f"{YAU}, Theorem 7", "with one state, a finite E has dimension 4, 2 or 1", (one, _is_finite(model)), conclusion
-    )
+    return TheoremCheck(f"{YAU}, Theorem 7", "with one state, a finite E has dimension 4, 2 or 1", assumptions, conclusion)
 
 
 def theorem_8(model: Model) -> TheoremCheck:
-    """If n = 2 and E is finite of maximal rank, its dimension is 6."""
+    """If n = 2, G is regular and E is finite of maximal rank, its dimension is 6."""
     algebra = estimation_algebra(model)
     two = Condition("n = 2", model.n == 2, f"n = {model.n}", YAU)
     rank = Condition("E has maximal rank", algebra.linear_rank == model.n, f"linear rank {algebra.linear_rank}", YAU)
     statement = "with two states, a finite E of maximal rank has dimension 6"
-    return TheoremCheck(f"{YAU}, Theorem 8", statement, (two, _is_finite(model), rank), _has_dimension(algebra, (6,)))
+    assumptions = (two, _is_regular(model), _is_finite(model), rank)
+    return TheoremCheck(f"{YAU}, Theorem 8", statement, assumptions, _has_dimension(algebra, (6,)))
 
 
 def lemma_2_5(model: Model, g: sp.Expr, i: Sequence[int], h: sp.Expr, j: Sequence[int]) -> TheoremCheck:
     """[g D^i, h D^j] = sum_l (i_l g d_l h - j_l h d_l g) D^(i + j - e_l) modulo operators of order r + s - 2 (G = I).
 
     `g` and `h` are functions in the ring of the model's formulas, `i` and `j` multi-indices with |i| = r and |j| = s, r + s >= 2.
+    Raises InputError where the operators D_i are not defined, and for a function that is not in the ring.
     """
     operators = _operators(model)
+    if isinstance(operators, Condition):
+        raise InputError(f"{model.source}: the operators D_i are not defined: {operators.evidence}")
     ring, r, s = operators.ring, sum(i), sum(j)
-    a, b = operators.reader.read(g), operators.reader.read(h)
+    try:
+        a, b = operators.reader.read(g), operators.reader.read(h)
+    except Unreadable as reason:
+        raise InputError(f"g, h: {reason}; give functions in the ring of the model's formulas") from None
     bracket = ring.bracket(a * operators.power_of_D(i), b * operators.power_of_D(j))
     for l in range(ring.n):
         c = i[l] * a * ring.total_derivative(b, l) - j[l] * b * ring.total_derivative(a, l)
@@ -162,23 +172,11 @@ def lemma_2_5(model: Model, g: sp.Expr, i: Sequence[int], h: sp.Expr, j: Sequenc
 
 def lemma_3_3(model: Model) -> TheoremCheck:
     """If h is affine in x_1 alone, omega_1j = 0 and eta = P_2(x_1) + phi(x_2, ...), then E has the basis L_0, D_1, x_1, 1."""
-    operators = _operators(model)
-    ring, x = operators.ring, model.x
-    affine = affine_observation(model)
+    x, affine = model.x, affine_observation(model)
     alone = affine is not None and any(affine[0][:, 0]) and not any(affine[0][:, 1:])
-    entries = {pair: entry for pair, entry in operators.omega.items() if pair[0] == 0}
-    moving = next((f"omega_1,{j + 1} = {operators.reader.expression(e)}" for (_, j), e in entries.items() if e != 0), None)
-    assert operators.eta is not None
-    slope = ring.total_derivative(operators.eta, 0)
-    mixed = [ring.total_derivative(slope, j) for j in range(1, ring.n)]
-    third = ring.total_derivative(ring.total_derivative(slope, 0), 0)
-    splits = third.is_zero() and all(m.is_zero() for m in mixed)
     assumptions = (
         Condition(f"h is affine in {x[0]} alone and not constant", alone, str(list(model.observation)), DONG),
-        Condition("omega_1j = 0", moving is None, moving or "omega_1j = 0", DONG),
-        Condition(
-            f"eta = P_2({x[0]}) + phi of the rest", splits, f"d_1 eta = {short(str(operators.reader.expression(slope)))}", DONG
-        ),
+        *_first_coordinate_splits(model),
     )
     algebra = estimation_algebra(model)
     basis = [str(e) for e in algebra.basis]
@@ -187,19 +185,49 @@ def lemma_3_3(model: Model) -> TheoremCheck:
     return TheoremCheck(f"{DONG}, Lemma 3.3", "E has the basis L_0, D_1, x_1, 1", assumptions, conclusion)
 
 
-def _operators(model: Model) -> DmzOperators:
-    return DmzOperators(model, dict(zip(model.parameter_symbols, model.parameters.values(), strict=True)))
+def _first_coordinate_splits(model: Model) -> tuple[Condition, Condition]:
+    """Whether omega_1j = 0, and whether d_1 eta is affine in x_1 alone."""
+    first, second = "omega_1j = 0", f"eta = P_2({model.x[0]}) + phi of the rest"
+    operators = _operators(model)
+    if isinstance(operators, Condition):
+        return replace(operators, statement=first, source=DONG), replace(operators, statement=second, source=DONG)
+    ring = operators.ring
+    slope = ring.total_derivative(operators.eta, 0)
+    mixed = [ring.total_derivative(slope, j) for j in range(1, ring.n)]
+    third = ring.total_derivative(ring.total_derivative(slope, 0), 0)
+    splits = third.is_zero() and all(m.is_zero() for m in mixed)
+    moving = next((f"omega_1,{j + 1} = {_text(e, operators)}" for (i, j), e in operators.omega.items() if i == 0 and e != 0), "")
+    return (
+        Condition(first, not moving, moving or first, DONG),
+        Condition(second, splits, f"d_1 eta = {_text(slope, operators)}", DONG),
+    )
+
+
+def _operators(model: Model) -> DmzOperators | Condition:
+    """Those of a regular G; or the condition, without its statement, that there are none."""
+    try:
+        operators = DmzOperators(model, dict(zip(model.parameter_symbols, model.parameters.values(), strict=True)))
+    except Unreadable as reason:
+        return Condition("", None, str(reason), YAU)
+    return Condition("", False, "G is singular", YAU) if operators.g is None else operators
+
+
+def _text(function: Symbol, operators: DmzOperators) -> str:
+    return short(str(readable(operators.reader.expression(function))))
+
+
+def _is_regular(model: Model) -> Condition:
+    return replace(definite_covariance(model), source=YAU)
 
 
 def _omega_is_constant(model: Model) -> Condition:
     operators = _operators(model)
-    if operators.g is None:
-        return Condition("Omega is constant", False, "G is singular", YAU)
+    if isinstance(operators, Condition):
+        return replace(operators, statement="Omega is constant")
     for (i, j), entry in operators.omega.items():
         if not operators.is_polynomial(entry, 0):
-            evidence = f"omega_{i + 1},{j + 1} = {short(str(operators.reader.expression(entry)))}"
-            return Condition("Omega is constant", False, evidence, YAU)
-    entries = {f"{i + 1},{j + 1}": str(operators.reader.expression(e)) for (i, j), e in operators.omega.items() if e != 0}
+            return Condition("Omega is constant", False, f"omega_{i + 1},{j + 1} = {_text(entry, operators)}", YAU)
+    entries = {f"{i + 1},{j + 1}": _text(e, operators) for (i, j), e in operators.omega.items() if e != 0}
     return Condition("Omega is constant", True, f"omega = {entries}" if entries else "Omega = 0", YAU)
 
 
@@ -221,16 +249,16 @@ def _full_rank(model: Model) -> Condition:
 
 
 def _eta_is_quadratic(model: Model) -> Condition:
-    operators = _operators(model)
-    holds = operators.eta is not None and operators.is_polynomial(operators.eta, 2)
-    text = "not defined" if operators.eta is None else short(str(operators.reader.expression(operators.eta)))
-    return Condition("eta is a polynomial of degree two at most", holds, f"eta = {text}", YAU)
+    statement, operators = "eta is a polynomial of degree two at most", _operators(model)
+    if isinstance(operators, Condition):
+        return replace(operators, statement=statement)
+    return Condition(statement, operators.is_polynomial(operators.eta, 2), f"eta = {_text(operators.eta, operators)}", YAU)
 
 
 def _quadratic_part(model: Model) -> sp.Matrix | None:
     """That of eta - h'S^-1 h, where eta is a polynomial of degree two."""
     operators = _operators(model)
-    if operators.eta is None or not operators.is_polynomial(operators.eta, 2) or affine_observation(model) is None:
+    if isinstance(operators, Condition) or not operators.is_polynomial(operators.eta, 2) or affine_observation(model) is None:
         return None
     values = dict(zip(model.parameter_symbols, model.parameters.values(), strict=True))
     h, S = model.observation.xreplace(values), model.observation_noise.xreplace(values)
