@@ -1,0 +1,196 @@
+"""The kernel of the Kolmogorov equation near its diagonal, for any smooth f and h that do not depend on time.
+
+    u_t = G : Hess u / 2 - f . grad u - (div f + V) u,         z = x - y,     V = h'S^-1 h / 2 or 0
+
+    phi(t, x, y) = (2 pi t)^(-n/2) |G|^(-1/2) exp(-z'G^-1 z / (2 t) + a) (1 + A_1 t + ... + A_N t^N)               "sum"
+                 = (2 pi t)^(-n/2) |G|^(-1/2) exp(-z'G^-1 z / (2 t) + a + L_1 t + ... + L_N t^N)                    "log"
+
+with the recursion that `zakai.algebra.kolmogorov_series` writes out.  a, A_k and L_k are Taylor polynomials in z at y: of f they
+need the jet at y alone.  As z is of the size of sqrt(t), the relative error near the diagonal is of order t^(N+1) if f is known
+to degree 2 N or more.  The logarithmic form is positive for every x, y and t; the sum changes sign away from the diagonal, where
+exp(a) is large, and must not be composed.
+
+Yau (1993), Theorems 10 to 12 and Corollary 13.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zakai import _float64  # noqa: F401
+from zakai.algebra.yau import eta, observation_energy
+from zakai.errors import ConditionError
+from zakai.kolmogorov.jets import Jet, jets
+from zakai.models.compile import jax_function
+from zakai.models.model import Model
+
+REACH = 7.0  # standard deviations of the Gaussian beyond which the kernel is zero: a Taylor polynomial may be anything there
+FORMS = ("log", "sum")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class HeatSeries:
+    """The series at the points `y` (count, n): a, A_1, ... and L_1, ... as Taylor polynomials in z; `covariance` is G.
+
+    `rest` is what the next A would be the radial integral of.
+    """
+
+    y: Any
+    covariance: Any
+    exponent: Jet
+    coefficients: tuple[Jet, ...]
+    logarithms: tuple[Jet, ...]
+    rest: Jet
+
+    def kernel(self, x: Any, t: Any, form: str = "log", order: int | None = None) -> jax.Array:
+        """phi(t, x, y), (..., count), for x (..., n)."""
+        return self.offset(jnp.asarray(x, float)[..., None, :] - self.y, t, form, order)
+
+    def offset(self, z: jax.Array, t: Any, form: str = "log", order: int | None = None) -> jax.Array:
+        """phi(t, y + z, y) for z (..., count, n)."""
+        series = (self.logarithms if form == "log" else self.coefficients)[:order]
+        powers = self.exponent.monomials.values(z)
+        logs = self._log_gaussian(z, t) + self._sum(powers, self.exponent.coefficients)
+        nothing = jnp.zeros(self.exponent.coefficients.shape)
+        values = self._sum(powers, sum((jet.coefficients * t**k for k, jet in enumerate(series, 1)), nothing))
+        return jnp.exp(logs + values) if form == "log" else jnp.exp(logs) * (1.0 + values)
+
+    def _log_gaussian(self, z: jax.Array, t: Any) -> jax.Array:
+        n = z.shape[-1]
+        white = jnp.einsum("...i,ij,...j->...", z, jnp.linalg.inv(self.covariance), z)
+        return -white / (2 * t) - 0.5 * (n * jnp.log(2 * jnp.pi * t) + jnp.linalg.slogdet(self.covariance)[1])
+
+    @staticmethod
+    def _sum(powers: jax.Array, coefficients: jax.Array) -> jax.Array:
+        return jnp.einsum("...yk,ky->...y", powers, coefficients)
+
+
+def heat_series(
+    model: Model, y: Any, order: int, *, degree: int | None = None, theta: Any = None, potential: bool = True
+) -> HeatSeries:
+    """The series of a model up to t^`order` at the points `y` (count, n); JAX may trace y and theta.
+
+    `degree` is that of the jets of f, by default 2 `order` + 4; those of V are one degree shorter. `potential` says whether
+    V = h'S^-1 h / 2 is part of the equation; without it the kernel is the density of the transition.
+
+        >>> model = zakai.Model(state=["x"], drift=["tanh(x)"], observation=["0"])
+        >>> heat_series(model, np.zeros((1, 1)), 1).kernel(np.array([0.1]), 0.04)
+        Array([1.73448562], dtype=float64)
+
+    Source: Yau (1993), Theorems 10 and 11.
+    """
+    theta = model.theta() if theta is None else theta
+    degree = 2 * order + 4 if degree is None else degree
+    energy = observation_energy(model) / 2 if potential else 0
+    *f, V = jets([*model.drift, energy], model, jnp.asarray(y), degree + 1, theta)
+    G = jax_function(model.covariance, model, (model.n, model.n))(jnp.zeros(model.n), model.start, theta)
+    return series(y, G, f, V, order, degree)
+
+
+def series(y: Any, G: Any, f: list[Jet], V: Jet, order: int, degree: int) -> HeatSeries:
+    """The recursion on jets that hold monomials up to `degree` + 1 of f and V, which are right up to `degree` or more."""
+    n, precision, states = len(f), jnp.linalg.inv(G), range(len(f))
+    unit = f[0] * 0.0
+    z = [Jet(unit.coefficients.at[unit.monomials.place[tuple(row)]].set(1.0), unit.monomials) for row in np.eye(n, dtype=int)]
+    a = sum((z[i] * f[j] * precision[i, j] for i in states for j in states), unit).radial(0)
+    slope = [a.derivative(i) for i in states]
+    transport = [(sum((slope[j] * G[i, j] for j in states), unit) - f[i]).truncated(degree) for i in states]
+
+    def laplacian(p: Jet) -> Jet:
+        return sum((p.derivative(i).derivative(j) * G[i, j] for i in states for j in states), unit)
+
+    def moved(p: Jet) -> Jet:
+        """G : Hess p / 2 + (G grad a - f) . grad p."""
+        return laplacian(p) * 0.5 + sum((transport[i] * p.derivative(i) for i in states), unit)
+
+    def weighted(p: Jet, q: Jet) -> Jet:
+        """grad p'G grad q."""
+        return sum((p.derivative(i) * q.derivative(j) * G[i, j] for i in states for j in states), unit)
+
+    divergence = sum((f[i].derivative(i) for i in states), unit)
+    W = (moved(a) - weighted(a, a) * 0.5 - divergence - V).truncated(degree - 1)
+    coefficients: list[Jet] = [unit + 1.0]
+    logarithms: list[Jet] = []
+    for k in range(1, order + 2):
+        # A Laplacian takes two degrees.
+        known = degree + 1 - 2 * k
+        last = (W * coefficients[-1] + moved(coefficients[-1])).truncated(known)
+        if k > order:
+            break
+        coefficients.append(last.radial(k))
+        rate = W if k == 1 else moved(logarithms[-1])
+        rate = rate + sum((weighted(logarithms[i - 1], logarithms[k - 2 - i]) for i in range(1, k - 1)), unit) * 0.5
+        logarithms.append(rate.truncated(known).radial(k))
+    return HeatSeries(jnp.asarray(y), G, a, tuple(coefficients[1:]), tuple(logarithms), last)
+
+
+def transition(
+    heat: HeatSeries, cell: Any, t: Any, *, substeps: int = 1, form: str = "log", order: int | None = None
+) -> jax.Array:
+    """The matrix P (M, M) that carries the values of a density on the lattice y (M, 1) of `heat` over a time t.
+
+    The kernel of t / `substeps`, zero where |z| exceeds `REACH` of its standard deviations, times the cell, to the power
+    `substeps` (Theorem 12, in which K - 1 integrals and not K join K kernels).
+    """
+    part = t / substeps
+    z = heat.y[:, None] - heat.y
+    near = jnp.abs(z[..., 0]) <= REACH * jnp.sqrt(heat.covariance[0, 0] * part)
+    # Far from the diagonal a polynomial may overflow; it is not looked at there.
+    values = heat.offset(jnp.where(near[..., None], z, 0.0), part, form, order)
+    return jnp.linalg.matrix_power(jnp.where(near, values, 0.0) * cell, substeps)
+
+
+def parametrix(
+    model: Model, x: Any, t: float, order: int, terms: int, *, nodes: int = 10, degree: int | None = None
+) -> list[np.ndarray]:
+    """The convergent series of Corollary 13 on a lattice x (M,), for one state, cut after each of its first `terms` terms.
+
+        phi = phi_N - phi_N * e_N + phi_N * e_N * e_N - ...,      e_N = (d/dt - L) phi_N,
+        (p * q)(t, x, y) = int_0^t int p(t - s, x, r) q(s, r, y) dr ds
+
+    in the gauge u = exp(F) v with G F' = f, in which v_t = G v'' / 2 - eta v / 2 and no exponent grows; phi_N is the sum up to
+    t^N.  The kernel of u is exp(F(x) - F(y)) times that.  Time integrals have `nodes` Gauss nodes, space integrals are sums over
+    the lattice.  e_N is exact if eta is a polynomial whose degree, times N + 1, is at most `degree` - 2 N - 1; by default
+    `degree` is 8 (N + 1).  The cost grows with nodes^terms: this verifies, it does not filter.
+
+    Gives `terms` + 1 arrays (M, M), phi_N and the sums after 1, 2, ... terms. Raises ConditionError for more than one state.
+
+    Source: Yau (1993), Theorem 12 and Corollary 13.
+    """
+    potential = eta(model)
+    if model.n > 1 or potential is None:
+        raise ConditionError(f"{model.source}: the series of Corollary 13 is for one state and positive G")
+    y, theta = jnp.asarray(x, float)[:, None], model.theta()
+    degree = 8 * (order + 1) if degree is None else degree
+    zero, V = jets([0 * model.x[0], potential / 2], model, y, degree + 1, theta)
+    G = jax_function(model.covariance, model, (1, 1))(jnp.zeros(1), model.start, theta)
+    heat, cell = series(y, G, [zero], V, order, degree), x[1] - x[0]
+    z = y[:, None] - y
+    powers = heat.exponent.monomials.values(z)
+    sums = [heat._sum(powers, jet.coefficients) for jet in (*heat.coefficients, heat.rest)]
+    points, weights = np.polynomial.legendre.leggauss(nodes)
+    points, weights = 0.5 * (points + 1.0), 0.5 * weights * cell
+
+    def main(t: float) -> jax.Array:
+        return jnp.exp(heat._log_gaussian(z, t)) * (1.0 + sum(p * t**k for k, p in enumerate(sums[:-1], 1)))
+
+    def residual(t: float) -> jax.Array:
+        return -jnp.exp(heat._log_gaussian(z, t)) * t**order * sums[-1]
+
+    def term(m: int, t: float) -> jax.Array:
+        """phi_N * e_N * ... * e_N with m factors e_N."""
+        if m == 0:
+            return main(t)
+        parts = (w * (term(m - 1, t * (1.0 - s)) @ residual(t * s)) for s, w in zip(points, weights, strict=True))
+        return t * sum(parts, start=jnp.zeros(()))
+
+    found = [term(0, t)]
+    for m in range(1, terms + 1):
+        found.append(found[-1] + (-1) ** m * term(m, t))
+    return [np.asarray(one) for one in found]
