@@ -37,6 +37,9 @@ def test_an_explosion_is_found_and_its_time_is_that_of_the_solution_in_closed_fo
         ("-exp(x)",),
         ("x*log(1 + x**2)",),  # faster than every exponential, and yet never at infinity
         ("x**2*sin(x)",),
+        ("x**2*(1 + sin(x))",),  # comes to rest where 1 + sin(x) is zero
+        ("x**3*cos(3*x)**2",),
+        ("x**2*sin(y)**2", "x**2*sin(y)**2"),
         ("sqrt(400 - x**2)",),  # leaves the numbers at 20
         ("-1/x",),
         ("y", "1000*(1 - x**2)*y - x"),
