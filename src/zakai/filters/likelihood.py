@@ -6,7 +6,7 @@ taken again as a pure function of the parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -17,7 +17,6 @@ import numpy as np
 
 from zakai import _float64  # noqa: F401
 from zakai.errors import ConditionError, InputError
-from zakai.filters._protocol import Method
 from zakai.filters._run import Piece, Run, Setting, scanned
 from zakai.filters.driver import check_records, planned
 from zakai.filters.results import FilterResult
@@ -86,14 +85,16 @@ def replayed(
     runs = plan.runs(record, "moments", recorded=True)
     for run in runs:
         run.all(None)
-    # Of independent blocks the evidence is the product.
     replays = [_Replay(run.setting, run) for run in runs]
+    compiled: dict[Hashable, Callable[[jax.Array], Any]] = {}
     where = np.array([list(model.parameters).index(name) for name in names])
     own, noise = model.theta(), _noise_is_noise(model, names, np.concatenate([[model.start], record.times]))
 
     def function(values: Any) -> jax.Array:
         theta = jnp.asarray(own).at[where].set(jnp.asarray(values, dtype=jnp.float64))
-        total = sum((replay(theta) for replay in replays), start=jnp.zeros(()))
+        at = _At(theta, compiled)
+        # Of independent blocks the evidence is the product.
+        total = sum((replay(at) for replay in replays), start=jnp.zeros(()))
         return jnp.where(noise(jax.lax.stop_gradient(theta)), total, jnp.nan)
 
     result = plan.result(runs)
@@ -101,22 +102,35 @@ def replayed(
     return function, result
 
 
+class _At:
+    """Functions of one value of the parameters: each is compiled once, and computed once for all blocks that share it."""
+
+    def __init__(self, theta: jax.Array, compiled: dict[Hashable, Callable[[jax.Array], Any]]):
+        self.theta, self.compiled, self.known = theta, compiled, {}  # type: ignore[var-annotated]
+
+    def __call__(self, key: Hashable, function: Callable[[jax.Array], Any]) -> Any:
+        if key not in self.known:
+            self.known[key] = self.compiled.setdefault(key, jax.jit(function))(self.theta)
+        return self.known[key]
+
+
 class _Replay:
     """An ordinary run, taken again for other values of the parameters."""
 
     def __init__(self, setting: Setting, run: Run):
-        self.setting, self.pieces = setting, run.pieces or []
-        self.start = jax.jit(self._start(run))
-        self.inputs = [jax.jit(partial(self._inputs, piece)) for piece in self.pieces]
+        self.setting, self.run, self.pieces = setting, run, run.pieces or []
+        # Without a reading at the start the first state is that of every block with the same prior.
+        self.same_start = ("start", id(run.first), id(setting.prior), id(run) if run.at_start else None)
 
-    def __call__(self, theta: jax.Array) -> jax.Array:
-        state, total = self.start(theta)
-        for piece, inputs in zip(self.pieces, self.inputs, strict=True):
-            intervals, observations = inputs(theta)
+    def __call__(self, at: _At) -> jax.Array:
+        state, total = at(self.same_start, self._start(self.run))
+        for piece in self.pieces:
+            intervals = at(("intervals", id(piece.prepared)), partial(self._intervals, piece))
+            observations = at(("observations", id(piece)), partial(self._observations, piece))
             for rows, begin in _merged(piece):
                 if begin is not None:
                     assert self.setting.method.resume is not None
-                    state = self.setting.method.resume(_with(piece.prepared, theta, intervals), state, rows, begin)
+                    state = self.setting.method.resume(_with(piece.prepared, at.theta, intervals), state, rows, begin)
                 part = jax.tree.map(lambda a: a[rows], (intervals, observations))  # noqa: B023
                 state, more = _advance(self.setting.method.step, state, *part)
                 total = total + more
@@ -127,7 +141,7 @@ class _Replay:
         reading = run.data.part(slice(0, 1))
 
         def start(theta):
-            prepared = _at(method, run.first, theta)
+            prepared = _with(run.first, theta, run.first.intervals)
             if not run.at_start:
                 return method.init(prepared, prior), jnp.zeros(())
             state, info = method.correct(prepared, prior, method.observations(prepared, reading))
@@ -135,9 +149,13 @@ class _Replay:
 
         return start
 
-    def _inputs(self, piece: Piece, theta: jax.Array) -> Any:
-        prepared = _at(self.setting.method, piece.prepared, theta)
-        return prepared.intervals, self.setting.method.observations(prepared, piece.data)
+    def _intervals(self, piece: Piece, theta: jax.Array) -> Any:
+        assert self.setting.method.with_parameters is not None
+        return self.setting.method.with_parameters(piece.prepared, theta).intervals
+
+    def _observations(self, piece: Piece, theta: jax.Array) -> Any:
+        # Of what was prepared, only the parameters are read.
+        return self.setting.method.observations(_with(piece.prepared, theta, piece.prepared.intervals), piece.data)
 
 
 def _merged(piece: Piece) -> list[tuple[slice, Any]]:
@@ -158,11 +176,6 @@ def _advance(step, state, intervals, observations):
 
     state, increments = scanned(one, state, (intervals, observations))
     return state, jnp.sum(increments)
-
-
-def _at(method: Method, prepared: Any, theta: Any) -> Any:
-    assert method.with_parameters is not None
-    return method.with_parameters(prepared, theta)
 
 
 def _with(prepared: Any, theta: Any, intervals: Any) -> Any:
