@@ -13,9 +13,12 @@ import sympy as sp
 
 import zakai
 from zakai.algebra import estimation_algebra as engine
+from zakai.algebra.affine_elements import dimension_and_rank
 from zakai.algebra.certificates import CLOSED, OCONE, OMEGA, RANK, SYMBOL
 from zakai.algebra.closure import Budget
+from zakai.algebra.dmz_operators import DmzOperators
 from zakai.algebra.estimation_algebra import estimation_algebra
+from zakai.algebra.ratios import TooLarge
 from zakai.algebra.verification import verify
 
 
@@ -124,9 +127,20 @@ def test_linear_systems_of_many_states_have_2_n_plus_2_elements(n):
 
 def test_more_states_than_are_explored_are_decided_by_a_theorem():
     algebra = estimation_algebra(linear(25))
-    assert (algebra.verdict, algebra.dimension, algebra.certificate.code) == ("finite", None, "FIN-THM4i")
+    assert (algebra.verdict, algebra.dimension, algebra.linear_rank) == ("finite", 52, 25)
+    assert algebra.certificate.code == "FIN-THM4i" and not algebra.basis and algebra.no_wei_norman == "no basis is known"
     assert "not listed" in algebra.note and verify(algebra.certificate)
     assert not verify(dataclasses.replace(algebra.certificate, model=INFINITE["double well"][0]))
+
+
+AFFINE = [name for name, (model, _, _) in FINITE.items() if name.startswith(("linear", "Ben", "rot", "Bro", "an ", "aff"))]
+
+
+@pytest.mark.parametrize("name", [*AFFINE, "constant observation"])
+def test_the_size_without_a_table_of_brackets_is_that_of_the_table(name):
+    model, rank, basis = FINITE[name]
+    values = dict(zip(model.parameter_symbols, model.parameters.values(), strict=True))
+    assert dimension_and_rank(DmzOperators(model, values)) == (len(basis.split(",")), rank)
 
 
 def named(algebra) -> dict[str, str]:
@@ -214,7 +228,7 @@ def test_a_parameter_may_change_the_verdict_and_the_report_says_so():
 def test_many_parameters_are_tried_at_random_rationals_and_the_report_says_so(monkeypatch):
     monkeypatch.setattr(engine, "MOST_SYMBOLS", 1)
     algebra = estimation_algebra.__wrapped__(system(["a*x"], ["b*x"], parameters={"a": 1, "b": 2}))
-    assert algebra.verdict == "finite" and "the same at 2 random rationals" in algebra.parameters
+    assert algebra.verdict == "finite" and "the same at 2 random rationals: a = " in algebra.parameters
     assert named(algebra)["[L0, D1]"] == "5*x"
 
 
@@ -277,3 +291,17 @@ def test_derivatives_of_undetermined_functions_are_written_with_primes_and_numbe
     assert "none was found: omega_12 = -gamma'(x1 + x2 + x3) depends on x1" in page
     page = str(zakai.analyze(system(["0", "gamma(x1, x1 + x2)"], ["x1"], functions=["gamma"])))
     assert "omega_1,2 = gamma_1(x1, x1 + x2) + gamma_2(x1, x1 + x2)" in page
+
+
+def test_pi_beside_many_parameters_ends_in_words(monkeypatch):
+    monkeypatch.setattr(engine, "MOST_SYMBOLS", 0)
+    whole = engine._explore
+
+    def explore(model, values):
+        if values and sp.Integer(1) not in values.values():
+            raise TooLarge("polynomials in the constants grow too large")
+        return whole(model, values)
+
+    monkeypatch.setattr(engine, "_explore", explore)
+    algebra = estimation_algebra.__wrapped__(system(["a*pi*x"], ["x"], parameters={"a": 1}))
+    assert algebra.verdict == "finite" and "other values were not explored: polynomials" in algebra.parameters

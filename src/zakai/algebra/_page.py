@@ -117,7 +117,7 @@ def _algebra(analysis: Analysis) -> Iterator[str]:
     if algebra.basis and algebra.brackets:
         yield "  all other brackets are 0" if any(algebra.brackets.values()) else "  all brackets are 0"
     if algebra.linear_rank is not None:
-        found = "" if algebra.verdict == "finite" else " (of what was explored)"
+        found = "" if algebra.verdict == "finite" and algebra.dimension is not None else " (of what was explored)"
         yield f"  linear rank {algebra.linear_rank}{found}"
     if proof is not None:
         yield from _wrapped(f"  {proof.code}  ", f"{proof.statement} [{proof.source}]", 4)
@@ -179,7 +179,8 @@ def _recommendation(analysis: Analysis) -> str:
         named = f"; if it is named, {' or '.join(others)} can be used" if others else ""
         return f"Recommended: none, for no method that auto tries holds{named}"
     prior = "" if analysis.model.prior is not None else "; to filter, the model needs a prior"
-    return f"Recommended: {analysis.recommended}{prior}"
+    blocks = "" if analysis.division is None else f"; {analysis.division.why}"
+    return "\n".join(_wrapped("", f"Recommended: {analysis.recommended}{blocks}{prior}", 2))
 
 
 def _flat(matrix: sp.MatrixBase) -> str:

@@ -21,7 +21,8 @@ from zakai.models.model import Model
 
 
 class DmzOperators:
-    """`L0`, `f` (n), `h` and `driven` = S^-1 h (m), `g` (n) or None, `eta` or None and `omega` of a model as elements of `ring`.
+    """`L0`, `f` (n), `h` and `driven` = S^-1 h (m), `covariance` G (n, n), `g` (n) or None, `eta` or None and `omega` of a model
+    as elements of `ring`.
 
     `values` are numbers for parameters, the others stay symbols; raises Unreadable.
     """
@@ -42,7 +43,7 @@ class DmzOperators:
         self.numbers = Numbers(ring, bool(constants) or drift.has(sp.pi) or h.has(sp.pi) or G.has(sp.pi) or S.has(sp.pi), reader)
         self.f = f = [reader.read(entry) for entry in drift]
         self.h = [reader.read(entry) for entry in h]
-        covariance = _rows(G, reader)
+        self.covariance = covariance = _rows(G, reader)
         self.driven = [ring.normal(_form([ring.one], [row], self.h)) for row in _rows(S_inverse, reader)]
         energy = sum((a * b for a, b in zip(self.h, self.driven)), ring.zero)
         divergence = sum((ring.total_derivative(f_i, i) for i, f_i in enumerate(f)), ring.zero)
