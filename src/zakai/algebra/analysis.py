@@ -5,17 +5,16 @@ print(zakai.analyze(model))
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import sympy as sp
 
-from zakai.algebra import _page
+from zakai.algebra import _json, _page
 from zakai.algebra.blocks import Block, blocks
-from zakai.algebra.choice import recommended
-from zakai.algebra.conditions import Condition, all_hold
+from zakai.algebra.choice import Division, divided, recommended
+from zakai.algebra.conditions import Condition
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
 from zakai.algebra.explosion import Explosion, explosion
 from zakai.algebra.observed_block import ObservedBlock, observed_block
@@ -46,7 +45,8 @@ class Analysis:
     `q` is without h'S^-1 h, for they do not act between their times.  `algebra` is an `EstimationAlgebra` and `observed_block` an
     `ObservedBlock`, or None where it is not known; `explosion` is an `Explosion`, or None where none was seen; `blocks` are
     the `Block`s that the system falls into; each is looked for when it is first asked for.  `methods` are the conditions of
-    every method by its name, `recommended` the method that "auto" takes, or None.  `print` shows a page.
+    every method by its name, `recommended` the method that "auto" takes, or None; for a system that is filtered block by block it
+    is what `division.method` says.  `print` shows a page.
     """
 
     model: Model
@@ -80,6 +80,11 @@ class Analysis:
         return tuple(analyze(block.model) for block in self.blocks) if len(self.blocks) > 1 else ()
 
     @cached_property
+    def division(self) -> Division | None:
+        """The independent blocks, given the prior, and the method that "auto" takes for each; None where it takes one for all."""
+        return None if self.recommended is None else divided(self.model, self.model.prior)
+
+    @cached_property
     def explosion(self) -> Explosion | None:
         """A state that the drift takes to infinity in a finite time."""
         return explosion(self.model)
@@ -93,75 +98,7 @@ class Analysis:
 
     def to_json(self) -> str:
         """Everything as JSON; expressions are text, `holds` is true, false or null."""
-        form = self.yau_form
-        content = {
-            "model": self.model.name,
-            "source": self.model.source,
-            "state": list(self.model.state),
-            "observation_kind": self.model.observation_kind,
-            "omega": None if self.omega is None else _strings(self.omega),
-            "eta": None if self.eta is None else str(self.eta),
-            "yau_form": None
-            if form is None
-            else {"L": _strings(form.matrix), "l": [str(e) for e in form.offset], "phi": str(form.potential)},
-            "q": None if self.q is None else str(self.q),
-            "algebra": self._algebra_for_json(),
-            "observed_block": self._block_for_json(),
-            "blocks": [self._part_for_json(block, part) for block, part in zip(self.blocks, self.by_blocks)],
-            "explosion": None if self.explosion is None else {"start": self.explosion.start, "time": self.explosion.time},
-            "methods": {
-                name: {"holds": all_hold(conditions), "conditions": [vars(c) for c in conditions]}
-                for name, conditions in self.methods.items()
-            },
-            "recommended": self.recommended,
-        }
-        return json.dumps(content, indent=2, ensure_ascii=False)
-
-    def _algebra_for_json(self) -> dict[str, object]:
-        algebra, proof = self.algebra, self.algebra.certificate
-        return {
-            "verdict": algebra.verdict,
-            "dimension": algebra.dimension,
-            "basis": [str(e) for e in algebra.basis],
-            "brackets": {f"{i},{j}": str(e) for (i, j), e in algebra.brackets.items()},
-            "structure_constants": {f"{i},{j}": [str(c) for c in row] for (i, j), row in algebra.structure_constants.items()},
-            "linear_rank": algebra.linear_rank,
-            "certificate": None
-            if proof is None
-            else {key: getattr(proof, key) for key in ("code", "statement", "source", "witness")},
-            "wei_norman": self._wei_norman_for_json(),
-            "note": algebra.note,
-            "parameters": algebra.parameters,
-        }
-
-    def _block_for_json(self) -> dict[str, object] | None:
-        block = self.observed_block
-        if block is None:
-            return None
-        lists = {key: [str(e) for e in getattr(block, key)] for key in ("coordinates", "symbols", "drift", "observation")}
-        return {**lists, "covariance": _strings(block.covariance), "linear": block.linear}
-
-    @staticmethod
-    def _part_for_json(block: Block, part: Analysis) -> dict[str, object]:
-        return {
-            "state": block.model.state,
-            "observations": block.observations,
-            "algebra": part._algebra_for_json(),
-            "recommended": part.recommended,
-        }
-
-    def _wei_norman_for_json(self) -> dict[str, object] | None:
-        equations = self.algebra.wei_norman
-        if equations is None:
-            return None
-        return {
-            "product": equations.product,
-            "statistics": [str(r) for r in equations.statistics],
-            "path": [str(y) for y in equations.path],
-            "rates": [str(z) for z in equations.rates],
-            "robust": {str(r): str(rate) for r, rate in equations.robust.items()},
-            "stratonovich": {str(r): str(rate) for r, rate in equations.stratonovich.items()},
-        }
+        return _json.text(self)
 
 
 def analyze(model: Model) -> Analysis:
@@ -202,6 +139,3 @@ def _shortest(expression: sp.Expr, model: Model) -> sp.Expr:
         return quadratic_expression(quadratic, model.x)
     return tidy_state(expression, model.x)
 
-
-def _strings(matrix: sp.MatrixBase) -> list[list[str]]:
-    return [[str(entry) for entry in row] for row in matrix.tolist()]

@@ -15,6 +15,8 @@ from zakai.models.files import load_model
 from zakai.models.simulate import Truth
 from zakai.records import Record, read_record, read_truth
 
+_SHOWN = 20  # states whose last estimates are printed
+
 
 def filter(
     source: str,
@@ -52,8 +54,10 @@ def filter(
         ("observations", f"{len(record):,}, times {record.times[0]:g} to {record.times[-1]:g}"),
         ("log-likelihood", f"{result.log_likelihood:.6f}"),
     ]
-    last = zip(result.state, result.mean[-1], np.sqrt(result.variance[-1]), strict=True)
-    lines += [(f"{name} at the end", f"{mean:.6g} +- {deviation:.3g}") for name, mean, deviation in last]
+    last = list(zip(result.state, result.mean[-1], np.sqrt(result.variance[-1]), strict=True))
+    lines += [(f"{name} at the end", f"{mean:.6g} +- {deviation:.3g}") for name, mean, deviation in last[:_SHOWN]]
+    if len(last) > _SHOWN:
+        lines.append(("and", f"{len(last) - _SHOWN} more states, in the result"))
     lines += [("written", str(path)) for path in (output, report) if path is not None]
     width = max(len(what) for what, _ in lines)
     for what, said in lines:

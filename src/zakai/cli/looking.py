@@ -38,6 +38,8 @@ def methods(source: str | None) -> None:
         rows.append((name, verdict + ("" if held else f"{open_ones[0].statement} ({open_ones[0].evidence})")))
     _columns(rows)
     print(f"\nauto takes: {analysis.recommended or 'none, for none that it tries holds'}")
+    if analysis.division is not None:
+        print(textwrap.fill(analysis.division.why, 110))
 
 
 def gallery(name: str | None) -> None:

@@ -13,6 +13,7 @@ import sympy
 from zakai.models.expressions import MAX_DIGITS
 
 _OPTIONAL: dict[str, Any] = {"observation_kind": "increments", "start": 0.0, "periodic": (), "functions": ()}
+_MATRICES = ("diffusion", "process_noise", "observation_noise")
 _ORDER = (
     "name",
     "state",
@@ -30,7 +31,7 @@ _ORDER = (
 
 def to_toml(keys: Mapping[str, Any]) -> str:
     """The TOML of a model's keys, all formulas as text; keys that hold their default are left out."""
-    lines = [f"{key} = {_value(keys[key])}" for key in _ORDER if key not in _OPTIONAL or keys[key] != _OPTIONAL[key]]
+    lines = [f"{key} = {_value(keys[key])}" for key in _ORDER if not _is_default(key, keys[key])]
     if keys["parameters"]:
         lines += [
             "",
@@ -40,6 +41,14 @@ def to_toml(keys: Mapping[str, Any]) -> str:
     if keys["prior"]:
         lines += ["", "[prior]", *(f"{name} = {_value(value)}" for name, value in keys["prior"].items())]
     return "\n".join(lines) + "\n"
+
+
+def _is_default(key: str, value: Any) -> bool:
+    if key in _MATRICES:
+        size = len(value)
+        row = ["0"] * size
+        return all(own == [*row[:i], "1", *row[i + 1 :]] for i, own in enumerate(value))
+    return key in _OPTIONAL and value == _OPTIONAL[key]
 
 
 def _value(value: Any) -> str:

@@ -129,7 +129,10 @@ def read_prior(keys: Any, n: int, read_formula: Callable[[str], sympy.Expr]) -> 
         with named("log_density"):
             text = formula(keys["log_density"])
             return DensityPrior(read_formula(text)), {"kind": kind, "log_density": text}
-    return prior, {"kind": kind} | {key: getattr(prior, key).tolist() for key in _KEYS[kind]}
+    table = {"kind": kind} | {key: getattr(prior, key).tolist() for key in _KEYS[kind]}
+    if isinstance(prior, GaussianPrior) and n > 1 and np.array_equal(prior.cov, np.diag(np.diag(prior.cov))):
+        table["cov"] = np.diag(prior.cov).tolist()
+    return prior, table
 
 
 def _read_gaussian(keys: Mapping[str, Any], n: int) -> GaussianPrior:

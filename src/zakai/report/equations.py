@@ -25,7 +25,9 @@ def _state(model: Any) -> list[str]:
     rows = []
     for i, symbol in enumerate(model.x):
         terms = [(model.drift[i, 0], [_differential(model.t)])]
-        terms += [(model.diffusion[i, j], [_differential(_indexed("v", j, noises))]) for j in range(noises)]
+        terms += [
+            (entry, [_differential(_indexed("v", j, noises))]) for (_, j), entry in sorted(model.diffusion.row(i).todok().items())
+        ]
         rows.append(_row(_differential(symbol), _operator("="), *_sum(terms)))
     said = "State" + (
         f": {_names(model.periodic)} {'is an angle' if len(model.periodic) == 1 else 'are angles'}, on the circle"
@@ -67,13 +69,9 @@ def _observation(model: Any) -> list[str]:
 
 def _covariance(said: str, noise: str, letter: str, matrix: Any, model: Any) -> list[str]:
     size = matrix.shape[0]
-    value = [
-        _operator(","),
-        f"<mi>{letter}</mi>",
-        _operator("="),
-        _mathml(matrix if size > 1 else matrix[0, 0]),
-    ]
-    value = value if size <= _LARGEST_MATRIX else []
+    value = []
+    if size <= _LARGEST_MATRIX:
+        value = [_operator(","), f"<mi>{letter}</mi>", _operator("="), _mathml(matrix if size > 1 else matrix[0, 0])]
     if noise == "r":
         law = _row(f"<mi>{noise}</mi>", _operator("∼"), _NORMAL, _operator("("), "<mn>0</mn>", _operator(","))
         return [_words(said), _block([_row(law, f"<mi>{letter}</mi>", _operator(")"), *value)])]

@@ -8,6 +8,8 @@ import numpy as np
 
 from zakai.report.heatmap import state_names
 
+_MOST_STATES = 12  # whose errors are told one by one
+
 # Figures that say the same for every method: what they are, and the bound where it is not the method's own.
 _HEALTH: dict[str, tuple[str, float | None]] = {
     "edge_mass": (
@@ -91,7 +93,11 @@ def exactness(result: Any) -> str:
 def verdict(result: Any) -> str:
     """In a sentence or two: which method, how much data, how likely, whether anything went wrong, how exact."""
     observations = len(result.times) - 1
+    by_blocks = getattr(result, "blocks", ())
     text = f"The method {result.method}"
+    if by_blocks:
+        methods = result.method.removeprefix("blocks: ")
+        text = f"A method for each of {count(len(by_blocks), 'independent block')} ({methods})"
     total = signed(f"{result.log_likelihood:,.2f}")
     text += f" filtered {count(observations, 'observation')} with a log-likelihood of {total}"
     if observations:
@@ -99,7 +105,8 @@ def verdict(result: Any) -> str:
     warned = len(result.warnings)
     text += f"; it raised {count(warned, 'warning')}, below." if warned else "; it raised no warning."
     kind = exactness(result)
-    return text + (f" The method is {kind.rstrip('.')}." if kind else "")
+    what = "What they are" if len({block.method for block in by_blocks}) > 1 else "It is" if by_blocks else "The method is"
+    return text + (f" {what}{':' if what.startswith('What') else ''} {kind.rstrip('.')}." if kind else "")
 
 
 def errors(result: Any, error: np.ndarray | None) -> list[tuple[str, str]]:
@@ -110,6 +117,8 @@ def errors(result: Any, error: np.ndarray | None) -> list[tuple[str, str]]:
     if error is None:
         return facts
     names = state_names(result)
+    if len(names) > _MOST_STATES and np.isfinite(error).any():
+        return [(f"rms error of the {len(names)} means", f"{np.sqrt(np.nanmean(error**2)):.4g}")]
     for i, name in enumerate(names):
         known = error[np.isfinite(error[:, i]), i]
         if known.size:
