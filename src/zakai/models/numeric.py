@@ -22,7 +22,7 @@ def flattened(expressions: Any, shape: Sequence[int] | None = None) -> tuple[lis
     """The expressions of a list or Matrix in order, and the shape of their values ((k,) for a column)."""
     if isinstance(expressions, sympy.MatrixBase):
         natural: tuple[int, ...] = expressions.shape if expressions.shape[1] != 1 else (expressions.shape[0],)
-        flat = list(expressions)
+        flat = expressions.flat()  # one entry after the other is slow for a million
     elif isinstance(expressions, sympy.Basic):
         natural, flat = (), [expressions]
     else:
