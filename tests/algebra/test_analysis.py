@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 import sympy as sp
 
 import zakai
+
+KEYS = ("state", "drift", "observation", "diffusion", "process_noise", "observation_noise", "observation_kind", "parameters") + (
+    "functions",
+    "periodic",
+)
 
 
 def test_omega_has_the_sign_of_its_convention():
@@ -61,6 +67,14 @@ def test_every_form_of_the_analysis_says_the_same(name):
             assert "".join(f"{condition.evidence}[{condition.source}]".split()) in words
     latex = analysis.to_latex()
     assert latex.count("{") == latex.count("}") and latex.startswith("\\begin{align*}") and latex.endswith("\\end{align*}")
+    for form in (latex, page, analysis.to_json()):
+        assert not re.search(r"Subs|Derivative|_xi|_z1|Symbol|Matrix\(", form)
+    proof = analysis.algebra.certificate
+    assert proof is None or proof.source.split(";")[0].replace("_", r"\_") in latex and proof.code in latex
+    assert all(len(line) <= 110 for line in page.splitlines())
+    given = analysis.model
+    assert read["drift"] == [str(entry) for entry in given.drift] and read["observation"] == [str(h) for h in given.observation]
+    assert zakai.Model(**{key: read[key] for key in KEYS}).drift == given.drift
 
 
 def test_a_model_without_prior_or_with_undetermined_functions_is_analysed():
@@ -83,3 +97,20 @@ def test_a_recommendation_for_a_model_without_prior_says_what_is_missing():
 def test_a_sum_before_dt_stands_in_parentheses():
     latex = zakai.analyze(zakai.Model(state=["x"], drift=["1 - x"], observation=["x + 2"])).to_latex()
     assert r"dx &= \left(1 - x\right)\,dt + dv" in latex and r"dy &= \left(x + 2\right)\,dt + dw" in latex
+
+
+def test_json_says_why_there_is_no_yau_form_and_no_product():
+    analysis = zakai.analyze(zakai.load_model("gallery:lorenz"))
+    read = json.loads(analysis.to_json())
+    assert read["no_yau_form"] == analysis.no_yau_form == "omega_12 = -x3 depends on x3"
+    assert read["algebra"]["no_wei_norman"] == "no basis is known"
+    undetermined = json.loads(zakai.analyze(zakai.load_model("gallery:wong")).to_json())
+    assert undetermined["omega"][0][1] == "-gamma'(x1 + x2 + x3)" and undetermined["functions"] == ["gamma"]
+
+
+def test_latex_has_the_certificate_in_words_that_latex_takes_for_words():
+    latex = zakai.analyze(zakai.load_model("gallery:lorenz")).to_latex()
+    assert r"Witness: E contains x1, x2, x3, and omega\_1,2 = " in latex and r"\text{linear rank} &\ge 3" in latex
+    assert r"\mathop{\gamma'}{\left(x_{1} + x_{2} + x_{3} \right)}" in zakai.analyze(zakai.load_model("gallery:wong")).to_latex()
+    model = zakai.Model(state=["x1", "x2"], drift=["0", "g(x1, x2)"], observation=["x1"], functions=["g"])
+    assert r"\mathop{\partial_{1} g}" in zakai.analyze(model).to_latex()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import sympy as sp
 
-from zakai.algebra._readable import readable, times
+from zakai.algebra._readable import for_latex, readable, times
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.models.model import Model
 
@@ -51,7 +51,7 @@ def text(analysis: Analysis) -> str:
     for name, conditions in analysis.methods.items():
         blocks.append([f"Method {name}: {_WORDS[all_hold(conditions)]}", *_conditions(conditions)])
     blocks.append([_recommendation(analysis)])
-    return "\n\n".join("\n".join(line.rstrip() for line in block) for block in blocks)
+    return "\n\n".join("\n".join(short.rstrip() for line in block for short in _fitted(line)) for block in blocks)
 
 
 def _equations(model: Model) -> Iterator[str]:
@@ -167,6 +167,11 @@ def _conditions(conditions: tuple[Condition, ...]) -> Iterator[str]:
         yield from _wrapped(" " * 13, f"{condition.evidence}  [{condition.source}]")
 
 
+def _fitted(line: str) -> list[str]:
+    margin = len(line) - len(line.lstrip())
+    return [line] if len(line) <= WIDTH else _wrapped(" " * margin, line.lstrip(), margin + 4)
+
+
 def _wrapped(head: str, body: str, indent: int = 13) -> list[str]:
     return textwrap.wrap(
         body, WIDTH, initial_indent=head, subsequent_indent=" " * indent, break_long_words=False, break_on_hyphens=False
@@ -194,8 +199,9 @@ def latex(analysis: Analysis) -> str:
     names = {s: rf"\mathrm{{{s.name}}}" for s in (*model.x, *model.parameter_symbols) if sp.latex(s) == s.name and s.name[1:]}
 
     def tex(value: sp.Basic) -> str:
-        scalar = isinstance(value, sp.MatrixBase) and value.shape == (1, 1)
-        return sp.latex(value[0, 0] if scalar else value, symbol_names=names)
+        if isinstance(value, sp.MatrixBase):
+            value = value[0, 0] if value.shape == (1, 1) else value.applyfunc(for_latex)
+        return sp.latex(for_latex(value) if isinstance(value, sp.Expr) else value, symbol_names=names)
 
     def in_dt(field: sp.MatrixBase) -> str:
         sums = field.shape == (1, 1) and field[0, 0].is_Add
@@ -228,15 +234,34 @@ def latex(analysis: Analysis) -> str:
 
 
 def _algebra_in_tex(algebra: EstimationAlgebra, tex: Callable[[sp.Basic], str]) -> Iterator[str]:
-    if algebra.verdict == "infinite" and algebra.certificate is not None:
-        yield rf"\dim E &= \infty & &\text{{({algebra.certificate.code})}}"
+    proof = algebra.certificate
+    said = algebra.note if proof is None else f"{proof.statement} [{proof.source}] Witness: {proof.witness}."
+    dimension = algebra.dimension if algebra.dimension is not None else r"\text{unknown}"
+    size = r"\infty" if algebra.verdict == "infinite" else dimension
+    code = "" if proof is None else rf" & &\text{{({proof.code})}}"
+    # What stands between two rows of a display has no end of its own.
+    yield rf"\intertext{{The estimation algebra is {_prose(_verdict(algebra))}: {_prose(said)}}}" + f"\n\\dim E &= {size}{code}"
+    if algebra.linear_rank is not None:
+        relation = "=" if algebra.verdict == "finite" and algebra.dimension is not None else r"\ge"
+        yield rf"\text{{linear rank}} &{relation} {algebra.linear_rank}"
     if algebra.basis:
-        yield rf"E &= \left\langle {', '.join(map(tex, algebra.basis))} \right\rangle, & \dim E &= {algebra.dimension}"
+        yield rf"E &= \left\langle {', '.join(map(tex, algebra.basis))} \right\rangle"
     for (i, j), bracket in algebra.brackets.items():
         if bracket != 0:
             yield rf"\left[{tex(algebra.basis[i])}, {tex(algebra.basis[j])}\right] &= {tex(bracket)}"
     if algebra.wei_norman is not None:
         yield from _wei_norman_in_tex(algebra.wei_norman, tex)
+
+
+def _verdict(algebra: EstimationAlgebra) -> str:
+    words = {"finite": "finite dimensional", "infinite": "infinite dimensional"}
+    return words.get(algebra.verdict, algebra.verdict) + (f", {algebra.parameters}" if algebra.parameters else "")
+
+
+def _prose(words: str) -> str:
+    """Text with what LaTeX takes for commands as it stands."""
+    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    return "".join(special.get(c, f"\\{c}" if c in "&%$#_{}" else c) for c in words)
 
 
 def _wei_norman_in_tex(equations: WeiNorman, tex: Callable[[sp.Basic], str]) -> Iterator[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import sympy as sp
 from sympy.core.function import AppliedUndef
 
@@ -13,23 +15,45 @@ def readable(expression: sp.Basic) -> sp.Basic:
     >>> print(readable(sp.Function("gamma")(2 * x).diff(x)))
     2*gamma'(2*x)
     """
-    inside = expression.replace(lambda e: isinstance(e, sp.Subs), lambda e: _named(e.expr, dict(zip(e.variables, e.point))) or e)
-    return inside.replace(lambda e: isinstance(e, sp.Derivative), lambda e: _named(e, {}) or e)
+    return _replaced(expression, _in_text)
 
 
-def _named(derivative: sp.Expr, values: dict[sp.Symbol, sp.Expr]) -> sp.Expr | None:
+def for_latex(expression: sp.Basic) -> sp.Basic:
+    """The same with names that are LaTeX."""
+    return _replaced(expression, _in_latex)
+
+
+def _replaced(expression: sp.Basic, named: Callable[[str, list[int]], str]) -> sp.Basic:
+    def at(e: sp.Subs) -> sp.Expr:
+        return _one(e.expr, dict(zip(e.variables, e.point)), named) or e
+
+    inside = expression.replace(lambda e: isinstance(e, sp.Subs), at)
+    return inside.replace(lambda e: isinstance(e, sp.Derivative), lambda e: _one(e, {}, named) or e)
+
+
+def _one(derivative: sp.Expr, values: dict[sp.Symbol, sp.Expr], named: Callable[[str, list[int]], str]) -> sp.Expr | None:
     if not isinstance(derivative, sp.Derivative) or not isinstance(derivative.expr, AppliedUndef):
         return None
     function = derivative.expr
     if len(set(function.args)) < len(function.args) or any(z not in function.args for z, _ in derivative.variable_count):
         return None
     orders = [sum(k for z, k in derivative.variable_count if z == argument) for argument in function.args]
-    name = function.func.__name__
-    if len(orders) == 1:
-        name += "'" * orders[0] if orders[0] <= 3 else f"^({orders[0]})"
-    else:
-        name += "_" + "".join(str(j + 1) * k for j, k in enumerate(orders))
+    name = named(function.func.__name__, orders)
     return sp.Function(name, real=True)(*[argument.xreplace(values) for argument in function.args])
+
+
+def _in_text(name: str, orders: list[int]) -> str:
+    if len(orders) > 1:
+        return f"{name}_" + "".join(str(j + 1) * k for j, k in enumerate(orders))
+    return name + ("'" * orders[0] if orders[0] <= 3 else f"^({orders[0]})")
+
+
+def _in_latex(name: str, orders: list[int]) -> str:
+    base = sp.latex(sp.Symbol(name))
+    base = rf"\mathrm{{{name}}}" if base == name and name[1:] else base
+    if len(orders) > 1:
+        return rf"\mathop{{\partial_{{{''.join(str(j + 1) * k for j, k in enumerate(orders))}}} {base}}}"
+    return rf"\mathop{{{base}{chr(39) * orders[0]}}}" if orders[0] <= 3 else rf"\mathop{{{base}^{{({orders[0]})}}}}"
 
 
 def times(factor: sp.Expr, noise: str) -> str:
