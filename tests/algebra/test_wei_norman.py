@@ -17,6 +17,8 @@ from references.dmz import dmz
 from references.kolmogorov import Box
 from references.wei_norman import residuals
 from zakai.algebra.estimation_algebra import estimation_algebra
+from zakai.algebra.exponentials import wei_norman_filter
+from zakai.algebra.named_conditions import dong_chen_yau_class
 from zakai.algebra.wei_norman import NoFactorisation, wei_norman
 
 
@@ -278,8 +280,26 @@ def test_an_algebra_that_is_not_finite_has_no_equations():
 def test_the_symbols_of_the_equations_are_not_those_of_the_model():
     model = zakai.Model(state=["r1", "y"], drift=["k*y", "-r1"], observation=["y2*y"], parameters={"k": 2, "y2": 3, "ydot": 1})
     found = equations(model)
-    assert [r.name for r in found.statistics] == [f"r_{k}" for k in range(1, 6)] and found.path[0].name == "y_"
+    assert [r.name for r in found.statistics] == [f"rr{k}" for k in range(1, 6)] and found.path[0].name == "yy"
     assert max(map(abs, residuals(model, found, True))) < 1e-40
+
+
+def test_a_page_has_one_meaning_for_each_name():
+    model = zakai.Model(state=["D1", "L0", "y"], drift=["L0 - D1", "-L0", "sin(y)"], observation=["2*D1"])
+    analysis = zakai.analyze(model)
+    assert ", ".join(map(str, analysis.algebra.basis)) == "LL0, DD1, DD2, D1, L0, 1"
+    page, latex = str(analysis), analysis.to_latex()
+    for line in ("dy = sin(y) dt + dv3", "dyy = (2*D1) dt + dw", "with LL0 = (D'G D - eta)/2", "[LL0, D1] = DD1"):
+        assert f"\n  {line}" in page
+    assert "exp(t*LL0) sigma_0" in page and r"e^{t LL_{0}}" in latex and r"dyy &= 2 D_{1}\,dt" in latex
+    assert {str(y) for y in analysis.algebra.wei_norman.path} == {"yy"}  # though y is in no element of E
+
+
+def test_the_filter_knows_the_operators_of_a_state_that_is_named_like_one():
+    model = zakai.Model(state=["D1"], drift=["-D1"], observation=["D1"])
+    conditions = wei_norman_filter(model)
+    assert [c.holds for c in conditions] == [True] * len(conditions)
+    assert dong_chen_yau_class(zakai.Model(state=["D1", "y"], drift=["D1 + y", "D1 - y"], observation=["D1"])).conclusion.holds
 
 
 def test_a_basis_that_gives_no_product_says_why():

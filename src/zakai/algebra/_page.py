@@ -10,13 +10,13 @@ import sympy as sp
 
 from zakai.algebra._readable import for_latex, readable, times
 from zakai.algebra.conditions import Condition, all_hold
+from zakai.algebra.wei_norman import WeiNorman, path_symbols
 from zakai.models.model import Model
 
 if TYPE_CHECKING:
     from zakai.algebra.analysis import Analysis
     from zakai.algebra.estimation_algebra import EstimationAlgebra
     from zakai.algebra.observed_block import ObservedBlock
-    from zakai.algebra.wei_norman import WeiNorman
 
 WIDTH = 110
 _WORDS = {True: "holds", False: "fails", None: "undecided"}
@@ -63,12 +63,13 @@ def _equations(model: Model) -> Iterator[str]:
         yield f"  d{name} = {' + '.join(term for term in terms if term) or '0'}{angle}"
     yield f"  E dv dv' = Q dt,  Q = {_flat(model.process_noise)},  G = g Q g' = {_flat(model.covariance)}"
     samples = model.observation_kind == "samples"
+    path, _ = path_symbols(model.m, {*model.state, *model.parameters, *model.functions})
     for j in range(model.m):
         number = f"{j + 1}" if model.m > 1 else ""
         if samples:
             yield f"  z{number} = {model.observation[j]} + r{number}"
         else:
-            yield f"  dy{number} = {times(model.observation[j], 'dt') or '0'} + dw{number}"
+            yield f"  d{path[j]} = {times(model.observation[j], 'dt') or '0'} + dw{number}"
     law = "r ~ N(0, S)" if samples else "E dw dw' = S dt"
     yield f"  {law},  S = {_flat(model.observation_noise)};  {_MEANING[model.observation_kind]}"
     if model.parameters:
@@ -110,7 +111,7 @@ def _algebra(analysis: Analysis) -> Iterator[str]:
     if algebra.basis:
         yield from _wrapped("  basis: ", ", ".join(str(readable(e)) for e in algebra.basis), 9)
         named = "D_i = d_i - g_i" if analysis.omega is not None else "D_i = d_i"
-        yield f"  with L0 = (D'G D - eta)/2, {named}" if analysis.omega is not None else f"  with {named}"
+        yield f"  with {algebra.basis[0]} = (D'G D - eta)/2, {named}" if analysis.omega is not None else f"  with {named}"
     for (i, j), bracket in algebra.brackets.items():
         if bracket != 0:
             yield from _wrapped("  ", f"[{readable(algebra.basis[i])}, {readable(algebra.basis[j])}] = {readable(bracket)}", 6)
@@ -216,7 +217,8 @@ def latex(analysis: Analysis) -> str:
     if model.observation_kind == "samples":
         lines.append(rf"z_k &= {tex(model.observation)} + r_k, & r_k &\sim N\left(0, {S}\right)")
     else:
-        lines.append(rf"dy &= {in_dt(model.observation)} + dw, & \mathrm E\,dw\,dw^\top &= {S}\,dt")
+        path, _ = path_symbols(1, {*model.state, *model.parameters, *model.functions})
+        lines.append(rf"d{tex(path[0])} &= {in_dt(model.observation)} + dw, & \mathrm E\,dw\,dw^\top &= {S}\,dt")
     if analysis.omega is not None:
         lines.append(rf"\Omega &= {tex(analysis.omega)}, & \eta &= {tex(analysis.eta)}")
     form = analysis.yau_form
@@ -266,7 +268,7 @@ def _prose(words: str) -> str:
 
 def _wei_norman_in_tex(equations: WeiNorman, tex: Callable[[sp.Basic], str]) -> Iterator[str]:
     powers = [_power_in_tex(r, e, tex) for r, e in zip(equations.statistics, equations.basis[1:], strict=True)]
-    product = r"\,".join(f"e^{{{power}}}" for power in [*reversed(powers), "t L_{0}"]) + r"\,\sigma_0"
+    product = r"\,".join(f"e^{{{power}}}" for power in [*reversed(powers), f"t {tex(equations.basis[0])}"]) + r"\,\sigma_0"
     for left, rates in ((r"e^{-h^\top S^{-1} y}\,\sigma", equations.robust), (r"\sigma", equations.stratonovich)):
         yield rf"{left} &= {product}, & r(0) &= 0"
         yield from (rf"\dot{{{tex(r)}}} &= {tex(rate)}" for r, rate in rates.items())

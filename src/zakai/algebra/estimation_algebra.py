@@ -69,9 +69,18 @@ class EstimationAlgebra:
         if not self.basis:
             return "L_0 and h are zero" if self.dimension == 0 else "no basis is known"
         try:
-            return wei_norman(self.basis, self.structure_constants, self.observation)
+            return wei_norman(self.basis, self.structure_constants, self.observation, self._names)
         except NoFactorisation as reason:
             return str(reason)
+
+
+    @property
+    def _names(self) -> frozenset[str]:
+        """Those of the model."""
+        if self.certificate is None:
+            return frozenset()
+        model = self.certificate.model
+        return frozenset([*model.state, *model.parameters, *model.functions])
 
 
 @dataclass(frozen=True)

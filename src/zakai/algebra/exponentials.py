@@ -16,7 +16,7 @@ import sympy as sp
 
 from zakai.algebra.conditions import Condition
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
-from zakai.algebra.normal_form import D
+from zakai.algebra.normal_form import operator_symbols
 from zakai.algebra.systems import determined
 from zakai.algebra.yau import inverse, short
 from zakai.models.model import Model
@@ -39,13 +39,13 @@ def exponentials(model: Model, algebra: EstimationAlgebra) -> tuple[Exponential,
     own = dict(zip(model.parameter_symbols, model.parameters.values(), strict=True))
     singular = sp.cancel(G.xreplace(own).det()) == 0  # then D_i is d_i
     g = sp.zeros(model.n, 1) if singular else inverse(G) * drift
-    found = []
+    found, D = [], operator_symbols(model)[1]
     for element in algebra.basis[1:]:
         direction, function = [sp.Integer(0)] * model.n, sp.Integer(0)
         for term in sp.Add.make_args(sp.expand(element)):
             numbers, operators = term.args_cnc()
             factor = sp.Mul(*numbers)
-            which = [i for i in range(model.n) if operators == [D(i + 1)]]
+            which = [i for i in range(model.n) if operators == [D[i]]]
             if which and not factor.free_symbols & set(model.x):
                 direction[which[0]] += factor
             elif not operators:

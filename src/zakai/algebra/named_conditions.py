@@ -12,6 +12,7 @@ from zakai.algebra._readable import readable
 from zakai.algebra.conditions import Condition
 from zakai.algebra.estimation_algebra import estimation_algebra
 from zakai.algebra.identities import all_zero
+from zakai.algebra.normal_form import operator_symbols
 from zakai.algebra.systems import affine_parts
 from zakai.algebra.yau import as_quadratic, eta, observation_energy, short, wong_omega
 from zakai.algebra.yau_theorems import DONG, TheoremCheck
@@ -71,9 +72,9 @@ def dong_chen_yau_class(model: Model) -> TheoremCheck:
         ),
         Condition(f"h is affine in {first} alone and not constant", alone, f"h = {_text(list(h))}", f"{DONG}, (C.5)"),
     )
-    algebra = estimation_algebra(model)
+    algebra, (L0, D) = estimation_algebra(model), operator_symbols(model)
     basis = [str(e) for e in algebra.basis]
-    holds = {"finite": basis == ["L0", "D1", str(first), "1"], "infinite": False}.get(algebra.verdict)
+    holds = {"finite": algebra.basis == (L0, D[0], first, 1), "infinite": False}.get(algebra.verdict)
     conclusion = Condition(f"E has the basis L_0, D_1, {first}, 1", holds, f"{algebra.verdict}, basis {basis}", DONG)
     return TheoremCheck(f"{DONG}, (C.1) to (C.5)", "E has the basis L_0, D_1, x_1, 1", assumptions, conclusion)
 

@@ -12,13 +12,19 @@ from zakai.algebra.closure import Closure
 from zakai.algebra.dmz_operators import DmzOperators
 from zakai.algebra.linear_span import Span, Vector, Word
 from zakai.algebra.operators import Symbol
+from zakai.models.model import Model
 
-L0 = sp.Symbol("L0", commutative=False)
 
-
-def D(i: int) -> sp.Symbol:
-    """D_i = d/dx_i - g_i, i from 1."""
-    return sp.Symbol(f"D{i}", commutative=False)
+def operator_symbols(model: Model) -> tuple[sp.Symbol, tuple[sp.Symbol, ...]]:
+    """L_0 and the D_i = d/dx_i - g_i: L0, D1, D2, ...; with a letter twice, or more, where the model has such a name."""
+    taken = {*model.state, *model.parameters, *model.functions}
+    first, letter = "L", "D"
+    while f"{first}0" in taken:
+        first += "L"
+    while any(f"{letter}{i + 1}" in taken for i in range(model.n)):
+        letter += "D"
+    D = tuple(sp.Symbol(f"{letter}{i + 1}", commutative=False) for i in range(model.n))
+    return sp.Symbol(f"{first}0", commutative=False), D
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,7 @@ def basis_of(operators: DmzOperators, closure: Closure) -> Basis:
         span.add(numbers.vector(operators.in_D(symbol)), word)
     leading = max(numbers.vector(operators.in_D(operators.L0)))
     combinations: list[Vector] = [{(0,): numbers.one}]
-    elements: list[sp.Expr] = [L0]
+    elements: list[sp.Expr] = [operator_symbols(operators.model)[0]]
     for pivot, (row, words) in sorted(span.rows.items(), key=_place):
         if pivot != leading:
             combinations.append(words)
@@ -90,8 +96,9 @@ def _coordinates(
 
 def _expression(row: Vector, operators: DmzOperators) -> sp.Expr:
     terms = []
+    D = operator_symbols(operators.model)[1]
     for key, number in sorted(row.items(), reverse=True):
         exponents, function = operators.numbers.monomial(key)
-        powers = [D(i + 1) ** k for i, k in enumerate(exponents) if k]
+        powers = [D_i**k for D_i, k in zip(D, exponents, strict=True) if k]
         terms.append(sp.Mul(operators.numbers.expression(number), function, *powers))
     return sp.Add(*terms)

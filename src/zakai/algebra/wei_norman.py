@@ -16,7 +16,7 @@ another, as polynomials in r.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from typing import Any
@@ -61,7 +61,7 @@ class WeiNorman:
     def product(self) -> str:
         """u, factor by factor."""
         factors = [f"exp({_multiple(r, readable(e))})" for r, e in zip(self.statistics, self.basis[1:], strict=True)]
-        return " ".join([*reversed(factors), "exp(t*L0) sigma_0"])
+        return " ".join([*reversed(factors), f"exp(t*{self.basis[0]}) sigma_0"])
 
     def lines(self) -> list[str]:
         """What `print` shows."""
@@ -87,17 +87,16 @@ def wei_norman(
     basis: Sequence[sp.Expr],
     constants: Mapping[tuple[int, int], Sequence[sp.Expr]],
     observation: Sequence[Sequence[sp.Expr]],
+    names: AbstractSet[str] = frozenset(),
 ) -> WeiNorman:
     """The equations of an algebra with [E_i, E_j] = sum_k constants[i, j][k] E_k, i < j, and L_0 first in its basis.
 
-    observation: (m, d + 1), the coordinates of S^-1 h.  Raises NoFactorisation.
+    observation: (m, d + 1), the coordinates of S^-1 h; names: what no new symbol may be called.  Raises NoFactorisation.
     """
     given = [entry for row in (*constants.values(), *observation) for entry in row]
-    taken = {symbol.name for part in (*basis, *given) for symbol in part.free_symbols}
-    single = len(observation) == 1
-    r = _symbols("r", len(basis) - 1, taken)
-    y = _symbols("y", len(observation), taken, single)
-    rates = _symbols("ydot", len(observation), taken, single)
+    taken = names | {symbol.name for part in (*basis, *given) for symbol in part.free_symbols}
+    (r,) = _symbols(("r",), range(1, len(basis)), taken)
+    y, rates = path_symbols(len(observation), taken)
     domain, _ = sp.construct_domain(given, field=True)
     polynomials, *variables = ring([*r, *y], domain)
     statistics, path = variables[: len(r)], variables[len(r) :]
@@ -183,13 +182,18 @@ def _add(target: Element, element: Element, factor: Any) -> None:
             target.pop(k, None)
 
 
-def _symbols(letter: str, count: int, taken: AbstractSet[str], single: bool = False) -> tuple[sp.Symbol, ...]:
-    """letter1, letter2, ...; with underscores where the model has such a name."""
-    while True:
-        names = [letter] if single else [f"{letter}{k + 1}" for k in range(count)]
-        if not taken & {*names}:
-            return tuple(sp.Symbol(name, real=True) for name in names)
-        letter += "_"
+def path_symbols(count: int, taken: AbstractSet[str]) -> tuple[tuple[sp.Symbol, ...], tuple[sp.Symbol, ...]]:
+    """y, or y1, ..., ym, and their rates ydot, with names that are not taken."""
+    y, rates = _symbols(("y", "ydot"), [""] if count == 1 else range(1, count + 1), taken)
+    return y, rates
+
+
+def _symbols(stems: tuple[str, ...], endings: Iterable[Any], taken: AbstractSet[str]) -> tuple[tuple[sp.Symbol, ...], ...]:
+    """A symbol of every stem for each ending; the stems begin with their letter twice, or more, where a name is taken."""
+    endings, letter = list(endings), stems[0]
+    while taken & {f"{stem}{ending}" for stem in stems for ending in endings}:
+        stems = tuple(f"{letter}{stem}" for stem in stems)
+    return tuple(tuple(sp.Symbol(f"{stem}{ending}", real=True) for ending in endings) for stem in stems)
 
 
 def _expression(polynomial: Any, symbols: Sequence[sp.Symbol]) -> sp.Expr:

@@ -18,6 +18,7 @@ from zakai.algebra.arguments import Unreadable
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.dmz_operators import DmzOperators
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
+from zakai.algebra.normal_form import operator_symbols
 from zakai.algebra.operators import Symbol
 from zakai.algebra.systems import affine_observation, cached_yau_form, definite_covariance
 from zakai.algebra.yau import YauForm, short
@@ -178,9 +179,9 @@ def lemma_3_3(model: Model) -> TheoremCheck:
         Condition(f"h is affine in {x[0]} alone and not constant", alone, str(list(model.observation)), DONG),
         *_first_coordinate_splits(model),
     )
-    algebra = estimation_algebra(model)
+    algebra, (L0, D) = estimation_algebra(model), operator_symbols(model)
     basis = [str(e) for e in algebra.basis]
-    holds = {"finite": basis == ["L0", "D1", str(x[0]), "1"], "infinite": False}.get(algebra.verdict)
+    holds = {"finite": algebra.basis == (L0, D[0], x[0], 1), "infinite": False}.get(algebra.verdict)
     conclusion = Condition(f"E has the basis L_0, D_1, {x[0]}, 1", holds, f"{algebra.verdict}, basis {basis}", DONG)
     return TheoremCheck(f"{DONG}, Lemma 3.3", "E has the basis L_0, D_1, x_1, 1", assumptions, conclusion)
 
