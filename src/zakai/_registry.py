@@ -34,7 +34,7 @@ METHODS = {
     ),
     "limited-direct": Entry(
         "zakai.filters.limited_direct",
-        "exact between observations for time-varying Yau systems whose q is quadratic, in one or two dimensions",
+        "exact between observations for time-varying Yau systems whose q is quadratic, in one to three states",
     ),
     "general-direct": Entry(
         "zakai.filters.general_direct",
