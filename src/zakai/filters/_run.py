@@ -161,7 +161,10 @@ class Run:
         method, count = self.setting.method, len(self.record.times)
         if self.state is None:
             self.start()
-        for rows in self.setting.chunks(self.data, self.done):
+        # A run that goes on from where it was left finds the same chunks.
+        for rows in self.setting.chunks(self.data, int(self.at_start)):
+            if rows.stop <= self.done:
+                continue
             data = self.data.part(rows)
             prepared = self.setting.prepared(data)
             observations = method.observations(prepared, data)

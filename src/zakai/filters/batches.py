@@ -18,6 +18,7 @@ from zakai.filters._run import RUN, Run, run_steps, scanned, size_of
 LANES = 32  # records that are filtered by one scan, at most: one that asks for a large lattice slows no more than these
 LANE_BYTES = 256 * 2**20  # what they give in one run of steps, at most
 WORTH_A_CORE = 16  # records
+FEW_ILL = 0.25  # the share of the records of a scan that may leave it at once for a lattice of their own
 
 
 class _Count:
@@ -32,9 +33,8 @@ class _Count:
             if self.progress is not None:
                 self.progress(self.done, self.total)
 
-    def of_one(self) -> Callable[[int, int], None]:
-        """The same as the progress of a single record, which counts from its own beginning."""
-        last = 0
+    def of_one(self, last: int = 0) -> Callable[[int, int], None]:
+        """The same as the progress of a single record, which counts from its own beginning; `last` of it are done."""
 
         def progress(done: int, _: int) -> None:
             nonlocal last
@@ -86,36 +86,60 @@ def _groups(runs: list[Run]) -> Iterator[tuple[list[Run], int]]:
 
 
 def _together(runs: list[Run], lanes: int, count: _Count) -> None:
-    """Filter a group of records; a scan that is made for more `lanes` repeats the last of them."""
+    """Filter a group of records; a scan that is made for more `lanes` repeats the last of them.
+
+    A record that alone asks for a larger lattice leaves the group and goes on by itself.
+    """
     if lanes == 1:
         return runs[0].all(count.of_one())
     setting, total = runs[0].setting, len(runs[0].record.times)
     method = setting.method
-    fill = [runs[-1]] * (lanes - len(runs))
-    states = _stacked([run.state for run in [*runs, *fill]], 0)
+    states = [run.state for run in runs]
+    alone: list[Run] = []
     for rows in setting.chunks(runs[0].data, runs[0].done, lanes):
         prepared = setting.prepared(runs[0].data.part(rows))
         given = [method.observations(prepared, run.data.part(rows)) for run in runs]
-        observations = _stacked([*given, *given[-1:] * len(fill)], 1)
-        while runs[0].done < rows.stop:
+        while runs and runs[0].done < rows.stop:
             left = slice(runs[0].done - rows.start, rows.stop - rows.start)
-            part, begin, states, info, kept = run_steps(
-                method, _adapt(method), _scan_lanes, prepared, states, observations, left, rows.stop == total, runs[0].keep
-            )
+            fill = lanes - len(runs)
+            adapt = _Adapt(method, len(runs))
+            part, begin, ends, info, kept = run_steps(
+                method, adapt if method.adapt_many else None, _scan_lanes, prepared, _stacked([*states, *states[-1:] * fill], 0),
+                _stacked([*given, *given[-1:] * fill], 1), left, rows.stop == total, runs[0].keep,
+            )  # fmt: skip
             for lane, run in enumerate(runs):
-                run.take(prepared, _lane(begin, lane, 0), _lane(info, lane, 1), _lane(kept, lane, 1))
+                first = _lane(begin, lane, 0)
+                if lane in adapt.ill:
+                    run.state = first
+                    alone.append(run)
+                else:
+                    run.take(prepared, first, _lane(info, lane, 1), _lane(kept, lane, 1))
+            well = [lane for lane in range(len(runs)) if lane not in adapt.ill]
+            runs, given, states = [runs[i] for i in well], [given[i] for i in well], [_lane(ends, i, 0) for i in well]
             count.add(len(runs) * (part.stop - part.start))
+        if not runs:
+            break
+    for run in alone:
+        run.all(count.of_one(run.done))
 
 
-def _adapt(method):
-    """`adapt_many`, given what the scan tells with the records in front."""
-    if method.adapt_many is None:
+class _Adapt:
+    """`adapt_many`, given what the scan tells with the records in front; `ill` are the few records that alone ask for more."""
+
+    def __init__(self, method: Any, count: int):
+        self.method, self.count, self.ill = method, count, frozenset[int]()
+
+    def __call__(self, prepared, states, rows, info):
+        method = self.method
+        info = jax.tree.map(lambda a: np.swapaxes(a, 0, 1), info)
+        again = method.adapt_many(prepared, states, rows, info)
+        if info is None or again is None:
+            return again
+        ill = [k for k in range(self.count) if method.adapt(prepared, _lane(states, k, 0), rows, _lane(info, k, 0)) is not None]
+        if not 0 < len(ill) <= self.count * FEW_ILL:
+            return again
+        self.ill = frozenset(ill)
         return None
-
-    def adapt(prepared, states, rows, info):
-        return method.adapt_many(prepared, states, rows, jax.tree.map(lambda a: np.swapaxes(a, 0, 1), info))
-
-    return adapt
 
 
 def _shape(tree: Any) -> Hashable:
