@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from zakai._registry import AUTO
+from zakai.algebra import theorems
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.independent import IndependentBlock, independent_blocks
-from zakai.algebra.theorems import THEOREMS
 from zakai.errors import ConditionError
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior
@@ -55,13 +55,13 @@ def chosen(model: Model, method: str) -> tuple[str, str, Mapping[str, Conditions
     Raises ConditionError, with what fails, if it does not hold, or none does.
     """
     if method != "auto":
-        conditions = THEOREMS[method](model)
+        conditions = theorems.THEOREMS[method](model)
         if all_hold(conditions) is not True:
             raise ConditionError(f"{model.source}: {method} does not hold: {failure(conditions)}")
         return method, "asked for by name, and every assumption of its theorem holds", {method: conditions}
     considered: dict[str, Conditions] = {}
     for name in AUTO:
-        considered[name] = THEOREMS[name](model)
+        considered[name] = theorems.THEOREMS[name](model)
         if all_hold(considered[name]) is True:
             return name, "the first method whose every assumption holds for this system", considered
     reasons = "; ".join(f"{name}: {failure(conditions)}" for name, conditions in considered.items())
@@ -84,9 +84,9 @@ def divided(model: Model, prior: Any, method: str = "auto", by_value: bool = Tru
         return None
     if method == "auto":
         plain = model.n <= FEW and isinstance(prior, GaussianPrior | None)
-        if plain and all_hold(THEOREMS["kalman-bucy"](model)) is True:
+        if plain and all_hold(theorems.THEOREMS["kalman-bucy"](model)) is True:
             return None
-    elif model.n <= MANY and all_hold(THEOREMS[method](model)) is True:
+    elif model.n <= MANY and all_hold(theorems.THEOREMS[method](model)) is True:
         return None
     methods, conditions = {}, {}
     for part in dict.fromkeys(block.model for block in blocks):
@@ -95,7 +95,7 @@ def divided(model: Model, prior: Any, method: str = "auto", by_value: bool = Tru
         except ConditionError as error:
             if method == "auto" or model.n > MANY:
                 raise
-            whole = failure(THEOREMS[method](model))
+            whole = failure(theorems.THEOREMS[method](model))
             raise ConditionError(f"{model.source}: {method} does not hold: {whole}; nor block by block: {error}") from None
     return Division(blocks, methods, conditions, method != "auto")
 

@@ -39,7 +39,7 @@ def methods(source: str | None) -> None:
     _columns(rows)
     print(f"\nauto takes: {analysis.recommended or 'none, for none that it tries holds'}")
     if analysis.division is not None:
-        print(textwrap.fill(analysis.division.why, 110))
+        print(textwrap.fill(analysis.division.why, 110, break_on_hyphens=False))
 
 
 def gallery(name: str | None) -> None:
