@@ -1,9 +1,9 @@
 """Certificates checked again, by a plain path that shares no code with the engine that found them.
 
 Operators are tables {alpha: coefficient} of SymPy expressions, multiplied by Leibniz' rule with SymPy's derivatives; there is
-no ring of symbols, no generator, no echelon form.  Polynomials are compared exactly.  Other expressions are compared in
-120 digits at random points, with concrete functions in the place of undetermined ones; that refutes exactly, and what a
-certificate of infinite dimension needs most is a refutation: a derivative that is not zero.
+no ring of symbols, no generator, no echelon form.  Polynomials and their quotients are compared exactly.  Other expressions are
+compared in 120 digits at random points, with concrete functions in the place of undetermined ones; that refutes exactly, and
+what a certificate of infinite dimension needs most is a refutation: a derivative that is not zero.
 """
 
 from __future__ import annotations
@@ -55,8 +55,9 @@ class _Plain:
         )
         self.x, self.n = model.x, model.n
         entries = [*f, *h, *G, *S]
-        exact = all(e.is_polynomial(*model.x) and all(c.is_Rational for c in sp.Poly(e, *model.x).coeffs()) for e in entries)
-        self.ring = sp.ring(model.x, sp.QQ)[0] if exact else None
+        exact = all(e.is_rational_function(*model.x) and _has_rational_numbers(e) for e in entries)
+        whole = all(e.is_polynomial(*model.x) for e in entries)
+        self.ring = (sp.ring if whole else sp.field)(model.x, sp.QQ)[0] if exact else None
         self.drift, self.h, self.G = f, h, G
         energy = (h.T * S.LUsolve(h))[0, 0]
         zero = (0,) * self.n
@@ -71,7 +72,7 @@ class _Plain:
         self.word = lru_cache(maxsize=None)(self._word)
 
     def prepared(self, operator: Operator) -> Operator:
-        """Coefficients as SymPy's sparse polynomials where all are polynomials, or else expanded."""
+        """Coefficients as SymPy's sparse polynomials, or quotients of them, where all are; or else expanded."""
         ring = self.ring
         if ring is None:
             return {alpha: e for alpha, c in operator.items() if (e := sp.expand(c)) != 0}
@@ -245,6 +246,10 @@ def _is_a_polynomial(e: sp.Expr, plain: _Plain) -> bool:
     """Whether a function is a polynomial of any degree; one of which high differences do not vanish is not taken for one."""
     e = sp.expand(e)
     return e.is_polynomial(*plain.x) or differences_vanish(e, plain.x, 24)
+
+
+def _has_rational_numbers(e: sp.Expr) -> bool:
+    return all(part.is_Rational or not part.is_number for part in sp.preorder_traversal(e))
 
 
 def _plus(alpha: tuple[int, ...], i: int) -> tuple[int, ...]:
