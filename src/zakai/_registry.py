@@ -48,6 +48,10 @@ METHODS = {
         "zakai.filters.wei_norman",
         "for finite estimation algebras in one to three states, exp(t L0) on a lattice; only when it is asked for",
     ),
+    "kolmogorov-series": Entry(
+        "zakai.filters.kolmogorov_series",
+        "convergent for one state and any smooth f without time: the explicit series of the kernel; only when it is asked for",
+    ),
     "extended-kalman-bucy": Entry(
         "zakai.filters.extended_kalman_bucy",
         "approximate for any smooth system: linearised at the mean, one Gaussian; only when it is asked for",

@@ -151,6 +151,33 @@ def smooth_system(model: Model) -> tuple[Condition, ...]:
     return (determined(model),)
 
 
+@lru_cache(maxsize=64)
+def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
+    """A smooth drift without time and a constant, definite G: its kernel has the series of Yau 1993, Theorems 10 and 11.
+
+    The paper asks for constant h, which its robust equation needs and the transition between observations does not.
+    """
+    source = "Yau 1993, Theorems 10 to 12"
+    conditions = [determined(model)]
+    if conditions[0].holds is not True:
+        return tuple(conditions)
+    varying = [part for part in (*model.drift, *model.covariance) if model.t in part.free_symbols]
+    bent = [part for part in model.drift if part.has(sp.Abs, sp.sign)]
+    return (
+        *conditions,
+        Condition(
+            "f and G are constant in time",
+            not varying,
+            f"{short(str(varying[0]))} depends on t" if varying else "neither depends on t",
+            source,
+        ),
+        definite_covariance(model),
+        Condition("f is smooth", not bent, f"f contains {short(str(bent[0]))}" if bent else "no absolute value", source),
+        Condition("there is one state", model.n == 1, f"n = {model.n}", "the lattice of this method"),
+        Condition("the state is no angle", not model.periodic, f"periodic: {list(model.periodic)}", "the lattice of this method"),
+    )
+
+
 def _form_text(form: YauForm) -> str:
     return f"L = {short(str(form.matrix.tolist()))}, l = {short(str(list(form.offset)))}, phi = {short(str(form.potential))}"
 
@@ -164,6 +191,7 @@ THEOREMS: Mapping[str, Callable[[Model], tuple[Condition, ...]]] = {
     "general-direct": general_direct,
     "gaussian-sum": gaussian_sum,
     "wei-norman": wei_norman_filter,
+    "kolmogorov-series": kolmogorov_series,
     "extended-kalman-bucy": smooth_system,
 }
 
@@ -178,6 +206,7 @@ __all__ = [
     "general_direct",
     "inverse",
     "kalman_bucy",
+    "kolmogorov_series",
     "limited_direct",
     "smooth_system",
     "wei_norman_filter",

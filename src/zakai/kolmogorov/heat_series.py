@@ -19,15 +19,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
 from zakai.algebra.yau import eta, observation_energy
 from zakai.errors import ConditionError
 from zakai.kolmogorov.jets import Jet, jets
+from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 from zakai.models.compile import jax_function
 from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
 
 REACH = 7.0  # standard deviations of the Gaussian beyond which the kernel is zero: a Taylor polynomial may be anything there
 FORMS = ("log", "sum")
@@ -48,27 +49,28 @@ class HeatSeries:
     logarithms: tuple[Jet, ...]
     rest: Jet
 
-    def kernel(self, x: Any, t: Any, form: str = "log", order: int | None = None) -> jax.Array:
+    def kernel(self, x: Any, t: Any, form: str = "log", order: int | None = None) -> Any:
         """phi(t, x, y), (..., count), for x (..., n)."""
-        return self.offset(jnp.asarray(x, float)[..., None, :] - self.y, t, form, order)
+        return self.offset(x[..., None, :] - self.y, t, form, order)
 
-    def offset(self, z: jax.Array, t: Any, form: str = "log", order: int | None = None) -> jax.Array:
+    def offset(self, z: Any, t: Any, form: str = "log", order: int | None = None) -> Any:
         """phi(t, y + z, y) for z (..., count, n)."""
+        xp = numpy_or_jax(self.exponent.coefficients, z, t)
         series = (self.logarithms if form == "log" else self.coefficients)[:order]
         powers = self.exponent.monomials.values(z)
         logs = self._log_gaussian(z, t) + self._sum(powers, self.exponent.coefficients)
-        nothing = jnp.zeros(self.exponent.coefficients.shape)
+        nothing = np.zeros(self.exponent.coefficients.shape)
         values = self._sum(powers, sum((jet.coefficients * t**k for k, jet in enumerate(series, 1)), nothing))
-        return jnp.exp(logs + values) if form == "log" else jnp.exp(logs) * (1.0 + values)
+        return xp.exp(logs + values) if form == "log" else xp.exp(logs) * (1.0 + values)
 
-    def _log_gaussian(self, z: jax.Array, t: Any) -> jax.Array:
-        n = z.shape[-1]
-        white = jnp.einsum("...i,ij,...j->...", z, jnp.linalg.inv(self.covariance), z)
-        return -white / (2 * t) - 0.5 * (n * jnp.log(2 * jnp.pi * t) + jnp.linalg.slogdet(self.covariance)[1])
+    def _log_gaussian(self, z: Any, t: Any) -> Any:
+        n, xp = z.shape[-1], numpy_or_jax(self.covariance, z, t)
+        white = xp.sum((z @ xp.linalg.inv(self.covariance)) * z, axis=-1)
+        return -white / (2 * t) - 0.5 * (n * xp.log(2 * np.pi * t) + xp.linalg.slogdet(self.covariance)[1])
 
     @staticmethod
-    def _sum(powers: jax.Array, coefficients: jax.Array) -> jax.Array:
-        return jnp.einsum("...yk,ky->...y", powers, coefficients)
+    def _sum(powers: Any, coefficients: Any) -> Any:
+        return numpy_or_jax(powers, coefficients).einsum("...yk,ky->...y", powers, coefficients)
 
 
 def heat_series(
@@ -81,23 +83,28 @@ def heat_series(
 
         >>> model = zakai.Model(state=["x"], drift=["tanh(x)"], observation=["0"])
         >>> heat_series(model, np.zeros((1, 1)), 1).kernel(np.array([0.1]), 0.04)
-        Array([1.73448562], dtype=float64)
+        array([1.73410437])
 
     Source: Yau (1993), Theorems 10 and 11.
     """
     theta = model.theta() if theta is None else theta
     degree = 2 * order + 4 if degree is None else degree
     energy = observation_energy(model) / 2 if potential else 0
-    *f, V = jets([*model.drift, energy], model, jnp.asarray(y), degree + 1, theta)
-    G = jax_function(model.covariance, model, (model.n, model.n))(jnp.zeros(model.n), model.start, theta)
-    return series(y, G, f, V, order, degree)
+    *f, V = jets([*model.drift, energy], model, y, degree + 1, theta)
+    return series(y, _covariance(model, theta), f, V, order, degree)
+
+
+def _covariance(model: Model, theta: Any) -> Any:
+    function: Any = numpy_function if isinstance(theta, np.ndarray) else jax_function
+    return function(model.covariance, model, (model.n, model.n))(np.zeros(model.n), model.start, theta)
 
 
 def series(y: Any, G: Any, f: list[Jet], V: Jet, order: int, degree: int) -> HeatSeries:
     """The recursion on jets that hold monomials up to `degree` + 1 of f and V, which are right up to `degree` or more."""
-    n, precision, states = len(f), jnp.linalg.inv(G), range(len(f))
+    n, precision, states = len(f), numpy_or_jax(G).linalg.inv(G), range(len(f))
     unit = f[0] * 0.0
-    z = [Jet(unit.coefficients.at[unit.monomials.place[tuple(row)]].set(1.0), unit.monomials) for row in np.eye(n, dtype=int)]
+    places = [unit.monomials.place[tuple(row)] for row in np.eye(n, dtype=int)]
+    z = [Jet(unit.coefficients + np.eye(len(unit.monomials.powers), 1, -place), unit.monomials) for place in places]
     a = sum((z[i] * f[j] * precision[i, j] for i in states for j in states), unit).radial(0)
     slope = [a.derivative(i) for i in states]
     transport = [(sum((slope[j] * G[i, j] for j in states), unit) - f[i]).truncated(degree) for i in states]
@@ -127,23 +134,24 @@ def series(y: Any, G: Any, f: list[Jet], V: Jet, order: int, degree: int) -> Hea
         rate = W if k == 1 else moved(logarithms[-1])
         rate = rate + sum((weighted(logarithms[i - 1], logarithms[k - 2 - i]) for i in range(1, k - 1)), unit) * 0.5
         logarithms.append(rate.truncated(known).radial(k))
-    return HeatSeries(jnp.asarray(y), G, a, tuple(coefficients[1:]), tuple(logarithms), last)
+    return HeatSeries(y, G, a, tuple(coefficients[1:]), tuple(logarithms), last)
 
 
 def transition(
     heat: HeatSeries, cell: Any, t: Any, *, substeps: int = 1, form: str = "log", order: int | None = None
-) -> jax.Array:
+) -> Any:
     """The matrix P (M, M) that carries the values of a density on the lattice y (M, 1) of `heat` over a time t.
 
     The kernel of t / `substeps`, zero where |z| exceeds `REACH` of its standard deviations, times the cell, to the power
     `substeps` (Theorem 12, in which K - 1 integrals and not K join K kernels).
     """
-    part = t / substeps
-    z = heat.y[:, None] - heat.y
-    near = jnp.abs(z[..., 0]) <= REACH * jnp.sqrt(heat.covariance[0, 0] * part)
+    part, z = t / substeps, heat.y[:, None] - heat.y
+    xp = numpy_or_jax(heat, cell, t)
+    near = xp.abs(z[..., 0]) <= REACH * xp.sqrt(heat.covariance[0, 0] * part)
     # Far from the diagonal a polynomial may overflow; it is not looked at there.
-    values = heat.offset(jnp.where(near[..., None], z, 0.0), part, form, order)
-    return jnp.linalg.matrix_power(jnp.where(near, values, 0.0) * cell, substeps)
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = xp.where(near, heat.offset(xp.where(near[..., None], z, 0.0), part, form, order), 0.0)
+        return xp.linalg.matrix_power(values * cell, substeps)
 
 
 def parametrix(
@@ -166,31 +174,30 @@ def parametrix(
     potential = eta(model)
     if model.n > 1 or potential is None:
         raise ConditionError(f"{model.source}: the series of Corollary 13 is for one state and positive G")
-    y, theta = jnp.asarray(x, float)[:, None], model.theta()
+    y, theta = np.asarray(x, float)[:, None], model.theta()
     degree = 8 * (order + 1) if degree is None else degree
     zero, V = jets([0 * model.x[0], potential / 2], model, y, degree + 1, theta)
-    G = jax_function(model.covariance, model, (1, 1))(jnp.zeros(1), model.start, theta)
-    heat, cell = series(y, G, [zero], V, order, degree), x[1] - x[0]
+    heat, cell = series(y, _covariance(model, theta), [zero], V, order, degree), x[1] - x[0]
     z = y[:, None] - y
     powers = heat.exponent.monomials.values(z)
     sums = [heat._sum(powers, jet.coefficients) for jet in (*heat.coefficients, heat.rest)]
     points, weights = np.polynomial.legendre.leggauss(nodes)
     points, weights = 0.5 * (points + 1.0), 0.5 * weights * cell
 
-    def main(t: float) -> jax.Array:
-        return jnp.exp(heat._log_gaussian(z, t)) * (1.0 + sum(p * t**k for k, p in enumerate(sums[:-1], 1)))
+    def main(t: float) -> np.ndarray:
+        return np.exp(heat._log_gaussian(z, t)) * (1.0 + sum(p * t**k for k, p in enumerate(sums[:-1], 1)))
 
-    def residual(t: float) -> jax.Array:
-        return -jnp.exp(heat._log_gaussian(z, t)) * t**order * sums[-1]
+    def residual(t: float) -> np.ndarray:
+        return -np.exp(heat._log_gaussian(z, t)) * t**order * sums[-1]
 
-    def term(m: int, t: float) -> jax.Array:
+    def term(m: int, t: float) -> np.ndarray:
         """phi_N * e_N * ... * e_N with m factors e_N."""
         if m == 0:
             return main(t)
         parts = (w * (term(m - 1, t * (1.0 - s)) @ residual(t * s)) for s, w in zip(points, weights, strict=True))
-        return t * sum(parts, start=jnp.zeros(()))
+        return t * sum(parts, start=np.zeros(()))
 
     found = [term(0, t)]
     for m in range(1, terms + 1):
         found.append(found[-1] + (-1) ** m * term(m, t))
-    return [np.asarray(one) for one in found]
+    return found

@@ -20,8 +20,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 
 from zakai import _float64  # noqa: F401
+from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 from zakai.models._program import operations
 from zakai.models.model import Model
 from zakai.models.numeric import program_of
@@ -60,19 +62,27 @@ class Monomials:
         made, left, right = np.array(sorted(pairs)).T
         return left, right, made
 
-    def lowered(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(from, to, factor) of d/dz_i."""
-        used = np.flatnonzero(self.powers[:, i])
-        unit = np.arange(self.n) == i
-        return used, np.array([self.place[tuple(p)] for p in self.powers[used] - unit]), self.powers[used, i]
+    def lowered(self, i: int) -> np.ndarray:
+        """The matrix (count, count) of d/dz_i."""
+        matrix = np.zeros((len(self.powers), len(self.powers)))
+        for column, power in enumerate(self.powers):
+            if power[i]:
+                matrix[self.place[tuple(power - (np.arange(self.n) == i))], column] = power[i]
+        return matrix
 
-    def values(self, z: jax.Array) -> jax.Array:
+    @cached_property
+    def first_of(self) -> np.ndarray:
+        """Where the pairs of `products` that make each monomial begin."""
+        return np.searchsorted(self.products[2], np.arange(len(self.powers)))
+
+    def values(self, z: Any) -> Any:
         """All monomials (..., count) at z (..., n)."""
-        ladders = [[jnp.ones(z.shape[:-1])] for _ in range(self.n)]
+        xp = numpy_or_jax(z)
+        ladders = [[xp.ones(z.shape[:-1])] for _ in range(self.n)]
         for i, ladder in enumerate(ladders):
             for _ in range(self.degree):
                 ladder.append(ladder[-1] * z[..., i])
-        return jnp.stack([reduce(operator.mul, [ladders[i][k] for i, k in enumerate(p)]) for p in self.powers], axis=-1)
+        return xp.stack([reduce(operator.mul, [ladders[i][k] for i, k in enumerate(p)]) for p in self.powers], axis=-1)
 
 
 @cache
@@ -84,36 +94,41 @@ def monomials(n: int, degree: int) -> Monomials:
 @partial(jax.tree_util.register_dataclass, data_fields=["coefficients"], meta_fields=["monomials"])
 @dataclass(frozen=True, eq=False)
 class Jet:
-    """A truncated polynomial in z: `coefficients` (count, points) of the `monomials`."""
+    """A truncated polynomial in z: `coefficients` (count, points) of the `monomials`, of NumPy or of JAX."""
 
-    coefficients: jax.Array
+    coefficients: Any
     monomials: Monomials
 
     __array_ufunc__ = None  # a NumPy number leaves arithmetic to this class
 
-    def _like(self, coefficients: jax.Array) -> Jet:
+    def _like(self, coefficients: Any) -> Jet:
         return Jet(coefficients, self.monomials)
+
+    @property
+    def _first_only(self) -> np.ndarray:
+        return np.eye(len(self.monomials.powers), 1)
 
     def constant(self, value: Any) -> Jet:
         """The jet of a function that is constant in z."""
-        zeros = jnp.zeros_like(self.coefficients)
-        return self._like(zeros.at[0].set(value))
+        return self._like(self._first_only * value + 0.0 * self.first)
 
     @property
-    def first(self) -> jax.Array:
+    def first(self) -> Any:
         """The values at z = 0."""
         return self.coefficients[0]
 
     def __add__(self, other: Any) -> Jet:
         if isinstance(other, Jet):
             return self._like(self.coefficients + other.coefficients)
-        return self._like(self.coefficients.at[0].add(other))
+        return self._like(self.coefficients + self._first_only * other)
 
     def __mul__(self, other: Any) -> Jet:
         if not isinstance(other, Jet):
             return self._like(self.coefficients * other)
         left, right, made = self.monomials.products
         pairs = self.coefficients[left] * other.coefficients[right]
+        if isinstance(pairs, np.ndarray):
+            return self._like(np.add.reduceat(pairs, self.monomials.first_of, axis=0))
         return self._like(jax.ops.segment_sum(pairs, made, len(self.monomials.powers), indices_are_sorted=True))
 
     def __neg__(self) -> Jet:
@@ -135,9 +150,7 @@ class Jet:
 
     def derivative(self, i: int) -> Jet:
         """d/dz_i; the highest degree is lost."""
-        used, to, factor = self.monomials.lowered(i)
-        zeros = jnp.zeros_like(self.coefficients)
-        return self._like(zeros.at[to].set(self.coefficients[used] * factor[:, None]))
+        return self._like(self.monomials.lowered(i) @ self.coefficients)
 
     def radial(self, k: int) -> Jet:
         """int_0^1 s^(k-1) p(s z) ds; for k = 0 of a polynomial without a constant."""
@@ -147,7 +160,7 @@ class Jet:
         """Without what is of a higher degree."""
         return self._like(self.coefficients * (self.monomials.degrees <= degree)[:, None])
 
-    def solved(self, first: jax.Array, rate: Callable[[Jet], Jet]) -> Jet:
+    def solved(self, first: Any, rate: Callable[[Jet], Jet]) -> Jet:
         """The w with w(0) = `first` and E w = rate(w) E u, u this one."""
         w, scaled = self.constant(first), self._like(self.coefficients * self.monomials.degrees[:, None])
         for _ in range(self.monomials.degree):
@@ -175,7 +188,7 @@ def _power(u: Any, p: Any) -> Any:
     return u.solved(u.first**p, lambda w: p * w * inverse)
 
 
-def _pair(u: Jet, sine: jax.Array, cosine: jax.Array, sign: float) -> tuple[Jet, Jet]:
+def _pair(u: Jet, sine: Any, cosine: Any, sign: float) -> tuple[Jet, Jet]:
     """The sine and the cosine (`sign` -1), or the hyperbolic ones (1)."""
     scaled = Jet(u.coefficients * u.monomials.degrees[:, None], u.monomials)
     s, c = u.constant(sine), u.constant(cosine)
@@ -184,78 +197,89 @@ def _pair(u: Jet, sine: jax.Array, cosine: jax.Array, sign: float) -> tuple[Jet,
     return s, c
 
 
+_NUMPY, _JAX = operations(np, scipy.special.erf), operations(jnp, jax.scipy.special.erf)
+
+
+def _value(name: str, u: Jet) -> Any:
+    """The value of a function at z = 0."""
+    return _plain(name, u.first)
+
+
+def _plain(name: str, u: Any) -> Any:
+    return (_JAX if isinstance(u, jax.Array) else _NUMPY)[name](u)
+
+
 def _circular(u: Jet) -> tuple[Jet, Jet]:
-    return _pair(u, jnp.sin(u.first), jnp.cos(u.first), -1.0)
+    return _pair(u, _value("sin", u), _value("cos", u), -1.0)
 
 
 def _hyperbolic(u: Jet) -> tuple[Jet, Jet]:
-    return _pair(u, jnp.sinh(u.first), jnp.cosh(u.first), 1.0)
+    return _pair(u, _value("sinh", u), _value("cosh", u), 1.0)
 
 
 def _tanh(u: Jet) -> Jet:
-    return u.solved(jnp.tanh(u.first), lambda w: 1.0 - w * w)
+    return u.solved(_value("tanh", u), lambda w: 1.0 - w * w)
 
 
-def _known(first: Callable[[Any], Any], rate: Callable[[Jet], Jet]) -> Callable[[Jet], Jet]:
-    """The rule of a function from its value and its derivative, a function of u."""
-    return lambda u: u.solved(first(u.first), partial(lambda slope, _: slope, rate(u)))
+def _known(name: str, rate: Callable[[Jet], Jet]) -> Callable[[Jet], Jet]:
+    """The rule of a function from its derivative, a function of u."""
+    return lambda u: u.solved(_value(name, u), partial(lambda slope, _: slope, rate(u)))
 
 
-def _erf_rate(u: Jet) -> Jet:
-    return (2.0 / np.sqrt(np.pi)) * _RULES["exp"](-(u * u))
+def _exp(u: Jet) -> Jet:
+    return u.solved(_value("exp", u), lambda w: w)
 
 
 _RULES: dict[str, Callable[[Jet], Jet]] = {
-    "exp": lambda u: u.solved(jnp.exp(u.first), lambda w: w),
-    "log": _known(jnp.log, _reciprocal),
+    "exp": _exp,
+    "log": _known("log", _reciprocal),
     "sqrt": lambda u: _power(u, 0.5),
     "sin": lambda u: _circular(u)[0],
     "cos": lambda u: _circular(u)[1],
-    "tan": lambda u: u.solved(jnp.tan(u.first), lambda w: 1.0 + w * w),
+    "tan": lambda u: u.solved(_value("tan", u), lambda w: 1.0 + w * w),
     "sinh": lambda u: _hyperbolic(u)[0],
     "cosh": lambda u: _hyperbolic(u)[1],
     "tanh": _tanh,
-    "logcosh": _known(lambda u: jnp.logaddexp(u, -u) - np.log(2.0), _tanh),
-    "asin": _known(jnp.arcsin, lambda u: _power(1.0 - u * u, -0.5)),
-    "acos": _known(jnp.arccos, lambda u: -_power(1.0 - u * u, -0.5)),
-    "atan": _known(jnp.arctan, lambda u: _reciprocal(1.0 + u * u)),
-    "erf": _known(jax.scipy.special.erf, _erf_rate),
-    "abs": lambda u: u * jnp.sign(u.first),
-    "sign": lambda u: u.constant(jnp.sign(u.first)),
+    "logcosh": _known("logcosh", _tanh),
+    "asin": _known("asin", lambda u: _power(1.0 - u * u, -0.5)),
+    "acos": _known("acos", lambda u: -_power(1.0 - u * u, -0.5)),
+    "atan": _known("atan", lambda u: _reciprocal(1.0 + u * u)),
+    "erf": _known("erf", lambda u: _exp(-(u * u)) * (2.0 / np.sqrt(np.pi))),
+    "abs": lambda u: u * _value("sign", u),
+    "sign": lambda u: u.constant(_value("sign", u)),
 }
 
 
-def _rule(name: str, plain: Callable) -> Callable:
-    return lambda u: _RULES[name](u) if isinstance(u, Jet) else plain(u)
+def _rule(name: str) -> Callable:
+    return lambda u: _RULES[name](u) if isinstance(u, Jet) else _plain(name, u)
 
 
-_PLAIN = operations(jnp, jax.scipy.special.erf)
-_OPERATIONS = _PLAIN | {name: _rule(name, _PLAIN[name]) for name in _RULES} | {"power": _power}
+_OPERATIONS = _NUMPY | {name: _rule(name) for name in _RULES} | {"power": _power}
 
 
 class _States:
     """What a program takes its states from."""
 
-    def __init__(self, points: jax.Array, of: Monomials):
-        count, n = points.shape
-        zeros = jnp.zeros((len(of.powers), count))
-        units = [of.place[tuple(row)] for row in np.eye(n, dtype=int)]
-        self.jets = [Jet(zeros.at[0].set(points[:, i]).at[units[i]].set(1.0), of) for i in range(n)]
+    def __init__(self, points: Any, of: Monomials):
+        count = len(of.powers)
+        units = [of.place[tuple(row)] for row in np.eye(of.n, dtype=int)]
+        self.jets = [Jet(np.eye(count, 1) * points[:, i] + np.eye(count, 1, -unit), of) for i, unit in enumerate(units)]
 
     def __getitem__(self, key: Any) -> Jet:
         return self.jets[key[-1]]
 
 
-def jets(expressions: Sequence[Any], model: Model, points: jax.Array, degree: int, theta: Any) -> list[Jet]:
+def jets(expressions: Sequence[Any], model: Model, points: Any, degree: int, theta: Any) -> list[Jet]:
     """The Taylor polynomials of expressions without time about `points` (count, n), up to `degree` >= 1; theta may be traced.
 
         >>> model = zakai.Model(state=["x"], drift=["exp(x)"], observation=["x"])
-        >>> jets(model.drift, model, jnp.zeros((1, 1)), 3, model.theta())[0].coefficients[:, 0].round(3)
-        Array([1.   , 1.   , 0.5  , 0.167], dtype=float64)
+        >>> jets(model.drift, model, np.zeros((1, 1)), 3, model.theta())[0].coefficients[:, 0].round(3)
+        array([1.   , 1.   , 0.5  , 0.167])
     """
-    of = monomials(model.n, degree)
-    states = _States(jnp.asarray(points, float), of)
+    states = _States(points, monomials(model.n, degree))
     program = program_of(list(expressions), model)
-    values = program.run(states, jnp.zeros(()), jnp.asarray(theta, float), _OPERATIONS)
+    # NumPy where nothing is traced: a few milliseconds against seconds of compilation.
+    with np.errstate(all="ignore"):
+        values = program.run(states, 0.0, theta, _OPERATIONS)
     zero = states.jets[0] * 0.0
     return [v if isinstance(v := values[slot], Jet) else zero.constant(v) for slot in program.outputs]
