@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from typing import Any, overload
 
@@ -90,7 +90,8 @@ def _filter(model, record, prior, method, keep, progress, options):
     if len(priors) != len(records):
         raise InputError(f"filter_from: {len(priors)} priors do not go with {len(records)} records; give one for each")
     check_records(model, record)
-    plans = {id(own): planned(model, records, own, method, options) for own in {id(own): own for own in priors}.values()}
+    plans = {key: planned(model, own, method, options) for key, own in {id(own): own for own in priors}.items()}
+    check_noise(plans.values(), records)
     chosen = [plans[id(own)] for own in priors]
     runs = [plan.runs(one, keep, most=KEPT_BYTES / len(records)) for plan, one in zip(chosen, records, strict=True)]
     flat = [run for of_one in runs for run in of_one]
@@ -110,17 +111,19 @@ def _per_record(progress: Callable[[int, int], None], total: int, blocks: float)
     return lambda done, _: progress(min(total, int(done / blocks + 1e-6)), total)
 
 
-def planned(
-    model: Model, records: Sequence[Record], prior: Any, method: str, options: Mapping[str, Any], by_value: bool = True
-) -> Plan:
-    """How some records, which were checked, are filtered, with the noise checked at their times; None is the model's prior."""
-    plan = plan_of(model, model.prior if prior is None else prior, method, options, by_value)
+def planned(model: Model, prior: Any, method: str, options: Mapping[str, Any], by_value: bool = True) -> Plan:
+    """How a system is filtered from a prior, None being the model's own."""
+    return plan_of(model, model.prior if prior is None else prior, method, options, by_value)
+
+
+def check_noise(plans: Iterable[Plan], records: Sequence[Record]) -> None:
+    """Raise InputError unless the noise of what is filtered is noise at the times of the records and between them."""
     times = {one.times.tobytes(): one.times for one in records}
-    together = np.unique(np.concatenate([[model.start], *times.values()]))
-    for part in {id(setting.model): setting.model for setting in plan.settings}.values():
+    models = {id(setting.model): setting.model for plan in plans for setting in plan.settings}
+    for part in models.values():
+        together = np.unique(np.concatenate([[part.start], *times.values()]))
         check_noise_at(part, together)
         check_noise_within(part, together)
-    return plan
 
 
 def check_records(model: Model, record: Record | Sequence[Record]) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from zakai import _float64  # noqa: F401
 from zakai.errors import ConditionError, InputError
 from zakai.filters._run import Piece, Run, Setting, scanned
-from zakai.filters.driver import check_records, planned
+from zakai.filters.driver import check_noise, check_records, planned
 from zakai.filters.results import FilterResult
 from zakai.models._definite import ROUNDING
 from zakai.models._errors import did_you_mean, listing
@@ -76,7 +76,8 @@ def replayed(
 ) -> tuple[Callable[[Any], jax.Array], FilterResult]:
     """The function of `log_likelihood`, and the result of the ordinary run that it repeats."""
     check_records(model, record)
-    plan = planned(model, [record], None, method, options, by_value=False)
+    plan = planned(model, None, method, options, by_value=False)
+    check_noise([plan], [record])
     for setting in plan.settings:
         chosen = setting.method
         if chosen.with_parameters is None or (chosen.adapt and chosen.resume is None):
