@@ -29,11 +29,6 @@ LATTICE = {1: (33, 0.375), 2: (13, 1.0), 3: (9, 1.1), 4: (5, 1.3), 5: (4, 1.5)}
 # A lattice is laid so often, each time wider by this factor than the product that was found on the one before.
 _LAID = 3
 _STRETCH = 1.25
-# Of the weights that make up for what single products lose: what is added to a matrix of norm one, the largest relative change,
-# and the share below which a component keeps its weight.
-_RIDGE, _CHANGE, _LIGHT = 1e-3, 0.5, 1e-12
-# An empty slot has minus this for the logarithm of its weight where minus infinity would make no number.
-_EMPTY = 1e30
 
 
 class Rule(NamedTuple):
@@ -116,42 +111,8 @@ def refit(
     means = sum_.means + jnp.einsum("kia,ka->ki", gain, shift)
     covs = sum_.covs + jnp.einsum("kia,kab,kjb->kij", gain, cov - jnp.eye(k), gain)
     new = Components(sum_.log_weights + log_mass, means, 0.5 * (covs + jnp.swapaxes(covs, 1, 2)), sum_.signs)
-    if sum_.means.shape[1] == 1 and not sharp:
-        new = _rebalanced(sum_, new, points(sum_, gain, nodes)[..., 0], values, rule)
     moved = jnp.sqrt(jax.lax.stop_gradient(jnp.sum(shift**2, -1)))
     return Refitted(new, moved, jax.lax.stop_gradient(_divergence(logs, values, z, log_mass, cov)), doubt)
-
-
-def _rebalanced(old: Components, new: Components, x: jax.Array, values: jax.Array, rule: Rule) -> Components:
-    """`new`, which has the moments of each product, with weights that make up for the shape that each lost; one state.
-
-    A product's skewness, lost at every reading, adds up to a wrong evidence of each mode; neighbours can carry it.  With
-    p = sum_i w_i N_i e^g, known at nodes x (K, Q), and q = `new` this is Newton's step for the weights w_j (1 + e_j) of least
-    E_p log(p / q),
-
-        sum_l E_p[r_j r_l] e_l = E_p[r_j] - E_q[r_j],    r_j = w_j N_j / q.
-
-    Since sum_j r_j = 1, components that overlap no others keep their weight, and modes their mass.
-    """
-    alive = jnp.isfinite(new.log_weights)
-
-    def log_gaussian(v, y):
-        variance = jnp.maximum(v.covs[:, 0, 0], 1e-12 * old.covs[:, 0, 0] + 1e-280)
-        return -0.5 * jnp.log(variance) - 0.5 * (y - v.means[:, 0]) ** 2 / variance
-
-    before, after = (jnp.where(alive, v.log_weights, -_EMPTY) for v in (old, new))
-    product = before[:, None] + values + np.log(rule.weights)
-    fitted = after[:, None] + (log_gaussian(new, x.T) - log_gaussian(old, x.T)).T + np.log(rule.weights)
-    log_mass = jax.nn.logsumexp(product)
-    p, q = (jnp.exp(logs - log_mass).reshape(-1) for logs in (product, fitted))
-    share = jnp.exp(after - log_mass)
-    counted = share > _LIGHT
-    scale = jnp.where(counted, jax.lax.rsqrt(jnp.where(counted, share, 1.0)), 0.0)
-    parts = jax.nn.softmax(after + log_gaussian(new, x.reshape(-1, 1)), axis=1) * scale
-    gram = parts.T @ (p[:, None] * parts) + _RIDGE * jnp.eye(len(share))
-    change = scale * jax.scipy.linalg.solve(gram, (p - q) @ parts, assume_a="pos")
-    change = jnp.clip(jnp.where(jnp.all(jnp.isfinite(change)), change, 0.0), -_CHANGE, _CHANGE)
-    return new._replace(log_weights=new.log_weights + jnp.log1p(change) - jnp.log1p(share @ change))
 
 
 def refit_affine(sum_: Components, C: jax.Array, c: jax.Array, linear: jax.Array, energy: jax.Array) -> Components:
