@@ -62,13 +62,14 @@ def _system(of: Formulas, order: int, form: str) -> System:
 
 
 class Table(NamedTuple):
-    """What is composed offline for the lengths `of` (U,), numbers of those of the schedule: `matrices` (U, M, M), and for each
-    point where a density may be, by how much its transition is off and by how much its mass was, `errors` and `defects` (U, M).
+    """What is composed offline for the lengths `of` (U,): `matrices` (U, M, M), by how much they may be `off` (U, M, M), and for
+    each column whether the series is of no use there, `lost` (U, M), and by how much its mass was off, `defects` (U, M).
     """
 
     of: Any
     matrices: Any
-    errors: Any
+    off: Any
+    lost: Any
     defects: Any
 
 
@@ -263,6 +264,9 @@ def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> S
             return replace(state, source=source, cut=choice.SAME)
     else:
         source, health = state.source, info.health
+        if _is_chosen(prepared) and not np.all(health["truncation"] < 0.1):
+            # No lattice helps a series that is of no use over so long a time.
+            return None
         margin, fineness = float(state.margin), float(state.fineness)
         finite = np.all(np.isfinite(info.log_likelihood_increment))
         narrow = not finite or not np.all(health["edge_mass"] < _EDGE)
@@ -294,7 +298,8 @@ def _with_transitions(prepared, state, source, which, margin, fineness, first: b
                 )
             return best
         weights = np.exp(np.asarray(laid.lattice.log_values) - np.max(laid.lattice.log_values))
-        off = np.max(np.asarray(laid.table.errors) @ weights) / weights.sum()
+        table = laid.table
+        off = np.max(np.abs(table.off @ weights).sum(axis=1) + table.lost @ weights) / weights.sum()
         if _is_chosen(prepared) or off <= _GOOD or laid.substeps >= _MOST_SUBSTEPS:
             return laid
         best = laid
@@ -367,8 +372,7 @@ def _composed(system: System, substeps: tuple[int, ...], x: Any, spans: Any, the
             (P, defect, good), (finer, _, fine) = (
                 scaled(transition(heat, x[1, 0] - x[0, 0], span, substeps=s, form=system.form)) for s in (count, 2 * count)
             )
-            error = xp.where(good & fine, share * xp.sum(xp.abs(P - finer), axis=0), 2.0)
-            found.append((P, error, defect))
+            found.append((P, share * (P - finer), 1.0 - (good & fine), defect))
     return Table(spans, *(xp.stack(parts) for parts in zip(*found, strict=True)))
 
 
@@ -404,13 +408,17 @@ def step(interval: Interval, state: State, observation: Reading) -> tuple[State,
     total = jnp.sum(values)
     spread = lat.log(jnp.maximum(moved, 0.0))
     h = state.system.observed(points, interval.stop, theta)
-    after = spread + top + _log_factor(h, observation.after, observation.after_energy) + observation.constant
+    factor = _log_factor(h, observation.after, observation.after_energy)
+    after = spread + top + factor + observation.constant
+    # What the factor does to the density it does to its error, which may be large where an observation surprises.
+    weight = jnp.exp(factor + spread - jnp.max(factor + spread))
+    relative = jnp.where(moved > 0, jnp.abs(table.off[slot] @ values) / jnp.where(moved > 0, moved, 1.0), 0.0)
     new = lattice._replace(log_values=after)
     summary = lat.summary(new)
     told = {
         "edge_mass": summary.edge_mass,
         "quadrature_error": _quadrature(jnp.minimum(_cells(logs), _cells(after))),
-        "truncation": table.errors[slot] @ values / total,
+        "truncation": weight @ relative / jnp.sum(weight) + table.lost[slot] @ values / total,
         "mass_defect": table.defects[slot] @ values / total,
         "negative": -jnp.sum(jnp.minimum(moved, 0.0)) / jnp.sum(jnp.abs(moved)),
         "depth": lat.reach(new, spread),
