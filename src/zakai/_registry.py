@@ -48,6 +48,10 @@ METHODS = {
         "zakai.filters.wei_norman",
         "for finite estimation algebras in one to three states, exp(t L0) on a lattice; only when it is asked for",
     ),
+    "yau-yau": Entry(
+        "zakai.filters.yau_yau",
+        "convergent for any smooth system in one to four states: the Kolmogorov equation on a lattice that moves; by name",
+    ),
     "kolmogorov-series": Entry(
         "zakai.filters.kolmogorov_series",
         "convergent for one state and any smooth f without time: the explicit series of the kernel; only when it is asked for",

@@ -33,7 +33,9 @@ SYSTEMS = {
 # A Gaussian sum has few components: it stands near the density, and how near says its own test. On the spiral system two starts
 # that differ in rounding come to differ by as much as each is off; on the other system both sums are exact but for the cut prior.
 NEAR = {"general-direct": 2e-2, "gaussian-sum": 5e-4}
-LONG_TO_COMPILE = ("general-direct", "gaussian-sum", "wei-norman", "limited-direct", "kolmogorov-series")
+LONG_TO_COMPILE = ("general-direct", "gaussian-sum", "wei-norman", "limited-direct", "kolmogorov-series", "yau-yau")
+# A method whose lattice is as good as it was asked to be is asked for more where rounding is to be compared.
+OPTIONS = {"yau-yau": {"tolerance": 1e-8}}
 TIMES = np.cumsum([0.1, 0.05, 0.2, 0.1, 0.1, 0.15, 0.05, 0.1, 0.3, 0.1])
 
 
@@ -136,13 +138,13 @@ def test_one_prior_said_in_two_ways_gives_one_posterior(method, name, prior):
 
 @on_every_system(costly=True)
 def test_many_records_give_what_each_gives_alone(method, name):
-    model = system(name)
+    model, options = system(name), OPTIONS.get(method, {})
     records = [readings(name, "increments", gaps=seed == 2, seed=seed) for seed in range(5)]
-    for many, record in zip(zakai.filter(model, records, method), records, strict=True):
-        alone = zakai.filter(model, record, method)
-        same(many, alone)
+    for many, record in zip(zakai.filter(model, records, method, **options), records, strict=True):
+        alone = zakai.filter(model, record, method, **options)
+        same(many, alone, 1e-8 if options else 1e-9)
         assert many.warnings == alone.warnings and many.record is record
-        assert np.allclose(many.density(4).mean(), alone.density(4).mean(), rtol=0, atol=1e-9)
+        assert np.allclose(many.density(4).mean(), alone.density(4).mean(), rtol=0, atol=1e-8)
 
 
 @on_every_system(costly=True)
@@ -150,15 +152,15 @@ def test_many_records_give_what_each_gives_alone(method, name):
 def test_the_gradient_is_that_of_differences(method, name, kind):
     if not holds(method, name, kind):
         pytest.skip(f"the theorem of {method} does not hold for {kind}")
-    model, record = system(name, kind), readings(name, kind, gaps=True)
+    model, record, options = system(name, kind), readings(name, kind, gaps=True), OPTIONS.get(method, {})
     assert _registry.load(method).with_parameters is not None
-    likelihood = log_likelihood(model, record, method)
+    likelihood = log_likelihood(model, record, method, **options)
     theta = model.theta()
     value, gradient = jax.value_and_grad(likelihood)(theta)
-    assert np.isclose(value, zakai.filter(model, record, method).log_likelihood, rtol=0, atol=1e-9)
+    assert np.isclose(value, zakai.filter(model, record, method, **options).log_likelihood, rtol=0, atol=1e-9)
 
     def at(**changed):
-        return zakai.filter(model.with_parameters(**changed), record, method).log_likelihood
+        return zakai.filter(model.with_parameters(**changed), record, method, **options).log_likelihood
 
     for index, parameter in enumerate(model.parameters):
         above, below = (at(**{parameter: theta[index] + shift}) for shift in (1e-4, -1e-4))

@@ -152,6 +152,23 @@ def smooth_system(model: Model) -> tuple[Condition, ...]:
 
 
 @lru_cache(maxsize=64)
+def any_smooth_system(model: Model) -> tuple[Condition, ...]:
+    """Any smooth system whose density fits on a lattice."""
+    return (
+        determined(model),
+        Condition(
+            "the state has at most four coordinates, so that the density fits on a lattice",
+            model.n <= 4,
+            f"n = {model.n}",
+            "the lattice of this method",
+        ),
+        Condition(
+            "no coordinate is an angle", not model.periodic, f"periodic = {list(model.periodic)}", "the lattice of this method"
+        ),
+    )
+
+
+@lru_cache(maxsize=64)
 def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
     """A smooth drift without time and a constant, definite G: its kernel has the series of Yau 1993, Theorems 10 and 11.
 
@@ -191,6 +208,7 @@ THEOREMS: Mapping[str, Callable[[Model], tuple[Condition, ...]]] = {
     "general-direct": general_direct,
     "gaussian-sum": gaussian_sum,
     "wei-norman": wei_norman_filter,
+    "yau-yau": any_smooth_system,
     "kolmogorov-series": kolmogorov_series,
     "extended-kalman-bucy": smooth_system,
 }
@@ -199,6 +217,7 @@ __all__ = [
     "THEOREMS",
     "YauSystem",
     "affine_observation",
+    "any_smooth_system",
     "benes",
     "cached_yau_form",
     "hu_yau",

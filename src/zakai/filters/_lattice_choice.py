@@ -119,7 +119,7 @@ def first_lattice(
 
     `spread` (n, n) is the covariance of the first kernel; a window that moves needs cells that are small enough for it.
     """
-    axes, log_prior, box = _prior_box(model, prior)
+    axes, log_prior, box = prior_box(model, prior)
     widest = np.full(model.n, np.inf)
     if spread is not None and model.n == 1 and not model.periodic:
         widest = COARSEST / np.sqrt(np.diag(axes.T @ np.linalg.solve(spread, axes)))
@@ -181,10 +181,10 @@ def _order(model: Model) -> list[int]:
 
 def log_prior(model: Model, prior: Any) -> Callable[[np.ndarray], np.ndarray]:
     """The logarithm of the prior, as `first_lattice` takes it."""
-    return _prior_box(model, prior)[1]
+    return prior_box(model, prior)[1]
 
 
-def _prior_box(model, prior):
+def prior_box(model, prior):
     """Axes (columns), the prior's logarithm, and a box in their coordinates that holds all of it; no width: a point mass."""
     n, periodic = model.n, tuple(name in model.periodic for name in model.state)
     axes = np.eye(n)[:, _order(model)]
@@ -228,7 +228,7 @@ def _prior_box(model, prior):
 
 def _search(model, log_prior, axes):
     """A box around a density of which nothing is known: angles have their circle, the rest is looked for up to 10^6."""
-    count = {1: 4001, 2: 401, 3: 161}[model.n]
+    count = {1: 4001, 2: 401, 3: 161, 4: 41}[model.n]
     angles = len(model.periodic)
     lines = [
         np.linspace(-np.pi, np.pi, count) if d < angles else np.sinh(np.linspace(-21.4, 21.4, count)) * 1e-3

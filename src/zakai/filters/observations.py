@@ -154,3 +154,27 @@ def _at_end(xp, kind, values, elapsed, at_end, noise):
 
 def _times(matrices, vectors):
     return (matrices @ vectors[..., None])[..., 0]
+
+
+class Whole(NamedTuple):
+    """The whole likelihood of K intervals' readings, log factor(x) = linear . h - h'(energy) h / 2 + constant.
+
+    `inside` (K,) is one where all of it was gathered over just the interval, so that it may act in parts, and zero where it acts
+    at the end.
+    """
+
+    linear: Any
+    energy: Any
+    constant: Any
+    inside: Any
+
+
+def whole_factors(model: Model, data: Data, theta: Any) -> Whole:
+    """The likelihoods for the parameters `theta` (p,), which JAX may trace; S is that in the middle of an increment's time."""
+    xp = np if isinstance(theta, np.ndarray) else jnp
+    seen = ~np.isnan(data.values)
+    values = np.where(seen, data.values, 0.0)
+    inside = (schedule_of(data, True).inside | ~seen).all(axis=1) & (data.stops > data.starts)
+    times = np.where(inside, 0.5 * (data.starts + data.stops), data.stops)
+    energy, linear, constant = _at_end(xp, model.observation_kind, values, data.elapsed, seen, noise_at(model, times, theta))
+    return Whole(linear, energy, xp.broadcast_to(constant, (len(values),)), inside.astype(float))

@@ -1,0 +1,275 @@
+"""Where the lattice of a density stands, how fine it is and how a run of steps is taken: all of it from the prior and the data.
+
+A lattice must hold the mass and resolve the narrowest feature.  The first is seen in what lies beyond each of its layers, the
+second in the spectrum along each axis: both are measured on the density itself, at the beginning of every run of steps and,
+by the health of the steps, within it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from zakai.errors import InputError
+from zakai.filters import _lattice_choice as choice
+from zakai.kolmogorov.comoving import Field, axes_of
+from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
+
+LEAST = {1: 32, 2: 24, 3: 20, 4: 16}
+MOST = {1: 4096, 2: 512, 3: 128, 4: 48}
+RUNS = {1: 256, 2: 64, 3: 16, 4: 8}
+SHORTEST = 8  # a run that must be shorter than this asks for a lattice that is laid anew in every step
+MOST_PARTS = 4096
+FEW = {1: 128, 2: 8, 3: 4, 4: 4}  # parts of an interval beyond which the lattice had better follow the flow
+SPARE = 1.25  # how much wider than its density a window is, and
+WORST = {1: 8.0, 2: 3.0, 3: 2.0, 4: 2.0}  # how much more of both a run may ask for before it is cut into shorter ones
+FINER = 1.15  # how much finer than the density needs: what may change within a run
+FOLLOWED = 1.9  # cells that a deviation has, and
+REACH = 6.5  # deviations on each side that a lattice holds that is laid anew in every step
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The static part of a state: `sizes` of the lattice, `run` steps between two looks at it.
+
+    An interval is split in `splits`, the transition of each of these stepped in `parts`.  `order` is that of the time stepping, 2
+    or 4.  With `follow` the basis moves with the flow and is laid anew in every step; with `cross` the noise may couple axes of
+    the lattice.  `wider` and `finer` multiply SPARE and FINER for this run.
+    """
+
+    sizes: tuple[int, ...]
+    tolerance: float
+    splits: int = 1
+    parts: int = 1
+    order: int = 2
+    run: int = 256
+    follow: bool = False
+    cross: bool = False
+    wider: float = 1.0
+    finer: float = 1.0
+
+    @property
+    def reach(self) -> float:
+        """The deviations on each side of a lattice that is laid anew in every step."""
+        return REACH * self.wider
+
+    @property
+    def aliasing(self) -> float:
+        """The largest share of the density that may be at the highest frequency."""
+        return 0.1 * self.tolerance
+
+    @property
+    def edge(self) -> float:
+        """The largest share of the mass that may be in the outermost layers."""
+        return 0.01 * self.tolerance
+
+    @property
+    def stepping(self) -> float:
+        """The largest error in time of one interval."""
+        return 0.1 * self.tolerance
+
+
+def rounded_up(size: float, n: int) -> int:
+    """The next even size out of few: few shapes, few compilations."""
+    sizes = (LEAST[n] * 2**power * quarters // 4 // 2 * 2 for power in range(20) for quarters in (4, 6))
+    return next(candidate for candidate in sizes if candidate >= size)
+
+
+def needs(values: np.ndarray, aliasing: float, edge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of a density on a lattice, along each axis (n,): the first and the last index that matter, and the share of all
+    frequencies that does."""
+    total = values.sum()
+    first, last, band = [], [], []
+    for d, size in enumerate(values.shape):
+        marginal = values.sum(axis=tuple(a for a in range(values.ndim) if a != d)) / total
+        first.append(int(np.searchsorted(np.cumsum(marginal), edge)))
+        last.append(size - 1 - int(np.searchsorted(np.cumsum(marginal[::-1]), edge)))
+        spectrum = np.abs(np.fft.rfft(values, axis=d)).sum(axis=tuple(a for a in range(values.ndim) if a != d)) / total
+        above = np.flatnonzero(spectrum > aliasing)
+        band.append((above[-1] + 1) / (len(spectrum) - 1) if len(above) else 0.0)
+    return np.array(first), np.array(last), np.minimum(np.array(band), 1.0)
+
+
+def fitted(fields: Field, plan: Plan, check: Callable[[tuple[int, ...]], None]) -> tuple[np.ndarray, Plan]:
+    """How to lay densities, one a record, on lattices of one size with the same axes as theirs: cuts (records, 2, n), the middle
+    as an index from the centre and the cell in cells; and the plan with the sizes."""
+    values = np.asarray(fields.values)
+    n = values.ndim - 1
+    sizes = np.array(values.shape[1:])
+    if plan.follow:
+        wanted = np.array([rounded_up(2 * REACH * plan.wider * FOLLOWED * plan.finer, n)] * n)
+        plan = replace(plan, sizes=tuple(int(s) for s in np.minimum(wanted, MOST[n])))
+        check(plan.sizes)
+        cut = np.stack([np.zeros(n), np.maximum(sizes / plan.sizes, 1.0)])
+        return np.tile(cut, (len(values), 1, 1)), plan
+    first, last, band = (np.array(part) for part in zip(*[needs(one, plan.aliasing / 10, plan.edge / 10) for one in values]))
+    # What the highest frequency still holds was not resolved.
+    ratio = np.where(band > 0.98, 0.7, 1 / (FINER * plan.finer * np.maximum(band, 0.1)))
+    span = (last - first + 3) * SPARE * plan.wider
+    wanted = np.array([rounded_up(s, n) for s in (span / ratio).max(axis=0)])
+    wanted = np.minimum(wanted, MOST[n])
+    wanted = np.where((wanted <= sizes) & (wanted > 0.55 * sizes), sizes, wanted)
+    plan = replace(plan, sizes=tuple(int(s) for s in wanted))
+    check(plan.sizes)
+    middle = 0.5 * (first + last) - sizes // 2
+    # The size is given: what there is too much of goes to the window and to the cells alike.
+    least = span / wanted
+    ratio = np.where(least > ratio, least, np.sqrt(ratio * least))
+    # A lattice that is about as good is kept, since to lay one anew has an error of its own.
+    good = (np.abs(middle) < 0.05 * sizes) & (np.abs(np.log(ratio)) < 0.15) & (wanted == sizes)
+    return np.where(good[:, None], [[0.0], [1.0]], np.stack([middle, ratio], axis=1)), plan
+
+
+def composed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """The cuts (records, 2, n) that do what two do one after the other."""
+    return np.stack([first[:, 0] + first[:, 1] * second[:, 0], first[:, 1] * second[:, 1]], axis=1)
+
+
+def first_field(
+    model: Model, prior: Any, log_factor: Callable[[np.ndarray], np.ndarray] | None, plan: Plan
+) -> tuple[Field, Plan, float]:
+    """The prior, times a factor if there is one, on a lattice of its own; the plan for it; and the logarithm of its mass."""
+    axes, log_prior, box = choice.prior_box(model, prior)
+    low, high = box
+    if np.any(high <= low):
+        raise InputError(f"{model.source}: prior: a variance is zero; yau-yau needs a density in every coordinate")
+    factor = log_factor or (lambda x: np.zeros(x.shape[:-1]))
+    n = model.n
+    sizes: tuple[int, ...] = (rounded_up({1: 256, 2: 96, 3: 48, 4: 32}[n], n),) * n
+    for _ in range(60):
+        size = np.array(sizes)
+        cell = (high - low) / size
+        basis, centre = axes * cell, axes @ (0.5 * (low + high))
+        index = np.stack(np.meshgrid(*axes_of(sizes), indexing="ij"), axis=-1)
+        points = centre + index @ basis.T
+        with np.errstate(all="ignore"):
+            logs = log_prior(points)
+            logs = logs + np.where(np.isfinite(logs), factor(points), 0.0)
+        if np.isnan(logs).any():
+            raise InputError(f"{model.source}: prior: log_density is not a number at x = {points[np.isnan(logs)][0].tolist()}")
+        top = logs.max()
+        if not np.isfinite(top):
+            raise InputError(f"{model.source}: prior: log_density is not finite anywhere; give a density")
+        values = np.exp(logs - top)
+        first, last, band = needs(values, plan.aliasing / 10, plan.edge / 100)
+        used = (last - first + 1) / size
+        if np.any(used < 0.55):
+            middle = low + cell * (0.5 * (first + last) + 0.5)
+            half = 0.5 * cell * (last - first + 3) * 1.15
+            low, high = np.maximum(low, middle - half), np.minimum(high, middle + half)
+            continue
+        if np.any(band > 0.95) and np.all(size < MOST[n]):
+            sizes = tuple(min(rounded_up(s + 1, n), MOST[n]) if b > 0.95 else s for s, b in zip(sizes, band, strict=True))
+            continue
+        break
+    mass = values.sum()
+    field = Field(values / mass, centre, basis)
+    log_mass = float(top + np.log(mass) + np.log(abs(np.linalg.det(basis))))
+    return field, replace(plan, sizes=values.shape), log_mass
+
+
+def healthy(info: Any) -> bool:
+    """Whether a run kept every bound."""
+    return bool(np.all(np.isfinite(info.log_likelihood_increment)) and np.all(info.health["missed"] < 1.0))
+
+
+def more(plan: Plan, info: Any) -> Plan | None:
+    """A better plan for the same run; None where nothing better can be had.
+
+    The cells come first: of a density that they do not resolve the other figures say nothing.
+    """
+    n, health = len(plan.sizes), {name: np.where(np.isfinite(figure), figure, 1.0) for name, figure in info.health.items()}
+    lost = ~np.isfinite(info.log_likelihood_increment)
+    alias, edge = (np.where(lost, 1.0, health[name]).max() for name in ("aliasing", "edge_mass"))
+    error, cut = health["time_error"].max(), health["lost"].max()
+    # The spectrum of a Gaussian falls as exp(-(pi s)^2 / 2), s its deviation in cells.
+    finer = np.sqrt(np.log(plan.aliasing) / np.log(np.clip(alias, 1e-12, 0.3)))
+    finer = max(finer, 1.2 if cut >= plan.tolerance else 1.0) if finer > 1 or cut >= plan.tolerance else 1.0
+    if error > 1e-2 or (error >= plan.stepping and finer == 1):
+        # An unstable step spoils all other figures.
+        if plan.parts >= MOST_PARTS:
+            return None
+        if plan.order == 2:
+            return replace(plan, order=4)
+        if not plan.follow and plan.parts >= FEW[n]:
+            return replace(plan, follow=True, parts=1)
+        parts = 2.0 ** np.ceil(np.log2(np.clip((error / plan.stepping) ** 0.25, 2, 8)))
+        return replace(plan, parts=int(plan.parts * parts))
+    if finer == 1 and edge < plan.edge:
+        return None
+    plan = replace(plan, finer=plan.finer * min(1.1 * finer, 3.0), wider=plan.wider * (1.0 if edge < plan.edge else 1.35))
+    if plan.finer * plan.wider < WORST[n] * (4.0 if plan.follow else 1.0):
+        return plan
+    if plan.follow:
+        return None
+    shorter = plan.run // 4
+    return replace(plan, run=max(shorter, SHORTEST), finer=1.0, wider=1.0, follow=shorter < SHORTEST, order=4)
+
+
+def relaxed(plan: Plan, run: int) -> Plan:
+    """The plan for the next run: what the last one needed more of is given back step by step."""
+    return replace(
+        plan,
+        run=min(run, 2 * plan.run),
+        wider=max(1.0, plan.wider / 1.2),
+        finer=max(1.0, plan.finer / 1.2),
+        parts=max(1, plan.parts // 2),
+    )
+
+
+def timed(model: Model, plan: Plan, intervals: Any, rows: slice, fields: Field, ratio: np.ndarray) -> Plan:
+    """The plan with what the coefficients say: whether the noise couples axes of the lattices, and in how many parts and by which
+    formula an interval is stepped; `ratio` (records, n) says of how many of their cells the new ones will be."""
+    times = np.unique(np.linspace(intervals.start[rows][0], intervals.stop[rows][-1], 5))
+    basis, theta = np.asarray(fields.basis) * ratio[:, None, :], model.theta()
+    inverse = np.linalg.inv(basis)
+    if model.n > 1 and not plan.cross:
+        G = numpy_function(model.covariance, model, (model.n, model.n))(np.zeros(model.n), times, theta)
+        spread = np.abs(np.einsum("rij,kjl,rml->rkim", inverse, np.broadcast_to(G, (len(times), model.n, model.n)), inverse))
+        diagonal = np.einsum("rkii->rk", spread)
+        couples = (spread.sum(axis=(2, 3)) - diagonal) > 1e-12 * diagonal
+        plan = replace(plan, cross=plan.follow or bool(couples.any()))
+    tau = (intervals.stop[rows] - intervals.start[rows]).max() / plan.splits
+    function = numpy_function(model.drift, model)
+    fastest = crossing = 0.0
+    for values, centre, base, back, cells in zip(np.asarray(fields.values), np.asarray(fields.centre), basis, inverse, ratio):
+        index = np.stack(np.meshgrid(*axes_of(values.shape), indexing="ij"), axis=-1).reshape(-1, model.n) / cells
+        weights = values.ravel() / values.sum()
+        matters = weights > 1e-11 * weights.max()
+        index, weights = index[matters], weights[matters]
+        with np.errstate(all="ignore"):
+            flow = np.concatenate([function(centre + index @ base.T, t, theta) @ back.T for t in times[[0, -1]]], axis=0)
+        flow, apart, weights = flow - weights @ flow[: len(index)], np.tile(index, (2, 1)), np.tile(weights, 2)
+        apart = apart - weights @ apart / 2
+        variance = weights @ apart**2
+        if plan.follow:
+            # The basis takes the part that is affine, and leaves the growth by diffusion.
+            slopes = np.linalg.solve((apart * weights[:, None]).T @ apart, (apart * weights[:, None]).T @ flow)
+            G = numpy_function(model.covariance, model, (model.n, model.n))(np.zeros(model.n), times[0], theta)
+            flow = flow - apart @ slopes - apart * (np.diagonal(back @ G @ back.T) / variance)
+        fastest = max(fastest, np.sqrt((weights @ flow**2 / np.maximum(variance, 1e-12)).max()))
+        crossing = max(crossing, np.pi * np.abs(flow).sum(axis=1).max())
+    if not np.isfinite(fastest + crossing):
+        return plan
+    parts = 2 ** int(np.ceil(np.log2(max(tau * crossing / 2.5, tau * fastest / (30 * plan.stepping) ** 0.2, 1.0))))
+    if plan.follow:
+        return replace(plan, parts=parts)
+    if parts > FEW[model.n]:
+        return replace(plan, follow=True, order=4, parts=1, cross=model.n > 1)
+    order = 2 if parts == 1 and (tau * fastest) ** 3 < plan.stepping and tau * crossing < 0.5 else 4
+    return replace(plan, order=order, parts=parts)
+
+
+def check_memory(model: Model, sizes: tuple[int, ...], budget: int) -> None:
+    """Raise InputError if a step on such a lattice needs more than `budget` bytes."""
+    needed = 8.0 * np.prod(sizes, dtype=float) * (24 + 4 * model.n + 2 * model.m)
+    if needed > budget:
+        lattice = " x ".join(map(str, sizes))
+        raise InputError(
+            f"option memory: {model.source} needs a lattice of {lattice} points, {needed / 2**20:.0f} MiB, and has "
+            f"{budget / 2**20:.0f}; set memory to more MiB or tolerance to more"
+        )

@@ -1,0 +1,382 @@
+"""The on-and-offline filter of Yau and Yau for any smooth system, in one to four states.
+
+Between readings the density obeys the Kolmogorov forward equation, which knows no data; a reading multiplies it by its
+likelihood, all of it online:
+
+    u <- exp(h'S^-1 dy - h'S^-1 h dt / 2) u        for increments;        u <- N(z; h, S) u        for a sample
+
+An increment acts in two halves around the transition (Strang's splitting), of second order in the interval.  The transition is
+that of `zakai.kolmogorov.comoving`, spectrally accurate on a lattice that follows the mass.  S.-T. Yau and S.S.-T. Yau (2008);
+the likelihood is not inside the operator, so that no large factor is undone by another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zakai import _float64  # noqa: F401
+from zakai.algebra.theorems import any_smooth_system as theorem
+from zakai.densities import GridDensity
+from zakai.errors import InputError
+from zakai.filters import _window as window
+from zakai.filters._formulas import Formulas, formulas
+from zakai.filters._lattice_choice import free_memory
+from zakai.filters._protocol import Info, Method, Schedule
+from zakai.filters._window import Plan
+from zakai.filters.observations import Data, Whole, whole_factors
+from zakai.kolmogorov import comoving
+from zakai.kolmogorov.comoving import Field
+from zakai.models.compile import jax_field, jax_function
+from zakai.models.model import Model
+
+
+class System:
+    """The formulas of a model as functions of many points at once."""
+
+    def __init__(self, model: Model):
+        self.n = model.n
+        self.drift = jax_field(model.drift, model)
+        self.observe = jax_field(model.observation, model)
+        self.covariance = jax_function(model.covariance, model, (model.n, model.n))
+
+
+@lru_cache(maxsize=64)
+def _system(of: Formulas) -> System:
+    return System(of.model)
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["field", "observed", "cut"], meta_fields=["plan"])
+@dataclass(frozen=True)
+class State:
+    """The probabilities of the cells of a lattice, the static plan, and h at the points, an array for each coordinate.
+
+    `observed` is None where the lattice is laid anew in every step.  `cut` (2, n) says how the first lattice of this run of steps
+    was cut out of the last of the run before.
+    """
+
+    field: Field
+    observed: Any
+    cut: Any
+    plan: Plan
+
+    @property
+    def kept(self) -> State:
+        """What a result keeps of the state."""
+        return replace(self, observed=None)
+
+    @property
+    def run_length(self) -> int:
+        """How many steps to take before the lattice is looked at again."""
+        return self.plan.run
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["start", "stop", "theta"], meta_fields=["system"])
+@dataclass(frozen=True)
+class Interval:
+    """One interval: its ends, the parameters, and the static system."""
+
+    start: Any
+    stop: Any
+    theta: Any
+    system: System
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What is known without data."""
+
+    model: Model
+    system: System
+    schedule: Schedule
+    plan: Plan
+    theta: Any
+    intervals: Interval
+    memory: int
+    # The first state of the last prior, which many records share.
+    first: dict[int, tuple[Any, State]] = field(init=False, default_factory=dict)
+
+
+def prepare(
+    model: Model, schedule: Schedule, *, tolerance: float = 1e-4, substeps: int = 1, memory: float | None = None
+) -> Prepared:
+    """The intervals and the plan to begin with.
+
+    `tolerance` is how far from the solution of the equation, relative to itself, a density may be after a step for each of three
+    reasons: the window, the cells, the steps in time.  `substeps` splits each interval, observation included, in equal parts: the
+    splitting is not the tolerance's concern.  `memory` is how many MiB lattices may take, by default half of what the machine
+    has free.  Raises InputError for another value.
+    """
+    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 1e-9 <= tolerance <= 0.1:
+        raise InputError(f"option tolerance: {tolerance!r} must be a number from 1e-9 to 0.1")
+    if isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1:
+        raise InputError(f"option substeps: {substeps!r} must be a whole number from 1")
+    if memory is not None and not (isinstance(memory, (int, float)) and not isinstance(memory, bool) and 0 < memory < np.inf):
+        raise InputError(f"option memory: {memory!r} must be a positive number of MiB")
+    theta = model.theta()
+    sizes = (window.LEAST[model.n],) * model.n
+    follow = model.n > 1 and model.observation_kind == "samples"
+    plan = Plan(sizes, float(tolerance), substeps, run=window.RUNS[model.n], follow=follow, order=4)
+    system = _system(formulas(model))
+    budget = free_memory() if memory is None else int(memory * 2**20)
+    return Prepared(model, system, schedule, plan, theta, _intervals(system, schedule, theta), budget)
+
+
+def _intervals(system: System, schedule: Schedule, theta: Any) -> Interval:
+    xp = np if isinstance(theta, np.ndarray) else jnp
+    count = len(schedule.starts)
+    return Interval(schedule.starts, schedule.stops, xp.broadcast_to(theta, (count, len(theta))), system)
+
+
+def with_parameters(prepared: Prepared, theta: Any) -> Prepared:
+    """The same for other values of the parameters; traced by JAX."""
+    return replace(prepared, theta=theta, intervals=_intervals(prepared.system, prepared.schedule, theta))
+
+
+def observations(prepared: Prepared, data: Data) -> Whole:
+    """The whole likelihood of every interval's readings."""
+    return whole_factors(prepared.model, data, prepared.theta)
+
+
+def init(prepared: Prepared, prior: Any) -> State:
+    """The prior on a lattice that fits it."""
+    known, state = prepared.first.get(id(prior), (None, None))
+    if known is not prior or state is None:
+        with jax.ensure_compile_time_eval():
+            first, plan, _ = window.first_field(prepared.model, prior, None, prepared.plan)
+            state = _looked_at(prepared, first, plan, prepared.model.start)
+        prepared.first.clear()
+        prepared.first[id(prior)] = prior, state
+    return state
+
+
+def correct(prepared: Prepared, prior: Any, observation: Whole) -> tuple[State, Info]:
+    """The prior after samples at the start itself."""
+    model = prepared.model
+    one = jax.tree.map(lambda a: np.asarray(a)[0], observation)
+    with jax.ensure_compile_time_eval():
+
+        def log_factor(x: np.ndarray) -> np.ndarray:
+            return np.asarray(_log_factor(prepared.system.observe(x, model.start, prepared.theta), one, 1.0) + one.constant)
+
+        _, _, before = window.first_field(model, prior, None, prepared.plan)
+        first, plan, after = window.first_field(model, prior, log_factor, prepared.plan)
+        state = _looked_at(prepared, first, plan, model.start)
+        mean, cov = _moments(first)
+        health = {name: jnp.zeros(()) for name in ("aliasing", "edge_mass", "time_error", "lost", "missed")}
+    return state, Info(jnp.asarray(after - before), mean, cov, health)
+
+
+def _looked_at(prepared: Prepared, field: Field, plan: Plan, time: float) -> State:
+    observed = None
+    if not plan.follow:
+        observed = prepared.system.observe(comoving.points_of(plan.sizes, field.centre, field.basis), time, prepared.theta)
+    return State(jax.tree.map(jnp.asarray, field), observed, jnp.asarray(_SAME(prepared.model.n)), plan)
+
+
+def _moments(field: Field) -> tuple[jax.Array, jax.Array]:
+    _, mean, cov = comoving.moments(field.values)
+    return field.centre + field.basis @ mean, field.basis @ cov @ field.basis.T
+
+
+def _log_factor(h: Sequence[jax.Array], factor: Whole, share: Any) -> jax.Array:
+    """share (linear . h - h'(energy) h / 2)."""
+    total = sum((factor.linear[i] * a for i, a in enumerate(h)), start=jnp.zeros(()))
+    for i, a in enumerate(h):
+        total = total - 0.5 * a * sum(factor.energy[i, j] * b for j, b in enumerate(h))
+    return share * total
+
+
+class _Worst(NamedTuple):
+    """The worst over the parts of an interval: see `METHOD.bounds`."""
+
+    aliasing: Any
+    edge: Any
+    error: Any
+    lost: Any
+
+    def over(self, other: _Worst) -> _Worst:
+        return _Worst(*(jnp.maximum(a, b) for a, b in zip(self, other)))
+
+
+def _multiplied(values: jax.Array, logs: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The values times exp(logs), summing to one; the logarithm of what they summed to; and that of the factor by which what
+    stood in the tails has grown, relative to the maximum."""
+    still = jax.lax.stop_gradient
+    top = still(jnp.max(jnp.where(values > comoving.LOST * jnp.max(values), logs, -jnp.inf)))
+    # Where nothing of the density is left a factor may be as large as it likes.
+    after = values * jnp.exp(logs - top - still(jnp.maximum(logs - top, 0.0)))
+    grown = still(jnp.log(jnp.max(values) / jnp.max(after)))
+    total = jnp.sum(after)
+    return after / total, jnp.log(total) + top, grown
+
+
+def step(interval: Interval, state: State, observation: Whole) -> tuple[State, Info]:
+    """One interval: half of the likelihood, the transition, the other half, or all of it at the end."""
+    system, plan, theta = interval.system, state.plan, interval.theta
+    length = (interval.stop - interval.start) / plan.splits
+    share = 0.5 * observation.inside / plan.splits
+    zero = jnp.zeros(())
+
+    def drift(x: jax.Array, t: Any) -> Sequence[jax.Array]:
+        return system.drift(x, t, theta)
+
+    def covariance(t: Any) -> jax.Array:
+        return system.covariance(jnp.zeros(system.n), t, theta)
+
+    def part(carry: Any, time: Any) -> tuple[Any, None]:
+        field, spent = carry
+        tau = length / plan.parts
+        field, error = comoving.moved(field, drift, covariance, time, tau, plan.order, plan.follow, plan.cross)
+        return (field, spent + error), None
+
+    def looked_at(values: jax.Array, noise: Any, error: Any, grown: Any) -> _Worst:
+        # Noise is the same everywhere; what a formula of order four leaves is a polynomial of degree five times the density.
+        lost = noise * jnp.exp(jnp.minimum(grown, 99.0))
+        return _Worst(comoving.aliasing(values), comoving.edge_mass(values), error * (1 + grown) ** 2.5, lost)
+
+    def split(carry: Any, k: Any) -> tuple[Any, None]:
+        field, observed, log_mass, spent, worst = carry
+        time = interval.start + k * length
+        values, gained, grown = _multiplied(field.values, _log_factor(observed, observation, share))
+        worst = worst.over(looked_at(values, comoving.LOST, spent, grown))
+        moving = field._replace(values=values), spent
+        if plan.parts == 1:
+            (field, spent), _ = part(moving, time)
+        else:
+            (field, spent), _ = jax.lax.scan(part, moving, time + length * (np.arange(plan.parts) / plan.parts))
+        observed = system.observe(field.points(), time + length, theta)
+        noise = comoving.noise(field.values)
+        # Only here: to cut tails in every part would make kinks, and these more noise.
+        values = jnp.where(field.values > noise * jnp.max(field.values), field.values, 0.0)
+        last = _log_factor(observed, observation, share)
+        if plan.splits == 1:
+            last = last + _log_factor(observed, observation, 1.0 - observation.inside)
+        values, more, grown = _multiplied(values, last)
+        worst = worst.over(looked_at(values, noise, spent, grown))
+        return (field._replace(values=values), observed, log_mass + gained + more, spent, worst), None
+
+    field, observed = state.field, state.observed
+    if observed is None:
+        observed = system.observe(field.points(), interval.start, theta)
+    carry = (field, observed, observation.constant, zero, _Worst(zero, zero, zero, zero))
+    if plan.splits == 1:
+        carry, _ = split(carry, 0)
+    else:
+        carry, _ = jax.lax.scan(split, carry, jnp.arange(float(plan.splits)))
+    field, observed, log_mass, spent, worst = carry
+    if plan.splits > 1:
+        values, more, grown = _multiplied(field.values, _log_factor(observed, observation, 1.0 - observation.inside))
+        field, log_mass = field._replace(values=values), log_mass + more
+        worst = worst.over(looked_at(values, comoving.LOST, spent, grown))
+    mean, cov = _moments(field)
+    if plan.follow:
+        field, observed = comoving.relaid(field, plan.reach), None
+    health = {"aliasing": worst.aliasing, "edge_mass": worst.edge, "time_error": worst.error, "lost": worst.lost}
+    allowed = (plan.aliasing, plan.edge, plan.stepping, plan.tolerance)
+    health["missed"] = jnp.max(jnp.stack([figure / most for figure, most in zip(health.values(), allowed, strict=True)]))
+    health = jax.lax.stop_gradient(health)
+    return State(field, observed, state.cut, plan), Info(log_mass, mean, cov, health)
+
+
+def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
+    """The state to begin the intervals `rows` with: its lattice and its plan."""
+    one = jax.tree.map(lambda a: np.asarray(a)[None], (state, info))
+    many = adapt_many(prepared, one[0], rows, one[1])
+    return None if many is None else jax.tree.map(lambda a: a[0], many)
+
+
+def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None) -> State | None:
+    """`adapt` of states with a leading axis of records: one plan for all, the best that any of them needs."""
+    model, plan = prepared.model, states.plan
+    if info is None:
+        plan = window.relaxed(plan, window.RUNS[model.n])
+        before = np.tile(_SAME(model.n), (len(states.field.centre), 1, 1))
+    else:
+        better = None if window.healthy(info) else window.more(plan, info)
+        if better is None:
+            return None
+        plan, before = better, np.asarray(states.cut)
+    cut, _ = window.fitted(states.field, plan, lambda sizes: None)
+    least = window.timed(model, plan, prepared.intervals, rows, states.field, cut[:, 1])
+    # What a try has shown counts for more than what the coefficients say.
+    plan = least if info is None else replace(least, order=max(plan.order, least.order), parts=max(plan.parts, least.parts))
+    cut, plan = window.fitted(states.field, plan, lambda sizes: window.check_memory(model, sizes, prepared.memory))
+    if plan == states.plan and np.all(cut == _SAME(model.n)):
+        return replace(states, cut=before) if info is None else None
+    fields = _cut_out(jax.tree.map(jnp.asarray, states.field), cut, plan.sizes, plan.follow, plan.reach)
+    cut = window.composed(before, cut)
+    time = float(prepared.schedule.starts[rows.start])
+    observed = None if plan.follow else _observed(prepared.system, fields, time, prepared.theta)
+    return State(fields, observed, cut, plan)
+
+
+def _SAME(n: int) -> np.ndarray:
+    return np.stack([np.zeros(n), np.ones(n)])
+
+
+@partial(jax.jit, static_argnums=(2, 3, 4))
+def _cut_out(fields: Field, cuts: Any, sizes: tuple[int, ...], follow: bool, reach: float) -> Field:
+    def one(field: Field, cut: Any) -> Field:
+        field = comoving.resampled(field, cut[0], cut[1], sizes)
+        return comoving.relaid(field, reach) if follow else field
+
+    return jax.vmap(one)(fields, cuts)
+
+
+@partial(jax.jit, static_argnums=0)
+def _observed(system: System, fields: Field, time: Any, theta: Any) -> Any:
+    return jax.vmap(lambda field: system.observe(field.points(), time, theta))(fields)
+
+
+def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State:
+    """The traced `state` on a lattice cut out of its own as that of `begin` was, with the same plan."""
+    plan, cut = begin.plan, np.asarray(begin.cut)
+    fields = jax.tree.map(lambda a: a[None], state.field)
+    if not np.array_equal(cut, _SAME(prepared.model.n)) or plan.sizes != state.plan.sizes or plan.follow:
+        fields = _cut_out(fields, cut[None], plan.sizes, plan.follow, plan.reach)
+    time = float(prepared.schedule.starts[rows.start])
+    observed = None if plan.follow else _observed(prepared.system, fields, time, prepared.theta)
+    return jax.tree.map(lambda a: a[0], State(fields, observed, cut[None], plan))
+
+
+def density(prepared: Prepared, state: State) -> GridDensity:
+    """The posterior on its lattice; zero where rounding leaves nothing of it."""
+    field = jax.tree.map(np.asarray, state.field)
+    with np.errstate(divide="ignore"):
+        logs = np.log(np.maximum(field.values, 0.0))
+    names = prepared.model.state
+    return GridDensity(logs, field.centre, field.basis, names, (False,) * len(names))
+
+
+METHOD = Method(
+    name="yau-yau",
+    source="S.-T. Yau and S.S.-T. Yau 2008; likelihood online",
+    exactness="convergent: spectral in the lattice, of fourth order in the parts of a transition; for increments of second order "
+    "in the interval for smooth paths (Strang splitting)",
+    theorem=theorem,
+    options={"tolerance": 1e-4, "substeps": 1, "memory": None},
+    prepare=prepare,
+    init=init,
+    correct=correct,
+    observations=observations,
+    step=step,
+    density=density,
+    adapt=adapt,
+    with_parameters=with_parameters,
+    resume=resume,
+    adapt_many=adapt_many,
+    bounds={
+        "missed": (
+            1.0,
+            "by what factor the tolerance was missed: aliasing (a tenth of it is allowed), edge_mass (a hundredth), time_error "
+            "(a tenth) or lost, the share of the maximum below which tails were lost when an observation came to need them",
+        ),
+    },
+)

@@ -1,0 +1,155 @@
+"""The filter for any smooth system: against exact filters, and an independent solver where there are none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zakai
+from references.kolmogorov import Box, propagate
+
+STANDARD = {"kind": "gaussian", "mean": [0.5], "cov": [1.0]}
+
+
+def linear(kind: str, noise: float, until: float, count: int):
+    model = zakai.Model(
+        state=["x"], drift=["-x/2"], observation=["x"], observation_noise=[[noise]], observation_kind=kind, prior=STANDARD
+    )
+    return model, zakai.simulate(model, until * np.arange(1, count + 1) / count, seed=1)[1]
+
+
+def distance(a: zakai.FilterResult, b: zakai.FilterResult) -> float:
+    """The largest of: means in deviations, relative variances, evidence."""
+    mean = np.abs(a.mean - b.mean) / np.sqrt(b.variance)
+    return max(mean.max(), np.abs(a.variance / b.variance - 1).max(), abs(a.log_likelihood - b.log_likelihood))
+
+
+@pytest.mark.parametrize("tolerance", [1e-4, pytest.param(1e-6, marks=pytest.mark.slow)])
+def test_samples_of_a_linear_system_give_what_kalman_bucy_gives(tolerance):
+    model, record = linear("samples", 0.1, 3.0, 30)
+    result = zakai.filter(model, record, "yau-yau", tolerance=tolerance)
+    assert not result.warnings
+    assert distance(result, zakai.filter(model, record, "kalman-bucy")) < 10 * tolerance
+
+
+@pytest.mark.slow
+def test_long_intervals_are_followed():
+    model, record = linear("samples", 0.1, 20.0, 20)
+    result = zakai.filter(model, record, "yau-yau")
+    assert not result.warnings
+    assert distance(result, zakai.filter(model, record, "kalman-bucy")) < 1e-3
+
+
+@pytest.mark.slow
+def test_the_splitting_of_increments_is_of_second_order():
+    model, record = linear("increments", 1.0, 2.0, 8)
+    exact = zakai.filter(model, record, "kalman-bucy")
+    coarse, fine = (zakai.filter(model, record, "yau-yau", tolerance=1e-7, substeps=parts) for parts in (64, 128))
+    coarse, fine = (np.abs(one.mean - exact.mean).max() for one in (coarse, fine))
+    assert 3.5 < coarse / fine < 4.5
+
+
+@pytest.mark.slow
+def test_two_states_that_are_sampled_give_what_kalman_bucy_gives():
+    model = zakai.Model(
+        state=["a", "b"], drift=["-0.3*a + b", "-a - 0.2*b"], process_noise=[[1, 0.3], [0.3, 0.5]], observation=["a"],
+        observation_noise=[[0.3]], observation_kind="samples", prior={"kind": "gaussian", "mean": [0.5, 0.5], "cov": [1, 1]},
+    )
+    record = zakai.simulate(model, 0.2 * np.arange(1, 16), seed=1)[1]
+    result = zakai.filter(model, record, "yau-yau")
+    assert not result.warnings
+    assert distance(result, zakai.filter(model, record, "kalman-bucy")) < 1e-3
+
+
+def test_a_nonlinear_system_against_an_independent_solver():
+    model = zakai.Model(
+        state=["x"], drift=["1.5*sin(2*x)"], process_noise=[["0.7"]], observation=["x**2"], observation_noise=[["0.3"]],
+        observation_kind="samples", prior={"kind": "density", "log_density": "-2*(x - 0.3)**2 + cos(2*x)"},
+    )
+    times, values = np.array([0.2, 0.4]), np.array([[0.9], [1.4]])
+    result = zakai.filter(model, zakai.Record(times, values, "samples"), "yau-yau", tolerance=1e-6)
+    assert not result.warnings
+    box = Box(7.0, 192)
+    x = box.x[..., 0]
+    u, evidence, start = np.exp(-2 * (x - 0.3) ** 2 + np.cos(2 * x)), 0.0, 0.0
+    for stop, z in zip(times, values[:, 0], strict=True):
+        u = propagate(
+            box, u / (u.sum() * box.cell), start, stop, lambda x, t: 1.5 * np.sin(2 * x), lambda x, t: 3 * np.cos(2 * x[..., 0]),
+            lambda t: np.array([[0.7]]), lambda x, t: np.zeros(x.shape[:-1]), 1e-12,
+        )
+        u = u * np.exp(-((z - x**2) ** 2) / 0.6) / np.sqrt(0.6 * np.pi)
+        evidence, start = evidence + np.log(u.sum() * box.cell), stop
+        u = u / (u.sum() * box.cell)
+    assert abs(result.log_likelihood - evidence) < 1e-6
+    got = np.exp(result.density(-1).log_density(x[np.abs(x) < 4.0][:, None]))
+    assert np.abs(got - u[np.abs(x) < 4.0]).max() < 3e-6 * u.max()
+
+
+@pytest.mark.slow
+def test_an_oscillator_whose_noise_is_singular_against_an_independent_solver():
+    model = zakai.Model(
+        state=["x", "v"], drift=["v", "0.3*(1 - x**2)*v - x"], process_noise=[["0", "0"], ["0", "1"]], observation=["x"],
+        observation_noise=[["0.4"]], observation_kind="samples", prior={"kind": "gaussian", "mean": [1, 0], "cov": [0.5, 0.5]},
+    )
+    result = zakai.filter(model, zakai.Record(np.array([0.5, 1.0]), np.array([[0.9], [0.1]]), "samples"), "yau-yau")
+    assert not result.warnings
+    box = Box(5.5, 80, (0.0, 0.0))
+    x, v = box.x[..., 0], box.x[..., 1]
+    u, evidence = np.exp(-((x - 1) ** 2) - v**2), 0.0
+    for start, z in ((0.0, 0.9), (0.5, 0.1)):
+        u = propagate(
+            box, u / (u.sum() * box.cell), start, start + 0.5,
+            lambda y, t: np.stack([y[..., 1], 0.3 * (1 - y[..., 0] ** 2) * y[..., 1] - y[..., 0]], axis=-1),
+            lambda y, t: 0.3 * (1 - y[..., 0] ** 2), lambda t: np.diag([0.0, 1.0]), lambda y, t: np.zeros(y.shape[:-1]), 1e-9,
+        )
+        u = u * np.exp(-((z - x) ** 2) / 0.8) / np.sqrt(0.8 * np.pi)
+        evidence += np.log(u.sum() * box.cell)
+        u = u / (u.sum() * box.cell)
+    mean = np.array([(u * x).sum(), (u * v).sum()]) * box.cell
+    assert np.abs(result.mean[-1] - mean).max() < 1e-4
+    assert abs(result.log_likelihood - evidence) < 1e-4
+
+
+@pytest.mark.slow
+def test_the_lattice_follows_a_state_that_wanders_far():
+    model = zakai.Model(
+        state=["x"], drift=["cos(x)"], observation=["x**3"], prior={"kind": "density", "log_density": "-10*x**2"}
+    )
+    times = 0.001 * np.arange(1, 4001)
+    record = zakai.simulate(model, times, seed=0, initial=[0.0])[1]
+    usual, fine = (zakai.filter(model, record, "yau-yau", keep="moments", tolerance=tolerance) for tolerance in (1e-4, 1e-7))
+    assert not usual.warnings and not fine.warnings
+    assert (np.abs(usual.mean - fine.mean) / np.sqrt(fine.variance)).max() < 1e-3
+    assert abs(usual.log_likelihood - fine.log_likelihood) < 1e-3
+
+
+@pytest.mark.slow
+def test_a_reading_far_beyond_the_prior_is_not_passed_over_in_silence():
+    model, _ = linear("samples", 0.01, 1.0, 1)
+    result = zakai.filter(model, zakai.Record(np.array([0.1]), np.array([[30.0]]), "samples"), "yau-yau")
+    assert result.warnings
+
+
+@pytest.mark.parametrize("options", [{"tolerance": 0}, {"tolerance": "fine"}, {"substeps": 0}, {"memory": -1}])
+def test_an_option_that_makes_no_sense_is_refused(options):
+    model, record = linear("samples", 0.1, 1.0, 2)
+    with pytest.raises(zakai.InputError, match=f"option {next(iter(options))}"):
+        zakai.filter(model, record, "yau-yau", **options)
+
+
+def test_what_the_method_cannot_do_is_said():
+    prior = {"kind": "gaussian", "mean": [0] * 5, "cov": [1] * 5}
+    five = zakai.Model(state=list("abcde"), drift=["-a**3"] * 5, observation=["a"], prior=prior)
+    angle = zakai.Model(state=["a"], drift=["sin(a)"], observation=["cos(a)"], periodic=["a"], prior=STANDARD)
+    for model, said in ((five, "at most four"), (angle, "angle")):
+        with pytest.raises(zakai.ConditionError, match=said):
+            zakai.filter(model, zakai.Record(np.array([1.0]), np.array([[0.0]]), "increments"), "yau-yau")
+    point = zakai.Model(state=["x"], drift=["cos(x)"], observation=["x"], prior={"kind": "gaussian", "mean": [0], "cov": [0]})
+    with pytest.raises(zakai.InputError, match="variance is zero"):
+        zakai.filter(point, zakai.Record(np.array([1.0]), np.array([[0.0]]), "increments"), "yau-yau")
+
+
+def test_a_lattice_that_needs_too_much_memory_is_refused():
+    model, record = linear("samples", 0.1, 1.0, 2)
+    with pytest.raises(zakai.InputError, match="option memory"):
+        zakai.filter(model, record, "yau-yau", memory=0.001)
