@@ -168,6 +168,18 @@ def test_every_model_of_the_gallery_loads_and_survives_being_written(name):
     assert 20 < len(gallery.describe(name)) < 140
 
 
+@pytest.mark.parametrize("k", [1, 2, 6, 40])
+def test_the_example_that_is_a_family_has_a_member_for_every_exponent(k):
+    model = load_model(f"gallery:dong-chen-yau-3-6-k{k}")
+    x1, x2, x3, x4 = model.x
+    assert model.drift[1] == x1 - x2 - x3**k + x4**k + x2 ** (k + 1) * x3 ** (k + 3)
+    # The terms of degree more than one of the last three cancel in their sum.
+    assert sympy.expand(sum(model.drift)) == 4 * x1
+    assert model.name.endswith(f"k = {k}") and gallery.describe(f"dong-chen-yau-3-6-k{k}").count(f"k = {k}:") == 1
+    if k == 1:
+        assert model.drift == load_model("gallery:dong-chen-yau-3-6").drift
+
+
 def test_the_gallery_holds_the_promised_models():
     promised = {"spiral-sensor", "falling-body", "kalman-bucy-1d", "kalman-bucy-2d", "benes", "cubic-sensor",
                 "encoder", "wind-vane", "wind-vane-rate", "wong", "dong-chen-yau-3-4", "dong-chen-yau-3-5",
