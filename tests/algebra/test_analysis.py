@@ -66,7 +66,7 @@ def test_every_form_of_the_analysis_says_the_same(name):
         for condition in conditions:
             assert "".join(f"{condition.evidence}[{condition.source}]".split()) in words
     latex = analysis.to_latex()
-    assert latex.count("{") == latex.count("}") and latex.startswith("\\begin{align*}") and latex.endswith("\\end{align*}")
+    assert latex.count("{") == latex.count("}") and latex.startswith("\\begin{align*}") and latex.endswith("\\end{tabular}")
     for form in (latex, page, analysis.to_json()):
         assert not re.search(r"Subs|Derivative|_xi|_z1|Symbol|Matrix\(", form)
     proof = analysis.algebra.certificate

@@ -194,7 +194,7 @@ def _flat(matrix: sp.MatrixBase) -> str:
 
 
 def latex(analysis: Analysis) -> str:
-    """The equations and what was found, as LaTeX displays."""
+    """The equations and what was found, as LaTeX displays, and the methods, as a table."""
     model = analysis.model
     # A name of several letters is not a product.
     names = {s: rf"\mathrm{{{s.name}}}" for s in (*model.x, *model.parameter_symbols) if sp.latex(s) == s.name and s.name[1:]}
@@ -232,7 +232,21 @@ def latex(analysis: Analysis) -> str:
         lines.append(rf"{z} &= {coordinates}, & d{z} &= {moves}")
     lines.extend(_algebra_in_tex(analysis.algebra, tex))
     body = " \\\\\n".join(lines)
-    return f"\\begin{{align*}}\n{body}\n\\end{{align*}}"
+    return f"\\begin{{align*}}\n{body}\n\\end{{align*}}\n{_methods_in_tex(analysis)}"
+
+
+def _methods_in_tex(analysis: Analysis) -> str:
+    """A row for each method, with what failed or was not decided."""
+    rows = []
+    for name, conditions in analysis.methods.items():
+        open_ones = [one for one in conditions if one.holds is not True]
+        first = next((one for one in open_ones if one.holds is False), open_ones[0] if open_ones else None)
+        reason = "" if first is None else f"{_prose(first.statement)}: {_prose(first.evidence)}"
+        word = {True: "yes", False: "no", None: "undecided"}[all_hold(conditions)]
+        rows.append(rf"\texttt{{{name}}} & {word} & {reason} \\")
+    table = "\n".join(rows)
+    head = r"\begin{tabular}{llp{0.6\linewidth}}" + "\n" + r"method & holds & fails, or is not decided \\ \hline"
+    return f"{head}\n{table}\n\\end{{tabular}}"
 
 
 def _algebra_in_tex(algebra: EstimationAlgebra, tex: Callable[[sp.Basic], str]) -> Iterator[str]:
@@ -269,8 +283,9 @@ def _prose(words: str) -> str:
 def _wei_norman_in_tex(equations: WeiNorman, tex: Callable[[sp.Basic], str]) -> Iterator[str]:
     powers = [_power_in_tex(r, e, tex) for r, e in zip(equations.statistics, equations.basis[1:], strict=True)]
     product = r"\,".join(f"e^{{{power}}}" for power in [*reversed(powers), f"t {tex(equations.basis[0])}"]) + r"\,\sigma_0"
-    for left, rates in ((r"e^{-h^\top S^{-1} y}\,\sigma", equations.robust), (r"\sigma", equations.stratonovich)):
-        yield rf"{left} &= {product}, & r(0) &= 0"
+    robust = r"e^{-h^\top S^{-1} y}\,\sigma", equations.robust, "robust"
+    for left, rates, form in (robust, (r"\sigma", equations.stratonovich, "Stratonovich")):
+        yield rf"{left} &= {product}, & r(0) &= 0 \quad \text{{({form})}}"
         yield from (rf"\dot{{{tex(r)}}} &= {tex(rate)}" for r, rate in rates.items())
 
 
