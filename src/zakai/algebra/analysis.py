@@ -93,7 +93,7 @@ class Analysis:
         return _page.text(self)
 
     def to_latex(self) -> str:
-        """The equations, Omega, eta, the Yau form, q and the estimation algebra as LaTeX displays (amsmath), and a table of the methods."""
+        """The equations, Omega, eta, the Yau form, q and the algebra as LaTeX displays (amsmath), and a table of the methods."""
         return _page.latex(self)
 
     def to_json(self) -> str:
