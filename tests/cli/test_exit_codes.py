@@ -117,6 +117,8 @@ def process(*arguments: str, **more):
     return subprocess.Popen(
         [sys.executable, "-c", "import sys; from zakai.cli import main; sys.exit(main())", *arguments],
         stderr=subprocess.PIPE,
+        # A test run in the background of a shell is deaf to Ctrl-C, and so would its children be.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         **more,
     )
 
