@@ -92,6 +92,7 @@ def check_whole_and_parts(kind, times=TIMES):
     return model, record, result
 
 
+@pytest.mark.slow
 def test_a_sampled_system_of_three_blocks_is_its_parts():
     times = np.concatenate([[0.0], TIMES])  # a sample at the start itself too
     _, _, result = check_whole_and_parts("samples", times)
@@ -274,6 +275,7 @@ def decaying():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_likelihood_of_blocks_is_their_sum_at_any_parameters():
     model = decaying()
     record = readings(model)
