@@ -38,11 +38,11 @@ demo: .venv/.plots
 test: .venv/.dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy src
-	$(BIN)/python -m pytest -q -n auto -m "not slow"
+	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not slow"
 
 # pytest says 5 when no test is marked slow, which is no failure.
 slow: .venv/.dev
-	$(BIN)/python -m pytest -q -n auto -m slow || [ $$? -eq 5 ]
+	$(BIN)/python -m pytest -q -n auto --dist worksteal -m slow || [ $$? -eq 5 ]
 
 clean:
 	rm -rf .venv build dist $(EXAMPLE)/out .pytest_cache .mypy_cache .ruff_cache .jax_cache .hypothesis

@@ -114,6 +114,7 @@ def test_the_double_bracket_of_lemma_1_is_a_function_and_has_no_operator_in_it()
     assert sympy.expand(double - right * generator(u).doit()) != 0
 
 
+@pytest.mark.slow
 def test_the_running_code_has_the_wrong_evidence_with_14_as_printed(monkeypatch):
     model = zakai.Model(
         state=["x"],

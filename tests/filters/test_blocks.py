@@ -189,6 +189,7 @@ def test_an_option_goes_to_the_blocks_whose_method_has_it():
         zakai.filter(model, record, speed=3)
 
 
+@pytest.mark.slow
 def test_a_prior_that_couples_blocks_joins_them():
     model = pairs(3, np.zeros(6))
     record = readings(model)

@@ -155,8 +155,7 @@ PRIORS = {
 @pytest.mark.parametrize(
     ("prior", "reduction"),
     [
-        *[pytest.param(prior, "split-merge", marks=pytest.mark.slow) for prior in ("gaussian", "mixture")],
-        ("density", "split-merge"),
+        *[pytest.param(prior, "split-merge", marks=pytest.mark.slow) for prior in ("gaussian", "mixture", "density")],
         ("mixture", "nnls"),
         ("gaussian", "algorithm-1"),
     ],
@@ -170,6 +169,7 @@ def test_a_start_that_is_not_the_prior_is_said(prior, reduction):
         assert np.all(narrow.health["start_error"][1:] <= 1e-4)
 
 
+@pytest.mark.slow
 def test_an_angle_that_is_cut_is_the_prior_still():
     model = zakai.Model(
         state=["a"], drift=["0"], observation=["sin(a)", "cos(a)"], periodic=["a"],

@@ -61,7 +61,7 @@ def said(result):
 
 @pytest.mark.parametrize(
     ("name", "seed"),
-    [("cubic", 3), pytest.param("mirror", 3, marks=pytest.mark.slow)]
+    [pytest.param(name, 3, marks=pytest.mark.slow) for name in ("cubic", "mirror")]
     + [pytest.param(name, seed, marks=pytest.mark.slow) for name in SENSORS for seed in (4, 5)],
 )
 def test_a_sum_is_near_the_density_or_says_that_it_is_not(name, seed):

@@ -252,7 +252,7 @@ def test_more_than_three_states_and_a_prior_without_width_are_refused():
     names = ["a", "b", "c", "d"]
     model = zakai.Model(
         state=names,
-        drift=["-a", "-b", "-c", "-d"],
+        drift=["b - a", "c - b", "d - c", "-d"],
         observation=["a"],
         prior={"kind": "gaussian", "mean": [0] * 4, "cov": [1] * 4},
     )
