@@ -114,13 +114,11 @@ def test_an_interruption_that_a_library_drops_is_seen_at_the_next_step(zakai, tm
 
 
 def process(*arguments: str, **more):
-    return subprocess.Popen(
-        [sys.executable, "-c", "import sys; from zakai.cli import main; sys.exit(main())", *arguments],
-        stderr=subprocess.PIPE,
-        # A test run in the background of a shell is deaf to Ctrl-C, and so would its children be.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-        **more,
-    )
+    # A test run in the background of a shell is deaf to Ctrl-C, and so would its children be; mended in the child, because
+    # a function between fork and exec would fork a process with JAX's threads.
+    hear = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = f"{hear}; import sys; from zakai.cli import main; sys.exit(main())"
+    return subprocess.Popen([sys.executable, "-c", command, *arguments], stderr=subprocess.PIPE, **more)
 
 
 def test_control_c_is_code_130(tmp_path):
