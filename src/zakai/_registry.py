@@ -50,7 +50,7 @@ METHODS = {
     ),
     "yau-yau": Entry(
         "zakai.filters.yau_yau",
-        "convergent for any smooth system in one to four states: the Kolmogorov equation on a lattice that moves; by name",
+        "convergent for any smooth system in one to four states: the Kolmogorov equation on a lattice that moves",
     ),
     "kolmogorov-series": Entry(
         "zakai.filters.kolmogorov_series",
@@ -61,8 +61,8 @@ METHODS = {
         "approximate for any smooth system: linearised at the mean, one Gaussian; only when it is asked for",
     ),
 }
-# What "auto" tries, most exact and cheapest first.
-AUTO = ("kalman-bucy", "benes", "hu-yau", "limited-direct", "general-direct")
+# What "auto" tries, most exact and cheapest first; the last holds for any smooth system of few states.
+AUTO = ("kalman-bucy", "benes", "hu-yau", "limited-direct", "general-direct", "yau-yau")
 
 
 def load(name: str) -> Any:

@@ -37,9 +37,9 @@ def test_the_page_gives_the_verdict_of_every_block_and_that_of_the_whole():
     page = str(analysis)
     assert "  x: finite of dimension 4, linear rank 1 (FIN-closed); auto takes kalman-bucy\n" in page
     assert "  y: finite of dimension 4, linear rank 1 (FIN-closed); auto takes benes\n" in page
-    assert "  z: infinite, linear rank 1 (INF-MAXRANK); no method that auto tries holds\n  E is infinite dimensional" in page
+    assert "  z: infinite, linear rank 1 (INF-MAXRANK); auto takes yau-yau\n  E is infinite dimensional" in page
     parts = json.loads(analysis.to_json())["blocks"]
-    assert [part["recommended"] for part in parts] == ["kalman-bucy", "benes", None]
+    assert [part["recommended"] for part in parts] == ["kalman-bucy", "benes", "yau-yau"]
     assert analysis.algebra.verdict == "infinite"
 
 

@@ -10,6 +10,7 @@ import time
 
 import pytest
 
+from zakai import Model
 from zakai.cli import _interrupt, looking
 
 USAGE = {
@@ -59,11 +60,22 @@ def test_an_unknown_option_is_answered_with_those_that_there_are(zakai):
     assert all(word in error for word in ("kernal", "kernel", "splitting", "order"))
 
 
-@pytest.mark.parametrize("method", ["auto", "limited-direct"])
-def test_a_method_that_does_not_hold_is_code_3_and_says_what_fails(zakai, tmp_path, method):
-    answer = zakai("filter", "gallery:cubic-sensor", "record.csv", "-o", "result.nc", "--method", method)
+def test_a_method_that_does_not_hold_is_code_3_and_says_what_fails(zakai, tmp_path):
+    answer = zakai("filter", "gallery:cubic-sensor", "record.csv", "-o", "result.nc", "--method", "limited-direct")
     assert answer.code == 3
     assert answer.err.count("\n") == 1 and "x**6" in answer.err and "Assumption 3" in answer.err
+    assert not (tmp_path / "result.nc").exists()
+
+
+def test_a_system_for_which_no_method_holds_is_code_3_and_says_what_fails(zakai, tmp_path):
+    names = ["a", "b", "c", "d", "e"]
+    drift = [f"cos({name})" for name in (*names[1:], names[0])]
+    prior = {"kind": "gaussian", "mean": [0.0] * 5, "cov": [[float(i == j) for i in range(5)] for j in range(5)]}
+    keys = {"state": names, "drift": drift, "observation": ["a**3"], "prior": prior}
+    (tmp_path / "five.toml").write_text(Model(**keys).to_toml())
+    answer = zakai("filter", "five.toml", "record.csv", "-o", "result.nc")
+    assert answer.code == 3
+    assert answer.err.count("\n") == 1 and "at most four coordinates" in answer.err
     assert not (tmp_path / "result.nc").exists()
 
 

@@ -67,7 +67,7 @@ def chosen(model: Model, method: str) -> tuple[str, str, Mapping[str, Conditions
     reasons = "; ".join(f"{name}: {failure(conditions)}" for name, conditions in considered.items())
     raise ConditionError(
         f"{model.source}: no method holds for this system ({reasons}); "
-        "if they are named, `yau-yau` filters any smooth system of up to four states and `extended-kalman-bucy` approximates any"
+        "if it is named, `extended-kalman-bucy` approximates any smooth system"
     )
 
 
