@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,14 +32,44 @@ FOLLOWED = 1.9  # cells that a deviation has, and
 REACH = 6.5  # deviations on each side that a lattice holds that is laid anew in every step
 
 
-@dataclass(frozen=True)
-class Plan:
-    """The static part of a state: `sizes` of the lattice, `run` steps between two looks at it.
+class Shape(NamedTuple):
+    """What a step is compiled for: `sizes` of the lattice and the way to take it.
 
     An interval is split in `splits`, the transition of each of these stepped in `parts`.  `order` is that of the time stepping, 2
     or 4.  With `follow` the basis moves with the flow and is laid anew in every step; with `cross` the noise may couple axes of
-    the lattice.  `wider` and `finer` multiply SPARE and FINER for this run.
+    the lattice.
     """
+
+    sizes: tuple[int, ...]
+    splits: int = 1
+    parts: int = 1
+    order: int = 2
+    follow: bool = False
+    cross: bool = False
+
+
+class Room(NamedTuple):
+    """What a step is told and not compiled for; `wider` and `finer` multiply SPARE and FINER for a run of `run` steps."""
+
+    tolerance: Any
+    wider: Any = 1.0
+    finer: Any = 1.0
+    run: Any = 256.0
+
+    @property
+    def reach(self) -> Any:
+        """The deviations on each side of a lattice that is laid anew in every step."""
+        return REACH * self.wider
+
+    @property
+    def allowed(self) -> tuple[Any, Any, Any, Any]:
+        """The most that may be of aliasing, of the mass in the outermost layers, of the error in time and of what is lost."""
+        return 0.1 * self.tolerance, 0.01 * self.tolerance, 0.1 * self.tolerance, self.tolerance
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a run of steps is taken: the fields of a Shape and of a Room."""
 
     sizes: tuple[int, ...]
     tolerance: float
@@ -52,25 +82,36 @@ class Plan:
     wider: float = 1.0
     finer: float = 1.0
 
+    @classmethod
+    def of(cls, shape: Shape, room: Room) -> Plan:
+        """The plan that was divided into these, of which every record of a batch has the same room."""
+        tolerance, wider, finer, run = (float(np.ravel(np.asarray(part))[0]) for part in room)
+        return cls(**shape._asdict(), tolerance=tolerance, wider=wider, finer=finer, run=int(run))
+
     @property
-    def reach(self) -> float:
-        """The deviations on each side of a lattice that is laid anew in every step."""
-        return REACH * self.wider
+    def shape(self) -> Shape:
+        """The static part."""
+        return Shape(self.sizes, self.splits, self.parts, self.order, self.follow, self.cross)
+
+    @property
+    def room(self) -> Room:
+        """The part that may change without a compilation."""
+        return Room(self.tolerance, self.wider, self.finer, float(self.run))
 
     @property
     def aliasing(self) -> float:
         """The largest share of the density that may be at the highest frequency."""
-        return 0.1 * self.tolerance
+        return self.room.allowed[0]
 
     @property
     def edge(self) -> float:
         """The largest share of the mass that may be in the outermost layers."""
-        return 0.01 * self.tolerance
+        return self.room.allowed[1]
 
     @property
     def stepping(self) -> float:
         """The largest error in time of one interval."""
-        return 0.1 * self.tolerance
+        return self.room.allowed[2]
 
 
 def rounded_up(size: float, n: int) -> int:

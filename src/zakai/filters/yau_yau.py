@@ -29,7 +29,7 @@ from zakai.filters import _window as window
 from zakai.filters._formulas import Formulas, formulas
 from zakai.filters._lattice_choice import free_memory
 from zakai.filters._protocol import Info, Method, Schedule
-from zakai.filters._window import Plan
+from zakai.filters._window import Plan, Room, Shape
 from zakai.filters.observations import Data, Whole, whole_factors
 from zakai.kolmogorov import comoving
 from zakai.kolmogorov.comoving import Field
@@ -52,10 +52,10 @@ def _system(of: Formulas) -> System:
     return System(of.model)
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["field", "observed", "cut"], meta_fields=["plan"])
+@partial(jax.tree_util.register_dataclass, data_fields=["field", "observed", "cut", "room"], meta_fields=["shape"])
 @dataclass(frozen=True)
 class State:
-    """The probabilities of the cells of a lattice, the static plan, and h at the points, an array for each coordinate.
+    """The probabilities of the cells of a lattice, the plan in two parts, and h at the points, an array for each coordinate.
 
     `observed` is None where the lattice is laid anew in every step.  `cut` (2, n) says how the first lattice of this run of steps
     was cut out of the last of the run before.
@@ -64,7 +64,13 @@ class State:
     field: Field
     observed: Any
     cut: Any
-    plan: Plan
+    room: Room
+    shape: Shape
+
+    @property
+    def plan(self) -> Plan:
+        """The two parts of the plan together; not inside of a compiled step."""
+        return Plan.of(self.shape, self.room)
 
     @property
     def kept(self) -> State:
@@ -177,7 +183,7 @@ def _looked_at(prepared: Prepared, field: Field, plan: Plan, time: float) -> Sta
     observed = None
     if not plan.follow:
         observed = prepared.system.observe(comoving.points_of(plan.sizes, field.centre, field.basis), time, prepared.theta)
-    return State(jax.tree.map(jnp.asarray, field), observed, jnp.asarray(_SAME(prepared.model.n)), plan)
+    return State(jax.tree.map(jnp.asarray, field), observed, jnp.asarray(_SAME(prepared.model.n)), plan.room, plan.shape)
 
 
 def _moments(field: Field) -> tuple[jax.Array, jax.Array]:
@@ -219,7 +225,7 @@ def _multiplied(values: jax.Array, logs: jax.Array) -> tuple[jax.Array, jax.Arra
 
 def step(interval: Interval, state: State, observation: Whole) -> tuple[State, Info]:
     """One interval: half of the likelihood, the transition, the other half, or all of it at the end."""
-    system, plan, theta = interval.system, state.plan, interval.theta
+    system, plan, theta = interval.system, state.shape, interval.theta
     length = (interval.stop - interval.start) / plan.splits
     share = 0.5 * observation.inside / plan.splits
     zero = jnp.zeros(())
@@ -277,12 +283,12 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
         worst = worst.over(looked_at(values, comoving.LOST, spent, grown))
     mean, cov = _moments(field)
     if plan.follow:
-        field, observed = comoving.relaid(field, plan.reach), None
+        field, observed = comoving.relaid(field, state.room.reach), None
     health = {"aliasing": worst.aliasing, "edge_mass": worst.edge, "time_error": worst.error, "lost": worst.lost}
-    allowed = (plan.aliasing, plan.edge, plan.stepping, plan.tolerance)
-    health["missed"] = jnp.max(jnp.stack([figure / most for figure, most in zip(health.values(), allowed, strict=True)]))
+    allowed = zip(health.values(), state.room.allowed, strict=True)
+    health["missed"] = jnp.max(jnp.stack([figure / most for figure, most in allowed]))
     health = jax.lax.stop_gradient(health)
-    return State(field, observed, state.cut, plan), Info(log_mass, mean, cov, health)
+    return State(field, observed, state.cut, state.room, plan), Info(log_mass, mean, cov, health)
 
 
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
@@ -310,19 +316,23 @@ def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None
     cut, plan = window.fitted(states.field, plan, lambda sizes: window.check_memory(model, sizes, prepared.memory))
     if plan == states.plan and np.all(cut == _SAME(model.n)):
         return replace(states, cut=before) if info is None else None
-    fields = _cut_out(jax.tree.map(jnp.asarray, states.field), cut, plan.sizes, plan.follow, plan.reach)
+    fields = _cut_out(jax.tree.map(jnp.asarray, states.field), cut, plan.room.reach, plan.sizes, plan.follow)
     cut = window.composed(before, cut)
     time = float(prepared.schedule.starts[rows.start])
     observed = None if plan.follow else _observed(prepared.system, fields, time, prepared.theta)
-    return State(fields, observed, cut, plan)
+    return State(fields, observed, cut, _room(plan, len(cut)), plan.shape)
 
 
 def _SAME(n: int) -> np.ndarray:
     return np.stack([np.zeros(n), np.ones(n)])
 
 
-@partial(jax.jit, static_argnums=(2, 3, 4))
-def _cut_out(fields: Field, cuts: Any, sizes: tuple[int, ...], follow: bool, reach: float) -> Field:
+def _room(plan: Plan, count: int) -> Room:
+    return Room(*(np.full(count, part) for part in plan.room))
+
+
+@partial(jax.jit, static_argnums=(3, 4))
+def _cut_out(fields: Field, cuts: Any, reach: Any, sizes: tuple[int, ...], follow: bool) -> Field:
     def one(field: Field, cut: Any) -> Field:
         field = comoving.resampled(field, cut[0], cut[1], sizes)
         return comoving.relaid(field, reach) if follow else field
@@ -339,11 +349,11 @@ def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State
     """The traced `state` on a lattice cut out of its own as that of `begin` was, with the same plan."""
     plan, cut = begin.plan, np.asarray(begin.cut)
     fields = jax.tree.map(lambda a: a[None], state.field)
-    if not np.array_equal(cut, _SAME(prepared.model.n)) or plan.sizes != state.plan.sizes or plan.follow:
-        fields = _cut_out(fields, cut[None], plan.sizes, plan.follow, plan.reach)
+    if not np.array_equal(cut, _SAME(prepared.model.n)) or plan.sizes != state.shape.sizes or plan.follow:
+        fields = _cut_out(fields, cut[None], plan.room.reach, plan.sizes, plan.follow)
     time = float(prepared.schedule.starts[rows.start])
     observed = None if plan.follow else _observed(prepared.system, fields, time, prepared.theta)
-    return jax.tree.map(lambda a: a[0], State(fields, observed, cut[None], plan))
+    return jax.tree.map(lambda a: a[0], State(fields, observed, cut[None], _room(plan, 1), plan.shape))
 
 
 def density(prepared: Prepared, state: State) -> GridDensity:
