@@ -24,6 +24,7 @@ MOST = {1: 4096, 2: 512, 3: 128, 4: 48}
 RUNS = {1: 256, 2: 64, 3: 16, 4: 8}
 SHORTEST = 8  # a run that must be shorter than this asks for a lattice that is laid anew in every step
 MOST_PARTS = 4096
+MOST_POINTS = 2**20  # of lattices whose flow is looked at together
 FEW = {1: 128, 2: 8, 3: 4, 4: 4}  # parts of an interval beyond which the lattice had better follow the flow
 SPARE = 1.25  # how much wider than its density a window is, and
 WORST = {1: 8.0, 2: 3.0, 3: 2.0, 4: 2.0}  # how much more of both a run may ask for before it is cut into shorter ones
@@ -120,34 +121,52 @@ def rounded_up(size: float, n: int) -> int:
     return next(candidate for candidate in sizes if candidate >= size)
 
 
-def needs(values: np.ndarray, aliasing: float, edge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of a density on a lattice, along each axis (n,): the first and the last index that matter, and the share of all
+class Extent(NamedTuple):
+    """Of densities on lattices, along each axis (records, n): the first and the last index that matter, and the share of all
     frequencies that does."""
-    total = values.sum()
-    first, last, band = [], [], []
-    for d, size in enumerate(values.shape):
-        marginal = values.sum(axis=tuple(a for a in range(values.ndim) if a != d)) / total
-        first.append(int(np.searchsorted(np.cumsum(marginal), edge)))
-        last.append(size - 1 - int(np.searchsorted(np.cumsum(marginal[::-1]), edge)))
-        spectrum = np.abs(np.fft.rfft(values, axis=d)).sum(axis=tuple(a for a in range(values.ndim) if a != d)) / total
-        above = np.flatnonzero(spectrum > aliasing)
-        band.append((above[-1] + 1) / (len(spectrum) - 1) if len(above) else 0.0)
-    return np.array(first), np.array(last), np.minimum(np.array(band), 1.0)
+
+    first: np.ndarray
+    last: np.ndarray
+    band: np.ndarray
 
 
-def fitted(fields: Field, plan: Plan, check: Callable[[tuple[int, ...]], None]) -> tuple[np.ndarray, Plan]:
+def extent(values: np.ndarray, aliasing: float, edge: float) -> Extent:
+    """What matters of the values (records, *sizes): all but a share `edge` of the mass on each side of an axis, and all
+    frequencies that hold more than the share `aliasing`."""
+    n = values.ndim - 1
+    total = values.sum(axis=tuple(range(1, n + 1)))[:, None]
+    columns = []
+    for d in range(1, n + 1):
+        others = tuple(a for a in range(1, n + 1) if a != d)
+        marginal = values.sum(axis=others) / total
+        first = (np.cumsum(marginal, axis=1) < edge).sum(axis=1)
+        last = values.shape[d] - 1 - (np.cumsum(marginal[:, ::-1], axis=1) < edge).sum(axis=1)
+        above = np.abs(np.fft.rfft(values, axis=d)).sum(axis=others) / total > aliasing
+        frequencies = above.shape[1]
+        highest = np.where(above.any(axis=1), frequencies - np.argmax(above[:, ::-1], axis=1), 0)
+        columns.append((first, last, np.minimum(highest / (frequencies - 1), 1.0)))
+    return Extent(*(np.stack(part, axis=1) for part in zip(*columns, strict=True)))
+
+
+def measured(fields: Field, plan: Plan) -> Extent | None:
+    """What matters of densities, one a record; nothing is looked at where the lattice is laid anew in every step."""
+    return None if plan.follow else extent(np.asarray(fields.values), plan.aliasing / 10, plan.edge / 10)
+
+
+def fitted(
+    fields: Field, measures: Extent | None, plan: Plan, check: Callable[[tuple[int, ...]], None]
+) -> tuple[np.ndarray, Plan]:
     """How to lay densities, one a record, on lattices of one size with the same axes as theirs: cuts (records, 2, n), the middle
     as an index from the centre and the cell in cells; and the plan with the sizes."""
-    values = np.asarray(fields.values)
-    n = values.ndim - 1
-    sizes = np.array(values.shape[1:])
-    if plan.follow:
+    records, *shape = fields.values.shape
+    n, sizes = len(shape), np.array(shape)
+    if plan.follow or measures is None:
         wanted = np.array([rounded_up(2 * REACH * plan.wider * FOLLOWED * plan.finer, n)] * n)
         plan = replace(plan, sizes=tuple(int(s) for s in np.minimum(wanted, MOST[n])))
         check(plan.sizes)
         cut = np.stack([np.zeros(n), np.maximum(sizes / plan.sizes, 1.0)])
-        return np.tile(cut, (len(values), 1, 1)), plan
-    first, last, band = (np.array(part) for part in zip(*[needs(one, plan.aliasing / 10, plan.edge / 10) for one in values]))
+        return np.tile(cut, (records, 1, 1)), plan
+    first, last, band = measures
     # What the highest frequency still holds was not resolved.
     ratio = np.where(band > 0.98, 0.7, 1 / (FINER * plan.finer * np.maximum(band, 0.1)))
     span = (last - first + 3) * SPARE * plan.wider
@@ -196,7 +215,7 @@ def first_field(
         if not np.isfinite(top):
             raise InputError(f"{model.source}: prior: log_density is not finite anywhere; give a density")
         values = np.exp(logs - top)
-        first, last, band = needs(values, plan.aliasing / 10, plan.edge / 100)
+        first, last, band = (part[0] for part in extent(values[None], plan.aliasing / 10, plan.edge / 100))
         used = (last - first + 1) / size
         if np.any(used < 0.55):
             middle = low + cell * (0.5 * (first + last) + 0.5)
@@ -275,25 +294,13 @@ def timed(model: Model, plan: Plan, intervals: Any, rows: slice, fields: Field, 
         couples = (spread.sum(axis=(2, 3)) - diagonal) > 1e-12 * diagonal
         plan = replace(plan, cross=plan.follow or bool(couples.any()))
     tau = (intervals.stop[rows] - intervals.start[rows]).max() / plan.splits
-    function = numpy_function(model.drift, model)
     fastest = crossing = 0.0
-    for values, centre, base, back, cells in zip(np.asarray(fields.values), np.asarray(fields.centre), basis, inverse, ratio):
-        index = np.stack(np.meshgrid(*axes_of(values.shape), indexing="ij"), axis=-1).reshape(-1, model.n) / cells
-        weights = values.ravel() / values.sum()
-        matters = weights > 1e-11 * weights.max()
-        index, weights = index[matters], weights[matters]
-        with np.errstate(all="ignore"):
-            flow = np.concatenate([function(centre + index @ base.T, t, theta) @ back.T for t in times[[0, -1]]], axis=0)
-        flow, apart, weights = flow - weights @ flow[: len(index)], np.tile(index, (2, 1)), np.tile(weights, 2)
-        apart = apart - weights @ apart / 2
-        variance = weights @ apart**2
-        if plan.follow:
-            # The basis takes the part that is affine, and leaves the growth by diffusion.
-            slopes = np.linalg.solve((apart * weights[:, None]).T @ apart, (apart * weights[:, None]).T @ flow)
-            G = numpy_function(model.covariance, model, (model.n, model.n))(np.zeros(model.n), times[0], theta)
-            flow = flow - apart @ slopes - apart * (np.diagonal(back @ G @ back.T) / variance)
-        fastest = max(fastest, np.sqrt((weights @ flow**2 / np.maximum(variance, 1e-12)).max()))
-        crossing = max(crossing, np.pi * np.abs(flow).sum(axis=1).max())
+    many = max(1, MOST_POINTS // int(np.prod(fields.values.shape[1:])))
+    for begin in range(0, len(basis), many):
+        some = slice(begin, begin + many)
+        part = Field(np.asarray(fields.values)[some], np.asarray(fields.centre)[some], basis[some])
+        fast, far = _speeds(model, part, ratio[some], times, plan.follow)
+        fastest, crossing = max(fastest, fast), max(crossing, far)
     if not np.isfinite(fastest + crossing):
         return plan
     parts = 2 ** int(np.ceil(np.log2(max(tau * crossing / 2.5, tau * fastest / (30 * plan.stepping) ** 0.2, 1.0))))
@@ -303,6 +310,34 @@ def timed(model: Model, plan: Plan, intervals: Any, rows: slice, fields: Field, 
         return replace(plan, follow=True, order=4, parts=1, cross=model.n > 1)
     order = 2 if parts == 1 and (tau * fastest) ** 3 < plan.stepping and tau * crossing < 0.5 else 4
     return replace(plan, order=order, parts=parts)
+
+
+def _speeds(model: Model, fields: Field, ratio: np.ndarray, times: np.ndarray, follow: bool) -> tuple[float, float]:
+    """Of the flow around the mean, which takes the lattices of `fields` with it: its root mean square in deviations, and its
+    largest sum over the axes in cells, times pi; a unit of time, the worst of all records and of the first and the last time."""
+    n, theta, back = model.n, model.theta(), np.swapaxes(np.linalg.inv(fields.basis), 1, 2)
+    weights = fields.values.reshape(len(ratio), -1)
+    weights = np.where(weights > 1e-11 * weights.max(axis=1, keepdims=True), weights, 0.0)
+    weights, matters = weights / weights.sum(axis=1, keepdims=True), (weights > 0)[..., None]
+    index = np.stack(np.meshgrid(*axes_of(fields.values.shape[1:]), indexing="ij"), axis=-1).reshape(-1, n) / ratio[:, None]
+    points = fields.centre[:, None] + index @ np.swapaxes(fields.basis, 1, 2)
+    function = numpy_function(model.drift, model)
+    with np.errstate(all="ignore"):
+        flow = np.where(matters, np.stack([function(points, t, theta) @ back for t in times[[0, -1]]]), 0.0)
+    flow = flow - np.einsum("rp,rpi->ri", weights, flow[0])[:, None]
+    apart = index - np.einsum("rp,rpi->ri", weights, index)[:, None]
+    variance = np.einsum("rp,rpi->ri", weights, apart**2)
+    if follow:
+        # The basis takes the part that is affine, and leaves the growth by diffusion.
+        weighted = np.swapaxes(apart * weights[..., None], 1, 2)
+        slopes = np.linalg.solve(weighted @ apart, weighted @ flow.mean(axis=0))
+        G = numpy_function(model.covariance, model, (n, n))(np.zeros(n), times[0], theta)
+        growth = 0.5 * np.diagonal(np.swapaxes(back, 1, 2) @ G @ back, axis1=1, axis2=2) / variance
+        flow = flow - apart @ slopes - apart * growth[:, None]
+    flow = np.where(matters, flow, 0.0)
+    spread = np.einsum("rp,trpi->ri", weights, flow**2) / 2
+    fastest = np.sqrt((spread / np.maximum(variance, 1e-12)).max())
+    return float(fastest), float(np.pi * np.abs(flow).sum(axis=-1).max())
 
 
 def check_memory(model: Model, sizes: tuple[int, ...], budget: int) -> None:

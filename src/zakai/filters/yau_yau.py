@@ -293,9 +293,10 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
 
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
     """The state to begin the intervals `rows` with: its lattice and its plan."""
-    one = jax.tree.map(lambda a: np.asarray(a)[None], (state, info))
-    many = adapt_many(prepared, one[0], rows, one[1])
-    return None if many is None else jax.tree.map(lambda a: a[0], many)
+    if info is not None and window.healthy(info):
+        return None
+    many = adapt_many(prepared, jax.tree.map(lambda a: np.asarray(a)[None], state), rows, info)
+    return None if many is None else jax.tree.map(lambda a: np.asarray(a)[0], many)
 
 
 def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None) -> State | None:
@@ -309,14 +310,16 @@ def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None
         if better is None:
             return None
         plan, before = better, np.asarray(states.cut)
-    cut, _ = window.fitted(states.field, plan, lambda sizes: None)
-    least = window.timed(model, plan, prepared.intervals, rows, states.field, cut[:, 1])
+    fields = jax.tree.map(np.asarray, states.field)
+    measures = window.measured(fields, plan)
+    cut, _ = window.fitted(fields, measures, plan, lambda sizes: None)
+    least = window.timed(model, plan, prepared.intervals, rows, fields, cut[:, 1])
     # What a try has shown counts for more than what the coefficients say.
     plan = least if info is None else replace(least, order=max(plan.order, least.order), parts=max(plan.parts, least.parts))
-    cut, plan = window.fitted(states.field, plan, lambda sizes: window.check_memory(model, sizes, prepared.memory))
+    cut, plan = window.fitted(fields, measures, plan, lambda sizes: window.check_memory(model, sizes, prepared.memory))
     if plan == states.plan and np.all(cut == _SAME(model.n)):
         return replace(states, cut=before) if info is None else None
-    fields = _cut_out(jax.tree.map(jnp.asarray, states.field), cut, plan.room.reach, plan.sizes, plan.follow)
+    fields = _cut_out(fields, cut, plan.room.reach, plan.sizes, plan.follow)
     cut = window.composed(before, cut)
     time = float(prepared.schedule.starts[rows.start])
     observed = None if plan.follow else _observed(prepared.system, fields, time, prepared.theta)
