@@ -63,6 +63,9 @@ class Method:
     Batches.  `init`, `observations` and `step` serve many records at once as they are.  A method with `adapt` has
     `adapt_many(prepared, states, rows, info)`: `states` and `info` have a leading axis of records, and all records get one
     plan and arrays of one size.  None: records are filtered one by one.
+
+    Early ends.  `healthy(info)` says, traced by JAX, whether steps kept their bounds.  A run then ends before the first that did
+    not, and where it took enough steps by then, the next run begins there: no step is taken twice.
     """
 
     name: str
@@ -80,4 +83,5 @@ class Method:
     with_parameters: Callable[..., Any] | None = None
     resume: Callable[..., Any] | None = None
     adapt_many: Callable[..., Any] | None = None
+    healthy: Callable[[Info], Any] | None = None
     bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)

@@ -62,15 +62,42 @@ def scanned(one: Callable[..., Any], state: Any, slices: Any) -> tuple[Any, Any]
     return state, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
 
 
-@partial(jax.jit, static_argnums=(0, 4))
-def scan(step, state, intervals, observations, keep):
-    """All steps of a run: the last state, and of every step its Info and, with `keep`, its state."""
+@partial(jax.jit, static_argnums=(0, 1, 5))
+def scan(step, healthy, state, intervals, observations, keep, limit):
+    """Steps of a run: the last state; of every step its Info and, with `keep`, its state; and how many count.
+
+    `limit` is how many steps count at most and, where `healthy` is given, whether the run ends before the first that is not well.
+    """
 
     def one(carry, slices):
         new, info = step(slices[0], carry, slices[1])
         return new, (info, getattr(new, "kept", new) if keep else None)
 
-    return scanned(one, state, (intervals, observations))
+    return taken(one, healthy, state, (intervals, observations), *limit)
+
+
+def taken(one: Callable[..., Any], healthy: Callable[[Info], Any] | None, state: Any, slices: Any, most: Any, strict: Any) -> Any:
+    """`scanned`, or where `healthy` is given the same up to the first step that is not well; with the number of steps."""
+    if healthy is None:
+        return *scanned(one, state, slices), most
+
+    def at(k: Any) -> Any:
+        return jax.tree.map(lambda a: a[k], slices)
+
+    slices = jax.tree.map(jnp.asarray, slices)
+    length = len(jax.tree.leaves(slices)[0])
+    rows = jax.tree.map(lambda a: jnp.zeros((length, *a.shape), a.dtype), jax.eval_shape(one, state, at(0))[1])
+
+    def go(carry: Any) -> Any:
+        k, _, state, rows = carry
+        new, told = one(state, at(k))
+        well = jnp.all(healthy(told[0])) | ~strict
+        state = jax.tree.map(lambda a, b: jnp.where(well, a, b), new, state)
+        return k + well, well, state, jax.tree.map(lambda table, row: table.at[k].set(row), rows, told)
+
+    start = jnp.zeros((), int), jnp.array(True), state, rows
+    k, _, state, rows = jax.lax.while_loop(lambda carry: carry[1] & (carry[0] < most), go, start)
+    return state, rows, k
 
 
 def rows_of(tree: Any, rows: slice, length: int) -> Any:
@@ -116,11 +143,12 @@ class Setting(NamedTuple):
             yield slice(begin, min(begin + length, count))
 
 
-def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, ends: bool, keep: bool):
+def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, ends: bool, keep: bool, enough: float = 0.25):
     """One run of steps from one look at the lattice to the next, tried until its health is good.
 
-    `rows` are those of the chunk that are left; `ends` says that the record ends with them.  Gives the rows that were taken,
-    the state they began with, the state they ended with, and what `scan` tells of each.
+    `rows` are those of the chunk that are left; `ends` says that the record ends with them; a run that was well for the share
+    `enough` of its steps ends there.  Gives the rows that were taken, the state they began with, the state they ended with, and
+    what `scan` tells of each.
     """
     run = getattr(state, "run_length", RUN)
     count = min(run, rows.stop - rows.start)
@@ -130,14 +158,25 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
     part = slice(rows.start, rows.start + count)
     intervals, given = rows_of(prepared.intervals, part, length), rows_of(observations, part, length)
     begin = adapt(prepared, state, part, None) if adapt else state
-    for _ in range(TRIES):
-        end, told = scan(method.step, begin, intervals, given, keep)
-        info, kept = jax.tree.map(lambda a: np.asarray(a)[:count], told)
-        again = adapt(prepared, begin, part, info) if adapt else None
-        if again is None:
+    strict = True
+    for tries in range(TRIES + 1):
+        end, told, taken = scan(method.step, method.healthy, begin, intervals, given, keep, (count, strict))
+        taken = int(taken)
+        if not strict or (method.healthy is not None and taken >= min(count, max(1.0, enough * run))):
             break
-        begin = again
-    return part, begin, end, info, kept
+        info = first_of(told[0], min(taken + 1, count))
+        again = adapt(prepared, begin, part, info) if adapt and tries < TRIES else None
+        if again is None and (method.healthy is None or getattr(adapt, "ill", ())):
+            break
+        # Where nothing better can be had the run is taken as it is, and its health says so.
+        begin, strict = (begin, False) if again is None else (again, True)
+    info, kept = first_of(told, taken)
+    return slice(part.start, part.start + taken), begin, end, info, kept
+
+
+def first_of(tree: Any, count: int) -> Any:
+    """The first rows of every array of a pytree."""
+    return jax.tree.map(lambda a: np.asarray(a)[:count], tree)
 
 
 class Run:

@@ -13,11 +13,12 @@ import jax
 import numpy as np
 
 from zakai import _float64  # noqa: F401
-from zakai.filters._run import RUN, Run, run_steps, scanned, size_of
+from zakai.filters._run import RUN, Run, run_steps, size_of, taken
 
 LANES = 32  # records that are filtered by one scan, at most: one that asks for a large lattice slows no more than these
 LANE_BYTES = 256 * 2**20  # what they give in one run of steps, at most
 WORTH_A_CORE = 16  # records
+ENOUGH = 1 / 16  # the share of a run after which a look at all lattices costs less than wider ones
 FEW_ILL = 0.25  # the share of the records of a scan that may leave it at once for a lattice of their own
 
 
@@ -105,14 +106,14 @@ def _together(runs: list[Run], lanes: int, count: _Count) -> None:
             adapt = _Adapt(method, len(runs))
             part, begin, ends, info, kept = run_steps(
                 method, adapt if method.adapt_many else None, _scan_lanes, prepared, _stacked([*states, *states[-1:] * fill], 0),
-                _stacked([*given, *given[-1:] * fill], 1), left, rows.stop == total, runs[0].keep,
+                _stacked([*given, *given[-1:] * fill], 1), left, rows.stop == total, runs[0].keep, ENOUGH,
             )  # fmt: skip
             for lane, run in enumerate(runs):
                 first = _lane(begin, lane, 0)
                 if lane in adapt.ill:
                     run.state = first
                     alone.append(run)
-                else:
+                elif part.stop > part.start:
                     run.take(prepared, first, _lane(info, lane, 1), _lane(kept, lane, 1))
             well = [lane for lane in range(len(runs)) if lane not in adapt.ill]
             runs, given, states = [runs[i] for i in well], [given[i] for i in well], [_lane(ends, i, 0) for i in well]
@@ -135,7 +136,11 @@ class _Adapt:
         again = method.adapt_many(prepared, states, rows, info)
         if info is None or again is None:
             return again
-        ill = [k for k in range(self.count) if method.adapt(prepared, _lane(states, k, 0), rows, _lane(info, k, 0)) is not None]
+        if method.healthy is None:
+            asks = [method.adapt(prepared, _lane(states, k, 0), rows, _lane(info, k, 0)) is not None for k in range(self.count)]
+        else:
+            asks = ~np.asarray(method.healthy(info)).all(axis=1)
+        ill = [k for k in range(self.count) if asks[k]]
         if not 0 < len(ill) <= self.count * FEW_ILL:
             return again
         self.ill = frozenset(ill)
@@ -154,8 +159,8 @@ def _lane(tree: Any, lane: int, axis: int) -> Any:
     return jax.tree.map(lambda a: np.asarray(a)[lane] if axis == 0 else a[:, lane], tree)
 
 
-@partial(jax.jit, static_argnums=(0, 4))
-def _scan(step, states, intervals, observations, keep):
+@partial(jax.jit, static_argnums=(0, 1, 5))
+def _scan(step, healthy, states, intervals, observations, keep, limit):
     def one_record(interval, state, observation):
         new, info = step(interval, state, observation)
         return new, (info, getattr(new, "kept", new) if keep else None)
@@ -163,19 +168,19 @@ def _scan(step, states, intervals, observations, keep):
     def one(carry, slices):
         return jax.vmap(one_record, (None, 0, 0))(slices[0], carry, slices[1])
 
-    return scanned(one, states, (intervals, observations))
+    return taken(one, healthy, states, (intervals, observations), *limit)
 
 
 _COMPILED: set[Hashable] = set()
 _COMPILING = Lock()
 
 
-def _scan_lanes(step, states, intervals, observations, keep):
+def _scan_lanes(step, healthy, states, intervals, observations, keep, limit):
     """`scan` of many records, with axes (steps, records, ...); two threads never compile the same."""
     key = (step, keep, _shape((states, intervals, observations)))
     if key in _COMPILED:
-        return _scan(step, states, intervals, observations, keep)
+        return _scan(step, healthy, states, intervals, observations, keep, limit)
     with _COMPILING:
-        result = _scan(step, states, intervals, observations, keep)
+        result = _scan(step, healthy, states, intervals, observations, keep, limit)
         _COMPILED.add(key)
     return result

@@ -293,8 +293,6 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
 
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
     """The state to begin the intervals `rows` with: its lattice and its plan."""
-    if info is not None and window.healthy(info):
-        return None
     many = adapt_many(prepared, jax.tree.map(lambda a: np.asarray(a)[None], state), rows, info)
     return None if many is None else jax.tree.map(lambda a: np.asarray(a)[0], many)
 
@@ -306,7 +304,7 @@ def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None
         plan = window.relaxed(plan, window.RUNS[model.n])
         before = np.tile(_SAME(model.n), (len(states.field.centre), 1, 1))
     else:
-        better = None if window.healthy(info) else window.more(plan, info)
+        better = None if window.healthy(info).all() else window.more(plan, info)
         if better is None:
             return None
         plan, before = better, np.asarray(states.cut)
@@ -385,6 +383,7 @@ METHOD = Method(
     with_parameters=with_parameters,
     resume=resume,
     adapt_many=adapt_many,
+    healthy=window.healthy,
     bounds={
         "missed": (
             1.0,
