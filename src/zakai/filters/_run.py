@@ -166,7 +166,7 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
             break
         info = first_of(told[0], min(taken + 1, count))
         again = adapt(prepared, begin, part, info) if adapt and tries < TRIES else None
-        if again is None and (method.healthy is None or getattr(adapt, "ill", ())):
+        if again is None and (method.healthy is None or getattr(adapt, "ill", False)):
             break
         # Where nothing better can be had the run is taken as it is, and its health says so.
         begin, strict = (begin, False) if again is None else (again, True)

@@ -35,6 +35,7 @@ from zakai.kolmogorov import comoving
 from zakai.kolmogorov.comoving import Field
 from zakai.models.compile import jax_field, jax_function
 from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
 
 
 class System:
@@ -317,11 +318,19 @@ def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None
     cut, plan = window.fitted(fields, measures, plan, lambda sizes: window.check_memory(model, sizes, prepared.memory))
     if plan == states.plan and np.all(cut == _SAME(model.n)):
         return replace(states, cut=before) if info is None else None
-    fields = _cut_out(fields, cut, plan.room.reach, plan.sizes, plan.follow)
+    fields = _cut_out(fields, cut, plan)
     cut = window.composed(before, cut)
-    time = float(prepared.schedule.starts[rows.start])
-    observed = None if plan.follow else _observed(prepared.system, fields, time, prepared.theta)
+    observed = None
+    if not plan.follow:
+        # With NumPy, as the cutting out: nothing is compiled to look at a lattice.
+        points = fields.centre[:, None] + _index(plan.sizes) @ np.swapaxes(fields.basis, 1, 2)
+        h = numpy_function(model.observation, model)(points, float(prepared.schedule.starts[rows.start]), prepared.theta)
+        observed = tuple(h[..., i].reshape(len(cut), *plan.sizes) for i in range(model.m))
     return State(fields, observed, cut, _room(plan, len(cut)), plan.shape)
+
+
+def _index(sizes: tuple[int, ...]) -> np.ndarray:
+    return np.stack(np.meshgrid(*comoving.axes_of(sizes), indexing="ij"), axis=-1).reshape(-1, len(sizes))
 
 
 def _SAME(n: int) -> np.ndarray:
@@ -332,29 +341,26 @@ def _room(plan: Plan, count: int) -> Room:
     return Room(*(np.full(count, part) for part in plan.room))
 
 
-@partial(jax.jit, static_argnums=(3, 4))
-def _cut_out(fields: Field, cuts: Any, reach: Any, sizes: tuple[int, ...], follow: bool) -> Field:
-    def one(field: Field, cut: Any) -> Field:
-        field = comoving.resampled(field, cut[0], cut[1], sizes)
-        return comoving.relaid(field, reach) if follow else field
-
-    return jax.vmap(one)(fields, cuts)
+def _cut_out(fields: Field, cut: np.ndarray, plan: Plan) -> Field:
+    fields = comoving.resampled(fields, cut[:, 0], cut[:, 1], plan.sizes)
+    return _relaid(fields, plan.room.reach) if plan.follow else fields
 
 
-@partial(jax.jit, static_argnums=0)
-def _observed(system: System, fields: Field, time: Any, theta: Any) -> Any:
-    return jax.vmap(lambda field: system.observe(field.points(), time, theta))(fields)
+@jax.jit
+def _relaid(fields: Field, reach: Any) -> Field:
+    return jax.vmap(lambda field: comoving.relaid(field, reach))(fields)
 
 
 def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State:
     """The traced `state` on a lattice cut out of its own as that of `begin` was, with the same plan."""
     plan, cut = begin.plan, np.asarray(begin.cut)
-    fields = jax.tree.map(lambda a: a[None], state.field)
+    field = state.field
     if not np.array_equal(cut, _SAME(prepared.model.n)) or plan.sizes != state.shape.sizes or plan.follow:
-        fields = _cut_out(fields, cut[None], plan.room.reach, plan.sizes, plan.follow)
-    time = float(prepared.schedule.starts[rows.start])
-    observed = None if plan.follow else _observed(prepared.system, fields, time, prepared.theta)
-    return jax.tree.map(lambda a: a[0], State(fields, observed, cut[None], _room(plan, 1), plan.shape))
+        field = jax.tree.map(lambda a: a[0], _cut_out(jax.tree.map(lambda a: a[None], field), cut[None], plan))
+    observed = None
+    if not plan.follow:
+        observed = prepared.system.observe(field.points(), float(prepared.schedule.starts[rows.start]), prepared.theta)
+    return State(field, observed, cut, plan.room, plan.shape)
 
 
 def density(prepared: Prepared, state: State) -> GridDensity:

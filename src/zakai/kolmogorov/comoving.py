@@ -276,14 +276,27 @@ def _views(sizes: Sequence[int]) -> list[np.ndarray]:
     return [_view(axis, d, len(sizes)) for d, axis in enumerate(axes_of(sizes))]
 
 
-def resampled(field: Field, middle: Any, ratio: Any, sizes: Sequence[int]) -> Field:
-    """The sinc interpolant on a lattice around the index `middle` (n,) from the centre, its cells `ratio` (n,) of the old."""
-    values = field.values
-    for d, (old, new) in enumerate(zip(axes_of(values.shape), axes_of(sizes), strict=True)):
-        values = ratio[d] * along(jnp.sinc(middle[d] + ratio[d] * new[:, None] - old), values, d)
-    values = jnp.maximum(values, 0.0)
-    middle, ratio = jnp.asarray(middle), jnp.asarray(ratio)
-    return Field(values / jnp.sum(values), field.centre + field.basis @ middle, field.basis * ratio)
+def resampled(fields: Field, middle: np.ndarray, ratio: np.ndarray, sizes: Sequence[int]) -> Field:
+    """The sinc interpolants of fields with a leading axis of records on lattices around the indices `middle` (records, n) from
+    the centres, their cells `ratio` (records, n) of the old; in NumPy for a Field of NumPy arrays, which compiles nothing."""
+    values = fields.values
+    xp = np if isinstance(values, np.ndarray) else jnp
+    for d, (old, new) in enumerate(zip(axes_of(values.shape[1:]), axes_of(sizes), strict=True)):
+        at = middle[:, d, None] + ratio[:, d, None] * new
+        # sin(pi (at - old)) from one sine for each point.
+        whole = np.round(at)
+        sine = np.sin(np.pi * (at - whole)) * (1.0 - 2.0 * (whole % 2))
+        apart = at[..., None] - old
+        close = np.abs(apart) < 1e-9
+        signs = 1.0 - 2.0 * (old % 2)
+        sinc = np.where(close, 1.0, sine[..., None] * signs / (np.pi * np.where(close, 1.0, apart)))
+        lines = xp.moveaxis(values, d + 1, 1)
+        product = xp.matmul(ratio[:, d, None, None] * sinc, lines.reshape(*lines.shape[:2], -1))
+        values = xp.moveaxis(product.reshape(len(lines), len(new), *lines.shape[2:]), 1, d + 1)
+    values = xp.maximum(values, 0.0)
+    total = values.sum(axis=tuple(range(1, values.ndim)), keepdims=True)
+    moved = xp.matmul(fields.basis, middle[..., None])[..., 0]
+    return Field(values / total, fields.centre + moved, fields.basis * ratio[:, None, :])
 
 
 def relaid(field: Field, reach: float) -> Field:
