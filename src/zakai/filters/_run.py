@@ -12,6 +12,7 @@ from weakref import WeakKeyDictionary
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from zakai import _float64  # noqa: F401
 from zakai.algebra.conditions import Condition
@@ -86,18 +87,20 @@ def taken(one: Callable[..., Any], healthy: Callable[[Info], Any] | None, state:
 
     slices = jax.tree.map(jnp.asarray, slices)
     length = len(jax.tree.leaves(slices)[0])
-    rows = jax.tree.map(lambda a: jnp.zeros((length, *a.shape), a.dtype), jax.eval_shape(one, state, at(0))[1])
+    told = jax.tree.map(lambda a: np.zeros(a.shape), jax.eval_shape(one, state, at(0))[1])
+    row, unravel = ravel_pytree(told)
 
     def go(carry: Any) -> Any:
         k, _, state, rows = carry
         new, told = one(state, at(k))
         well = jnp.all(healthy(told[0])) | ~strict
         state = jax.tree.map(lambda a, b: jnp.where(well, a, b), new, state)
-        return k + well, well, state, jax.tree.map(lambda table, row: table.at[k].set(row), rows, told)
+        return k + well, well, state, rows.at[k].set(ravel_pytree(told)[0])
 
-    start = jnp.zeros((), int), jnp.array(True), state, rows
+    # One array, for the compiler takes its time for each.
+    start = jnp.zeros((), int), jnp.array(True), state, jnp.zeros((length, len(row)))
     k, _, state, rows = jax.lax.while_loop(lambda carry: carry[1] & (carry[0] < most), go, start)
-    return state, rows, k
+    return state, jax.vmap(unravel)(rows), k
 
 
 def rows_of(tree: Any, rows: slice, length: int) -> Any:
@@ -154,7 +157,7 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
     count = min(run, rows.stop - rows.start)
     # The short rest of a record is padded to a power of two: few shapes, few compilations.
     length = run if run <= 64 or 2 * count > run else max(16, 2 ** int(np.ceil(np.log2(count))))
-    length = length if ends else count
+    length = length if ends or method.healthy is not None else count
     part = slice(rows.start, rows.start + count)
     intervals, given = rows_of(prepared.intervals, part, length), rows_of(observations, part, length)
     begin = adapt(prepared, state, part, None) if adapt else state

@@ -132,8 +132,12 @@ class _Replay:
                 if begin is not None:
                     assert self.setting.method.resume is not None
                     state = self.setting.method.resume(_with(piece.prepared, at.theta, intervals), state, rows, begin)
-                part = jax.tree.map(lambda a: a[rows], (intervals, observations))  # noqa: B023
-                state, more = _advance(self.setting.method.step, state, *part)
+                count = rows.stop - rows.start
+                # Runs that end where their lattice no longer holds have any length: few shapes, few compilations.
+                length = count if self.setting.method.healthy is None else 2 ** int(np.ceil(np.log2(count)))
+                which = np.minimum(np.arange(rows.start, rows.start + length), rows.stop - 1)
+                part = jax.tree.map(lambda a: a[which], (intervals, observations))  # noqa: B023
+                state, more = _advance(self.setting.method.step, state, *part, None if length == count else count)
                 total = total + more
         return total
 
@@ -167,15 +171,26 @@ def _merged(piece: Piece) -> list[tuple[slice, Any]]:
 
 
 @partial(jax.jit, static_argnums=0)
-def _advance(step, state, intervals, observations):
-    """The last state of a run and its log-likelihood; to differentiate, a step is computed again and only states are kept."""
+def _advance(step, state, intervals, observations, count):
+    """The last state of a run and its log-likelihood; to differentiate, a step is computed again and only states are kept.
+
+    With `count` only so many of the steps are taken.
+    """
     again = jax.checkpoint(step, prevent_cse=False)
 
     def one(carry, slices):
         new, info = again(slices[0], carry, slices[1])
         return new, info.log_likelihood_increment
 
-    state, increments = scanned(one, state, (intervals, observations))
+    def one_of_some(carry, slices):
+        k, *rest = slices
+        return jax.lax.cond(k < count, one, lambda carry, _: (carry, jnp.zeros(())), carry, rest)
+
+    if count is None:
+        state, increments = scanned(one, state, (intervals, observations))
+    else:
+        length = len(jax.tree.leaves(intervals)[0])
+        state, increments = jax.lax.scan(one_of_some, state, (jnp.arange(length), intervals, observations))
     return state, jnp.sum(increments)
 
 
