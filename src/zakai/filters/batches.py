@@ -134,7 +134,8 @@ class _Adapt:
         method = self.method
         info = jax.tree.map(lambda a: np.swapaxes(a, 0, 1), info)
         again = method.adapt_many(prepared, states, rows, info)
-        if info is None or again is None:
+        # A run that ends early loses nothing by a record that asks for more, unless there is no more for it.
+        if info is None or (again is None) != (method.healthy is not None):
             return again
         if method.healthy is None:
             asks = [method.adapt(prepared, _lane(states, k, 0), rows, _lane(info, k, 0)) is not None for k in range(self.count)]
