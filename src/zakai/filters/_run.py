@@ -93,7 +93,7 @@ def taken(one: Callable[..., Any], healthy: Callable[[Info], Any] | None, state:
     def go(carry: Any) -> Any:
         k, _, state, rows = carry
         new, told = one(state, at(k))
-        well = jnp.all(healthy(told[0])) | ~strict
+        well = jnp.all(healthy(told[0])) | jnp.logical_not(strict)
         state = jax.tree.map(lambda a, b: jnp.where(well, a, b), new, state)
         return k + well, well, state, rows.at[k].set(ravel_pytree(told)[0])
 
