@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from zakai.cli import _interrupt
+from zakai.cli import _compiled, _interrupt
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -17,6 +17,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if arguments is None:
         _interrupt.watch()
+        _compiled.keep()
     try:
         return _run(arguments)
     except KeyboardInterrupt:
