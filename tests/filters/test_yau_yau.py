@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 import pytest
 
@@ -153,3 +154,16 @@ def test_a_lattice_that_needs_too_much_memory_is_refused():
     model, record = linear("samples", 0.1, 1.0, 2)
     with pytest.raises(zakai.InputError, match="option memory"):
         zakai.filter(model, record, "yau-yau", memory=0.001)
+
+
+@pytest.mark.slow
+def test_the_gradient_with_a_sample_at_the_start_is_that_of_finite_differences():
+    model = zakai.Model(
+        state=["x"], drift=["a*sin(x)"], observation=["a*x**3"], observation_kind="samples", observation_noise=[["1"]],
+        parameters={"a": 0.5}, prior={"kind": "gaussian", "mean": [0.5], "cov": [[1.0]]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, np.arange(0.0, 4.0), seed=0)
+    evidence = zakai.log_likelihood(model, record, "yau-yau", parameters=["a"])
+    assert abs(evidence(np.array([0.5])) - zakai.filter(model, record, "yau-yau").log_likelihood) < 1e-7
+    slope = (evidence(np.array([0.5001])) - evidence(np.array([0.4999]))) / 2e-4
+    assert np.allclose(jax.grad(evidence)(np.array([0.5])), slope, rtol=1e-5)

@@ -25,9 +25,9 @@ from zakai import _float64  # noqa: F401
 from zakai.algebra.theorems import any_smooth_system as theorem
 from zakai.densities import GridDensity
 from zakai.errors import InputError
+from zakai.filters import _lattice_choice as choice
 from zakai.filters import _window as window
 from zakai.filters._formulas import Formulas, formulas
-from zakai.filters._lattice_choice import free_memory
 from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters._window import Plan, Room, Shape
 from zakai.filters.observations import Data, Whole, whole_factors
@@ -106,8 +106,8 @@ class Prepared:
     theta: Any
     intervals: Interval
     memory: int
-    # The first state of the last prior, which many records share.
-    first: dict[int, tuple[Any, State]] = field(init=False, default_factory=dict)
+    # Of the last prior, which many records share: the first state; and the lattice after a sample at the start, for gradients.
+    first: dict[Any, tuple[Any, Any]] = field(default_factory=dict)
 
 
 def prepare(
@@ -131,7 +131,7 @@ def prepare(
     follow = model.n > 1 and model.observation_kind == "samples"
     plan = Plan(sizes, float(tolerance), substeps, run=window.RUNS[model.n], follow=follow, order=4)
     system = _system(formulas(model))
-    budget = free_memory() if memory is None else int(memory * 2**20)
+    budget = choice.free_memory() if memory is None else int(memory * 2**20)
     return Prepared(model, system, schedule, plan, theta, _intervals(system, schedule, theta), budget)
 
 
@@ -153,19 +153,23 @@ def observations(prepared: Prepared, data: Data) -> Whole:
 
 def init(prepared: Prepared, prior: Any) -> State:
     """The prior on a lattice that fits it."""
-    known, state = prepared.first.get(id(prior), (None, None))
+    traced = isinstance(prepared.theta, jax.core.Tracer)
+    known, state = (None, None) if traced else prepared.first.get(id(prior), (None, None))
     if known is not prior or state is None:
         with jax.ensure_compile_time_eval():
             first, plan, _ = window.first_field(prepared.model, prior, None, prepared.plan)
             state = _looked_at(prepared, first, plan, prepared.model.start)
-        prepared.first.clear()
-        prepared.first[id(prior)] = prior, state
+        if not traced:
+            prepared.first.clear()
+            prepared.first[id(prior)] = prior, state
     return state
 
 
 def correct(prepared: Prepared, prior: Any, observation: Whole) -> tuple[State, Info]:
     """The prior after samples at the start itself."""
     model = prepared.model
+    if isinstance(prepared.theta, jax.core.Tracer):
+        return _corrected_again(prepared, prior, observation)
     one = jax.tree.map(lambda a: np.asarray(a)[0], observation)
     with jax.ensure_compile_time_eval():
 
@@ -176,8 +180,32 @@ def correct(prepared: Prepared, prior: Any, observation: Whole) -> tuple[State, 
         first, plan, after = window.first_field(model, prior, log_factor, prepared.plan)
         state = _looked_at(prepared, first, plan, model.start)
         mean, cov = _moments(first)
-        health = {name: jnp.zeros(()) for name in ("aliasing", "edge_mass", "time_error", "lost", "missed")}
-    return state, Info(jnp.asarray(after - before), mean, cov, health)
+    prepared.first["corrected"] = prior, (first, plan, before)
+    return state, Info(jnp.asarray(after - before), mean, cov, _no_health())
+
+
+def _no_health() -> dict[str, jax.Array]:
+    return {name: jnp.zeros(()) for name in ("aliasing", "edge_mass", "time_error", "lost", "missed")}
+
+
+def _corrected_again(prepared: Prepared, prior: Any, observation: Whole) -> tuple[State, Info]:
+    """`correct` for traced parameters, on the lattice that an ordinary run has found."""
+    model = prepared.model
+    known, (field, plan, before) = prepared.first["corrected"]
+    assert known is prior
+    points = (field.centre + _index(plan.sizes) @ field.basis.T).reshape(*plan.sizes, model.n)
+    with np.errstate(all="ignore"):
+        logs = choice.prior_box(model, prior)[1](points)
+    one = jax.tree.map(lambda a: a[0], observation)
+    factor = _log_factor(prepared.system.observe(points, model.start, prepared.theta), one, 1.0) + one.constant
+    logs = np.where(np.isnan(logs), -np.inf, logs) + factor
+    top = jax.lax.stop_gradient(jnp.max(logs))
+    values = jnp.exp(logs - top)
+    mass = jnp.sum(values)
+    gained = top + jnp.log(mass) + np.log(abs(np.linalg.det(np.asarray(field.basis)))) - before
+    state = _looked_at(prepared, Field(values / mass, field.centre, field.basis), plan, model.start)
+    mean, cov = _moments(state.field)
+    return state, Info(gained, mean, cov, _no_health())
 
 
 def _looked_at(prepared: Prepared, field: Field, plan: Plan, time: float) -> State:

@@ -153,7 +153,12 @@ class _Path:
 
 
 def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    return (matrices @ vectors[..., None])[..., 0]
+    if matrices.ndim > 2:
+        return (matrices @ vectors[..., None])[..., 0]
+    diagonal = np.diagonal(matrices)
+    if matrices.shape[0] == matrices.shape[1] and np.array_equal(matrices, np.diag(diagonal)):
+        return vectors * diagonal
+    return vectors @ matrices.T
 
 
 def _checked_times(model: Model, times: Any) -> np.ndarray:
