@@ -59,6 +59,8 @@ class Method:
     A method with `adapt` has `resume(prepared, state, rows, begin)` beside it: the traced `state`, laid on the lattice and
     given the static plan of `begin`, the state with which an ordinary run began the intervals `rows` (a slice of those of
     `prepared`).  Only the values depend on theta; the lattice of `begin` is a constant.  None: the method has no gradient.
+    Where `correct` cannot be traced, `correct_again(prepared, prior, observation, begin)` can: `begin` is what `correct` gave an
+    ordinary run.
 
     Batches.  `init`, `observations` and `step` serve many records at once as they are.  A method with `adapt` has
     `adapt_many(prepared, states, rows, info)`: `states` and `info` have a leading axis of records, and all records get one
@@ -82,6 +84,7 @@ class Method:
     adapt: Callable[..., Any] | None = None
     with_parameters: Callable[..., Any] | None = None
     resume: Callable[..., Any] | None = None
+    correct_again: Callable[..., Any] | None = None
     adapt_many: Callable[..., Any] | None = None
     healthy: Callable[[Info], Any] | None = None
     bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)

@@ -162,7 +162,7 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
     intervals, given = rows_of(prepared.intervals, part, length), rows_of(observations, part, length)
     begin = adapt(prepared, state, part, None) if adapt else state
     strict = True
-    for tries in range(TRIES + 1):
+    for tries in range(TRIES + 2):
         end, told, taken = scan(method.step, method.healthy, begin, intervals, given, keep, (count, strict))
         taken = int(taken)
         if not strict or (method.healthy is not None and taken >= min(count, max(1.0, enough * run))):
@@ -194,6 +194,7 @@ class Run:
         self.keep, self.must_keep = keep != "moments", keep == "densities"
         self.pieces: list[Piece] | None = [] if recorded else None
         self.first: Any = None
+        self.corrected: Any = None
         self.state: Any = None
         self.bytes = 0
         self.done = 0
@@ -237,6 +238,7 @@ class Run:
         if self.at_start:
             observation = method.observations(prepared, self.data.part(slice(0, 1)))
             self.state, info = method.correct(prepared, prior, observation)
+            self.corrected = self.state
             self.infos.append(jax.tree.map(lambda a: np.asarray(a)[None], info))
             self._keep_one(prepared, 1)
             self.done = 1

@@ -149,7 +149,11 @@ class _Replay:
             prepared = _with(run.first, theta, run.first.intervals)
             if not run.at_start:
                 return method.init(prepared, prior), jnp.zeros(())
-            state, info = method.correct(prepared, prior, method.observations(prepared, reading))
+            observation = method.observations(prepared, reading)
+            if method.correct_again is None:
+                state, info = method.correct(prepared, prior, observation)
+            else:
+                state, info = method.correct_again(prepared, prior, observation, run.corrected)
             return state, info.log_likelihood_increment
 
         return start

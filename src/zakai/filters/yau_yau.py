@@ -106,8 +106,8 @@ class Prepared:
     theta: Any
     intervals: Interval
     memory: int
-    # Of the last prior, which many records share: the first state; and the lattice after a sample at the start, for gradients.
-    first: dict[Any, tuple[Any, Any]] = field(default_factory=dict)
+    # The first state of the last prior, which many records share.
+    first: dict[int, tuple[Any, State]] = field(init=False, default_factory=dict)
 
 
 def prepare(
@@ -153,23 +153,19 @@ def observations(prepared: Prepared, data: Data) -> Whole:
 
 def init(prepared: Prepared, prior: Any) -> State:
     """The prior on a lattice that fits it."""
-    traced = isinstance(prepared.theta, jax.core.Tracer)
-    known, state = (None, None) if traced else prepared.first.get(id(prior), (None, None))
+    known, state = prepared.first.get(id(prior), (None, None))
     if known is not prior or state is None:
         with jax.ensure_compile_time_eval():
             first, plan, _ = window.first_field(prepared.model, prior, None, prepared.plan)
             state = _looked_at(prepared, first, plan, prepared.model.start)
-        if not traced:
-            prepared.first.clear()
-            prepared.first[id(prior)] = prior, state
+        prepared.first.clear()
+        prepared.first[id(prior)] = prior, state
     return state
 
 
 def correct(prepared: Prepared, prior: Any, observation: Whole) -> tuple[State, Info]:
     """The prior after samples at the start itself."""
     model = prepared.model
-    if isinstance(prepared.theta, jax.core.Tracer):
-        return _corrected_again(prepared, prior, observation)
     one = jax.tree.map(lambda a: np.asarray(a)[0], observation)
     with jax.ensure_compile_time_eval():
 
@@ -180,7 +176,6 @@ def correct(prepared: Prepared, prior: Any, observation: Whole) -> tuple[State, 
         first, plan, after = window.first_field(model, prior, log_factor, prepared.plan)
         state = _looked_at(prepared, first, plan, model.start)
         mean, cov = _moments(first)
-    prepared.first["corrected"] = prior, (first, plan, before)
     return state, Info(jnp.asarray(after - before), mean, cov, _no_health())
 
 
@@ -188,11 +183,10 @@ def _no_health() -> dict[str, jax.Array]:
     return {name: jnp.zeros(()) for name in ("aliasing", "edge_mass", "time_error", "lost", "missed")}
 
 
-def _corrected_again(prepared: Prepared, prior: Any, observation: Whole) -> tuple[State, Info]:
-    """`correct` for traced parameters, on the lattice that an ordinary run has found."""
-    model = prepared.model
-    known, (field, plan, before) = prepared.first["corrected"]
-    assert known is prior
+def correct_again(prepared: Prepared, prior: Any, observation: Whole, begin: State) -> tuple[State, Info]:
+    """`correct` for traced parameters, on the lattice of the state that an ordinary run began with."""
+    model, plan, field = prepared.model, begin.plan, jax.tree.map(np.asarray, begin.field)
+    _, _, before = window.first_field(model, prior, None, prepared.plan)
     points = (field.centre + _index(plan.sizes) @ field.basis.T).reshape(*plan.sizes, model.n)
     with np.errstate(all="ignore"):
         logs = choice.prior_box(model, prior)[1](points)
@@ -202,7 +196,7 @@ def _corrected_again(prepared: Prepared, prior: Any, observation: Whole) -> tupl
     top = jax.lax.stop_gradient(jnp.max(logs))
     values = jnp.exp(logs - top)
     mass = jnp.sum(values)
-    gained = top + jnp.log(mass) + np.log(abs(np.linalg.det(np.asarray(field.basis)))) - before
+    gained = top + jnp.log(mass) + np.log(abs(np.linalg.det(field.basis))) - before
     state = _looked_at(prepared, Field(values / mass, field.centre, field.basis), plan, model.start)
     mean, cov = _moments(state.field)
     return state, Info(gained, mean, cov, _no_health())
@@ -410,6 +404,7 @@ METHOD = Method(
     prepare=prepare,
     init=init,
     correct=correct,
+    correct_again=correct_again,
     observations=observations,
     step=step,
     density=density,
