@@ -29,6 +29,11 @@ LATTICE = {1: (33, 0.375), 2: (13, 1.0), 3: (9, 1.1), 4: (5, 1.3), 5: (4, 1.5)}
 # A lattice is laid so often, each time wider by this factor than the product that was found on the one before.
 _LAID = 3
 _STRETCH = 1.25
+# Of the weights that make up for what single products lose: what is added to a matrix of norm one, the largest relative change,
+# and the share below which a component keeps its weight.
+_RIDGE, _CHANGE, _LIGHT = 1e-3, 0.5, 1e-12
+# An empty slot has minus this for the logarithm of its weight where minus infinity would make no number.
+_EMPTY = 1e30
 
 
 class Rule(NamedTuple):
@@ -79,11 +84,12 @@ def points(sum_: Components, gain: jax.Array, nodes: jax.Array) -> jax.Array:
 
 
 def refit(
-    sum_: Components, log_factor: Callable[[jax.Array], jax.Array], directions: np.ndarray, sharp: bool
+    sum_: Components, log_factor: Callable[[jax.Array], jax.Array], directions: np.ndarray, sharp: bool, products: int = 0
 ) -> Refitted:
     """The sum times exp(log_factor), which takes (K, Q, n) and gives (K, Q).
 
     sharp: the factor may be much narrower than a component, as that of a sample may, and have several peaks there.
+    products: for how many such products the weights make up for the shape that each loses; one state, not sharp.
     """
     k = directions.shape[1]
     zero = jnp.zeros(len(sum_.signs))
@@ -111,8 +117,49 @@ def refit(
     means = sum_.means + jnp.einsum("kia,ka->ki", gain, shift)
     covs = sum_.covs + jnp.einsum("kia,kab,kjb->kij", gain, cov - jnp.eye(k), gain)
     new = Components(sum_.log_weights + log_mass, means, 0.5 * (covs + jnp.swapaxes(covs, 1, 2)), sum_.signs)
+    if products and sum_.means.shape[1] == 1 and not sharp:
+        new = _rebalanced(sum_, new, points(sum_, gain, nodes)[..., 0], values, rule, products)
     moved = jnp.sqrt(jax.lax.stop_gradient(jnp.sum(shift**2, -1)))
     return Refitted(new, moved, jax.lax.stop_gradient(_divergence(logs, values, z, log_mass, cov)), doubt)
+
+
+def _rebalanced(old: Components, new: Components, x: jax.Array, values: jax.Array, rule: Rule, products: int) -> Components:
+    """`new`, which has the moments of each product, with weights that make up for the shape that each lost; one state.
+
+    A product's skewness, lost at every reading, adds up to a wrong evidence of each mode; neighbours can carry it.  With
+    p = sum_i w_i N_i e^g, known at nodes x (K, Q), and q = `new` this is Newton's step for the weights w_j (1 + e_j) of least
+    E_p log(p / q),
+
+        sum_l E_p[r_j r_l] e_l = E_p[r_j] - E_q[r_j],    r_j = w_j N_j / q,
+
+    as many times as there were `products` that lost about the same.  Since sum_j r_j = 1, components that overlap no others
+    keep their weight, and modes their mass.
+    """
+    log_mass = jax.nn.logsumexp(new.log_weights)
+    before, after = (jnp.where(jnp.isfinite(v.log_weights), v.log_weights - log_mass, -_EMPTY) for v in (old, new))
+    wide = old.covs[:, :1, 0] + 1e-280
+    narrow = jnp.maximum(new.covs[:, :1, 0], 1e-12 * wide)
+    height, half = after[:, None] - 0.5 * jnp.log(narrow), jnp.sqrt(0.5 / narrow)
+
+    def logs(y):
+        return height - ((y - new.means) * half) ** 2
+
+    log_weights = np.log(rule.weights)
+    p = jnp.exp(before[:, None] + values + log_weights).reshape(-1)
+    q = jnp.exp(logs(x) + 0.5 * (jnp.log(wide) + rule.nodes[:, 0] ** 2) + log_weights).reshape(-1)
+    share = jnp.exp(after)
+    counted = share > _LIGHT
+    scale = jnp.where(counted, jax.lax.rsqrt(jnp.where(counted, share, 1.0)), 0.0)
+    parts = jnp.exp(logs(x.reshape(-1)))
+    parts = parts * scale[:, None] / jnp.maximum(jnp.sum(parts, axis=0), 1e-290)
+    gram = (parts * p) @ parts.T + _RIDGE * jnp.eye(len(share))
+    # A sum and no product of a matrix and a vector, which takes several times as long here.
+    slope = jnp.sum(parts * (p - q), axis=1)
+    change = products * scale * jax.scipy.linalg.solve(gram, slope, assume_a="pos")
+    change = jnp.where(jnp.all(jnp.isfinite(change)), change, 0.0)
+    # The step is shortened as a whole: of near-duplicates the changes cancel, and one of them cut short alone would not.
+    change = change / jnp.maximum(1.0, jnp.max(jnp.abs(change)) / _CHANGE)
+    return new._replace(log_weights=new.log_weights + jnp.log1p(change) - jnp.log1p(jnp.sum(share * change)))
 
 
 def refit_affine(sum_: Components, C: jax.Array, c: jax.Array, linear: jax.Array, energy: jax.Array) -> Components:

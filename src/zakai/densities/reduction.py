@@ -18,6 +18,10 @@ import numpy as np
 from zakai.densities.components import Components, wrapped
 
 PRUNED = 1e-7
+# Between readings that say little less is dropped: what is light may be the seed of a mode, and costs little to put together.
+_DROPPED = 1e-12
+# There weights count by this power: a light mode that may become the heavy one needs components of its own.
+_POWER = 0.7
 # A component of no variance counts as one of this share of the others'; what is further apart than _FAR is just far.
 _POINT, _TINY, _FAR = 1e-12, 1e-100, 1e100
 # A split leaves about a quarter of a loss that is quadratic in the variance.
@@ -31,8 +35,10 @@ class Exchanged(NamedTuple):
     together: Any
 
 
-def pair_costs(share: Any, means: Any, covs: Any, loss: Any, angles: tuple[int, ...] = (), xp: Any = jnp) -> Any:
-    """What putting together components i and j would cost, (K, K): nats of relative entropy, weighted.
+def pair_costs(
+    share: Any, means: Any, covs: Any, loss: Any, angles: tuple[int, ...] = (), xp: Any = jnp, power: float = 1.0
+) -> Any:
+    """What putting together components i and j would cost, (K, K): nats of relative entropy, weighted by their share^power.
 
     The loss of the pair as one Gaussian, and the relative entropy of the pair's shape: for components far apart Runnalls' (2007)
     bound, for close ones the leading cumulants (skewness^2 / 12 + kurtosis^2 / 48), whichever is smaller.
@@ -65,7 +71,7 @@ def pair_costs(share: Any, means: Any, covs: Any, loss: Any, angles: tuple[int, 
     # What the pair would lose as one, beyond what the two lose now.
     bent = xp.maximum(loss[:, None], loss) * (1.0 + between) ** 2 - alpha * loss[:, None] - beta * loss
     dead = (share[:, None] <= 0) | (share <= 0) | xp.eye(len(share), dtype=bool)
-    cost = both * (bent + shape)
+    cost = both**power * (bent + shape)
     # Two whose cost does not exist are the last that are put together, and not the first.
     return xp.where(dead, xp.inf, xp.where(xp.isnan(cost), _FAR, cost))
 
@@ -83,17 +89,18 @@ def exchange(
     K = len(share)
     tries = max(1, K // 4)
     share, loss = jax.lax.stop_gradient(share), jax.lax.stop_gradient(loss)
-    alive = share > PRUNED
+    alive = share > _DROPPED
     pruned = jnp.sum(jnp.where(alive, 0.0, share))
     share = jnp.where(alive, share, 0.0)
     index = jnp.arange(K)
 
-    gains = share * loss
+    gains = share**_POWER * loss
     parents = jnp.argsort(-gains)[:tries]
     gain = gains[parents]
     wanted = gain > tolerance / K
     kept = jnp.zeros(K, bool).at[jnp.where(wanted, parents, K)].set(True, mode="drop")
-    costs = jax.lax.stop_gradient(pair_costs(jnp.where(kept, 0.0, share), sum_.means, sum_.covs, loss, angles))
+    others = jnp.where(kept, 0.0, share)
+    costs = jax.lax.stop_gradient(pair_costs(others, sum_.means, sum_.covs, loss, angles, power=_POWER))
     nearest = jnp.argmin(costs, axis=1)
     mutual = (nearest[nearest] == index) & (index < nearest)
     pair_cost = jnp.where(mutual, jnp.min(costs, axis=1), jnp.inf)
@@ -107,7 +114,9 @@ def exchange(
     count = jnp.maximum(0, 2 * jnp.sum(accepted) - free)
     merged, gone = _merge(sum_, pairs, nearest[pairs], place < count, angles)
     alive = alive & ~gone
-    together = jnp.sum(jnp.where(accepted, price, 0.0))
+    # What is told is in nats, whatever the power.
+    nats = pair_cost[pairs] * (share[pairs] + share[nearest[pairs]]) ** (1.0 - _POWER)
+    together = jnp.sum(jnp.where(place < count, nats, 0.0))
     empty = jnp.argsort(alive)[: 2 * tries]
     new = merged._replace(log_weights=jnp.where(alive, merged.log_weights, -jnp.inf))
     return _split(new, parents, axis[parents], empty, accepted), Exchanged(pruned, together)

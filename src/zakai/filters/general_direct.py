@@ -75,6 +75,8 @@ class Sum:
         self.reduction, self.tolerance, self.alpha = reduction, tolerance, alpha
         self.rounds = rounds
         self.sampled = model.observation_kind == "samples"
+        # The last factor of an interval makes up for what both halves lose; other reductions may have negative parts.
+        self.products = 1 + bool(self.system.halves) if reduction == "split-merge" else 0
         # Whether components are split before each reading rather than after it.
         self.roomy = self.sampled and bool(self.directions.shape[1]) and reduction == "split-merge"
 
@@ -364,8 +366,7 @@ def _move(flow: Flow, v: Components, inputs: jax.Array) -> Components:
 
 def _observe(static: Sum, v: Components, slots, edge, after, factor: Factors, precision, t, theta) -> tuple[Components, Info]:
     """The factor at the end of an interval, and what the step tells."""
-    zero = jnp.zeros(())
-    pruned, together = zero, zero
+    pruned = together = jnp.zeros(())
     bent = bool(static.directions.shape[1])
     at_once = static.sampled or factor.energy is not None
     room = bent and at_once and static.reduction == "split-merge"
@@ -380,7 +381,7 @@ def _observe(static: Sum, v: Components, slots, edge, after, factor: Factors, pr
 
         v, dropped = jax.lax.scan(split, padded(v, (1 + _EXTRA) * size), None, length=ROUNDS)
         pruned = jnp.sum(dropped)
-    product = _multiply(static, v, after, factor, t, theta)
+    product = _multiply(static, v, after, factor, t, theta, static.products)
     v = product.sum
     share, log_mass = _share_of_u(static, v, t, theta)
     moved, nonlinearity, doubt = (jnp.sum(jnp.where(share > 0, share * a, 0.0)) for a in product[1:])
@@ -426,8 +427,8 @@ def _exchange(static: Sum, v: Components, share, slots, precision, t, theta):
     return exchange(v, share, loss, axis, static.tolerance, slots, static.angles)
 
 
-def _multiply(static: Sum, v: Components, linear, factor: Factors | None, t, theta) -> Refitted:
-    """v exp(linear.h - h'(energy) h / 2 + constant), with energy and constant of `factor`."""
+def _multiply(static: Sum, v: Components, linear, factor: Factors | None, t, theta, products: int = 0) -> Refitted:
+    """v exp(linear.h - h'(energy) h / 2 + constant), with energy and constant of `factor`; `products` is that of `refit`."""
     energy = None if factor is None else factor.energy
     constant = 0.0 if factor is None else factor.constant
     if static.affine:
@@ -441,10 +442,9 @@ def _multiply(static: Sum, v: Components, linear, factor: Factors | None, t, the
             return value
         return value - 0.5 * sum(energy[i, j] * a * b for i, a in enumerate(h) for j, b in enumerate(h))
 
-    told = refit(v, log_factor, static.directions, energy is not None)
+    told = refit(v, log_factor, static.directions, energy is not None, products)
     # Where nothing was read, nothing is summed again.
-    zero = jnp.zeros(len(v.signs))
-    same = Refitted(v._replace(log_weights=v.log_weights + constant), zero, zero, zero)
+    same = Refitted(v._replace(log_weights=v.log_weights + constant), *[jnp.zeros(len(v.signs))] * 3)
     read = jnp.any(linear != 0) if energy is None else jnp.any(linear != 0) | jnp.any(energy != 0)
     return jax.tree.map(lambda a, b: jnp.where(read, a, b), told, same)
 
