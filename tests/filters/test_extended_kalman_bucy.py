@@ -234,8 +234,14 @@ def test_the_densities_are_the_gaussians(increments):
 def test_auto_never_chooses_it_and_wrong_options_are_named():
     cubic = zakai.load_model("gallery:cubic-sensor")
     record = zakai.Record([0.1], [[0.0]], "increments")
+    ring = zakai.Model(
+        state=["a", "b", "c", "d", "e"],
+        drift=["cos(b)", "cos(c)", "cos(d)", "cos(e)", "cos(a)"],
+        observation=["a**3"],
+        prior={"kind": "gaussian", "mean": [0.0] * 5, "cov": np.eye(5).tolist()},
+    )
     with pytest.raises(zakai.ConditionError, match="extended-kalman-bucy"):
-        zakai.filter(cubic, record)
+        zakai.filter(ring, record)
     for options, said in [({"riccati": "rk4"}, "riccati"), ({"substeps": 0}, "substeps"), ({"steps": 2}, "riccati, substeps")]:
         with pytest.raises(InputError, match=said):
             run(cubic, record, **options)
