@@ -34,7 +34,6 @@ SYSTEMS = {
 # that differ in rounding come to differ by as much as each is off; on the other system both sums are exact but for the cut prior.
 NEAR = {"general-direct": 2e-2, "gaussian-sum": 5e-4}
 LONG_TO_COMPILE = ("general-direct", "gaussian-sum", "wei-norman", "limited-direct", "kolmogorov-series", "yau-yau")
-ON_ONE_SYSTEM = ("general-direct", "gaussian-sum", "yau-yau")
 LONGEST_TO_COMPILE = ("general-direct", "gaussian-sum")
 # A method whose lattice is as good as it was asked to be is asked for more where rounding is to be compared.
 OPTIONS = {"yau-yau": {"tolerance": 1e-8}}
@@ -63,7 +62,7 @@ def case(method: str, name: str, costly: bool) -> object:
     marks = []
     if name not in holds:
         marks.append(pytest.mark.skip(reason=f"the theorem of {method} does not hold for the {name} system"))
-    elif name != holds[-1] and costly and method in ON_ONE_SYSTEM:
+    elif name != holds[-1] and costly and method in LONG_TO_COMPILE:
         marks.append(pytest.mark.skip(reason=f"{method} takes long to compile, and is tested on the {holds[-1]} system"))
     elif name != holds[-1] or (costly and method in LONG_TO_COMPILE) or method in LONGEST_TO_COMPILE:
         marks.append(pytest.mark.slow)
