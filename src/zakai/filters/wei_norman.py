@@ -29,7 +29,7 @@ from zakai.filters import _lattice_choice as choice
 from zakai.filters._exponentials import STEP, System, system_of
 from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters.observations import Data, Factors, factors, noise_at
-from zakai.kolmogorov import spectral
+from zakai.kolmogorov import resolution, spectral
 from zakai.kolmogorov.spectral import Field, Generator
 from zakai.models.compile import jax_field
 from zakai.models.model import Model
@@ -178,7 +178,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
     # Where a coordinate is missing L_0 and the algebra are others: what is known of the observation acts inside, on the density.
     state = lax.cond(interval.whole, lambda: state, lambda: _formed(state))
     zero = jnp.zeros(())
-    health = _Health(spectral.aliasing(state.field.values), zero, zero, zero, zero)
+    health = _Health(resolution.aliasing(state.field.values), zero, zero, zero, zero)
     coefficients, directions = system.numbers(theta)
     rates = observation.inputs[1:]
 
@@ -198,9 +198,9 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
         state = _driven(state, generator, density, shift, tau)
         far = jnp.max(jnp.abs(shift) / (field.cell * np.array(field.values.shape))) > _SHIFT
         health = _Health(
-            jnp.maximum(health.aliasing, jnp.maximum(noise, spectral.aliasing(density))),
+            jnp.maximum(health.aliasing, jnp.maximum(noise, resolution.aliasing(density))),
             jnp.maximum(health.exponent, exponent),
-            jnp.maximum(health.edge, spectral.edge_mass(density)),
+            jnp.maximum(health.edge, resolution.edge_mass(density)),
             jnp.maximum(health.surprise, jnp.max(jnp.abs(state.driven))),
             health.parts + 1,
         )
@@ -297,7 +297,7 @@ def _read(state: State, observation: Factors, health: _Health) -> tuple[State, _
     mean = lax.stop_gradient(spectral.moments(state.field)[1])
     driven = state.driven + (mean - before) / jnp.sqrt(jnp.diagonal(cov))
     health = health._replace(
-        aliasing=jnp.maximum(health.aliasing, spectral.aliasing(density)),
+        aliasing=jnp.maximum(health.aliasing, resolution.aliasing(density)),
         exponent=jnp.maximum(health.exponent, exponent),
         surprise=jnp.maximum(health.surprise, jnp.max(jnp.abs(driven))),
     )

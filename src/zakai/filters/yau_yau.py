@@ -31,7 +31,7 @@ from zakai.filters._formulas import Formulas, formulas
 from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters._window import Plan, Room, Shape
 from zakai.filters.observations import Data, Whole, whole_factors
-from zakai.kolmogorov import comoving
+from zakai.kolmogorov import comoving, resolution
 from zakai.kolmogorov.comoving import Field
 from zakai.models.compile import jax_field, jax_function
 from zakai.models.model import Model
@@ -268,7 +268,7 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
     def looked_at(values: jax.Array, noise: Any, error: Any, grown: Any) -> _Worst:
         # Noise is the same everywhere; what a formula of order four leaves is a polynomial of degree five times the density.
         lost = noise * jnp.exp(jnp.minimum(grown, 99.0))
-        return _Worst(comoving.aliasing(values), comoving.edge_mass(values), error * (1 + grown) ** 2.5, lost)
+        return _Worst(resolution.aliasing(values), resolution.edge_mass(values), error * (1 + grown) ** 2.5, lost)
 
     def split(carry: Any, k: Any) -> tuple[Any, None]:
         field, observed, log_mass, spent, worst = carry

@@ -24,6 +24,7 @@ import numpy as np
 from jax import lax
 
 from zakai import _float64  # noqa: F401
+from zakai.kolmogorov.resolution import along
 
 LOST = 1e-14  # of the maximum: what rounding leaves
 _TERMS = 10  # of the exponential of the basis' motion
@@ -63,13 +64,6 @@ def combined(matrix: Any, sizes: Sequence[int]) -> list[Any]:
 def points_of(sizes: Sequence[int], centre: Any, basis: Any) -> jax.Array:
     """centre + basis z (*sizes, n)."""
     return centre + jnp.stack(combined(basis, sizes), axis=-1)
-
-
-def along(matrix: Any, values: jax.Array, axis: int) -> jax.Array:
-    """A matrix applied to one axis of an array."""
-    if values.ndim == 1:
-        return matrix @ values
-    return jnp.moveaxis(jnp.tensordot(matrix, values, axes=([1], [axis])), 0, axis)
 
 
 @lru_cache(maxsize=64)
@@ -332,21 +326,3 @@ def _shifted(values: jax.Array, axis: int, shift: jax.Array) -> jax.Array:
 def noise(values: jax.Array) -> jax.Array:
     """What is not known of the values, as a share of their maximum: what is negative is noise, as is what rounding leaves."""
     return lax.stop_gradient(jnp.maximum(LOST, -jnp.min(values) / jnp.max(values)))
-
-
-def edge_mass(values: jax.Array) -> jax.Array:
-    """The share of the mass in the two outermost layers."""
-    outer = jnp.zeros(())
-    for d, size in enumerate(values.shape):
-        for begin in (0, size - 2):
-            outer = outer + jnp.sum(lax.slice_in_dim(values, begin, begin + 2, axis=d))
-    return outer / jnp.sum(values)
-
-
-def aliasing(values: jax.Array) -> jax.Array:
-    """How much of the density is at the highest frequency of an axis, relative to its mass: of a resolved one nothing."""
-    worst = jnp.zeros(())
-    for d, size in enumerate(values.shape):
-        signs = 1.0 - 2.0 * (np.arange(size) % 2)
-        worst = jnp.maximum(worst, jnp.sum(jnp.abs(jnp.tensordot(signs, values, axes=([0], [d])))))
-    return worst / jnp.sum(values)

@@ -21,6 +21,7 @@ import numpy as np
 from jax import lax
 
 from zakai import _float64  # noqa: F401
+from zakai.kolmogorov.resolution import along
 
 DEGREE = 20  # of the Taylor polynomial
 STABLE = 6.0  # largest tau |L_0| for which it is stable, with something to spare
@@ -67,11 +68,6 @@ class Generator(NamedTuple):
         diffusion = 0.5 * highest @ jnp.abs(self.covariance) @ highest
         transport = sum(jnp.max(jnp.abs(f)) * highest[i] for i, f in enumerate(self.drift))
         return diffusion + transport + jnp.max(jnp.abs(self.potential))
-
-
-def along(matrix: Any, values: jax.Array, axis: int) -> jax.Array:
-    """A matrix applied to one axis of an array."""
-    return jnp.moveaxis(jnp.tensordot(matrix, values, axes=([1], [axis])), 0, axis)
 
 
 def _derivative(size: int) -> np.ndarray:
@@ -129,24 +125,6 @@ def resampled(field: Field, low: Any, cell: Any) -> Field:
         at = (low[d] + cell[d] * np.arange(size) - field.low[d]) / field.cell[d]
         values = along(jnp.sinc(at[:, None] - np.arange(size)), values, d)
     return Field(values, jnp.asarray(low), jnp.asarray(cell))
-
-
-def aliasing(values: jax.Array) -> jax.Array:
-    """How much of the density is at the highest frequency of an axis, relative to its mass: of a resolved one nothing."""
-    worst = jnp.zeros(())
-    for d, size in enumerate(values.shape):
-        signs = 1.0 - 2.0 * (np.arange(size) % 2)
-        worst = jnp.maximum(worst, jnp.sum(jnp.abs(jnp.tensordot(signs, values, axes=([0], [d])))))
-    return worst / jnp.sum(values)
-
-
-def edge_mass(values: jax.Array) -> jax.Array:
-    """The share of the mass in the two outermost layers."""
-    outer = jnp.zeros(())
-    for d, size in enumerate(values.shape):
-        for begin in (0, size - 2):
-            outer = outer + jnp.sum(lax.slice_in_dim(values, begin, begin + 2, axis=d))
-    return outer / jnp.sum(values)
 
 
 def moments(field: Field) -> tuple[jax.Array, jax.Array, jax.Array]:
