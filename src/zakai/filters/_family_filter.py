@@ -23,7 +23,7 @@ from zakai.filters._formulas import formulas
 from zakai.filters._gauge import GaugeFunctions, Posterior, Tilts, gauge_of, posterior
 from zakai.filters._gauged_density import GaugedDensity
 from zakai.filters._protocol import Info, Schedule
-from zakai.filters.observations import Data, Factors, factors
+from zakai.filters.observations import Data, FactorRule, Factors, factor_rule
 from zakai.kolmogorov.families import Family, log_terms, move, read
 from zakai.kolmogorov.flow import Flow
 from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
@@ -132,10 +132,14 @@ def _intervals(plan: Plan, system: AffineSystem, gauge: GaugeFunctions, schedule
 
 def observations(prepared: Prepared, data: Data) -> Factors:
     """What `step` is given for each interval: y runs linearly inside of it, and what cannot is a factor at its end."""
-    found = factors(
+    return rule(prepared, data)(data.filled)
+
+
+def rule(prepared: Prepared, data: Data) -> FactorRule:
+    """The same but for the values."""
+    return factor_rule(
         prepared.model, data, prepared.schedule, rates=True, splitting="strang", remove=False, theta=prepared.theta
     )
-    return found
 
 
 def init(prepared: Prepared, prior: Any) -> State:

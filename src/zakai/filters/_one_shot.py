@@ -30,7 +30,7 @@ from zakai.filters._affine_system import AffineSystem, affine_system_of
 from zakai.filters._formulas import formulas
 from zakai.filters._gauge import posterior
 from zakai.filters._protocol import Info, Schedule
-from zakai.filters.observations import Data, Factors
+from zakai.filters.observations import Data, FactorRule, Factors
 from zakai.kolmogorov.families import Family, move, read
 from zakai.models.model import Model
 
@@ -152,6 +152,11 @@ def _interval(first: base.Prepared) -> Interval:
 def observations(prepared: Prepared, data: Data) -> Factors:
     """The rates of y."""
     return base.observations(prepared.base, data)
+
+
+def rule(prepared: Prepared, data: Data) -> FactorRule:
+    """The same but for the values."""
+    return base.rule(prepared.base, data)
 
 
 def init(prepared: Prepared, prior: Any) -> State:

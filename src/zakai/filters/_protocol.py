@@ -66,6 +66,11 @@ class Method:
     `adapt_many(prepared, states, rows, info)`: `states` and `info` have a leading axis of records, and all records get one
     plan and arrays of one size.  None: records are filtered one by one.
 
+    One reading at a time.  `rule(prepared, data)` is what `observations` gives but for the values of the readings, a pytree whose
+    slices are called with values (m,), zero where there is none: observations(prepared, data) is
+    rule(prepared, data)(data.filled).  None: `observations` is asked for every reading.  `fits(state, info)`, traced by JAX, says
+    of the step that gave them that `adapt` would find nothing to better.  None: `healthy` says it, or `adapt` is asked.
+
     Early ends.  `healthy(info)` says, traced by JAX, whether steps kept their bounds.  A run then ends before the first that did
     not, and where it took enough steps by then, the next run begins there: no step is taken twice.
     """
@@ -87,4 +92,6 @@ class Method:
     correct_again: Callable[..., Any] | None = None
     adapt_many: Callable[..., Any] | None = None
     healthy: Callable[[Info], Any] | None = None
+    rule: Callable[..., Any] | None = None
+    fits: Callable[[Any, Info], Any] | None = None
     bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)

@@ -23,6 +23,7 @@ METHOD = Method(
     init=families.init,
     correct=families.correct,
     observations=families.observations,
+    rule=families.rule,
     step=families.step,
     density=families.density,
     with_parameters=families.with_parameters,

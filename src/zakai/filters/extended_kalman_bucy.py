@@ -125,19 +125,45 @@ def observations(prepared: Prepared, data: Data) -> Observation:
     Readings that were all gathered over just the interval act inside of it; otherwise all act at its end, where increments
     share the noise of the time that they have in common.
     """
+    return rule(prepared, data)(data.filled)
+
+
+class ReadingRule(NamedTuple):
+    """What a Reading is but for the values, each of which is divided by its `spans` (m,)."""
+
+    spans: Any
+    seen: Any
+    scale: Any
+
+    def __call__(self, values: Any) -> Reading:
+        return Reading(values / self.spans, self.seen, self.scale)
+
+
+class Rule(NamedTuple):
+    """What an Observation is but for the values."""
+
+    inside: ReadingRule | None
+    at_end: ReadingRule | None
+
+    def __call__(self, values: Any) -> Observation:
+        return Observation(*(None if part is None else part(values) for part in self))
+
+
+def rule(prepared: Prepared, data: Data) -> Rule:
+    """What `observations` gives but for the values."""
     seen = ~np.isnan(data.values)
-    values = np.where(seen, data.values, 0.0)
     if prepared.system.sampled:
-        return Observation(None, Reading(values, seen.astype(float), np.ones((*values.shape, values.shape[1]))))
+        ones = np.ones((*seen.shape, seen.shape[1]))
+        return Rule(None, ReadingRule(np.where(seen, 1.0, np.inf), seen.astype(float), ones))
     spans = np.where(seen, data.elapsed, 1.0)
-    rates = values / spans
     scale = np.minimum(spans[:, :, None], spans[:, None, :]) / (spans[:, :, None] * spans[:, None, :])
     inside = seen & np.all(prepared.schedule.inside == seen, axis=1, keepdims=True)
     at_end = seen & ~inside
-    return Observation(
-        Reading(np.where(inside, rates, 0.0), inside.astype(float), scale) if inside.any() else None,
-        Reading(np.where(at_end, rates, 0.0), at_end.astype(float), scale) if at_end.any() else None,
-    )
+
+    def part(which: np.ndarray) -> ReadingRule | None:
+        return ReadingRule(np.where(which, spans, np.inf), which.astype(float), scale) if which.any() else None
+
+    return Rule(part(inside), part(at_end))
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -275,6 +301,7 @@ METHOD = Method(
     init=init,
     correct=correct,
     observations=observations,
+    rule=rule,
     step=step,
     density=density,
     with_parameters=with_parameters,

@@ -31,7 +31,7 @@ from zakai.filters._formulas import Formulas, formulas
 from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters._sum_gauge import SumGauge
 from zakai.filters._yau_flow import FlowPlan, System, plan_flows, planned_flows, system_of
-from zakai.filters.observations import Data, Factors, factors, noise_at
+from zakai.filters.observations import Data, FactorRule, Factors, factor_rule, noise_at
 from zakai.kolmogorov.flow import Flow, move_gaussian
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior, MixturePrior
@@ -246,8 +246,13 @@ def with_parameters(prepared: Prepared, theta: Any) -> Prepared:
 
 def observations(prepared: Prepared, data: Data) -> Factors:
     """What `step` is given for each interval."""
+    return rule(prepared, data)(data.filled)
+
+
+def rule(prepared: Prepared, data: Data) -> FactorRule:
+    """The same but for the values."""
     system = prepared.static.system
-    return factors(
+    return factor_rule(
         prepared.model,
         data,
         prepared.schedule,
@@ -481,6 +486,7 @@ METHOD = Method(
     init=init,
     correct=correct,
     observations=observations,
+    rule=rule,
     step=step,
     density=density,
     with_parameters=with_parameters,

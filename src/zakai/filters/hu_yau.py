@@ -141,6 +141,7 @@ METHOD = Method(
     init=_by_form("init"),
     correct=_correct,
     observations=_by_form("observations"),
+    rule=_by_form("rule"),
     step=_step,
     density=_by_form("density"),
     with_parameters=_by_form("with_parameters"),

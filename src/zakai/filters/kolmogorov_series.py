@@ -29,7 +29,7 @@ from zakai.errors import InputError
 from zakai.filters import _lattice_choice as choice
 from zakai.filters._formulas import Formulas, formulas
 from zakai.filters._protocol import Info, Method, Schedule
-from zakai.filters.observations import Data, factors, noise_at
+from zakai.filters.observations import Data, FactorRule, factor_rule, noise_at
 from zakai.kolmogorov import lattice as lat
 from zakai.kolmogorov.heat_series import FORMS, heat_series, transition
 from zakai.kolmogorov.lattice import Lattice
@@ -171,20 +171,35 @@ def with_parameters(prepared: Prepared, theta: Any) -> Prepared:
 
 def observations(prepared: Prepared, data: Data) -> Any:
     """What `step` is given for each interval: the whole likelihood, outside of the transition."""
-
-    def at(theta: Any) -> Reading:
-        model, schedule = prepared.model, prepared.schedule
-        given = factors(model, data, schedule, rates=False, splitting=prepared.splitting, remove=False, theta=theta)
-        xp = np if isinstance(theta, np.ndarray) else jnp
-        spans = np.where(schedule.inside.all(axis=1), schedule.stops - schedule.starts, 0.0)[:, None, None]
-        start, end = (xp.linalg.inv(noise_at(model, times, theta)) * spans for times in (schedule.starts, schedule.stops))
-        start, end = (0.0 * start, end) if prepared.splitting == "lie" else (0.5 * start, 0.5 * end)
-        return Reading(given.before, start, given.after, end if given.energy is None else end + given.energy, given.constant)
-
+    given = rule(prepared, data)(data.filled)
     if data.stops[0] > prepared.model.start or isinstance(prepared.theta, np.ndarray):
-        return at(prepared.theta)
+        return given
     # The lattice of a posterior at the start is chosen for the model's own parameters.
-    return at(prepared.theta), at(prepared.model.theta())
+    return given, rule(prepared, data, prepared.model.theta())(data.filled)
+
+
+class Rule(NamedTuple):
+    """What a Reading is but for the values."""
+
+    factors: FactorRule
+    start: Any
+    end: Any
+
+    def __call__(self, values: Any) -> Reading:
+        given = self.factors(values)
+        end = self.end if given.energy is None else self.end + given.energy
+        return Reading(given.before, self.start, given.after, end, given.constant)
+
+
+def rule(prepared: Prepared, data: Data, theta: Any = None) -> Rule:
+    """What `observations` gives but for the values, for the parameters `theta`, by default those of `prepared`."""
+    model, schedule, theta = prepared.model, prepared.schedule, prepared.theta if theta is None else theta
+    found = factor_rule(model, data, schedule, rates=False, splitting=prepared.splitting, remove=False, theta=theta)
+    xp = np if isinstance(theta, np.ndarray) else jnp
+    spans = np.where(schedule.inside.all(axis=1), schedule.stops - schedule.starts, 0.0)[:, None, None]
+    start, end = (xp.linalg.inv(noise_at(model, times, theta)) * spans for times in (schedule.starts, schedule.stops))
+    start, end = (0.0 * start, end) if prepared.splitting == "lie" else (0.5 * start, 0.5 * end)
+    return Rule(found, start, end)
 
 
 def _log_factor(h: Any, linear: Any, energy: Any) -> Any:
@@ -278,6 +293,13 @@ def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> S
         state = replace(state, substeps=more)
         margin, fineness = margin * (2.0 if narrow else 1.0), fineness * (1.5 if coarse and not narrow else 1.0)
     return _with_transitions(prepared, state, source, which, margin, fineness, info is None)
+
+
+def _kept_bounds(state: State, info: Info) -> Any:
+    """Whether a step kept every bound that `adapt` looks at."""
+    health = info.health
+    kept = (health["edge_mass"] < _EDGE) & (health["quadrature_error"] < _quadrature(_FEW)) & (health["truncation"] < 10 * _GOOD)
+    return kept & (abs(info.log_likelihood_increment) < np.inf)
 
 
 def _is_chosen(prepared: Prepared) -> bool:
@@ -456,6 +478,8 @@ METHOD = Method(
     init=init,
     correct=correct,
     observations=observations,
+    rule=rule,
+    fits=_kept_bounds,
     step=step,
     density=density,
     adapt=adapt,

@@ -28,7 +28,7 @@ from zakai.filters import _lattice_choice as choice
 from zakai.filters._formulas import formulas
 from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters._yau_flow import FlowPlan, System, plan_flows, planned_flows, system_of
-from zakai.filters.observations import Data, Factors, factors
+from zakai.filters.observations import Data, FactorRule, Factors, factor_rule
 from zakai.kolmogorov import lattice as lat
 from zakai.kolmogorov.flow import Flow
 from zakai.kolmogorov.lattice import Lattice
@@ -212,21 +212,23 @@ def _series_flows(model: Model, plan: FlowPlan, order: int | None) -> Flow:
 def observations(prepared: Prepared, data: Data) -> Any:
     """What `step` is given for each interval."""
 
-    def at(theta):
-        return factors(
-            prepared.model,
-            data,
-            prepared.schedule,
-            rates=prepared.system.rates,
-            splitting=prepared.splitting,
-            remove=not prepared.system.bare,
-            theta=theta,
-        )
-
-    given, theta = at(prepared.theta), prepared.model.theta()
+    given = rule(prepared, data)(data.filled)
     # The lattice of a posterior at the start is chosen for the model's own parameters.
     at_start = not isinstance(prepared.theta, np.ndarray) and data.stops[0] == prepared.model.start
-    return (given, at(theta)) if at_start else given
+    return (given, rule(prepared, data, prepared.model.theta())(data.filled)) if at_start else given
+
+
+def rule(prepared: Prepared, data: Data, theta: Any = None) -> FactorRule:
+    """The same but for the values, for the parameters `theta`, by default those of `prepared`."""
+    return factor_rule(
+        prepared.model,
+        data,
+        prepared.schedule,
+        rates=prepared.system.rates,
+        splitting=prepared.splitting,
+        remove=not prepared.system.bare,
+        theta=prepared.theta if theta is None else theta,
+    )
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -369,6 +371,11 @@ def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None
     if lattice is None:
         return replace(states, plan=plan, cut=cut)
     return _looked_at(prepared, lattice, plan, prepared.schedule.starts[rows.start], cut)
+
+
+def _fits(state: State, info: Info) -> Any:
+    """Whether a step kept every bound that `adapt` looks at."""
+    return choice.healthy(info, state.plan)
 
 
 def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State:
@@ -532,6 +539,8 @@ METHOD = Method(
     init=init,
     correct=correct,
     observations=observations,
+    rule=rule,
+    fits=_fits,
     step=step,
     density=density,
     adapt=adapt,

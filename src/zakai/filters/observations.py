@@ -36,6 +36,11 @@ class Data(NamedTuple):
     def part(self, rows: slice) -> Data:
         return Data(*(array[rows] for array in self))
 
+    @property
+    def filled(self) -> np.ndarray:
+        """The values (K, m), zero where there is none."""
+        return np.where(np.isnan(self.values), 0.0, self.values)
+
 
 class Factors(NamedTuple):
     """What multiplies the density, for K intervals: `before` (K, m) at the start, `after` (K, m), `energy` (K, m, m), or None
@@ -48,6 +53,35 @@ class Factors(NamedTuple):
     energy: Any
     constant: Any
     inputs: Any
+
+
+class FactorRule(NamedTuple):
+    """What Factors are but for the values (..., m) of the readings, zero where there are none, of which it makes them.
+
+    `before` and `after` (..., m, m), or None for zero, and 1 / `spans` (..., m), or None for no inputs, multiply the values; the
+    constant is `offset` (...) - values'(`weight`) values / 2.
+    """
+
+    before: Any
+    after: Any
+    energy: Any
+    offset: Any
+    weight: Any
+    spans: Any
+
+    def __call__(self, values: Any) -> Factors:
+        xp = np if isinstance(values, np.ndarray) else jnp
+        nothing = np.zeros(np.shape(values))
+        inputs = xp.ones((*np.shape(values)[:-1], 1))
+        if self.spans is not None:
+            inputs = xp.concatenate([inputs, values / self.spans], axis=-1)
+        return Factors(
+            nothing if self.before is None else _times(self.before, values),
+            nothing if self.after is None else _times(self.after, values),
+            self.energy,
+            _constant(self.offset, self.weight, values),
+            inputs,
+        )
 
 
 def data_of(model: Model, record: Record) -> Data:
@@ -88,42 +122,42 @@ def schedule_of(data: Data, per_coordinate: bool) -> Schedule:
     return Schedule(data.starts, data.stops, inside)
 
 
-def factors(
+def factor_rule(
     model: Model, data: Data, schedule: Schedule, *, rates: bool, splitting: str, remove: bool, theta: Any = None
-) -> Factors:
-    """The factors of a run of intervals, for the parameters `theta` (p,), by default the model's; JAX may trace them.
+) -> FactorRule:
+    """What the factors of a run of intervals are but for the values of the readings, of which `data` says where they are.
 
-    Readings that act inside enter as rates (`rates`: y runs linearly, for affine h) or as exp(h'S^-1 dy), in two halves or,
-    with `splitting="lie"`, whole at the end.  The others are whole factors at the end; with `remove` the energy
-    that the transition holds inside, h'S^-1 h dt / 2, is taken out again there.
+    For the parameters `theta` (p,), by default the model's; JAX may trace them.  Readings that act inside enter as rates
+    (`rates`: y runs linearly, for affine h) or as exp(h'S^-1 dy), in two halves or, with `splitting="lie"`, whole at the end.
+    The others are whole factors at the end; with `remove` the energy that the transition holds inside, h'S^-1 h dt / 2, is
+    taken out again there.
     """
-    count, m = data.values.shape
+    count = len(data.stops)
     theta = model.theta() if theta is None else theta
     xp = np if isinstance(theta, np.ndarray) else jnp
     seen = np.logical_not(np.isnan(data.values))
     inside = schedule.inside
-    whole = np.asarray(inside.all(axis=1))[:, None]
-    values = np.where(seen, data.values, 0.0)
+    whole = np.asarray(inside.all(axis=1))[:, None, None]
     lengths = (data.stops - data.starts)[:, None]
-    before, energy = np.zeros((count, m)), None
-    after, constant = before, np.zeros(count)
-    inputs = np.ones((count, 1 + (m if rates else 0)))
+    before = after = energy = weight = spans = None
+    offset = np.zeros(count)
     noise_end = noise_at(model, data.stops, theta)
     if rates:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inputs[:, 1:] = np.where(inside, values / lengths, 0.0)
+        spans = np.where(inside, lengths, np.inf)
     elif splitting == "lie":
-        after = xp.where(whole, _times(xp.linalg.inv(noise_end), values), 0.0)
+        after = xp.where(whole, xp.linalg.inv(noise_end), 0.0)
     elif whole.any():
-        before = xp.where(whole, 0.5 * _times(xp.linalg.inv(noise_at(model, data.starts, theta)), values), 0.0)
-        after = xp.where(whole, 0.5 * _times(xp.linalg.inv(noise_end), values), 0.0)
+        before = xp.where(whole, 0.5 * xp.linalg.inv(noise_at(model, data.starts, theta)), 0.0)
+        after = xp.where(whole, 0.5 * xp.linalg.inv(noise_end), 0.0)
     if remove and not rates and not whole.all():
-        energy = -xp.where(whole[..., None], 0.0, xp.linalg.inv(noise_end) * lengths[..., None])
-    at_end = seen & ~inside if rates else seen & ~whole
+        energy = -xp.where(whole, 0.0, xp.linalg.inv(noise_end) * lengths[..., None])
+    at_end = seen & ~inside if rates else seen & ~whole[:, 0]
     if at_end.any():
-        more = _at_end(xp, model.observation_kind, values, data.elapsed, at_end, noise_end)
-        energy, after, constant = more[0] if energy is None else energy + more[0], after + more[1], constant + more[2]
-    return Factors(before, after, energy, constant, inputs)
+        more = _at_end(xp, model.observation_kind, data.elapsed, at_end, noise_end)
+        energy = more.energy if energy is None else energy + more.energy
+        after = more.linear if after is None else after + more.linear
+        offset, weight = offset + more.offset, more.weight
+    return FactorRule(before, after, energy, offset, weight, spans)
 
 
 def noise_at(model: Model, times: np.ndarray, theta: Any) -> Any:
@@ -134,26 +168,38 @@ def noise_at(model: Model, times: np.ndarray, theta: Any) -> Any:
     return jax.vmap(jax_function(model.observation_noise, model, (m, m)), (None, 0, None))(origin, jnp.asarray(times), theta)
 
 
-def _at_end(xp, kind, values, elapsed, at_end, noise):
-    """(energy, after, constant) of the readings that act as whole factors at the end; a row may have none."""
+class _AtEnd(NamedTuple):
+    """Readings that act as whole factors at the end: `energy`, and as in a FactorRule `linear`, `offset` and `weight`."""
+
+    energy: Any
+    linear: Any
+    offset: Any
+    weight: Any
+
+
+def _at_end(xp: Any, kind: str, elapsed: np.ndarray, at_end: np.ndarray, noise: Any) -> _AtEnd:
+    """The readings that act as whole factors at the end; a row may have none."""
     both = at_end[:, :, None] & at_end[:, None, :]
     # A coordinate without a reading has a unit variance of its own, which leaves the block of the others alone.
-    alone = np.eye(values.shape[1]) * ~at_end[:, None, :]
+    alone = np.eye(at_end.shape[1]) * ~at_end[:, None, :]
     if kind == "samples":
         noise = xp.where(both, noise, 0.0) + alone
         precision = xp.where(both, xp.linalg.inv(noise), 0.0)
-        after = _times(precision, values)
         log_volume = xp.linalg.slogdet(noise)[1] + np.log(2 * np.pi) * at_end.sum(axis=1)
-        return precision, after, -0.5 * (values * after).sum(axis=1) - 0.5 * log_volume
+        return _AtEnd(precision, precision, -0.5 * log_volume, precision)
     spans = np.where(at_end, elapsed, 0.0)
     # Increments that end together share the noise of the time that they have in common.
     precision = xp.linalg.inv(noise * np.minimum(spans[:, :, None], spans[:, None, :]) + alone)
-    precision = xp.where(both, precision, 0.0)
-    return precision * spans[:, :, None] * spans[:, None, :], spans * _times(precision, values), 0.0
+    linear = spans[:, :, None] * xp.where(both, precision, 0.0)
+    return _AtEnd(linear * spans[:, None, :], linear, np.zeros(len(spans)), None)
 
 
-def _times(matrices, vectors):
+def _times(matrices: Any, vectors: Any) -> Any:
     return (matrices @ vectors[..., None])[..., 0]
+
+
+def _constant(offset: Any, weight: Any, values: Any) -> Any:
+    return offset if weight is None else offset - 0.5 * (values * _times(weight, values)).sum(axis=-1)
 
 
 class Whole(NamedTuple):
@@ -169,12 +215,27 @@ class Whole(NamedTuple):
     inside: Any
 
 
-def whole_factors(model: Model, data: Data, theta: Any) -> Whole:
-    """The likelihoods for the parameters `theta` (p,), which JAX may trace; S is that in the middle of an increment's time."""
+class WholeRule(NamedTuple):
+    """What a Whole is but for the values; `linear`, `offset` and `weight` as in a FactorRule."""
+
+    linear: Any
+    energy: Any
+    offset: Any
+    weight: Any
+    inside: Any
+
+    def __call__(self, values: Any) -> Whole:
+        return Whole(_times(self.linear, values), self.energy, _constant(self.offset, self.weight, values), self.inside)
+
+
+def whole_rule(model: Model, data: Data, theta: Any) -> WholeRule:
+    """What the likelihoods are but for the values of the readings, for the parameters `theta` (p,), which JAX may trace.
+
+    `data` says where there are readings.  S is that in the middle of an increment's time.
+    """
     xp = np if isinstance(theta, np.ndarray) else jnp
     seen = ~np.isnan(data.values)
-    values = np.where(seen, data.values, 0.0)
     inside = (schedule_of(data, True).inside | ~seen).all(axis=1) & (data.stops > data.starts)
     times = np.where(inside, 0.5 * (data.starts + data.stops), data.stops)
-    energy, linear, constant = _at_end(xp, model.observation_kind, values, data.elapsed, seen, noise_at(model, times, theta))
-    return Whole(linear, energy, xp.broadcast_to(constant, (len(values),)), inside.astype(float))
+    found = _at_end(xp, model.observation_kind, data.elapsed, seen, noise_at(model, times, theta))
+    return WholeRule(found.linear, found.energy, found.offset, found.weight, inside.astype(float))

@@ -28,7 +28,7 @@ from zakai.errors import ConditionError, InputError
 from zakai.filters import _lattice_choice as choice
 from zakai.filters._exponentials import STEP, System, system_of
 from zakai.filters._protocol import Info, Method, Schedule
-from zakai.filters.observations import Data, Factors, factors, noise_at
+from zakai.filters.observations import Data, FactorRule, Factors, factor_rule, noise_at
 from zakai.kolmogorov import resolution, spectral
 from zakai.kolmogorov.spectral import Field, Generator
 from zakai.models.compile import jax_field
@@ -130,7 +130,14 @@ def _intervals(model: Model, schedule: Schedule, theta: Any) -> Interval:
 
 def observations(prepared: Prepared, data: Data) -> Factors:
     """What `step` is given for each interval: y runs linearly inside of it, and what cannot is a factor at its end."""
-    return factors(prepared.model, data, prepared.schedule, rates=True, splitting="strang", remove=False, theta=prepared.theta)
+    return rule(prepared, data)(data.filled)
+
+
+def rule(prepared: Prepared, data: Data) -> FactorRule:
+    """The same but for the values."""
+    return factor_rule(
+        prepared.model, data, prepared.schedule, rates=True, splitting="strang", remove=False, theta=prepared.theta
+    )
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -318,6 +325,11 @@ def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> S
     return replace(state, parts=min(parts, _MOST_PARTS))
 
 
+def _fits(state: State, info: Info) -> Any:
+    """Whether the parts of an interval were enough."""
+    return info.health["unfinished"] <= 0
+
+
 def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State:
     """The traced `state` with as many parts as `begin`."""
     return replace(state, parts=begin.parts)
@@ -344,6 +356,8 @@ METHOD = Method(
     init=init,
     correct=correct,
     observations=observations,
+    rule=rule,
+    fits=_fits,
     step=step,
     density=density,
     adapt=adapt,
