@@ -22,7 +22,7 @@ from zakai.algebra.theorems import yau_system
 from zakai.errors import InputError
 from zakai.filters._formulas import Formulas
 from zakai.filters._protocol import Schedule
-from zakai.kolmogorov.flow import Coefficients, Flow, Substeps, flows, substeps_for
+from zakai.kolmogorov.flow import Coefficients, Flow, Substeps, coefficients_at, flows, substeps_for
 from zakai.models.compile import jax_field, jax_function
 from zakai.models.model import Model
 
@@ -117,7 +117,7 @@ def parts_of(system: System, model: Model, starts: np.ndarray, stops: np.ndarray
     arguments = (np.tile(model.theta(), (len(starts), 1)), inside)
     rate = 0.0
     for times in (starts, stops):
-        c = jax.jit(jax.vmap(system.coefficients))(times, arguments)
+        c = coefficients_at(system.coefficients, times, arguments)
         waves = np.linalg.norm(np.asarray(c.covariance @ c.quadratic), ord=2, axis=(1, 2))
         speed = np.linalg.norm(np.asarray(c.matrix), ord=2, axis=(1, 2)) + np.sqrt(2 * waves)
         rate = max(rate, float(np.max(speed * (stops - starts))))

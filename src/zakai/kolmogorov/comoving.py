@@ -94,6 +94,11 @@ def _circle(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.cos(angle) / size, np.sin(angle) / size, difference
 
 
+def slope(values: jax.Array, axis: int) -> jax.Array:
+    """The derivative of the trigonometric interpolant along an axis, in cells."""
+    return along(jnp.asarray(_derivative(values.shape[axis])), values, axis)
+
+
 class Transport(NamedTuple):
     """exp(variance d^2/2 - shift d) along every axis: `variances` (n,) and `shifts` (n,), in cells."""
 
@@ -158,7 +163,7 @@ def moments(values: jax.Array) -> Moments:
     return Moments(total, mean, cov)
 
 
-def _inverse(matrix: jax.Array) -> jax.Array:
+def inverse(matrix: jax.Array) -> jax.Array:
     """Written out for one and two states: a call into LAPACK would cost more than the rest of a step."""
     n = matrix.shape[0]
     if n == 1:
@@ -200,21 +205,21 @@ def moved(
     start = drift(field.points(), time)
     total, mean, cov = still(moments(values))
     velocity = still(jnp.stack([jnp.sum(weights * f) for f in start]))
-    inverse = _inverse(field.basis)
+    back_to = inverse(field.basis)
     motion = jnp.zeros((n, n))
     if follow:
         apart = [z - mean[d] for d, z in enumerate(_views(sizes))]
         slopes = still(jnp.stack([jnp.stack([jnp.sum(weights * f * z) for z in apart]) for f in start]))
-        spread = inverse @ covariance(time) @ inverse.T
-        motion = still((inverse @ slopes + 0.5 * spread) @ _inverse(cov))
+        spread = back_to @ covariance(time) @ back_to.T
+        motion = still((back_to @ slopes + 0.5 * spread) @ inverse(cov))
 
     def frame(share: float) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Centre, basis and its inverse at the time + share tau."""
         if not follow:
-            return field.centre + share * (tau * velocity + field.basis @ mean), field.basis, inverse
+            return field.centre + share * (tau * velocity + field.basis @ mean), field.basis, back_to
         stretched, integral = _exponential(share * tau * motion)
         centre = field.centre + share * (tau * velocity + field.basis @ integral @ mean)
-        return centre, field.basis @ stretched, _exponential(-share * tau * motion)[0] @ inverse
+        return centre, field.basis @ stretched, _exponential(-share * tau * motion)[0] @ back_to
 
     def spread_at(share: float) -> jax.Array:
         back = frame(share)[2]

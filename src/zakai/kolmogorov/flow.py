@@ -319,6 +319,17 @@ _fixed = partial(jax.jit, static_argnums=(0, 4))(_integrate_all)
 _variable = partial(jax.jit, static_argnums=0)(_integrate_all)
 
 
+@partial(jax.jit, static_argnums=0)
+def coefficients_at(coefficients: Callable[[jax.Array, Any], Coefficients], times: Any, arguments: Any) -> Coefficients:
+    """The coefficients at times (K,), each with its own argument; compiled once."""
+    return jax.vmap(coefficients)(times, arguments)
+
+
+@partial(jax.jit, static_argnums=0)
+def _at_many(coefficients, times, arguments):
+    return jax.vmap(jax.vmap(coefficients, (0, None)))(times, arguments)
+
+
 def _in_blocks(coefficients, starts, stops, arguments, substeps):
     """`_integrate_all` in blocks of one size, whatever the number of intervals: one compilation, unless there is much to do."""
     slices = (np.asarray(starts, float), np.asarray(stops, float), jax.tree.map(np.asarray, arguments))
@@ -400,7 +411,7 @@ def _fastest(coefficients, starts, stops, arguments) -> tuple[int, float]:
     shares = irregular(max(4, budget // len(chosen)))
     times = starts[chosen, None] + (stops - starts)[chosen, None] * shares
     given = jax.tree.map(lambda a: np.asarray(a)[chosen], arguments)
-    values = jax.jit(jax.vmap(jax.vmap(coefficients, (0, None))))(times, given)
+    values = _at_many(coefficients, times, given)
     needed = np.zeros(len(chosen))
     for array in values:
         entries = np.asarray(array).reshape(*times.shape, -1)
