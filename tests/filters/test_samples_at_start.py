@@ -31,6 +31,7 @@ def test_the_first_density_is_found_again_when_only_moments_are_kept():
     np.testing.assert_allclose(moments.cov, kept.cov, atol=1e-10)
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_a_prior_with_a_kink_is_said_to_be_known_less_well():
     keys = {"state": ["x"], "drift": ["-x"], "observation": ["x"], "observation_kind": "samples"}

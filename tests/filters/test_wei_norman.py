@@ -120,6 +120,7 @@ def test_two_linear_states_with_readings_missing_are_kalman_and_bucys(kind):
     assert result.warnings == exact.warnings
 
 
+@pytest.mark.slow
 def test_a_passive_state_that_is_not_linear_is_as_the_equation_says():
     model = zakai.Model(
         state=["x1", "x2"],
@@ -217,6 +218,7 @@ def test_a_reading_that_contradicts_the_density_is_followed_or_said_to_be_too_fa
         assert any("surprise" in said for said in result.warnings) == (size == 12.0)
 
 
+@pytest.mark.slow
 def test_a_lattice_that_is_too_coarse_is_said_to_be():
     model = line(prior={"kind": "density", "log_density": "-3*abs(x)"})
     record = record_of(line(), [0.1, 0.2])

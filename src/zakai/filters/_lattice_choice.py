@@ -264,7 +264,7 @@ def adapted(
     records = len(lattice.centre)
     same = np.tile(SAME, (records, 1))
     if info is not None:
-        better = None if healthy(info, plan) else _more(plan, info)
+        better = None if np.all(healthy(info, plan)) else _more(plan, info)
         if better is None:
             return None, None, same
         plan = better
@@ -319,15 +319,15 @@ def free_memory() -> int:
         return 2**31
 
 
-def healthy(info: Any, plan: Plan) -> bool:
-    """Whether a try kept every bound."""
+def healthy(info: Any, plan: Plan) -> Any:
+    """Which steps kept every bound; traced by JAX or not."""
     health = info.health
     edge = EDGE_SHARPENED if plan.sharpen else EDGE
-    return bool(
-        np.all(np.isfinite(info.log_likelihood_increment))
-        and np.all(health["edge_mass"] < edge)
-        and np.all(health["resolution"] > plan.needed)
-        and np.all(health["quadrature_error"] < QUADRATURE)
+    return (
+        (abs(info.log_likelihood_increment) < np.inf)
+        & (health["edge_mass"] < edge)
+        & (health["resolution"] > plan.needed)
+        & (health["quadrature_error"] < QUADRATURE)
     )
 
 

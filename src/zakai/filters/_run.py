@@ -28,7 +28,7 @@ from zakai.records import Record
 CHUNK = 4096  # intervals that are prepared at once, at most
 CHUNK_BYTES = 512 * 2**20  # what is prepared for them, at most
 RUN = 256  # intervals between two looks at the lattice
-TRIES = 12
+TRIES = 16
 KEPT_BYTES = 512 * 2**20
 
 _PREPARED: WeakKeyDictionary[Model, OrderedDict[Any, Any]] = WeakKeyDictionary()
@@ -165,7 +165,8 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
     for tries in range(TRIES + 2):
         end, told, taken = scan(method.step, method.healthy, begin, intervals, given, keep, (count, strict))
         taken = int(taken)
-        if not strict or (method.healthy is not None and taken >= min(count, max(1.0, enough * run))):
+        # The more was tried in vain, the less is enough.
+        if not strict or (method.healthy is not None and taken >= max(1.0, enough * count / 2**tries)):
             break
         info = first_of(told[0], min(taken + 1, count))
         again = adapt(prepared, begin, part, info) if adapt and tries < TRIES else None

@@ -16,6 +16,7 @@ import numpy as np
 from zakai.errors import InputError
 from zakai.filters import _lattice_choice as choice
 from zakai.kolmogorov.comoving import Field, axes_of
+from zakai.kolmogorov.finite_volume import TERMS
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 
@@ -24,6 +25,7 @@ MOST = {1: 4096, 2: 512, 3: 128, 4: 48}
 RUNS = {1: 256, 2: 64, 3: 16, 4: 8}
 SHORTEST = 8  # a run that must be shorter than this asks for a lattice that is laid anew in every step
 MOST_PARTS = 4096
+MOST_SPLITS = 4096
 MOST_POINTS = 2**20  # of lattices whose flow is looked at together
 FEW = {1: 128, 2: 8, 3: 4, 4: 4}  # parts of an interval beyond which the lattice had better follow the flow
 SPARE = 1.25  # how much wider than its density a window is, and
@@ -36,9 +38,10 @@ REACH = 6.5  # deviations on each side that a lattice holds that is laid anew in
 class Shape(NamedTuple):
     """What a step is compiled for: `sizes` of the lattice and the way to take it.
 
-    An interval is split in `splits`, the transition of each of these stepped in `parts`.  `order` is that of the time stepping, 2
-    or 4.  With `follow` the basis moves with the flow and is laid anew in every step; with `cross` the noise may couple axes of
-    the lattice.
+    An interval is split in `splits`, the transition of each of these stepped in `parts`: one, 0 for what the Room says, or a
+    number that JAX can differentiate.  `order` is that of the time stepping, 2 or 4.  With `follow` the basis moves with the flow
+    and is laid anew in every step; with `cross` the noise may couple axes of the lattice.  `operator` is "spectral" or
+    "finite-volume"; of the latter `order` is the number of terms of its series.
     """
 
     sizes: tuple[int, ...]
@@ -47,15 +50,27 @@ class Shape(NamedTuple):
     order: int = 2
     follow: bool = False
     cross: bool = False
+    operator: str = "spectral"
 
 
 class Room(NamedTuple):
-    """What a step is told and not compiled for; `wider` and `finer` multiply SPARE and FINER for a run of `run` steps."""
+    """What a step is told and not compiled for; `wider` and `finer` multiply SPARE and FINER for a run of `run` steps.
+
+    `splitting` is the error of splitting that is allowed, infinite where `splits` is the user's.
+    """
 
     tolerance: Any
     wider: Any = 1.0
     finer: Any = 1.0
     run: Any = 256.0
+    splitting: Any = np.inf
+    splits: Any = 1.0
+    parts: Any = 1.0
+
+    @property
+    def counts(self) -> tuple[Any, Any, Any]:
+        """What changes a run though the lattice stays."""
+        return self.run, self.splits, self.parts
 
     @property
     def reach(self) -> Any:
@@ -63,14 +78,15 @@ class Room(NamedTuple):
         return REACH * self.wider
 
     @property
-    def allowed(self) -> tuple[Any, Any, Any, Any]:
-        """The most that may be of aliasing, of the mass in the outermost layers, of the error in time and of what is lost."""
-        return 0.1 * self.tolerance, 0.01 * self.tolerance, 0.1 * self.tolerance, self.tolerance
+    def allowed(self) -> tuple[Any, Any, Any, Any, Any]:
+        """The most that may be of aliasing, of the mass in the outermost layers, of the error in time, of what is lost and of the
+        error of splitting."""
+        return 0.1 * self.tolerance, 0.01 * self.tolerance, 0.1 * self.tolerance, self.tolerance, self.splitting
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How a run of steps is taken: the fields of a Shape and of a Room."""
+    """How a run of steps is taken: the fields of a Shape and of a Room; with `fixed` the counts are compiled."""
 
     sizes: tuple[int, ...]
     tolerance: float
@@ -80,24 +96,32 @@ class Plan:
     run: int = 256
     follow: bool = False
     cross: bool = False
+    operator: str = "spectral"
     wider: float = 1.0
     finer: float = 1.0
+    splitting: float = np.inf
+    fixed: bool = False
 
     @classmethod
     def of(cls, shape: Shape, room: Room) -> Plan:
         """The plan that was divided into these, of which every record of a batch has the same room."""
-        tolerance, wider, finer, run = (float(np.ravel(np.asarray(part))[0]) for part in room)
-        return cls(**shape._asdict(), tolerance=tolerance, wider=wider, finer=finer, run=int(run))
+        told = {name: float(np.ravel(np.asarray(part))[0]) for name, part in room._asdict().items()}
+        counts = {name: int(told[name]) for name in ("run", "splits", "parts")}
+        return cls(**{**shape._asdict(), **told, **counts})
 
     @property
     def shape(self) -> Shape:
         """The static part."""
-        return Shape(self.sizes, self.splits, self.parts, self.order, self.follow, self.cross)
+        # Where the splits are not the user's they may change with every run.
+        given = self.fixed or self.splitting == np.inf
+        parts = self.parts if self.fixed or self.parts == 1 else 0
+        return Shape(self.sizes, self.splits if given else 0, parts, self.order, self.follow, self.cross, self.operator)
 
     @property
     def room(self) -> Room:
         """The part that may change without a compilation."""
-        return Room(self.tolerance, self.wider, self.finer, float(self.run))
+        counts = float(self.run), self.splitting, float(self.splits), float(self.parts)
+        return Room(self.tolerance, self.wider, self.finer, *counts)
 
     @property
     def aliasing(self) -> float:
@@ -249,7 +273,11 @@ def more(plan: Plan, info: Any) -> Plan | None:
     # The spectrum of a Gaussian falls as exp(-(pi s)^2 / 2), s its deviation in cells.
     finer = np.sqrt(np.log(plan.aliasing) / np.log(np.clip(alias, 1e-12, 0.3)))
     finer = max(finer, 1.2 if cut >= plan.tolerance else 1.0) if finer > 1 or cut >= plan.tolerance else 1.0
-    if error > 1e-2 or (error >= plan.stepping and finer == 1):
+    if plan.operator == "finite-volume":
+        # Steps in time cost no accuracy: what is left is the error of the cells, of second order.
+        if finer == 1 and error >= plan.stepping:
+            finer = np.clip((error / plan.stepping) ** 0.5, 1.2, 3.0)
+    elif error > 1e-2 or (error >= plan.stepping and finer == 1):
         # An unstable step spoils all other figures.
         if plan.parts >= MOST_PARTS:
             return None
@@ -259,14 +287,21 @@ def more(plan: Plan, info: Any) -> Plan | None:
             return replace(plan, follow=True, parts=1)
         parts = 2.0 ** np.ceil(np.log2(np.clip((error / plan.stepping) ** 0.25, 2, 8)))
         return replace(plan, parts=int(plan.parts * parts))
+    apart = health["splitting"].max()
+    if apart >= plan.splitting and finer == 1:
+        if plan.splits >= MOST_SPLITS:
+            return None
+        splits = plan.splits * 2 ** int(np.ceil(np.log2(np.clip((apart / plan.splitting) ** 0.5, 2, 64))))
+        return replace(plan, splits=min(splits, MOST_SPLITS), parts=1)
     if finer == 1 and edge < plan.edge:
         return None
     plan = replace(plan, finer=plan.finer * min(1.1 * finer, 3.0), wider=plan.wider * (1.0 if edge < plan.edge else 1.35))
-    if plan.finer * plan.wider < WORST[n] * (4.0 if plan.follow else 1.0):
+    room = 4.0 if plan.follow else 8.0 if plan.operator == "finite-volume" else 1.0
+    if plan.finer * plan.wider < WORST[n] * room:
         return plan
-    if plan.follow:
-        return None
     shorter = plan.run // 4
+    if plan.follow or (plan.operator == "finite-volume" and shorter < SHORTEST):
+        return None
     return replace(plan, run=max(shorter, SHORTEST), finer=1.0, wider=1.0, follow=shorter < SHORTEST, order=4)
 
 
@@ -278,6 +313,7 @@ def relaxed(plan: Plan, run: int) -> Plan:
         wider=max(1.0, plan.wider / 1.2),
         finer=max(1.0, plan.finer / 1.2),
         parts=max(1, plan.parts // 2),
+        splits=plan.splits if plan.splitting == np.inf else max(1, plan.splits // 2),
     )
 
 
@@ -303,6 +339,11 @@ def timed(model: Model, plan: Plan, intervals: Any, rows: slice, fields: Field, 
         fastest, crossing = max(fastest, fast), max(crossing, far)
     if not np.isfinite(fastest + crossing):
         return plan
+    if plan.operator == "finite-volume":
+        least, most = TERMS
+        rate = tau * (crossing / np.pi + _leaving(model, basis, times))
+        parts = 2 ** int(np.ceil(np.log2(max(rate / TERMS[most], 1.0))))
+        return replace(plan, parts=parts, order=least if parts == 1 and rate <= TERMS[least] else most)
     parts = 2 ** int(np.ceil(np.log2(max(tau * crossing / 2.5, tau * fastest / (30 * plan.stepping) ** 0.2, 1.0))))
     if plan.follow:
         return replace(plan, parts=parts)
@@ -338,6 +379,21 @@ def _speeds(model: Model, fields: Field, ratio: np.ndarray, times: np.ndarray, f
     spread = np.einsum("rp,trpi->ri", weights, flow**2) / 2
     fastest = np.sqrt((spread / np.maximum(variance, 1e-12)).max())
     return float(fastest), float(np.pi * np.abs(flow).sum(axis=-1).max())
+
+
+def _leaving(model: Model, basis: np.ndarray, times: np.ndarray) -> float:
+    """The largest sum over the axes of the noise in cells; InputError where it couples axes too much for positive rates."""
+    inverse, theta = np.linalg.inv(basis), model.theta()
+    G = numpy_function(model.covariance, model, (model.n, model.n))(np.zeros(model.n), times, theta)
+    spread = np.einsum("rij,kjl,rml->rkim", inverse, np.broadcast_to(G, (len(times), model.n, model.n)), inverse)
+    own = np.einsum("rkii->rki", spread)
+    others = np.abs(spread).sum(axis=3) - own
+    if np.any(others > own * (1 + 1e-9)):
+        raise InputError(
+            f'option operator: the noise of {model.source} couples the axes of the lattice more than the positive rates of '
+            '"finite-volume" can; take operator "spectral"'
+        )
+    return float(own.sum(axis=2).max())
 
 
 def check_memory(model: Model, sizes: tuple[int, ...], budget: int) -> None:

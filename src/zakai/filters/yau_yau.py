@@ -5,14 +5,15 @@ likelihood, all of it online:
 
     u <- exp(h'S^-1 dy - h'S^-1 h dt / 2) u        for increments;        u <- N(z; h, S) u        for a sample
 
-An increment acts in two halves around the transition (Strang's splitting), of second order in the interval.  The transition is
-that of `zakai.kolmogorov.comoving`, spectrally accurate on a lattice that follows the mass.  S.-T. Yau and S.S.-T. Yau (2008);
-the likelihood is not inside the operator, so that no large factor is undone by another.
+An increment acts in two halves around the transition (Strang's splitting, its first error undone), in as many parts of the
+interval as the tolerance asks for.  The transition is that of `zakai.kolmogorov.comoving`, spectrally accurate on a lattice that
+follows the mass.  S.-T. Yau and S.S.-T. Yau (2008); the likelihood is not inside the operator, so that no large factor is undone
+by another.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -26,12 +27,13 @@ from zakai.algebra.theorems import any_smooth_system as theorem
 from zakai.densities import GridDensity
 from zakai.errors import InputError
 from zakai.filters import _lattice_choice as choice
+from zakai.filters import _splitting as splitting
 from zakai.filters import _window as window
 from zakai.filters._formulas import Formulas, formulas
 from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters._window import Plan, Room, Shape
-from zakai.filters.observations import Data, Whole, whole_factors
-from zakai.kolmogorov import comoving, resolution
+from zakai.filters.observations import Data, Whole, WholeRule, whole_rule
+from zakai.kolmogorov import comoving, finite_volume, resolution
 from zakai.kolmogorov.comoving import Field
 from zakai.models.compile import jax_field, jax_function
 from zakai.models.model import Model
@@ -45,6 +47,7 @@ class System:
         self.n = model.n
         self.drift = jax_field(model.drift, model)
         self.observe = jax_field(model.observation, model)
+        self.continuous = model.observation_kind != "samples"
         self.covariance = jax_function(model.covariance, model, (model.n, model.n))
 
 
@@ -53,10 +56,12 @@ def _system(of: Formulas) -> System:
     return System(of.model)
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["field", "observed", "cut", "room"], meta_fields=["shape"])
+@partial(jax.tree_util.register_dataclass, data_fields=["field", "observed", "cut", "room", "error"], meta_fields=["shape"])
 @dataclass(frozen=True)
 class State:
     """The probabilities of the cells of a lattice, the plan in two parts, and h at the points, an array for each coordinate.
+
+    `error` estimates how far the density is from that of the equation, relative to itself.
 
     `observed` is None where the lattice is laid anew in every step.  `cut` (2, n) says how the first lattice of this run of steps
     was cut out of the last of the run before.
@@ -67,6 +72,7 @@ class State:
     cut: Any
     room: Room
     shape: Shape
+    error: Any = 0.0
 
     @property
     def plan(self) -> Plan:
@@ -111,25 +117,37 @@ class Prepared:
 
 
 def prepare(
-    model: Model, schedule: Schedule, *, tolerance: float = 1e-4, substeps: int = 1, memory: float | None = None
+    model: Model,
+    schedule: Schedule,
+    *,
+    tolerance: float = 1e-4,
+    operator: str = "spectral",
+    substeps: int | None = None,
+    memory: float | None = None,
 ) -> Prepared:
     """The intervals and the plan to begin with.
 
     `tolerance` is how far from the solution of the equation, relative to itself, a density may be after a step for each of three
-    reasons: the window, the cells, the steps in time.  `substeps` splits each interval, observation included, in equal parts: the
-    splitting is not the tolerance's concern.  `memory` is how many MiB lattices may take, by default half of what the machine
-    has free.  Raises InputError for another value.
+    reasons, the window, the cells and the steps in time, and in the long run because an increment's likelihood is split from
+    the transition.  `operator` is "spectral" or "finite-volume", which is positive and conserves mass whatever the cells, and of
+    second order in them.  `substeps` splits each interval, observation included, in equal parts, by default as many as the
+    tolerance asks for.  `memory` is how many MiB lattices may take, by default half of what the machine has free.
+    Raises InputError for another value.
     """
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 1e-9 <= tolerance <= 0.1:
         raise InputError(f"option tolerance: {tolerance!r} must be a number from 1e-9 to 0.1")
-    if isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1:
+    if operator not in ("spectral", "finite-volume"):
+        raise InputError(f'option operator: {operator!r} is neither "spectral" nor "finite-volume"')
+    if substeps is not None and (isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1):
         raise InputError(f"option substeps: {substeps!r} must be a whole number from 1")
     if memory is not None and not (isinstance(memory, (int, float)) and not isinstance(memory, bool) and 0 < memory < np.inf):
         raise InputError(f"option memory: {memory!r} must be a positive number of MiB")
     theta = model.theta()
     sizes = (window.LEAST[model.n],) * model.n
-    follow = model.n > 1 and model.observation_kind == "samples"
-    plan = Plan(sizes, float(tolerance), substeps, run=window.RUNS[model.n], follow=follow, order=4)
+    follow = model.n > 1 and model.observation_kind == "samples" and operator == "spectral"
+    allowed = 0.5 * tolerance if substeps is None and model.observation_kind != "samples" else np.inf
+    plan = Plan(sizes, float(tolerance), substeps or 1, run=window.RUNS[model.n], follow=follow, order=4)
+    plan = replace(plan, operator=operator, splitting=allowed)
     system = _system(formulas(model))
     budget = choice.free_memory() if memory is None else int(memory * 2**20)
     return Prepared(model, system, schedule, plan, theta, _intervals(system, schedule, theta), budget)
@@ -148,7 +166,12 @@ def with_parameters(prepared: Prepared, theta: Any) -> Prepared:
 
 def observations(prepared: Prepared, data: Data) -> Whole:
     """The whole likelihood of every interval's readings."""
-    return whole_factors(prepared.model, data, prepared.theta)
+    return rule(prepared, data)(data.filled)
+
+
+def rule(prepared: Prepared, data: Data) -> WholeRule:
+    """The same but for the values."""
+    return whole_rule(prepared.model, data, prepared.theta)
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -179,8 +202,12 @@ def correct(prepared: Prepared, prior: Any, observation: Whole) -> tuple[State, 
     return state, Info(jnp.asarray(after - before), mean, cov, _no_health())
 
 
+OUTSIDE = 10.0  # what mass at the edges counts for: it is far from the mean
+HEALTH = ("aliasing", "edge_mass", "time_error", "lost", "splitting", "missed", "error_estimate")
+
+
 def _no_health() -> dict[str, jax.Array]:
-    return {name: jnp.zeros(()) for name in ("aliasing", "edge_mass", "time_error", "lost", "missed")}
+    return {name: jnp.zeros(()) for name in HEALTH}
 
 
 def correct_again(prepared: Prepared, prior: Any, observation: Whole, begin: State) -> tuple[State, Info]:
@@ -206,7 +233,8 @@ def _looked_at(prepared: Prepared, field: Field, plan: Plan, time: float) -> Sta
     observed = None
     if not plan.follow:
         observed = prepared.system.observe(comoving.points_of(plan.sizes, field.centre, field.basis), time, prepared.theta)
-    return State(jax.tree.map(jnp.asarray, field), observed, jnp.asarray(_SAME(prepared.model.n)), plan.room, plan.shape)
+    cut = jnp.asarray(_SAME(prepared.model.n))
+    return State(jax.tree.map(jnp.asarray, field), observed, cut, plan.room, plan.shape, jnp.zeros(()))
 
 
 def _moments(field: Field) -> tuple[jax.Array, jax.Array]:
@@ -229,6 +257,7 @@ class _Worst(NamedTuple):
     edge: Any
     error: Any
     lost: Any
+    splitting: Any
 
     def over(self, other: _Worst) -> _Worst:
         return _Worst(*(jnp.maximum(a, b) for a, b in zip(self, other)))
@@ -246,12 +275,22 @@ def _multiplied(values: jax.Array, logs: jax.Array) -> tuple[jax.Array, jax.Arra
     return after / total, jnp.log(total) + top, grown
 
 
+def _repeated(body: Callable[[Any, Any], Any], carry: Any, known: int, count: Any) -> Any:
+    """`body` of the carry and 0, 1, ... `count` times; `known` is the count, or 0 where it is not known to the compiler."""
+    if known == 1:
+        return body(carry, 0)
+    if known == 0:
+        return jax.lax.fori_loop(0, jnp.asarray(count, int), lambda k, carry: body(carry, k), carry)
+    return jax.lax.scan(lambda carry, k: (body(carry, k), None), carry, jnp.arange(float(known)))[0]
+
+
 def step(interval: Interval, state: State, observation: Whole) -> tuple[State, Info]:
     """One interval: half of the likelihood, the transition, the other half, or all of it at the end."""
     system, plan, theta = interval.system, state.shape, interval.theta
-    length = (interval.stop - interval.start) / plan.splits
-    share = 0.5 * observation.inside / plan.splits
-    zero = jnp.zeros(())
+    splits, parts = plan.splits or state.room.splits, plan.parts or state.room.parts
+    length = (interval.stop - interval.start) / splits
+    share = 0.5 * observation.inside / splits
+    zero, still = jnp.zeros(()), jax.lax.stop_gradient
 
     def drift(x: jax.Array, t: Any) -> Sequence[jax.Array]:
         return system.drift(x, t, theta)
@@ -259,59 +298,69 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
     def covariance(t: Any) -> jax.Array:
         return system.covariance(jnp.zeros(system.n), t, theta)
 
-    def part(carry: Any, time: Any) -> tuple[Any, None]:
+    def spread(inverse: jax.Array, t: Any) -> jax.Array:
+        return inverse @ covariance(t) @ inverse.T
+
+    def part(time: Any, carry: Any, k: Any) -> Any:
         field, spent = carry
-        tau = length / plan.parts
-        field, error = comoving.moved(field, drift, covariance, time, tau, plan.order, plan.follow, plan.cross)
-        return (field, spent + error), None
+        tau = length / parts
+        if plan.operator == "finite-volume":
+            field, error = finite_volume.moved(field, drift, covariance, time + k * tau, tau, plan.order)
+        else:
+            field, error = comoving.moved(field, drift, covariance, time + k * tau, tau, plan.order, plan.follow, plan.cross)
+        return field, spent + error
 
     def looked_at(values: jax.Array, noise: Any, error: Any, grown: Any) -> _Worst:
         # Noise is the same everywhere; what a formula of order four leaves is a polynomial of degree five times the density.
         lost = noise * jnp.exp(jnp.minimum(grown, 99.0))
-        return _Worst(resolution.aliasing(values), resolution.edge_mass(values), error * (1 + grown) ** 2.5, lost)
+        return _Worst(resolution.aliasing(values), resolution.edge_mass(values), error * (1 + grown) ** 2.5, lost, zero)
 
-    def split(carry: Any, k: Any) -> tuple[Any, None]:
-        field, observed, log_mass, spent, worst = carry
+    def split(carry: Any, k: Any) -> Any:
+        field, observed, log_mass, before, error, worst = carry
         time = interval.start + k * length
-        values, gained, grown = _multiplied(field.values, _log_factor(observed, observation, share))
-        worst = worst.over(looked_at(values, comoving.LOST, spent, grown))
-        moving = field._replace(values=values), spent
-        if plan.parts == 1:
-            (field, spent), _ = part(moving, time)
-        else:
-            (field, spent), _ = jax.lax.scan(part, moving, time + length * (np.arange(plan.parts) / plan.parts))
-        observed = system.observe(field.points(), time + length, theta)
+        half = _log_factor(observed, observation, share)
+        if system.continuous:
+            half = splitting.corrected(half, spread(comoving.inverse(field.basis), time), length)
+        values, gained, grown = _multiplied(field.values, half)
+        worst = worst.over(looked_at(values, comoving.LOST, before, grown))
+        field, spent = _repeated(partial(part, time), (field._replace(values=values), before), plan.parts, parts)
+        points = field.points()
+        observed = system.observe(points, time + length, theta)
         noise = comoving.noise(field.values)
         # Only here: to cut tails in every part would make kinks, and these more noise.
         values = jnp.where(field.values > noise * jnp.max(field.values), field.values, 0.0)
-        last = _log_factor(observed, observation, share)
+        half = _log_factor(observed, observation, share)
+        inverse = comoving.inverse(field.basis)
+        G = spread(inverse, time + length)
+        last = splitting.corrected(half, G, length) if system.continuous else half
         if plan.splits == 1:
             last = last + _log_factor(observed, observation, 1.0 - observation.inside)
         values, more, grown = _multiplied(values, last)
-        worst = worst.over(looked_at(values, noise, spent, grown))
-        return (field._replace(values=values), observed, log_mass + gained + more, spent, worst), None
+        f = drift(points, time + length)
+        flow = list(jnp.tensordot(inverse, jnp.stack(f), axes=1))
+        left = still(splitting.left(values, half, flow, G, length))
+        last_look = looked_at(values, noise, spent, grown)
+        made = spent - before + last_look.aliasing + last_look.lost + OUTSIDE * last_look.edge
+        error = still(splitting.added(error, left.error + made, left.forgets, length))
+        worst = worst.over(last_look._replace(splitting=still(splitting.expected(left.error, left.forgets, length))))
+        return field._replace(values=values), observed, log_mass + gained + more, spent, error, worst
 
     field, observed = state.field, state.observed
     if observed is None:
         observed = system.observe(field.points(), interval.start, theta)
-    carry = (field, observed, observation.constant, zero, _Worst(zero, zero, zero, zero))
-    if plan.splits == 1:
-        carry, _ = split(carry, 0)
-    else:
-        carry, _ = jax.lax.scan(split, carry, jnp.arange(float(plan.splits)))
-    field, observed, log_mass, spent, worst = carry
-    if plan.splits > 1:
+    carry = (field, observed, observation.constant, zero, state.error, _Worst(zero, zero, zero, zero, zero))
+    carry = _repeated(split, carry, plan.splits, splits)
+    field, observed, log_mass, spent, error, worst = carry
+    if plan.splits != 1:
         values, more, grown = _multiplied(field.values, _log_factor(observed, observation, 1.0 - observation.inside))
         field, log_mass = field._replace(values=values), log_mass + more
         worst = worst.over(looked_at(values, comoving.LOST, spent, grown))
     mean, cov = _moments(field)
     if plan.follow:
         field, observed = comoving.relaid(field, state.room.reach), None
-    health = {"aliasing": worst.aliasing, "edge_mass": worst.edge, "time_error": worst.error, "lost": worst.lost}
-    allowed = zip(health.values(), state.room.allowed, strict=True)
-    health["missed"] = jnp.max(jnp.stack([figure / most for figure, most in allowed]))
-    health = jax.lax.stop_gradient(health)
-    return State(field, observed, state.cut, state.room, plan), Info(log_mass, mean, cov, health)
+    missed = jnp.max(jnp.stack([figure / most for figure, most in zip(worst, state.room.allowed, strict=True)]))
+    health = still(dict(zip(HEALTH, (*worst, missed, error), strict=True)))
+    return State(field, observed, state.cut, state.room, plan, error), Info(log_mass, mean, cov, health)
 
 
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
@@ -322,24 +371,31 @@ def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> S
 
 def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None) -> State | None:
     """`adapt` of states with a leading axis of records: one plan for all, the best that any of them needs."""
-    model, plan = prepared.model, states.plan
-    if info is None:
-        plan = window.relaxed(plan, window.RUNS[model.n])
-        before = np.tile(_SAME(model.n), (len(states.field.centre), 1, 1))
-    else:
-        better = None if window.healthy(info).all() else window.more(plan, info)
-        if better is None:
-            return None
-        plan, before = better, np.asarray(states.cut)
+    model, plan, before = prepared.model, states.plan, np.asarray(states.cut)
     fields = jax.tree.map(np.asarray, states.field)
-    measures = window.measured(fields, plan)
-    cut, _ = window.fitted(fields, measures, plan, lambda sizes: None)
-    least = window.timed(model, plan, prepared.intervals, rows, fields, cut[:, 1])
-    # What a try has shown counts for more than what the coefficients say.
-    plan = least if info is None else replace(least, order=max(plan.order, least.order), parts=max(plan.parts, least.parts))
-    cut, plan = window.fitted(fields, measures, plan, lambda sizes: window.check_memory(model, sizes, prepared.memory))
-    if plan == states.plan and np.all(cut == _SAME(model.n)):
-        return replace(states, cut=before) if info is None else None
+    if info is None:
+        plan, before = window.relaxed(plan, window.RUNS[model.n]), np.tile(_SAME(model.n), (len(before), 1, 1))
+    elif window.healthy(info).all():
+        return None
+    while True:
+        if info is not None:
+            better = window.more(plan, info)
+            if better is None:
+                return None
+            plan = better
+        measures = window.measured(fields, plan)
+        cut, _ = window.fitted(fields, measures, plan, lambda sizes: None)
+        least = window.timed(model, plan, prepared.intervals, rows, fields, cut[:, 1])
+        # What a try has shown counts for more than what the coefficients say.
+        best = least if info is None else replace(least, order=max(plan.order, least.order), parts=max(plan.parts, least.parts))
+        cut, best = window.fitted(fields, measures, best, lambda sizes: window.check_memory(model, sizes, prepared.memory))
+        same = np.all(cut == _SAME(model.n))
+        if best == states.plan and same:
+            return replace(states, cut=before) if info is None else None
+        # Sizes are few: what asks for a little more may get the same.
+        if info is None or not same or best.shape != states.plan.shape or best.room.counts != states.plan.room.counts:
+            plan = best
+            break
     fields = _cut_out(fields, cut, plan)
     cut = window.composed(before, cut)
     observed = None
@@ -348,7 +404,7 @@ def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None
         points = fields.centre[:, None] + _index(plan.sizes) @ np.swapaxes(fields.basis, 1, 2)
         h = numpy_function(model.observation, model)(points, float(prepared.schedule.starts[rows.start]), prepared.theta)
         observed = tuple(h[..., i].reshape(len(cut), *plan.sizes) for i in range(model.m))
-    return State(fields, observed, cut, _room(plan, len(cut)), plan.shape)
+    return State(fields, observed, cut, _room(plan, len(cut)), plan.shape, np.asarray(states.error))
 
 
 def _index(sizes: tuple[int, ...]) -> np.ndarray:
@@ -375,14 +431,14 @@ def _relaid(fields: Field, reach: Any) -> Field:
 
 def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State:
     """The traced `state` on a lattice cut out of its own as that of `begin` was, with the same plan."""
-    plan, cut = begin.plan, np.asarray(begin.cut)
+    plan, cut = replace(begin.plan, fixed=True), np.asarray(begin.cut)
     field = state.field
     if not np.array_equal(cut, _SAME(prepared.model.n)) or plan.sizes != state.shape.sizes or plan.follow:
         field = jax.tree.map(lambda a: a[0], _cut_out(jax.tree.map(lambda a: a[None], field), cut[None], plan))
     observed = None
     if not plan.follow:
         observed = prepared.system.observe(field.points(), float(prepared.schedule.starts[rows.start]), prepared.theta)
-    return State(field, observed, cut, plan.room, plan.shape)
+    return State(field, observed, cut, plan.room, plan.shape, state.error)
 
 
 def density(prepared: Prepared, state: State) -> GridDensity:
@@ -397,15 +453,16 @@ def density(prepared: Prepared, state: State) -> GridDensity:
 METHOD = Method(
     name="yau-yau",
     source="S.-T. Yau and S.S.-T. Yau 2008; likelihood online",
-    exactness="convergent: spectral in the lattice, of fourth order in the parts of a transition; for increments of second order "
-    "in the interval for smooth paths (Strang splitting)",
+    exactness="convergent: spectral in the lattice, of fourth order in the parts of a transition, of second order in the parts "
+    "of an interval for increments (Strang's splitting with its first error undone)",
     theorem=theorem,
-    options={"tolerance": 1e-4, "substeps": 1, "memory": None},
+    options={"tolerance": 1e-4, "operator": "spectral", "substeps": None, "memory": None},
     prepare=prepare,
     init=init,
     correct=correct,
     correct_again=correct_again,
     observations=observations,
+    rule=rule,
     step=step,
     density=density,
     adapt=adapt,
@@ -417,7 +474,8 @@ METHOD = Method(
         "missed": (
             1.0,
             "by what factor the tolerance was missed: aliasing (a tenth of it is allowed), edge_mass (a hundredth), time_error "
-            "(a tenth) or lost, the share of the maximum below which tails were lost when an observation came to need them",
+            "(a tenth), lost, the share of the maximum below which tails were lost when an observation came to need them, or "
+            "splitting, what the splitting of increments from the transition comes to in the long run",
         ),
     },
 )
