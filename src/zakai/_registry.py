@@ -1,6 +1,6 @@
-"""Every method by its name: the one list of what there is, loaded when it is asked for.
+"""Every method and peer by its name: the one list of what there is, loaded when it is asked for.
 
-When a method holds is said by `algebra.theorems.THEOREMS` under the same name.
+When one holds is said by `algebra.theorems.theorem_of` under the same name.
 """
 
 from __future__ import annotations
@@ -61,14 +61,32 @@ METHODS = {
         "approximate for any smooth system: linearised at the mean, one Gaussian; only when it is asked for",
     ),
 }
+# Filters of other libraries, to compare with: never taken by "auto", and each needs the extra `peers`.
+EXTRA = "peers"
+PEERS = {
+    "ekf": Entry("zakai.peers.ekf", "the extended Kalman filter of dynamax: approximate for any smooth system, one Gaussian"),
+    "ukf": Entry("zakai.peers.ukf", "the unscented Kalman filter of dynamax: approximate for any smooth system, one Gaussian"),
+    "enkf": Entry("zakai.peers.enkf", "the ensemble Kalman filter of cuthbert: approximate for any smooth system, by sampling"),
+    "particle": Entry(
+        "zakai.peers.particle", "the bootstrap particle filter of cuthbert: convergent for any smooth system, by sampling"
+    ),
+}
 # What "auto" tries, most exact and cheapest first; the last holds for any smooth system of few states.
 AUTO = ("kalman-bucy", "benes", "hu-yau", "limited-direct", "general-direct", "yau-yau")
 
 
 def load(name: str) -> Any:
-    """The METHOD of that name; InputError for an unknown one."""
-    if name not in METHODS:
-        close = difflib.get_close_matches(name, METHODS, n=1)
-        hint = f'; did you mean "{close[0]}"?' if close else ""
-        raise InputError(f'there is no method "{name}"{hint}; methods: auto, {", ".join(METHODS)}')
-    return import_module(METHODS[name].module).METHOD
+    """The METHOD of that name; InputError for an unknown one, and for a peer whose library is not installed."""
+    if name in METHODS:
+        return import_module(METHODS[name].module).METHOD
+    if name in PEERS:
+        try:
+            return import_module(PEERS[name].module).METHOD
+        except ModuleNotFoundError as error:
+            missing = (error.name or "a library").partition(".")[0]
+            if missing == "zakai":
+                raise
+            raise InputError(f"{name}: {missing} is not installed; the peers need it: pip install 'zakai[{EXTRA}]'") from error
+    close = difflib.get_close_matches(name, [*METHODS, *PEERS], n=1)
+    hint = f'; did you mean "{close[0]}"?' if close else ""
+    raise InputError(f'there is no method "{name}"{hint}; methods: auto, {", ".join(METHODS)}; peers: {", ".join(PEERS)}')
