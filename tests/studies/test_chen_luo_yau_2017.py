@@ -95,6 +95,7 @@ def test_a_study_that_is_not_there_and_a_folder_that_cannot_be_made_are_said(tmp
         studies.reproduce(NAME, tmp_path / "file")
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_the_direct_method_is_optimal_and_the_ekf_far_from_it_on_whole_paths():
     study = study_module.run(paths=24)

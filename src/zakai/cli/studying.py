@@ -1,8 +1,10 @@
-"""zakai reproduce"""
+"""zakai study and zakai reproduce"""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from typing import Any
 
 from zakai.cli._progress import progress
 from zakai.errors import InputError
@@ -17,3 +19,70 @@ def reproduce(name: str, folder: Path | None) -> None:
         raise InputError(f'there is no study "{name}"; there is: {", ".join(known)}')
     with progress(name) as advance:
         studies.reproduce(name, folder, advance)
+
+
+def study(file: Path, folder: Path, scheduler: str | None, processes: int | None) -> None:
+    """Run a study, or go on with it; print its table."""
+    from zakai.studies.specification import read_study
+    from zakai.studies.study import run_study
+
+    read = read_study(file)
+    with progress(read.name) as advance:
+        outcome = run_study(read, folder, scheduler, processes, advance)
+    for point, seconds in zip(outcome.summary["points"], outcome.timing["points"], strict=True):
+        _print_table(outcome.summary, point, seconds["methods"])
+    names = ["study.nc", "summary.json", "timing.json", *_pictures(outcome)]
+    print(f"written to {folder}: {', '.join(names)}")
+
+
+def _pictures(outcome: Any) -> list[str]:
+    """The names of the pictures and of the page, where what draws them is installed."""
+    from zakai.report.study_page import write_study
+
+    try:
+        return [path.name for path in write_study(outcome)]
+    except InputError as error:
+        print(f"note: no pictures: {error}", file=sys.stderr)
+        return []
+
+
+def _print_table(summary: dict[str, Any], point: dict[str, Any], costs: dict[str, Any]) -> None:
+    """The figures of a point, a line a method."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=None if sys.stdout.isatty() else 132, highlight=False)
+    title = f"{point['point']}: {summary['runs']:,} runs of {point['observations']:,} observations"
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    figures = ("squared error", "median", "worst", "failures", "warned", "distance", "NEES/n", "in 95%", "per observation")
+    for name in ("method", *figures):
+        table.add_column(name, justify="left" if name == "method" else "right", overflow="fold")
+    for label, own in point["methods"].items():
+        error, nees = own.get("squared_error", {}), own.get("nees", {})
+        spread = error.get("standard_error")
+        table.add_row(
+            label,
+            _number(error.get("mean")) + (f" ±{spread:.1g}" if spread else ""),
+            _number(error.get("median")),
+            _number(error.get("worst")),
+            str(own["failures"]),
+            str(own["warned"]),
+            _number(own.get("distance", {}).get("mean")),
+            _number(nees.get("mean"), 3),
+            "-" if nees.get("within") is None else f"{nees['within']:.0%}",
+            _time(costs[label]["seconds_per_observation"]),
+        )
+    console.print(table)
+    for label, own in point["methods"].items():
+        if own["said"]:
+            console.print(f"{label}: {own['said']}", markup=False, soft_wrap=True)
+
+
+def _number(value: float | None, digits: int = 4) -> str:
+    return "-" if value is None else f"{value:.{digits}g}"
+
+
+def _time(seconds: float | None) -> str:
+    if seconds is None:
+        return "-"
+    return f"{1e6 * seconds:.3g} us" if seconds < 1e-3 else f"{1e3 * seconds:.3g} ms"

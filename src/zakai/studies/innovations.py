@@ -1,0 +1,108 @@
+"""What an observation says that the filter did not expect: innovations and their normalised square, NIS.
+
+From one reading to the next the Gaussian with the filter's mean m and covariance P moves by the linearised equations, together
+with what will be observed,
+
+    dm = f dt,   da = h dt,   d Sigma = (A Sigma + Sigma A' + diag(G, S)) dt,   A = (F 0; H 0),   F = df/dx, H = dh/dx at m,
+
+from Sigma = diag(P, 0).  An increment y(t_k) - y(t_{k-1}) is then expected to be a with the covariance Sigma_yy; a sample to be
+h(m) with H P H' + S.  For a linear system this is exact (Jazwinski 1970, chapter 7).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from zakai.filters.observations import Data, data_of
+from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
+from zakai.records import Record
+from zakai.studies.metrics import mahalanobis
+
+_STEP = 0.1  # of the Runge-Kutta steps, in units of 1/|A|
+_MOST_STEPS = 160
+_LATE = 1 + 1e-9
+
+
+class Innovations:
+    """The innovations of one model's records, from what a filter said."""
+
+    def __init__(self, model: Model):
+        n, m = model.n, model.m
+        self.model, self.theta = model, model.theta()
+        self.drift = numpy_function(model.drift, model)
+        self.observation = numpy_function(model.observation, model)
+        self.drift_slope = numpy_function(model.drift.jacobian(model.x), model, (n, n))
+        self.slope = numpy_function(model.observation.jacobian(model.x), model, (m, n))
+        self.covariance = numpy_function(model.covariance, model, (n, n))
+        self.noise = numpy_function(model.observation_noise, model, (m, m))
+
+    def __call__(self, record: Record, mean: np.ndarray, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The innovations (K, m) and their covariances (K, m, m), from `mean` (K+1, n) and `cov` (K+1, n, n), the prior first.
+
+        nan where nothing was observed, or an increment was gathered over more than its interval.
+        """
+        data = data_of(self.model, record)
+        n, m = self.model.n, self.model.m
+        with np.errstate(invalid="ignore", over="ignore"):
+            x, sigma = self._moved(data, np.asarray(mean, float)[:-1], np.asarray(cov, float)[:-1])
+            if record.kind == "samples":
+                slope = self.slope(x[:, :n], data.stops, self.theta)
+                expected = self.observation(x[:, :n], data.stops, self.theta)
+                spread = slope @ sigma[:, :n, :n] @ np.swapaxes(slope, 1, 2) + self.noise(x[:, :n], data.stops, self.theta)
+                late = np.zeros((len(x), m), bool)
+            else:
+                expected, spread = x[:, n:], sigma[:, n:, n:]
+                late = data.elapsed > _LATE * (data.stops - data.starts)[:, None]
+        return np.where(late, np.nan, data.values - expected), spread
+
+    def nis(self, record: Record, mean: np.ndarray, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """nu' S^-1 nu (K,), and how many coordinates were observed (K,), the degrees of freedom of its chi-square law.
+
+        For a filter of a linear system with the right model it is chi-square with m degrees and independent from time to time
+        (Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2); for a curved h it is that to first order.
+        """
+        found, spread = self(record, mean, cov)
+        seen = ~np.isnan(found)
+        both = seen[:, :, None] & seen[:, None, :]
+        value = mahalanobis(np.where(seen, found, 0.0), np.where(both, spread, np.eye(self.model.m)))
+        count = seen.sum(axis=1)
+        return np.where(count > 0, value, np.nan), count
+
+    def _moved(self, data: Data, mean: np.ndarray, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(x, y) and their covariance at the ends of the intervals, by the classical Runge-Kutta method."""
+        n, m, K = self.model.n, self.model.m, len(mean)
+        z = np.concatenate([mean, np.zeros((K, m))], axis=1)
+        sigma = np.zeros((K, n + m, n + m))
+        sigma[:, :n, :n] = cov
+        lengths = data.stops - data.starts
+        size = np.abs(self._matrix(mean, data.starts)).sum(axis=2).max(axis=1) * lengths
+        finite = size[np.isfinite(size)]
+        steps = int(np.clip(np.ceil(finite.max(initial=0.0) / _STEP), 1, _MOST_STEPS))
+        z[np.nan_to_num(size, nan=np.inf) > 10 * _STEP * _MOST_STEPS] = np.nan  # stiffer than this method can follow
+        d = lengths / steps
+        for j in range(steps):
+            t = data.starts + j * d
+            z1, s1 = self._rates(z, sigma, t)
+            z2, s2 = self._rates(z + 0.5 * d[:, None] * z1, sigma + 0.5 * d[:, None, None] * s1, t + 0.5 * d)
+            z3, s3 = self._rates(z + 0.5 * d[:, None] * z2, sigma + 0.5 * d[:, None, None] * s2, t + 0.5 * d)
+            z4, s4 = self._rates(z + d[:, None] * z3, sigma + d[:, None, None] * s3, t + d)
+            z = z + d[:, None] / 6 * (z1 + 2 * z2 + 2 * z3 + z4)
+            sigma = sigma + d[:, None, None] / 6 * (s1 + 2 * s2 + 2 * s3 + s4)
+        return z, sigma
+
+    def _matrix(self, x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        n, m = self.model.n, self.model.m
+        matrix = np.zeros((len(x), n + m, n + m))
+        matrix[:, :n, :n] = self.drift_slope(x, t, self.theta)
+        matrix[:, n:, :n] = self.slope(x, t, self.theta)
+        return matrix
+
+    def _rates(self, z: np.ndarray, sigma: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        n = self.model.n
+        x = z[:, :n]
+        moved = self._matrix(x, t) @ sigma
+        moved = moved + np.swapaxes(moved, 1, 2)
+        moved[:, :n, :n] += self.covariance(x, t, self.theta)
+        moved[:, n:, n:] += self.noise(x, t, self.theta)
+        return np.concatenate([self.drift(x, t, self.theta), self.observation(x, t, self.theta)], axis=1), moved
