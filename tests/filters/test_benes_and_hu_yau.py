@@ -239,6 +239,7 @@ def test_theorem_6_needs_a_G_that_has_an_inverse():
         zakai.filter(model, record, "hu-yau", choice="theorem-6")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["path", pytest.param("samples", marks=pytest.mark.slow)])
 def test_gaps_irregular_times_and_other_records_agree_with_the_lattice(kind):
     model = model_of(scalar_benes, observation_kind=kind)

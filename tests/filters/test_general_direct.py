@@ -82,6 +82,7 @@ def test_an_affine_observation_of_the_benes_system_is_exact_once_the_start_is_cu
     assert max(errors(result, exact)) <= 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("variance", "step"), [(1e-8, 1e-6), (1e8, 0.1), (1.0, 10.0)])
 def test_extreme_variances_and_steps_give_numbers_and_positive_variances(variance, step):
     model = zakai.Model(
@@ -152,6 +153,7 @@ PRIORS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("prior", "reduction"),
     [
@@ -223,6 +225,7 @@ def test_a_reduction_without_error_figures_says_that_it_has_none(reduction):
     assert reduction in line and "no error figures" in line
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_points_of_no_variance_are_put_together_without_a_division_by_zero():
     points = {"kind": "mixture", "weights": [0.3, 0.3, 0.4], "means": [[0.0], [0.1], [2.0]], "covs": [[[0.0]], [[0.0]], [[1.0]]]}

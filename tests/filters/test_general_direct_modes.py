@@ -53,6 +53,7 @@ def test_neighbours_carry_the_shape_that_a_product_loses_and_modes_keep_their_ma
     assert np.allclose([kept[part].sum() for part in parts], [mass[part].sum() for part in parts], rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 def test_among_near_duplicates_a_large_factor_leaves_the_mean_and_the_shape(seed):
     rng = np.random.default_rng(seed)

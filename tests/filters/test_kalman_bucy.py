@@ -117,6 +117,7 @@ def test_a_mixture_is_filtered_component_by_component():
     assert model.n == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["increments", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("path", "samples"))])
 def test_a_prior_density_and_every_kind_of_record_agree_with_the_lattice(kind):
     model = zakai.Model(

@@ -9,7 +9,10 @@ from __future__ import annotations
 import signal
 import threading
 
+AGAIN = 2.0  # seconds after which an interruption that nobody heard is asked for again
+
 _asked = False
+_insists = False
 
 
 def watch() -> None:
@@ -20,9 +23,19 @@ def watch() -> None:
         signal.signal(signal.SIGINT, _note)
 
 
+def insist() -> None:
+    """Ask again and again: for what waits for its input, where no step comes at which `check` is asked."""
+    global _insists
+    if signal.getsignal(signal.SIGINT) is _note and hasattr(signal, "setitimer"):
+        _insists = True
+        signal.signal(signal.SIGALRM, _note)
+
+
 def _note(*_: object) -> None:
     global _asked
     _asked = True
+    if _insists:
+        signal.setitimer(signal.ITIMER_REAL, AGAIN)
     raise KeyboardInterrupt
 
 

@@ -80,6 +80,23 @@ def filter(
 
 
 @app.command()
+def stream(
+    model: _Model,
+    method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
+    option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
+    checkpoint: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the state there, and go on from it.")] = None,
+    checkpoint_every: Annotated[int | None, typer.Option(metavar="N", min=1, help="Save after every N observations.")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Stop at the first line that cannot be used.")] = False,
+    every: Annotated[int, typer.Option(metavar="N", min=1, help="Print every Nth estimate.")] = 1,
+    fields: Annotated[str, typer.Option(metavar="a,b", help="What to print: time, mean, cov, interval, ...")] = "",
+) -> None:
+    """Filter observations as they come: JSON lines or CSV on standard input, one line of JSON out for each."""
+    from zakai.cli import streaming
+
+    streaming.stream(model, method, option or [], checkpoint, checkpoint_every, strict, every, fields)
+
+
+@app.command()
 def methods(
     model: Annotated[str | None, typer.Argument(metavar="[MODEL]", help="Say which hold for this model.")] = None,
 ) -> None:
@@ -97,6 +114,19 @@ def gallery(
     from zakai.cli import looking
 
     looking.gallery(name)
+
+
+@app.command()
+def study(
+    file: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="Which models, methods and seeds.")],
+    folder: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Where it goes, and is gone on with.")],
+    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run it on the workers of a Dask scheduler.")] = None,
+    processes: Annotated[int | None, typer.Option(metavar="N", help="Run it in N processes.")] = None,
+) -> None:
+    """Run many records through many methods; a study that was interrupted goes on where it was."""
+    from zakai.cli import studying
+
+    studying.study(file, folder, scheduler, processes)
 
 
 @app.command()

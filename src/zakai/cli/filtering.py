@@ -29,7 +29,7 @@ def filter(
 ) -> None:
     """Filter a record; write the result and the report.  Whatever can be refused is refused before the work begins."""
     check_outputs([output, report], [source, record_path, truth_path])
-    options = _options(settings)
+    options = options_of(settings)
     if report is not None:
         from zakai.report import write_report
         from zakai.report._extra import plotting
@@ -46,9 +46,9 @@ def filter(
         result = run(model, record, method, keep=None if report else "moments", progress=advance, **options)
     for warning in result.warnings:
         print(f"warning: {warning}", file=sys.stderr)
+    result.save(output)
     if report is not None:
         write_report(result, report, truth=truth)
-    result.save(output)
     lines = [
         ("method", f"{result.method}: {result.why}"),
         ("observations", f"{len(record):,}, times {record.times[0]:g} to {record.times[-1]:g}"),
@@ -73,7 +73,7 @@ def _truth(path: Path, model: Any, record: Record) -> Truth:
     return truth
 
 
-def _options(settings: list[str]) -> dict[str, Any]:
+def options_of(settings: list[str]) -> dict[str, Any]:
     """KEY=VALUE as keywords: numbers, true, false and none by their meaning, anything else as text."""
     options: dict[str, Any] = {}
     for setting in settings:

@@ -24,6 +24,8 @@ def methods(source: str | None) -> None:
     if source is None:
         _columns([(name, entry.summary) for name, entry in _registry.METHODS.items()])
         print(f"\nauto takes the first that holds of: {', '.join(_registry.AUTO)}")
+        print(f"\npeers, filters of other libraries to compare with; pip install 'zakai[{_registry.EXTRA}]':")
+        _columns([(name, entry.summary) for name, entry in _registry.PEERS.items()])
         return
     from zakai.algebra.analysis import analyze
     from zakai.algebra.conditions import all_hold

@@ -18,7 +18,7 @@ from zakai.models.model import Model
 from zakai.records import Record
 
 # Of these figures of health the smallest is the worst; of all others the largest.
-_SMALLEST_IS_WORST = ("resolution",)
+SMALLEST_IS_WORST = ("resolution",)
 _NUMBER = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 
 
@@ -47,7 +47,7 @@ def joined(model: Model, division: Division, runs: Sequence[Run]) -> FilterResul
         mean[:, block.states], variance[:, block.states] = part.mean, part.variance
         increments += part.log_likelihood_increments
         for name, values in part.health.items():
-            worse = np.fmin if name in _SMALLEST_IS_WORST else np.fmax
+            worse = np.fmin if name in SMALLEST_IS_WORST else np.fmax
             health[name] = worse(health[name], values) if name in health else values
         for name, bound in part.bounds.items():
             bounds[name] = min(bound, bounds.get(name, bound))

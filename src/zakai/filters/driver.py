@@ -137,11 +137,18 @@ def check_records(model: Model, record: Record | Sequence[Record]) -> None:
             _check(model, one)
 
 
-def _check(model: Model, record: Record) -> None:
+def check_model(model: Model) -> None:
+    """Raise InputError unless the model is one that can be filtered."""
+    if not isinstance(model, Model):
+        raise InputError(f"expected a Model, got a {type(model).__name__}; zakai.load_model reads one from a file")
     if model.prior is None:
         raise InputError(f"{model.source}: prior: the table is missing; it is needed to filter")
     if model.functions:
         raise InputError(f"{model.source}: functions: a model with undetermined functions can be analysed and not filtered")
+
+
+def _check(model: Model, record: Record) -> None:
+    check_model(model)
     if record.kind != model.observation_kind:
         raise InputError(
             f"record: its kind is {record.kind}, but {model.source} observes {model.observation_kind} (observation_kind)"

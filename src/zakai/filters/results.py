@@ -16,6 +16,7 @@ from zakai.densities import Density
 from zakai.errors import InputError
 from zakai.models.model import Model
 from zakai.records import Record, load_dataset, save_dataset
+from zakai.records.writing import shown
 
 if TYPE_CHECKING:
     import xarray
@@ -145,10 +146,15 @@ def load_result(path: str | os.PathLike[str]) -> FilterResult:
 
     Raises InputError for a file that is not such a result.
     """
+    return result_of(load_dataset(path), shown(path))
+
+
+def result_of(data: xarray.Dataset, source: str) -> FilterResult:
+    """The result that a dataset holds; `source` is what errors call it. Raises InputError for one that is not a result."""
     from zakai.models.files import read_model
 
-    data = load_dataset(path)
     known = {"mean", "variance", "cov", "log_likelihood_increment"}
+    _check_layout(data, source, known)
     mean = data["mean"].values
     text = str(data.attrs.get("model", ""))
     return FilterResult(
@@ -160,11 +166,35 @@ def load_result(path: str | os.PathLike[str]) -> FilterResult:
         warnings=[line for line in str(data.attrs.get("warnings", "")).split("\n") if line],
         method=str(data.attrs.get("method", "")),
         why=str(data.attrs.get("why", "")),
-        model=read_model(text, str(path)) if text else None,
+        model=read_model(text, source) if text else None,
         state=tuple(str(name) for name in data["state"].values),
         _cov=data["cov"].values if "cov" in data else None,
-        _no_density=f"{path}: a stored result has no densities; filter again to have them",
+        _no_density=f"{source}: a stored result has no densities; filter again to have them",
     )
+
+
+def warnings_of_step(health: Mapping[str, Any], bounds: Mapping[str, tuple[float, str]]) -> list[str]:
+    """A sentence for every bound that one step did not keep."""
+    return [
+        f"{name} is {float(health[name]):.2g} and exceeds {bound:g}: {what}"
+        for name, (bound, what) in bounds.items()
+        if float(health[name]) > bound
+    ]
+
+
+def _check_layout(data: xarray.Dataset, source: str, known: set[str]) -> None:
+    """Raise InputError unless the variables are those of a result, over the right dimensions."""
+    expected = {"mean": ("time", "state"), "variance": ("time", "state"), "cov": ("time", "state", "state_")}
+    for name in ("time", "state", *sorted(known - {"cov"})):
+        if name not in data.variables:
+            raise InputError(f"{source}: has no variable {name!r}; give a result written by zakai filter")
+    for key, variable in data.variables.items():
+        name = str(key)
+        dimensions = (name,) if key in data.coords else expected.get(name, ("time",))
+        numbers = variable.dtype.kind == "f" or name in ("state", "state_")
+        if variable.dims != dimensions or not numbers or data.sizes.get("state_", 0) not in (0, data.sizes["state"]):
+            fault = f"{name[:40]!r} is over {', '.join(map(str, variable.dims))[:60]!r} or holds no floating-point numbers"
+            raise InputError(f"{source}: {fault}; give a result written by zakai filter")
 
 
 @lru_cache(maxsize=1)

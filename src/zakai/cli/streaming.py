@@ -1,0 +1,118 @@
+"""zakai stream"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from zakai.cli import _interrupt
+from zakai.cli._files import check_outputs
+from zakai.cli.filtering import options_of
+from zakai.errors import InputError
+from zakai.models.files import load_model
+from zakai.records.stream import Line, lines_of
+
+FIELDS: dict[str, Callable[[Any], Any]] = {
+    "time": lambda estimate: estimate.time,
+    "mean": lambda estimate: _plain(estimate.mean.tolist()),
+    "cov": lambda estimate: _plain(estimate.cov.tolist()),
+    "interval": lambda estimate: _plain(estimate.interval(0.95).tolist()),
+    "log_likelihood_increment": lambda estimate: _plain(estimate.log_likelihood_increment),
+    "health": lambda estimate: {name: _plain(figure) for name, figure in estimate.health.items()},
+}
+_NUMBERS = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
+
+
+def stream(
+    source: str,
+    method: str,
+    settings: list[str],
+    checkpoint: Path | None,
+    checkpoint_every: int | None,
+    strict: bool,
+    every: int,
+    fields: str,
+) -> None:
+    """Filter the lines of standard input; one line of JSON out for each.  What can be refused is refused before the first."""
+    if checkpoint is None and checkpoint_every is not None:
+        raise InputError("--checkpoint-every: needs --checkpoint FILE")
+    wanted = _wanted(fields)
+    check_outputs([checkpoint], [source])
+    options = options_of(settings)
+    model = load_model(source)
+
+    from zakai.filters.online import online
+
+    _Stream(online(model, method, **options), wanted, every, checkpoint, checkpoint_every or 1, strict).run()
+
+
+class _Stream:
+    """A live filter between standard input and standard output."""
+
+    def __init__(self, online: Any, fields: list[str], every: int, checkpoint: Path | None, save_every: int, strict: bool):
+        self.online, self.fields, self.every, self.strict = online, fields, every, strict
+        self.checkpoint, self.save_every = checkpoint, save_every
+        self.accepted = 0
+        self.warned: set[str] = set()
+        self.skip_until: float | None = None
+
+    def run(self) -> None:
+        if self.checkpoint is not None and self.checkpoint.exists():
+            self.accepted = int(self.online.restore(self.checkpoint).get("accepted", 0))
+            if self.accepted:
+                self.skip_until = self.online.time
+                self.show(self.online.last)
+        _interrupt.insist()
+        for line in lines_of(sys.stdin.buffer, self.online.model.m):
+            _interrupt.check()
+            try:
+                self.take(line)
+            except InputError as error:
+                fault = f"line {line.number}: {error}"
+                if self.strict:
+                    raise InputError(f"standard input: {fault}") from None
+                print(f"error: {' '.join(fault.split())}", file=sys.stderr, flush=True)
+
+    def take(self, line: Line) -> None:
+        """Use one line; InputError where it cannot be used."""
+        if line.fault is not None:
+            raise InputError(line.fault)
+        if self.skip_until is not None and isinstance(line.time, int | float) and line.time <= self.skip_until:
+            return  # the checkpoint knows it already
+        estimate = self.online.update(line.time, line.values)
+        self.skip_until = None
+        self.accepted += 1
+        if self.checkpoint is not None and self.accepted % self.save_every == 0:
+            self.online.save(self.checkpoint, {"accepted": self.accepted})
+        self.show(estimate)
+
+    def show(self, estimate: Any) -> None:
+        """Print an estimate where it is due, and what is new of its warnings."""
+        for warning in estimate.warnings:
+            kind = _NUMBERS.sub("0", warning)
+            if kind not in self.warned:
+                self.warned.add(kind)
+                print(f"warning: from t = {estimate.time:g} on: {warning}", file=sys.stderr, flush=True)
+        if self.accepted % self.every == 0:
+            sys.stdout.write(json.dumps({name: FIELDS[name](estimate) for name in self.fields}, allow_nan=False) + "\n")
+            sys.stdout.flush()
+
+
+def _wanted(fields: str) -> list[str]:
+    names = [name.strip() for name in fields.split(",")] if fields else list(FIELDS)
+    for name in names:
+        if name not in FIELDS:
+            raise InputError(f'--fields: there is no field "{name}"; the fields are {", ".join(FIELDS)}')
+    return names
+
+
+def _plain(value: Any) -> Any:
+    """Numbers as JSON can say them: null for what is none."""
+    if isinstance(value, list):
+        return [_plain(part) for part in value]
+    return value if math.isfinite(value) else None

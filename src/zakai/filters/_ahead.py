@@ -1,0 +1,199 @@
+"""What a live filter knows of the intervals before their readings come.
+
+Where nothing depends on time an interval is known by its length, and prepared once.  Where something does, intervals are prepared
+many at once as soon as their steps repeat, and one by one where they do not.  What is prepared depends on nothing but its key, so
+that a filter that is started again from a checkpoint finds the same numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from zakai import _float64  # noqa: F401
+from zakai.errors import InputError
+from zakai.filters._compiled_step import Layout, packed_rows
+from zakai.filters._run import Setting
+from zakai.filters.observations import Data
+from zakai.models.checks import check_noise_at, check_noise_within
+
+CHUNK = 2048  # intervals that are prepared at once, at most
+CHUNK_BYTES = 64 * 2**20  # what is prepared for them, at most
+KEPT = 64  # prepared intervals of different lengths or gaps, and
+KEPT_BYTES = 64 * 2**20  # what they take, at most
+
+
+class Key(NamedTuple):
+    """Some intervals, each beginning where the last one ends: which coordinates are read, over what time each if not over just
+    the interval."""
+
+    start: float
+    step: float
+    number: int
+    seen: tuple[bool, ...]
+    elapsed: tuple[float, ...] | None = None
+
+    @property
+    def edges(self) -> np.ndarray:
+        """Where they begin and end (number + 1,)."""
+        return self.start + self.step * np.arange(self.number + 1)
+
+
+class Block(NamedTuple):
+    """What was prepared for the intervals of a key: for each a row, which `layout` describes."""
+
+    key: Key
+    prepared: Any
+    rows: np.ndarray
+    layout: Layout
+    notes: tuple[str, ...]
+
+
+class Clock(NamedTuple):
+    """How regularly readings came: `steps` equal ones since the time `since`; and the key of what was prepared for them."""
+
+    since: float
+    steps: int
+    seen: tuple[bool, ...]
+    ahead: Key | None
+    begun: bool
+
+
+class Given(NamedTuple):
+    """A rule that gives an observation that was made for just one reading."""
+
+    observation: Any
+
+    def __call__(self, values: Any) -> Any:
+        return self.observation
+
+
+def _close(time: float, expected: float, step: float) -> bool:
+    """Whether two times are the same but for rounding."""
+    return abs(time - expected) <= 1e-9 * step + 4 * math.ulp(time)
+
+
+class Ahead:
+    """The intervals of one setting."""
+
+    def __init__(self, setting: Setting):
+        self.setting = setting
+        model = setting.model
+        matrices = (model.drift, model.diffusion, model.process_noise, model.observation, model.observation_noise)
+        self.varying = any(matrix.has(model.t) for matrix in matrices)
+        self.noise_varies = any(matrix.has(model.t) for matrix in (matrices[1], matrices[2], matrices[4]))
+        self.kept: OrderedDict[Key, Block] = OrderedDict()
+        self.bytes = 0
+        self.chunk: Block | None = None
+
+    def at(
+        self,
+        clock: Clock,
+        start: float,
+        stop: float,
+        values: np.ndarray,
+        seen: tuple[bool, ...],
+        elapsed: tuple[float, ...] | None,
+    ) -> tuple[Block, int, Clock]:
+        """The block and the row of an interval, and the clock after it."""
+        if self.setting.method.rule is None:
+            return self._made(Key(start, stop - start, 1, seen, elapsed), (start, stop), values), 0, clock
+        if not self.varying:
+            # Lengths that differ by rounding alone are one.
+            last = clock.ahead
+            same = last is not None and last.seen == seen and last.elapsed == elapsed
+            if last is None or not same or not _close(stop, start + last.step, last.step):
+                last = Key(0.0, stop - start, 1, seen, elapsed)
+                clock = clock._replace(ahead=last)
+            return self._remembered(last), 0, clock
+        step = (start - clock.since) / clock.steps if clock.steps else stop - start
+        repeats = bool(clock.steps) and seen == clock.seen and _close(stop, start + step, step)
+        clock = clock._replace(steps=clock.steps + 1) if repeats else clock._replace(since=start, steps=1, seen=seen)
+        if elapsed is not None:
+            return self._made(Key(start, stop - start, 1, seen, elapsed), (start, stop)), 0, clock._replace(begun=True)
+        row = self._row(clock.ahead, start, stop, seen)
+        # Of the first interval it is supposed that others like it follow.
+        if row is None and (repeats or not clock.begun):
+            key = self._many(Key(start, (stop - clock.since) / clock.steps, CHUNK, seen))
+            clock, row = clock._replace(ahead=key), 0
+        clock = clock._replace(begun=True)
+        if row is None or clock.ahead is None:
+            return self._made(Key(start, stop - start, 1, seen), (start, stop)), 0, clock
+        return self._ahead(clock.ahead), row, clock
+
+    def again(self, key: Key, ends: tuple[float, float]) -> Block:
+        """The block of a key once more, for an interval with these ends."""
+        if not self.varying:
+            return self._remembered(key)
+        return self._ahead(key) if key.number > 1 else self._made(key, ends)
+
+    def _row(self, key: Key | None, start: float, stop: float, seen: tuple[bool, ...]) -> int | None:
+        if key is None or key.seen != seen:
+            return None
+        row = round((start - key.start) / key.step)
+        if not 0 <= row < key.number:
+            return None
+        first = key.start + row * key.step
+        close = _close(start, first, key.step) and _close(stop, key.start + (row + 1) * key.step, key.step)
+        return row if close else None
+
+    def _many(self, key: Key) -> Key:
+        """The same key with as many intervals as can be prepared ahead: some time the coefficients may end to exist."""
+        size = self._made(key._replace(number=1)).rows.nbytes
+        key = key._replace(number=max(1, min(key.number, CHUNK_BYTES // max(size, 1))))
+        while True:
+            try:
+                self.chunk = self._made(key)
+                return key
+            except InputError:
+                if key.number == 1:
+                    raise
+                key = key._replace(number=max(1, key.number // 8))
+
+    def _ahead(self, key: Key) -> Block:
+        if self.chunk is None or self.chunk.key != key:
+            self.chunk = self._made(key)
+        return self.chunk
+
+    def _remembered(self, key: Key) -> Block:
+        if self.chunk is not None and self.chunk.key is key:
+            return self.chunk
+        block = self.kept.get(key)
+        if block is None:
+            block = self.kept[key] = self._made(key)
+            self.bytes += block.rows.nbytes
+            while len(self.kept) > KEPT or (len(self.kept) > 1 and self.bytes > KEPT_BYTES):
+                self.bytes -= self.kept.popitem(last=False)[1].rows.nbytes
+        else:
+            self.kept.move_to_end(key)
+        self.chunk = block
+        return block
+
+    def _made(self, key: Key, ends: tuple[float, float] | None = None, values: np.ndarray | None = None) -> Block:
+        """What is prepared for a key, with the very ends of a single interval where they matter."""
+        method, model = self.setting.method, self.setting.model
+        edges = key.edges if ends is None else np.array(ends)
+        data = data_at(model.observation_kind, edges, key.seen, key.elapsed, values)
+        if self.noise_varies:
+            check_noise_at(model, edges)
+            check_noise_within(model, edges)
+        prepared = self.setting.prepared(data)
+        rule = Given(method.observations(prepared, data)) if method.rule is None else method.rule(prepared, data)
+        tree = (prepared.intervals, rule)
+        layout = Layout.of_rows(jax.tree.map(np.asarray, tree))
+        return Block(key, prepared, packed_rows(tree, key.number), layout, tuple(getattr(prepared, "notes", ())))
+
+
+def data_at(
+    kind: str, edges: np.ndarray, seen: tuple[bool, ...], elapsed: tuple[float, ...] | None, values: np.ndarray | None = None
+) -> Data:
+    """Readings at the ends of intervals of the coordinates that are `seen`; zero where no `values` (m,) are given."""
+    starts, stops, shape = edges[:-1], edges[1:], (len(edges) - 1, len(seen))
+    read = np.where(seen, np.zeros(len(seen)) if values is None else values, np.nan)
+    spans = np.broadcast_to((stops - starts)[:, None] if elapsed is None else np.array(elapsed), shape)
+    spans = np.zeros(shape) if kind == "samples" else np.where(seen, spans, np.nan)
+    return Data(starts, stops, np.broadcast_to(read, shape), spans)

@@ -1,0 +1,202 @@
+"""One method on its way through readings that come one by one."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from zakai import _float64  # noqa: F401
+from zakai.densities import Density
+from zakai.errors import InputError
+from zakai.filters._ahead import Ahead, Block, Clock, data_at
+from zakai.filters._compiled_step import Layout, Step, Told, compiled, packed
+from zakai.filters._protocol import Info
+from zakai.filters._run import RUN, TRIES, Setting
+
+AFTER_GAP = (
+    "a path is read after a gap: the increment since the last reading of that coordinate acts as one factor at its end, which is "
+    "exact only as the gaps shrink"
+)
+
+
+class Moment(NamedTuple):
+    """Everything that decides what a filter says next; it never changes, the next reading makes another.
+
+    `vector` holds the state, in `layout`, and what was told of it; of the run of steps since the lattice was looked at `left`
+    are left, in `block`, whose interval now ended began and ended at `ends`.  `read` and `read_at` (m,) are the last values of a
+    path and their times.  `first` are samples at the start itself: what they make of the prior waits for the first interval.
+    """
+
+    time: float
+    vector: Any
+    layout: Layout | None
+    told: Told | None
+    left: int
+    block: Block | None
+    ends: tuple[float, float]
+    clock: Clock
+    read: tuple[float, ...]
+    read_at: tuple[float, ...]
+    first: tuple[float, ...] | None
+    notes: tuple[str, ...]
+
+
+class Live:
+    """One method, its setting and the moment that it has come to."""
+
+    def __init__(self, setting: Setting):
+        self.setting, self.ahead = setting, Ahead(setting)
+        self.kind, self.m = setting.model.observation_kind, setting.model.m
+        method = setting.method
+        self.step: Step | None = None
+        self.inputs: Layout | None = None
+        self.adapts, self.path = method.adapt is not None, self.kind == "path"
+        start = float(setting.model.start)
+        clock = Clock(start, 0, (), None, False)
+        nothing = (0.0,) * self.m
+        self.now = Moment(start, None, None, None, 0, None, (start, start), clock, nothing, (start,) * self.m, None, ())
+
+    def moved(self, time: float, values: list[float], look_only: bool = False) -> Moment:
+        """The moment after a reading (m,), nan where there is none; this one stays as it is.
+
+        With `look_only` nothing is prepared for what may follow.
+        """
+        now = self.now
+        seen = tuple([value == value for value in values])
+        elapsed, read, read_at = None, now.read, now.read_at
+        notes: tuple[str, ...] = ()
+        if self.path:
+            elapsed, values, read, read_at = self._increments(time, values, seen)
+            notes = (AFTER_GAP,) if elapsed is not None else ()
+        elif self.kind == "rates":
+            values = [value * (time - now.time) for value in values]
+        reading = np.array(values)
+        if not all(seen):
+            reading = np.where(seen, reading, 0.0)
+        if time == now.time:
+            return self._at_start(reading, seen)
+        clock = now.clock._replace(begun=True) if look_only else now.clock
+        block, row, clock = self.ahead.at(clock, now.time, time, reading, seen, elapsed)
+        vector, layout, left = now.vector, now.layout, now.left
+        if vector is None or now.first is not None:
+            vector, layout, left = *self._begun(block, row), 0
+        assert layout is not None
+        given = np.concatenate([reading, block.rows[row]])
+        looks = self.adapts and (left == 0 or block is not now.block)
+        if looks:
+            vector, layout, left = self._looked(block, row, vector, layout)
+        after, step, told = self._step(vector, layout, block, given)
+        if self.adapts and not told.well:
+            if not looks:
+                vector, layout, left = self._looked(block, row, vector, layout)
+                after, step, told = self._step(vector, layout, block, given)
+            if not told.well:
+                after, step, told, left = self._tried(block, row, vector, layout, given, (after, step, told, left))
+        if told.verdict != told.verdict:
+            raise InputError(
+                f"{self.setting.model.source}: at t = {time:g} the reading leaves nothing of the density, or takes it "
+                "beyond what numbers can hold; it is not used"
+            )
+        ends = (now.time, time)
+        return Moment(time, after, step.new, told, left - 1, block, ends, clock, read, read_at, None, notes + block.notes)
+
+    def density(self, moment: Moment) -> Density:
+        """The density at a moment."""
+        method = self.setting.method
+        if moment.layout is None or moment.block is None:
+            prepared = self._stand_in().prepared
+            return method.density(prepared, method.init(prepared, self.setting.prior))
+        return method.density(moment.block.prepared, moment.layout.unpacked(np.asarray(moment.vector)))
+
+    def _increments(self, time: float, values: list[float], seen: tuple[bool, ...]) -> tuple[Any, ...]:
+        """What a path's readings add to the last ones, and over what time where that is not just the interval."""
+        now = self.now
+        increments = [value - last for value, last in zip(values, now.read, strict=True)]
+        spans = tuple(time - last if there else 0.0 for last, there in zip(now.read_at, seen, strict=True))
+        plain = all(last == now.time for last, there in zip(now.read_at, seen, strict=True) if there)
+        read = tuple(value if there else last for value, last, there in zip(values, now.read, seen, strict=True))
+        read_at = tuple(time if there else last for last, there in zip(now.read_at, seen, strict=True))
+        return None if plain else spans, increments, read, read_at
+
+    def _at_start(self, reading: np.ndarray, seen: tuple[bool, ...]) -> Moment:
+        """The moment after samples at the start itself."""
+        now, block = self.now, self._stand_in()
+        state, info = self._corrected(block, reading, seen)
+        info = jax.tree.map(np.asarray, info._replace(need=None))
+        told = Told(np.append(packed(info), 1.0), Layout.of(info))
+        if not np.isfinite(told.vector[: 1 + len(info.mean)]).all():
+            raise InputError(f"{self.setting.model.source}: the reading at the start leaves nothing of the prior; it is not used")
+        state = jax.tree.map(np.asarray, state)
+        first = tuple(np.where(seen, reading, np.nan).tolist())
+        notes = block.notes
+        ends = (now.time, now.time + 1.0)
+        return now._replace(
+            vector=packed(state), layout=Layout.of(state), told=told, block=block, ends=ends, first=first, notes=notes
+        )
+
+    def _corrected(self, block: Block, reading: np.ndarray, seen: tuple[bool, ...]) -> tuple[Any, Info]:
+        method, start = self.setting.method, self.now.time
+        data = data_at(self.kind, np.array([start, start]), seen, None, reading)
+        prepared = self.setting.prepared(data) if block.prepared is None else block.prepared
+        return method.correct(prepared, self.setting.prior, method.observations(prepared, data))
+
+    def _stand_in(self) -> Block:
+        """An interval after the start, where none is known yet."""
+        start = float(self.setting.model.start)
+        clock = self.now.clock._replace(begun=True)
+        return self.ahead.at(clock, start, start + 1.0, np.zeros(self.m), (False,) * self.m, None)[0]
+
+    def _begun(self, block: Block, row: int) -> tuple[Any, Layout]:
+        """The state at the start of the first interval."""
+        now, method = self.now, self.setting.method
+        if now.first is None:
+            state = method.init(block.prepared, self.setting.prior)
+        else:
+            first = np.array(now.first)
+            state, _ = self._corrected(block, np.nan_to_num(first), tuple((first == first).tolist()))
+        if not self.adapts:
+            return self._laid(state, block)
+        # No step may be taken before the lattice was looked at.
+        state = jax.tree.map(np.asarray, state)
+        return packed(state), Layout.of(state)
+
+    def _laid(self, state: Any, block: Block) -> tuple[Any, Layout]:
+        state = jax.tree.map(np.asarray, state)
+        layout = Layout.of(state)
+        step = compiled(self.setting.method, layout, block.layout, self.m)
+        return step.begun(state), step.state
+
+    def _looked(self, block: Block, row: int, vector: Any, layout: Layout) -> tuple[Any, Layout, int]:
+        """The state on a lattice that was looked at, and how many steps may be taken on it."""
+        state = layout.unpacked(np.asarray(vector))
+        run = getattr(state, "run_length", RUN)
+        rows = slice(row, min(row + run, block.key.number))
+        adapt = self.setting.method.adapt
+        assert adapt is not None
+        state = adapt(block.prepared, state, rows, None)
+        return *self._laid(state, block), getattr(state, "run_length", RUN)
+
+    def _tried(self, block: Block, row: int, vector: Any, layout: Layout, given: np.ndarray, found: Any) -> Any:
+        """One step from better lattices, until it is well or nothing better can be had; health then says so."""
+        adapt = self.setting.method.adapt
+        assert adapt is not None
+        for _ in range(TRIES):
+            info = jax.tree.map(lambda a: np.asarray(a)[None], found[2].info)
+            state = adapt(block.prepared, layout.unpacked(np.asarray(vector)), slice(row, row + 1), info)
+            if state is None:
+                break
+            vector, layout = self._laid(state, block)
+            found = (*self._step(vector, layout, block, given), getattr(state, "run_length", RUN))
+            if found[2].well:
+                break
+        return found
+
+    def _step(self, vector: Any, layout: Layout, block: Block, given: np.ndarray) -> tuple[Any, Step, Told]:
+        step = self.step
+        if step is None or layout is not step.state or block.layout is not self.inputs:
+            self.step = step = compiled(self.setting.method, layout, block.layout, self.m)
+            self.inputs = block.layout
+        after = step.call(vector, given)
+        return after, step, Told(np.asarray(after)[step.begin :], step.info)

@@ -1,0 +1,330 @@
+"""The filter of a running machine: one observation in, one estimate out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from functools import lru_cache
+from statistics import NormalDist
+from threading import RLock
+from typing import Any
+
+import numpy as np
+
+from zakai.densities import Density, ProductDensity
+from zakai.densities.product import renamed
+from zakai.errors import InputError
+from zakai.filters._blocks import SMALLEST_IS_WORST
+from zakai.filters._live import Live, Moment
+from zakai.filters._plan import ByBlocks
+from zakai.filters._saved import restore, saved
+from zakai.filters.driver import check_model, planned
+from zakai.filters.results import versions, warnings_of_step
+from zakai.models.checks import check_noise_at
+from zakai.models.model import Model
+from zakai.models.prior import GaussianPrior
+from zakai.records.checkpoint import read_checkpoint, write_checkpoint
+from zakai.records.record import LARGEST
+from zakai.records.writing import shown
+
+
+def online(model: Model, method: str = "auto", **options: Any) -> Online:
+    """A filter that is given one observation at a time, and gives the estimate after it.
+
+    model: what the system is, with a prior. method: a method's name, or "auto", as for `zakai.filter`. options: those of the
+    method.
+
+    What it says is what `zakai.filter` says of the same record.  The first call of `update` prepares and compiles; the later
+    ones take microseconds.
+
+    Raises InputError for a wrong model or option, ConditionError if the method's theorem does not hold.
+
+    Example:
+
+        online = zakai.online(zakai.load_model("gallery:spiral-sensor"))
+        estimate = online.update(0.01, [0.02, -0.01])
+        estimate.mean, estimate.interval()
+    """
+    return Online(model, method, options)
+
+
+class Online:
+    """A live filter: `update` with an observation, `predict` without one.  Many of them do not disturb each other, in threads
+    neither; one that several threads share takes them one after the other."""
+
+    def __init__(self, model: Model, method: str, options: dict[str, Any]):
+        check_model(model)
+        if options.get("form") == "one-shot":
+            raise InputError('option form: "one-shot" needs all times from the start on; a live filter takes "stepwise"')
+        plan = planned(model, None, method, options)
+        self.model, self.options = model, options
+        self.blocks: Any = plan.division.blocks if isinstance(plan, ByBlocks) else None
+        self.method = plan.division.method if isinstance(plan, ByBlocks) else plan.setting.method.name
+        self.why = plan.division.why if isinstance(plan, ByBlocks) else plan.why
+        check_noise_at(model, [model.start])
+        self.lives = tuple(Live(setting) for setting in plan.settings)
+        self.lock = RLock()
+        self._columns = [list(block.observations) for block in self.blocks] if self.blocks else None
+
+    def __repr__(self) -> str:
+        return f"Online({self.method} of {self.model.source}, at t = {self.time:g})"
+
+    @property
+    def time(self) -> float:
+        """The time of the last observation, or the model's start."""
+        return self.lives[0].now.time
+
+    def update(self, time: float, value: Any) -> Estimate:
+        """The estimate after an observation.
+
+        time: later than that of the last observation, or for samples the model's start itself. value: (m,), in what the
+        model's `observation_kind` says; nan or None where a coordinate was not observed. A number will do where m is one.
+
+        Raises InputError for a value or a time that cannot be used; the filter then stays as it was.
+        """
+        values = self._values(value)
+        with self.lock:
+            time = self._time(time)
+            moments = tuple(live.moved(time, part) for live, part in zip(self.lives, self._divided(values), strict=True))
+            for live, moment in zip(self.lives, moments, strict=True):
+                live.now = moment
+        return Estimate(self, moments)
+
+    def predict(self, time: float) -> Estimate:
+        """The estimate at a later time, or now, if nothing is observed until then; the filter stays as it was."""
+        with self.lock:
+            time = _number(time)
+            if time == self.time:
+                return self.last
+            if not time > self.time:
+                raise InputError(f"predict: the time {time!r} is before {self.time!r}, the time of the filter")
+            nothing = self._divided([np.nan] * self.model.m)
+            moments = (live.moved(time, part, look_only=True) for live, part in zip(self.lives, nothing, strict=True))
+            return Estimate(self, tuple(moments))
+
+    @property
+    def last(self) -> Estimate:
+        """The estimate after the last observation, before the first the prior."""
+        with self.lock:
+            return Estimate(self, tuple(live.now for live in self.lives))
+
+    def save(self, path: str | os.PathLike[str], more: Mapping[str, Any] | None = None) -> None:
+        """Write a checkpoint, atomically: all that decides what the filter says next, and `more` that JSON can say.
+
+        Raises InputError where the file cannot be written.
+        """
+        with self.lock:
+            parts = [saved(live) for live in self.lives]
+        arrays = {f"{i}/{k}": array for i, (_, own) in enumerate(parts) for k, array in enumerate(own)}
+        write_checkpoint(path, {**self._bound, "lives": [said for said, _ in parts], "more": dict(more or {})}, arrays)
+
+    def restore(self, path: str | os.PathLike[str]) -> dict[str, Any]:
+        """Go on from a checkpoint of a filter of the same model, method, options and versions, with the same numbers to the bit.
+
+        Gives what was said with it. Raises InputError where the checkpoint is damaged, or that of another filter; this one then
+        stays as it was.
+        """
+        about, arrays = read_checkpoint(path)
+        for what, own in self._bound.items():
+            if about.get(what) != own:
+                said = "" if what == "model" else f" ({_short(about.get(what))}, not {_short(own)})"
+                raise InputError(f"{shown(path)}: is the checkpoint of another {what}{said}; name another file, or remove it")
+        try:
+            lives, more = about["lives"], dict(about["more"])
+            own_arrays = [[arrays[f"{i}/{k}"] for k in range(_count(arrays, i))] for i in range(len(self.lives))]
+            with self.lock:
+                every = zip(self.lives, lives, own_arrays, strict=True)
+                moments = [restore(live, said, own) for live, said, own in every]
+                for live, moment in zip(self.lives, moments, strict=True):
+                    live.now = moment
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"{shown(path)}: the checkpoint does not fit this filter; remove it to begin anew") from None
+        return more
+
+    @property
+    def _bound(self) -> dict[str, Any]:
+        """What a checkpoint is bound to."""
+        options = {name: self.options[name] for name in sorted(self.options)}
+        return {"model": self.model.text, "method": self.method, "options": options, "versions": versions()}
+
+    def _divided(self, values: list[float]) -> list[list[float]]:
+        """What each block is told; one that is not observed at all, nothing of a sensor that shows nothing."""
+        if self._columns is None:
+            return [values]
+        return [[values[i] for i in columns] or [np.nan] for columns in self._columns]
+
+    def _time(self, time: Any) -> float:
+        time, now = _number(time), self.time
+        if time > now:
+            return time
+        begins = self.lives[0].now.told is None
+        if time == now and begins and self.model.observation_kind == "samples":
+            return time
+        if begins:
+            raise InputError(f"update: the time {time!r} must be after the model's start {now!r}")
+        if time == now:
+            raise InputError(f"update: the time {time!r} repeats that of the last observation")
+        raise InputError(f"update: the time {time!r} is late by {now - time:g}: the last observation was at {now!r}")
+
+    def _values(self, value: Any) -> list[float]:
+        m = self.model.m
+        if isinstance(value, list | tuple):
+            values = [np.nan if one is None else one for one in value]
+        else:
+            values = np.atleast_1d(np.nan if value is None else value).tolist()
+        if len(values) != m:
+            raise InputError(f"update: {_counted(len(values))} where {self.model.source} has {_counted(m)} of observations")
+        for index, one in enumerate(values):
+            if isinstance(one, np.floating | np.integer):
+                values[index] = one = float(one)
+            if isinstance(one, bool) or not isinstance(one, float | int):
+                raise InputError(f"update: observation {index + 1} is {_short(one)}; give a number, or nan where there is none")
+            if abs(one) > LARGEST:
+                raise InputError(
+                    f"update: observation {index + 1} is {_short(one)}; values must be finite and at most {LARGEST:g} in size"
+                )
+        return [float(one) for one in values]
+
+
+class Estimate:
+    """What is known at a time: its moments, the health of the step, and the whole density."""
+
+    __slots__ = ("_online", "_moments", "_density", "_info")
+
+    def __init__(self, online: Online, moments: tuple[Moment, ...]):
+        self._online, self._moments = online, moments
+        self._density: Density | None = None
+        self._info: Any = None
+
+    def __repr__(self) -> str:
+        names = self._online.model.state
+        deviations = np.sqrt(np.maximum(np.diag(self.cov), 0.0))
+        parts = (f"{name} = {mean:.6g} +- {deviation:.3g}" for name, mean, deviation in zip(names, self.mean, deviations))
+        return f"Estimate(t = {self.time:g}: {', '.join(parts)})"
+
+    @property
+    def time(self) -> float:
+        """The time of the estimate."""
+        return self._moments[0].time
+
+    @property
+    def _infos(self) -> list[Any]:
+        if self._info is None:
+            self._info = [moment.told.info if moment.told is not None else None for moment in self._moments]
+        return self._info
+
+    @property
+    def mean(self) -> np.ndarray:
+        """The mean of the state (n,)."""
+        means = [self._part(i).mean() if info is None else info.mean for i, info in enumerate(self._infos)]
+        if self._online.blocks is None:
+            return means[0]
+        mean = np.empty(self._online.model.n)
+        for block, part in zip(self._online.blocks, means, strict=True):
+            mean[list(block.states)] = part
+        return mean
+
+    @property
+    def cov(self) -> np.ndarray:
+        """The covariance of the state (n, n)."""
+        covs = [self._part(i).cov() if info is None else info.cov for i, info in enumerate(self._infos)]
+        if self._online.blocks is None:
+            return covs[0]
+        cov = np.zeros((self._online.model.n,) * 2)
+        for block, part in zip(self._online.blocks, covs, strict=True):
+            cov[np.ix_(block.states, block.states)] = part
+        return cov
+
+    @property
+    def log_likelihood_increment(self) -> float:
+        """What the observation adds to the log-likelihood; zero where there was none."""
+        return sum(float(info.log_likelihood_increment) for info in self._infos if info is not None)
+
+    @property
+    def health(self) -> dict[str, float]:
+        """The figures of health of the step, of blocks the worst."""
+        worst: dict[str, float] = {}
+        for info in self._infos:
+            for name, figure in ({} if info is None else info.health).items():
+                figure = float(figure)
+                choose = min if name in SMALLEST_IS_WORST else max
+                worst[name] = choose(figure, worst[name]) if name in worst else figure
+        return worst
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for every bound that this step did not keep, and for what else is to be known of it."""
+        said: dict[str, None] = {}
+        for live, moment, info in zip(self._online.lives, self._moments, self._infos, strict=True):
+            said.update(dict.fromkeys(moment.notes))
+            if info is not None:
+                said.update(dict.fromkeys(warnings_of_step(info.health, live.setting.method.bounds)))
+        return tuple(said)
+
+    @property
+    def density(self) -> Density:
+        """The conditional density of the state."""
+        if self._density is None:
+            online, parts = self._online, [self._part(i) for i in range(len(self._moments))]
+            if online.blocks is None:
+                self._density = parts[0]
+            else:
+                model, blocks = online.model, online.blocks
+                named = [renamed(part, block.names) for part, block in zip(parts, blocks, strict=True)]
+                angles = tuple(name in model.periodic for name in model.state)
+                self._density = ProductDensity(named, tuple(block.states for block in blocks), model.state, angles)
+        return self._density
+
+    def interval(self, probability: float = 0.95) -> np.ndarray:
+        """The credible interval of each coordinate (n, 2): outside of it, on each side, is half of what is left."""
+        if not 0 < probability < 1:
+            raise InputError(f"interval: the probability {probability!r} must be between 0 and 1")
+        tail = 0.5 * (1 - probability)
+        online, found = self._online, np.empty((self._online.model.n, 2))
+        for i, live in enumerate(online.lives):
+            info = self._infos[i]
+            if info is not None and _is_gaussian(live):
+                half = _deviations(1 - tail) * np.sqrt(np.maximum(np.diag(info.cov), 0.0))
+                part = np.stack([info.mean - half, info.mean + half], axis=1)
+            else:
+                part = self._part(i).quantile([tail, 1 - tail]).T
+            found[slice(None) if online.blocks is None else list(online.blocks[i].states)] = part
+        return found
+
+    def _part(self, index: int) -> Density:
+        return self._online.lives[index].density(self._moments[index])
+
+
+@lru_cache(maxsize=8)
+def _deviations(probability: float) -> float:
+    return NormalDist().inv_cdf(probability)
+
+
+def _is_gaussian(live: Live) -> bool:
+    """Whether what the filter carries is a Gaussian and always was."""
+    name, prior = live.setting.method.name, live.setting.prior
+    return name == "extended-kalman-bucy" or (name == "kalman-bucy" and isinstance(prior, GaussianPrior))
+
+
+def _count(arrays: Mapping[str, Any], live: int) -> int:
+    """How many arrays belong to one of the blocks."""
+    return sum(name.startswith(f"{live}/") for name in arrays)
+
+
+def _number(time: Any) -> float:
+    if isinstance(time, bool) or not isinstance(time, float | int | np.floating | np.integer):
+        raise InputError(f"the time is {_short(time)}; give a number")
+    if not -LARGEST <= time <= LARGEST:
+        raise InputError(f"the time is {_short(time)}; times must be finite and at most {LARGEST:g} in size")
+    return float(time)
+
+
+def _counted(count: int) -> str:
+    return f"{count} column" if count == 1 else f"{count} columns"
+
+
+def _short(what: Any) -> str:
+    text = ascii(what)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+

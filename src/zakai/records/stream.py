@@ -1,0 +1,106 @@
+"""Observations line by line, as they come: JSON lines, or CSV where the first line is a header of it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from typing import Any, BinaryIO, NamedTuple
+
+from zakai.errors import InputError
+
+LONGEST = 2**20  # bytes of a line
+_NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
+
+
+class Line(NamedTuple):
+    """One line: its number, from 1, its time and its values, None where nothing was observed; or what is wrong with it."""
+
+    number: int
+    time: Any
+    values: list[Any]
+    fault: str | None = None
+
+
+def lines_of(file: BinaryIO, m: int) -> Iterator[Line]:
+    """The lines of a stream of observations, each as soon as it is there.
+
+    JSON lines are {"time": 0.1, "y": [0.5, null]}, of which other keys are left alone; a stream whose first line begins with
+    `time` is CSV, with m columns after that. Empty lines are passed over. No line is held in memory beyond a mebibyte.
+
+    Arguments:
+        file: bytes, as `sys.stdin.buffer`.
+        m: how many values an observation has.
+
+    Raises:
+        InputError: the header of a CSV does not fit.
+
+    Example:
+        >>> import io
+        >>> from zakai.records.stream import lines_of
+        >>> [line.values for line in lines_of(io.BytesIO(b'{"time": 1, "y": [0.5]}\\n{"time": 2, "y": [null]}\\n'), 1)]
+        [[0.5], [None]]
+    """
+    parse: Callable[[str], tuple[Any, list[Any]]] | None = None
+    number = 0
+    while content := file.readline(LONGEST + 1):
+        number += 1
+        if len(content) > LONGEST:
+            _skip_rest(file, content)
+            yield Line(number, None, [], f"is longer than {LONGEST} bytes")
+            continue
+        try:
+            text = content.decode("utf-8-sig" if number == 1 else "utf-8")
+        except UnicodeDecodeError:
+            yield Line(number, None, [], "holds bytes that are not UTF-8 text")
+            continue
+        if not text.strip():
+            continue
+        if parse is None:
+            if text.split(",")[0].strip().strip('"') == "time":
+                _check_header(text, m)
+                parse = _csv
+                continue
+            parse = _json
+        try:
+            yield Line(number, *parse(text))
+        except ValueError as error:
+            yield Line(number, None, [], str(error))
+
+
+def _skip_rest(file: BinaryIO, content: bytes) -> None:
+    while content and not content.endswith(b"\n"):
+        content = file.readline(LONGEST)
+
+
+def _json(text: str) -> tuple[Any, list[Any]]:
+    try:
+        told = json.loads(text)
+    except (ValueError, RecursionError):
+        raise ValueError(f'{_quoted(text.strip())} is not JSON; expected {{"time": ..., "y": [...]}}') from None
+    if not isinstance(told, dict) or "time" not in told or "y" not in told:
+        raise ValueError(f'{_quoted(text.strip())} is not an object with "time" and "y"')
+    values = told["y"]
+    return told["time"], values if isinstance(values, list) else [values]
+
+
+def _csv(text: str) -> tuple[Any, list[Any]]:
+    cells = [cell.strip() for cell in text.split(",")]
+    for cell in cells:
+        if cell and not _NUMBER.fullmatch(cell):
+            raise ValueError(f"{_quoted(cell)} is not a number; leave the cell empty if nothing was observed")
+    if not cells[0]:
+        raise ValueError("the time is missing")
+    return float(cells[0]), [float(cell) if cell else None for cell in cells[1:]]
+
+
+def _check_header(text: str, m: int) -> None:
+    columns = len(text.split(","))
+    if columns != m + 1:
+        raise InputError(
+            f"standard input: line 1: a header of {columns} columns; the model needs time and {m} observations, {m + 1} in all"
+        )
+
+
+def _quoted(text: str) -> str:
+    return ascii(text if len(text) <= 40 else text[:37] + "...")

@@ -1,0 +1,190 @@
+"""`zakai stream`: a line in, a line out, whatever the lines are."""
+
+from __future__ import annotations
+
+import io
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import zakai as package
+from zakai.records.stream import LONGEST, lines_of
+
+COMMAND = [sys.executable, "-c", "import sys; from zakai.cli import main; sys.exit(main())", "stream", "model.toml"]
+LINES = [json.dumps({"time": k / 10, "y": [round(np.sin(k), 3)]}) for k in range(1, 13)]
+
+
+@pytest.fixture
+def stream(zakai, monkeypatch):
+    """The command with these bytes on standard input."""
+
+    def run(given, *arguments, model="model.toml"):
+        content = given if isinstance(given, bytes) else "".join(line + "\n" for line in given).encode()
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
+        return zakai("stream", model, *arguments)
+
+    return run
+
+
+def read(answer):
+    return [json.loads(line) for line in answer.out.splitlines()]
+
+
+def test_every_line_is_answered_with_what_a_record_gives(stream, tmp_path):
+    answer = stream(LINES)
+    assert answer.code == 0 and answer.err == ""
+    model = package.load_model("model.toml")
+    given = [json.loads(line) for line in LINES]
+    record = package.Record([one["time"] for one in given], [one["y"] for one in given], "increments")
+    result, told = package.filter(model, record), read(answer)
+    assert list(told[0]) == ["time", "mean", "cov", "interval", "log_likelihood_increment", "health"]
+    assert np.allclose([one["mean"] for one in told], result.mean[1:], rtol=0, atol=1e-12)
+    assert np.allclose([one["cov"] for one in told], result.cov[1:], rtol=0, atol=1e-12)
+    deviations = 1.959963984540054 * np.sqrt(result.variance[1:])
+    both = np.stack([result.mean[1:] - deviations, result.mean[1:] + deviations], axis=2)
+    assert np.allclose([one["interval"] for one in told], both, rtol=0, atol=1e-9)
+
+
+def test_csv_is_read_as_json_lines_are(stream):
+    rows = ["time,angle", *(f"{one['time']},{one['y'][0]}" for one in map(json.loads, LINES))]
+    assert stream(rows).out == stream(LINES).out
+    assert stream([rows[0], "", "0.1,", "0.2,nan"]).out == stream(['{"time": 0.1, "y": [null]}', '{"time": 0.2, "y": [NaN]}']).out
+    wrong = stream(["time,a,b", "1,2,3"])
+    assert wrong.code == 2 and "header of 3 columns" in wrong.err and wrong.err.count("\n") == 1
+
+
+BAD = [
+    (b"garbage", "not JSON"),
+    (b'{"time": 0.55, "y": [1, 2]}', "2 columns"),
+    (b'{"time": 0.55}', '"y"'),
+    (b"[0.55, 1]", "not an object"),
+    (b'{"time": 0.55, "y": [1e300]}', "1e+300"),
+    (b'{"time": 0.55, "y": [Infinity]}', "inf"),
+    (b'{"time": 0.55, "y": ["1"]}', "'1'"),
+    (b'{"time": 0.55, "y": [[1]]}', "[1]"),
+    (b'{"time": 0.55, "y": [{}]}', "{}"),
+    (b'{"time": null, "y": [1]}', "time"),
+    (b'{"time": NaN, "y": [1]}', "nan"),
+    (b'{"time": true, "y": [1]}', "True"),
+    (b'{"time": 0.25, "y": [1]}', "late by 0.25"),
+    (b'{"time": 0.5, "y": [1]}', "repeats"),
+    (b'{"time": 1' + b"0" * 5000 + b', "y": [1]}', "JSON"),
+    (b'{"time": 1' + b"0" * 400 + b', "y": [1]}', "time"),
+    (b"[" * 5000, "JSON"),
+    (b"\xff\xfe", "UTF-8"),
+    (b"x" * (3 * LONGEST), "longer"),
+]
+
+
+def test_a_bad_line_is_said_by_its_number_and_leaves_the_filter_as_it_was(stream):
+    good = [line.encode() for line in LINES]
+    clean = stream(b"\n".join(good)).out
+    answer = stream(b"\n".join([*good[:5], *(line for line, _ in BAD), *good[5:]]))
+    assert answer.code == 0 and answer.out == clean
+    said = answer.err.splitlines()
+    assert len(said) == len(BAD)
+    for number, (line, (_, words)) in enumerate(zip(said, BAD, strict=True), start=6):
+        assert line.startswith(f"error: line {number}: ") and words in line and len(line) < 300, line
+        assert line.isprintable()
+
+
+def test_strict_stops_at_the_first_bad_line(stream):
+    answer = stream([*LINES[:3], "garbage", *LINES[3:]], "--strict")
+    assert answer.code == 2 and len(read(answer)) == 3
+    assert answer.err.startswith("error: standard input: line 4: ") and answer.err.count("\n") == 1
+
+
+def test_fewer_lines_and_fewer_fields_when_asked_for(stream):
+    full = read(stream(LINES))
+    answer = read(stream(LINES, "--every", "4", "--fields", "mean, time"))
+    assert answer == [{"mean": one["mean"], "time": one["time"]} for one in full[3::4]]
+    assert "no field" in stream(LINES, "--fields", "median").err
+    assert stream(LINES, "--every", "0").code == 2
+    assert "--checkpoint" in stream(LINES, "--checkpoint-every", "2").err
+
+
+def test_a_method_that_does_not_hold_and_a_model_that_is_not_there_have_their_codes(stream):
+    assert stream(LINES, "--method", "benes").code == 3
+    assert stream(LINES, model="none.toml").code == 2
+    assert stream(LINES, "--method", "kalman-bucy", "--option", "points=3").code == 2
+    assert stream(LINES, "--method", "extended-kalman-bucy").code == 0
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_a_restart_skips_what_the_checkpoint_knows_and_says_its_estimate_again(stream, tmp_path, every):
+    whole = stream(LINES).out.splitlines()
+    saved = ("--checkpoint", "state", "--checkpoint-every", str(every))
+    first = stream(LINES[:9], *saved).out.splitlines()
+    known = 9 // every * every
+    assert first == whole[:9]
+    for replayed in (0, 3, known):
+        content = (tmp_path / "state").read_bytes()
+        again = stream(LINES[replayed:10], *saved)
+        assert again.out.splitlines() == whole[known - 1 : 10] and again.err == ""
+        (tmp_path / "state").write_bytes(content)
+    late = stream([*LINES, LINES[2]], *saved)
+    assert "line 13" in late.err and "late" in late.err
+
+
+def test_a_checkpoint_that_does_not_fit_is_refused(stream, tmp_path):
+    (tmp_path / "state").write_bytes(b"junk")
+    answer = stream(LINES, "--checkpoint", "state")
+    assert answer.code == 2 and "not a checkpoint" in answer.err and answer.out == ""
+    assert (tmp_path / "state").read_bytes() == b"junk"
+    assert "also an input" in stream(LINES, "--checkpoint", "model.toml").err
+    assert stream(LINES, "--checkpoint", "none/state").code == 2
+
+
+def test_lines_are_counted_and_bounded():
+    long = b"a" * (5 * LONGEST) + b"\n"
+    lines = list(lines_of(io.BytesIO(b'\xef\xbb\xbf{"time": 1, "y": 2}\r\n\n' + long + b'{"time": 2, "y": [null]}'), 1))
+    assert [line.number for line in lines] == [1, 3, 4]
+    assert lines[0].values == [2] and "longer" in lines[1].fault and lines[2].values == [None]
+
+
+def fed(process, lines):
+    process.stdin.write("".join(line + "\n" for line in lines).encode())
+    process.stdin.flush()
+
+
+@pytest.mark.slow
+def test_a_killed_stream_goes_on_with_the_same_bits_and_an_interrupted_one_says_130(stream, tmp_path):
+    whole = stream(LINES).out.splitlines()
+    start = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=tmp_path)
+    killed = subprocess.Popen([*COMMAND, "--checkpoint", "state"], **start)
+    fed(killed, LINES[:6])
+    printed = [killed.stdout.readline().decode().rstrip() for _ in range(6)]  # each line is there before the next is sent
+    fed(killed, LINES[6:8])
+    time.sleep(0.002)
+    killed.kill()
+    printed += killed.communicate()[0].decode().splitlines()
+    again = stream(LINES, "--checkpoint", "state").out.splitlines()
+    assert printed == whole[: len(printed)] and again == whole[-len(again) :]
+    assert len(printed) + len(again) >= len(whole)
+
+    stopped = subprocess.Popen(COMMAND, **start)
+    try:
+        fed(stopped, LINES[:1])
+        assert stopped.stdout.readline().decode().rstrip() == whole[0]
+        stopped.send_signal(signal.SIGINT)
+        assert stopped.wait(60) == 130
+    finally:
+        stopped.kill()
+        stopped.communicate()
+
+
+def test_a_reader_that_closes_the_pipe_is_no_error(tmp_path, stream):
+    lines = [json.dumps({"time": k / 10, "y": [0.1]}) for k in range(1, 3000)]
+    (tmp_path / "lines").write_text("".join(line + "\n" for line in lines))
+    with open(tmp_path / "lines", "rb") as given:
+        process = subprocess.Popen(COMMAND, stdin=given, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path)
+        process.stdout.readline()
+        process.stdout.close()
+        assert process.wait(30) == 0
+        assert process.stderr.read() == b""
+        process.stderr.close()
