@@ -1,3 +1,4 @@
+import os
 import pickle
 
 import numpy as np
@@ -152,8 +153,24 @@ def test_a_byte_order_mark_and_windows_line_ends_are_accepted(tmp_path):
 def test_a_missing_file_and_a_folder_are_one_line(tmp_path):
     with pytest.raises(InputError, match="there is no such file"):
         load_model(tmp_path / "none.toml")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="is a folder; give a model file"):
         load_model(tmp_path)
+
+
+def test_a_pipe_and_a_device_are_refused_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", "/dev/zero"):
+        with pytest.raises(InputError, match="is not a regular file; give a model file"):
+            load_model(path)
+
+
+@pytest.mark.parametrize("key", ["name", "start", "observation_kind", "drift", "periodic", "functions", "parameters", "prior"])
+def test_an_integer_of_a_million_digits_is_one_short_line(tmp_path, key):
+    keys = {"state": "['x']", "drift": "['x']", "observation": "['x']"} | {key: "0x" + "f" * 900_000}
+    (tmp_path / "m.toml").write_text("\n".join(f"{name} = {value}" for name, value in keys.items()))
+    with pytest.raises(InputError, match=f"m.toml: {key}: ") as error:
+        load_model(tmp_path / "m.toml")
+    assert len(str(error.value)) < 300
 
 
 @pytest.mark.parametrize("name", gallery.names())

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -14,6 +14,7 @@ from zakai.errors import InputError
 from zakai.records import Record, atomic_write, load_dataset, read_record, save_dataset, write_record
 
 
+@settings(deadline=None)
 @given(
     values=arrays(
         float, st.tuples(st.integers(1, 8), st.just(2)), elements=st.floats(-1e150, 1e150) | st.just(np.nan)

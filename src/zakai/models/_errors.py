@@ -22,7 +22,10 @@ def named(place: str) -> Iterator[None]:
 
 def echo(value: object, length: int = 20) -> str:
     """The value as one short printable word, whatever it holds."""
-    text = value if isinstance(value, str) else str(value)[:200]
+    try:
+        text = value if isinstance(value, str) else str(value)[:200]
+    except ValueError:  # Python refuses to print integers of more than 4,300 digits
+        text = hex(value)  # type: ignore[arg-type]
     return ascii(text if len(text) <= length else text[:length] + "...")
 
 

@@ -15,6 +15,7 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import NamedTuple
 
 import sympy
 
@@ -111,7 +112,7 @@ Node = Number | Name | Call | Negative | Power | Sum | Product
 
 _TOKEN = re.compile(
     r"(?P<space>[ \t\r\n]+)|(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
-    r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*)|(?P<symbol>\*\*|[-+*/(),])"
+    r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*)|(?:\*\*|[-+*/(),])"
 )
 _HINTS = {
     "^": "; write ** for a power",
@@ -124,26 +125,25 @@ _HINTS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class _Token:
+class _Token(NamedTuple):
     kind: str  # number, name, end, or the symbol itself
     text: str
     position: int
 
 
 def _tokens(text: str) -> Iterator[_Token]:
-    start = 0
-    while start < len(text):
-        match = _TOKEN.match(text, start)
-        if match is None:
-            raise ExpressionError(
-                f"unexpected character in {echo(text[start : start + 21])}{_HINTS.get(text[start], '')}",
-                start + 1,
-            )
-        kind, word = match.lastgroup or "", match.group()
+    end = 0
+    for match in _TOKEN.finditer(text):
+        if match.start() != end:  # something between two words that is none
+            break
+        end = match.end()
+        kind = match.lastgroup
         if kind != "space":
-            yield _Token(word if kind == "symbol" else kind, word, start + 1)
-        start = match.end()
+            word = match.group()
+            yield _Token(word if kind is None else kind, word, match.start() + 1)
+    if end < len(text):
+        hint = _HINTS.get(text[end], "")
+        raise ExpressionError(f"unexpected character in {echo(text[end : end + 21])}{hint}", end + 1)
     yield _Token("end", "", len(text) + 1)
 
 

@@ -17,6 +17,10 @@ MAX_BYTES = 1 << 20
 # Nine dotted parts are never a model's key, and the time of tomllib grows with the square of their number.
 _LONG_KEY = re.compile(r"""(?<![A-Za-z0-9_-])(?:(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){9}""")
 
+# A model has two tables; a row of numbers in a list of rows can look like the head of one.
+_TABLE = re.compile(r"^[ \t]*\[", re.MULTILINE)
+MOST_TABLES = 8_192
+
 
 def load_model(source: str | os.PathLike[str]) -> Model:
     """Read a model from a model file or from the gallery.
@@ -42,11 +46,17 @@ def load_model(source: str | os.PathLike[str]) -> Model:
 def read_model(text: str, source: str) -> Model:
     """The model in the text of a model file; `source` is what errors call it."""
     with named(source):
+        if len(text) > MAX_BYTES:
+            raise InputError("larger than 1 MiB, which no model file is")
         return Model._from_file(_read_keys(text), source, text)
 
 
 def _read_text(path: Path, shown: str) -> str:
     try:
+        # A pipe would be waited for; a device can be endless.
+        if path.exists() and not path.is_file():
+            kind = "a folder" if path.is_dir() else "not a regular file"
+            raise InputError(f"{shown}: is {kind}; give a model file")
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
@@ -54,17 +64,24 @@ def _read_text(path: Path, shown: str) -> str:
         raise InputError(f"{shown}: there is no such file{hint}") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{shown}: cannot be read: {getattr(error, 'strerror', None) or 'not a path'}") from None
+    return decoded(data, shown)
+
+
+def decoded(data: bytes, source: str) -> str:
+    """The text of a model file from its bytes; `source` is what errors call it."""
     if len(data) > MAX_BYTES:
-        raise InputError(f"{shown}: larger than 1 MiB, which no model file is")
+        raise InputError(f"{source}: larger than 1 MiB, which no model file is")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{shown}: byte {error.start + 1} is not UTF-8 text; a model file is TOML") from None
+        raise InputError(f"{source}: byte {error.start + 1} is not UTF-8 text; a model file is TOML") from None
 
 
 def _read_keys(text: str) -> dict[str, Any]:
     if _LONG_KEY.search(text):
         raise InputError("is not a model: it has a key of nine or more parts with dots")
+    if sum(1 for _ in _TABLE.finditer(text)) > MOST_TABLES:
+        raise InputError(f"is not a model: it has more than {MOST_TABLES} lines that begin with [")
     try:
         # Decimals stay exact, and 1e999999999 is never computed.
         keys = tomllib.loads(text, parse_float=Decimal)

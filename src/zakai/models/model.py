@@ -14,7 +14,7 @@ from zakai.errors import InputError
 from zakai.models import _entries, checks
 from zakai.models._errors import did_you_mean, listing, named
 from zakai.models._toml import to_toml
-from zakai.models.expressions import parse_expression
+from zakai.models.expressions import MAX_LENGTH, parse_expression
 from zakai.models.prior import Prior, read_prior
 
 KEYS = (
@@ -33,6 +33,8 @@ KEYS = (
     "prior",
 )
 MOST_STATES = 1024  # of states, sensors and noises: a default identity matrix has this many squared entries
+MOST_CHARACTERS = 250_000  # of all different formulas together: what a computer reads in seconds
+MOST_PARENTHESES = 8_192
 OBSERVATION_KINDS = ("increments", "path", "rates", "samples")
 
 
@@ -131,6 +133,8 @@ class Model:
                 raise InputError(f"expected a list of 1 to {MOST_STATES} names, got {len(state)}")
         with named("functions"):
             functions = _entries.names(keys.get("functions", ()), "a list of names")
+            if len(functions) > MOST_STATES:
+                raise InputError(f"expected a list of at most {MOST_STATES} names, got {len(functions)}")
             _refuse_clash(functions, state, "a state")
         with named("parameters"):
             parameters = _read_parameters(keys.get("parameters") or {})
@@ -186,6 +190,7 @@ class Model:
             with named(key):
                 rows = f"{size} rows of {size} formulas (one a {what})"
                 canonical[key] = _entries.matrix_of_formulas(given[key], size, size, rows)
+        _refuse_long(canonical)
         read = self._reader()
         for key in ("drift", "observation"):
             with named(key):
@@ -269,6 +274,17 @@ def _matrix(rows: int, columns: int, entries: Mapping[tuple[int, int], sympy.Exp
     return sympy.ImmutableDenseMatrix._fromrep(sympy.SparseMatrix(rows, columns, entries)._rep)
 
 
+def _refuse_long(canonical: Mapping[str, Any]) -> None:
+    """Raise InputError if all formulas together are more than can be read in a moment, before any of them is."""
+    rows = (row for key in checks.COEFFICIENTS for row in canonical[key])
+    texts = set(canonical["drift"]).union(canonical["observation"], *rows)
+    characters, parentheses = sum(map(len, texts)), sum(text.count("(") for text in texts)
+    if characters > MOST_CHARACTERS and max(map(len, texts)) <= MAX_LENGTH:
+        raise InputError(f"its formulas have {characters} characters together; at most {MOST_CHARACTERS} are read")
+    if parentheses > MOST_PARENTHESES and max(text.count("(") for text in texts) <= MOST_PARENTHESES:
+        raise InputError(f"its formulas have {parentheses} parentheses together; at most {MOST_PARENTHESES} are read")
+
+
 def _identity(size: int) -> list[list[str]]:
     return [["1" if i == j else "0" for j in range(size)] for i in range(size)]
 
@@ -276,6 +292,8 @@ def _identity(size: int) -> list[list[str]]:
 def _read_parameters(table: Any) -> dict[str, sympy.Rational]:
     if not isinstance(table, Mapping):
         raise InputError(f"expected a table of names and numbers, got {_entries.kind_of(table)}")
+    if len(table) > MOST_STATES:
+        raise InputError(f"expected a table of at most {MOST_STATES} numbers, got {len(table)}")
     parameters = {}
     for name, value in table.items():
         _entries.allowed_name(str(name))

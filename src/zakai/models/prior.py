@@ -91,6 +91,7 @@ class DensityPrior:
     log_density: sympy.Expr
 
 
+MOST_COMPONENTS = 10_000
 Prior = GaussianPrior | MixturePrior | DensityPrior
 
 _KEYS = {"gaussian": ("mean", "cov"), "mixture": ("weights", "means", "covs"), "density": ("log_density",)}
@@ -148,6 +149,8 @@ def _read_mixture(keys: Mapping[str, Any], n: int) -> MixturePrior:
         weights = array(keys["weights"], (count,), "a list of positive numbers")
         if count == 0 or not (weights > 0).all() or not np.isfinite(weights.sum()):
             raise InputError("expected a list of positive numbers, at least one")
+        if count > MOST_COMPONENTS:
+            raise InputError(f"expected at most {MOST_COMPONENTS} numbers, got {count}")
     with named("means"):
         means = array(keys["means"], (count, n), f"{count} lists of {n} numbers (one list a component)")
     with named("covs"):

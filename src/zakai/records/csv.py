@@ -1,4 +1,4 @@
-"""Records from CSV files: a fast road for good files, and a careful one that names the first bad row."""
+"""Records from CSV files: a fast road for good lines, and a careful one that names the first bad row."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import os
 import re
 from array import array
 from collections.abc import Iterator, Sequence
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
@@ -17,7 +17,10 @@ from zakai.errors import InputError
 from zakai.records.record import Record, early, first_fault
 from zakai.records.writing import shown
 
+LONGEST_LINE = 1 << 20  # characters: room for a thousand numbers with a thousand blanks each
 _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
+_AT_ONCE = 1 << 18  # characters
+_NO_TEXT = re.compile("[\ud800-\udfff]")
 
 
 def read_record(path: str | os.PathLike[str], model: Any) -> Record:
@@ -44,132 +47,161 @@ def read_record(path: str | os.PathLike[str], model: Any) -> Record:
         Record(3 rows x 1 increments, times 0.1 to 0.4)
     """
     path = Path(path)
-    table = read_table(path, model.m, "observations")
+    table, row = read_table(path, model.m, "observations")
     record = Record(table[:, 0], table[:, 1:], model.observation_kind)
     fault = early(record.times[0], record.kind, model.start)
     if fault is not None:
-        raise InputError(f"{shown(path)}: row {_first_row(path)}: {fault}")
+        raise InputError(f"{shown(path)}: row {row}: {fault}")
     return record
 
 
-def read_table(path: Path, columns: int, what: str, names: Sequence[str] | None = None) -> np.ndarray:
-    """The times and the `columns` numbers of every row of a CSV file, (K, 1 + columns).
+def read_table(path: Path, columns: int, what: str, names: Sequence[str] | None = None) -> tuple[np.ndarray, int]:
+    """The times and the `columns` numbers of every row of a CSV file, (K, 1 + columns), and the line of the first row.
 
     `what` is what a column holds, in the plural; with `names` the columns must have just these. Raises
     InputError as `read_record` does.
     """
     try:
-        # A pipe or a device could be endless, and cannot be read a second time to find the row that is wrong.
+        # A pipe or a device could be endless.
         if path.exists() and not path.is_file():
             kind = "a folder" if path.is_dir() else "not a regular file"
             raise InputError(f"{shown(path)}: is {kind}; give a CSV file")
         # Bytes that are not UTF-8 become lone surrogates, which no number has; so their row is found.
         with path.open(encoding="utf-8-sig", errors="surrogateescape", newline=None) as file:
-            header = _header(path, file, columns, what, names)
-            table = _fast(file, len(header))
-        if table is None or first_fault(table[:, 0], table[:, 1:]) is not None:
-            with path.open(encoding="utf-8-sig", errors="surrogateescape", newline=None) as file:
-                table = _careful(path, file, header)
+            return table_of(file, shown(path), columns, what, names)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{shown(path)}: cannot be read: {reason}; give a CSV file") from None
-    return table
 
 
-def _header(path: Path, file: TextIO, m: int, what: str, expected: Sequence[str] | None) -> list[str]:
-    line = file.readline()
-    if not line:
-        raise InputError(f"{shown(path)}: is empty; expected a header of time and {m} names, then rows")
+def table_of(
+    file: TextIO, source: str, columns: int, what: str, names: Sequence[str] | None = None
+) -> tuple[np.ndarray, int]:
+    """`read_table` of an open file, which is read once, a part at a time; `source` is what errors call it."""
+    parts = _parts(file, source)
+    first = next(parts, None)
+    if first is None:
+        raise InputError(f"{source}: is empty; expected a header of time and {columns} names, then rows")
+    header = _header(source, first.lines[0], columns, what, names)
+    numbers, row, before = array("d"), 0, np.empty((0, len(header)))
+    for part in chain([first._replace(number=2, lines=first.lines[1:])], parts):
+        rows, wrong = _fast(part.lines, len(header)), None
+        if rows is None:
+            rows, wrong = _careful(part, header)
+        # The first bad row is the one to name: an earlier one may break a rule about its numbers.
+        both = np.vstack([before, rows])
+        fault = first_fault(both[:, 0], both[:, 1:])
+        if fault is not None:
+            wrong = _line(part, fault[0] - len(before)), fault[1]
+        if wrong is not None:
+            raise InputError(f"{source}: row {wrong[0]}: {wrong[1]}")
+        if len(rows):
+            row = row or _line(part, 0)
+            numbers.frombytes(rows.tobytes())
+            before = rows[-1:]
+    if not numbers:
+        raise InputError(f"{source}: has a header but no row; a record needs at least one observation")
+    return np.frombuffer(numbers).reshape(-1, len(header)), row
+
+
+class _Part(NamedTuple):
+    """Some lines of a file, the number of the first, and whether the last has an end."""
+
+    number: int
+    lines: list[str]
+    whole: bool
+
+
+def _parts(file: TextIO, source: str) -> Iterator[_Part]:
+    """The lines of a file, little more than the longest at once."""
+    number, rest = 1, ""
+    while block := file.read(_AT_ONCE):
+        lines = (rest + block).split("\n")
+        rest = lines.pop()
+        if lines:
+            yield _Part(number, lines, True)
+        number += len(lines)
+        if len(rest) > LONGEST_LINE:
+            fault = _not_text(rest) or f"is longer than {LONGEST_LINE:,} characters; is this a CSV file?"
+            raise InputError(f"{source}: row {number}: {fault}")
+    if rest:
+        yield _Part(number, [rest], False)
+
+
+def _header(source: str, line: str, m: int, what: str, expected: Sequence[str] | None) -> list[str]:
     if (fault := _not_text(line)) is not None:
-        raise InputError(f"{shown(path)}: row 1: {fault}")
+        raise InputError(f"{source}: row 1: {fault}")
     names = [name.strip() for name in _cells(line)]
     if names[0] != "time":
         hint = " (is the header missing?)" if _NUMBER.fullmatch(names[0]) else ""
         fault = f"the first column is {_quoted(names[0])}; the header must begin with time{hint}"
-        raise InputError(f"{shown(path)}: row 1: {fault}")
+        raise InputError(f"{source}: row 1: {fault}")
     if len(names) != m + 1:
         fault = f"{len(names)} columns; the model needs time and {m} {what}, {m + 1} columns in all"
-        raise InputError(f"{shown(path)}: row 1: {fault}")
+        raise InputError(f"{source}: row 1: {fault}")
     for name, wanted in zip(names[1:], expected or names[1:]):
         if name != wanted:
-            raise InputError(f"{shown(path)}: row 1: a column is {_quoted(name)}; expected time, {', '.join(expected or ())}")
+            raise InputError(f"{source}: row 1: a column is {_quoted(name)}; expected time, {', '.join(expected or ())}")
     return names
 
 
-def _fast(file: TextIO, columns: int) -> np.ndarray | None:
-    """The rows after the header as a table (K, columns); None if they are not all plain numbers and gaps."""
-
-    def filled() -> Iterator[str]:
-        for line in file:
-            if "\0" in line:
-                raise ValueError("NUL")
-            line = line.rstrip("\n")
-            while ",," in line:
-                line = line.replace(",,", ",nan,")
-            yield line + "nan" if line.endswith(",") else line
-
-    lines = filled()
+def _fast(lines: list[str], columns: int) -> np.ndarray | None:
+    """The rows as a table (k, columns); None if they are not all plain numbers and gaps."""
+    text = "\n".join(lines)
+    if not text.strip():
+        return np.empty((0, columns))
+    if "\0" in text:
+        return None
+    text = f"{text}\n".replace(",,", ",nan,").replace(",,", ",nan,").replace(",\n", ",nan\n")
     try:
-        first = next(lines)
-        while not first.strip():
-            first = next(lines)
-        table = np.loadtxt(chain([first], lines), delimiter=",", comments=None, ndmin=2)
-    except (StopIteration, ValueError):
+        table = np.loadtxt(text.split("\n"), delimiter=",", comments=None, ndmin=2)
+    except ValueError:
         return None
     return table if table.shape[1] == columns else None
 
 
-def _careful(path: Path, file: TextIO, names: list[str]) -> np.ndarray:
-    """The same table, cell by cell; raises for the first row that is wrong."""
-    table, lines = array("d"), array("q")
-
-    def so_far() -> np.ndarray:
-        rows = np.array(table, dtype=np.float64).reshape(len(lines), len(names))
-        fault = first_fault(rows[:, 0], rows[:, 1:]) if len(rows) else None
-        if fault is not None:
-            raise InputError(f"{shown(path)}: row {lines[fault[0]]}: {fault[1]}")
-        return rows
-
-    def refuse(number: int, what: str) -> NoReturn:
-        so_far()  # an earlier row may break a rule about its numbers; the first bad row is the one to name
-        raise InputError(f"{shown(path)}: row {number}: {what}")
-
-    for number, line in enumerate(file, start=1):
-        if number == 1 or not line.strip():
+def _careful(part: _Part, names: list[str]) -> tuple[np.ndarray, tuple[int, str] | None]:
+    """The same table, cell by cell, up to the first row that cannot be read; the line of that one, and why."""
+    table, wrong = array("d"), None
+    for number, line in enumerate(part.lines, start=part.number):
+        if not line.strip():
             continue
-        if (fault := _not_text(line)) is not None:
-            refuse(number, fault)
         cells = [cell.strip() for cell in _cells(line)]
-        if len(cells) != len(names):
-            cut = "" if line.endswith("\n") else " (the file ends in this row; was it cut off?)"
-            refuse(number, f"{len(cells)} columns; expected {len(names)}: {_quoted(','.join(names))}{cut}")
-        for name, cell in zip(names, cells):
-            if cell and not _NUMBER.fullmatch(cell):
-                what = f"{_quoted(cell)} in column {_quoted(name)} is not a number"
-                refuse(number, f"{what}; leave the cell empty if nothing was observed")
+        what = _not_text(line) or _not_numbers(cells, names, part.whole)
+        if what is not None:
+            wrong = number, what
+            break
         table.extend(float(cell) if cell else np.nan for cell in cells)
-        lines.append(number)
-    if not lines:
-        raise InputError(f"{shown(path)}: has a header but no row; a record needs at least one observation")
-    return so_far()
+    return np.array(table, dtype=np.float64).reshape(-1, len(names)), wrong
 
 
-def _first_row(path: Path) -> int:
-    """The line number of the first row after the header."""
-    with path.open(encoding="utf-8-sig", errors="surrogateescape", newline=None) as file:
-        return next(number for number, line in enumerate(file, start=1) if number > 1 and line.strip())
+def _not_numbers(cells: list[str], names: list[str], whole: bool) -> str | None:
+    if len(cells) != len(names):
+        cut = "" if whole else " (the file ends in this row; was it cut off?)"
+        return f"{len(cells)} columns; expected {len(names)}: {_quoted(','.join(names))}{cut}"
+    for name, cell in zip(names, cells):
+        if cell and not _NUMBER.fullmatch(cell):
+            what = f"{_quoted(cell)} in column {_quoted(name)} is not a number"
+            return f"{what}; leave the cell empty if nothing was observed"
+    return None
+
+
+def _line(part: _Part, row: int) -> int:
+    """The number of the line that holds this row of a part, blank lines not counted."""
+    filled = (number for number, line in enumerate(part.lines, start=part.number) if line.strip())
+    return next(islice(filled, row, None))
 
 
 def _cells(line: str) -> list[str]:
     """The cells of one line; one that `csv` refuses is split at its commas."""
     try:
-        return next(csv.reader([line.rstrip("\n")]), [""]) or [""]
+        return next(csv.reader([line]), [""]) or [""]
     except csv.Error:
-        return line.rstrip("\n").split(",")
+        return line.split(",")
 
 
 def _not_text(line: str) -> str | None:
-    if any("\ud800" <= character <= "\udfff" for character in line):
+    if _NO_TEXT.search(line):
         return "bytes that are not UTF-8 text; save the file as UTF-8"
     if "\0" in line:
         return "a NUL byte; is this a CSV file?"

@@ -1,10 +1,13 @@
-"""Results as NetCDF files (HDF5 inside), written whole or not at all."""
+"""Results as NetCDF files (HDF5 inside), written whole or not at all; what is read is looked at before it is loaded."""
 
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from zakai.errors import InputError
 from zakai.records.writing import atomic_write, shown
@@ -12,8 +15,7 @@ from zakai.records.writing import atomic_write, shown
 if TYPE_CHECKING:
     import xarray
 
-# The attribute by which a file of ours is known, and the number that changes when its layout does.
-FORMAT = "zakai result 1"
+DAMAGED = "is damaged or no NetCDF; give a result of zakai filter"
 
 
 def save_dataset(dataset: xarray.Dataset, path: str | os.PathLike[str]) -> None:
@@ -34,6 +36,8 @@ def save_dataset(dataset: xarray.Dataset, path: str | os.PathLike[str]) -> None:
         >>> load_dataset(path)["mean"].values.tolist()
         [0.1, 0.2]
     """
+    from zakai.records._hdf5 import FORMAT
+
     # Built in memory first: HDF5 meets a full disk with errors at close and with files that cannot be closed.
     content = dataset.assign_attrs(format=FORMAT).to_netcdf(engine="h5netcdf")
     with atomic_write(path) as temporary:
@@ -51,16 +55,47 @@ def load_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
 
     Example: see `save_dataset`.
     """
-    import xarray
-
     if not Path(path).is_file():
         what = "is not a regular file" if os.path.exists(path) else "there is no such file"
         raise InputError(f"{shown(path)}: {what}; give a result written by zakai filter")
+    fault = _look(path)
+    if fault is not None:
+        raise InputError(f"{shown(path)}: {fault}")
+    import h5py
+
+    from zakai.records import _hdf5
+
     try:
-        dataset = xarray.load_dataset(path, engine="h5netcdf", decode_times=False)
-    except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError):
-        raise InputError(f"{shown(path)}: is damaged or no NetCDF; give a result of zakai filter") from None
-    if dataset.attrs.get("format") != FORMAT:
-        fault = f"its attribute format is {str(dataset.attrs.get('format'))[:40]!r}, not {FORMAT!r}"
-        raise InputError(f"{shown(path)}: {fault}; give a result written by this version's zakai filter")
-    return dataset
+        with h5py.File(path, "r") as file:
+            return assembled(*_hdf5.read(file))
+    except MemoryError:
+        raise InputError(f"{shown(path)}: does not fit into the memory of this machine") from None
+    except Exception:  # the dimensions do not fit together
+        raise InputError(f"{shown(path)}: {DAMAGED}") from None
+
+
+def assembled(variables: Mapping[str, Any], attributes: Mapping[str, Any]) -> xarray.Dataset:
+    """The dataset of these variables, those that are named as a dimension being its coordinates."""
+    import xarray
+
+    axes = {dimension for dimensions, _, _ in variables.values() for dimension in dimensions}
+    coordinates = {name: variable for name, variable in variables.items() if name in axes}
+    return xarray.Dataset({name: variables[name] for name in variables if name not in axes}, coordinates, attributes)
+
+
+def _look(path: str | os.PathLike[str]) -> str | None:
+    """What is wrong with a file, found out by another process: a file can be made so that HDF5 crashes or never ends."""
+    from zakai.records import _hdf5
+
+    if not sys.executable:  # an embedded Python has nobody to send
+        return None
+    # -P: its folder has a csv.py, which is not Python's.
+    command = [sys.executable, "-P", "-W", "ignore", _hdf5.__file__, os.path.abspath(path)]
+    alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    patience = 60 + os.stat(path).st_size // 10_000_000  # seconds; it limits itself to much less, where the system has limits
+    try:
+        said = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, timeout=patience, env=alone, check=False)
+    except subprocess.TimeoutExpired:
+        return DAMAGED
+    word = said.stdout.decode("utf-8", errors="replace").strip()
+    return None if word == _hdf5.READABLE else word or DAMAGED

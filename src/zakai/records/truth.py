@@ -26,7 +26,7 @@ def read_truth(path: str | os.PathLike[str], model: Any) -> Truth:
         >>> read_truth(path, zakai.load_model("gallery:benes")).values.shape
         (2, 1)
     """
-    table = read_table(Path(path), model.n, "states", model.state)
+    table, _ = read_table(Path(path), model.n, "states", model.state)
     return Truth(table[:, 0], table[:, 1:])
 
 
