@@ -7,12 +7,13 @@ EXAMPLE := examples/wind-vane
 # A half-made environment or stamp would look finished to the next run.
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow clean
+.PHONY: help demo test slow longest clean
 
 help:
 	@echo "make demo    filter a year of real wind directions; draws $(EXAMPLE)/out/wind-vane.html"
 	@echo "make test    linter, type checker and the fast tests"
 	@echo "make slow    the tests that take minutes"
+	@echo "make longest what takes the better part of a minute by itself"
 	@echo "make clean   remove the environment and everything that was generated"
 
 # The stamps say which extras the environment holds; they are older than pyproject.toml when it must be brought up to date.
@@ -42,7 +43,10 @@ test: .venv/.dev
 
 # pytest says 5 when no test is marked slow, which is no failure.
 slow: .venv/.dev
-	$(BIN)/python -m pytest -q -n auto --dist worksteal -m slow || [ $$? -eq 5 ]
+	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "slow and not longest" || [ $$? -eq 5 ]
+
+longest: .venv/.dev
+	$(BIN)/python -m pytest -q -n auto --dist worksteal -m longest
 
 clean:
 	rm -rf .venv build dist $(EXAMPLE)/out .pytest_cache .mypy_cache .ruff_cache .jax_cache .hypothesis

@@ -87,6 +87,7 @@ def test_every_key_of_a_model_file_is_in_its_page():
     assert sorted(rows) == sorted(KEYS)
 
 
+@pytest.mark.slow
 def test_the_method_that_contributing_adds_works_as_it_stands_there(monkeypatch):
     theorem, entry, method, registry, test = (block.code for block in blocks("CONTRIBUTING.md", "python"))
     name = "continuous-discrete-kalman"

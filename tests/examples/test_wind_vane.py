@@ -37,6 +37,7 @@ def angle_between(direction: np.ndarray, mean: np.ndarray) -> np.ndarray:
     return np.abs(np.angle(direction * np.exp(-1j * mean)))
 
 
+@pytest.mark.slow
 def test_two_weeks_of_wind_agree_with_bayes_rule_on_the_circle():
     model = zakai.load_model(FOLDER / "wind-vane.toml")
     record = first_hours(model, 300)
@@ -72,6 +73,7 @@ def test_the_model_files_hold_the_most_likely_parameters_that_the_comparison_fou
             assert float(parameters[name]) == pytest.approx(RESULTS["direct"][name], abs=0.002)
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_over_the_year_the_direct_method_forecasts_better_than_the_extended_kalman_filter():
     year = script("compare").Year()
@@ -87,6 +89,7 @@ def test_over_the_year_the_direct_method_forecasts_better_than_the_extended_kalm
     assert scores["direct"] > scores["extended_kalman"] + 2000
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_over_the_year_particles_agree_within_their_own_scatter(monkeypatch):
     compare = script("compare")

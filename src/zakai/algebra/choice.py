@@ -55,7 +55,7 @@ def chosen(model: Model, method: str) -> tuple[str, str, Mapping[str, Conditions
     Raises ConditionError, with what fails, if it does not hold, or none does.
     """
     if method != "auto":
-        conditions = theorems.THEOREMS[method](model)
+        conditions = theorems.theorem_of(method)(model)
         if all_hold(conditions) is not True:
             raise ConditionError(f"{model.source}: {method} does not hold: {failure(conditions)}")
         return method, "asked for by name, and every assumption of its theorem holds", {method: conditions}
@@ -86,7 +86,7 @@ def divided(model: Model, prior: Any, method: str = "auto", by_value: bool = Tru
         plain = model.n <= FEW and isinstance(prior, GaussianPrior | None)
         if plain and all_hold(theorems.THEOREMS["kalman-bucy"](model)) is True:
             return None
-    elif model.n <= MANY and all_hold(theorems.THEOREMS[method](model)) is True:
+    elif model.n <= MANY and all_hold(theorems.theorem_of(method)(model)) is True:
         return None
     methods, conditions = {}, {}
     for part in dict.fromkeys(block.model for block in blocks):
@@ -95,7 +95,7 @@ def divided(model: Model, prior: Any, method: str = "auto", by_value: bool = Tru
         except ConditionError as error:
             if method == "auto" or model.n > MANY:
                 raise
-            whole = failure(theorems.THEOREMS[method](model))
+            whole = failure(theorems.theorem_of(method)(model))
             raise ConditionError(f"{model.source}: {method} does not hold: {whole}; nor block by block: {error}") from None
     return Division(blocks, methods, conditions, method != "auto")
 

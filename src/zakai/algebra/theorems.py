@@ -212,8 +212,18 @@ THEOREMS: Mapping[str, Callable[[Model], tuple[Condition, ...]]] = {
     "kolmogorov-series": kolmogorov_series,
     "extended-kalman-bucy": smooth_system,
 }
+# Filters of other libraries; an analysis is about the system, and leaves them out.
+PEERS: Mapping[str, Callable[[Model], tuple[Condition, ...]]] = dict.fromkeys(("ekf", "ukf", "enkf", "particle"), smooth_system)
+
+
+def theorem_of(name: str) -> Callable[[Model], tuple[Condition, ...]]:
+    """The theorem of a method or a peer."""
+    return THEOREMS[name] if name in THEOREMS else PEERS[name]
+
+
 
 __all__ = [
+    "PEERS",
     "THEOREMS",
     "YauSystem",
     "affine_observation",
@@ -228,6 +238,7 @@ __all__ = [
     "kolmogorov_series",
     "limited_direct",
     "smooth_system",
+    "theorem_of",
     "wei_norman_filter",
     "yau_system",
 ]
