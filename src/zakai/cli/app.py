@@ -133,8 +133,11 @@ def study(
 def reproduce(
     name: Annotated[str, typer.Argument(metavar="NAME", help="A published experiment, such as chen-luo-yau-2017.")],
     folder: Annotated[Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="Where pictures and tables go.")] = None,
+    option: Annotated[
+        list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the study, such as paths=5; repeatable.")
+    ] = None,
 ) -> None:
-    """Run a published experiment again, and print its table beside ours."""
+    """Run a published experiment again, and print what is published beside ours."""
     from zakai.cli import studying
 
-    studying.reproduce(name, folder)
+    studying.reproduce(name, folder, option or [])

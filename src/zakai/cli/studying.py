@@ -7,18 +7,22 @@ from pathlib import Path
 from typing import Any
 
 from zakai.cli._progress import progress
+from zakai.cli.filtering import options_of
 from zakai.errors import InputError
 
 
-def reproduce(name: str, folder: Path | None) -> None:
+def reproduce(name: str, folder: Path | None, settings: list[str]) -> None:
     """Run a published experiment."""
     from zakai import studies
 
     known = studies.names()
     if name not in known:
         raise InputError(f'there is no study "{name}"; there is: {", ".join(known)}')
+    options = options_of(settings)
+    for key in {"name", "folder"} & set(options):
+        raise InputError(f"--option {key}: is not an option of a study")
     with progress(name) as advance:
-        studies.reproduce(name, folder, advance)
+        studies.reproduce(name, folder, advance, **options)
 
 
 def study(file: Path, folder: Path, scheduler: str | None, processes: int | None) -> None:

@@ -5,12 +5,19 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from importlib import import_module
+from inspect import signature
 from typing import Any
 
 from zakai.errors import InputError
 from zakai.studies._drawing import new_figure
+from zakai.studies._published import Pictures
 
-_STUDIES = {"chen-luo-yau-2017": "zakai.studies.chen_luo_yau_2017"}
+_STUDIES = {
+    name: f"zakai.studies.{name.replace('-', '_')}"
+    for name in (
+        "chen-luo-yau-2017",
+    )
+}  # fmt: skip
 
 
 def names() -> tuple[str, ...]:
@@ -27,9 +34,10 @@ def reproduce(
     """Run a published experiment again, print its figures beside ours, and give them back.
 
     name: one of `names()`. folder: where the pictures and the figures as JSON go; it is made if it is not there; None: nowhere.
-    progress: called with the work done and all of it. options: those of the study, such as `paths=100`.
+    progress: called with the work done and all of it. options: those of the study, such as `paths=100`. Pictures are written as
+    soon as they can be drawn, and every file that is written is said.
 
-    Raises InputError for another name, a folder that cannot be made, or pictures without matplotlib.
+    Raises InputError for another name or option, a folder that cannot be made, or pictures without matplotlib.
 
     Example:
 
@@ -37,13 +45,18 @@ def reproduce(
     """
     if name not in _STUDIES:
         raise InputError(f'there is no study "{name}"; there is: {", ".join(_STUDIES)}')
+    run = import_module(_STUDIES[name]).run
+    known = [key for key, one in signature(run).parameters.items() if one.kind is one.KEYWORD_ONLY]
+    for option in options:
+        if option not in known:
+            raise InputError(f'{name}: there is no option "{option}"; there is: {", ".join(known)}')
     if folder is not None:
         new_figure(1.0, 1.0)  # a missing library is better said before the minutes of work than after
         try:
             os.makedirs(folder, exist_ok=True)
         except OSError as error:
             raise InputError(f"{os.fspath(folder)}: the folder cannot be made: {error.strerror}") from None
-    study = import_module(_STUDIES[name]).run(progress=progress, **options)
+    study = run(progress, Pictures(folder), **options)
     print(study.text())
     if folder is not None:
         study.save(folder)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zakai.studies._drawing import new_figure
+from zakai.studies._drawing import new_figure, plain
 
 if TYPE_CHECKING:
     from zakai.studies.chen_luo_yau_2017 import Study
@@ -40,9 +40,7 @@ def draw(study: Study, spread: float, number: int) -> Any:
     panels[0, 0].set_ylabel("state and estimates,\naveraged over paths")
     panels[1, 0].set_ylabel("squared error,\naveraged over paths")
     for panel in panels.flat:
-        panel.spines[["top", "right"]].set_visible(False)
-        panel.grid(color="#e4e7eb", linewidth=0.6)
-        panel.set_axisbelow(True)
+        plain(panel)
     handles = {label: line for line, label in zip(*panels[0, 0].get_legend_handles_labels(), strict=True)}
     handles |= {label: line for line, label in zip(*panels[0, -1].get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, fontsize=9, frameon=False)

@@ -6,6 +6,9 @@ from typing import Any
 
 from zakai.errors import InputError
 
+INK, OURS, TRUTH, OTHER, PALE = "#1d2430", "#2f75ad", "#d55e00", "#009e73", "#cfe0f0"
+SERIES = (OURS, TRUTH, OTHER, "#cc79a7", INK, "#e69f00", "#6b7480")
+
 
 def new_figure(width: float, height: float) -> Any:
     """An empty figure in inches; InputError where matplotlib is not installed."""
@@ -17,3 +20,11 @@ def new_figure(width: float, height: float) -> Any:
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def plain(panel: Any) -> Any:
+    """A panel without a frame above and to the right, and with a faint grid below everything."""
+    panel.spines[["top", "right"]].set_visible(False)
+    panel.grid(color="#e4e7eb", linewidth=0.6)
+    panel.set_axisbelow(True)
+    return panel
