@@ -15,7 +15,7 @@ from zakai.studies._published import Pictures
 _STUDIES = {
     name: f"zakai.studies.{name.replace('-', '_')}"
     for name in (
-        "chen-luo-yau-2017", "cubic-sensor", "yau-1993", "hu-yau-2002", "survey", "dong-chen-yau-2021",
+        "chen-luo-yau-2017", "cubic-sensor", "yau-1993", "hu-yau-2002", "survey", "dong-chen-yau-2021", "lorenz-63-sakov-2012",
     )
 }  # fmt: skip
 
