@@ -46,12 +46,13 @@ def conditional_densities(
     half_width: float,
     count: int,
     tolerance: float = 1e-11,
+    frozen: bool = False,
 ) -> Solution:
     """The density after each reading, by Fourier collocation on a periodic box and DOP853, in one or two states.
 
     drift, observation: of points (..., n), giving (..., n) and (..., m); observation noise is white. covariance: G (n, n).
     prior: the initial density up to a factor. increments: (K, m). The box reaches from -half_width to half_width, `count` points
-    an axis, and must be wide enough for the density to vanish at its edge.
+    an axis, and must be wide enough for the density to vanish at its edge. frozen: y stays where it is until a reading.
     """
     n = len(covariance)
     axis = half_width * (2 * np.arange(count) / count - 1)
@@ -66,7 +67,7 @@ def conditional_densities(
     evidence: list[float] = []
     before = 0.0
     for time, increment in zip(times, increments, strict=True):
-        rate = h @ increment / (time - before) - energy
+        rate = -energy if frozen else h @ increment / (time - before) - energy
 
         def slope(t: float, values: np.ndarray, rate: np.ndarray = rate) -> np.ndarray:
             now = values.reshape(diffusion.shape)
@@ -77,7 +78,7 @@ def conditional_densities(
         solved = solve_ivp(
             slope, (before, time), sigma.ravel(), "DOP853", rtol=tolerance, atol=tolerance * sigma.max(), t_eval=[time]
         )
-        sigma = solved.y[:, -1].reshape(diffusion.shape)
+        sigma = solved.y[:, -1].reshape(diffusion.shape) * (np.exp(h @ increment) if frozen else 1.0)
         mass = sigma.sum() * cell
         sigma, before = sigma / mass, time
         densities.append(sigma)
@@ -97,7 +98,8 @@ def crank_nicolson(
     """Means and variances (paths, K) of one state with G = 1 and one observation, for many paths (paths, K) at once.
 
     Half of the likelihood exp(h dy - h^2 dt / 2), Crank and Nicolson's step of the Kolmogorov equation in finite volumes, which
-    keeps the mass, and the other half. `axis` is an equidistant lattice wide enough for every path.
+    keeps the mass, and the other half. `axis` is an equidistant lattice wide enough for every path; `progress` is called now and
+    then.
     """
     cell = axis[1] - axis[0]
     middle, rate = drift(0.5 * (axis[1:] + axis[:-1])) / 2, 0.5 / cell**2
@@ -118,7 +120,8 @@ def crank_nicolson(
         right[:-1] += up[:, None] * density[1:]
         density = np.maximum(lapack.dgttrs(*factors, density + 0.5 * step * right)[0], 0.0) * factor
         density /= density.sum(axis=0)
+        if k % 100 == 0:
+            progress()
         means[:, k] = axis @ density
         variances[:, k] = axis**2 @ density - means[:, k] ** 2
-        progress()
     return means, variances
