@@ -313,6 +313,7 @@ def draw(errors: dict[int, list[float]], joined: dict[str, list[float]], correct
     left.set_ylabel("largest relative error near the diagonal")
     middle.loglog(FACTORS, joined["log"], color=SERIES[1], marker="o", markersize=4, label="logarithmic form")
     middle.plot([], [], " ", label=f"sum: {joined['sum'][0]:.0e} to {joined['sum'][-1]:.0e}, far above")
+    middle.set_ylim(joined["log"][-1] / 3, joined["log"][0] * 10)
     middle.set_xticks(FACTORS, [str(K) for K in FACTORS])
     middle.minorticks_off()
     middle.set_xlabel("kernels that are joined in a unit of time")
