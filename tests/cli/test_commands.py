@@ -89,3 +89,13 @@ def test_the_version_and_the_help_are_printed(zakai):
     assert all(command in zakai().out for command in commands)
     for command in commands:
         assert zakai(command, "--help").code == 0
+
+
+def test_an_option_of_a_study_reaches_it_and_another_is_refused(zakai):
+    for option, said in (
+        ("paths=0", "option paths: 0 is not a whole number from 1"),
+        ("path=3", 'cubic-sensor: there is no option "path"; there is: paths, steps, seed'),
+        ("folder=here", "--option folder: is not an option of a study"),
+    ):
+        answer = zakai("reproduce", "cubic-sensor", "--option", option)
+        assert answer.code == 2 and said in answer.err and len(answer.err.splitlines()) == 1
