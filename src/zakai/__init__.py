@@ -26,6 +26,8 @@ _PUBLIC = {
     "read_record": "zakai.records",
     "filter": "zakai.filters.driver",
     "FilterResult": "zakai.filters.results",
+    "prepare": "zakai.filters.prepared",
+    "Prepared": "zakai.filters.prepared",
     "online": "zakai.filters.online",
     "Estimate": "zakai.filters.online",
     "log_likelihood": "zakai.filters.likelihood",

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from zakai.cli import _compiled
+from zakai import _compiled
 
 NAMES = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES")
 

@@ -57,7 +57,7 @@ def test_a_checkpoint_that_was_cut_or_changed_anywhere_is_refused(tmp_path, cont
 
 def test_another_file_a_folder_and_nothing_are_refused(tmp_path, content):
     (tmp_path / "state").write_text("time,y\n1,2\n")
-    refused(tmp_path / "state", "is not a checkpoint")
+    refused(tmp_path / "state", "is not a checkpoint file")
     refused(tmp_path, "not a regular file")
     refused(tmp_path / "none", "cannot be read")
     later = content[:-32].replace(b"zakai checkpoint 1\n", b"zakai checkpoint 2\n")

@@ -6,7 +6,8 @@ import os
 import sys
 from collections.abc import Sequence
 
-from zakai.cli import _compiled, _interrupt
+from zakai import _compiled
+from zakai.cli import _interrupt
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

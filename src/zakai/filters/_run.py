@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from threading import Lock
+from types import MappingProxyType
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -18,7 +19,7 @@ from zakai import _float64  # noqa: F401
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.errors import InputError
-from zakai.filters._protocol import Info, Method
+from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters.observations import Data, data_of, schedule_of
 from zakai.filters.results import FilterResult, versions
 from zakai.models.model import Model
@@ -39,13 +40,18 @@ def prepared_for(method: Method, model: Model, schedule: Any, options: Mapping[s
     """`prepare`, remembered for the last schedules of each model."""
     with _LOCK:
         kept = _PREPARED.setdefault(model, OrderedDict())
-        key = (method.name, tuple(sorted(options.items())), *(np.ascontiguousarray(a).tobytes() for a in schedule))
+        key = (method.name, tuple(sorted(options.items())), *key_of(schedule))
         if key not in kept:
             kept[key] = method.prepare(model, schedule, **options)
             while len(kept) > 4 or (len(kept) > 1 and sum(size_of(one.intervals) for one in kept.values()) > 2 * CHUNK_BYTES):
                 kept.popitem(last=False)
         kept.move_to_end(key)
         return kept[key]
+
+
+def key_of(schedule: Schedule) -> tuple[bytes, ...]:
+    """A schedule as the key of a dictionary."""
+    return tuple(np.ascontiguousarray(a).tobytes() for a in schedule)
 
 
 def size_of(tree: Any) -> int:
@@ -123,16 +129,22 @@ class Piece(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """What is filtered by what: all but the record."""
+    """What is filtered by what: all but the record.
+
+    `stored` is what was prepared before and kept: schedules with the method's Prepared, found by `key_of` the schedule.
+    """
 
     model: Model
     prior: Any
     method: Method
     options: Mapping[str, Any]
+    stored: Mapping[Any, tuple[Schedule, Any]] = MappingProxyType({})
 
     def prepared(self, data: Data) -> Any:
         """What the method prepares for the intervals of some data."""
-        return prepared_for(self.method, self.model, schedule_of(data, True), self.options)
+        schedule = schedule_of(data, True)
+        found = self.stored.get(key_of(schedule)) if self.stored else None
+        return prepared_for(self.method, self.model, schedule, self.options) if found is None else found[1]
 
     def chunks(self, data: Data, first: int, lanes: int = 1) -> Iterator[slice]:
         """The rows that are prepared at once, from `first`, so that neither they nor `lanes` records of them fill the memory."""
@@ -224,6 +236,14 @@ class Run:
                 self.take(prepared, begin, info, kept)
                 if progress is not None:
                     progress(self.done, count)
+
+    def prepared(self) -> Iterator[tuple[Schedule, Any]]:
+        """All that is prepared for the record, each with its schedule."""
+        parts = [self._first_interval(), *(self.data.part(rows) for rows in self.setting.chunks(self.data, int(self.at_start)))]
+        if len(parts) > 1:
+            parts.append(parts[1].part(slice(0, 1)))  # by which the size of a chunk is chosen
+        for data in parts:
+            yield schedule_of(data, True), self.setting.prepared(data)
 
     def start(self, same: Run | None = None) -> None:
         """The first state: that of another run with the same prior, or the prior, after a sample at the start if there is one."""

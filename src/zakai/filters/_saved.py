@@ -62,10 +62,10 @@ def put_together(said: Any, arrays: list[np.ndarray], shared: Mapping[str, Any])
 
 
 def _fields(cls: type) -> tuple[str, ...] | None:
-    """The names of what a record is made of; None for anything else."""
+    """The names of what a record is made of, but for what it only remembers; None for anything else."""
     if issubclass(cls, tuple) and hasattr(cls, "_fields"):
         return cls._fields
-    return tuple(field.name for field in dataclasses.fields(cls)) if dataclasses.is_dataclass(cls) else None
+    return tuple(field.name for field in dataclasses.fields(cls) if field.init) if dataclasses.is_dataclass(cls) else None
 
 
 def saved(live: Live) -> tuple[dict[str, Any], list[np.ndarray]]:

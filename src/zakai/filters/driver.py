@@ -80,8 +80,6 @@ def filter_from(prior, model, record, method="auto", **options):
 
 
 def _filter(model, record, prior, method, keep, progress, options):
-    if keep not in (None, "densities", "moments"):
-        raise InputError(f'keep: "{keep}" is neither "densities" nor "moments"')
     many = isinstance(record, list | tuple)
     if many and not record:
         return []
@@ -92,7 +90,16 @@ def _filter(model, record, prior, method, keep, progress, options):
     check_records(model, record)
     plans = {key: planned(model, own, method, options) for key, own in {id(own): own for own in priors}.items()}
     check_noise(plans.values(), records)
-    chosen = [plans[id(own)] for own in priors]
+    results = filter_planned([plans[id(own)] for own in priors], records, keep, progress)
+    return results if many else results[0]
+
+
+def filter_planned(
+    chosen: Sequence[Plan], records: Sequence[Record], keep: str | None, progress: Callable[[int, int], None] | None
+) -> list[FilterResult]:
+    """Every record by its plan, side by side."""
+    if keep not in (None, "densities", "moments"):
+        raise InputError(f'keep: "{keep}" is neither "densities" nor "moments"')
     runs = [plan.runs(one, keep, most=KEPT_BYTES / len(records)) for plan, one in zip(chosen, records, strict=True)]
     flat = [run for of_one in runs for run in of_one]
     if len(flat) == 1:
@@ -103,7 +110,7 @@ def _filter(model, record, prior, method, keep, progress, options):
     for plan, one, of_one in zip(chosen, records, runs, strict=True):
         results.append(plan.result(of_one))
         results[-1].record = one
-    return results if many else results[0]
+    return results
 
 
 def _per_record(progress: Callable[[int, int], None], total: int, blocks: float) -> Callable[[int, int], None]:

@@ -1,4 +1,4 @@
-"""What the command compiles is kept on disk, so that the second run of a model starts at once.
+"""What is compiled is kept on disk, so that the second run of a model starts at once.
 
 In the user's cache folder (`XDG_CACHE_HOME`, or `~/.cache`; `LOCALAPPDATA` on Windows), under `zakai/compiled`, or in that which
 `ZAKAI_CACHE` names; where it is empty nothing is kept.  A folder that JAX's own `JAX_COMPILATION_CACHE_DIR` names comes first.
@@ -7,6 +7,7 @@ In the user's cache folder (`XDG_CACHE_HOME`, or `~/.cache`; `LOCALAPPDATA` on W
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 MOST_BYTES = 512 * 2**20
@@ -14,7 +15,7 @@ WORTH_KEEPING = "0.2"  # seconds of compilation
 
 
 def keep() -> None:
-    """Name the folder to JAX, which is not imported yet; nothing happens where it cannot be written."""
+    """Name the folder to JAX, imported or not; nothing happens where it cannot be written."""
     if "JAX_COMPILATION_CACHE_DIR" in os.environ or os.environ.get("ZAKAI_CACHE") == "":
         return
     try:
@@ -28,6 +29,12 @@ def keep() -> None:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", WORTH_KEEPING)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+    if "jax" in sys.modules:
+        config = sys.modules["jax"].config
+        if config.jax_compilation_cache_dir is None:
+            config.update("jax_compilation_cache_dir", str(folder))
+            config.update("jax_persistent_cache_min_compile_time_secs", float(WORTH_KEEPING))
+            config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 def _folder() -> Path:
