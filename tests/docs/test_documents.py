@@ -19,7 +19,13 @@ from zakai.models.files import read_model
 DOCUMENTS = sorted(path.relative_to(ROOT).as_posix() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 
 
-@pytest.mark.parametrize("name", [name for name in DOCUMENTS if blocks(name, "python")])
+LONG = [f"docs/{name}.md" for name in ("fit", "estimation-algebras", "yau-yau", "blocks", "kolmogorov-series")]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in DOCUMENTS if blocks(name, "python")],
+)
 def test_the_python_of_a_document_runs_and_prints_what_is_shown(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     names: dict = {}

@@ -92,6 +92,7 @@ TIMES = np.array([0.1, 0.17, 0.3])
 INCREMENTS = np.array([[0.25], [-0.2], [0.3]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", ["benes", "erf", pytest.param("planar", marks=pytest.mark.slow)]
 )
@@ -129,6 +130,7 @@ def modes_far_apart(variance):
     )
 
 
+@pytest.mark.slow
 def test_modes_that_are_narrow_and_far_apart_keep_their_shares():
     """Each mode is a Kalman filter of dx = x dt + dw; both explain a reading of zero equally well."""
     result = zakai.filter(modes_far_apart(0.0025), zakai.Record([0.0005, 0.001], [[0.0], [0.0]], "samples"), "hu-yau")
@@ -165,6 +167,7 @@ def model_of(make, **more):
     return zakai.Model(**{"state": ["x"], **make()[0], **more})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", ["theorem-4", pytest.param("theorem-5", marks=pytest.mark.slow), "theorem-6"])
 def test_one_shot_is_stepwise_early(choice):
     model = model_of(scalar_benes, prior={"kind": "gaussian", "mean": [0.3], "cov": [[0.5]]})
@@ -187,6 +190,7 @@ def test_one_shot_refuses_when_its_digits_are_lost_and_stepwise_does_not():
         zakai.filter(model, record, "hu-yau", form="one-shot")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "said"), [(0.0, False), (1000.0, True)])
 def test_one_shot_says_what_a_large_observation_costs_it(size, said):
     """The evidence of h = x + c is that of h = x but for what c itself explains, so that the error grows with c."""
@@ -276,6 +280,7 @@ def test_extreme_variances_and_steps_have_the_right_limits(variance, step):
         assert result.mean[-1, 0] == pytest.approx(1.0 + np.tanh(1.0), abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variance", [0.0, pytest.param(1e-8, marks=pytest.mark.slow)])
 def test_a_start_that_is_known_under_a_gauge_without_exponentials_has_the_right_limits(variance):
     model = model_of(scalar_erf, prior={"kind": "gaussian", "mean": [0.3], "cov": [[variance]]})

@@ -170,6 +170,7 @@ def sines(count, **keys):
     return zakai.Model(**{"state": state, **plain, **keys})
 
 
+@pytest.mark.slow
 def test_a_named_method_is_taken_block_by_block_where_it_holds_only_so():
     model = sines(5)
     result = zakai.filter(model, readings(model), "limited-direct", order=3, kernel="power-series")
@@ -230,6 +231,7 @@ def test_records_of_a_list_and_what_is_kept_and_progress():
             result.density(0)
 
 
+@pytest.mark.slow
 def test_the_same_warning_of_many_blocks_is_said_once():
     count = 12
     state = [f"x{i}" for i in range(count)]

@@ -42,6 +42,7 @@ def assert_agrees(result, expected, tolerance):
         assert result.log_likelihood_increments[: k + 1].sum() == pytest.approx(evidence, abs=tolerance)
 
 
+@pytest.mark.slow
 def test_one_state_with_two_sensors_gaps_and_irregular_times_is_kalman_and_bucy():
     model = zakai.Model(
         state=["x"],
@@ -91,6 +92,7 @@ def test_two_states_are_kalman_and_bucy():
     assert_agrees(result, expected, 1e-8)
 
 
+@pytest.mark.slow
 def test_an_observation_far_beyond_the_prediction_is_said():
     model = zakai.load_model("gallery:kalman-bucy-1d")
     result = zakai.filter(model, zakai.Record([0.01, 0.02], [[1e6], [0.0]], "increments"), "limited-direct")
@@ -107,6 +109,7 @@ def test_a_long_interval_is_taken_in_parts_and_agrees_with_many_short_ones():
     assert long.log_likelihood == pytest.approx(short.log_likelihood, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_a_path_that_is_read_after_a_gap_is_said_to_be_an_approximation():
     model = zakai.Model(
         state=["x"], drift=["-x"], observation=["x", "x/2"], observation_kind="path",

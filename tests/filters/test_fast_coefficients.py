@@ -18,6 +18,7 @@ def walk(noise, kind="samples", read="1"):
     )
 
 
+@pytest.mark.slow
 def test_a_short_pulse_of_noise_in_a_long_interval_is_not_missed():
     record = zakai.Record([10.0, 20.0], [[1.0], [2.0]], "samples")
     result = zakai.filter(walk("1/100 + 100*exp(-10000*(t - 5.3)**2)"), record)

@@ -78,6 +78,7 @@ def test_a_parameter_at_its_bound_is_said(line):
     assert "at a bound (c = 1.5)" in fitted.warnings[0]
 
 
+@pytest.mark.slow
 def test_parameters_that_the_record_does_not_tell_apart_have_no_standard_errors(line):
     model = zakai.Model(**{**LINE, "observation": ["c*d*x"], "parameters": {**LINE["parameters"], "d": 1.0}})
     fitted = zakai.fit(model, line[1], parameters=["c", "d"], method="kalman-bucy")
@@ -85,6 +86,7 @@ def test_parameters_that_the_record_does_not_tell_apart_have_no_standard_errors(
     assert "does not determine c, d" in fitted.warnings[0]
 
 
+@pytest.mark.slow
 def test_a_fit_that_does_not_converge_says_so(line, monkeypatch):
     monkeypatch.setattr(fitting, "ITERATIONS", 1)
     monkeypatch.setattr(fitting, "NEAR", 0.0)

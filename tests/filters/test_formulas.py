@@ -13,6 +13,7 @@ MODEL = zakai.Model(
 RECORD = zakai.simulate(MODEL, np.linspace(0.05, 1.0, 20), seed=1)[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["limited-direct", "extended-kalman-bucy"])
 def test_other_values_of_the_parameters_compile_no_step_again(method):
     zakai.filter(MODEL, RECORD, method=method)

@@ -39,6 +39,7 @@ def lost(p, q):
     return np.sum(p * (np.log(p + 1e-300) - np.log(q + 1e-300)))
 
 
+@pytest.mark.slow
 def test_neighbours_carry_the_shape_that_a_product_loses_and_modes_keep_their_mass():
     means = np.array([-6.0, -5.4, -4.8, 1.25, 1.75, 2.25, 2.75, 3.25, 3.75, 9.0])
     weights = np.array([0.02, 0.03, 0.02, 0.04, 0.15, 0.27, 0.27, 0.15, 0.04, 0.01])

@@ -60,6 +60,7 @@ def test_the_posterior_is_that_of_a_plain_solver(observed, result):
     assert result.warnings == []
 
 
+@pytest.mark.slow
 def test_the_error_that_is_told_is_near_the_error(observed):
     """One transition of an interval, of few kernels, between the means of two densities."""
     mean, _, _ = reference(observed.times, observed.values[:, 0])
@@ -81,6 +82,7 @@ def test_the_error_falls_with_the_power_of_the_order(observed):
     assert 1.7 < np.log2(error(2, 8) / error(2, 16)) < 2.7
 
 
+@pytest.mark.slow
 def test_too_few_kernels_and_the_sum_are_warned_of():
     model = double_well("samples")
     record = zakai.simulate(model, [0.3, 0.6], seed=2)[1]
@@ -90,6 +92,7 @@ def test_too_few_kernels_and_the_sum_are_warned_of():
     assert any("truncation" in words or "lost" in words for words in added.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["samples", "increments"])
 def test_where_an_exact_filter_exists_the_posterior_is_its(kind):
     keys = dict(
@@ -135,6 +138,7 @@ def test_intervals_that_are_too_short_for_a_lattice_are_refused():
         zakai.filter(double_well(), zakai.Record([1e-7, 2e-7], [[0.0], [0.0]], "increments"), "kolmogorov-series")
 
 
+@pytest.mark.slow
 def test_an_observation_that_contradicts_the_prior_is_followed_or_warned_of():
     model = double_well("samples", observation=["x"], observation_noise=[["1/100"]], drift=["-x"])
     record = zakai.Record([0.1, 0.2], [[7.0], [7.0]], "samples")

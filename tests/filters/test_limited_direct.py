@@ -24,6 +24,7 @@ def one_state():
     return system, box, filter_system(box, system)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", ["flow", "power-series"])
 def test_the_density_of_one_state_agrees_with_the_kolmogorov_equation(one_state, kernel):
     system, box, reference = one_state

@@ -64,10 +64,8 @@ SYSTEMS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[] if name == "spiral sensor" else [pytest.mark.slow]) for name in SYSTEMS],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_the_gradient_agrees_with_central_differences(name):
     keys = SYSTEMS[name]
     model = zakai.Model(**keys)

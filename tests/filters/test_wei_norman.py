@@ -77,6 +77,7 @@ def as_the_equation_says(model, record, box, drift, divergence, h, S, tolerance)
     return result
 
 
+@pytest.mark.slow
 def test_benes_with_two_peaks_and_gaps_is_the_exact_filter():
     model = line()
     record = record_of(model, np.arange(1, 81) * 0.05, missing=[(10, 0), (11, 0)])
@@ -199,6 +200,7 @@ def test_what_it_cannot_resolve_is_said():
     assert any("aliasing" in said for said in result.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variance", [pytest.param(1e-6, marks=pytest.mark.slow), 1e-2, 1e4])
 def test_a_narrow_or_wide_prior_is_kalman_and_bucys(variance):
     model = line("1 - x/2", {"kind": "gaussian", "mean": [2.0], "cov": [[variance]]})

@@ -25,6 +25,7 @@ def distance(a: zakai.FilterResult, b: zakai.FilterResult) -> float:
     return max(mean.max(), np.abs(a.variance / b.variance - 1).max(), abs(a.log_likelihood - b.log_likelihood))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [1e-4, pytest.param(1e-6, marks=pytest.mark.slow)])
 def test_samples_of_a_linear_system_give_what_kalman_bucy_gives(tolerance):
     model, record = linear("samples", 0.1, 3.0, 30)
@@ -66,6 +67,7 @@ def test_what_the_splitting_leaves_is_estimated_and_held_to_the_tolerance():
     assert error.max() < 1e-4
 
 
+@pytest.mark.slow
 def test_the_first_error_of_the_splitting_is_undone_in_the_evidence():
     model, record = linear("increments", 1.0, 2.0, 40)
     exact = zakai.filter(model, record, "kalman-bucy").log_likelihood

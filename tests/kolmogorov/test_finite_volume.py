@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import scipy.linalg
 
 from zakai.kolmogorov.comoving import Field
@@ -38,6 +39,7 @@ def test_it_is_the_exponential_of_a_matrix_of_rates():
     assert np.allclose(np.roll(np.asarray(after.values), whole), expected, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_mass_is_conserved_and_nothing_is_negative_however_long_the_step():
     rng = np.random.default_rng(0)
     values = rng.uniform(size=(12, 10)) * (rng.uniform(size=(12, 10)) > 0.7)
@@ -48,6 +50,7 @@ def test_mass_is_conserved_and_nothing_is_negative_however_long_the_step():
     assert np.all(np.asarray(after.values) >= 0) and abs(float(after.values.sum()) - 1) < 1e-12
 
 
+@pytest.mark.slow
 def test_the_error_is_of_second_order_in_the_cells_and_estimated():
     def error(size: int, cross: float) -> tuple[float, float]:
         cell, G, tau = 9.0 / size, np.array([[1.0, cross], [cross, 0.8]]), 0.2

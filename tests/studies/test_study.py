@@ -158,6 +158,7 @@ def kill_when(process, parts, count):
     return len([entry for entry in parts.iterdir() if not entry.name.startswith(".")])
 
 
+@pytest.mark.slow
 def test_a_study_that_was_killed_ends_with_the_same_bytes(done, tmp_path):
     path, folder, _ = done
     process = command(path, tmp_path / "out")
