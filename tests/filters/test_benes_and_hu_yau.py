@@ -94,7 +94,7 @@ INCREMENTS = np.array([[0.25], [-0.2], [0.3]])
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "case", ["benes", "erf", pytest.param("planar", marks=pytest.mark.slow)]
+    "case", ["benes", "erf", pytest.param("planar", marks=pytest.mark.longest)]
 )
 def test_the_density_solves_the_dmz_equation(case):
     make, box, methods = CASES[case]

@@ -149,6 +149,7 @@ def test_names_and_their_order_do_not_matter():
     assert np.allclose(turned.log_likelihood, first.log_likelihood, rtol=0, atol=1e-11)
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_two_spirals_are_one_system_of_two_states():
     state = ["x", "y"]
@@ -292,6 +293,7 @@ def test_the_likelihood_of_blocks_is_their_sum_at_any_parameters():
     assert abs(other.log_likelihood - result.log_likelihood) > 1e-3
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_the_gradient_of_blocks_is_that_of_the_whole():
     model = decaying()
@@ -300,6 +302,7 @@ def test_the_gradient_of_blocks_is_that_of_the_whole():
     assert np.allclose(*gradients, rtol=0, atol=1e-8) and abs(gradients[0][0] - gradients[0][1]) > 0.01
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_a_splitting_system_is_fitted_as_the_whole_is():
     model = pairs(3, np.linspace(-1, 1, 6))

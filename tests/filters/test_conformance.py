@@ -35,6 +35,7 @@ SYSTEMS = {
 NEAR = {"general-direct": 2e-2, "gaussian-sum": 5e-4}
 LONG_TO_COMPILE = ("general-direct", "gaussian-sum", "wei-norman", "limited-direct", "kolmogorov-series", "yau-yau")
 LONGEST_TO_COMPILE = ("general-direct", "gaussian-sum")
+LONGEST_GRADIENTS = ("general-direct", "gaussian-sum", "yau-yau")
 # A method whose lattice is as good as it was asked to be is asked for more where rounding is to be compared.
 OPTIONS = {"yau-yau": {"tolerance": 1e-8}}
 TIMES = np.cumsum([0.1, 0.05, 0.2, 0.1, 0.1, 0.15, 0.05, 0.1, 0.3, 0.1])
@@ -55,7 +56,7 @@ def readings(name: str, kind: str, gaps: bool = False, seed: int = 0) -> zakai.R
     return zakai.Record(record.times, values, kind)
 
 
-def case(method: str, name: str, costly: bool) -> object:
+def case(method: str, name: str, costly: bool, longest: tuple[str, ...]) -> object:
     """The pair as a case of a test: skipped where the theorem says no, slow but for the last system for which it says yes, and
     slow there too for methods that take long to compile, if the test is `costly`."""
     holds = [one for one in SYSTEMS if all_hold(_registry.load(method).theorem(system(one))) is True]
@@ -66,11 +67,13 @@ def case(method: str, name: str, costly: bool) -> object:
         marks.append(pytest.mark.skip(reason=f"{method} takes long to compile, and is tested on the {holds[-1]} system"))
     elif name != holds[-1] or (costly and method in LONG_TO_COMPILE) or method in LONGEST_TO_COMPILE:
         marks.append(pytest.mark.slow)
+    if method in longest:
+        marks += [pytest.mark.slow, pytest.mark.longest]
     return pytest.param(method, name, marks=marks, id=f"{method}-{name}")
 
 
-def on_every_system(costly: bool):
-    cases = [case(method, name, costly) for method in _registry.METHODS for name in SYSTEMS]
+def on_every_system(costly: bool, longest: tuple[str, ...] = ()):
+    cases = [case(method, name, costly, longest) for method in _registry.METHODS for name in SYSTEMS]
     return pytest.mark.parametrize(("method", "name"), cases)
 
 
@@ -150,7 +153,7 @@ def test_many_records_give_what_each_gives_alone(method, name):
         assert np.allclose(many.density(4).mean(), alone.density(4).mean(), rtol=0, atol=1e-8)
 
 
-@on_every_system(costly=True)
+@on_every_system(costly=True, longest=LONGEST_GRADIENTS)
 @pytest.mark.parametrize("kind", ["increments", pytest.param("samples", marks=pytest.mark.slow)])
 def test_the_gradient_is_that_of_differences(method, name, kind):
     if not holds(method, name, kind):

@@ -110,7 +110,9 @@ DRIFTS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "drift"), [(kind, drift) for kind in KINDS for drift in DRIFTS if (kind, drift) != ("wide", "erf")]
+    ("kind", "drift"),
+    [(kind, "benes") for kind in KINDS]
+    + [pytest.param(kind, "erf", marks=pytest.mark.longest) for kind in KINDS if kind != "wide"],
 )
 def test_the_log_likelihood_has_the_gradient_of_differences_for_every_kind_of_prior(kind, drift):
     method, field, parameters = DRIFTS[drift]

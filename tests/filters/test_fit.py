@@ -54,6 +54,7 @@ def test_the_maximum_is_that_of_a_plain_scan(line, fitted):
     assert np.allclose(np.linalg.inv(fitted.covariance).diagonal(), -np.array(hessian), rtol=0.01)
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_the_covariance_is_the_inverse_of_the_hessian(line, fitted):
     likelihood = zakai.log_likelihood(*line, "kalman-bucy", ["a", "s"])
@@ -126,10 +127,11 @@ def test_a_model_without_parameters_has_nothing_to_fit():
     ("keys", "truth", "method"),
     [
         (dict(drift=["a*tanh(a*x)"], observation=["c*x"], parameters={"a": 0.8, "c": 1.0}), {"a": 0.8, "c": 1.0}, "benes"),
-        (
+        pytest.param(
             dict(drift=["t/40*x"], observation=["c*x*sin(x)", "c*x*cos(x)"], parameters={"c": 1.0}),
             {"c": 1.0},
             "limited-direct",
+            marks=pytest.mark.longest,
         ),
     ],
 )

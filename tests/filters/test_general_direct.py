@@ -42,6 +42,7 @@ def test_a_time_varying_system_with_a_log_cosh_gauge_agrees_with_the_exact_densi
     assert finer <= 5e-3
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_sine_and_cosine_samples_of_two_states_agree_with_the_exact_density():
     model = encoder()
@@ -96,6 +97,7 @@ def test_extreme_variances_and_steps_give_numbers_and_positive_variances(varianc
     assert np.isfinite(result.mean).all() and np.isfinite(result.log_likelihood) and (result.variance > 0).all()
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_a_row_without_readings_is_a_prediction_and_the_density_is_the_state_that_is_reported():
     model = encoder()
@@ -111,6 +113,7 @@ def test_a_row_without_readings_is_a_prediction_and_the_density_is_the_state_tha
     assert np.allclose(density.mean(), result.mean[-1]) and np.allclose(density.cov(), result.cov[-1])
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_the_gradient_of_the_log_likelihood_is_its_slope():
     from zakai.filters.likelihood import log_likelihood
@@ -193,7 +196,13 @@ VARIANCES = [1e-8, 1e-4, 1e-2, 1.0, 10.0, 1e2, 1e4, 1e6, 1e8]
 @pytest.mark.parametrize(
     ("variance", "step"),
     [(1e4, 1e-6)]
-    + [pytest.param(v, h, marks=pytest.mark.slow) for v in VARIANCES for h in (1e-6, 0.01, 10.0) if (v, h) != (1e4, 1e-6)],
+    + [pytest.param(v, 0.01, marks=pytest.mark.slow) for v in VARIANCES]
+    + [
+        pytest.param(v, h, marks=[pytest.mark.slow, pytest.mark.longest])
+        for v in VARIANCES
+        for h in (1e-6, 10.0)
+        if (v, h) != (1e4, 1e-6)
+    ],
 )
 def test_a_prior_of_any_width_over_the_bend_of_the_gauge_is_right_or_warned_of(variance, step):
     model, record = benes(variance), readings(step)
@@ -207,6 +216,7 @@ def test_a_prior_of_any_width_over_the_bend_of_the_gauge_is_right_or_warned_of(v
     assert (not result.warnings) if step > 1e-6 else all(line.startswith("edge_weight") for line in result.warnings)
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_the_gradient_under_a_gauge_with_a_wide_prior_is_the_slope():
     from zakai.filters.likelihood import log_likelihood

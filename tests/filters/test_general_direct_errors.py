@@ -62,7 +62,7 @@ def said(result):
 @pytest.mark.parametrize(
     ("name", "seed"),
     [pytest.param(name, 3, marks=pytest.mark.slow) for name in ("cubic", "mirror")]
-    + [pytest.param(name, 4, marks=pytest.mark.slow) for name in SENSORS],
+    + [pytest.param(name, 4, marks=[pytest.mark.slow, pytest.mark.longest]) for name in SENSORS],
 )
 def test_a_sum_is_near_the_density_or_says_that_it_is_not(name, seed):
     model = sensor(name)
@@ -77,7 +77,7 @@ def test_a_sum_is_near_the_density_or_says_that_it_is_not(name, seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SENSORS)
-@pytest.mark.parametrize("components", [2, 4, 6, 10])
+@pytest.mark.parametrize("components", [*(pytest.param(few, marks=pytest.mark.longest) for few in (2, 4, 6)), 10])
 def test_a_sum_of_too_few_components_says_so(name, components):
     model = sensor(name)
     _, record = zakai.simulate(model, np.arange(1, 41) * 0.1, seed=3)
@@ -142,6 +142,7 @@ def paths(record, count=20000, turns=(-1, 0, 1)):
     return np.array([t[0] for t in told]), np.array([t[1] for t in told]), np.diff([t[2] for t in told], prepend=0.0)
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_sine_and_cosine_samples_of_three_states_are_near_the_density():
     model = zakai.Model(
@@ -156,6 +157,7 @@ def test_sine_and_cosine_samples_of_three_states_are_near_the_density():
         assert mean <= 0.02 and evidence <= 0.05
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_a_mirrored_system_gives_the_mirrored_density_and_a_batch_what_each_gives():
     model = sensor("sine", observation=["sin(x) + x/4"])
@@ -186,6 +188,7 @@ def plane(order):
     )  # fmt: skip
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_another_order_of_the_coordinates_gives_the_same_density_and_gaps_are_predictions():
     one, other = plane("xy"), plane("yx")
@@ -200,6 +203,7 @@ def test_another_order_of_the_coordinates_gives_the_same_density_and_gaps_are_pr
     assert a.log_likelihood_increments[5] == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_four_states_with_a_nonlinear_observation_of_two_run_and_report_their_error():
     model = zakai.Model(
@@ -216,6 +220,7 @@ def test_four_states_with_a_nonlinear_observation_of_two_run_and_report_their_er
     assert np.all(np.abs(result.mean[1:] - truth.values[1:]) <= 5 * np.sqrt(result.variance[1:]))
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_the_error_falls_with_the_number_of_slots():
     model = zakai.load_model("gallery:spiral-sensor")

@@ -78,6 +78,7 @@ def spiral(variance, **changes):
     return zakai.Model(**(keys | changes))
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_the_gradient_of_increments_is_the_slope():
     from zakai.filters.likelihood import log_likelihood
@@ -89,6 +90,7 @@ def test_the_gradient_of_increments_is_the_slope():
     assert jax.grad(value)(model.theta()) == pytest.approx(np.array([expected]), rel=1e-4)
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_paths_that_begin_anywhere_in_the_prior_keep_the_weights_of_their_modes():
     model = spiral(3.0)

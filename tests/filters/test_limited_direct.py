@@ -37,7 +37,7 @@ def test_the_density_of_one_state_agrees_with_the_kolmogorov_equation(one_state,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kernel", ["flow", "power-series"])
+@pytest.mark.parametrize("kernel", ["flow", pytest.param("power-series", marks=pytest.mark.longest)])
 def test_the_density_of_two_states_agrees_with_the_kolmogorov_equation(kernel):
     system = planar()
     box = Box(7.0, 96, (0.0, 0.0))

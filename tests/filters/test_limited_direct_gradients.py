@@ -65,7 +65,11 @@ SYSTEMS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.longest] * (name in ("wind vane", "two states, increments", "two states, samples")))
+     for name in SYSTEMS],
+)
 def test_the_gradient_agrees_with_central_differences(name):
     keys = SYSTEMS[name]
     model = zakai.Model(**keys)

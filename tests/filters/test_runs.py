@@ -61,6 +61,7 @@ def lengths(monkeypatch):
     return found
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_runs_that_end_early_take_few_steps_twice_and_change_no_estimate(lengths):
     model = zakai.Model(**CUBIC)
@@ -74,6 +75,7 @@ def test_runs_that_end_early_take_few_steps_twice_and_change_no_estimate(lengths
     assert np.abs(result.log_likelihood - finer.log_likelihood) < 1e-4
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_equal_sensors_side_by_side_give_what_each_gives_alone():
     names = [f"x{k}" for k in range(20)]

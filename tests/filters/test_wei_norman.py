@@ -149,6 +149,7 @@ def test_a_passive_state_that_is_not_linear_is_as_the_equation_says():
     )
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_three_states_with_a_passive_drift_are_as_the_equation_says():
     model = zakai.Model(state=["x1", "x2", "x3"], drift=PASSIVE, observation=["2*x1"], prior=SPACE)
@@ -167,6 +168,7 @@ def test_three_states_with_a_passive_drift_are_as_the_equation_says():
     as_the_equation_says(model, record, box, drift, divergence, lambda x, t: 2 * x[..., :1], np.eye(1), 1e-8)
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_the_observed_block_of_three_states_is_kalman_and_bucys():
     model = zakai.load_model("gallery:passive-drift")

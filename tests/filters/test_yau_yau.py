@@ -156,6 +156,7 @@ def test_a_reading_far_beyond_the_prior_is_not_passed_over_in_silence():
     assert result.warnings
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_finite_volumes_keep_their_tolerance_and_take_noise_across_their_axes():
     model, record = linear("samples", 0.1, 1.0, 5)
@@ -199,6 +200,7 @@ def test_a_lattice_that_needs_too_much_memory_is_refused():
         zakai.filter(model, record, "yau-yau", memory=0.001)
 
 
+@pytest.mark.longest
 @pytest.mark.slow
 def test_the_gradient_with_a_sample_at_the_start_is_that_of_finite_differences():
     model = zakai.Model(
