@@ -142,7 +142,7 @@ def test_the_errors_of_the_cubic_sensor_are_told_with_the_failures():
 def test_the_paths_of_lorenz_keep_to_the_attractor_and_their_errors_are_told():
     truth, readings = lorenz_63_sakov_2012.paths(np.random.default_rng(0), 2, 120)
     assert np.std(readings - truth) == pytest.approx(np.sqrt(2), rel=0.1) and 40 < truth[..., 2].max() < 50
-    good = np.array([lorenz_63_sakov_2012.root_mean_square(truth, truth + c) for c in (9.0, 0.3, 0.6, 0.8)])
+    good = np.array([lorenz_63_sakov_2012.root_mean_square(truth, truth + c) for c in (9.0, 0.9, 0.3, 0.6, 0.8)])
     errors = {"extended Kalman": good * 2, "ensemble, 100 members": good}
     told = lorenz_63_sakov_2012.reproduction(errors, {"observations": 120, "records": 2, "seed": 0})
     assert [row[1] for row in told.tables[0].rows] == ["18.00", "9.00"]

@@ -66,7 +66,8 @@ class Setting:
         return float(ndtr((-edge - START) / self.deviation) + ndtr((START - edge) / self.deviation))
 
 
-SETTINGS = tuple(Setting(reading, spread) for reading in ("variance", "standard deviation") for spread in PAPER)
+READINGS = ("variance", "standard deviation")
+SETTINGS = tuple(Setting(reading, spread) for reading in READINGS for spread in PAPER)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +87,10 @@ class Study:
     def text(self) -> str:
         """Table II beside our figures, the comparison on the same paths, and what can be reproduced."""
         comparisons = [Comparison(**one) for one in self.figures["comparisons"]]
-        return "\n".join([text_of(self.figures, PAPER), "", *comparison_lines(comparisons)])
+        agree = {reading: [c.verdict.startswith("agrees") for c in comparisons if reading in c.what] for reading in READINGS}
+        said = "; ".join(f"with P0 read as {reading} {sum(found)} of {len(found)}" for reading, found in agree.items() if found)
+        verdict = f"Verdict: of the paper's figures these agree within chance: {said}; the reasons are above."
+        return "\n".join([text_of(self.figures, PAPER), "", *comparison_lines(comparisons), "", verdict])
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write figures.json and table.txt."""
@@ -224,7 +228,7 @@ def _comparisons(figures: dict[str, Any]) -> list[Comparison]:
     for setting in figures["settings"]:
         published, where = PAPER[setting["P0"]], f"P0 = {setting['P0']:g} as {setting['reading']}"
         for key, name, because in (
-            ("direct", "direct method, MSE", "no exact filter gives it; a window cut at about 11 comes nearer"),
+            ("direct", "direct method, MSE", "an exact filter is better; a window cut at about 11 comes nearer"),
             ("ekf-euler", "EKF, MSE", "a few paths that lost track decide the mean"),
         ):
             figure, mse, error = published[key], setting["mse"][key], setting["standard_error"][key]

@@ -28,7 +28,7 @@ from zakai.studies.metrics import over_runs
 STEP, EACH, NOISE = 0.01, 25, 2.0
 START = np.array([1.509, -1.531, 25.46])
 SPIN_UP = 64  # readings, 16 units of time
-LEVELS = (0.0, 0.1, 1.0, 10.0)
+LEVELS = (0.0, 0.01, 0.1, 1.0, 10.0)
 ALL = 1000  # readings of the known figures
 
 
