@@ -163,14 +163,14 @@ def reproduction(errors: dict[str, np.ndarray], settings: dict[str, Any]) -> Rep
         tuple(rows),
     )
     agreeing = [one.what.split(", q")[0] for one in comparisons if one.verdict.startswith("agrees")]
-    worst = ", ".join(f"{name} {np.mean(found[0]):.1f}" for name, found in errors.items() if np.mean(found[0]) > 1)
+    worst = "; ".join(f"{name} ({np.mean(found[0]):.1f})" for name, found in errors.items() if np.mean(found[0]) > 1)
+    left = "" if len(agreeing) == len(errors) else " What is left of the differences is between cures, not filters."
     verdict = (
         f"the order of the filters is {'' if same else 'not '}the known one; from the worst to the best: "
-        f"{', '.join(f'{name} {best[name]:.2f}' for name in order)}. Within chance of the known figure: "
-        f"{', '.join(agreeing) or 'none'}. Without process noise the path is lost by some ({worst or 'none here'}), which is "
-        "why the known filters are tuned; ours have process noise in place of that, and what is left of the differences is "
-        "between cures, not filters. yau-yau is not part of it: three states that bend this much between readings ask for "
-        "more than 30 points an axis and seconds a reading."
+        f"{', '.join(f'{name} {best[name]:.2f}' for name in order)}. Within chance of the known figure: {len(agreeing)} of "
+        f"{len(errors)}. Without process noise the path is lost by {worst or 'none here'}, which is why the known filters are "
+        f"tuned; ours have process noise in place of that.{left} yau-yau is not part of it: three states that bend this much "
+        "between readings ask for more than 30 points an axis and seconds a reading."
     )
     return Reproduction(
         "Lorenz 1963, all coordinates sampled every 0.25 with variance 2, without process noise (Sakov, Oliver and Bertino 2012)",
