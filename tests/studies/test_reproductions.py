@@ -71,36 +71,46 @@ def test_wrong_names_options_and_folders_are_said(tmp_path):
             studies.reproduce(name, **options)
 
 
-def kalman_bucy(increments, step, slope, mean, variance, parts=40):
-    """Means, variances and evidence of f = slope x, h = x, y linear between readings; Runge and Kutta's formula."""
+def kalman_bucy(increments, step, slope, mean, variance, parts=40, frozen=False):
+    """Means, variances and evidence of f = slope x, h = x, y linear between readings, or frozen; Runge and Kutta's formula."""
 
     def rate(m, P, evidence, z):
         return np.array([slope * m + P * (z - m), 2 * slope * P + 1 - P**2, z * m - (m**2 + P) / 2])
 
     state, found = np.array([mean, variance, 0.0]), []
     for increment in increments:
-        z, d = increment / step, step / parts
+        z, d = 0.0 if frozen else increment / step, step / parts
         for _ in range(parts):
             k1 = rate(*state, z)
             k2 = rate(*(state + d / 2 * k1), z)
             k3 = rate(*(state + d / 2 * k2), z)
             state = state + d / 6 * (k1 + 2 * k2 + 2 * k3 + rate(*(state + d * k3), z))
+        if frozen:
+            state = state + np.array([state[1] * increment, 0.0, state[0] * increment + state[1] * increment**2 / 2])
         found.append(state)
     return np.array(found).T
 
 
-def test_the_converged_solutions_are_the_kalman_bucy_filter_of_a_linear_system():
+@pytest.mark.parametrize("frozen", [False, True])
+def test_the_converged_solution_is_the_kalman_bucy_filter_of_a_linear_system(frozen):
     increments = np.array([0.2, -0.3, 0.15, 0.4])
-    means, variances, evidence = kalman_bucy(increments, 0.1, -0.5, 0.4, 0.5)
+    means, variances, evidence = kalman_bucy(increments, 0.1, -0.5, 0.4, 0.5, frozen=frozen)
 
     def prior(x):
         return np.exp(-((x[..., 0] - 0.4) ** 2))
 
     times = 0.1 * np.arange(1, 5)
-    solution = conditional_densities(lambda x: -0.5 * x, lambda x: x, np.eye(1), prior, times, increments[:, None], 9.0, 128)
+    solution = conditional_densities(
+        lambda x: -0.5 * x, lambda x: x, np.eye(1), prior, times, increments[:, None], 9.0, 128, frozen=frozen
+    )
     np.testing.assert_allclose(solution.means[:, 0], means, rtol=0, atol=1e-8)
     np.testing.assert_allclose(solution.deviations[:, 0] ** 2, variances, rtol=0, atol=1e-8)
     np.testing.assert_allclose(solution.evidence, evidence, rtol=0, atol=1e-8)
+
+
+def test_many_paths_at_once_are_the_kalman_bucy_filter_of_a_linear_system():
+    increments = np.array([0.2, -0.3, 0.15, 0.4])
+    means, variances, _ = kalman_bucy(increments, 0.1, -0.5, 0.4, 0.5)
     fine = np.repeat(increments / 50, 50)
     found = crank_nicolson(
         lambda x: -0.5 * x, lambda x: x, lambda x: -((x - 0.4) ** 2), np.array([fine, -fine]), 0.002, np.arange(-8, 8, 0.02)
