@@ -35,7 +35,8 @@ def test_a_reproduction_is_printed_and_stored(tmp_path, capsys):
     table = published.Table("More", ("filter", "mean"), (("ours", 1.4), ("theirs", None)))
     one = published.Reproduction("Title", "Scope", rows, "as it is.", (table,), {"paths": np.int64(7)})
     text = one.text()
-    assert "1.400 +- 0.250" in text and "Verdict: as it is." in text and max(map(len, text.splitlines())) <= published.WIDTH
+    assert "1.400 +- 0.250" in text and "Verdict (1 of 2 figures agree): as it is." in text
+    assert max(map(len, text.splitlines())) <= published.WIDTH
     one.save(tmp_path)
     assert (tmp_path / "table.txt").read_text() == text + "\n"
     stored = json.loads((tmp_path / "figures.json").read_text())

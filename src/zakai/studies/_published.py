@@ -28,6 +28,11 @@ class Comparison:
     standard_error: float | None = None
     verdict: str = ""
 
+    @property
+    def compared(self) -> bool:
+        """Whether there was enough to compare."""
+        return self.verdict.startswith(("agrees", "differs"))
+
 
 def by_chance(
     what: str, published: float, ours: float | None, error: float | None, because: str, published_error: float = 0.0
@@ -94,7 +99,12 @@ class Reproduction:
         lines = [self.title, "", *textwrap.wrap(self.scope, WIDTH), "", *comparison_lines(self.comparisons)]
         for table in self.tables:
             lines += ["", *table.lines()]
-        return "\n".join([*lines, "", *textwrap.wrap(f"Verdict: {self.verdict}", WIDTH)])
+        return "\n".join([*lines, "", *textwrap.wrap(f"Verdict{self._count()}: {self.verdict}", WIDTH)])
+
+    def _count(self) -> str:
+        """How many of the figures that can be compared agree."""
+        words = [comparison.verdict.startswith("agrees") for comparison in self.comparisons if comparison.compared]
+        return f" ({sum(words)} of {len(words)} figures agree)" if words else ""
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write figures.json and table.txt."""

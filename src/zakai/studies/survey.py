@@ -207,7 +207,7 @@ def draw_distances(times: np.ndarray, linear: Solution, frozen: Solution, runs: 
     right.fill_between(x[near], linear.densities[-1][near], color=PALE, label="converged, y linear")
     # What lies on top is narrower, so that equal lines are all seen.
     for number, (colour, (name, (result, _))) in enumerate(zip(SERIES, runs.items())):
-        width = 5.0 - 0.65 * number
+        width = 3.6 - 0.4 * number
         label = f"({name.replace(':', ')', 1)}"
         apart = distances(METHODS[name].reference(linear, frozen), result)[0]
         left.semilogy(times, np.maximum(apart, 1e-16), color=colour, linewidth=width, label=label)
