@@ -44,10 +44,10 @@ def figures(model: zakai.Model, step: float, count: int, repeats: int, seed: int
         taken.append(1e3 * (time.perf_counter() - begin) / count)
     near = zakai.filter(model, record, "yau-yau", keep="moments", tolerance=1e-7)
     apart = (result.mean - near.mean) / np.sqrt(near.variance)
-    last = zakai.Record(record.times[:50], record.values[:50], record.kind)
-    shape = np.shape(zakai.filter(model, last, "yau-yau").density(-1).values)
+    begun = zakai.Record(record.times[:50], record.values[:50], record.kind)
+    density = zakai.filter(model, begun, "yau-yau").density(-1)
     return {
-        "lattice after 50 observations": list(shape),
+        "lattice after 50 observations": list(np.shape(density.log_values)),
         "ms_per_observation": round(float(np.median(taken)), 4),
         "rms_distance": float(f"{np.sqrt(np.mean(apart**2)):.2g}"),
         "largest_distance": float(f"{np.abs(apart).max():.2g}"),

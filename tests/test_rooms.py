@@ -11,7 +11,7 @@ import pytest
 import zakai
 
 ROOMS = ["models", "algebra", "kolmogorov", "densities", "records", "filters", "peers", "studies", "report", "cli"]
-EVERYWHERE = {"errors", "_float64", "_registry"}
+EVERYWHERE = {"errors", "_float64", "_registry", "_compiled"}
 SOURCE = Path(zakai.__file__).parent
 # Simulating makes a record, which is a later room's; inside functions, so that nothing is loaded in a circle.
 LAZILY = {("models/simulate.py", "records")}

@@ -54,7 +54,10 @@ def prepare(model: Model, times: Any, method: str = "auto", **options: Any) -> P
 
 
 def _nothing_read(model: Model, times: Any) -> Record:
-    times = np.asarray(times, dtype=float)
+    try:
+        times = np.asarray(times, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"prepare: the times are a {type(times).__name__}; give a vector of numbers or a Record") from None
     if times.ndim != 1 or not len(times):
         raise InputError(f"prepare: the times have the shape {times.shape}; give a vector of at least one")
     return Record(times, np.zeros((len(times), model.m)), model.observation_kind)

@@ -87,11 +87,12 @@ def _hartley(size: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def _circle(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """cos(k j) and sin(k j) over `size`, and the index i - j of a circulant matrix."""
-    angle = np.outer(np.arange(size), _frequencies(size))
-    difference = (np.arange(size)[:, None] - np.arange(size)) % size
-    return np.cos(angle) / size, np.sin(angle) / size, difference
+def _circle(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The frequencies k >= 0 (size / 2 + 1,), cos(k i), sin(k i), and the transpose of both times the share of k and -k."""
+    k = 2 * np.pi * np.arange(size // 2 + 1) / size
+    cos, sin = np.cos(np.outer(np.arange(size), k)), np.sin(np.outer(np.arange(size), k))
+    often = np.where((k == 0) | (np.arange(len(k)) == size // 2), 1.0, 2.0) / size
+    return k, cos, sin, np.concatenate([cos * often, sin * often], axis=1).T
 
 
 def slope(values: jax.Array, axis: int) -> jax.Array:
@@ -115,8 +116,7 @@ class Transport(NamedTuple):
             arrays = [along(matrix, values, d) for values in arrays]
         return list(arrays)
 
-    def _decay(self, d: int, size: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-        k = _frequencies(size)
+    def _decay(self, d: int, k: np.ndarray) -> tuple[jax.Array, jax.Array, jax.Array]:
         decay = jnp.exp(-0.5 * self.variances[d] * k**2)
         return decay, jnp.cos(k * self.shifts[d]), jnp.sin(k * self.shifts[d])
 
@@ -125,14 +125,16 @@ class Transport(NamedTuple):
         size = values.shape[0]
         hartley = _hartley(size)
         spectrum = hartley @ values
-        decay, cos, sin = self._decay(0, size)
+        decay, cos, sin = self._decay(0, _frequencies(size))
         mirrored = jnp.concatenate([spectrum[:1], spectrum[:0:-1]])
         return jnp.matmul(hartley, decay * (cos * spectrum + sin * mirrored))
 
     def _matrix(self, d: int, size: int) -> jax.Array:
-        cos_table, sin_table, difference = _circle(size)
-        decay, cos, sin = self._decay(d, size)
-        return (cos_table @ (decay * cos) + sin_table @ (decay * sin))[difference]
+        # The sum over k of decay cos(k (i - j - shift)), as one product.
+        k, cosines, sines, table = _circle(size)
+        decay, cos, sin = self._decay(d, k)
+        cos, sin = decay * cos, decay * sin
+        return jnp.concatenate([cosines * cos + sines * sin, sines * cos - cosines * sin], axis=1) @ table
 
 
 class Moments(NamedTuple):
