@@ -225,6 +225,11 @@ def draw_errors(scores: dict[str, dict[str, np.ndarray]]) -> Any:
             style |= {"marker": "_", "markersize": 14, "color": INK}
         panel.semilogy(np.arange(1, len(order) + 1), one["rmse"][order], **style)
     panel.axhline(KNOWN["YauYauAL 0.1.0"].rmse, color=OURS, linewidth=0.8, linestyle=(0, (4, 2)), label="YauYauAL, known mean")
+    panel.set_yticks([0.1, 0.2, 0.5, 1.0, 2.0, 5.0], ["0.1", "0.2", "0.5", "1", "2", "5"])
+    panel.minorticks_off()
+    every = np.concatenate([one["rmse"] for one in scores.values()])
+    panel.set_ylim(0.8 * np.nanmin(every), 1.25 * np.nanmax(every))
+    panel.xaxis.get_major_locator().set_params(integer=True)
     panel.set_xlabel("path, in the order of the converged solution's error")
     panel.set_ylabel("root mean square error")
     panel.legend(frameon=False, fontsize=9, ncols=3)
