@@ -23,6 +23,7 @@ from zakai.models.numeric import numpy_function
 LEAST = {1: 32, 2: 24, 3: 20, 4: 16}
 MOST = {1: 4096, 2: 512, 3: 128, 4: 48}
 RUNS = {1: 256, 2: 64, 3: 16, 4: 8}
+BRIEF = 4  # a run of the characteristics: in how many parts an interval is stepped differs from one to the next
 SHORTEST = 8  # a run that must be shorter than this asks for a lattice that is laid anew in every step
 MOST_PARTS = 4096
 MOST_SPLITS = 4096
@@ -32,6 +33,8 @@ SPARE = 1.25  # how much wider than its density a window is, and
 WORST = {1: 8.0, 2: 3.0, 3: 2.0, 4: 2.0}  # how much more of both a run may ask for before it is cut into shorter ones
 FINER = 1.15  # how much finer than the density needs: what may change within a run
 FOLLOWED = 1.9  # cells that a deviation has, and
+NEARER = 0.85  # of REACH, for a lattice that was laid where the reading will put the mass
+TURN = 1.5  # by how much the flow may stretch, as an exponent, along a part of a path
 REACH = 6.5  # deviations on each side that a lattice holds that is laid anew in every step
 
 
@@ -40,8 +43,8 @@ class Shape(NamedTuple):
 
     An interval is split in `splits`, the transition of each of these stepped in `parts`: one, 0 for what the Room says, or a
     number that JAX can differentiate.  `order` is that of the time stepping, 2 or 4.  With `follow` the basis moves with the flow
-    and is laid anew in every step; with `cross` the noise may couple axes of the lattice.  `operator` is "spectral" or
-    "finite-volume"; of the latter `order` is the number of terms of its series.
+    and is laid anew in every step; with `cross` the noise may couple axes of the lattice.  `operator` is "spectral",
+    "finite-volume", of which `order` is the number of terms of its series, or "characteristics".
     """
 
     sizes: tuple[int, ...]
@@ -273,7 +276,11 @@ def more(plan: Plan, info: Any) -> Plan | None:
     # The spectrum of a Gaussian falls as exp(-(pi s)^2 / 2), s its deviation in cells.
     finer = np.sqrt(np.log(plan.aliasing) / np.log(np.clip(alias, 1e-12, 0.3)))
     finer = max(finer, 1.2 if cut >= plan.tolerance else 1.0) if finer > 1 or cut >= plan.tolerance else 1.0
-    if plan.operator == "finite-volume":
+    if plan.operator == "characteristics":
+        if error >= plan.stepping and finer == 1:
+            parts = int(np.ceil(plan.parts * np.clip((error / plan.stepping) ** (1 / 3), 1.1, 4.0)))
+            return replace(plan, parts=parts) if plan.parts < MOST_PARTS else None
+    elif plan.operator == "finite-volume":
         # Steps in time cost no accuracy: what is left is the error of the cells, of second order.
         if finer == 1 and error >= plan.stepping:
             finer = np.clip((error / plan.stepping) ** 0.5, 1.2, 3.0)
@@ -296,7 +303,7 @@ def more(plan: Plan, info: Any) -> Plan | None:
     if finer == 1 and edge < plan.edge:
         return None
     plan = replace(plan, finer=plan.finer * min(1.1 * finer, 3.0), wider=plan.wider * (1.0 if edge < plan.edge else 1.35))
-    room = 4.0 if plan.follow else 8.0 if plan.operator == "finite-volume" else 1.0
+    room = 2.0 if plan.operator == "characteristics" else 4.0 if plan.follow else 8.0 if plan.operator == "finite-volume" else 1.0
     if plan.finer * plan.wider < WORST[n] * room:
         return plan
     shorter = plan.run // 4
@@ -312,7 +319,7 @@ def relaxed(plan: Plan, run: int) -> Plan:
         run=min(run, 2 * plan.run),
         wider=max(1.0, plan.wider / 1.2),
         finer=max(1.0, plan.finer / 1.2),
-        parts=max(1, plan.parts // 2),
+        parts=max(1, plan.parts * 2 // 3 if plan.operator == "characteristics" else plan.parts // 2),
         splits=plan.splits if plan.splitting == np.inf else max(1, plan.splits // 2),
     )
 
@@ -330,6 +337,10 @@ def timed(model: Model, plan: Plan, intervals: Any, rows: slice, fields: Field, 
         couples = (spread.sum(axis=(2, 3)) - diagonal) > 1e-12 * diagonal
         plan = replace(plan, cross=plan.follow or bool(couples.any()))
     tau = (intervals.stop[rows] - intervals.start[rows]).max() / plan.splits
+    if plan.operator == "characteristics":
+        rate = _turning(model, np.asarray(fields.centre), times)
+        least = int(np.ceil(tau * rate / TURN)) if 0 < tau * rate < TURN * MOST_PARTS else 1
+        return replace(plan, parts=max(least, plan.parts))
     fastest = crossing = 0.0
     many = max(1, MOST_POINTS // int(np.prod(fields.values.shape[1:])))
     for begin in range(0, len(basis), many):
@@ -379,6 +390,14 @@ def _speeds(model: Model, fields: Field, ratio: np.ndarray, times: np.ndarray, f
     spread = np.einsum("rp,trpi->ri", weights, flow**2) / 2
     fastest = np.sqrt((spread / np.maximum(variance, 1e-12)).max())
     return float(fastest), float(np.pi * np.abs(flow).sum(axis=-1).max())
+
+
+def _turning(model: Model, centres: np.ndarray, times: np.ndarray) -> float:
+    """The largest absolute eigenvalue of the derivative of the drift at the centres (records, n)."""
+    n, theta = model.n, model.theta()
+    slope = numpy_function(model.drift.jacobian(model.x), model, (n, n))
+    slopes = np.stack([np.broadcast_to(slope(centres, t, theta), (len(centres), n, n)) for t in times[[0, -1]]])
+    return float(np.abs(np.linalg.eigvals(slopes)).max()) if np.isfinite(slopes).all() else np.inf
 
 
 def _leaving(model: Model, basis: np.ndarray, times: np.ndarray) -> float:

@@ -33,7 +33,7 @@ from zakai.filters._formulas import Formulas, formulas
 from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters._window import Plan, Room, Shape
 from zakai.filters.observations import Data, Whole, WholeRule, whole_rule
-from zakai.kolmogorov import comoving, finite_volume, resolution
+from zakai.kolmogorov import characteristics, comoving, finite_volume, resolution
 from zakai.kolmogorov.comoving import Field
 from zakai.models.compile import jax_field, jax_function
 from zakai.models.model import Model
@@ -129,28 +129,36 @@ def prepare(
 
     `tolerance` is how far from the solution of the equation, relative to itself, a density may be after a step for each of three
     reasons, the window, the cells and the steps in time, and in the long run because an increment's likelihood is split from
-    the transition.  `operator` is "spectral" or "finite-volume", which is positive and conserves mass whatever the cells, and of
-    second order in them.  `substeps` splits each interval, observation included, in equal parts, by default as many as the
-    tolerance asks for.  `memory` is how many MiB lattices may take, by default half of what the machine has free.
+    the transition.  `operator` is "spectral", "finite-volume", which is positive and conserves mass whatever the cells, and of
+    second order in them, or "characteristics", which is for weak noise and long intervals.  `substeps` splits each interval,
+    observation included, in equal parts, by default as many as the tolerance asks for.  `memory` is how many MiB lattices may
+    take, by default half of what the machine has free.
     Raises InputError for another value.
     """
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 1e-9 <= tolerance <= 0.1:
         raise InputError(f"option tolerance: {tolerance!r} must be a number from 1e-9 to 0.1")
-    if operator not in ("spectral", "finite-volume"):
-        raise InputError(f'option operator: {operator!r} is neither "spectral" nor "finite-volume"')
+    if operator not in OPERATORS:
+        raise InputError(f"option operator: {operator!r} is none of {', '.join(OPERATORS)}")
+    if operator == "characteristics" and model.n > 3:
+        raise InputError(f'option operator: "characteristics" is for one to three states, {model.source} has {model.n}')
     if substeps is not None and (isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1):
         raise InputError(f"option substeps: {substeps!r} must be a whole number from 1")
     if memory is not None and not (isinstance(memory, (int, float)) and not isinstance(memory, bool) and 0 < memory < np.inf):
         raise InputError(f"option memory: {memory!r} must be a positive number of MiB")
     theta = model.theta()
     sizes = (window.LEAST[model.n],) * model.n
-    follow = model.n > 1 and model.observation_kind == "samples" and operator == "spectral"
+    follow = model.n > 1 and model.observation_kind == "samples" and operator == "spectral" or operator == "characteristics"
     allowed = 0.5 * tolerance if substeps is None and model.observation_kind != "samples" else np.inf
-    plan = Plan(sizes, float(tolerance), substeps or 1, run=window.RUNS[model.n], follow=follow, order=4)
+    plan = Plan(sizes, float(tolerance), substeps or 1, run=_most(model.n, operator), follow=follow, order=4)
     plan = replace(plan, operator=operator, splitting=allowed)
     system = _system(formulas(model))
     budget = choice.free_memory() if memory is None else int(memory * 2**20)
     return Prepared(model, system, schedule, plan, theta, _intervals(system, schedule, theta), budget)
+
+
+def _most(n: int, operator: str) -> int:
+    """How many steps a run has at most."""
+    return window.BRIEF if operator == "characteristics" else window.RUNS[n]
 
 
 def _intervals(system: System, schedule: Schedule, theta: Any) -> Interval:
@@ -202,6 +210,7 @@ def correct(prepared: Prepared, prior: Any, observation: Whole) -> tuple[State, 
     return state, Info(jnp.asarray(after - before), mean, cov, _no_health())
 
 
+OPERATORS = "spectral", "finite-volume", "characteristics"
 OUTSIDE = 10.0  # what mass at the edges counts for: it is far from the mean
 HEALTH = ("aliasing", "edge_mass", "time_error", "lost", "splitting", "missed", "error_estimate")
 
@@ -301,19 +310,34 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
     def spread(inverse: jax.Array, t: Any) -> jax.Array:
         return inverse @ covariance(t) @ inverse.T
 
-    def part(time: Any, carry: Any, k: Any) -> Any:
-        field, spent = carry
-        tau = length / parts
-        if plan.operator == "finite-volume":
-            field, error = finite_volume.moved(field, drift, covariance, time + k * tau, tau, plan.order)
-        else:
-            field, error = comoving.moved(field, drift, covariance, time + k * tau, tau, plan.order, plan.follow, plan.cross)
-        return field, spent + error
+    def ahead(x: jax.Array) -> jax.Array:
+        """The sample at the end of the interval; increments are many, and none says much."""
+        if system.continuous:
+            return jnp.zeros(x.shape[:-1])
+        return _log_factor(system.observe(x, interval.stop, theta), observation, 1.0 - observation.inside)
 
-    def looked_at(values: jax.Array, noise: Any, error: Any, grown: Any) -> _Worst:
+    def part(number: Any, time: Any, carry: Any, k: Any) -> Any:
+        field, spent, cells = carry
+        tau = length / parts
+        time = time + k * tau
+        if plan.operator == "characteristics":
+            left = 0 if system.continuous else jnp.asarray((splits - number) * parts - k - 1, int)
+            reach = window.NEARER * state.room.reach
+            field, error, rough = characteristics.moved(field, drift, covariance, time, tau, reach, ahead, left)
+            return field, spent + error, cells + rough
+        if plan.operator == "finite-volume":
+            field, error = finite_volume.moved(field, drift, covariance, time, tau, plan.order)
+        else:
+            field, error = comoving.moved(field, drift, covariance, time, tau, plan.order, plan.follow, plan.cross)
+        return field, spent + error, cells
+
+    def looked_at(values: jax.Array, noise: Any, error: Any, grown: Any, cells: Any = 0.0) -> _Worst:
         # Noise is the same everywhere; what a formula of order four leaves is a polynomial of degree five times the density.
         lost = noise * jnp.exp(jnp.minimum(grown, 99.0))
-        return _Worst(resolution.aliasing(values), resolution.edge_mass(values), error * (1 + grown) ** 2.5, lost, zero)
+        # The error of the characteristics is that of a logarithm, where the reading is going to put the mass.
+        steep = 1.0 if plan.operator == "characteristics" else (1 + grown) ** 2.5
+        aliasing = jnp.maximum(resolution.aliasing(values), cells)
+        return _Worst(aliasing, resolution.edge_mass(values), error * steep, lost, zero)
 
     def split(carry: Any, k: Any) -> Any:
         field, observed, log_mass, before, error, worst = carry
@@ -323,12 +347,15 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
             half = splitting.corrected(half, spread(comoving.inverse(field.basis), time), length)
         values, gained, grown = _multiplied(field.values, half)
         worst = worst.over(looked_at(values, comoving.LOST, before, grown))
-        field, spent = _repeated(partial(part, time), (field._replace(values=values), before), plan.parts, parts)
+        carry = field._replace(values=values), before, zero
+        field, spent, cells = _repeated(partial(part, k, time), carry, plan.parts, parts)
         points = field.points()
         observed = system.observe(points, time + length, theta)
         noise = comoving.noise(field.values)
         # Only here: to cut tails in every part would make kinks, and these more noise.
-        values = jnp.where(field.values > noise * jnp.max(field.values), field.values, 0.0)
+        values = field.values
+        if plan.operator != "characteristics":
+            values = jnp.where(values > noise * jnp.max(values), values, 0.0)
         half = _log_factor(observed, observation, share)
         inverse = comoving.inverse(field.basis)
         G = spread(inverse, time + length)
@@ -339,7 +366,7 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
         f = drift(points, time + length)
         flow = list(jnp.tensordot(inverse, jnp.stack(f), axes=1))
         left = still(splitting.left(values, half, flow, G, length))
-        last_look = looked_at(values, noise, spent, grown)
+        last_look = looked_at(values, noise, spent, grown, cells)
         made = spent - before + last_look.aliasing + last_look.lost + OUTSIDE * last_look.edge
         error = still(splitting.added(error, left.error + made, left.forgets, length))
         worst = worst.over(last_look._replace(splitting=still(splitting.expected(left.error, left.forgets, length))))
@@ -356,7 +383,9 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
         field, log_mass = field._replace(values=values), log_mass + more
         worst = worst.over(looked_at(values, comoving.LOST, spent, grown))
     mean, cov = _moments(field)
-    if plan.follow:
+    if plan.operator == "characteristics":
+        observed = None
+    elif plan.follow:
         field, observed = comoving.relaid(field, state.room.reach), None
     missed = jnp.max(jnp.stack([figure / most for figure, most in zip(worst, state.room.allowed, strict=True)]))
     health = still(dict(zip(HEALTH, (*worst, missed, error), strict=True)))
@@ -374,7 +403,7 @@ def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None
     model, plan, before = prepared.model, states.plan, np.asarray(states.cut)
     fields = jax.tree.map(np.asarray, states.field)
     if info is None:
-        plan, before = window.relaxed(plan, window.RUNS[model.n]), np.tile(_SAME(model.n), (len(before), 1, 1))
+        plan, before = window.relaxed(plan, _most(model.n, plan.operator)), np.tile(_SAME(model.n), (len(before), 1, 1))
     elif window.healthy(info).all():
         return None
     while True:
@@ -420,6 +449,9 @@ def _room(plan: Plan, count: int) -> Room:
 
 
 def _cut_out(fields: Field, cut: np.ndarray, plan: Plan) -> Field:
+    if plan.operator == "characteristics":
+        # The step lays the lattice, also this one but for its sizes.
+        return fields if fields.values.shape[1:] == plan.sizes else _laid(fields, plan.sizes, window.NEARER * plan.room.reach)
     fields = comoving.resampled(fields, cut[:, 0], cut[:, 1], plan.sizes)
     return _relaid(fields, plan.room.reach) if plan.follow else fields
 
@@ -427,6 +459,11 @@ def _cut_out(fields: Field, cut: np.ndarray, plan: Plan) -> Field:
 @jax.jit
 def _relaid(fields: Field, reach: Any) -> Field:
     return jax.vmap(lambda field: comoving.relaid(field, reach))(fields)
+
+
+@partial(jax.jit, static_argnums=1)
+def _laid(fields: Field, sizes: tuple[int, ...], reach: Any) -> Field:
+    return jax.vmap(lambda field: characteristics.relaid(field, sizes, reach))(fields)
 
 
 def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State:
