@@ -31,6 +31,7 @@ def mean_and_cov(field: Field):
     return np.asarray(field.centre + field.basis @ mean), np.asarray(field.basis @ cov @ field.basis.T)
 
 
+@pytest.mark.slow
 def test_a_linear_system_has_the_moments_of_kalman_and_bucy():
     A, b = np.array([[-1.0, 2.0], [-0.5, -6.0]]), np.array([0.3, -1.0])
     G, tau = np.array([[0.2, 0.05], [0.05, 0.1]]), 0.3
@@ -73,6 +74,7 @@ def logistic(size: int) -> tuple[float, float]:
     return np.abs(density - exact).max() / exact.max(), abs(float(field.values.sum()) - 1)
 
 
+@pytest.mark.slow
 def test_a_logistic_flow_is_followed_to_the_third_order_of_the_cells_or_better():
     (coarse, _), (fine, mass) = logistic(24), logistic(48)
     assert fine < 1e-4 and mass < 1e-4
