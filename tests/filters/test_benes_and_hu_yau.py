@@ -154,6 +154,7 @@ def test_modes_that_are_narrow_and_far_apart_keep_their_shares():
         assert np.mean(density.sample(3, 4000)[:, 0] > 0) == pytest.approx(0.7, abs=0.03)
 
 
+@pytest.mark.slow
 def test_a_lattice_that_cannot_resolve_a_density_says_so_and_the_density_does_not_need_it():
     result = zakai.filter(modes_far_apart(1e-6), zakai.Record([1e-9], [[0.0]], "samples"), "hu-yau")
     density = result.density(0)
@@ -301,6 +302,7 @@ def test_a_start_that_is_not_known_under_a_gauge_without_exponentials_is_said_to
     assert any("representation_error" in warning for warning in result.warnings)
 
 
+@pytest.mark.slow
 def test_the_exponents_of_a_steep_gauge_do_not_overflow():
     model = zakai.Model(
         state=["x"], drift=["60*tanh(60*x)"], observation=["x"], prior={"kind": "gaussian", "mean": [0.0], "cov": [[4.0]]}

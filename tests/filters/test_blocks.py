@@ -123,6 +123,7 @@ def pairs(count, means, names="x"):
     return zakai.Model(state=state, drift=drift, observation=observation, prior=gaussian(list(means), cov.tolist()))
 
 
+@pytest.mark.slow
 def test_linear_blocks_are_one_kalman_bucy_filter():
     model = pairs(2, np.linspace(-1, 1, 4))
     record = readings(model)

@@ -71,6 +71,7 @@ def test_the_error_that_is_told_is_near_the_error(observed):
         assert error < 4 * told and told < 100 * error
 
 
+@pytest.mark.slow
 def test_the_error_falls_with_the_power_of_the_order(observed):
     mean, _, _ = reference(observed.times, observed.values[:, 0])
 

@@ -212,6 +212,7 @@ def test_a_narrow_or_wide_prior_is_kalman_and_bucys(variance):
     assert result.warnings == []
 
 
+@pytest.mark.slow
 def test_a_reading_that_contradicts_the_density_is_followed_or_said_to_be_too_far():
     model = line("1 - x/2", MIXTURE)
     for size in (4.0, 12.0):

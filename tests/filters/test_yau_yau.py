@@ -215,3 +215,16 @@ def test_the_gradient_with_a_sample_at_the_start_is_that_of_finite_differences()
         assert abs(evidence(np.array([0.5])) - zakai.filter(model, record, "yau-yau").log_likelihood) < 1e-6
         slope = (evidence(np.array([0.5001])) - evidence(np.array([0.4999]))) / 2e-4
         assert np.allclose(jax.grad(evidence)(np.array([0.5])), slope, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_what_a_try_has_cut_away_is_there_for_the_next():
+    """The ninth reading makes heavy what the first lattice that is tried for it does not hold."""
+    model = zakai.Model(
+        state=["x"], drift=["x - x**3"], observation=["x"], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
+    )  # fmt: skip
+    record = zakai.simulate(model, 0.5 * np.arange(1, 61), seed=1)[1]
+    record = zakai.Record(record.times[:10], record.values[:10], "samples")
+    near, nearer = (zakai.filter(model, record, "yau-yau", keep="moments", tolerance=one) for one in (1e-8, 1e-9))
+    assert np.abs(near.variance / nearer.variance - 1).max() <= 1e-7

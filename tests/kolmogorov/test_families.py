@@ -27,6 +27,7 @@ def coefficients(t):
     )
 
 
+@pytest.mark.slow
 def test_a_family_moves_and_is_read_as_its_gaussians_are_one_by_one():
     flow, inputs = integrate(coefficients, 0.1, 0.4, 2), jnp.array([1.0, 0.7])
     root, response, mean, nodes = (RNG.standard_normal(s) for s in ((N, N), (N, K), N, (4, K)))

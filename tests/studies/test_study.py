@@ -277,6 +277,7 @@ def test_a_run_without_a_truth_is_nobodys_number_and_a_lost_one_is_counted(tmp_p
     assert outcome.summary["points"][0]["methods"]["euler"]["failures"] == (failed > 0).sum()
 
 
+@pytest.mark.slow
 def test_records_from_files_are_the_runs(tmp_path):
     model = zakai.load_model("gallery:kalman-bucy-2d")
     times = 0.1 * np.arange(1, 8)

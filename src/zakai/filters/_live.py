@@ -84,6 +84,7 @@ class Live:
             vector, layout, left = *self._begun(block, row), 0
         assert layout is not None
         given = np.concatenate([reading, block.rows[row]])
+        own, own_layout = vector, layout
         looks = self.adapts and (left == 0 or block is not now.block)
         if looks:
             vector, layout, left = self._looked(block, row, vector, layout)
@@ -93,7 +94,8 @@ class Live:
                 vector, layout, left = self._looked(block, row, vector, layout)
                 after, step, told = self._step(vector, layout, block, given)
             if not told.well:
-                after, step, told, left = self._tried(block, row, vector, layout, given, (after, step, told, left))
+                own_state = own_layout.unpacked(np.asarray(own))
+                after, step, told, left = self._tried(block, row, own_state, vector, layout, given, (after, step, told, left))
         if told.verdict != told.verdict:
             raise InputError(
                 f"{self.setting.model.source}: at t = {time:g} the reading leaves nothing of the density, or takes it "
@@ -178,13 +180,17 @@ class Live:
         state = adapt(block.prepared, state, rows, None)
         return *self._laid(state, block), getattr(state, "run_length", RUN)
 
-    def _tried(self, block: Block, row: int, vector: Any, layout: Layout, given: np.ndarray, found: Any) -> Any:
-        """One step from better lattices, until it is well or nothing better can be had; health then says so."""
+    def _tried(self, block: Block, row: int, own: Any, vector: Any, layout: Layout, given: np.ndarray, found: Any) -> Any:
+        """One step from better lattices, until it is well or nothing better can be had; health then says so.
+
+        `own` is the state before any lattice was laid for the step.
+        """
         adapt = self.setting.method.adapt
         assert adapt is not None
         for _ in range(TRIES):
             info = jax.tree.map(lambda a: np.asarray(a)[None], found[2].info)
-            state = adapt(block.prepared, layout.unpacked(np.asarray(vector)), slice(row, row + 1), info)
+            begin = layout.unpacked(np.asarray(vector))
+            state = adapt(block.prepared, own.tried(begin) if hasattr(own, "tried") else begin, slice(row, row + 1), info)
             if state is None:
                 break
             vector, layout = self._laid(state, block)

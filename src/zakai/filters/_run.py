@@ -181,7 +181,8 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
         if not strict or (method.healthy is not None and taken >= max(1.0, enough * count / 2**tries)):
             break
         info = first_of(told[0], min(taken + 1, count))
-        again = adapt(prepared, begin, part, info) if adapt and tries < TRIES else None
+        tried = state.tried(begin) if hasattr(state, "tried") else begin
+        again = adapt(prepared, tried, part, info) if adapt and tries < TRIES else None
         if again is None and (method.healthy is None or getattr(adapt, "ill", False)):
             break
         # Where nothing better can be had the run is taken as it is, and its health says so.

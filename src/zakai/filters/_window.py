@@ -211,11 +211,6 @@ def fitted(
     return np.where(good[:, None], [[0.0], [1.0]], np.stack([middle, ratio], axis=1)), plan
 
 
-def composed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """The cuts (records, 2, n) that do what two do one after the other."""
-    return np.stack([first[:, 0] + first[:, 1] * second[:, 0], first[:, 1] * second[:, 1]], axis=1)
-
-
 def first_field(
     model: Model, prior: Any, log_factor: Callable[[np.ndarray], np.ndarray] | None, plan: Plan
 ) -> tuple[Field, Plan, float]:

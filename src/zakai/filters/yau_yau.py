@@ -84,6 +84,13 @@ class State:
         """What a result keeps of the state."""
         return replace(self, observed=None)
 
+    def tried(self, begin: State) -> State:
+        """This state, which a run of steps was to begin with, with the plan and the cut of `begin`, with which it was tried.
+
+        The next try is cut out of this one again: what a try has cut away is not there any more.
+        """
+        return replace(self, cut=begin.cut, room=begin.room, shape=begin.shape)
+
     @property
     def run_length(self) -> int:
         """How many steps to take before the lattice is looked at again."""
@@ -400,10 +407,10 @@ def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> S
 
 def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None) -> State | None:
     """`adapt` of states with a leading axis of records: one plan for all, the best that any of them needs."""
-    model, plan, before = prepared.model, states.plan, np.asarray(states.cut)
+    model, plan, last = prepared.model, states.plan, np.asarray(states.cut)
     fields = jax.tree.map(np.asarray, states.field)
     if info is None:
-        plan, before = window.relaxed(plan, _most(model.n, plan.operator)), np.tile(_SAME(model.n), (len(before), 1, 1))
+        plan, last = window.relaxed(plan, _most(model.n, plan.operator)), np.tile(_SAME(model.n), (len(last), 1, 1))
     elif window.healthy(info).all():
         return None
     while True:
@@ -418,15 +425,14 @@ def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None
         # What a try has shown counts for more than what the coefficients say.
         best = least if info is None else replace(least, order=max(plan.order, least.order), parts=max(plan.parts, least.parts))
         cut, best = window.fitted(fields, measures, best, lambda sizes: window.check_memory(model, sizes, prepared.memory))
-        same = np.all(cut == _SAME(model.n))
+        same = np.all(cut == last)
         if best == states.plan and same:
-            return replace(states, cut=before) if info is None else None
+            return replace(states, cut=last) if info is None else None
         # Sizes are few: what asks for a little more may get the same.
         if info is None or not same or best.shape != states.plan.shape or best.room.counts != states.plan.room.counts:
             plan = best
             break
     fields = _cut_out(fields, cut, plan)
-    cut = window.composed(before, cut)
     observed = None
     if not plan.follow:
         # With NumPy, as the cutting out: nothing is compiled to look at a lattice.
