@@ -183,12 +183,24 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
         info = first_of(told[0], min(taken + 1, count))
         tried = state.tried(begin) if hasattr(state, "tried") else begin
         again = adapt(prepared, tried, part, info) if adapt and tries < TRIES else None
-        if again is None and (method.healthy is None or getattr(adapt, "ill", False)):
+        if again is None and (method.healthy is None or getattr(adapt, "ill", False) or taken > 0):
             break
         # Where nothing better can be had the run is taken as it is, and its health says so.
         begin, strict = (begin, False) if again is None else (again, True)
+    if not strict:
+        # What comes after a number that does not exist is begun anew, from before it.
+        there = _existing(told[0].log_likelihood_increment, taken)
+        if 0 < there < taken:
+            end, told, _ = scan(method.step, method.healthy, begin, intervals, given, keep, (there, strict))
+            taken = there
     info, kept = first_of(told, taken)
     return slice(part.start, part.start + taken), begin, end, info, kept
+
+
+def _existing(increments: Any, count: int) -> int:
+    """How many steps of all records there are before a number that does not exist."""
+    exist = np.isfinite(np.asarray(increments)[:count]).reshape(count, -1).all(axis=1)
+    return count if exist.all() else int(np.argmin(exist))
 
 
 def first_of(tree: Any, count: int) -> Any:
