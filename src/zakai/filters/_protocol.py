@@ -52,6 +52,9 @@ class Method:
     `adapt(prepared, state, intervals, info)`: the state to start (or, after a try with `info`, to start again) a run of intervals
     with, or None where nothing need or can be changed.
 
+    Where a try can cut something away, the state has `tried(begin)`: itself, with the plan of the `begin` that was tried, which
+    is what `adapt` is then given with `info`.
+
     Gradients.  A Prepared has `theta` (p,), the values of the parameters: the model's own, a NumPy array, out of `prepare`.
     `with_parameters(prepared, theta)` gives the same Prepared with another `theta` and the `intervals` that belong to it.  It
     is traced by JAX: what is adaptive (substeps, parts, nodes, sizes) stays as it was decided for the model's own values, which
