@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -94,6 +95,7 @@ def test_no_bytes_are_read_as_a_checkpoint_by_chance(junk):
 
 
 WALK = dict(state=["x"], drift=["-x/2"], observation=["2*x"], prior={"kind": "gaussian", "mean": [0.3], "cov": [[2.0]]})
+MIXTURE = {"kind": "mixture", "weights": [0.25, 0.75], "means": [[-1.0], [1.0]], "covs": [[[0.5]], [[0.5]]]}
 TIMED = dict(WALK, drift=["cos(t) - x/2"])
 CUBIC = dict(WALK, drift=["cos(x)"], observation=["x**3"])
 SINE = dict(WALK, observation=["x*sin(x)", "x*cos(x)"])
@@ -148,6 +150,38 @@ def test_a_filter_goes_on_from_a_checkpoint_with_the_same_bits(tmp_path, keys, m
 )
 def test_adaptive_filters_go_on_from_a_checkpoint_with_the_same_bits(tmp_path, keys, method, kind):
     check_continuation(tmp_path, zakai.Model(**keys, observation_kind=kind), method, TIMES[:20], 6)
+
+
+@pytest.mark.parametrize(
+    ("keys", "method", "fields"),
+    [
+        (dict(WALK, prior=MIXTURE), "kalman-bucy", ("edge", "log_error")),
+        pytest.param(CUBIC, "yau-yau", ("cut", "room"), marks=pytest.mark.slow),
+    ],
+)
+def test_what_no_step_changes_stands_beside_the_vector_of_a_state_and_changes_no_bit(tmp_path, monkeypatch, keys, method, fields):
+    model = zakai.Model(**keys, observation_kind="samples")
+    rng = np.random.default_rng(3)
+
+    def run(path=None):
+        online, found = zakai.online(model, method), []
+        for k, time in enumerate(TIMES):
+            if path and k == 7:
+                online.save(path)
+                online = zakai.online(model, method)
+                online.restore(path)
+            found.append(told(online.update(time, values[k])))
+        return found, online.lives[0].now.laid
+
+    values = rng.standard_normal(len(TIMES))
+    before, whole = run()
+    monkeypatch.setattr(type(whole.state), "LASTING", fields, raising=False)
+    after, divided = run()
+    assert after == before
+    apart = [np.ravel(leaf) for field in fields for leaf in jax.tree.leaves(getattr(whole.state, field))]
+    assert len(whole.lasting) == 0 and len(divided.lasting) == len(apart)
+    assert len(divided.vector) == len(whole.vector) - sum(map(len, apart)) < len(whole.vector)
+    assert run(tmp_path / "state")[0] == before
 
 
 def test_the_checkpoint_of_another_filter_is_refused_and_changes_nothing(tmp_path):

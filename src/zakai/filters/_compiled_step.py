@@ -1,13 +1,14 @@
 """One step of a method as one compiled function of two vectors, for a filter that is called thousands of times a second.
 
 A call takes its time for every array that goes in or comes out.  So one vector holds a whole state with what the step told, and
-another a whole interval with its reading.
+another a whole interval with its reading.  What no step changes of a state stands apart: it goes in as it is and does not come
+out.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -21,16 +22,21 @@ from zakai.filters._protocol import Info, Method
 
 
 class Layout(NamedTuple):
-    """How a pytree of arrays is laid in a vector of float64, which holds every number that a step is made of exactly."""
+    """How a pytree of arrays is laid in a vector of float64, which holds every number that a step is made of exactly.
+
+    Beside it stand the arrays that are `apart` (a flag for each): those in the fields that the pytree's class names in `LASTING`.
+    """
 
     tree: Any
     shapes: tuple[tuple[int, ...], ...]
     types: tuple[str, ...]
+    apart: tuple[bool, ...]
 
     @classmethod
     def of(cls, tree: Any) -> Layout:
-        leaves, structure = jax.tree.flatten(tree)
-        return cls(structure, tuple(np.shape(leaf) for leaf in leaves), tuple(np.dtype(_type(leaf)).str for leaf in leaves))
+        found, structure = jax.tree.flatten(tree)
+        shapes, types = tuple(np.shape(leaf) for leaf in found), tuple(np.dtype(_type(leaf)).str for leaf in found)
+        return cls(structure, shapes, types, _apart(tree))
 
     @classmethod
     def of_rows(cls, tree: Any) -> Layout:
@@ -40,22 +46,34 @@ class Layout(NamedTuple):
 
     @property
     def size(self) -> int:
-        return sum(math.prod(shape) for shape in self.shapes)
+        return _places(self.shapes, self.apart)[-1][1] if self.shapes else 0
 
-    def unpacked(self, vector: Any) -> Any:
-        """The pytree that begins a vector; JAX may trace it."""
-        leaves = []
-        for (begin, end), shape, kind in zip(_places(self.shapes), self.shapes, self.types, strict=True):
-            leaf = vector[begin:end].reshape(shape)
-            leaves.append(leaf if kind == "<f8" else leaf.astype(kind))
+    def unpacked(self, vector: Any, lasting: Sequence[Any] = ()) -> Any:
+        """The pytree that begins a vector, with the arrays that stand apart; JAX may trace it."""
+        leaves, beside = [], iter(lasting)
+        for (begin, end), shape, kind, apart in zip(_places(self.shapes, self.apart), *self[1:], strict=True):
+            leaf = next(beside) if apart else vector[begin:end].reshape(shape)
+            leaves.append(leaf if apart or kind == "<f8" else leaf.astype(kind))
         return jax.tree.unflatten(self.tree, leaves)
 
 
+def _apart(tree: Any) -> tuple[bool, ...]:
+    """Of each array of a pytree whether it stands apart."""
+    names = getattr(type(tree), "LASTING", ())
+    return tuple(bool(path) and getattr(path[0], "name", "") in names for path, _ in jax.tree_util.tree_leaves_with_path(tree))
+
+
 @lru_cache(maxsize=256)
-def _places(shapes: tuple[tuple[int, ...], ...]) -> tuple[tuple[int, int], ...]:
+def _places(shapes: tuple[tuple[int, ...], ...], apart: tuple[bool, ...]) -> tuple[tuple[int, int], ...]:
     """Where in a vector each array begins and ends."""
-    ends = np.cumsum([0, *(math.prod(shape) for shape in shapes)]).tolist()
-    return tuple(pairwise(ends))
+    sizes = (0 if beside else math.prod(shape) for shape, beside in zip(shapes, apart, strict=True))
+    return tuple(pairwise(np.cumsum([0, *sizes]).tolist()))
+
+
+def _divided(tree: Any) -> tuple[list[Any], tuple[Any, ...]]:
+    """The arrays of a pytree that are laid in a vector, and those that stand apart."""
+    both = list(zip(jax.tree.leaves(tree), _apart(tree), strict=True))
+    return [leaf for leaf, apart in both if not apart], tuple(leaf for leaf, apart in both if apart)
 
 
 def _type(leaf: Any) -> Any:
@@ -63,8 +81,8 @@ def _type(leaf: Any) -> Any:
 
 
 def packed(tree: Any) -> np.ndarray:
-    """A pytree as a vector."""
-    return np.concatenate([np.zeros(0), *(np.ravel(np.asarray(leaf)).astype(float) for leaf in jax.tree.leaves(tree))])
+    """A pytree as a vector, but for what stands apart."""
+    return np.concatenate([np.zeros(0), *(np.ravel(np.asarray(leaf)).astype(float) for leaf in _divided(tree)[0])])
 
 
 def packed_rows(tree: Any, count: int) -> np.ndarray:
@@ -73,22 +91,39 @@ def packed_rows(tree: Any, count: int) -> np.ndarray:
     return np.concatenate([np.zeros((count, 0)), *leaves], axis=1)
 
 
-class Step(NamedTuple):
-    """A compiled step: `call(vector, inputs)` gives the vector of the new state, with what was told behind it.
+class Laid(NamedTuple):
+    """A state as a vector, which may go on with something else, how it is laid in it, and the arrays that stand apart."""
 
-    `inputs` are the values of the reading, zero where there is none, and a row of a Block.  `state` is the layout before and
-    `new` that after; `info` is that of the Info; the last number is its verdict.
+    vector: Any
+    layout: Layout
+    lasting: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, state: Any) -> Laid:
+        # What goes into many calls is brought to the device once.
+        return cls(packed(state), Layout.of(state), tuple(map(jnp.asarray, _divided(state)[1])))
+
+    @property
+    def state(self) -> Any:
+        return self.layout.unpacked(np.asarray(self.vector), self.lasting)
+
+
+class Step(NamedTuple):
+    """A compiled step: `call(vector, inputs, lasting)` gives the vector of the new state, with what was told behind it.
+
+    `inputs` are the values of the reading, zero where there is none, and a row of a Block; `lasting` is what stands apart.
+    `state` is the layout before and `new` that after; `info` is that of the Info; the last number is its verdict.
     """
 
-    call: Callable[[Any, np.ndarray], Any]
+    call: Callable[[Any, np.ndarray, tuple[Any, ...]], Any]
     state: Layout
     new: Layout
     info: Layout
     begin: int  # of what is told, in the vector
 
-    def begun(self, state: Any) -> np.ndarray:
-        """The vector of a state that no step told of."""
-        return np.concatenate([packed(state), np.zeros(self.info.size + 1)])
+    def begun(self, laid: Laid) -> Laid:
+        """A state that no step told of, with room for it."""
+        return Laid(np.concatenate([laid.vector, np.zeros(self.info.size + 1)]), self.state, laid.lasting)
 
 
 class Told(NamedTuple):
@@ -118,18 +153,19 @@ def compiled(method: Method, state: Layout, inputs: Layout, values: int) -> Step
 
 @lru_cache(maxsize=128)
 def _compiled(step, fits, healthy, rigid: bool, state: Layout, inputs: Layout, values: int) -> Step:
-    def stepped(vector: Any, given: Any) -> tuple[Any, Info]:
+    def stepped(vector: Any, given: Any, lasting: Any) -> tuple[Any, Info]:
         interval, rule = inputs.unpacked(given[values:])
-        return step(interval, state.unpacked(vector), rule(given[:values]))
+        return step(interval, state.unpacked(vector, lasting), rule(given[:values]))
 
-    def one(vector: Any, given: Any) -> Any:
-        new, info = stepped(vector, given)
+    def one(vector: Any, given: Any, lasting: Any) -> Any:
+        new, info = stepped(vector, given, lasting)
         well = jnp.array(rigid) if fits is None and healthy is None else fits(new, info) if fits else healthy(info)
         # With the evidence and the mean all the rest is finite.
         finite = jnp.isfinite(info.log_likelihood_increment + jnp.sum(info.mean))
-        leaves = (*jax.tree.leaves((new, info)), jnp.where(finite, well.astype(float), jnp.nan))
+        leaves = (*_divided(new)[0], *jax.tree.leaves(info), jnp.where(finite, well.astype(float), jnp.nan))
         return jnp.concatenate([jnp.ravel(leaf).astype(float) for leaf in leaves])
 
-    new, info = jax.eval_shape(stepped, np.zeros(state.size), np.zeros(values + inputs.size))
+    lasting = tuple(np.zeros(*of[:2]) for of in zip(*state[1:], strict=True) if of[2])
+    new, info = jax.eval_shape(stepped, np.zeros(state.size), np.zeros(values + inputs.size), lasting)
     after = Layout.of(new)
     return Step(jax.jit(one), state, state if after == state else after, Layout.of(info), after.size)

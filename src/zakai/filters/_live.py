@@ -11,7 +11,7 @@ from zakai import _float64  # noqa: F401
 from zakai.densities import Density
 from zakai.errors import InputError
 from zakai.filters._ahead import Ahead, Block, Clock, data_at
-from zakai.filters._compiled_step import Layout, Step, Told, compiled, packed
+from zakai.filters._compiled_step import Laid, Layout, Step, Told, compiled, packed
 from zakai.filters._protocol import Info
 from zakai.filters._run import RUN, TRIES, Setting
 
@@ -24,14 +24,13 @@ AFTER_GAP = (
 class Moment(NamedTuple):
     """Everything that decides what a filter says next; it never changes, the next reading makes another.
 
-    `vector` holds the state, in `layout`, and what was told of it; of the run of steps since the lattice was looked at `left`
-    are left, in `block`, whose interval now ended began and ended at `ends`.  `read` and `read_at` (m,) are the last values of a
-    path and their times.  `first` are samples at the start itself: what they make of the prior waits for the first interval.
+    `laid` holds the state, and behind it what was told of it; of the run of steps since the lattice was looked at `left` are
+    left, in `block`, whose interval now ended began and ended at `ends`.  `read` and `read_at` (m,) are the last values of a path
+    and their times.  `first` are samples at the start itself: what they make of the prior waits for the first interval.
     """
 
     time: float
-    vector: Any
-    layout: Layout | None
+    laid: Laid | None
     told: Told | None
     left: int
     block: Block | None
@@ -56,7 +55,7 @@ class Live:
         start = float(setting.model.start)
         clock = Clock(start, 0, (), None, False)
         nothing = (0.0,) * self.m
-        self.now = Moment(start, None, None, None, 0, None, (start, start), clock, nothing, (start,) * self.m, None, ())
+        self.now = Moment(start, None, None, 0, None, (start, start), clock, nothing, (start,) * self.m, None, ())
 
     def moved(self, time: float, values: list[float], look_only: bool = False) -> Moment:
         """The moment after a reading (m,), nan where there is none; this one stays as it is.
@@ -79,38 +78,36 @@ class Live:
             return self._at_start(reading, seen)
         clock = now.clock._replace(begun=True) if look_only else now.clock
         block, row, clock = self.ahead.at(clock, now.time, time, reading, seen, elapsed)
-        vector, layout, left = now.vector, now.layout, now.left
-        if vector is None or now.first is not None:
-            vector, layout, left = *self._begun(block, row), 0
-        assert layout is not None
+        laid, left = now.laid, now.left
+        if laid is None or now.first is not None:
+            laid, left = self._begun(block), 0
         given = np.concatenate([reading, block.rows[row]])
-        own, own_layout = vector, layout
+        own = laid
         looks = self.adapts and (left == 0 or block is not now.block)
         if looks:
-            vector, layout, left = self._looked(block, row, vector, layout)
-        after, step, told = self._step(vector, layout, block, given)
+            laid, left = self._looked(block, row, laid)
+        after, told = self._step(laid, block, given)
         if self.adapts and not told.well:
             if not looks:
-                vector, layout, left = self._looked(block, row, vector, layout)
-                after, step, told = self._step(vector, layout, block, given)
+                laid, left = self._looked(block, row, laid)
+                after, told = self._step(laid, block, given)
             if not told.well:
-                own_state = own_layout.unpacked(np.asarray(own))
-                after, step, told, left = self._tried(block, row, own_state, vector, layout, given, (after, step, told, left))
+                after, told, left = self._tried(block, row, own.state, laid, given, (after, told, left))
         if told.verdict != told.verdict:
             raise InputError(
                 f"{self.setting.model.source}: at t = {time:g} the reading leaves nothing of the density, or takes it "
                 "beyond what numbers can hold; it is not used"
             )
         ends = (now.time, time)
-        return Moment(time, after, step.new, told, left - 1, block, ends, clock, read, read_at, None, notes + block.notes)
+        return Moment(time, after, told, left - 1, block, ends, clock, read, read_at, None, notes + block.notes)
 
     def density(self, moment: Moment) -> Density:
         """The density at a moment."""
         method = self.setting.method
-        if moment.layout is None or moment.block is None:
+        if moment.laid is None or moment.block is None:
             prepared = self._stand_in().prepared
             return method.density(prepared, method.init(prepared, self.setting.prior))
-        return method.density(moment.block.prepared, moment.layout.unpacked(np.asarray(moment.vector)))
+        return method.density(moment.block.prepared, moment.laid.state)
 
     def _increments(self, time: float, values: list[float], seen: tuple[bool, ...]) -> tuple[Any, ...]:
         """What a path's readings add to the last ones, and over what time where that is not just the interval."""
@@ -130,13 +127,10 @@ class Live:
         told = Told(np.append(packed(info), 1.0), Layout.of(info))
         if not np.isfinite(told.vector[: 1 + len(info.mean)]).all():
             raise InputError(f"{self.setting.model.source}: the reading at the start leaves nothing of the prior; it is not used")
-        state = jax.tree.map(np.asarray, state)
         first = tuple(np.where(seen, reading, np.nan).tolist())
         notes = block.notes
         ends = (now.time, now.time + 1.0)
-        return now._replace(
-            vector=packed(state), layout=Layout.of(state), told=told, block=block, ends=ends, first=first, notes=notes
-        )
+        return now._replace(laid=Laid.of(state), told=told, block=block, ends=ends, first=first, notes=notes)
 
     def _corrected(self, block: Block, reading: np.ndarray, seen: tuple[bool, ...]) -> tuple[Any, Info]:
         method, start = self.setting.method, self.now.time
@@ -150,7 +144,7 @@ class Live:
         clock = self.now.clock._replace(begun=True)
         return self.ahead.at(clock, start, start + 1.0, np.zeros(self.m), (False,) * self.m, None)[0]
 
-    def _begun(self, block: Block, row: int) -> tuple[Any, Layout]:
+    def _begun(self, block: Block) -> Laid:
         """The state at the start of the first interval."""
         now, method = self.now, self.setting.method
         if now.first is None:
@@ -158,29 +152,24 @@ class Live:
         else:
             first = np.array(now.first)
             state, _ = self._corrected(block, np.nan_to_num(first), tuple((first == first).tolist()))
-        if not self.adapts:
-            return self._laid(state, block)
         # No step may be taken before the lattice was looked at.
-        state = jax.tree.map(np.asarray, state)
-        return packed(state), Layout.of(state)
+        return Laid.of(state) if self.adapts else self._laid(state, block)
 
-    def _laid(self, state: Any, block: Block) -> tuple[Any, Layout]:
-        state = jax.tree.map(np.asarray, state)
-        layout = Layout.of(state)
-        step = compiled(self.setting.method, layout, block.layout, self.m)
-        return step.begun(state), step.state
+    def _laid(self, state: Any, block: Block) -> Laid:
+        laid = Laid.of(state)
+        return compiled(self.setting.method, laid.layout, block.layout, self.m).begun(laid)
 
-    def _looked(self, block: Block, row: int, vector: Any, layout: Layout) -> tuple[Any, Layout, int]:
+    def _looked(self, block: Block, row: int, laid: Laid) -> tuple[Laid, int]:
         """The state on a lattice that was looked at, and how many steps may be taken on it."""
-        state = layout.unpacked(np.asarray(vector))
+        state = laid.state
         run = getattr(state, "run_length", RUN)
         rows = slice(row, min(row + run, block.key.number))
         adapt = self.setting.method.adapt
         assert adapt is not None
         state = adapt(block.prepared, state, rows, None)
-        return *self._laid(state, block), getattr(state, "run_length", RUN)
+        return self._laid(state, block), getattr(state, "run_length", RUN)
 
-    def _tried(self, block: Block, row: int, own: Any, vector: Any, layout: Layout, given: np.ndarray, found: Any) -> Any:
+    def _tried(self, block: Block, row: int, own: Any, laid: Laid, given: np.ndarray, found: Any) -> Any:
         """One step from better lattices, until it is well or nothing better can be had; health then says so.
 
         `own` is the state before any lattice was laid for the step.
@@ -188,21 +177,21 @@ class Live:
         adapt = self.setting.method.adapt
         assert adapt is not None
         for _ in range(TRIES):
-            info = jax.tree.map(lambda a: np.asarray(a)[None], found[2].info)
-            begin = layout.unpacked(np.asarray(vector))
+            info = jax.tree.map(lambda a: np.asarray(a)[None], found[1].info)
+            begin = laid.state
             state = adapt(block.prepared, own.tried(begin) if hasattr(own, "tried") else begin, slice(row, row + 1), info)
             if state is None:
                 break
-            vector, layout = self._laid(state, block)
-            found = (*self._step(vector, layout, block, given), getattr(state, "run_length", RUN))
-            if found[2].well:
+            laid = self._laid(state, block)
+            found = (*self._step(laid, block, given), getattr(state, "run_length", RUN))
+            if found[1].well:
                 break
         return found
 
-    def _step(self, vector: Any, layout: Layout, block: Block, given: np.ndarray) -> tuple[Any, Step, Told]:
+    def _step(self, laid: Laid, block: Block, given: np.ndarray) -> tuple[Laid, Told]:
         step = self.step
-        if step is None or layout is not step.state or block.layout is not self.inputs:
-            self.step = step = compiled(self.setting.method, layout, block.layout, self.m)
+        if step is None or laid.layout is not step.state or block.layout is not self.inputs:
+            self.step = step = compiled(self.setting.method, laid.layout, block.layout, self.m)
             self.inputs = block.layout
-        after = step.call(vector, given)
-        return after, step, Told(np.asarray(after)[step.begin :], step.info)
+        after = step.call(laid.vector, given, laid.lasting)
+        return Laid(after, step.new, laid.lasting), Told(np.asarray(after)[step.begin :], step.info)

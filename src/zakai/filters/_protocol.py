@@ -72,7 +72,8 @@ class Method:
     One reading at a time.  `rule(prepared, data)` is what `observations` gives but for the values of the readings, a pytree whose
     slices are called with values (m,), zero where there is none: observations(prepared, data) is
     rule(prepared, data)(data.filled).  None: `observations` is asked for every reading.  `fits(state, info)`, traced by JAX, says
-    of the step that gave them that `adapt` would find nothing to better.  None: `healthy` says it, or `adapt` is asked.
+    of the step that gave them that `adapt` would find nothing to better.  None: `healthy` says it, or `adapt` is asked.  A class
+    of states may name in `LASTING` (a tuple) its fields that no step changes, only `adapt`: they are not copied with every step.
 
     Early ends.  `healthy(info)` says, traced by JAX, whether steps kept their bounds.  A run then ends before the first that did
     not, and where it took enough steps by then, the next run begins there: no step is taken twice.

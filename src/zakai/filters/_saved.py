@@ -16,7 +16,7 @@ import numpy as np
 
 from zakai.errors import InputError
 from zakai.filters._ahead import Clock, Key
-from zakai.filters._compiled_step import Layout, Told, compiled, packed
+from zakai.filters._compiled_step import Laid, Layout, Told, compiled, packed
 from zakai.filters._live import Live, Moment
 
 
@@ -72,10 +72,9 @@ def saved(live: Live) -> tuple[dict[str, Any], list[np.ndarray]]:
     """A live filter as words and arrays."""
     now = live.now
     arrays: list[np.ndarray] = []
-    state = None if now.layout is None else now.layout.unpacked(np.asarray(now.vector))
     said = {
         "time": now.time,
-        "state": taken_apart(state, arrays),
+        "state": None if now.laid is None else taken_apart(now.laid.state, arrays),
         "told": None if now.told is None else taken_apart(now.told.info, arrays),
         "well": None if now.told is None else now.told.well,
         "left": now.left,
@@ -107,7 +106,7 @@ def _restored(live: Live, said: Mapping[str, Any], arrays: list[np.ndarray]) -> 
     time = float(said["time"])
     key = _key(said["block"])
     if key is None:
-        return Moment(time, None, None, None, 0, None, ends, *rest)
+        return Moment(time, None, None, 0, None, ends, *rest)
     try:
         block = live.ahead.again(key, ends)
     except InputError as error:
@@ -115,13 +114,11 @@ def _restored(live: Live, said: Mapping[str, Any], arrays: list[np.ndarray]) -> 
     method = live.setting.method
     state = put_together(said["state"], arrays, shared_by(method.init(block.prepared, live.setting.prior)))
     info = put_together(said["told"], arrays, {})
-    layout = Layout.of(state)
+    laid = Laid.of(state)
     told = Told(np.append(packed(info), float(said["well"])), Layout.of(info))
-    vector = packed(state)
     if first is None:
-        step = compiled(method, layout, block.layout, live.m)
-        vector, layout = step.begun(state), step.state
-    return Moment(time, vector, layout, told, int(said["left"]), block, ends, *rest)
+        laid = compiled(method, laid.layout, block.layout, live.m).begun(laid)
+    return Moment(time, laid, told, int(said["left"]), block, ends, *rest)
 
 
 def _key(said: Any) -> Key | None:
