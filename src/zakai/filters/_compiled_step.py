@@ -60,6 +60,8 @@ class Layout(NamedTuple):
 def _apart(tree: Any) -> tuple[bool, ...]:
     """Of each array of a pytree whether it stands apart."""
     names = getattr(type(tree), "LASTING", ())
+    if not names:
+        return (False,) * len(jax.tree.leaves(tree))
     return tuple(bool(path) and getattr(path[0], "name", "") in names for path, _ in jax.tree_util.tree_leaves_with_path(tree))
 
 

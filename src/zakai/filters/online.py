@@ -85,8 +85,8 @@ class Online:
         values = self._values(value)
         with self.lock:
             time = self._time(time)
-            moments = tuple([live.moved(time, part) for live, part in zip(self.lives, self._divided(values), strict=True)])
-            for live, moment in zip(self.lives, moments, strict=True):
+            moments = tuple([live.moved(time, part) for live, part in zip(self.lives, self._divided(values))])
+            for live, moment in zip(self.lives, moments):
                 live.now = moment
         return Estimate(self, moments)
 
