@@ -67,7 +67,7 @@ def points_of(sizes: Sequence[int], centre: Any, basis: Any) -> jax.Array:
 
 
 @lru_cache(maxsize=64)
-def _derivative(size: int) -> np.ndarray:
+def derivative(size: int) -> np.ndarray:
     """The derivative of the trigonometric interpolant at the points, in cells; `size` is even."""
     distance = np.arange(size)[:, None] - np.arange(size)
     with np.errstate(divide="ignore"):
@@ -76,13 +76,13 @@ def _derivative(size: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def _frequencies(size: int) -> np.ndarray:
+def frequencies(size: int) -> np.ndarray:
     return 2 * np.pi * np.fft.fftfreq(size)
 
 
 @lru_cache(maxsize=64)
 def _hartley(size: int) -> np.ndarray:
-    angle = np.outer(_frequencies(size), np.arange(size))
+    angle = np.outer(frequencies(size), np.arange(size))
     return (np.cos(angle) + np.sin(angle)) / np.sqrt(size)
 
 
@@ -97,7 +97,7 @@ def _circle(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 def slope(values: jax.Array, axis: int) -> jax.Array:
     """The derivative of the trigonometric interpolant along an axis, in cells."""
-    return along(jnp.asarray(_derivative(values.shape[axis])), values, axis)
+    return along(jnp.asarray(derivative(values.shape[axis])), values, axis)
 
 
 class Transport(NamedTuple):
@@ -125,7 +125,7 @@ class Transport(NamedTuple):
         size = values.shape[0]
         hartley = _hartley(size)
         spectrum = hartley @ values
-        decay, cos, sin = self._decay(0, _frequencies(size))
+        decay, cos, sin = self._decay(0, frequencies(size))
         mirrored = jnp.concatenate([spectrum[:1], spectrum[:0:-1]])
         return jnp.matmul(hartley, decay * (cos * spectrum + sin * mirrored))
 
@@ -246,8 +246,8 @@ def moved(
         for d in range(n):
             flux = flows[d] * there
             if cross:
-                flux = flux - sum(spread[d, e] * along(_derivative(sizes[e]), u, e) for e in range(d))
-            result = result - along(_derivative(sizes[d]), flux, d)
+                flux = flux - sum(spread[d, e] * along(derivative(sizes[e]), u, e) for e in range(d))
+            result = result - along(derivative(sizes[d]), flux, d)
         return result
 
     k1 = slope(residual(0.0), spreads[0], values)
@@ -326,7 +326,7 @@ def _shifted(values: jax.Array, axis: int, shift: jax.Array) -> jax.Array:
     hartley = _hartley(size)
     spectrum = along(hartley, values, axis)
     mirrored = jnp.take(spectrum, (-np.arange(size)) % size, axis=axis)
-    angle = _view(_frequencies(size), axis, n) * shift
+    angle = _view(frequencies(size), axis, n) * shift
     return along(hartley, jnp.cos(angle) * spectrum - jnp.sin(angle) * mirrored, axis)
 
 
