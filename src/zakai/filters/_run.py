@@ -204,8 +204,8 @@ def _existing(increments: Any, count: int) -> int:
 
 
 def first_of(tree: Any, count: int) -> Any:
-    """The first rows of every array of a pytree."""
-    return jax.tree.map(lambda a: np.asarray(a)[:count], tree)
+    """The first rows of every array of a pytree, copied: small pieces of memory of their own, not views of what JAX holds."""
+    return jax.tree.map(lambda a: np.array(a)[:count], tree)
 
 
 class Run:
