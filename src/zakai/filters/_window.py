@@ -43,8 +43,9 @@ class Shape(NamedTuple):
 
     An interval is split in `splits`, the transition of each of these stepped in `parts`: one, 0 for what the Room says, or a
     number that JAX can differentiate.  `order` is that of the time stepping, 2 or 4.  With `follow` the basis moves with the flow
-    and is laid anew in every step; with `cross` the noise may couple axes of the lattice.  `operator` is "spectral",
-    "finite-volume", of which `order` is the number of terms of its series, or "characteristics".
+    and is laid anew in every step; with `cross` the noise may couple axes of the lattice.  With `tabled` the lattice stands still
+    and the transition is a known matrix.  `operator` is "spectral", "finite-volume", of which `order` is the number of terms of
+    its series, or "characteristics".
     """
 
     sizes: tuple[int, ...]
@@ -53,6 +54,7 @@ class Shape(NamedTuple):
     order: int = 2
     follow: bool = False
     cross: bool = False
+    tabled: bool = False
     operator: str = "spectral"
 
 
@@ -99,6 +101,7 @@ class Plan:
     run: int = 256
     follow: bool = False
     cross: bool = False
+    tabled: bool = False
     operator: str = "spectral"
     wider: float = 1.0
     finer: float = 1.0
@@ -117,8 +120,11 @@ class Plan:
         """The static part."""
         # Where the splits are not the user's they may change with every run.
         given = self.fixed or self.splitting == np.inf
+        splits = self.splits if given else 0
+        if self.tabled:
+            return Shape(self.sizes, splits, tabled=True)
         parts = self.parts if self.fixed or self.parts == 1 else 0
-        return Shape(self.sizes, self.splits if given else 0, parts, self.order, self.follow, self.cross, self.operator)
+        return Shape(self.sizes, splits, parts, self.order, self.follow, self.cross, False, self.operator)
 
     @property
     def room(self) -> Room:
@@ -180,6 +186,12 @@ def measured(fields: Field, plan: Plan) -> Extent | None:
     return None if plan.follow else extent(np.asarray(fields.values), plan.aliasing / 10, plan.edge / 10)
 
 
+def coarser(band: Any, plan: Plan) -> Any:
+    """How many times as wide a cell may be where the share `band` of the frequencies matters."""
+    # What the highest frequency still holds was not resolved.
+    return np.where(band > 0.98, 0.7, 1 / (FINER * np.maximum(band, 0.1))) / plan.finer
+
+
 def fitted(
     fields: Field, measures: Extent | None, plan: Plan, check: Callable[[tuple[int, ...]], None]
 ) -> tuple[np.ndarray, Plan]:
@@ -194,8 +206,7 @@ def fitted(
         cut = np.stack([np.zeros(n), np.maximum(sizes / plan.sizes, 1.0)])
         return np.tile(cut, (records, 1, 1)), plan
     first, last, band = measures
-    # What the highest frequency still holds was not resolved.
-    ratio = np.where(band > 0.98, 0.7, 1 / (FINER * plan.finer * np.maximum(band, 0.1)))
+    ratio = coarser(band, plan)
     span = (last - first + 3) * SPARE * plan.wider
     wanted = np.array([rounded_up(s, n) for s in (span / ratio).max(axis=0)])
     wanted = np.minimum(wanted, MOST[n])
@@ -298,7 +309,8 @@ def more(plan: Plan, info: Any) -> Plan | None:
     if finer == 1 and edge < plan.edge:
         return None
     plan = replace(plan, finer=plan.finer * min(1.1 * finer, 3.0), wider=plan.wider * (1.0 if edge < plan.edge else 1.35))
-    room = 2.0 if plan.operator == "characteristics" else 4.0 if plan.follow else 8.0 if plan.operator == "finite-volume" else 1.0
+    room = 2.0 if plan.operator == "characteristics" else 4.0 if plan.follow or plan.tabled else 1.0
+    room = 8.0 if plan.operator == "finite-volume" else room
     if plan.finer * plan.wider < WORST[n] * room:
         return plan
     shorter = plan.run // 4
@@ -307,11 +319,15 @@ def more(plan: Plan, info: Any) -> Plan | None:
     return replace(plan, run=max(shorter, SHORTEST), finer=1.0, wider=1.0, follow=shorter < SHORTEST, order=4)
 
 
-def relaxed(plan: Plan, run: int) -> Plan:
-    """The plan for the next run: what the last one needed more of is given back step by step."""
+def relaxed(plan: Plan, run: int, follow: bool) -> Plan:
+    """The plan for the next run: what the last one needed more of is given back step by step.
+
+    `run` and `follow` are those that a filter begins with.
+    """
     return replace(
         plan,
         run=min(run, 2 * plan.run),
+        follow=follow or (plan.follow and plan.run < 4 * SHORTEST),
         wider=max(1.0, plan.wider / 1.2),
         finer=max(1.0, plan.finer / 1.2),
         parts=max(1, plan.parts * 2 // 3 if plan.operator == "characteristics" else plan.parts // 2),

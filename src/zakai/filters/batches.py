@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from threading import Lock
 from typing import Any
@@ -103,11 +104,12 @@ def _together(runs: list[Run], lanes: int, count: _Count) -> None:
         while runs and runs[0].done < rows.stop:
             left = slice(runs[0].done - rows.start, rows.stop - rows.start)
             fill = lanes - len(runs)
-            adapt = _Adapt(method, len(runs))
+            adapt, own = _Adapt(method, len(runs)), _own(states)
             part, begin, ends, info, kept = run_steps(
-                method, adapt if method.adapt_many else None, _scan_lanes, prepared, _stacked([*states, *states[-1:] * fill], 0),
+                method, adapt if method.adapt_many else None, _scan_lanes, prepared, _stacked([*own, *own[-1:] * fill], 0),
                 _stacked([*given, *given[-1:] * fill], 1), left, rows.stop == total, runs[0].keep, ENOUGH,
             )  # fmt: skip
+            begin, ends = _own([begin, ends])
             for lane, run in enumerate(runs):
                 first = _lane(begin, lane, 0)
                 if lane in adapt.ill:
@@ -148,6 +150,12 @@ class _Adapt:
         return None
 
 
+def _own(states: list[Any]) -> list[Any]:
+    """States without what the records of a batch have in common; `adapt_many` gives it again."""
+    names = getattr(type(states[0]), "LASTING", ())
+    return [replace(state, **dict.fromkeys(names)) for state in states] if names else states
+
+
 def _shape(tree: Any) -> Hashable:
     return jax.tree.structure(tree), tuple(np.shape(leaf) for leaf in jax.tree.leaves(tree))
 
@@ -166,8 +174,12 @@ def _scan(step, healthy, states, intervals, observations, keep, limit):
         new, info = step(interval, state, observation)
         return new, (info, getattr(new, "kept", new) if keep else None)
 
+    # What the records have in common is there once.
+    names = getattr(type(states), "LASTING", ())
+    axes = replace(jax.tree.map(lambda a: 0, states), **dict.fromkeys(names)) if names else 0
+
     def one(carry, slices):
-        return jax.vmap(one_record, (None, 0, 0))(slices[0], carry, slices[1])
+        return jax.vmap(one_record, (None, axes, 0), (axes, 0))(slices[0], carry, slices[1])
 
     return taken(one, healthy, states, (intervals, observations), *limit)
 

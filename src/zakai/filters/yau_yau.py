@@ -28,6 +28,7 @@ from zakai.densities import GridDensity
 from zakai.errors import InputError
 from zakai.filters import _lattice_choice as choice
 from zakai.filters import _splitting as splitting
+from zakai.filters import _tabled as tabled
 from zakai.filters import _window as window
 from zakai.filters._formulas import Formulas, formulas
 from zakai.filters._protocol import Info, Method, Schedule
@@ -49,6 +50,7 @@ class System:
         self.observe = jax_field(model.observation, model)
         self.continuous = model.observation_kind != "samples"
         self.covariance = jax_function(model.covariance, model, (model.n, model.n))
+        self.tables = tabled.Tables(model) if tabled.serves(model) else None
 
 
 @lru_cache(maxsize=64)
@@ -56,15 +58,19 @@ def _system(of: Formulas) -> System:
     return System(of.model)
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["field", "observed", "cut", "room", "error"], meta_fields=["shape"])
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["field", "observed", "cut", "room", "error", "table"],
+    meta_fields=["shape"],
+)
 @dataclass(frozen=True)
 class State:
     """The probabilities of the cells of a lattice, the plan in two parts, and h at the points, an array for each coordinate.
 
     `error` estimates how far the density is from that of the equation, relative to itself.
 
-    `observed` is None where the lattice is laid anew in every step.  `cut` (2, n) says how the first lattice of this run of steps
-    was cut out of the last of the run before.
+    `observed` is None where the lattice is laid anew in every step, and where it stands still with a `table`.  `cut` (2, n) says
+    how the first lattice of this run of steps was cut out of the last of the run before.
     """
 
     field: Field
@@ -73,6 +79,9 @@ class State:
     room: Room
     shape: Shape
     error: Any = 0.0
+    table: Any = None
+
+    LASTING = ("table",)
 
     @property
     def plan(self) -> Plan:
@@ -82,7 +91,7 @@ class State:
     @property
     def kept(self) -> State:
         """What a result keeps of the state."""
-        return replace(self, observed=None)
+        return replace(self, observed=None, table=None)
 
     def tried(self, begin: State) -> State:
         """This state, which a run of steps was to begin with, with the plan and the cut of `begin`, with which it was tried.
@@ -279,14 +288,20 @@ class _Worst(NamedTuple):
         return _Worst(*(jnp.maximum(a, b) for a, b in zip(self, other)))
 
 
+def _weighted(values: jax.Array, most: Any, logs: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The values, of which `most` is the largest, times exp(logs - top), and top."""
+    still = jax.lax.stop_gradient
+    top = still(jnp.max(jnp.where(values > comoving.LOST * most, logs, -jnp.inf)))
+    # Where nothing of the density is left a factor may be as large as it likes.
+    return values * jnp.exp(logs - top - still(jnp.maximum(logs - top, 0.0))), top
+
+
 def _multiplied(values: jax.Array, logs: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The values times exp(logs), summing to one; the logarithm of what they summed to; and that of the factor by which what
     stood in the tails has grown, relative to the maximum."""
-    still = jax.lax.stop_gradient
-    top = still(jnp.max(jnp.where(values > comoving.LOST * jnp.max(values), logs, -jnp.inf)))
-    # Where nothing of the density is left a factor may be as large as it likes.
-    after = values * jnp.exp(logs - top - still(jnp.maximum(logs - top, 0.0)))
-    grown = still(jnp.log(jnp.max(values) / jnp.max(after)))
+    most = jnp.max(values)
+    after, top = _weighted(values, most, logs)
+    grown = jax.lax.stop_gradient(jnp.log(most / jnp.max(after)))
     total = jnp.sum(after)
     return after / total, jnp.log(total) + top, grown
 
@@ -302,6 +317,8 @@ def _repeated(body: Callable[[Any, Any], Any], carry: Any, known: int, count: An
 
 def step(interval: Interval, state: State, observation: Whole) -> tuple[State, Info]:
     """One interval: half of the likelihood, the transition, the other half, or all of it at the end."""
+    if state.shape.tabled:
+        return _tabled_step(interval, state, observation)
     system, plan, theta = interval.system, state.shape, interval.theta
     splits, parts = plan.splits or state.room.splits, plan.parts or state.room.parts
     length = (interval.stop - interval.start) / splits
@@ -399,18 +416,60 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
     return State(field, observed, state.cut, state.room, plan, error), Info(log_mass, mean, cov, health)
 
 
+def _tabled_step(interval: Interval, state: State, observation: Whole) -> tuple[State, Info]:
+    """The same on a lattice that stands still, with its Table."""
+    plan, table, increments = state.shape, state.table, interval.system.continuous
+    splits = plan.splits or state.room.splits
+    length = (interval.stop - interval.start) / splits
+    share, zero = observation.inside / splits, jnp.zeros(())
+    whole = tabled.likelihood(table, observation, 1.0)
+    b = tabled.Likelihood(*(share * part for part in whole))
+    half, at_end = tabled.corrected(b, length), (1.0 - observation.inside) * whole.log
+
+    def split(carry: Any, k: Any) -> Any:
+        values, log_mass, error, _, _, worst = carry
+        most, top = jnp.max(values), zero
+        if increments:
+            values, top = _weighted(values, most, half)
+        before = values
+        values, noise, middle = tabled.carried(table, values)
+        last = jnp.where(k == splits - 1, 1.0, 0.0) * at_end
+        last = half + last if increments else last
+        values, more = _weighted(values, middle, last)
+        told = tabled.told(table, before, values, b, length)
+        # The transition lowers the maximum, so that what is lost of the tails before it is not less than this says.
+        first = comoving.LOST * most / middle if increments else zero
+        lost = jnp.maximum(first, noise * middle / jnp.max(values))
+        made = told.aliasing + lost + OUTSIDE * told.edge
+        error = splitting.added(error, told.left.error + made, told.left.forgets, length)
+        apart = splitting.expected(told.left.error, told.left.forgets, length)
+        worst = worst.over(_Worst(told.aliasing, told.edge, zero, lost, apart))
+        return values / told.total, log_mass + top + more + jnp.log(told.total), error, told.mean, told.variance, worst
+
+    carry = state.field.values, observation.constant, state.error, zero, zero, _Worst(zero, zero, zero, zero, zero)
+    values, log_mass, error, mean, variance, worst = _repeated(split, carry, plan.splits, splits)
+    missed = jnp.max(jnp.stack([figure / most for figure, most in zip(worst, state.room.allowed, strict=True)]))
+    centre, basis = state.field.centre, state.field.basis
+    info = Info(log_mass, centre + basis[0] * mean, basis**2 * variance, dict(zip(HEALTH, (*worst, missed, error), strict=True)))
+    return replace(state, field=Field(values, centre, basis), error=error), info
+
+
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
     """The state to begin the intervals `rows` with: its lattice and its plan."""
-    many = adapt_many(prepared, jax.tree.map(lambda a: np.asarray(a)[None], state), rows, info)
-    return None if many is None else jax.tree.map(lambda a: np.asarray(a)[0], many)
+    one = jax.tree.map(lambda a: np.asarray(a)[None], replace(state, table=None))
+    many = adapt_many(prepared, one, rows, info)
+    if many is None:
+        return None
+    return replace(jax.tree.map(lambda a: np.asarray(a)[0], replace(many, table=None)), table=many.table)
 
 
 def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None) -> State | None:
-    """`adapt` of states with a leading axis of records: one plan for all, the best that any of them needs."""
+    """`adapt` of states with a leading axis of records: one plan for all, the best that any of them needs, and one table."""
     model, plan, last = prepared.model, states.plan, np.asarray(states.cut)
     fields = jax.tree.map(np.asarray, states.field)
     if info is None:
-        plan, last = window.relaxed(plan, _most(model.n, plan.operator)), np.tile(_SAME(model.n), (len(last), 1, 1))
+        plan = window.relaxed(plan, _most(model.n, plan.operator), prepared.plan.follow)
+        last = np.tile(_SAME(model.n), (len(last), 1, 1))
     elif window.healthy(info).all():
         return None
     while True:
@@ -419,27 +478,58 @@ def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None
             if better is None:
                 return None
             plan = better
-        measures = window.measured(fields, plan)
-        cut, _ = window.fitted(fields, measures, plan, lambda sizes: None)
-        least = window.timed(model, plan, prepared.intervals, rows, fields, cut[:, 1])
-        # What a try has shown counts for more than what the coefficients say.
-        best = least if info is None else replace(least, order=max(plan.order, least.order), parts=max(plan.parts, least.parts))
-        cut, best = window.fitted(fields, measures, best, lambda sizes: window.check_memory(model, sizes, prepared.memory))
+        cut, best, table = _lattice(prepared, fields, plan, rows, info)
         same = np.all(cut == last)
         if best == states.plan and same:
-            return replace(states, cut=last) if info is None else None
+            return replace(states, cut=last, table=table) if info is None else None
         # Sizes are few: what asks for a little more may get the same.
         if info is None or not same or best.shape != states.plan.shape or best.room.counts != states.plan.room.counts:
             plan = best
             break
-    fields = _cut_out(fields, cut, plan)
-    observed = None
-    if not plan.follow:
+    fields, observed = _cut_out(fields, cut, plan), None
+    if table is None and not plan.follow:
         # With NumPy, as the cutting out: nothing is compiled to look at a lattice.
         points = fields.centre[:, None] + _index(plan.sizes) @ np.swapaxes(fields.basis, 1, 2)
         h = numpy_function(model.observation, model)(points, float(prepared.schedule.starts[rows.start]), prepared.theta)
         observed = tuple(h[..., i].reshape(len(cut), *plan.sizes) for i in range(model.m))
-    return State(fields, observed, cut, _room(plan, len(cut)), plan.shape, np.asarray(states.error))
+    return State(fields, observed, cut, _room(plan, len(cut)), plan.shape, np.asarray(states.error), table)
+
+
+def _lattice(prepared: Prepared, fields: Field, plan: Plan, rows: slice, info: Info | None) -> tuple[np.ndarray, Plan, Any]:
+    """How to cut the lattices for the next run out of the fields' own, the plan for it and the Table, if it is taken with one."""
+    model, measures = prepared.model, window.measured(fields, plan)
+    found = None if measures is None else _table(prepared, fields, measures, plan, rows)
+    if found is not None:
+        return found
+    plan = replace(plan, tabled=False)
+    cut, _ = window.fitted(fields, measures, plan, lambda sizes: None)
+    least = window.timed(model, plan, prepared.intervals, rows, fields, cut[:, 1])
+    # What a try has shown counts for more than what the coefficients say.
+    best = least if info is None else replace(least, order=max(plan.order, least.order), parts=max(plan.parts, least.parts))
+    return *window.fitted(fields, measures, best, lambda sizes: window.check_memory(model, sizes, prepared.memory)), None
+
+
+def _table(
+    prepared: Prepared, fields: Field, measures: window.Extent, plan: Plan, rows: slice
+) -> tuple[np.ndarray, Plan, tabled.Table] | None:
+    """The same where a Table serves; None where it does not."""
+    tables = prepared.system.tables
+    if tables is None:
+        return None
+    lengths = prepared.schedule.stops[rows] - prepared.schedule.starts[rows]
+    tau, theta = float(lengths[0]) / plan.splits, prepared.theta
+    enough = plan.tabled or len(lengths) >= tabled.FEWEST
+    if plan.operator != "spectral" or not enough or np.ptp(lengths) > 1e-9 * tau or tabled.crossed(fields, tables, theta, tau):
+        return None
+    place = tabled.placed(fields, measures, plan)
+    table = None if place is None else tables.of(*place, tau, theta)
+    if place is None or table is None:
+        return None
+    centre, cell, size = place
+    old = fields.basis[:, 0, 0]
+    cut = np.stack([(centre - fields.centre[:, 0]) / old, cell / old], axis=1)[:, :, None]
+    plan = replace(plan, sizes=(size,), tabled=True, order=2, parts=1, cross=False)
+    return cut, plan, table
 
 
 def _index(sizes: tuple[int, ...]) -> np.ndarray:
@@ -455,6 +545,8 @@ def _room(plan: Plan, count: int) -> Room:
 
 
 def _cut_out(fields: Field, cut: np.ndarray, plan: Plan) -> Field:
+    if np.array_equal(cut, np.broadcast_to(_SAME(1), cut.shape)) and plan.tabled and fields.values.shape[1:] == plan.sizes:
+        return fields
     if plan.operator == "characteristics":
         # The step lays the lattice, also this one but for its sizes.
         return fields if fields.values.shape[1:] == plan.sizes else _laid(fields, plan.sizes, window.NEARER * plan.room.reach)
@@ -475,6 +567,10 @@ def _laid(fields: Field, sizes: tuple[int, ...], reach: Any) -> Field:
 def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State:
     """The traced `state` on a lattice cut out of its own as that of `begin` was, with the same plan."""
     plan, cut = replace(begin.plan, fixed=True), np.asarray(begin.cut)
+    if plan.tabled:
+        # A table has no derivatives: the transition is that of a lattice that moves.
+        own = jax.tree.map(lambda a: np.asarray(a)[None], begin.field)
+        plan = window.timed(prepared.model, replace(plan, tabled=False), prepared.intervals, rows, own, np.ones((1, 1)))
     field = state.field
     if not np.array_equal(cut, _SAME(prepared.model.n)) or plan.sizes != state.shape.sizes or plan.follow:
         field = jax.tree.map(lambda a: a[0], _cut_out(jax.tree.map(lambda a: a[None], field), cut[None], plan))

@@ -1,0 +1,212 @@
+"""A step in one state where nothing but the readings depends on the time: the transition is a matrix that is known beforehand.
+
+Between two looks at the lattice it stands still.  What a step needs of f, G and h is then a table, made once for a lattice, and
+an interval costs a product with a matrix, two factors and one more product for all that is told.  Lattices are taken out of
+few, so that a density that comes back to where it was finds its table.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from itertools import combinations_with_replacement
+from threading import Lock
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zakai import _float64  # noqa: F401
+from zakai.filters import _splitting as splitting
+from zakai.filters import _window as window
+from zakai.filters._window import Extent, Plan
+from zakai.filters.observations import Whole
+from zakai.kolmogorov.comoving import LOST, Field, axes_of
+from zakai.kolmogorov.transition import transition
+from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
+
+MOST = 384  # points, beyond which a product with a matrix costs more than a lattice that moves
+MOST_TOGETHER = 192  # the same where many records share it
+FEWEST = 8  # steps that a table is made for
+TERMS = 9  # products of coordinates of h, beyond which a sum over all of them costs more than it saves
+LEVELS = 4  # widths of cells in an octave
+PLACES = 8  # where lattices of one width may stand, in the length of one
+EDGE = 16  # what part of a lattice is its edge, on each side
+SOUND = 100.0  # the largest sum of the absolute values in a row of a transition: beyond, rounding is amplified
+KEPT_BYTES = 128 * 2**20
+
+
+class Table(NamedTuple):
+    """What is known of a lattice of N points without data.
+
+    `transition` (N, N); `terms` (a, 5, N), for each h_i and each h_i h_j: itself, the slope times the root of G, the second
+    derivative times G, the slope of L of it times the root of G, and L L of it, where L is the backward operator; `rows` (7, N),
+    whose products with a density are its sum, its first two moments, what is at the highest frequency and at the edges, where
+    the drift fades, and the mean of f and of f times the index; `spread` is G.  All of it in cells.
+    """
+
+    transition: Any
+    terms: Any
+    rows: Any
+    spread: Any
+
+
+def serves(model: Model) -> bool:
+    """Whether steps of a model can be taken with tables."""
+    timeless = not any(model.t in part.free_symbols for part in (*model.drift, *model.covariance, *model.observation))
+    return model.n == 1 and timeless and model.m + model.m * (model.m + 1) // 2 <= TERMS
+
+
+class Tables:
+    """The tables of one system."""
+
+    def __init__(self, model: Model):
+        self.drift = numpy_function(model.drift, model)
+        self.observe = numpy_function(model.observation, model)
+        self.covariance = numpy_function(model.covariance, model, (1, 1))
+        self.kept: OrderedDict[Any, Table | None] = OrderedDict()
+        self.bytes, self.lock = 0, Lock()
+
+    def of(self, centre: float, cell: float, size: int, tau: float, theta: np.ndarray) -> Table | None:
+        """That of a lattice and a length of time; None where there is none that is sound."""
+        # Intervals that are meant to be of one length differ by rounding.
+        key = centre, cell, size, float(f"{tau:.10g}"), theta.tobytes()
+        with self.lock:
+            if key not in self.kept:
+                self.kept[key] = table = self._made(*key[:4], theta)
+                self.bytes += 0 if table is None else sum(part.nbytes for part in table)
+                while self.bytes > KEPT_BYTES and len(self.kept) > 1:
+                    _, old = self.kept.popitem(last=False)
+                    self.bytes -= 0 if old is None else sum(part.nbytes for part in old)
+            self.kept.move_to_end(key)
+            return self.kept[key]
+
+    def _made(self, centre: float, cell: float, size: int, tau: float, theta: np.ndarray) -> Table | None:
+        (z,) = axes_of((size,))
+        points = (centre + cell * z)[:, None]
+        f, h = self.drift(points, 0.0, theta)[:, 0] / cell, self.observe(points, 0.0, theta).T
+        G = float(self.covariance(np.zeros(1), 0.0, theta)[0, 0]) / cell**2
+
+        def slope(values: np.ndarray) -> np.ndarray:
+            return np.gradient(values, axis=-1)
+
+        def backward(values: np.ndarray) -> np.ndarray:
+            return f * slope(values) + 0.5 * G * slope(slope(values))
+
+        with np.errstate(all="ignore"):
+            terms = np.stack([*h, *(h[i] * h[j] for i, j in _pairs(len(h)))])
+            once = backward(terms)
+            root = np.sqrt(G)
+            terms = np.stack([terms, root * slope(terms), G * slope(slope(terms)), root * slope(once), backward(once)], axis=1)
+            inwards = np.minimum(z - z[0], z[-1] - z) / (size // EDGE)
+            rows = np.stack([np.ones(size), z, z**2, 1.0 - 2.0 * (np.arange(size) % 2), inwards < 1, f, f * z])
+            if not (np.isfinite(terms).all() and np.isfinite(rows).all()):
+                return None
+            # What flows apart where the ends of a lattice meet would grow out of rounding.
+            matrix = transition(f * np.sin(0.5 * np.pi * np.minimum(inwards, 1.0)) ** 2, G, tau)
+            # What is not a number is not less either.
+            return Table(matrix, terms, rows, np.array(G)) if np.abs(matrix).sum(axis=1).max() < SOUND else None
+
+
+def _pairs(m: int) -> list[tuple[int, int]]:
+    return list(combinations_with_replacement(range(m), 2))
+
+
+def _near(middle: float, widest: float, size: int) -> tuple[float, float]:
+    """Centre and cell of the lattice that is nearest to the middle, of those whose cells are not wider."""
+    # The logarithm of a width that is one of them is off by rounding.
+    cell = float(2.0 ** (np.floor(LEVELS * np.log2(widest) + 1e-6) / LEVELS))
+    place = cell * size / PLACES
+    return round(middle / place) * place, cell
+
+
+def placed(fields: Field, measures: Extent, plan: Plan) -> tuple[float, float, int] | None:
+    """Centre, cell and size of a lattice, one of few, that holds and resolves densities, one a record: their own if that is as
+    good.
+
+    None if that were too many points.
+    """
+    size, centres, cells = fields.values.shape[-1], fields.centre[:, 0], fields.basis[:, 0, 0]
+    first, last, band = (part[:, 0] for part in measures)
+    spare = 0.5 * ((window.SPARE * plan.wider - 1) * (last - first) + 3 * window.SPARE * plan.wider)
+    low = float(np.min(centres + cells * (first - spare - size // 2)))
+    high = float(np.max(centres + cells * (last + spare - size // 2)))
+    widest = float(np.min(cells * window.coarser(band, plan)))
+    centre, cell = float(centres[0]), float(cells[0])
+    own = np.all(centres == centre) and np.all(cells == cell) and (centre, cell) == _near(centre, cell, size)
+    if own and centre - 0.5 * size * cell <= low and high <= centre + 0.5 * size * cell and 0.5 * widest <= cell <= widest:
+        return centre, cell, size
+    middle = 0.5 * (low + high)
+    size = window.rounded_up((high - low) / _near(middle, widest, size)[1] * (1 + 1 / PLACES), 1)
+    return (*_near(middle, widest, size), size) if size <= (MOST if len(cells) == 1 else MOST_TOGETHER) else None
+
+
+def crossed(fields: Field, tables: Tables, theta: np.ndarray, tau: float) -> bool:
+    """Whether the drift takes a density through a quarter of its lattice within few steps: then the lattice had better move."""
+    values, (size,) = fields.values, fields.values.shape[1:]
+    points = fields.centre[:, None] + fields.basis[:, 0, 0, None, None] * axes_of((size,))[0][:, None]
+    flow = np.where(values > 0, tables.drift(points, 0.0, theta)[..., 0], 0.0)
+    far = FEWEST * tau * np.abs((values * flow).sum(axis=1)) / values.sum(axis=1)
+    return not np.all(far < 0.25 * size * fields.basis[:, 0, 0])
+
+
+class Likelihood(NamedTuple):
+    """The logarithm b of a likelihood at the points, and of b what stands in the `terms` of a Table."""
+
+    log: Any
+    slope: Any
+    bend: Any
+    upward: Any
+    twice: Any
+
+
+def likelihood(table: Table, factor: Whole, share: Any) -> Likelihood:
+    """share (linear . h - h'(energy) h / 2)."""
+    m = factor.linear.shape[-1]
+    weights = [*(factor.linear[i] for i in range(m)), *(-(0.5 if i == j else 1.0) * factor.energy[i, j] for i, j in _pairs(m))]
+    return Likelihood(*(sum(share * w * table.terms[a, k] for a, w in enumerate(weights)) for k in range(5)))
+
+
+def corrected(b: Likelihood, length: Any) -> jax.Array:
+    """b/2 with the first error of the splitting undone: see `splitting.corrected`."""
+    more = length / 48 * b.slope**2
+    return 0.5 * b.log + more / (1.0 + more)
+
+
+class Told(NamedTuple):
+    """Of the densities before and after a transition: the sum, mean and variance of the second, in cells, the worst of the shares
+    at the highest frequency and at the edges, and what the splitting left."""
+
+    total: Any
+    mean: Any
+    variance: Any
+    aliasing: Any
+    edge: Any
+    left: splitting.Left
+
+
+def told(table: Table, before: jax.Array, after: jax.Array, b: Likelihood, length: Any) -> Told:
+    """All of it by one product; what the splitting leaves is that of `splitting.left` for the likelihood b."""
+    first = length / 24 * b.slope**2
+    sums = table.rows @ jnp.stack([before, after], axis=1)
+    shares = jnp.max(jnp.abs(sums[3:5]) / sums[0], axis=1)
+    total, means = sums[0, 1], sums[:, 1] / sums[0, 1]
+    mean = means[1]
+    variance = means[2] - mean**2
+    growth = table.spread / variance
+    parts = [b.twice, b.twice**2, first, first**2, b.upward**2, b.bend**2]
+    of = [jnp.sum(part * after) / total for part in parts]
+    twice, once = (jnp.sqrt(jnp.maximum(of[k + 1] - of[k] ** 2, 0.0)) for k in (0, 2))
+    rest = twice + 2 * jnp.sqrt(of[4] * growth) + growth * jnp.sqrt(2 * of[5])
+    error = length**2 / 12 * rest + once * jnp.minimum(1.0, jnp.sqrt(of[2]) + length * growth)
+    forgets = growth + (means[6] - mean * means[5]) / variance
+    return Told(total, mean, variance, shares[0], shares[1], splitting.Left(error, forgets))
+
+
+def carried(table: Table, values: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The density after the transition, without the tails of which rounding leaves nothing; that noise; and the maximum."""
+    after = table.transition @ values
+    top, bottom = jnp.max(jnp.stack([after, -after]), axis=1)
+    noise = jnp.maximum(LOST, bottom / top)
+    return jnp.where(after > noise * top, after, 0.0), noise, top

@@ -1,0 +1,92 @@
+"""Steps with tables: against steps on a lattice that moves, and what a table is made of against its own definition."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zakai
+from zakai.filters import _splitting as splitting
+from zakai.filters import _tabled as tabled
+from zakai.filters import yau_yau
+from zakai.filters.observations import Whole
+
+WELL = dict(
+    name="double well",
+    state=["x"],
+    diffusion=[["0.7"]],
+    observation=["x"],
+    prior={"kind": "gaussian", "mean": [0.4], "cov": [0.2]},
+)
+
+
+def wells(**keys) -> tuple[zakai.Model, zakai.Model]:
+    """A model whose steps are tabled, and the same with a drift of which that is not known."""
+    return zakai.Model(drift=["x - x**3"], **WELL | keys), zakai.Model(drift=["x - x**3 + 1e-30*t"], **WELL | keys)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        dict(),
+        pytest.param(dict(observation_kind="samples", observation_noise=[[0.1]]), marks=pytest.mark.slow),
+        pytest.param(dict(observation=["x", "x**2"], observation_noise=[["0.2", "0.1"], ["0.1", "0.3"]]), marks=pytest.mark.slow),
+    ],
+    ids=["increments", "samples", "two sensors whose noise is correlated"],
+)
+def test_a_lattice_that_stands_still_gives_what_one_that_moves_gives(keys):
+    model, moving = wells(**keys)
+    values = np.array(zakai.simulate(model, 0.02 * np.arange(1, 41), seed=3)[1].values)
+    values[10:12] = np.nan
+    record = zakai.Record(0.02 * np.arange(1, 41), values, model.observation_kind)
+    one, other = (zakai.filter(each, record, "yau-yau", tolerance=1e-6, substeps=4) for each in (model, moving))
+    # On a lattice that stands still there is no error of steps in time.
+    assert np.nanmax(one.health["time_error"]) == 0 < np.nanmax(other.health["time_error"])
+    assert not one.warnings
+    assert np.abs(one.mean - other.mean).max() < 2e-6
+    assert np.abs(one.variance / other.variance - 1).max() < 5e-6
+    assert abs(one.log_likelihood - other.log_likelihood) < 5e-6
+
+
+def test_what_a_table_tells_is_what_its_parts_say():
+    model, _ = wells(observation=["x", "x**2"])
+    centre, cell, size, tau = 0.25, 0.0625, 64, 0.01
+    table = yau_yau.System(model).tables.of(centre, cell, size, tau, model.theta())
+    z = np.arange(size) - size // 2.0
+    x = centre + cell * z
+    factor = Whole(np.array([0.3, -0.2]), np.array([[0.1, 0.04], [0.04, 0.2]]), 0.0, 1.0)
+    h = np.stack([x, x**2])
+    log = factor.linear @ h - 0.5 * np.sum(h * (factor.energy @ h), axis=0)
+    b = tabled.likelihood(table, factor, 1.0)
+    assert np.allclose(b.log, log, atol=1e-14)
+    values = np.exp(-8 * (x - 0.5) ** 2)
+    told = tabled.told(table, values[::-1], values, b, tau)
+    spread = np.array([[0.49 / cell**2]])
+    left = splitting.left(values, 0.5 * log, [(x - x**3) / cell], spread, tau)
+    assert np.allclose(told.left, left, rtol=1e-10)
+    assert np.allclose(tabled.corrected(b, tau), splitting.corrected(0.5 * log, spread, tau), atol=1e-14)
+    mean = values @ z / values.sum()
+    assert np.allclose([told.mean, told.variance], [mean, values @ (z - mean) ** 2 / values.sum()], rtol=1e-12)
+
+
+def test_drift_that_flows_apart_where_the_ends_of_a_lattice_meet_does_not_grow():
+    model, _ = wells()
+    table = yau_yau.System(model).tables.of(0.0, 0.125, 128, 0.01, model.theta())
+    assert np.abs(np.linalg.eigvals(table.transition)).max() < 1 + 1e-9
+
+
+def test_what_depends_on_the_time_or_is_not_a_number_has_no_table():
+    model, moving = wells()
+    assert yau_yau.System(moving).tables is None
+    roots = yau_yau.System(zakai.Model(drift=["sqrt(x)"], **WELL))
+    assert roots.tables.of(0.0, 0.125, 64, 0.01, model.theta()) is None
+
+
+def test_a_state_that_comes_back_finds_its_table():
+    model, _ = wells()
+    record = zakai.simulate(model, 0.01 * np.arange(1, 2001), seed=1)[1]
+    zakai.filter(model, record, "yau-yau", keep="moments")
+    tables = yau_yau._system(yau_yau.formulas(model)).tables
+    made = len(tables.kept)
+    zakai.filter(model, record, "yau-yau", keep="moments")
+    assert 0 < made == len(tables.kept) < 40
