@@ -106,7 +106,9 @@ class Tables:
             # What flows apart where the ends of a lattice meet would grow out of rounding.
             matrix = transition(f * np.sin(0.5 * np.pi * np.minimum(inwards, 1.0)) ** 2, G, tau)
             # What is not a number is not less either.
-            return Table(matrix, terms, rows, np.array(G)) if np.abs(matrix).sum(axis=1).max() < SOUND else None
+            sound = np.abs(matrix).sum(axis=1).max() < SOUND
+        # On the device once, for all runs of steps.
+        return jax.tree.map(jnp.asarray, Table(matrix, terms, rows, np.array(G))) if sound else None
 
 
 def _pairs(m: int) -> list[tuple[int, int]]:
@@ -187,19 +189,19 @@ class Told(NamedTuple):
 
 
 def told(table: Table, before: jax.Array, after: jax.Array, b: Likelihood, length: Any) -> Told:
-    """All of it by one product; what the splitting leaves is that of `splitting.left` for the likelihood b."""
+    """All of it by three products; what the splitting leaves is that of `splitting.left` for the likelihood b."""
     first = length / 24 * b.slope**2
-    sums = table.rows @ jnp.stack([before, after], axis=1)
-    shares = jnp.max(jnp.abs(sums[3:5]) / sums[0], axis=1)
-    total, means = sums[0, 1], sums[:, 1] / sums[0, 1]
+    sums, first_sums = table.rows @ after, table.rows @ before
+    total, means = sums[0], sums / sums[0]
+    shares = jnp.maximum(jnp.abs(means[3:5]), jnp.abs(first_sums[3:5]) / first_sums[0])
     mean = means[1]
     variance = means[2] - mean**2
     growth = table.spread / variance
-    parts = [b.twice, b.twice**2, first, first**2, b.upward**2, b.bend**2]
-    of = [jnp.sum(part * after) / total for part in parts]
-    twice, once = (jnp.sqrt(jnp.maximum(of[k + 1] - of[k] ** 2, 0.0)) for k in (0, 2))
-    rest = twice + 2 * jnp.sqrt(of[4] * growth) + growth * jnp.sqrt(2 * of[5])
-    error = length**2 / 12 * rest + once * jnp.minimum(1.0, jnp.sqrt(of[2]) + length * growth)
+    parts = jnp.stack([b.twice, b.twice**2, first, first**2, b.upward**2, b.bend**2])
+    of = parts @ (after / total)
+    squares = [of[1] - of[0] ** 2, of[3] - of[2] ** 2, of[4] * growth, 2 * of[5] * growth**2, of[2]]
+    twice, once, upward, bend, slope = jnp.sqrt(jnp.maximum(jnp.stack(squares), 0.0))
+    error = length**2 / 12 * (twice + 2 * upward + bend) + once * jnp.minimum(1.0, slope + length * growth)
     forgets = growth + (means[6] - mean * means[5]) / variance
     return Told(total, mean, variance, shares[0], shares[1], splitting.Left(error, forgets))
 
@@ -207,6 +209,6 @@ def told(table: Table, before: jax.Array, after: jax.Array, b: Likelihood, lengt
 def carried(table: Table, values: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The density after the transition, without the tails of which rounding leaves nothing; that noise; and the maximum."""
     after = table.transition @ values
-    top, bottom = jnp.max(jnp.stack([after, -after]), axis=1)
-    noise = jnp.maximum(LOST, bottom / top)
+    top = jnp.max(after)
+    noise = jnp.maximum(LOST, -jnp.min(after) / top)
     return jnp.where(after > noise * top, after, 0.0), noise, top

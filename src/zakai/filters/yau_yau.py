@@ -443,12 +443,13 @@ def _tabled_step(interval: Interval, state: State, observation: Whole) -> tuple[
         made = told.aliasing + lost + OUTSIDE * told.edge
         error = splitting.added(error, told.left.error + made, told.left.forgets, length)
         apart = splitting.expected(told.left.error, told.left.forgets, length)
-        worst = worst.over(_Worst(told.aliasing, told.edge, zero, lost, apart))
+        # One array, for the compiler takes its time for each.
+        worst = jnp.maximum(worst, jnp.stack([told.aliasing, told.edge, zero, lost, apart]))
         return values / told.total, log_mass + top + more + jnp.log(told.total), error, told.mean, told.variance, worst
 
-    carry = state.field.values, observation.constant, state.error, zero, zero, _Worst(zero, zero, zero, zero, zero)
+    carry = state.field.values, observation.constant, state.error, zero, zero, jnp.zeros(5)
     values, log_mass, error, mean, variance, worst = _repeated(split, carry, plan.splits, splits)
-    missed = jnp.max(jnp.stack([figure / most for figure, most in zip(worst, state.room.allowed, strict=True)]))
+    missed = jnp.max(worst / jnp.stack(state.room.allowed))
     centre, basis = state.field.centre, state.field.basis
     info = Info(log_mass, centre + basis[0] * mean, basis**2 * variance, dict(zip(HEALTH, (*worst, missed, error), strict=True)))
     return replace(state, field=Field(values, centre, basis), error=error), info
