@@ -4,7 +4,7 @@
 
 The spiral sensor (one state, time-varying, a new filter every 1,000 observations) by the method that `auto` takes, and a
 Kalman-Bucy filter of four states.  Settings:
-JAX runs computations on the CPU in the calling thread (JAX_CPU_ENABLE_ASYNC_DISPATCH=false), one thread each for linear algebra
+JAX runs computations on the CPU in the calling thread (`jax_cpu_enable_async_dispatch` off), one thread each for linear algebra
 (OMP_NUM_THREADS=1), and the garbage of the warm-up is frozen (`gc.freeze()`).  Percentiles in microseconds are printed as JSON.
 With `--watch` each tenth of the observations is printed too, with the memory of the process and the largest distance of the mass
 of the density from one: a soak.  Expected: median at most 30, 99.9 % at most 1,000; memory flat within 5 %, time within 10 %.
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import os
 
-os.environ.setdefault("JAX_CPU_ENABLE_ASYNC_DISPATCH", "false")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
@@ -24,9 +23,12 @@ import resource
 import time
 from typing import Any
 
+import jax
 import numpy as np
 
 import zakai
+
+jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 WARM = 5000
 BATCH = 10_000

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import zakai
+from zakai.filters import _compiled_step
 
 WALK = dict(state=["x"], drift=["-x/2"], observation=["2*x"], prior={"kind": "gaussian", "mean": [0.3], "cov": [[2.0]]})
 TIMED = dict(WALK, drift=["cos(t) - x/2"], observation_noise=[["1 + sin(t)/2"]])
@@ -140,6 +141,14 @@ def test_a_gap_of_any_length_is_filtered():
     # The law of the state has long been forgotten: variance 1 / (2 * 1/2) = 1 before the sample.
     assert np.isclose(after.cov[0, 0], 1 / (1 + 4)) and np.isclose(after.mean[0], 2 * 0.4 / 5)
     assert np.isfinite(online.update(1e4 + 0.1, 0.1).mean).all()
+
+
+def test_a_compiler_that_does_not_know_an_option_is_not_given_it(monkeypatch):
+    assert _compiled_step._known(_compiled_step.ONE_THREAD) == dict(_compiled_step.ONE_THREAD)
+    monkeypatch.setattr(_compiled_step, "ONE_THREAD", (("xla_cpu_of_another_version", True),))
+    assert _compiled_step._known(_compiled_step.ONE_THREAD) == {}
+    model = zakai.Model(**WALK, observation_kind="rates")  # which no other test here has compiled
+    compare(model, simulated(model, UNIFORM), "extended-kalman-bucy")
 
 
 def test_an_option_that_needs_all_times_is_refused():

@@ -46,8 +46,13 @@ def stream(
     options = options_of(settings)
     model = load_model(source)
 
+    import jax
+
+    from zakai import _float64  # noqa: F401
     from zakai.filters.online import online
 
+    # An observation is answered before the next is read: that another thread computes would only be waited for.
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
     _Stream(online(model, method, **options), wanted, every, checkpoint, checkpoint_every or 1, strict).run()
 
 

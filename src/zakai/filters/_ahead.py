@@ -44,7 +44,7 @@ class Key(NamedTuple):
 
 
 class Block(NamedTuple):
-    """What was prepared for the intervals of a key: for each a row, which `layout` describes."""
+    """What was prepared for the intervals of a key: for each a row, which `layout` describes behind room for a reading (m,)."""
 
     key: Key
     prepared: Any
@@ -95,7 +95,7 @@ class Ahead:
         clock: Clock,
         start: float,
         stop: float,
-        values: np.ndarray,
+        values: Any,
         seen: tuple[bool, ...],
         elapsed: tuple[float, ...] | None,
     ) -> tuple[Block, int, Clock]:
@@ -110,20 +110,20 @@ class Ahead:
                 last = Key(0.0, stop - start, 1, seen, elapsed)
                 clock = clock._replace(ahead=last)
             return self._remembered(last), 0, clock
-        step = (start - clock.since) / clock.steps if clock.steps else stop - start
-        repeats = bool(clock.steps) and seen == clock.seen and _close(stop, start + step, step)
-        clock = clock._replace(steps=clock.steps + 1) if repeats else clock._replace(since=start, steps=1, seen=seen)
-        if elapsed is not None:
-            return self._made(Key(start, stop - start, 1, seen, elapsed), (start, stop)), 0, clock._replace(begun=True)
-        row = self._row(clock.ahead, start, stop, seen)
-        # Of the first interval it is supposed that others like it follow.
-        if row is None and (repeats or not clock.begun):
-            key = self._many(Key(start, (stop - clock.since) / clock.steps, CHUNK, seen))
-            clock, row = clock._replace(ahead=key), 0
-        clock = clock._replace(begun=True)
-        if row is None or clock.ahead is None:
-            return self._made(Key(start, stop - start, 1, seen), (start, stop)), 0, clock
-        return self._ahead(clock.ahead), row, clock
+        since, steps, before, ahead, begun = clock
+        step = (start - since) / steps if steps else stop - start
+        repeats = bool(steps) and seen == before and _close(stop, start + step, step)
+        since, steps = (since, steps + 1) if repeats else (start, 1)
+        row = None
+        if elapsed is None:
+            row = self._row(ahead, start, stop, seen)
+            # Of the first interval it is supposed that others like it follow.
+            if row is None and (repeats or not begun):
+                ahead, row = self._many(Key(start, (stop - since) / steps, CHUNK, seen)), 0
+        clock = Clock(since, steps, seen, ahead, True)
+        if row is None or ahead is None:
+            return self._made(Key(start, stop - start, 1, seen, elapsed), (start, stop)), 0, clock
+        return self._ahead(ahead), row, clock
 
     def again(self, key: Key, ends: tuple[float, float]) -> Block:
         """The block of a key once more, for an interval with these ends."""
@@ -155,7 +155,7 @@ class Ahead:
                 key = key._replace(number=max(1, key.number // 8))
 
     def _ahead(self, key: Key) -> Block:
-        if self.chunk is None or self.chunk.key != key:
+        if self.chunk is None or (self.chunk.key is not key and self.chunk.key != key):
             self.chunk = self._made(key)
         return self.chunk
 
@@ -173,7 +173,7 @@ class Ahead:
         self.chunk = block
         return block
 
-    def _made(self, key: Key, ends: tuple[float, float] | None = None, values: np.ndarray | None = None) -> Block:
+    def _made(self, key: Key, ends: tuple[float, float] | None = None, values: Any = None) -> Block:
         """What is prepared for a key, with the very ends of a single interval where they matter."""
         method, model = self.setting.method, self.setting.model
         edges = key.edges if ends is None else np.array(ends)
@@ -185,11 +185,11 @@ class Ahead:
         rule = Given(method.observations(prepared, data)) if method.rule is None else method.rule(prepared, data)
         tree = (prepared.intervals, rule)
         layout = Layout.of_rows(jax.tree.map(np.asarray, tree))
-        return Block(key, prepared, packed_rows(tree, key.number), layout, tuple(getattr(prepared, "notes", ())))
+        return Block(key, prepared, packed_rows(tree, key.number, model.m), layout, tuple(getattr(prepared, "notes", ())))
 
 
 def data_at(
-    kind: str, edges: np.ndarray, seen: tuple[bool, ...], elapsed: tuple[float, ...] | None, values: np.ndarray | None = None
+    kind: str, edges: np.ndarray, seen: tuple[bool, ...], elapsed: tuple[float, ...] | None, values: Any = None
 ) -> Data:
     """Readings at the ends of intervals of the coordinates that are `seen`; zero where no `values` (m,) are given."""
     starts, stops, shape = edges[:-1], edges[1:], (len(edges) - 1, len(seen))

@@ -60,6 +60,8 @@ class Layout(NamedTuple):
 def _apart(tree: Any) -> tuple[bool, ...]:
     """Of each array of a pytree whether it stands apart."""
     names = getattr(type(tree), "LASTING", ())
+    if not names:
+        return (False,) * len(jax.tree.leaves(tree))
     return tuple(bool(path) and getattr(path[0], "name", "") in names for path, _ in jax.tree_util.tree_leaves_with_path(tree))
 
 
@@ -85,10 +87,10 @@ def packed(tree: Any) -> np.ndarray:
     return np.concatenate([np.zeros(0), *(np.ravel(np.asarray(leaf)).astype(float) for leaf in _divided(tree)[0])])
 
 
-def packed_rows(tree: Any, count: int) -> np.ndarray:
-    """A pytree whose arrays have a leading axis, as a matrix (count, size)."""
+def packed_rows(tree: Any, count: int, room: int) -> np.ndarray:
+    """A pytree whose arrays have a leading axis, as a matrix (count, room + size), with `room` for something in front."""
     leaves = (np.asarray(leaf).reshape(count, -1).astype(float) for leaf in jax.tree.leaves(tree))
-    return np.concatenate([np.zeros((count, 0)), *leaves], axis=1)
+    return np.concatenate([np.zeros((count, room)), *leaves], axis=1)
 
 
 class Laid(NamedTuple):
@@ -111,7 +113,7 @@ class Laid(NamedTuple):
 class Step(NamedTuple):
     """A compiled step: `call(vector, inputs, lasting)` gives the vector of the new state, with what was told behind it.
 
-    `inputs` are the values of the reading, zero where there is none, and a row of a Block; `lasting` is what stands apart.
+    `inputs` is a row of a Block with the values of the reading, zero where there is none; `lasting` is what stands apart.
     `state` is the layout before and `new` that after; `info` is that of the Info; the last number is its verdict.
     """
 
@@ -127,14 +129,15 @@ class Step(NamedTuple):
 
 
 class Told(NamedTuple):
-    """The Info of one step, out of its vector."""
+    """The Info of one step, which in a vector stands from `begin` on."""
 
     vector: np.ndarray
+    begin: int
     layout: Layout
 
     @property
     def info(self) -> Info:
-        return self.layout.unpacked(self.vector)
+        return self.layout.unpacked(self.vector[self.begin :])
 
     @property
     def verdict(self) -> float:
@@ -149,6 +152,22 @@ class Told(NamedTuple):
 def compiled(method: Method, state: Layout, inputs: Layout, values: int) -> Step:
     """The step for a state and inputs of these layouts; `values` is how many a reading has."""
     return _compiled(method.step, method.fits, method.healthy, method.adapt is None, state, inputs, values)
+
+
+# To hand a part of so small a step to another thread takes longer than the whole.
+ONE_THREAD = (("xla_cpu_scheduler_type", "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"), ("xla_cpu_multi_thread_eigen", False))
+
+
+@lru_cache(maxsize=2)
+def _known(options: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
+    """These options of the CPU's compiler, or none where it is another's or they are those of another version."""
+    if jax.default_backend() != "cpu":
+        return {}
+    try:
+        jax.jit(lambda x: x, compiler_options=dict(options)).lower(0.0).compile()
+    except jax.errors.JaxRuntimeError:
+        return {}
+    return dict(options)
 
 
 @lru_cache(maxsize=128)
@@ -168,4 +187,5 @@ def _compiled(step, fits, healthy, rigid: bool, state: Layout, inputs: Layout, v
     lasting = tuple(np.zeros(*of[:2]) for of in zip(*state[1:], strict=True) if of[2])
     new, info = jax.eval_shape(stepped, np.zeros(state.size), np.zeros(values + inputs.size), lasting)
     after = Layout.of(new)
-    return Step(jax.jit(one), state, state if after == state else after, Layout.of(info), after.size)
+    call = jax.jit(one, compiler_options=_known(ONE_THREAD))
+    return Step(call, state, state if after == state else after, Layout.of(info), after.size)

@@ -115,7 +115,7 @@ def _restored(live: Live, said: Mapping[str, Any], arrays: list[np.ndarray]) -> 
     state = put_together(said["state"], arrays, shared_by(method.init(block.prepared, live.setting.prior)))
     info = put_together(said["told"], arrays, {})
     laid = Laid.of(state)
-    told = Told(np.append(packed(info), float(said["well"])), Layout.of(info))
+    told = Told(np.append(packed(info), float(said["well"])), 0, Layout.of(info))
     if first is None:
         laid = compiled(method, laid.layout, block.layout, live.m).begun(laid)
     return Moment(time, laid, told, int(said["left"]), block, ends, *rest)

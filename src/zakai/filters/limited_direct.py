@@ -354,7 +354,8 @@ def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> S
     """The state to begin the intervals `rows` with: the window, the cell and the way to convolve."""
     one = jax.tree.map(lambda a: np.asarray(a)[None], (state, info))
     many = adapt_many(prepared, one[0], rows, one[1])
-    return None if many is None else jax.tree.map(lambda a: a[0], many)
+    # To take a part of JAX's arrays takes longer than all the rest.
+    return None if many is None else jax.tree.map(lambda a: np.asarray(a)[0], many)
 
 
 def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None) -> State | None:

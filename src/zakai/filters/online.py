@@ -85,8 +85,8 @@ class Online:
         values = self._values(value)
         with self.lock:
             time = self._time(time)
-            moments = tuple(live.moved(time, part) for live, part in zip(self.lives, self._divided(values), strict=True))
-            for live, moment in zip(self.lives, moments, strict=True):
+            moments = tuple([live.moved(time, part) for live, part in zip(self.lives, self._divided(values))])
+            for live, moment in zip(self.lives, moments):
                 live.now = moment
         return Estimate(self, moments)
 
@@ -154,7 +154,10 @@ class Online:
         return [[values[i] for i in columns] or [np.nan] for columns in self._columns]
 
     def _time(self, time: Any) -> float:
-        time, now = _number(time), self.time
+        now = self.lives[0].now.time
+        if type(time) is float and now < time <= LARGEST:
+            return time
+        time = _number(time)
         if time > now:
             return time
         begins = self.lives[0].now.told is None
@@ -168,6 +171,9 @@ class Online:
 
     def _values(self, value: Any) -> list[float]:
         m = self.model.m
+        # What nearly always comes is known at a glance.
+        if type(value) is list and len(value) == m and all([type(one) is float and -LARGEST <= one <= LARGEST for one in value]):
+            return value
         if isinstance(value, list | tuple):
             values = [np.nan if one is None else one for one in value]
         else:
@@ -284,8 +290,8 @@ class Estimate:
         for i, live in enumerate(online.lives):
             info = self._infos[i]
             if info is not None and _is_gaussian(live):
-                half = _deviations(1 - tail) * np.sqrt(np.maximum(np.diag(info.cov), 0.0))
-                part = np.stack([info.mean - half, info.mean + half], axis=1)
+                half = _deviations(1 - tail) * np.sqrt(np.maximum(info.cov.diagonal(), 0.0))
+                part = np.array([info.mean - half, info.mean + half]).T
             else:
                 part = self._part(i).quantile([tail, 1 - tail]).T
             found[slice(None) if online.blocks is None else list(online.blocks[i].states)] = part
