@@ -81,7 +81,7 @@ class Ahead:
     """The intervals of one setting."""
 
     def __init__(self, setting: Setting):
-        self.setting = setting
+        self.setting, self.ruled = setting, setting.method.rule is not None
         model = setting.model
         matrices = (model.drift, model.diffusion, model.process_noise, model.observation, model.observation_noise)
         self.varying = any(matrix.has(model.t) for matrix in matrices)
@@ -100,7 +100,7 @@ class Ahead:
         elapsed: tuple[float, ...] | None,
     ) -> tuple[Block, int, Clock]:
         """The block and the row of an interval, and the clock after it."""
-        if self.setting.method.rule is None:
+        if not self.ruled:
             return self._made(Key(start, stop - start, 1, seen, elapsed), (start, stop), values), 0, clock
         if not self.varying:
             # Lengths that differ by rounding alone are one.

@@ -85,8 +85,12 @@ class Online:
         values = self._values(value)
         with self.lock:
             time = self._time(time)
-            moments = tuple([live.moved(time, part) for live, part in zip(self.lives, self._divided(values))])
-            for live, moment in zip(self.lives, moments):
+            if self._columns is None:
+                (live,) = self.lives
+                live.now = moment = live.moved(time, values)
+                return Estimate(self, (moment,))
+            moments = tuple(live.moved(time, part) for live, part in zip(self.lives, self._divided(values), strict=True))
+            for live, moment in zip(self.lives, moments, strict=True):
                 live.now = moment
         return Estimate(self, moments)
 
