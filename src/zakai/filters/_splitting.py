@@ -73,7 +73,12 @@ def product(spread: jax.Array, a: Sequence[jax.Array], b: Sequence[jax.Array]) -
 def corrected(half: jax.Array, spread: jax.Array, length: Any) -> jax.Array:
     """b/2 + tau grad b . G grad b / 48 for b/2 on a lattice in whose coordinates G is `spread`; where that is large, less."""
     slope = slopes(half)
-    more = length / 12 * product(spread, slope, slope)
+    return made_up(half, length * product(spread, slope, slope))
+
+
+def made_up(half: Any, steepness: Any) -> Any:
+    """The same, where tau grad(b/2) . G grad(b/2) is known."""
+    more = steepness / 12
     return half + more / (1.0 + more)
 
 

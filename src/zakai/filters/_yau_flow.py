@@ -71,6 +71,13 @@ class System:
 
     def coefficients(self, t: jax.Array, argument: tuple[jax.Array, jax.Array]) -> Coefficients:
         """The coefficients of the flow at time t; `argument` is (theta, inside), the coordinates that act inside."""
+    def observe_sloped(self, x: Any, t: Any, theta: Any) -> list[jax.Array]:
+        """h at points (..., n), an array for each coordinate; with one state the slopes of h behind them."""
+        if self.n > 1:
+            return list(self.observe(x, t, theta))
+        h, slopes = jax.jvp(lambda x: list(self.observe(x, t, theta)), (x,), (jnp.ones_like(x),))
+        return [*h, *slopes]
+
         theta, inside = argument
         numbers = self._numbers(jnp.zeros(self.n), t, theta)
         ends = np.cumsum([rows * columns for rows, columns in self._shapes])[:-1]

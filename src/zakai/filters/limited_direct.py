@@ -5,7 +5,8 @@ q the gauge u = e^phi v makes the Kolmogorov equation linear-quadratic, and its 
 Hamiltonian flow (`zakai.kolmogorov.flow`).  What remains is a sum over a lattice, whose error is watched and kept below 1e-11.
 
 Affine h with increments: y runs linearly between readings and the step is exact.  Nonlinear h: half of the observation's
-factor, the transition with -h'S^-1 h / 2 inside, the other half.  Samples: exact for every h.
+factor, the transition with -h'S^-1 h / 2 inside, the other half; with one state the first error of this splitting is undone.
+Samples: exact for every h.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from zakai.filters import _lattice_choice as choice
 from zakai.filters._formulas import formulas
 from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters._yau_flow import FlowPlan, System, plan_flows, planned_flows, system_of
+from zakai.filters._splitting import made_up
 from zakai.filters.observations import Data, FactorRule, Factors, factor_rule
 from zakai.kolmogorov import lattice as lat
 from zakai.kolmogorov.flow import Flow
@@ -51,8 +53,8 @@ class State:
     """The normalised density on a lattice, and the static plan by which the next steps move it.
 
     What the last step computed and the next one needs again is carried: h at the points, `observed`, an array for each
-    coordinate, the narrowest feature in `cells` (n,), and the `middle` of the support (n,), an index from the centre.
-    `cut` (2,) says how the first lattice of this run of steps was cut out of the last of the run before.
+    coordinate, with one state its slopes behind, the narrowest feature in `cells` (n,), and the `middle` of the support (n,), an
+    index from the centre. `cut` (2,) says how the first lattice of this run of steps was cut out of the last of the run before.
     """
 
     lattice: Lattice
@@ -332,12 +334,12 @@ def _looked_at_one(prepared: Prepared, lattice: Lattice, plan: choice.Plan, time
 
 @partial(jax.jit, static_argnums=0)
 def _observed_at(system, lattice, time, theta):
-    return jax.vmap(lambda one: system.observe(one.points(), time, theta))(lattice)
+    return jax.vmap(lambda one: system.observe_sloped(one.points(), time, theta))(lattice)
 
 
 def _linear(weights: Any, h: Sequence[jax.Array]) -> Any:
-    """weights . h, an elementwise sum that is fused with what follows."""
-    return sum((weights[i] * values for i, values in enumerate(h)), start=jnp.zeros(()))
+    """weights . h, an elementwise sum that is fused with what follows; what stands behind h does not count."""
+    return sum((weights[i] * values for i, values in enumerate(h[: len(weights)])), start=jnp.zeros(()))
 
 
 def _log_factor(h: Sequence[jax.Array] | None, factor: Factors) -> Any:
@@ -347,7 +349,7 @@ def _log_factor(h: Sequence[jax.Array] | None, factor: Factors) -> Any:
     value = _linear(factor.after, h) + factor.constant
     if factor.energy is None:
         return value
-    return value - 0.5 * sum(_linear(factor.energy[i], h) * values for i, values in enumerate(h))
+    return value - 0.5 * sum(_linear(factor.energy[i], h) * values for i, values in enumerate(h[: len(factor.after)]))
 
 
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
@@ -407,16 +409,16 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
     carry = (lattice, cells, observed, zero, worst)
 
     def inner(carry, slices):
-        return _part(system, plan, interval.theta, observation, carry, slices, False, False)[0], None
+        return _part(system, plan, interval.theta, observation, width, carry, slices, False, False)[0], None
 
     def at(k):
         return jax.tree.map(lambda a: a[k], slices)
 
-    carry, summary = _part(system, plan, interval.theta, observation, carry, at(0), True, parts == 1)
+    carry, summary = _part(system, plan, interval.theta, observation, width, carry, at(0), True, parts == 1)
     if parts > 2:
         carry, _ = jax.lax.scan(inner, carry, jax.tree.map(lambda a: a[1:-1], slices))
     if parts > 1:
-        carry, summary = _part(system, plan, interval.theta, observation, carry, at(parts - 1), False, True)
+        carry, summary = _part(system, plan, interval.theta, observation, width, carry, at(parts - 1), False, True)
     lattice, cells, observed, log_mass, worst = carry
     # A feature that the first look, over everything that could be reached, may have stepped over counts as unresolved.
     resolution = cells * jnp.minimum(1.0, 4.0 / worst.first_look)
@@ -444,24 +446,35 @@ class _Worst(NamedTuple):
     room: jax.Array
 
 
-def _part(system, plan, theta, observation, carry, slices, first: bool, last: bool):
-    """One part of an interval; the halves of the observation's factor stand at the `first` and the `last`."""
+def _part(system, plan, theta, observation, width, carry, slices, first: bool, last: bool):
+    """One part of an interval; the halves of the observation's factor stand at the `first` and the `last`.
+
+    `width` is the variance by which the whole interval spreads one state.
+    """
     lattice, cells, observed, log_mass, worst = carry
     flow, start, stop = slices
     still = jax.lax.stop_gradient  # of health nothing is differentiated
     # Readings that act as rates leave nothing to multiply with at the end.
+    width = jnp.sum(interval.flow.spread[:, 0, 0])
     needs_h = last and (system.halves or not system.rates or observation.energy is not None)
 
     def observe(x):
-        return system.observe(x, stop, theta) if needs_h else None
+        if not needs_h:
+            return None
+        return system.observe_sloped(x, stop, theta) if system.halves else system.observe(x, stop, theta)
+
+    def half(logs, h):
+        """Half of the observation's factor; with one state, made up for the first error of the splitting."""
+        slopes = h[len(h) // 2 :] if system.halves and system.n == 1 else None
+        return logs if slopes is None else made_up(logs, width * _linear(observation.before, slopes) ** 2)
 
     def factor(x, h):
         value = _potential(system, x, stop, theta) if system.gauged else jnp.zeros(x.shape[:-1])
-        return value + _log_factor(h, observation) if last else value
+        return value + half(_log_factor(h, observation), h) if last else value
 
     before = jnp.zeros(lattice.sizes)
     if first and observed is not None:
-        before = _linear(observation.before, observed)
+        before = half(_linear(observation.before, observed), observed)
     exponent = worst.exponent
     if system.gauged:
         before = before - _potential(system, lattice.points(), start, theta)
@@ -533,7 +546,7 @@ METHOD = Method(
     name="limited-direct",
     source="Chen, Luo and Yau 2017, Theorems 1-3, corrected; x-coordinate form",
     exactness="exact between observations for every h in the class; for increments of nonlinear h, second order in the "
-    "interval for smooth paths (Strang splitting)",
+    "interval for smooth paths (Strang's splitting, with one state its first error undone)",
     theorem=theorem,
     options={"kernel": "flow", "splitting": "strang", "order": None, "memory": None},
     prepare=prepare,
