@@ -15,6 +15,7 @@ import numpy as np
 
 from zakai import _float64  # noqa: F401
 from zakai.filters._run import RUN, Run, run_steps, size_of, taken
+from zakai.filters.observations import Data
 
 LANES = 32  # records that are filtered by one scan, at most: one that asks for a large lattice slows no more than these
 LANE_BYTES = 256 * 2**20  # what they give in one run of steps, at most
@@ -100,7 +101,7 @@ def _together(runs: list[Run], lanes: int, count: _Count) -> None:
     alone: list[Run] = []
     for rows in setting.chunks(runs[0].data, runs[0].done, lanes):
         prepared = setting.prepared(runs[0].data.part(rows))
-        given = [method.observations(prepared, run.data.part(rows)) for run in runs]
+        given = _observations(method, prepared, [run.data.part(rows) for run in runs])
         while runs and runs[0].done < rows.stop:
             left = slice(runs[0].done - rows.start, rows.stop - rows.start)
             fill = lanes - len(runs)
@@ -124,6 +125,14 @@ def _together(runs: list[Run], lanes: int, count: _Count) -> None:
             break
     for run in alone:
         run.all(count.of_one(run.done))
+
+
+def _observations(method: Any, prepared: Any, data: Sequence[Data]) -> list[Any]:
+    """What `step` is given for records with readings at the same times: all but the values is the same for all of them."""
+    if method.rule is None:
+        return [method.observations(prepared, one) for one in data]
+    rule = method.rule(prepared, data[0])
+    return [rule(one.filled) for one in data]
 
 
 class _Adapt:
