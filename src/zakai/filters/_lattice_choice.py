@@ -33,6 +33,7 @@ JOINT = 1.16  # standard deviation, in cells, from which the error of a sum is b
 ROOM = 64.0  # the longest rows of a slanted lattice, in sizes of an axis
 BASE = {1: 128, 2: 64, 3: 48}
 MOST = {1: 8192, 2: 1024, 3: 256}
+STILL_ROOM = 12  # cells to each side of a window that is moved every few steps only
 FINE = {1: 2.0, 2: 2.0, 3: 1.2}  # by how much the first lattice is finer than it need be
 
 
@@ -46,7 +47,7 @@ class Plan:
 
     `banded` steps keep a window of `sizes` that moves along; the others choose a lattice of `sizes` each time. `window` and
     `cells` say how generous the banded window and its cell are, `run` how many steps it is for, `room` the length of the
-    rows of a lattice that is slanted against the kernel.
+    rows of a lattice that is slanted against the kernel. A banded window that is `still` has the same cells throughout the run.
     """
 
     banded: bool
@@ -59,6 +60,7 @@ class Plan:
     cells: float = CELLS
     run: int = 256
     room: float = 2.0
+    still: bool = False
 
     @property
     def needed(self) -> float:
@@ -252,22 +254,33 @@ def _search(model, log_prior, axes):
 
 
 def adapted(
-    model: Model, lattice: Lattice, plan: Plan, spreads: np.ndarray, maps: np.ndarray, info: Any, budget: int
+    model: Model,
+    lattice: Lattice,
+    plan: Plan,
+    spreads: np.ndarray,
+    maps: np.ndarray,
+    info: Any,
+    budget: int,
+    still: bool = False,
 ) -> tuple[Lattice | None, Plan | None, np.ndarray]:
     """A plan for a run of intervals of several records, their lattices if they change, and how these were cut out (records, 2).
 
     The arrays of `lattice` and `info` have a leading axis of records.  The kernels have covariances `spreads` and move by `maps`
     (K, parts, n, n).  With the `info` of a try: a better plan, or None where the try was good or nothing better can be had.
+    With `still` the first try is one with a window that stands still, where there is a window.
 
     Raises InputError if a lattice needs more than `budget` bytes.
     """
     records = len(lattice.centre)
     same = np.tile(SAME, (records, 1))
     if info is not None:
-        better = None if np.all(healthy(info, plan)) else _more(plan, info)
+        more = replace(plan, still=False) if plan.still else _more(plan, info)
+        better = None if np.all(healthy(info, plan)) else more
         if better is None:
             return None, None, same
         plan = better
+    else:
+        plan = replace(plan, still=still)
     one_line = model.n == 1 and not plan.angles and maps.shape[1] == 1
     if one_line and lattice.log_values[0].size > 1:
 
@@ -294,7 +307,7 @@ def adapted(
     reach = REACH * angle / (2 * np.pi)
     images = max(0, int(np.ceil(reach - 0.5))) if plan.angles else 0
     check_memory(model, sizes, plan.room, records, budget)
-    return None, replace(plan, banded=False, sizes=sizes, images=images, run=run), same
+    return None, replace(plan, banded=False, sizes=sizes, images=images, run=run, still=False), same
 
 
 def check_memory(model: Model, sizes: tuple[int, ...], room: float, records: int, budget: int) -> None:
@@ -371,16 +384,20 @@ def _banded(
     logs = lattice.log_values
     count = logs.shape[1]
     cell = np.abs(lattice.basis[:, 0, 0])
-    growth = np.concatenate([[1.0], np.cumprod(maps)])[: len(deviation)] / deviation
+    # A window that moves along grows with the flow; a kernel between points that stand still has the variance map Sigma.
+    along = np.concatenate([[1.0], np.cumprod(maps)])[: len(deviation)]
+    growth = (1 / np.sqrt(maps) if plan.still else along) / deviation
     widest = np.minimum(COARSEST / growth.max(), features(logs)[:, 0] * cell / plan.cells)
     new_cell = np.where((0.8 * widest <= cell) & (cell <= widest), cell, 0.97 * widest)
     taps = 16
     while taps * new_cell.min() * growth.min() < REACH:
         taps *= 2
+    if plan.still:
+        taps = 4 * int(np.ceil(REACH / (4 * new_cell.min() * growth.min())))
     used = logs > _top(logs) + np.log(0.1 * EDGE)
     first, last = used.argmax(axis=1), count - 1 - used[:, ::-1].argmax(axis=1)
     span = (last - first + 1) * cell
-    size = rounded_up(plan.window * (span / new_cell).max() + 8)
+    size = rounded_up(plan.window * (span / new_cell).max() + 8 + (2 * STILL_ROOM if plan.still else 0))
     if plan.banded and plan.sizes[0] >= size >= 0.6 * plan.sizes[0]:
         size = plan.sizes[0]
     pairs = max(BASE[1], rounded_up(span.max() / (COARSEST * deviation.min())))

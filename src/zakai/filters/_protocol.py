@@ -75,6 +75,10 @@ class Method:
     of the step that gave them that `adapt` would find nothing to better.  None: `healthy` says it, or `adapt` is asked.  A class
     of states may name in `LASTING` (a tuple) its fields that no step changes, only `adapt`: they are not copied with every step.
 
+    Runs.  `at_once` is the same method for a run whose steps need not be taken one by one again, as when they are differentiated.
+    A state that its `adapt` gives may have `together(state, intervals, observations, keep)`, traced by JAX, which gives what a
+    scan of `step` gives: the last state, and of every step its Info and, with `keep`, what is kept of its state.
+
     Early ends.  `healthy(info)` says, traced by JAX, whether steps kept their bounds.  A run then ends before the first that did
     not, and where it took enough steps by then, the next run begins there: no step is taken twice.
     """
@@ -98,4 +102,5 @@ class Method:
     healthy: Callable[[Info], Any] | None = None
     rule: Callable[..., Any] | None = None
     fits: Callable[[Any, Info], Any] | None = None
+    at_once: Method | None = None
     bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)

@@ -76,6 +76,10 @@ def scan(step, healthy, state, intervals, observations, keep, limit):
     `limit` is how many steps count at most and, where `healthy` is given, whether the run ends before the first that is not well.
     """
 
+    together = getattr(state, "together", None)
+    if together is not None:
+        return *together(state, intervals, observations, keep), limit[0]
+
     def one(carry, slices):
         new, info = step(slices[0], carry, slices[1])
         return new, (info, getattr(new, "kept", new) if keep else None)
@@ -228,6 +232,8 @@ class Run:
     def all(self, progress: Callable[[int, int], None] | None) -> None:
         """Filter the whole record, chunk by chunk."""
         method, count = self.setting.method, len(self.record.times)
+        if self.pieces is None:
+            method = method.at_once or method
         if self.state is None:
             self.start()
         # A run that goes on from where it was left finds the same chunks.

@@ -38,6 +38,8 @@ class System:
         self.rates = rates and self.affine
         self.inputs = 1 + (model.m if self.rates else 0)
         self.bare = yau.bare is not None
+        # An h without time is the same at every reading.
+        self.steady = not model.observation.has(model.t)
         # Without a gauge nothing need be evaluated.
         self.gauged = yau.form.potential != 0
         # Whether a half of the observation's factor stands at the start of an interval.
@@ -69,8 +71,6 @@ class System:
         self.varying = any(model.t in entry.free_symbols for entry in used)
         self._numbers = jax_function(flat, model)
 
-    def coefficients(self, t: jax.Array, argument: tuple[jax.Array, jax.Array]) -> Coefficients:
-        """The coefficients of the flow at time t; `argument` is (theta, inside), the coordinates that act inside."""
     def observe_sloped(self, x: Any, t: Any, theta: Any) -> list[jax.Array]:
         """h at points (..., n), an array for each coordinate; with one state the slopes of h behind them."""
         if self.n > 1:
@@ -78,6 +78,8 @@ class System:
         h, slopes = jax.jvp(lambda x: list(self.observe(x, t, theta)), (x,), (jnp.ones_like(x),))
         return [*h, *slopes]
 
+    def coefficients(self, t: jax.Array, argument: tuple[jax.Array, jax.Array]) -> Coefficients:
+        """The coefficients of the flow at time t; `argument` is (theta, inside), the coordinates that act inside."""
         theta, inside = argument
         numbers = self._numbers(jnp.zeros(self.n), t, theta)
         ends = np.cumsum([rows * columns for rows, columns in self._shapes])[:-1]

@@ -96,7 +96,7 @@ def _together(runs: list[Run], lanes: int, count: _Count) -> None:
     if lanes == 1:
         return runs[0].all(count.of_one())
     setting, total = runs[0].setting, len(runs[0].record.times)
-    method = setting.method
+    method = setting.method.at_once or setting.method
     states = [run.state for run in runs]
     alone: list[Run] = []
     for rows in setting.chunks(runs[0].data, runs[0].done, lanes):
@@ -179,6 +179,11 @@ def _lane(tree: Any, lane: int, axis: int) -> Any:
 
 @partial(jax.jit, static_argnums=(0, 1, 5))
 def _scan(step, healthy, states, intervals, observations, keep, limit):
+    together = getattr(states, "together", None)
+    if together is not None:
+        by_record = jax.vmap(lambda *of_one: together(*of_one, keep), (0, None, 1), (0, 1))
+        return *by_record(states, intervals, observations), limit[0]
+
     def one_record(interval, state, observation):
         new, info = step(interval, state, observation)
         return new, (info, getattr(new, "kept", new) if keep else None)

@@ -11,7 +11,7 @@ Samples: exact for every h.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -26,10 +26,11 @@ from zakai.algebra.theorems import yau_system
 from zakai.densities import GridDensity
 from zakai.errors import InputError
 from zakai.filters import _lattice_choice as choice
+from zakai.filters import _still_window
 from zakai.filters._formulas import formulas
 from zakai.filters._protocol import Info, Method, Schedule
-from zakai.filters._yau_flow import FlowPlan, System, plan_flows, planned_flows, system_of
 from zakai.filters._splitting import made_up
+from zakai.filters._yau_flow import FlowPlan, System, plan_flows, planned_flows, system_of
 from zakai.filters.observations import Data, FactorRule, Factors, factor_rule
 from zakai.kolmogorov import lattice as lat
 from zakai.kolmogorov.flow import Flow
@@ -73,6 +74,11 @@ class State:
     def run_length(self) -> int:
         """How many steps to take before the lattice is looked at again."""
         return self.plan.run
+
+    @property
+    def together(self) -> Callable[..., Any] | None:
+        """What takes all steps of a run together, where they can be."""
+        return _steps if self.plan.still else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,20 +358,25 @@ def _log_factor(h: Sequence[jax.Array] | None, factor: Factors) -> Any:
     return value - 0.5 * sum(_linear(factor.energy[i], h) * values for i, values in enumerate(h[: len(factor.after)]))
 
 
-def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
+def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None, still: bool = False) -> State | None:
     """The state to begin the intervals `rows` with: the window, the cell and the way to convolve."""
     one = jax.tree.map(lambda a: np.asarray(a)[None], (state, info))
-    many = adapt_many(prepared, one[0], rows, one[1])
+    many = adapt_many(prepared, one[0], rows, one[1], still)
     # To take a part of JAX's arrays takes longer than all the rest.
     return None if many is None else jax.tree.map(lambda a: np.asarray(a)[0], many)
 
 
-def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None) -> State | None:
-    """`adapt` of states with a leading axis of records: one plan for all, the largest that any of them needs."""
+def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None, still: bool = False) -> State | None:
+    """`adapt` of states with a leading axis of records: one plan for all, the largest that any of them needs.
+
+    With `still` the window stands still where it can: one kernel for every interval, factors at both ends, an h without time.
+    """
+    system = prepared.system
+    still = still and system.halves and system.steady and not system.gauged and bool(prepared.schedule.inside[rows].all())
     flow = prepared.intervals.flow
     own = jax.tree.map(np.asarray, states.lattice)
     lattice, plan, cut = choice.adapted(
-        prepared.model, own, states.plan, flow.spread[rows], flow.map[rows], info, prepared.memory
+        prepared.model, own, states.plan, flow.spread[rows], flow.map[rows], info, prepared.memory, still
     )
     if plan is None:
         return None
@@ -379,6 +390,40 @@ def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None
 def _fits(state: State, info: Info) -> Any:
     """Whether a step kept every bound that `adapt` looks at."""
     return choice.healthy(info, state.plan)
+
+
+def _steps(state: State, intervals: Interval, observation: Factors, keep: bool) -> tuple[State, tuple[Info, Any]]:
+    """The steps of a run on a window that stands still; with `keep` the states of all."""
+    system, plan, lattice = intervals.system, state.plan, state.lattice
+
+    def observe(x: jax.Array) -> Any:
+        return system.observe_sloped(x, intervals.start[0], intervals.theta[0])
+
+    flow = jax.tree.map(lambda a: a[:, 0], intervals.flow)
+    last, told = _still_window.moved(lattice, flow, observation, observe, made_up, plan.taps, keep)
+    mass, first, second, outer = told.sums.T
+    cell, count = lattice.basis[0, 0], len(mass)
+    first, second = cell * first / mass, cell**2 * second / mass
+    centres = lattice.centre + cell * told.place[:, None]
+    cells, joint, depth = (jnp.repeat(a, count // len(a)) for a in (told.cells, told.joint, told.depth))
+    health = {
+        "edge_mass": outer / mass,
+        "resolution": cells,
+        "quadrature_error": 2 * jnp.exp(-2 * jnp.pi**2 * joint**2),
+        "exponent": jnp.zeros(count),
+        "surprise": depth / _HELD_CUT,
+    }
+    variance = second - first**2
+    log_mass = jnp.log(mass) + observation.constant
+    info = Info(log_mass, centres + first[:, None], variance[:, None, None], health, jnp.ones((count, 2)))
+
+    def laid(values: jax.Array, mass: jax.Array, centre: jax.Array, cells: jax.Array) -> State:
+        moved = Lattice(lat.log(values) - jnp.log(cell * mass), centre, lattice.basis)
+        return State(moved, None, cells[None], jnp.zeros(1), state.cut, plan)
+
+    end = laid(last, mass[-1], centres[-1], cells[-1])
+    kept = jax.vmap(laid)(told.values, mass, centres, cells) if keep else None
+    return replace(end, observed=observe(end.lattice.points())), (info, kept)
 
 
 def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State:
@@ -407,6 +452,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
     zero, n = jnp.array(0.0), len(lattice.sizes)
     worst = _Worst(zero, jnp.array(jnp.inf), jnp.ones(n), jnp.zeros(n), zero, jnp.ones(()))
     carry = (lattice, cells, observed, zero, worst)
+    width = jnp.sum(interval.flow.spread[:, 0, 0])
 
     def inner(carry, slices):
         return _part(system, plan, interval.theta, observation, width, carry, slices, False, False)[0], None
@@ -455,7 +501,6 @@ def _part(system, plan, theta, observation, width, carry, slices, first: bool, l
     flow, start, stop = slices
     still = jax.lax.stop_gradient  # of health nothing is differentiated
     # Readings that act as rates leave nothing to multiply with at the end.
-    width = jnp.sum(interval.flow.spread[:, 0, 0])
     needs_h = last and (system.halves or not system.rates or observation.energy is not None)
 
     def observe(x):
@@ -542,7 +587,7 @@ def density(prepared: Prepared, state: State) -> GridDensity:
     )
 
 
-METHOD = Method(
+_STEPWISE = Method(
     name="limited-direct",
     source="Chen, Luo and Yau 2017, Theorems 1-3, corrected; x-coordinate form",
     exactness="exact between observations for every h in the class; for increments of nonlinear h, second order in the "
@@ -567,4 +612,7 @@ METHOD = Method(
         "exponent": (600.0, "largest exponent of the gauge over the window; beyond 700 mass would be lost"),
         "surprise": (1.0, "how far into its tails the observation drives the density, as a share of the tails that were kept"),
     },
+)
+METHOD = replace(
+    _STEPWISE, at_once=replace(_STEPWISE, adapt=partial(adapt, still=True), adapt_many=partial(adapt_many, still=True))
 )

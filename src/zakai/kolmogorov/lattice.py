@@ -241,7 +241,7 @@ def slid(values: jax.Array, shift: jax.Array, fill: float) -> jax.Array:
     return lax.dynamic_slice(padded, (size // 4 + shift,), (size,))
 
 
-def _filtered(values: jax.Array, weights: jax.Array) -> jax.Array:
+def filtered(values: jax.Array, weights: jax.Array) -> jax.Array:
     """sum_j weights[|j|] values[i - j] over |j| <= taps, for `weights` (taps + 1,).
 
     A sum of shifted slices becomes one fused, vectorised loop, for many records at once too, where a convolution of the
@@ -280,7 +280,7 @@ def move_banded(
     variance = flow.spread[0, 0]
     weights = jnp.exp(-0.5 * (jnp.arange(taps + 1) * cell) ** 2 / variance)
     values = jnp.exp(gauged - top)
-    total = _filtered(values, weights)
+    total = filtered(values, weights)
     moved = motion(flow, lattice.centre, inputs)
     offset = cell * _axes((size,))[0]
     spread = log(total)
