@@ -52,6 +52,7 @@ def test_a_run_at_once_gives_the_numbers_of_its_steps(monkeypatch, moved):
         assert not one.warnings and not other.warnings
 
 
+@pytest.mark.slow
 def test_a_drift_that_is_a_constant_and_noise_that_is_not_one_are_in_the_kernel(monkeypatch, moved):
     model = zakai.Model(
         state=["x"], drift=["cos(t) - (1 + t)*x/2"], observation=["x*sin(x)", "x*cos(x)"], observation_kind="increments",
@@ -65,6 +66,7 @@ def test_a_drift_that_is_a_constant_and_noise_that_is_not_one_are_in_the_kernel(
     same(at_once, zakai.filter(model, record, "limited-direct"))
 
 
+@pytest.mark.slow
 def test_mass_that_leaves_the_window_is_followed_step_by_step(monkeypatch, moved):
     model = zakai.Model(
         state=["x"], drift=["100"], observation=["x*sin(x)", "x*cos(x)"], observation_kind="increments",
@@ -87,6 +89,7 @@ def test_where_readings_are_missing_or_h_depends_on_time_steps_are_taken_one_by_
     assert not moved
 
 
+@pytest.mark.slow
 def test_the_first_error_of_the_splitting_is_undone():
     """Readings of a path that runs linearly between two of them, given at finer and finer times, converge to one density."""
     (record,) = increments(SPIRAL, 64)
