@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import zakai
+from zakai.filters import batches
 from zakai.filters._run import Run
 
 
@@ -21,9 +22,9 @@ def test_a_record_that_asks_for_a_larger_lattice_goes_on_by_itself(monkeypatch):
     alone = [zakai.filter(model, record, keep="moments") for record in records]
     left, everything = [], Run.all
 
-    def spied(run, progress):
+    def spied(run, progress, until):
         left.append((run.record, run.done))
-        return everything(run, progress)
+        return everything(run, progress, until)
 
     monkeypatch.setattr(Run, "all", spied)
     told = []
@@ -34,3 +35,30 @@ def test_a_record_that_asks_for_a_larger_lattice_goes_on_by_itself(monkeypatch):
         assert np.allclose(one.mean, other.mean, rtol=0, atol=1e-8)
         assert np.allclose(one.log_likelihood_increments, other.log_likelihood_increments, rtol=0, atol=1e-8)
         assert one.warnings == other.warnings
+
+
+@pytest.mark.slow
+def test_many_records_are_grouped_anew_by_where_their_densities_are(monkeypatch):
+    model = zakai.Model(
+        state=["x"], drift=["cos(x)"], observation=["x**3"], prior={"kind": "gaussian", "mean": [0.0], "cov": [0.2]}
+    )
+    times = 0.005 * np.arange(1, 101)
+    records = [zakai.simulate(model, times, seed=seed)[1] for seed in range(8)]
+    alone = [zakai.filter(model, record, "yau-yau", keep="moments") for record in records]
+    for name, value in {"ROUND": 40, "MANY": 4, "LANES": 4}.items():
+        monkeypatch.setattr(batches, name, value)
+    groups, plain = [], batches._together
+
+    def spied(runs, lanes, count, until):
+        groups.append((until, [float(run.infos[-1].mean[-1, 0]) if run.infos else 0.0 for run in runs]))
+        return plain(runs, lanes, count, until)
+
+    monkeypatch.setattr(batches, "_together", spied)
+    told = []
+    together = zakai.filter(model, records, "yau-yau", keep="moments", progress=lambda done, total: told.append(done))
+    assert sorted({until for until, _ in groups}) == [40, 80, 100]
+    assert all(means == sorted(means) for _, means in groups)
+    assert told[-1] == 8 * len(times) and told == sorted(told)
+    for one, other in zip(alone, together, strict=True):
+        assert np.abs((one.mean - other.mean) / np.sqrt(one.variance)).max() < 1e-4
+        assert abs(one.log_likelihood - other.log_likelihood) < 1e-4 and not other.warnings

@@ -25,12 +25,13 @@ def wells(**keys) -> tuple[zakai.Model, zakai.Model]:
     return zakai.Model(drift=["x - x**3"], **WELL | keys), zakai.Model(drift=["x - x**3 + 1e-30*t"], **WELL | keys)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "keys",
     [
         dict(),
-        pytest.param(dict(observation_kind="samples", observation_noise=[[0.1]]), marks=pytest.mark.slow),
-        pytest.param(dict(observation=["x", "x**2"], observation_noise=[["0.2", "0.1"], ["0.1", "0.3"]]), marks=pytest.mark.slow),
+        dict(observation_kind="samples", observation_noise=[[0.1]]),
+        dict(observation=["x", "x**2"], observation_noise=[["0.2", "0.1"], ["0.1", "0.3"]]),
     ],
     ids=["increments", "samples", "two sensors whose noise is correlated"],
 )

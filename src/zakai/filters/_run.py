@@ -171,9 +171,12 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
     """
     run = getattr(state, "run_length", RUN)
     count = min(run, rows.stop - rows.start)
-    # The short rest of a record is padded to a power of two: few shapes, few compilations.
-    length = run if run <= 64 or 2 * count > run else max(16, 2 ** int(np.ceil(np.log2(count))))
-    length = length if ends or method.healthy is not None else count
+    # Few shapes, few compilations: a run that may end early is as long as any, and the short rest of a record that is taken to
+    # its end is padded to a power of two.
+    length = run
+    if method.healthy is None:
+        short = run > 64 and 2 * count <= run
+        length = (max(16, 2 ** int(np.ceil(np.log2(count)))) if short else run) if ends else count
     part = slice(rows.start, rows.start + count)
     intervals, given = rows_of(prepared.intervals, part, length), rows_of(observations, part, length)
     begin = adapt(prepared, state, part, None) if adapt else state
@@ -229,8 +232,8 @@ class Run:
         self.bytes = 0
         self.done = 0
 
-    def all(self, progress: Callable[[int, int], None] | None) -> None:
-        """Filter the whole record, chunk by chunk."""
+    def all(self, progress: Callable[[int, int], None] | None, until: int | None = None) -> None:
+        """Filter the whole record, or the first `until` of it, chunk by chunk."""
         method, count = self.setting.method, len(self.record.times)
         if self.pieces is None:
             method = method.at_once or method
@@ -238,15 +241,16 @@ class Run:
             self.start()
         # A run that goes on from where it was left finds the same chunks.
         for rows in self.setting.chunks(self.data, int(self.at_start)):
-            if rows.stop <= self.done:
+            stop = rows.stop if until is None else min(rows.stop, until)
+            if stop <= self.done:
                 continue
             data = self.data.part(rows)
             prepared = self.setting.prepared(data)
             observations = method.observations(prepared, data)
             if self.pieces is not None:
                 self.pieces.append(Piece(prepared, data, []))
-            while self.done < rows.stop:
-                left = slice(self.done - rows.start, rows.stop - rows.start)
+            while self.done < stop:
+                left = slice(self.done - rows.start, stop - rows.start)
                 part, begin, self.state, info, kept = run_steps(
                     method, method.adapt, scan, prepared, self.state, observations, left, rows.stop == count, self.keep
                 )

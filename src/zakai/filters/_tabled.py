@@ -27,7 +27,6 @@ from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 
 MOST = 384  # points, beyond which a product with a matrix costs more than a lattice that moves
-MOST_TOGETHER = 192  # the same where many records share it
 FEWEST = 8  # steps that a table is made for
 TERMS = 9  # products of coordinates of h, beyond which a sum over all of them costs more than it saves
 LEVELS = 4  # widths of cells in an octave
@@ -141,7 +140,7 @@ def placed(fields: Field, measures: Extent, plan: Plan) -> tuple[float, float, i
         return centre, cell, size
     middle = 0.5 * (low + high)
     size = window.rounded_up((high - low) / _near(middle, widest, size)[1] * (1 + 1 / PLACES), 1)
-    return (*_near(middle, widest, size), size) if size <= (MOST if len(cells) == 1 else MOST_TOGETHER) else None
+    return (*_near(middle, widest, size), size) if size <= MOST else None
 
 
 def crossed(fields: Field, tables: Tables, theta: np.ndarray, tau: float) -> bool:

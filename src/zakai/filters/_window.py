@@ -110,8 +110,8 @@ class Plan:
 
     @classmethod
     def of(cls, shape: Shape, room: Room) -> Plan:
-        """The plan that was divided into these, of which every record of a batch has the same room."""
-        told = {name: float(np.ravel(np.asarray(part))[0]) for name, part in room._asdict().items()}
+        """The plan that was divided into these; of the records of a batch that which has most room."""
+        told = {name: float(np.max(part)) for name, part in room._asdict().items()}
         counts = {name: int(told[name]) for name in ("run", "splits", "parts")}
         return cls(**{**shape._asdict(), **told, **counts})
 

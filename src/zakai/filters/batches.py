@@ -21,6 +21,8 @@ LANES = 32  # records that are filtered by one scan, at most: one that asks for 
 LANE_BYTES = 256 * 2**20  # what they give in one run of steps, at most
 WORTH_A_CORE = 16  # records
 ENOUGH = 1 / 16  # the share of a run after which a look at all lattices costs less than wider ones
+ROUND = RUN  # observations after which many records are grouped anew
+MANY = 4 * LANES  # records
 FEW_ILL = 0.25  # the share of the records of a scan that may leave it at once for a lattice of their own
 
 
@@ -53,10 +55,12 @@ def filter_all(runs: Sequence[Run], progress: Callable[[int, int], None] | None)
     Groups go to the cores of the machine; the work is in compiled code, which leaves Python to the others.
     """
     count = _Count(progress, sum(len(run.record.times) for run in runs))
-    groups = [group for alike in _alike(runs) for group in _groups(alike)]
-    with ThreadPoolExecutor(min(len(groups), os.cpu_count() or 1)) as pool:
-        for done in [pool.submit(_together, group, size, count) for group, size in groups]:
-            done.result()
+    alike = [_Alike(runs) for runs in _alike(runs)]
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        while left := [records for records in alike if not records.done]:
+            groups = [(*group, records.until()) for records in left for group in records.groups()]
+            for done in [pool.submit(_together, group, size, count, until) for group, size, until in groups]:
+                done.result()
 
 
 def _alike(runs: Sequence[Run]) -> Iterator[list[Run]]:
@@ -69,41 +73,70 @@ def _alike(runs: Sequence[Run]) -> Iterator[list[Run]]:
     yield from found.values()
 
 
-def _groups(runs: list[Run]) -> Iterator[tuple[list[Run], int]]:
-    """What is filtered by one scan, and how many records that scan is made for: groups of one size are compiled once."""
-    method = runs[0].setting.method
-    starts: dict[Hashable, list[Run]] = {}
-    first = None
-    for run in runs:
-        # Without a reading at the start, one prior gives one first state.
-        run.start(first if first and not run.at_start and run.setting.prior is first.setting.prior else None)
-        first = run
-        starts.setdefault(_shape(run.state) if method.adapt is None or method.adapt_many else id(run), []).append(run)
-    for alike in starts.values():
-        n = alike[0].setting.model.n
-        each = RUN * (8 * (n * n + n + 16) + (size_of(alike[0].state) if alike[0].keep else 0))
-        most = max(1, min(LANES, LANE_BYTES // each))
-        parts = max(-(-len(alike) // most), min(os.cpu_count() or 1, len(alike) // WORTH_A_CORE))
-        size = -(-len(alike) // max(1, parts))
-        yield from ((alike[k : k + size], size) for k in range(0, len(alike), size))
+class _Alike:
+    """Records that can be filtered side by side.
+
+    Where a method follows densities with lattices, many records are grouped anew after every `ROUND` observations, so that those
+    whose densities are near each other share a lattice and no more parts of an interval are taken than they need.
+    """
+
+    def __init__(self, runs: list[Run]):
+        self.runs, self.method = runs, runs[0].setting.method
+        self.total = len(runs[0].record.times)
+        first = None
+        for run in runs:
+            # Without a reading at the start, one prior gives one first state.
+            run.start(first if first and not run.at_start and run.setting.prior is first.setting.prior else None)
+            first = run
+        followed = self.method.adapt_many is not None and self.method.healthy is not None
+        self.round = ROUND if followed and len(runs) > MANY else self.total
+
+    @property
+    def done(self) -> bool:
+        return all(run.done == self.total for run in self.runs)
+
+    def until(self) -> int:
+        """Where the next round ends."""
+        return min(self.total, min(run.done for run in self.runs) // self.round * self.round + self.round)
+
+    def groups(self) -> Iterator[tuple[list[Run], int]]:
+        """What is filtered by one scan, and how many records that scan is made for: few sizes, few compilations."""
+        method = self.method
+        starts: dict[Hashable, list[Run]] = {}
+        for run in self.runs:
+            starts.setdefault(_shape(run.state) if method.adapt is None or method.adapt_many else id(run), []).append(run)
+        for alike in starts.values():
+            n = alike[0].setting.model.n
+            each = RUN * (8 * (n * n + n + 16) + (size_of(alike[0].state) if alike[0].keep else 0))
+            most = max(1, min(LANES, LANE_BYTES // each))
+            if len(starts) > 1 and self.round < self.total:
+                size = min(most, 2 ** int(np.ceil(np.log2(len(alike)))))
+            else:
+                parts = max(-(-len(alike) // most), min(os.cpu_count() or 1, len(alike) // WORTH_A_CORE))
+                size = -(-len(alike) // max(1, parts))
+            near = sorted(alike, key=lambda run: run.infos[-1].mean[-1].tolist()) if alike[0].infos else alike
+            yield from ((near[k : k + size], size) for k in range(0, len(near), size))
 
 
-def _together(runs: list[Run], lanes: int, count: _Count) -> None:
-    """Filter a group of records; a scan that is made for more `lanes` repeats the last of them.
+def _together(runs: list[Run], lanes: int, count: _Count, until: int) -> None:
+    """Filter a group of records as far as `until`; a scan that is made for more `lanes` repeats the last of them.
 
     A record that alone asks for a larger lattice leaves the group and goes on by itself.
     """
     if lanes == 1:
-        return runs[0].all(count.of_one())
+        return runs[0].all(count.of_one(runs[0].done), until)
     setting, total = runs[0].setting, len(runs[0].record.times)
     method = setting.method.at_once or setting.method
     states = [run.state for run in runs]
     alone: list[Run] = []
-    for rows in setting.chunks(runs[0].data, runs[0].done, lanes):
+    for rows in setting.chunks(runs[0].data, int(runs[0].at_start), LANES):
+        if rows.stop <= runs[0].done:
+            continue
         prepared = setting.prepared(runs[0].data.part(rows))
         given = _observations(method, prepared, [run.data.part(rows) for run in runs])
-        while runs and runs[0].done < rows.stop:
-            left = slice(runs[0].done - rows.start, rows.stop - rows.start)
+        stop = min(rows.stop, until)
+        while runs and runs[0].done < stop:
+            left = slice(runs[0].done - rows.start, stop - rows.start)
             fill = lanes - len(runs)
             adapt, own = _Adapt(method, len(runs)), _own(states)
             part, begin, ends, info, kept = run_steps(
@@ -121,10 +154,12 @@ def _together(runs: list[Run], lanes: int, count: _Count) -> None:
             well = [lane for lane in range(len(runs)) if lane not in adapt.ill]
             runs, given, states = [runs[i] for i in well], [given[i] for i in well], [_lane(ends, i, 0) for i in well]
             count.add(len(runs) * (part.stop - part.start))
-        if not runs:
+        if not runs or stop == until:
             break
+    for run, state in zip(runs, states, strict=True):
+        run.state = state
     for run in alone:
-        run.all(count.of_one(run.done))
+        run.all(count.of_one(run.done), until)
 
 
 def _observations(method: Any, prepared: Any, data: Sequence[Data]) -> list[Any]:
