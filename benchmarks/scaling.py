@@ -6,8 +6,9 @@ A chain whose states are all coupled, so that it does not fall into blocks, each
 
     dx_i = (-x_i/2 + (x_{i-1} + x_{i+1} - 2 x_i)/5) dt + dv_i,        dy_i = sin(x_i) dt + dw_i
 
-`kalman-bucy` sees the states themselves.  A method is left out for more states than it takes, or than take more than `--patience`
-seconds.  What is compiled is so before a clock starts; figures are medians over the repeats, which all contestants take in turn.
+The exact methods see the states themselves, dy_i = x_i dt + dw_i.  A method is left out for more states than it takes, or than
+take more than `--patience` seconds.  What is compiled is so before a clock starts; figures are medians over the repeats, which
+all contestants take in turn.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 
 import zakai
 
+EXACT = "kalman-bucy", "general-direct", "limited-direct"
 STATES = (1, 2, 3, 4, 6, 8, 12, 16)
 METHODS: dict[str, tuple[str, int, dict[str, Any]]] = {
     "kalman-bucy": ("kalman-bucy", 99, {}),
@@ -64,7 +66,7 @@ def main() -> None:
         for label, (method, most, options) in METHODS.items():
             if n > most or label in tired:
                 continue
-            model = chain(n, method == "kalman-bucy")
+            model = chain(n, method in EXACT)
             record = zakai.simulate(model, times, seed=n)[1]
             begin = time.perf_counter()
             result = zakai.filter(model, record, method, keep="moments", **options)
