@@ -1,8 +1,8 @@
 """A step in one state where nothing but the readings depends on the time: the transition is a matrix that is known beforehand.
 
 Between two looks at the lattice it stands still.  What a step needs of f, G and h is then a table, made once for a lattice, and
-an interval costs a product with a matrix, two factors and one more product for all that is told.  Lattices are taken out of
-few, so that a density that comes back to where it was finds its table.
+an interval costs a product with a matrix, two factors and small products for all that is told.  Lattices are taken out of few,
+so that a density that comes back to where it was finds its table.
 """
 
 from __future__ import annotations
@@ -171,8 +171,7 @@ def likelihood(table: Table, factor: Whole, share: Any) -> Likelihood:
 
 def corrected(b: Likelihood, length: Any) -> jax.Array:
     """b/2 with the first error of the splitting undone: see `splitting.corrected`."""
-    more = length / 48 * b.slope**2
-    return 0.5 * b.log + more / (1.0 + more)
+    return splitting.made_up(0.5 * b.log, 0.25 * length * b.slope**2)
 
 
 class Told(NamedTuple):
