@@ -233,6 +233,14 @@ def test_theorem_6_needs_a_symmetric_matrix():
         zakai.filter(model, zakai.Record([0.1], [[0.0]], "increments"), "hu-yau", choice="theorem-6")
 
 
+def test_theorem_6_refuses_a_prior_that_its_e_to_the_S_makes_flat():
+    # G grad S = x / 2, so that the precision 1/2 of the prior becomes zero.
+    prior = {"kind": "gaussian", "mean": [0.3], "cov": [[2.0]]}
+    model = zakai.Model(state=["x"], drift=["-x/2"], observation=["x"], prior=prior)
+    with pytest.raises(InputError, match="outgrows the prior"):
+        zakai.filter(model, zakai.Record([0.1], [[0.0]], "increments"), "hu-yau", choice="theorem-6")
+
+
 def test_theorem_6_needs_a_G_that_has_an_inverse():
     prior = {"kind": "gaussian", "mean": [0, 0], "cov": [1, 1]}
     model = zakai.Model(

@@ -163,7 +163,10 @@ def _families(prepared: Prepared, prior: Any) -> State:
 
 def check_normalisable(model: Model, covs: Any) -> None:
     """Refuse an e^S that outgrows the prior."""
-    if not isinstance(covs, jax.core.Tracer) and not np.all(np.linalg.eigvalsh(np.asarray(covs)) >= 0):
+    if isinstance(covs, jax.core.Tracer):
+        return
+    # Where e^S outgrows the prior just so, they are infinite.
+    if not (np.isfinite(covs).all() and np.all(np.linalg.eigvalsh(np.asarray(covs)) >= 0)):
         raise InputError(
             f'{model.source}: option choice: with "theorem-6" e^S outgrows the prior, so that e^S v is no density; '
             'take choice="theorem-4" or a narrower prior'
