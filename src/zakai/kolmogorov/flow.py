@@ -334,7 +334,8 @@ def _in_blocks(coefficients, starts, stops, arguments, substeps):
     """`_integrate_all` in blocks of one size, whatever the number of intervals: one compilation, unless there is much to do."""
     slices = (np.asarray(starts, float), np.asarray(stops, float), jax.tree.map(np.asarray, arguments))
     count, block = len(starts), _tried(coefficients, starts, arguments)
-    if substeps > MANY:
+    # One interval alone is all that a system with constant coefficients has, and what a live filter is given.
+    if count == 1 or substeps > MANY:
         block = min(block, 2 ** int(np.ceil(np.log2(count))))
     parts = []
     for first in range(0, count, block):
