@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import zakai
-from zakai.filters import _compiled_step
+from zakai.filters import _affine_system, _compiled_step
 
 WALK = dict(state=["x"], drift=["-x/2"], observation=["2*x"], prior={"kind": "gaussian", "mean": [0.3], "cov": [[2.0]]})
 TIMED = dict(WALK, drift=["cos(t) - x/2"], observation_noise=[["1 + sin(t)/2"]])
@@ -75,6 +75,34 @@ def test_steps_that_repeat_and_then_change_give_what_a_record_gives():
     model = zakai.Model(**TIMED, observation_kind="increments")
     times = np.concatenate([UNIFORM, UNIFORM[-1] + IRREGULAR, UNIFORM[-1] + IRREGULAR[-1] + np.arange(1, 20) / 10])
     compare(model, simulated(model, times), "extended-kalman-bucy", 1e-11)
+
+
+@pytest.mark.parametrize("kind", ["increments", *(pytest.param(k, marks=pytest.mark.slow) for k in ("path", "rates", "samples"))])
+def test_lengths_that_never_repeat_give_what_a_record_gives(kind):
+    model = zakai.Model(**TWO, observation_kind=kind)
+    lengths = np.random.default_rng(4).permutation(np.geomspace(0.04, 6.0, 20))
+    compare(model, simulated(model, np.cumsum(lengths), gaps=[(3, 0), (4, 1), (14, 0), (14, 1)]), "kalman-bucy", 1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("drift", "method", "options"),
+    [("tanh(x)", "benes", {}), ("-x/4", "hu-yau", {"choice": "theorem-6"})],
+)
+def test_lengths_that_never_repeat_are_those_of_every_family(drift, method, options):
+    model = zakai.Model(**dict(WALK, drift=[drift]), observation_kind="increments")
+    lengths = np.random.default_rng(5).permutation(np.geomspace(0.05, 0.3, 8))
+    compare(model, simulated(model, np.cumsum(lengths)), method, 1e-10, **options)
+
+
+def test_an_interval_of_a_new_length_is_decided_upon_once_for_each_power_of_two(monkeypatch):
+    decided, real = [], _affine_system.substeps_for
+    monkeypatch.setattr(_affine_system, "substeps_for", lambda *given, **more: decided.append(given) or real(*given, **more))
+    model = zakai.Model(**TWO, observation_kind="samples")
+    online = zakai.online(model, "kalman-bucy")
+    for time in np.cumsum(np.linspace(0.13, 0.24, 30)):
+        online.update(time, [0.1, 0.2])
+    assert len(decided) == 1
 
 
 def test_a_sample_at_the_start_gives_what_a_record_gives():

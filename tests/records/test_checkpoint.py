@@ -139,6 +139,11 @@ def test_a_filter_goes_on_from_a_checkpoint_with_the_same_bits(tmp_path, keys, m
     check_continuation(tmp_path, model, method, times, 5)
 
 
+def test_a_filter_of_lengths_that_never_repeat_goes_on_with_the_same_bits(tmp_path):
+    times = np.cumsum(np.random.default_rng(6).permutation(np.geomspace(0.1, 6.0, 12)))
+    check_continuation(tmp_path, zakai.Model(**WALK, observation_kind="samples"), "kalman-bucy", times, 3)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("keys", "method", "kind"),

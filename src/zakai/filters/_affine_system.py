@@ -23,9 +23,10 @@ from zakai import _float64  # noqa: F401
 from zakai.algebra.gauges import affine_system
 from zakai.algebra.systems import affine_observation
 from zakai.errors import InputError
+from zakai.filters._compiled_step import jit_small
 from zakai.filters._formulas import Formulas
 from zakai.filters._protocol import Schedule
-from zakai.kolmogorov.flow import MOST_IMPLICIT, Coefficients, Flow, flows, substeps_for
+from zakai.kolmogorov.flow import MOST_IMPLICIT, Coefficients, Flow, flows, integrate_one, substeps_for
 from zakai.kolmogorov.linear_solve import inverse
 from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 from zakai.models.compile import jax_function
@@ -146,6 +147,26 @@ class Plan:
         # NumPy arrays where nothing is traced: a run takes many slices of them.
         plain = (lambda a: a) if isinstance(theta, jax.core.Tracer) else np.asarray
         return jax.tree.map(lambda a: plain(a).reshape(len(self.inside), self.parts, *a.shape[1:])[self.which], flow)
+
+    def lasting(self, length: float, theta: np.ndarray) -> Flow:
+        """The flow of one interval of another length, (parts, ...), of a system that does not depend on time.
+
+        What was decided for a longer interval does for a shorter one.
+        """
+        coefficients, inside, steps = self.system.coefficients, self.inside[0], self.substeps.steps
+        found = _flow_of_one()(coefficients, length / self.parts, self.parts, theta, inside, steps)
+        return jax.tree.map(np.asarray, found)
+
+
+@lru_cache(maxsize=1)
+def _flow_of_one() -> Callable[..., Flow]:
+    """The compiled flow of `parts` equal pieces of one interval, which all have the same where nothing depends on time."""
+
+    def flow(coefficients: Any, length: Any, parts: int, theta: Any, inside: Any, substeps: Any) -> Flow:
+        one = integrate_one(coefficients, 0.0, length, (theta, inside), substeps)
+        return jax.tree.map(lambda a: jnp.broadcast_to(a, (parts, *a.shape)), one)
+
+    return jit_small(flow, static_argnums=(0, 2))
 
 
 def _distinct(schedule: Schedule, varying: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,7 @@
 """What a live filter knows of the intervals before their readings come.
 
-Where nothing depends on time an interval is known by its length, and prepared once.  Where something does, intervals are prepared
+Where nothing depends on time an interval is known by its length, and prepared once; lengths that never repeat are cheap for
+methods that have `lasting`.  Where something does, intervals are prepared
 many at once as soon as their steps repeat, and one by one where they do not.  What is prepared depends on nothing but its key, so
 that a filter that is started again from a checkpoint finds the same numbers.
 """
@@ -16,7 +17,7 @@ import numpy as np
 
 from zakai import _float64  # noqa: F401
 from zakai.errors import InputError
-from zakai.filters._compiled_step import Layout, packed_rows
+from zakai.filters._compiled_step import Layout, packed, packed_rows
 from zakai.filters._run import Setting
 from zakai.filters.observations import Data
 from zakai.models.checks import check_noise_at, check_noise_within
@@ -164,7 +165,7 @@ class Ahead:
             return self.chunk
         block = self.kept.get(key)
         if block is None:
-            block = self.kept[key] = self._made(key)
+            block = self.kept[key] = self._shortened(key)
             self.bytes += block.rows.nbytes
             while len(self.kept) > KEPT or (len(self.kept) > 1 and self.bytes > KEPT_BYTES):
                 self.bytes -= self.kept.popitem(last=False)[1].rows.nbytes
@@ -172,6 +173,18 @@ class Ahead:
             self.kept.move_to_end(key)
         self.chunk = block
         return block
+
+    def _shortened(self, key: Key) -> Block:
+        """The block of a length, out of that of the next power of two: all lengths up to it have as many parts and steps."""
+        lasting = self.setting.method.lasting
+        share, exponent = math.frexp(key.step)
+        # What is read over another time than the interval would be longer or shorter with it.
+        if lasting is None or key.elapsed is not None or share == 0.5:
+            return self._made(key)
+        like = self._remembered(key._replace(step=math.ldexp(1.0, exponent)))
+        interval, rule = like.layout.unpacked(like.rows[0, self.setting.model.m :])
+        row = packed(lasting(like.prepared, interval, rule, key.step))
+        return like._replace(key=key, rows=np.append(np.zeros(self.setting.model.m), row)[None])
 
     def _made(self, key: Key, ends: tuple[float, float] | None = None, values: Any = None) -> Block:
         """What is prepared for a key, with the very ends of a single interval where they matter."""

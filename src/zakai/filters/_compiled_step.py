@@ -170,6 +170,11 @@ def _known(options: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
     return dict(options)
 
 
+def jit_small(function: Callable[..., Any], static_argnums: tuple[int, ...] = ()) -> Callable[..., Any]:
+    """`jax.jit` for what takes microseconds."""
+    return jax.jit(function, static_argnums=static_argnums, compiler_options=_known(ONE_THREAD))
+
+
 @lru_cache(maxsize=128)
 def _compiled(step, fits, healthy, rigid: bool, state: Layout, inputs: Layout, values: int) -> Step:
     def stepped(vector: Any, given: Any, lasting: Any) -> tuple[Any, Info]:
@@ -187,5 +192,4 @@ def _compiled(step, fits, healthy, rigid: bool, state: Layout, inputs: Layout, v
     lasting = tuple(np.zeros(*of[:2]) for of in zip(*state[1:], strict=True) if of[2])
     new, info = jax.eval_shape(stepped, np.zeros(state.size), np.zeros(values + inputs.size), lasting)
     after = Layout.of(new)
-    call = jax.jit(one, compiler_options=_known(ONE_THREAD))
-    return Step(call, state, state if after == state else after, Layout.of(info), after.size)
+    return Step(jit_small(one), state, state if after == state else after, Layout.of(info), after.size)

@@ -142,6 +142,13 @@ def rule(prepared: Prepared, data: Data) -> FactorRule:
     )
 
 
+def lasting(prepared: Prepared, interval: Interval, rule: FactorRule, length: float) -> tuple[Interval, FactorRule]:
+    """The only interval that was prepared, and the rule of its readings, for a length that is no greater."""
+    flow = prepared.plan.lasting(length, prepared.theta)
+    spans = np.where(np.isfinite(rule.spans), length, np.inf)
+    return replace(interval, flow=flow, stop=np.asarray(length)), rule._replace(spans=spans)
+
+
 def init(prepared: Prepared, prior: Any) -> State:
     """The prior as families of Gaussians."""
     state, start, theta = _families(prepared, prior), prepared.model.start, prepared.theta

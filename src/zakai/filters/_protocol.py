@@ -74,6 +74,8 @@ class Method:
     rule(prepared, data)(data.filled).  None: `observations` is asked for every reading.  `fits(state, info)`, traced by JAX, says
     of the step that gave them that `adapt` would find nothing to better.  None: `healthy` says it, or `adapt` is asked.  A class
     of states may name in `LASTING` (a tuple) its fields that no step changes, only `adapt`: they are not copied with every step.
+    Where nothing depends on time, `lasting(prepared, interval, rule, length)` makes of the only interval of a Prepared, and
+    of its rule, those of a shorter one.  None: that is prepared like any other.
 
     Runs.  `at_once` is the same method for a run whose steps need not be taken one by one again, as when they are differentiated.
     A state that its `adapt` gives may have `together(state, intervals, observations, keep)`, traced by JAX, which gives what a
@@ -101,6 +103,7 @@ class Method:
     adapt_many: Callable[..., Any] | None = None
     healthy: Callable[[Info], Any] | None = None
     rule: Callable[..., Any] | None = None
+    lasting: Callable[..., tuple[Any, Any]] | None = None
     fits: Callable[[Any, Info], Any] | None = None
     at_once: Method | None = None
     bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)

@@ -24,6 +24,7 @@ METHOD = Method(
     correct=families.correct,
     observations=families.observations,
     rule=families.rule,
+    lasting=families.lasting,
     step=families.step,
     density=families.density,
     with_parameters=families.with_parameters,

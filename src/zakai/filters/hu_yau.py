@@ -142,6 +142,7 @@ METHOD = Method(
     correct=_correct,
     observations=_by_form("observations"),
     rule=_by_form("rule"),
+    lasting=families.lasting,  # a live filter has no other form
     step=_step,
     density=_by_form("density"),
     with_parameters=_by_form("with_parameters"),

@@ -294,7 +294,9 @@ def integrate_explicitly(
     return _flow(*jax.lax.fori_loop(0, substeps, step, zero))
 
 
-def _integrate_one(coefficients, start, stop, argument, substeps):
+def integrate_one(coefficients, start, stop, argument, substeps) -> Flow:
+    """The flow over one interval in `substeps` equal steps, by the method that is the cheaper one; pure."""
+
     def at(t):
         return coefficients(t, argument)
 
@@ -305,7 +307,7 @@ def _integrate_one(coefficients, start, stop, argument, substeps):
 
 def _integrate_all(coefficients, starts, stops, arguments, substeps):
     def one(slices):
-        return _integrate_one(coefficients, *slices, substeps)
+        return integrate_one(coefficients, *slices, substeps)
 
     head = jax.tree.map(lambda a: a[0], (starts, stops, arguments))
     n = jax.eval_shape(one, head).lift.shape[0]
