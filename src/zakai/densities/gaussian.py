@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.special import logsumexp, ndtr
 
 from zakai.densities._density import as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 
@@ -42,6 +40,10 @@ class GaussianMixture:
         return np.concatenate(parts or [np.zeros(0)]).reshape(x.shape[:-1])
 
     def _log_density(self, points: np.ndarray) -> np.ndarray:
+        # A live filter can do without, and would wait for it.
+        from scipy.linalg import solve_triangular
+        from scipy.special import logsumexp
+
         logs, signs = [], []
         for rows in self._shared():
             cov, means, weights = self.covs[rows.start], self.means[rows], self.weights[rows]
@@ -111,6 +113,8 @@ class GaussianMixture:
         return np.where(self.periodic, wrap(x), x)
 
     def quantile(self, q: Sequence[float]) -> np.ndarray:
+        from scipy.special import ndtr
+
         wanted = probabilities(q)
         deviations = np.sqrt(np.diagonal(self.covs, axis1=1, axis2=2))
         centre = self.mean()

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from zakai.densities._density import as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 
@@ -127,6 +126,8 @@ class GridDensity:
         logs[high] = np.log(total[high]) + top
         floor = top - 700.0
         if not high.all():
+            from scipy.ndimage import map_coordinates
+
             modes = ["grid-wrap" if closed else "nearest" for closed in self._closed]
             at = (index[~high] + shape // 2).T
             logs[~high] = map_coordinates(np.maximum(self.log_values, floor), at, order=1, mode=modes)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sympy
-from scipy.special import erf
 
 from zakai.models._program import Program, operations
 
@@ -15,7 +14,16 @@ if TYPE_CHECKING:
     from zakai.models.model import Model
 
 NumericFunction = Callable[..., np.ndarray]
-_NUMPY = operations(np, erf)
+
+
+def _erf(x: Any) -> Any:
+    # Few models have one, and every command would wait for SciPy.
+    from scipy.special import erf
+
+    return erf(x)
+
+
+_NUMPY = operations(np, _erf)
 
 
 def flattened(expressions: Any, shape: Sequence[int] | None = None) -> tuple[list[sympy.Expr], tuple[int, ...]]:
