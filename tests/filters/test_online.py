@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import zakai
-from zakai.filters import _affine_system, _compiled_step
+from zakai.filters import _affine_system
+from zakai.models import compile
 
 WALK = dict(state=["x"], drift=["-x/2"], observation=["2*x"], prior={"kind": "gaussian", "mean": [0.3], "cov": [[2.0]]})
 TIMED = dict(WALK, drift=["cos(t) - x/2"], observation_noise=[["1 + sin(t)/2"]])
@@ -174,9 +175,9 @@ def test_a_gap_of_any_length_is_filtered():
 
 
 def test_a_compiler_that_does_not_know_an_option_is_not_given_it(monkeypatch):
-    assert _compiled_step._known(_compiled_step.ONE_THREAD) == dict(_compiled_step.ONE_THREAD)
-    monkeypatch.setattr(_compiled_step, "ONE_THREAD", (("xla_cpu_of_another_version", True),))
-    assert _compiled_step._known(_compiled_step.ONE_THREAD) == {}
+    assert compile._known(compile.ONE_THREAD) == dict(compile.ONE_THREAD)
+    monkeypatch.setattr(compile, "ONE_THREAD", (("xla_cpu_of_another_version", True),))
+    assert compile._known(compile.ONE_THREAD) == {}
     model = zakai.Model(**WALK, observation_kind="rates")  # which no other test here has compiled
     compare(model, simulated(model, UNIFORM), "extended-kalman-bucy")
 

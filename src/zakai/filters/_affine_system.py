@@ -23,10 +23,9 @@ from zakai import _float64  # noqa: F401
 from zakai.algebra.gauges import affine_system
 from zakai.algebra.systems import affine_observation
 from zakai.errors import InputError
-from zakai.filters._compiled_step import jit_small
 from zakai.filters._formulas import Formulas
 from zakai.filters._protocol import Schedule
-from zakai.kolmogorov.flow import MOST_IMPLICIT, Coefficients, Flow, flows, integrate_one, substeps_for
+from zakai.kolmogorov.flow import MOST_IMPLICIT, Coefficients, Flow, flows, substeps_for
 from zakai.kolmogorov.linear_solve import inverse
 from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 from zakai.models.compile import jax_function
@@ -129,9 +128,11 @@ class Plan:
         self.which, first = _distinct(schedule, system.varying)
         self.inside = schedule.inside[first].astype(float)
         self.parts = _parts(system, model, starts[first], stops[first], self.inside)
-        edges = starts[first, None] + (stops - starts)[first, None] * np.arange(self.parts + 1) / self.parts
+        # Where nothing depends on time all parts of an interval are alike.
+        self.pieces = self.parts if system.varying else 1
+        edges = starts[first, None] + (stops - starts)[first, None] * np.arange(self.pieces + 1) / self.parts
         self.starts, self.stops = edges[:, :-1].ravel(), edges[:, 1:].ravel()
-        self.repeated = np.repeat(self.inside, self.parts, axis=0)
+        self.repeated = np.repeat(self.inside, self.pieces, axis=0)
         argument = self._argument(model.theta())
         self.substeps = substeps_for(system.coefficients, self.starts, self.stops, argument, varying=system.varying)
 
@@ -145,28 +146,23 @@ class Plan:
             self.system.coefficients, self.starts, self.stops, self._argument(theta), substeps=self.substeps.steps
         )
         # NumPy arrays where nothing is traced: a run takes many slices of them.
-        plain = (lambda a: a) if isinstance(theta, jax.core.Tracer) else np.asarray
-        return jax.tree.map(lambda a: plain(a).reshape(len(self.inside), self.parts, *a.shape[1:])[self.which], flow)
+        xp = jnp if isinstance(theta, jax.core.Tracer) else np
+        count = len(self.inside)
+
+        def arranged(array: Any) -> Any:
+            pieces = xp.reshape(xp.asarray(array), (count, self.pieces, *array.shape[1:]))
+            return xp.broadcast_to(pieces, (count, self.parts, *array.shape[1:]))[self.which]
+
+        return jax.tree.map(arranged, flow)
 
     def lasting(self, length: float, theta: np.ndarray) -> Flow:
         """The flow of one interval of another length, (parts, ...), of a system that does not depend on time.
 
         What was decided for a longer interval does for a shorter one.
         """
-        coefficients, inside, steps = self.system.coefficients, self.inside[0], self.substeps.steps
-        found = _flow_of_one()(coefficients, length / self.parts, self.parts, theta, inside, steps)
-        return jax.tree.map(np.asarray, found)
-
-
-@lru_cache(maxsize=1)
-def _flow_of_one() -> Callable[..., Flow]:
-    """The compiled flow of `parts` equal pieces of one interval, which all have the same where nothing depends on time."""
-
-    def flow(coefficients: Any, length: Any, parts: int, theta: Any, inside: Any, substeps: Any) -> Flow:
-        one = integrate_one(coefficients, 0.0, length, (theta, inside), substeps)
-        return jax.tree.map(lambda a: jnp.broadcast_to(a, (parts, *a.shape)), one)
-
-    return jit_small(flow, static_argnums=(0, 2))
+        piece, argument = np.array([length / self.parts]), (theta[None], self.inside)
+        flow = flows(self.system.coefficients, np.zeros(1), piece, argument, substeps=self.substeps.steps)
+        return jax.tree.map(lambda a: np.broadcast_to(a[0], (self.parts, *a.shape[1:])), flow)
 
 
 def _distinct(schedule: Schedule, varying: bool) -> tuple[np.ndarray, np.ndarray]:

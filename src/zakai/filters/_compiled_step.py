@@ -19,6 +19,7 @@ import numpy as np
 
 from zakai import _float64  # noqa: F401
 from zakai.filters._protocol import Info, Method
+from zakai.models.compile import jit_small
 
 
 class Layout(NamedTuple):
@@ -154,35 +155,14 @@ def compiled(method: Method, state: Layout, inputs: Layout, values: int) -> Step
     return _compiled(method.step, method.fits, method.healthy, method.adapt is None, state, inputs, values)
 
 
-# To hand a part of so small a step to another thread takes longer than the whole.
-ONE_THREAD = (("xla_cpu_scheduler_type", "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"), ("xla_cpu_multi_thread_eigen", False))
-
-
-@lru_cache(maxsize=2)
-def _known(options: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
-    """These options of the CPU's compiler, or none where it is another's or they are those of another version."""
-    if jax.default_backend() != "cpu":
-        return {}
-    try:
-        jax.jit(lambda x: x, compiler_options=dict(options)).lower(0.0).compile()
-    except jax.errors.JaxRuntimeError:
-        return {}
-    return dict(options)
-
-
-def jit_small(function: Callable[..., Any], static_argnums: tuple[int, ...] = ()) -> Callable[..., Any]:
-    """`jax.jit` for what takes microseconds."""
-    return jax.jit(function, static_argnums=static_argnums, compiler_options=_known(ONE_THREAD))
-
-
 @lru_cache(maxsize=128)
 def _compiled(step, fits, healthy, rigid: bool, state: Layout, inputs: Layout, values: int) -> Step:
-    def stepped(vector: Any, given: Any, lasting: Any) -> tuple[Any, Info]:
-        interval, rule = inputs.unpacked(given[values:])
-        return step(interval, state.unpacked(vector, lasting), rule(given[:values]))
+    layouts: list[Layout] = []
 
     def one(vector: Any, given: Any, lasting: Any) -> Any:
-        new, info = stepped(vector, given, lasting)
+        interval, rule = inputs.unpacked(given[values:])
+        new, info = step(interval, state.unpacked(vector, lasting), rule(given[:values]))
+        layouts[:] = Layout.of(new), Layout.of(info)
         well = jnp.array(rigid) if fits is None and healthy is None else fits(new, info) if fits else healthy(info)
         # With the evidence and the mean all the rest is finite.
         finite = jnp.isfinite(info.log_likelihood_increment + jnp.sum(info.mean))
@@ -190,6 +170,8 @@ def _compiled(step, fits, healthy, rigid: bool, state: Layout, inputs: Layout, v
         return jnp.concatenate([jnp.ravel(leaf).astype(float) for leaf in leaves])
 
     lasting = tuple(np.zeros(*of[:2]) for of in zip(*state[1:], strict=True) if of[2])
-    new, info = jax.eval_shape(stepped, np.zeros(state.size), np.zeros(values + inputs.size), lasting)
-    after = Layout.of(new)
-    return Step(jit_small(one), state, state if after == state else after, Layout.of(info), after.size)
+    call = jit_small(one)
+    # The first call finds it traced.
+    call.eval_shape(np.zeros(state.size), np.zeros(values + inputs.size), lasting)
+    after, info = layouts
+    return Step(call, state, state if after == state else after, info, after.size)

@@ -25,7 +25,7 @@ r.  A rate of observation enters in this way after the flow has been prepared.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -35,6 +35,7 @@ import numpy as np
 from zakai import _float64  # noqa: F401
 from zakai.kolmogorov.linear_solve import solve
 from zakai.models.checks import irregular
+from zakai.models.compile import jit_small
 
 STAGES = 8
 TOLERANCE = 1e-13
@@ -169,16 +170,16 @@ def integrate(
 ) -> Flow:
     """The flow over [start, stop] in `substeps` equal steps of Gauss' collocation method (order 16); pure."""
     length = (stop - start) / substeps
+    n, k = jax.eval_shape(coefficients, start).offset.shape
 
     def add(index, carry):
         deviation, growth, trace = carry
         step, more_growth, more_trace = _one_step(coefficients, start + index * length, length)
         return deviation + step + step @ deviation, growth + more_growth, trace + more_trace
 
-    first = _one_step(coefficients, start, length)
-    deviation, growth, trace = jax.lax.fori_loop(1, substeps, add, first)
-    k = growth.shape[0]
-    n = deviation.shape[0] // 2 - k
+    # From nothing, that the step is traced once.
+    nothing = jnp.zeros((2 * n + 2 * k, 2 * n + 2 * k)), jnp.zeros(k), jnp.zeros(())
+    deviation, growth, trace = jax.lax.fori_loop(0, substeps, add, nothing)
     forced, action = slice(2 * n, 2 * n + k), slice(2 * n + k, None)
     responses = deviation[: 2 * n, forced], deviation[action, :n], deviation[action, forced]
     return _flow(deviation[: 2 * n, : 2 * n], *responses, growth, trace)
@@ -294,9 +295,7 @@ def integrate_explicitly(
     return _flow(*jax.lax.fori_loop(0, substeps, step, zero))
 
 
-def integrate_one(coefficients, start, stop, argument, substeps) -> Flow:
-    """The flow over one interval in `substeps` equal steps, by the method that is the cheaper one; pure."""
-
+def _integrate_one(coefficients, start, stop, argument, substeps):
     def at(t):
         return coefficients(t, argument)
 
@@ -307,18 +306,22 @@ def integrate_one(coefficients, start, stop, argument, substeps) -> Flow:
 
 def _integrate_all(coefficients, starts, stops, arguments, substeps):
     def one(slices):
-        return integrate_one(coefficients, *slices, substeps)
+        return _integrate_one(coefficients, *slices, substeps)
 
-    head = jax.tree.map(lambda a: a[0], (starts, stops, arguments))
-    n = jax.eval_shape(one, head).lift.shape[0]
     # Large matrices fill the processor by themselves; all intervals at once would only fill the memory.
-    together = jax.vmap(one) if n <= MOST_TOGETHER else partial(jax.lax.map, one)
+    together = jax.vmap(one) if _states(coefficients, starts, arguments) <= MOST_TOGETHER else partial(jax.lax.map, one)
     return together((starts, stops, arguments))
 
 
 # With a fixed number of substeps the loop over them can be differentiated; with a variable one it is compiled only once.
 _fixed = partial(jax.jit, static_argnums=(0, 4))(_integrate_all)
 _variable = partial(jax.jit, static_argnums=0)(_integrate_all)
+
+
+@lru_cache(maxsize=1)
+def _alone() -> Callable[..., Flow]:
+    """The compiled flow of one interval by itself: a system with constant coefficients has no other, nor has a live filter."""
+    return jit_small(_integrate_one, static_argnums=0)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -335,9 +338,11 @@ def _at_many(coefficients, times, arguments):
 def _in_blocks(coefficients, starts, stops, arguments, substeps):
     """`_integrate_all` in blocks of one size, whatever the number of intervals: one compilation, unless there is much to do."""
     slices = (np.asarray(starts, float), np.asarray(stops, float), jax.tree.map(np.asarray, arguments))
+    if len(starts) == 1 and _states(coefficients, starts, arguments) <= MOST_TOGETHER:
+        flow = _alone()(coefficients, *jax.tree.map(lambda a: a[0], slices), substeps)
+        return jax.tree.map(lambda a: np.asarray(a)[None], flow)
     count, block = len(starts), _tried(coefficients, starts, arguments)
-    # One interval alone is all that a system with constant coefficients has, and what a live filter is given.
-    if count == 1 or substeps > MANY:
+    if substeps > MANY:
         block = min(block, 2 ** int(np.ceil(np.log2(count))))
     parts = []
     for first in range(0, count, block):
@@ -349,8 +354,12 @@ def _in_blocks(coefficients, starts, stops, arguments, substeps):
 
 def _tried(coefficients, starts, arguments) -> int:
     """How many intervals are tried, and how many are integrated together."""
-    n = jax.eval_shape(coefficients, starts[0], jax.tree.map(lambda a: a[0], arguments)).matrix.shape[0]
-    return 48 if n <= MOST_TOGETHER else 6
+    return 48 if _states(coefficients, starts, arguments) <= MOST_TOGETHER else 6
+
+
+def _states(coefficients, starts, arguments) -> int:
+    """How many states the coefficients are for."""
+    return jax.eval_shape(coefficients, starts[0], jax.tree.map(lambda a: a[0], arguments)).matrix.shape[0]
 
 
 class Substeps(NamedTuple):
@@ -408,7 +417,7 @@ def _fastest(coefficients, starts, stops, arguments) -> tuple[int, float]:
     A step is half of the time in which a coefficient could go through all its values at its greatest speed: that of a short
     pulse is about its width.  Seen are pulses that a few thousand times spread over all intervals do not miss.
     """
-    n = jax.eval_shape(coefficients, starts[0], jax.tree.map(lambda a: a[0], arguments)).matrix.shape[0]
+    n = _states(coefficients, starts, arguments)
     budget = min(PROBES, int(1e6 / (n * n)))
     chosen = np.unique(np.linspace(0, len(starts) - 1, max(1, budget // 4)).astype(int))
     shares = irregular(max(4, budget // len(chosen)))

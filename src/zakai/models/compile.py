@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -22,6 +23,27 @@ if TYPE_CHECKING:
 
 JaxFunction = Callable[[Any, Any, Any], jax.Array]
 _JAX = operations(jnp, jax.scipy.special.erf, sin=_trigonometry.sin, cos=_trigonometry.cos)
+
+
+# To hand a part of something small to another thread takes longer than the whole.
+ONE_THREAD = (("xla_cpu_scheduler_type", "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"), ("xla_cpu_multi_thread_eigen", False))
+
+
+@lru_cache(maxsize=2)
+def _known(options: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
+    """These options of the CPU's compiler, or none where it is another's or they are those of another version."""
+    if jax.default_backend() != "cpu":
+        return {}
+    try:
+        jax.jit(lambda x: x, compiler_options=dict(options)).lower(0.0).compile()
+    except jax.errors.JaxRuntimeError:
+        return {}
+    return dict(options)
+
+
+def jit_small(function: Callable[..., Any], static_argnums: int | tuple[int, ...] = ()) -> Any:
+    """`jax.jit` for what takes microseconds."""
+    return jax.jit(function, static_argnums=static_argnums, compiler_options=_known(ONE_THREAD))
 
 
 def jax_function(expressions: Any, model: Model, shape: Sequence[int] | None = None) -> JaxFunction:
