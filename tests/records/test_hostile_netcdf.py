@@ -66,6 +66,13 @@ def attribute(value, name="method", of="/", count=1):
     return change
 
 
+def twice(file):
+    del file["mean"]
+    mean = file.create_dataset("mean", data=np.zeros((6, 6)))
+    for axis in mean.dims:
+        axis.attach_scale(file["time"])
+
+
 def long_words(file):
     file.create_dataset("long", shape=(9,), dtype=h5py.string_dtype())[...] = "x" * 1_000_000
 
@@ -84,6 +91,8 @@ BAD = {
     "lists": (put(shape=(6, 2), dtype=h5py.vlen_dtype("f8")), "neither numbers nor words"),
     "records": (put(data=np.zeros((6, 2), dtype=[("a", "f8"), ("b", "i4")])), "neither numbers nor words"),
     "bytes": (put(data=np.zeros((6, 2), dtype="V8")), "neither numbers nor words"),
+    "one dimension twice": (twice, "'mean' is over 'time, time'"),
+    "a mean of its own": (lambda file: put(data=np.zeros(6))(file).make_scale("mean"), "'mean' is over 'mean'"),
     "a type": (lambda file: file.__setitem__("t", np.dtype("f8")), "'t' is not a variable"),
     "many variables": (lambda file: [file.create_dataset(f"v{i}", data=1.0) for i in range(300)], "more than 256 variables"),
     "many attributes": (attribute(1.0, count=300), "more than 64 attributes"),
@@ -95,6 +104,7 @@ BAD = {
     "no scales": (put(data=np.zeros((6, 2))), "is damaged or no NetCDF"),
     "other dimensions": (put("state", data=np.zeros(3)), "is damaged or no NetCDF"),
     "no variance": (lambda file: file.__delitem__("variance"), "has no variable 'variance'"),
+    "a method that moves the cursor": (attribute("\x1b[2J"), "is no name"),
     "a model that is none": (attribute("state = [", name="model"), "is not TOML"),
     "another format": (attribute("zakai result 0", name="format"), "its attribute format is"),
 }

@@ -15,13 +15,21 @@ from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.errors import InputError
 from zakai.models.model import Model
-from zakai.records import Record, load_dataset, save_dataset
+from zakai.records import Record, save_dataset
+from zakai.records.netcdf import load_variables
 from zakai.records.writing import shown
 
 if TYPE_CHECKING:
     import xarray
 
 _LARGEST_COV = 32
+_LONGEST_NAME = 64  # of a state, or a method
+# All others are over the time.
+_DIMENSIONS = {
+    **{name: (name,) for name in ("time", "state", "state_")},
+    **{name: ("time", "state") for name in ("mean", "variance")},
+    "cov": ("time", "state", "state_"),
+}
 _MOST_ASSEMBLED = 4 * 2**30  # bytes of the covariances of independent blocks, when they are put together
 
 
@@ -146,29 +154,37 @@ def load_result(path: str | os.PathLike[str]) -> FilterResult:
 
     Raises InputError for a file that is not such a result.
     """
-    return result_of(load_dataset(path), shown(path))
+    return result_of(*load_variables(path), shown(path))
 
 
-def result_of(data: xarray.Dataset, source: str) -> FilterResult:
-    """The result that a dataset holds; `source` is what errors call it. Raises InputError for one that is not a result."""
+def result_of(variables: Mapping[str, Any], attributes: Mapping[str, Any], source: str) -> FilterResult:
+    """The result that a file's variables and attributes are; `source` is what errors call it.
+
+    Raises InputError where they are none.
+    """
     from zakai.models.files import read_model
 
-    known = {"mean", "variance", "cov", "log_likelihood_increment"}
-    _check_layout(data, source, known)
-    mean = data["mean"].values
-    text = str(data.attrs.get("model", ""))
+    _check_layout(variables, source)
+    arrays = {name: values for name, (_, values, _) in variables.items()}
+    method, state = str(attributes.get("method", "")), tuple(str(name) for name in arrays["state"])
+    for word in (method, *state):
+        if not word.isprintable() or len(word) > _LONGEST_NAME:
+            fault = f"{ascii(word[:40])} is no name of a method or a state"
+            raise InputError(f"{source}: {fault}; give a result written by zakai filter")
+    text = str(attributes.get("model", ""))
+    known = {*_DIMENSIONS, "log_likelihood_increment"}
     return FilterResult(
-        times=data["time"].values,
-        mean=mean,
-        variance=data["variance"].values,
-        log_likelihood_increments=data["log_likelihood_increment"].values,
-        health={str(name): data[name].values for name in data.data_vars if name not in known},
-        warnings=[line for line in str(data.attrs.get("warnings", "")).split("\n") if line],
-        method=str(data.attrs.get("method", "")),
-        why=str(data.attrs.get("why", "")),
+        times=arrays["time"],
+        mean=arrays["mean"],
+        variance=arrays["variance"],
+        log_likelihood_increments=arrays["log_likelihood_increment"],
+        health={name: values for name, values in arrays.items() if name not in known},
+        warnings=[line for line in str(attributes.get("warnings", "")).split("\n") if line],
+        method=method,
+        why=str(attributes.get("why", "")),
         model=read_model(text, source) if text else None,
-        state=tuple(str(name) for name in data["state"].values),
-        _cov=data["cov"].values if "cov" in data else None,
+        state=state,
+        _cov=arrays.get("cov"),
         _no_density=f"{source}: a stored result has no densities; filter again to have them",
     )
 
@@ -182,18 +198,18 @@ def warnings_of_step(health: Mapping[str, Any], bounds: Mapping[str, tuple[float
     ]
 
 
-def _check_layout(data: xarray.Dataset, source: str, known: set[str]) -> None:
+def _check_layout(variables: Mapping[str, Any], source: str) -> None:
     """Raise InputError unless the variables are those of a result, over the right dimensions."""
-    expected = {"mean": ("time", "state"), "variance": ("time", "state"), "cov": ("time", "state", "state_")}
-    for name in ("time", "state", *sorted(known - {"cov"})):
-        if name not in data.variables:
+    for name in ("time", "state", "mean", "variance", "log_likelihood_increment"):
+        if name not in variables:
             raise InputError(f"{source}: has no variable {name!r}; give a result written by zakai filter")
-    for key, variable in data.variables.items():
-        name = str(key)
-        dimensions = (name,) if key in data.coords else expected.get(name, ("time",))
-        numbers = variable.dtype.kind == "f" or name in ("state", "state_")
-        if variable.dims != dimensions or not numbers or data.sizes.get("state_", 0) not in (0, data.sizes["state"]):
-            fault = f"{name[:40]!r} is over {', '.join(map(str, variable.dims))[:60]!r} or holds no floating-point numbers"
+    sizes = {name: np.size(variables[of][1]) for name, of in (("time", "time"), ("state", "state"), ("state_", "state"))}
+    for name, (dimensions, values, _) in variables.items():
+        expected = _DIMENSIONS.get(name, ("time",))
+        numbers = values.dtype.kind == "f" or name in ("state", "state_")
+        if tuple(dimensions) != expected or not numbers or values.shape != tuple(sizes[axis] for axis in expected):
+            over = ", ".join(map(str, dimensions))[:60]
+            fault = f"{name[:40]!r} is over {over!r} of shape {values.shape}, or holds no floating-point numbers"
             raise InputError(f"{source}: {fault}; give a result written by zakai filter")
 
 

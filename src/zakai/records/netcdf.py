@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,8 @@ from zakai.records.writing import atomic_write, shown
 
 if TYPE_CHECKING:
     import xarray
+
+    from zakai.records._hdf5 import Variable
 
 DAMAGED = "is damaged or no NetCDF; give a result of zakai filter"
 
@@ -55,6 +56,22 @@ def load_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
 
     Example: see `save_dataset`.
     """
+    import xarray
+
+    variables, attributes = load_variables(path)
+    axes = {dimension for dimensions, _, _ in variables.values() for dimension in dimensions}
+    coordinates = {name: variable for name, variable in variables.items() if name in axes}
+    try:
+        return xarray.Dataset({name: variables[name] for name in variables if name not in axes}, coordinates, attributes)
+    except Exception:  # the dimensions do not fit together
+        raise InputError(f"{shown(path)}: {DAMAGED}") from None
+
+
+def load_variables(path: str | os.PathLike[str]) -> tuple[dict[str, Variable], dict[str, Any]]:
+    """The same as what a file is made of: of each variable its dimensions, values and attributes; and the attributes of the file.
+
+    The dimensions need not fit together. Raises InputError as `load_dataset`.
+    """
     if not Path(path).is_file():
         what = "is not a regular file" if os.path.exists(path) else "there is no such file"
         raise InputError(f"{shown(path)}: {what}; give a result written by zakai filter")
@@ -67,20 +84,11 @@ def load_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
 
     try:
         with h5py.File(path, "r") as file:
-            return assembled(*_hdf5.read(file))
+            return _hdf5.read(file)
     except MemoryError:
         raise InputError(f"{shown(path)}: does not fit into the memory of this machine") from None
-    except Exception:  # the dimensions do not fit together
+    except Exception:  # it was changed since it was looked at
         raise InputError(f"{shown(path)}: {DAMAGED}") from None
-
-
-def assembled(variables: Mapping[str, Any], attributes: Mapping[str, Any]) -> xarray.Dataset:
-    """The dataset of these variables, those that are named as a dimension being its coordinates."""
-    import xarray
-
-    axes = {dimension for dimensions, _, _ in variables.values() for dimension in dimensions}
-    coordinates = {name: variable for name, variable in variables.items() if name in axes}
-    return xarray.Dataset({name: variables[name] for name in variables if name not in axes}, coordinates, attributes)
 
 
 def _look(path: str | os.PathLike[str]) -> str | None:
