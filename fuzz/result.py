@@ -58,7 +58,8 @@ def one_input(data: bytes) -> None:
 
 @atexit.register
 def _say() -> None:
-    print(ends)
+    if any(ends.values()):
+        print(ends)
 
 
 def _work(ours: Connection, connection: Connection) -> None:

@@ -350,16 +350,41 @@ BAD = {
     "a model twice": ("1d\"]", "1d\", \"gallery:kalman-bucy-1d\"]", "is there twice"),
     "records and seeds": ("[seeds]", '[[records]]\nfile = "a.csv"\n[seeds]', "seeds: the records are given"),
     "no TOML": ("[seeds]", "[seeds", "is not TOML"),
+    "a model 9,000 times": ('"gallery:kalman-bucy-1d"', '"gallery:kalman-bucy-1d",' * 9_000, "is there twice"),
+    "a model 40,000 times": ('"gallery:kalman-bucy-1d"', '"gallery:kalman-bucy-1d",' * 40_000, "more than 10,000 points"),
+    "a grid of many values": ("[seeds]", f"[parameters]\na = [{'1,' * 400_000}]\n[seeds]", "the list has 400,000 values"),
+    "many methods": ("[seeds]", "".join(f"[methods.m{k}]\n" for k in range(8000)) + "[seeds]", "at most 100 fit"),
+    "many tables": ("[seeds]", "[[a]]\n" * 100_000 + "[seeds]", "more than 8192 lines that begin with ["),
+    "many seeds": ("count = 6", "count = 100000000", "seeds.count: expected a whole number from 1 to 1,000,000"),
+    "many observations": ("step = 0.05", "step = 1e-8", "at most 10,000,000 are simulated"),
+    "a key that moves the cursor": ("[seeds]", '[methods."\\u001b[2J"]\n[seeds]', "methods.'\\x1b[2J': label: expected a text"),
+    "a key as long as a page": ("[seeds]", f"[methods.{'x' * 5000}]\noptions = 1\n[seeds]", "...': options: expected a table"),
+    "nested without end": ("[seeds]", f"[methods.b.options]\na = {'[' * 5000}\n[seeds]", "nested too deep"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("old, new, words", BAD.values(), ids=BAD.keys())
 def test_a_study_that_cannot_be_is_refused_in_one_line(tmp_path, old, new, words):
     assert old in STUDY
+    begun = time.process_time()
     with pytest.raises(InputError) as refused:
         read_study(written(tmp_path, STUDY.replace(old, new, 1)))
     said = str(refused.value)
-    assert words in said and said.startswith(str(tmp_path / "study.toml") + ": ") and "\n" not in said
+    assert words in said and said.startswith(str(tmp_path / "study.toml") + ": ")
+    assert said.isprintable() and len(said) < 400 + len(str(tmp_path)) and time.process_time() - begun < 2
+
+
+def test_the_batches_of_a_million_runs_are_known_at_once(tmp_path):
+    begun = time.process_time()
+    study = read_study(written(tmp_path, STUDY.replace("count = 6", "count = 1000000")))
+    assert len(study.batches) == 500_000 and study.job(400_000).runs == ("800003", "800004")
+    assert time.process_time() - begun < 10
+
+
+def test_a_study_file_that_is_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "study.toml")
+    with pytest.raises(InputError, match="study.toml: is not a regular file; give a study file"):
+        read_study(tmp_path / "study.toml")
 
 
 def test_a_metric_of_a_reference_needs_one(tmp_path):

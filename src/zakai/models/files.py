@@ -40,7 +40,7 @@ def load_model(source: str | os.PathLike[str]) -> Model:
     except TypeError:
         raise InputError(f"a model is a path or gallery:NAME, got a {type(source).__name__}") from None
     shown = str(source) if str(source).isprintable() else ascii(str(source))
-    return read_model(_read_text(path, shown), shown)
+    return read_model(read_text(path, shown), shown)
 
 
 def read_model(text: str, source: str) -> Model:
@@ -48,40 +48,43 @@ def read_model(text: str, source: str) -> Model:
     with named(source):
         if len(text) > MAX_BYTES:
             raise InputError("larger than 1 MiB, which no model file is")
-        return Model._from_file(_read_keys(text), source, text)
+        return Model._from_file(read_keys(text), source, text)
 
 
-def _read_text(path: Path, shown: str) -> str:
+def read_text(path: Path, shown: str, what: str = "model") -> str:
+    """The text of a file of at most 1 MiB, which is to be a `what`; `shown` is what errors call it."""
     try:
         # A pipe would be waited for; a device can be endless.
         if path.exists() and not path.is_file():
             kind = "a folder" if path.is_dir() else "not a regular file"
-            raise InputError(f"{shown}: is {kind}; give a model file")
+            raise InputError(f"{shown}: is {kind}; give a {what} file")
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
-        hint = "; the models of the gallery are named gallery:NAME" if path.suffix == "" else ""
+        gallery = what == "model" and path.suffix == ""
+        hint = "; the models of the gallery are named gallery:NAME" if gallery else f"; give a {what} file (TOML)"
         raise InputError(f"{shown}: there is no such file{hint}") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{shown}: cannot be read: {getattr(error, 'strerror', None) or 'not a path'}") from None
-    return decoded(data, shown)
+    return decoded(data, shown, what)
 
 
-def decoded(data: bytes, source: str) -> str:
-    """The text of a model file from its bytes; `source` is what errors call it."""
+def decoded(data: bytes, source: str, what: str = "model") -> str:
+    """The text of a file from its bytes; `source` is what errors call it."""
     if len(data) > MAX_BYTES:
-        raise InputError(f"{source}: larger than 1 MiB, which no model file is")
+        raise InputError(f"{source}: larger than 1 MiB, which no {what} file is")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{source}: byte {error.start + 1} is not UTF-8 text; a model file is TOML") from None
+        raise InputError(f"{source}: byte {error.start + 1} is not UTF-8 text; a {what} file is TOML") from None
 
 
-def _read_keys(text: str) -> dict[str, Any]:
+def read_keys(text: str, what: str = "model") -> dict[str, Any]:
+    """The keys of TOML that is to be a `what`, in bounded time."""
     if _LONG_KEY.search(text):
-        raise InputError("is not a model: it has a key of nine or more parts with dots")
+        raise InputError(f"is not a {what}: it has a key of nine or more parts with dots")
     if sum(1 for _ in _TABLE.finditer(text)) > MOST_TABLES:
-        raise InputError(f"is not a model: it has more than {MOST_TABLES} lines that begin with [")
+        raise InputError(f"is not a {what}: it has more than {MOST_TABLES} lines that begin with [")
     try:
         # Decimals stay exact, and 1e999999999 is never computed.
         keys = tomllib.loads(text, parse_float=Decimal)
@@ -90,5 +93,5 @@ def _read_keys(text: str) -> dict[str, Any]:
     except (ValueError, ArithmeticError):
         raise InputError("is not TOML: it holds a number that cannot be read") from None
     except RecursionError:
-        raise InputError("is not a model: its lists are nested too deep") from None
+        raise InputError(f"is not a {what}: its lists are nested too deep") from None
     return keys

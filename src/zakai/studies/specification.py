@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tomllib
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from decimal import Decimal
+from functools import cached_property
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from zakai.filters.results import versions
 from zakai.models import _entries
 from zakai.models._errors import did_you_mean, echo, listing, named
 from zakai.models.clock import clock
-from zakai.models.files import _LONG_KEY, MAX_BYTES, load_model
+from zakai.models.files import load_model, read_keys, read_text
 from zakai.models.model import Model
 from zakai.records import Record, read_record, read_truth
 from zakai.records.writing import shown
@@ -36,7 +37,9 @@ METRICS = (*OF_TRUTH, "nis", "distance", "hellinger")
 OF_REFERENCE = ("distance", "hellinger")
 BATCH = 25
 MOST_TOGETHER = 31  # records of one scan, whatever the machine: the driver divides more of them by the number of cores
-MOST_RUNS, MOST_POINTS, MOST_DENSITIES = 10_000_000, 10_000, 1000
+MOST_RUNS, MOST_POINTS, MOST_DENSITIES = 1_000_000, 10_000, 1000
+MOST_METHODS, MOST_RECORDS, MOST_BATCHES = 100, 10_000, 1_000_000
+MOST_NUMBERS = 100_000_000  # of the observations of one record, or of its states
 
 
 @dataclass(frozen=True)
@@ -91,16 +94,17 @@ class Study:
     lost_above: float | None = None
     batch: int = BATCH
 
-    @property
+    @cached_property
     def runs(self) -> tuple[str, ...]:
         """What each run is called: its seed, or its file."""
         return tuple(one.label for one in self.records) or tuple(str(self.first + k) for k in range(self.count))
 
-    @property
+    @cached_property
     def batches(self) -> list[tuple[int, slice]]:
         """The point and the runs of every batch: the same whatever was done before, and by whom."""
-        starts = range(0, len(self.runs), self.batch)
-        return [(p, slice(k, min(k + self.batch, len(self.runs)))) for p in range(len(self.points)) for k in starts]
+        count = len(self.runs)
+        slices = [slice(k, min(k + self.batch, count)) for k in range(0, count, self.batch)]
+        return [(p, runs) for p in range(len(self.points)) for runs in slices]
 
     def key(self) -> str:
         """A hash of all that decides the numbers: not of the name, nor of the versions of the libraries."""
@@ -136,54 +140,44 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     Every method is asked whether it holds for every model, before anything runs.  Raises InputError, in one line that names the
     file and the key, for what cannot be used; ConditionError where a method does not hold.
     """
-    where = Path(path)
-    with named(shown(path)):
-        keys = _toml(where)
-        _entries.known_keys(keys, KEYS)
-        for key in ("models", "methods"):
-            if key not in keys:
-                raise InputError(f"{key}: missing; a study needs models and methods, and seeds with times, or records")
-        models = _models(keys, where.parent)
-        methods = _methods(keys["methods"])
-        given = {
-            "name": _text("name", keys.get("name", where.stem)),
-            "methods": methods,
-            "points": tuple(point for point, _ in models),
-            **_runs(keys, [model for _, model in models], where.parent),
-            **_numbers(keys),
-        }
-        reference = keys.get("reference")
-        labels = [entry.label for entry in methods]
-        if reference is not None and reference not in labels:
-            hint = did_you_mean(str(reference), labels)
-            raise InputError(f"reference: {echo(reference, 40)} is not a label of the methods{hint}; labels: {listing(labels)}")
-        truth = not given.get("records") or all(one.truth is not None for one in given["records"])
-        study = Study(**given, reference=reference, metrics=_metrics(keys.get("metrics"), reference, truth))
-        for point, model in models:
-            _check(study, model, first=point is study.points[0])
+    where, source = Path(path), shown(path)
+    text = read_text(where, source, "study")
+    with named(source):
+        study, models = study_of(read_keys(text, "study"), where.stem, where.parent)
+        for model in models:
+            _check(study, model, first=model is models[0])
     return study
 
 
-def _toml(path: Path) -> dict[str, Any]:
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise InputError("larger than 1 MiB, which no study file is")
-        text = data.decode("utf-8-sig")
-        if _LONG_KEY.search(text):
-            raise InputError("has a key of nine or more parts with dots, which no study has")
-        return tomllib.loads(text, parse_float=Decimal)
-    except FileNotFoundError:
-        raise InputError("there is no such file; give a study file (TOML)") from None
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}; give a study file (TOML)") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"byte {error.start + 1} is not UTF-8 text; a study file is TOML") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"is not TOML: {' '.join(str(error).split())[:200]}") from None
-    except (ValueError, ArithmeticError, RecursionError):
-        raise InputError("is not TOML that can be read: a number is too long, or lists are nested too deep") from None
+def study_of(keys: Mapping[str, Any], name: str, folder: Path) -> tuple[Study, list[Model]]:
+    """The study of these keys, and the model of each of its points, before any method is asked whether it holds.
+
+    name: what it is called where it does not say so. folder: where models and records are looked for.
+    """
+    _entries.known_keys(keys, KEYS)
+    for key in ("models", "methods"):
+        if key not in keys:
+            raise InputError(f"{key}: missing; a study needs models and methods, and seeds with times, or records")
+    methods = _methods(keys["methods"])
+    models = _models(keys, folder)
+    given = {
+        "name": _text("name", keys.get("name", name)),
+        "methods": methods,
+        "points": tuple(point for point, _ in models),
+        **_runs(keys, [model for _, model in models], folder),
+        **_numbers(keys),
+    }
+    reference = keys.get("reference")
+    labels = [entry.label for entry in methods]
+    if reference is not None and reference not in labels:
+        hint = did_you_mean(str(reference), labels)
+        raise InputError(f"reference: {echo(reference, 40)} is not a label of the methods{hint}; labels: {listing(labels)}")
+    truth = not given.get("records") or all(one.truth is not None for one in given["records"])
+    study = Study(**given, reference=reference, metrics=_metrics(keys.get("metrics"), reference, truth))
+    if len(study.points) * -(-len(study.runs) // study.batch) > MOST_BATCHES:
+        fault = f"it has more than {MOST_BATCHES:,} batches of {study.batch} runs"
+        raise InputError(f"{fault}; take fewer points, fewer runs, or a larger batch")
+    return study, [model for _, model in models]
 
 
 def _table(key: str, value: Any, allowed: tuple[str, ...] | None = None, required: tuple[str, ...] = ()) -> Mapping[str, Any]:
@@ -217,26 +211,37 @@ def _models(keys: Mapping[str, Any], folder: Path) -> list[tuple[Point, Model]]:
     shared = _table("parameters", keys.get("parameters", {}))
     found: list[tuple[Point, Model]] = []
     used: set[str] = set()
+    read: dict[str, Model] = {}
     for number, entry in enumerate(entries):
         with named(f"models[{number}]"):
             source, own = _model_entry(entry)
             at = source if source.startswith("gallery:") else str(folder / source)
-            model = load_model(at)
+            if at not in read:
+                read[at] = load_model(at)
+            model = read[at]
             grid = {**{name: values for name, values in shared.items() if name in model.parameters}, **own}
             used |= set(grid)
             label = source.removeprefix("gallery:").removesuffix(".toml")
             found += _points(label, source, model, grid)
+        if len(found) > MOST_POINTS:
+            raise InputError(f"parameters: the grid has more than {MOST_POINTS:,} points, the most that fit one study")
     for name in shared:
         if name not in used:
             known = [parameter for _, model in found for parameter in model.parameters]
-            raise InputError(f"parameters.{name}: no model has this parameter{did_you_mean(name, known)}; take it out")
-    if len(found) > MOST_POINTS:
-        raise InputError(f"parameters: the grid has {len(found):,} points; at most {MOST_POINTS:,} fit one study")
-    labels = [point.label for point, _ in found]
-    for label in labels:
-        if labels.count(label) > 1:
-            raise InputError(f"models: {label} is there twice; take one out")
+            raise InputError(f"parameters.{_shown(name)}: no model has this parameter{did_you_mean(name, known)}; take it out")
+    _check_different("models", [point.label for point, _ in found])
     return found
+
+
+def _check_different(key: str, labels: list[str]) -> None:
+    twice = next((label for label, count in Counter(labels).items() if count > 1), None)
+    if twice is not None:
+        raise InputError(f"{key}: {twice[:80]} is there twice; take one out")
+
+
+def _shown(name: str) -> str:
+    """A name out of the file, as a part of an error."""
+    return name if name.isprintable() and len(name) <= 40 else echo(name, 40)
 
 
 def _model_entry(entry: Any) -> tuple[str, Mapping[str, Any]]:
@@ -251,10 +256,12 @@ def _model_entry(entry: Any) -> tuple[str, Mapping[str, Any]]:
 def _points(label: str, source: str, model: Model, grid: Mapping[str, Any]) -> list[tuple[Point, Model]]:
     axes = []
     for name, values in grid.items():
-        with named(f"parameters.{name}"):
+        with named(f"parameters.{_shown(name)}"):
             values = values if isinstance(values, list) else [values]
             if not values:
                 raise InputError("the list is empty; give at least one value, or take the key out")
+            if len(values) > MOST_POINTS:
+                raise InputError(f"the list has {len(values):,} values; at most {MOST_POINTS:,} fit one study")
             axes.append([(name, value, _entries.formula(value)) for value in values])
             for value in values:
                 _entries.exact_number(value)
@@ -272,9 +279,11 @@ def _methods(value: Any) -> tuple[Entry, ...]:
     table = _table("methods", value)
     if not table:
         raise InputError("methods: is empty; give a table for each, as in [methods.limited-direct]")
+    if len(table) > MOST_METHODS:
+        raise InputError(f"methods: there are {len(table):,}; at most {MOST_METHODS} fit one study")
     entries = []
     for label, given in table.items():
-        key = f"methods.{label}"
+        key = f"methods.{_shown(label)}"
         own = _table(key, given, ("method", "options"))
         with named(key):
             _text("label", label)
@@ -298,7 +307,8 @@ def _plain(key: str, value: Any) -> Any:
         return float(value)
     if isinstance(value, str | int | float | bool):
         return value
-    raise InputError(f"options.{key}: expected a number, a text, true, false or a list of them, got {_entries.kind_of(value)}")
+    kind = _entries.kind_of(value)
+    raise InputError(f"options.{_shown(key)}: expected a number, a text, true, false or a list of them, got {kind}")
 
 
 def _runs(keys: Mapping[str, Any], models: list[Model], folder: Path) -> dict[str, Any]:
@@ -317,7 +327,9 @@ def _runs(keys: Mapping[str, Any], models: list[Model], folder: Path) -> dict[st
         with named(f"times.{key}"):
             numbers[key] = _entries.number(times[key])
     for model in models:
-        clock(model.start, numbers["until"], numbers["step"], ("times.until", "times.step"))
+        count = len(clock(model.start, numbers["until"], numbers["step"], ("times.until", "times.step")))
+        if count * max(model.n, model.m) > MOST_NUMBERS:
+            raise InputError(f"times: {count:,} observations of {model.source} are more numbers than one record may hold")
     substeps = times.get("substeps")
     return {
         **numbers,
@@ -330,11 +342,17 @@ def _runs(keys: Mapping[str, Any], models: list[Model], folder: Path) -> dict[st
 def _records(value: Any, models: list[Model], folder: Path) -> tuple[Given, ...]:
     if not isinstance(value, list) or not value:
         raise InputError('records: expected a list of tables, as in [[records]] with file = "a.csv"')
+    if len(value) > MOST_RECORDS:
+        raise InputError(f"records: there are {len(value):,}; at most {MOST_RECORDS:,} fit one study")
     found: list[Given] = []
+    files: set[str] = set()
     for number, entry in enumerate(value):
         with named(f"records[{number}]"):
             table = _table("", {"file": entry} if isinstance(entry, str) else entry, ("file", "truth"), ("file",))
             file = _text("file", table["file"])
+            if file in files:
+                raise InputError(f"{file[:80]} is there twice; take one out")
+            files.add(file)
             record, truth = read_record(folder / file, models[0]), None
             if "truth" in table:
                 truth = _truth(folder / _text("truth", table["truth"]), models[0], record)
@@ -346,17 +364,15 @@ def _records(value: Any, models: list[Model], folder: Path) -> tuple[Given, ...]
             if found and times != found[0].times:
                 raise InputError(f"file: its times are not those of {found[0].label}; give it a study of its own")
             found.append(Given(file, times, tuple(map(tuple, record.values.tolist())), truth))
-    labels = [one.label for one in found]
-    for label in labels:
-        if labels.count(label) > 1:
-            raise InputError(f"records: {label} is there twice; take one out")
     return tuple(found)
 
 
 def _truth(path: Path, model: Model, record: Record) -> tuple[tuple[float, ...], ...]:
     truth = read_truth(path, model)
     times = np.concatenate([[model.start], record.times])
-    near = np.abs(truth.times - times[:, None]).argmin(axis=1)
+    after = np.clip(np.searchsorted(truth.times, times), 1, max(1, len(truth.times) - 1))
+    near = np.minimum(after, len(truth.times) - 1)
+    near = np.where(np.abs(truth.times[after - 1] - times) <= np.abs(truth.times[near] - times), after - 1, near)
     there = np.isclose(truth.times[near], times, rtol=1e-9, atol=1e-12)
     if not there[1:].all():
         missing = float(times[1:][~there[1:]][0])
@@ -405,11 +421,11 @@ def _check(study: Study, model: Model, first: bool) -> None:
     record = Record(times, np.zeros((len(times), model.m)), model.observation_kind)
     check_records(model, record)
     for entry in study.methods:
-        with named(f"methods.{entry.label}"):
+        with named(f"methods.{_shown(entry.label)}"):
             try:
                 plan = planned(model, None, entry.method, entry.options)
             except ConditionError as error:
-                raise ConditionError(f"methods.{entry.label}: {error}") from None
+                raise ConditionError(f"methods.{_shown(entry.label)}: {error}") from None
             check_noise([plan], [record])
             if first and entry.options:
                 for run in plan.runs(record, "moments"):
