@@ -174,6 +174,19 @@ def test_a_gap_of_any_length_is_filtered():
     assert np.isfinite(online.update(1e4 + 0.1, 0.1).mean).all()
 
 
+@pytest.mark.parametrize("time", [1e12, 1e150])
+@pytest.mark.parametrize("name", ["kalman-bucy-1d", "benes", "spiral-sensor"])
+def test_a_gap_that_no_memory_holds_is_refused_and_leaves_the_filter_as_it_was(name, time):
+    model = zakai.load_model(f"gallery:{name}")
+    online, other = zakai.online(model), zakai.online(model)
+    for one in (online, other):
+        one.update(0.1, [0.1] * model.m)
+    with pytest.raises(zakai.InputError, match="an interval of about .* times as long as the system's own") as caught:
+        online.update(time, [0.1] * model.m)
+    assert "\n" not in str(caught.value)
+    assert np.array_equal(online.update(0.2, [0.1] * model.m).mean, other.update(0.2, [0.1] * model.m).mean)
+
+
 def test_a_compiler_that_does_not_know_an_option_is_not_given_it(monkeypatch):
     assert compile._known(compile.ONE_THREAD) == dict(compile.ONE_THREAD)
     monkeypatch.setattr(compile, "ONE_THREAD", (("xla_cpu_of_another_version", True),))

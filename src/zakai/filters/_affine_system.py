@@ -25,15 +25,12 @@ from zakai.algebra.systems import affine_observation
 from zakai.errors import InputError
 from zakai.filters._formulas import Formulas
 from zakai.filters._protocol import Schedule
-from zakai.kolmogorov.flow import MOST_IMPLICIT, Coefficients, Flow, flows, substeps_for
+from zakai.kolmogorov.flow import MOST_IMPLICIT, Coefficients, Flow, flows, parts_for, substeps_for
 from zakai.kolmogorov.linear_solve import inverse
 from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 from zakai.models.compile import jax_function
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-
-# No flow may grow by more than about e^4, lest it lose digits.
-_GROWTH = 4.0
 
 
 class Matrices:
@@ -190,4 +187,5 @@ def _parts(system: AffineSystem, model: Model, starts: np.ndarray, stops: np.nda
             raise InputError(f"{model.source}: a coefficient is not finite between t = {starts[0]:g} and {stops[-1]:g}")
         waves = np.linalg.norm(c.covariance @ c.quadratic, ord=2, axis=(1, 2))
         rate = max(rate, float(np.max(np.linalg.norm(c.matrix, ord=2, axis=(1, 2)) + np.sqrt(2 * waves))))
-    return max(1, int(np.ceil(rate * np.max(stops - starts) / _GROWTH)))
+    longest = float(np.max(stops - starts))
+    return parts_for(rate * longest, model.n, 1 + model.m, f"{model.source}: an interval of about {longest:.2g}")

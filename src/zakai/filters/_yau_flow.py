@@ -22,7 +22,7 @@ from zakai.algebra.theorems import yau_system
 from zakai.errors import InputError
 from zakai.filters._formulas import Formulas
 from zakai.filters._protocol import Schedule
-from zakai.kolmogorov.flow import Coefficients, Flow, Substeps, coefficients_at, flows, substeps_for
+from zakai.kolmogorov.flow import Coefficients, Flow, Substeps, coefficients_at, flows, parts_for, substeps_for
 from zakai.models.compile import jax_field, jax_function
 from zakai.models.model import Model
 
@@ -132,7 +132,8 @@ def parts_of(system: System, model: Model, starts: np.ndarray, stops: np.ndarray
         rate = max(rate, float(np.max(speed * (stops - starts))))
     if not np.isfinite(rate):
         raise InputError(f"{model.source}: a coefficient is not finite between t = {starts[0]:g} and {stops[-1]:g}")
-    return max(1, int(np.ceil(rate / 4.0)))
+    longest = float(np.max(stops - starts))
+    return parts_for(rate, model.n, 1 + model.m, f"{model.source}: an interval of about {longest:.2g}")
 
 
 class FlowPlan(NamedTuple):

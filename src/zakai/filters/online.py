@@ -85,11 +85,15 @@ class Online:
         values = self._values(value)
         with self.lock:
             time = self._time(time)
-            if self._columns is None:
-                (live,) = self.lives
-                live.now = moment = live.moved(time, values)
-                return Estimate(self, (moment,))
-            moments = tuple(live.moved(time, part) for live, part in zip(self.lives, self._divided(values), strict=True))
+            try:
+                if self._columns is None:
+                    (live,) = self.lives
+                    live.now = moment = live.moved(time, values)
+                    return Estimate(self, (moment,))
+                moments = tuple(live.moved(time, part) for live, part in zip(self.lives, self._divided(values), strict=True))
+            except (MemoryError, OverflowError):
+                fault = f"the time from {self.time:g} to {time:g} is too long for this filter; check its unit"
+                raise InputError(f"update: {fault}") from None
             for live, moment in zip(self.lives, moments, strict=True):
                 live.now = moment
         return Estimate(self, moments)

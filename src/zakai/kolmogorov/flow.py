@@ -33,6 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
+from zakai.errors import InputError
 from zakai.kolmogorov.linear_solve import solve
 from zakai.models.checks import irregular
 from zakai.models.compile import jit_small
@@ -44,6 +45,8 @@ PROBES = 4096  # times at which coefficients are looked at, before it is believe
 MANY = 32  # substeps from which a short block is worth a compilation of its own
 KNOWN = 1e-9  # what a flow must be known to
 MOST_IMPLICIT = 4  # states up to which the implicit method is the cheaper one
+MOST_GROWTH = 4.0
+MOST_BYTES = 2**28  # of the flows of the parts of one interval
 MOST_TOGETHER = 32  # states up to which many intervals are integrated at once
 
 
@@ -434,6 +437,20 @@ def _fastest(coefficients, starts, stops, arguments) -> tuple[int, float]:
         needed = np.maximum(needed, 2 * speed * (stops - starts)[chosen])
     worst = int(np.argmax(needed))
     return int(chosen[worst]), float(needed[worst]) if np.isfinite(needed[worst]) else np.inf
+
+
+def parts_for(growth: float, states: int, inputs: int, what: str) -> int:
+    """Into how many equal parts an interval is cut whose flow grows by e^growth at most, lest it lose digits.
+
+    Raises InputError where they are too many to be held; `what` is what the error calls the interval.
+    """
+    parts = np.ceil(growth / MOST_GROWTH)
+    if not parts * 8 * (2 * (states + inputs)) ** 2 <= MOST_BYTES:
+        raise InputError(
+            f"{what} is {growth:.3g} times as long as the system's own time, too long for this filter; check the unit of the "
+            "times, or give rows in between in which nothing is observed"
+        )
+    return max(1, int(parts))
 
 
 def flows(
