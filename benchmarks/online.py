@@ -88,7 +88,9 @@ def measure(name: str, count: int, watch: bool) -> dict[str, Any]:
     online, source = zakai.online(model), readings(name, step)
     online.update(step, next(source))
     first = time.perf_counter() - begin
-    elapsed, parts = np.zeros(count), []
+    # Filled and looked at once, that what this script takes itself is there from the first observation on.
+    elapsed, parts = np.full(count, 0.0), []
+    np.median(elapsed[: count // 10 + 1])
     clock = time.perf_counter_ns
     for k in range(1, WARM + count):
         if k == WARM:
@@ -104,8 +106,9 @@ def measure(name: str, count: int, watch: bool) -> dict[str, Any]:
             continue
         elapsed[done] = clock() - begun
         if watch and (done + 1) % max(1, count // 10) == 0:
-            part = elapsed[done + 1 - count // 10 : done + 1] / 1e3
-            parts.append({"median": round(float(np.median(part)), 2), "MiB": round(memory(), 1), "mass": mass_error(online)})
+            held, mass = round(memory(), 1), mass_error(online)
+            part = np.median(elapsed[done + 1 - count // 10 : done + 1]) / 1e3
+            parts.append({"median": round(float(part), 2), "MiB": held, "mass": mass})
     marks = np.percentile(elapsed / 1e3, [50, 90, 99, 99.9])
     found = {"method": online.method, "observations": count, "first_s": round(first, 2)}
     found |= {mark: round(float(value), 1) for mark, value in zip(("median", "90%", "99%", "99.9%"), marks, strict=True)}
