@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from zakai import _compiled
 from zakai.densities import Density, ProductDensity
 from zakai.densities.product import renamed
 from zakai.errors import InputError
@@ -45,6 +46,7 @@ def online(model: Model, method: str = "auto", **options: Any) -> Online:
         estimate = online.update(0.01, [0.02, -0.01])
         estimate.mean, estimate.interval()
     """
+    _compiled.keep()
     return Online(model, method, options)
 
 
