@@ -82,7 +82,9 @@ def is_quadratic(q: sp.Expr, x: Sequence[sp.Symbol]) -> bool | None:
 
     Its third differences along random lines refute; a zero third derivative proves, if q is the same formula everywhere.
     """
-    others = sorted(q.free_symbols - set(x), key=lambda s: s.name)
+    free = q.free_symbols
+    # The number of third derivatives grows with the cube of that of the states; most terms have few of them.
+    x, others = [s for s in x if s in free], sorted(free - set(x), key=lambda s: s.name)
     vanished = 0
     for point in _points([*x, *others]):
         rng = random.Random(repr(sorted((s.name, str(v)) for s, v in point.items())))
