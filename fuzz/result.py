@@ -1,7 +1,7 @@
 """NetCDF to results, in a process that may be sent astray: HDF5 can crash or never end on a damaged file.
 
 `load_result` has such a file read by another process first, and takes the end of that process for "is damaged". Here one process
-reads file after file, with the time of that one for each, until HDF5 ends it; what comes out of the others is checked.  What came
+reads file after file, with a limit of time for each, until HDF5 ends it; what comes out of the others is checked.  What came
 to an end in a new way is read once more where the fuzzer sees it, and becomes a file to begin with:
 
     python -m fuzz result -runs=100000 -max_len=17000 -keep_seed=1 -len_control=0
@@ -24,6 +24,7 @@ from zakai.errors import InputError
 from zakai.filters.results import FilterResult, result_of
 from zakai.records import _hdf5
 
+SECONDS = 0.2  # of the process, for a small file; some milliseconds are usual, and `load_result` gives it more
 PATIENCE = 60  # seconds; a process that computes is ended long before
 ends = {"crash or hang of HDF5": 0, "refused by its reader": 0, "refused as a result": 0, "read": 0}
 _ways: set[str] = set()
@@ -71,7 +72,7 @@ def _work(ours: Connection, connection: Connection) -> None:
             data = connection.recv_bytes()
         except EOFError:
             os._exit(0)
-        signal.setitimer(signal.ITIMER_PROF, _hdf5.SECONDS)
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
         try:
             said = "\n".join(check(data))
         except BaseException:
