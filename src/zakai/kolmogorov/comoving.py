@@ -283,7 +283,10 @@ def resampled(fields: Field, middle: np.ndarray, ratio: np.ndarray, sizes: Seque
     values = fields.values
     xp = np if isinstance(values, np.ndarray) else jnp
     for d, (old, new) in enumerate(zip(axes_of(values.shape[1:]), axes_of(sizes), strict=True)):
-        at = middle[:, d, None] + ratio[:, d, None] * new
+        # Records that share both lattices share the matrix.
+        cuts = np.stack([middle[:, d], ratio[:, d]], axis=1)
+        cuts = cuts[:1] if np.array_equal(cuts, np.broadcast_to(cuts[:1], cuts.shape)) else cuts
+        at = cuts[:, :1] + cuts[:, 1:] * new
         # sin(pi (at - old)) from one sine for each point.
         whole = np.round(at)
         sine = np.sin(np.pi * (at - whole)) * (1.0 - 2.0 * (whole % 2))
@@ -292,7 +295,7 @@ def resampled(fields: Field, middle: np.ndarray, ratio: np.ndarray, sizes: Seque
         signs = 1.0 - 2.0 * (old % 2)
         sinc = np.where(close, 1.0, sine[..., None] * signs / (np.pi * np.where(close, 1.0, apart)))
         lines = xp.moveaxis(values, d + 1, 1)
-        product = xp.matmul(ratio[:, d, None, None] * sinc, lines.reshape(*lines.shape[:2], -1))
+        product = xp.matmul(cuts[:, 1, None, None] * sinc, lines.reshape(*lines.shape[:2], -1))
         values = xp.moveaxis(product.reshape(len(lines), len(new), *lines.shape[2:]), 1, d + 1)
     values = xp.maximum(values, 0.0)
     total = values.sum(axis=tuple(range(1, values.ndim)), keepdims=True)
