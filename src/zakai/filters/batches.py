@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -18,11 +19,14 @@ from zakai.filters._run import RUN, Run, run_steps, size_of, taken
 from zakai.filters.observations import Data
 
 LANES = 32  # records that are filtered by one scan, at most: one that asks for a large lattice slows no more than these
+FEW_LANES = 8  # what a scan of few records is made for: two sizes, few compilations
 LANE_BYTES = 256 * 2**20  # what they give in one run of steps, at most
 WORTH_A_CORE = 16  # records
 ENOUGH = 1 / 16  # the share of a run after which a look at all lattices costs less than wider ones
 ROUND = RUN  # observations after which many records are grouped anew
 MANY = 4 * LANES  # records
+HOLDS = 4.0  # deviations on each side of a mean that a lattice holds, about
+WIDEST = 32.0  # deviations of the narrowest density from end to end of a lattice that many share
 FEW_ILL = 0.25  # the share of the records of a scan that may leave it at once for a lattice of their own
 
 
@@ -110,12 +114,32 @@ class _Alike:
             each = RUN * (8 * (n * n + n + 16) + (size_of(alike[0].state) if alike[0].keep else 0))
             most = max(1, min(LANES, LANE_BYTES // each))
             if len(starts) > 1 and self.round < self.total:
-                size = min(most, 2 ** int(np.ceil(np.log2(len(alike)))))
+                size = min(most, FEW_LANES if len(alike) <= FEW_LANES else LANES)
             else:
                 parts = max(-(-len(alike) // most), min(os.cpu_count() or 1, len(alike) // WORTH_A_CORE))
                 size = -(-len(alike) // max(1, parts))
-            near = sorted(alike, key=lambda run: run.infos[-1].mean[-1].tolist()) if alike[0].infos else alike
-            yield from ((near[k : k + size], size) for k in range(0, len(near), size))
+            together = _near(alike, size) if alike[0].infos else (alike[k : k + size] for k in range(0, len(alike), size))
+            yield from ((group, size) for group in together)
+
+
+def _near(runs: list[Run], most: int) -> Iterator[list[Run]]:
+    """Groups of records whose means are next to each other, as many as `most`.
+
+    Densities in one state share a lattice: there no group is so wide that the narrowest of them would ask for many points.
+    """
+    order = sorted(runs, key=lambda run: run.infos[-1].mean[-1].tolist())
+    group: list[Run] = []
+    low, high, narrow = np.inf, -np.inf, np.inf
+    for run in order:
+        mean, deviation = run.infos[-1].mean[-1], np.sqrt(np.diagonal(run.infos[-1].cov[-1]))
+        begin, end = mean - HOLDS * deviation, mean + HOLDS * deviation
+        wide = np.maximum(high, end) - np.minimum(low, begin) > WIDEST * np.minimum(narrow, deviation)
+        if group and (len(group) == most or (len(mean) == 1 and wide.all())):
+            yield group
+            group, low, high, narrow = [], np.inf, -np.inf, np.inf
+        group.append(run)
+        low, high, narrow = np.minimum(low, begin), np.maximum(high, end), np.minimum(narrow, deviation)
+    yield group
 
 
 def _together(runs: list[Run], lanes: int, count: _Count, until: int) -> None:
@@ -134,25 +158,29 @@ def _together(runs: list[Run], lanes: int, count: _Count, until: int) -> None:
             continue
         prepared = setting.prepared(runs[0].data.part(rows))
         given = _observations(method, prepared, [run.data.part(rows) for run in runs])
+        together = None
         stop = min(rows.stop, until)
         while runs and runs[0].done < stop:
             left = slice(runs[0].done - rows.start, stop - rows.start)
             fill = lanes - len(runs)
             adapt, own = _Adapt(method, len(runs)), _own(states)
+            together = _stacked([*given, *given[-1:] * fill], 1) if together is None else together
             part, begin, ends, info, kept = run_steps(
                 method, adapt if method.adapt_many else None, _scan_lanes, prepared, _stacked([*own, *own[-1:] * fill], 0),
-                _stacked([*given, *given[-1:] * fill], 1), left, rows.stop == total, runs[0].keep, ENOUGH,
+                together, left, rows.stop == total, runs[0].keep, ENOUGH,
             )  # fmt: skip
-            begin, ends = _own([begin, ends])
-            for lane, run in enumerate(runs):
-                first = _lane(begin, lane, 0)
+            begins, states = (_lanes(each, len(runs), 0) for each in _own([begin, ends]))
+            told = zip(begins, *(_lanes(each, len(runs), 1) for each in (info, kept)), strict=True)
+            for lane, (run, (first, *of_one)) in enumerate(zip(runs, told, strict=True)):
                 if lane in adapt.ill:
                     run.state = first
                     alone.append(run)
                 elif part.stop > part.start:
-                    run.take(prepared, first, _lane(info, lane, 1), _lane(kept, lane, 1))
-            well = [lane for lane in range(len(runs)) if lane not in adapt.ill]
-            runs, given, states = [runs[i] for i in well], [given[i] for i in well], [_lane(ends, i, 0) for i in well]
+                    run.take(prepared, first, *of_one)
+            if adapt.ill:
+                well = [lane for lane in range(len(runs)) if lane not in adapt.ill]
+                runs, given, states = ([each[i] for i in well] for each in (runs, given, states))
+                together = None
             count.add(len(runs) * (part.stop - part.start))
         if not runs or stop == until:
             break
@@ -184,7 +212,8 @@ class _Adapt:
         if info is None or (again is None) != (method.healthy is not None):
             return again
         if method.healthy is None:
-            asks = [method.adapt(prepared, _lane(states, k, 0), rows, _lane(info, k, 0)) is not None for k in range(self.count)]
+            lanes = zip(*(_lanes(each, self.count, 0) for each in (states, info)), strict=True)
+            asks = [method.adapt(prepared, state, rows, told) is not None for state, told in lanes]
         else:
             asks = ~np.asarray(method.healthy(info)).all(axis=1)
         ill = [k for k in range(self.count) if asks[k]]
@@ -208,8 +237,11 @@ def _stacked(trees: Sequence[Any], axis: int) -> Any:
     return jax.tree.map(lambda *arrays: np.stack([np.asarray(a) for a in arrays], axis=axis), *trees)
 
 
-def _lane(tree: Any, lane: int, axis: int) -> Any:
-    return jax.tree.map(lambda a: np.asarray(a)[lane] if axis == 0 else a[:, lane], tree)
+def _lanes(tree: Any, count: int, axis: int) -> list[Any]:
+    """The first `count` records of a pytree, each by itself."""
+    leaves, structure = jax.tree.flatten(tree)
+    arrays = [np.moveaxis(np.asarray(leaf), axis, 0) for leaf in leaves]
+    return [jax.tree.unflatten(structure, [array[lane] for array in arrays]) for lane in range(count)]
 
 
 @partial(jax.jit, static_argnums=(0, 1, 5))
@@ -234,15 +266,15 @@ def _scan(step, healthy, states, intervals, observations, keep, limit):
 
 
 _COMPILED: set[Hashable] = set()
-_COMPILING = Lock()
+_COMPILING: defaultdict[Hashable, Lock] = defaultdict(Lock)
 
 
 def _scan_lanes(step, healthy, states, intervals, observations, keep, limit):
-    """`scan` of many records, with axes (steps, records, ...); two threads never compile the same."""
+    """`scan` of many records, with axes (steps, records, ...); two threads may compile, but never the same."""
     key = (step, keep, _shape((states, intervals, observations)))
     if key in _COMPILED:
         return _scan(step, healthy, states, intervals, observations, keep, limit)
-    with _COMPILING:
+    with _COMPILING[key]:
         result = _scan(step, healthy, states, intervals, observations, keep, limit)
         _COMPILED.add(key)
     return result
