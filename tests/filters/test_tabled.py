@@ -61,11 +61,14 @@ def test_what_a_table_tells_is_what_its_parts_say():
     b = tabled.likelihood(table, factor, 1.0)
     assert np.allclose(b.log, log, atol=1e-14)
     values = np.exp(-8 * (x - 0.5) ** 2)
-    told = tabled.told(table, values[::-1], values, b, tau)
     spread = np.array([[0.49 / cell**2]])
-    left = splitting.left(values, 0.5 * log, [(x - x**3) / cell], spread, tau)
-    assert np.allclose(told.left, left, rtol=1e-10)
-    assert np.allclose(tabled.corrected(b, tau), splitting.corrected(0.5 * log, spread, tau), atol=1e-14)
+    for scheme in (splitting.STRANG, splitting.CHIN):
+        told = tabled.told(table, values[::-1], values, b, scheme)
+        terms = splitting.terms(log, values, [(x - x**3) / cell], spread, scheme)
+        assert np.allclose(told.terms, terms, rtol=1e-9)
+        for share, undone in scheme.factors:
+            own, other = tabled.corrected(b, tau, share, undone), splitting.corrected(log, spread, tau, share, undone)
+            assert np.allclose(own, other, atol=1e-13)
     mean = values @ z / values.sum()
     assert np.allclose([told.mean, told.variance], [mean, values @ (z - mean) ** 2 / values.sum()], rtol=1e-12)
 

@@ -1,4 +1,4 @@
-"""The splitting of an increment's likelihood from the transition: its first error is undone, what is left is estimated.
+"""The splitting of an increment's likelihood from the transition: what its errors are, which are undone and what is left.
 
 With b the logarithm of the likelihood of an interval tau and A the forward operator, Strang's exp(b/2) exp(tau A) exp(b/2) is
 the exponential of
@@ -6,8 +6,13 @@ the exponential of
     tau A + b - tau [b, [b, A]] / 24 - tau^2 [A, [b, A]] / 12 - ...
 
 Of a path that has noise, b is of the order of sqrt(tau), so that the first error is of the order tau^2 in every interval and
-has always one sign.  [b, [b, A]] = grad b . G grad b is a function, so that it can be undone by the factors themselves
-(Takahashi and Imada 1984).  The second is smaller and changes its sign with the noise.
+has always one sign.  [b, [b, A]] = grad b . G grad b = g is a function, so that it can be undone by the factors themselves
+(Takahashi and Imada 1984).  The second is smaller and changes its sign with the noise.  Where it is too large, one transition
+more undoes it too (Chin 1997, scheme A of fourth order): exp(b/6) exp(tau A/2) exp(2b/3 - tau g/72) exp(tau A/2) exp(b/6) is the
+exponential of
+
+    tau A + b - tau^2 [[b, A], g] / 4320 - tau^3 (7 [A, [A, g]] / 8640 + [[b, A], [A, [b, A]]] / 2160)
+              + tau^4 [A, [A, [A, [A, b]]]] / 2880 + ...
 """
 
 from __future__ import annotations
@@ -22,27 +27,55 @@ import numpy as np
 
 from zakai import _float64  # noqa: F401
 from zakai.kolmogorov import comoving
+from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
 
+
+class Scheme(NamedTuple):
+    """Factors exp(share b + undone tau g), one a pair of the two, with equal parts of the transition between them; what is left
+    after a given time is of the `order` in tau."""
+
+    shares: tuple[float, ...]
+    undone: tuple[float, ...]
+    order: int
+
+    @property
+    def factors(self) -> tuple[tuple[float, float], ...]:
+        """The share and what is undone of each factor."""
+        return tuple(zip(self.shares, self.undone, strict=True))
+
+
+STRANG = Scheme((1 / 2, 1 / 2), (1 / 48, 1 / 48), 2)
+CHIN = Scheme((1 / 6, 2 / 3, 1 / 6), (0.0, -1 / 72, 0.0), 4)
+SECOND_ORDER = (1 / 2,)
+SIXTH_ORDER = (45 / 60, -9 / 60, 1 / 60)
 ALIKE = 0.1  # how much the errors of different intervals have in common: between those of noise, 0, and those of one sign, 1
 LONGEST = 1e4  # intervals after which every error is taken for forgotten
 
 
 def slopes(values: jax.Array) -> list[jax.Array]:
-    """The slope of an array along each of its axes, a cell the unit, by central differences."""
+    """The slope of an array along each of its axes, a cell the unit; see `differences`."""
     if values.ndim > 1:
-        return [_differences(values, d) for d in range(values.ndim)]
+        return [differences(values, d) for d in range(values.ndim)]
     # A product is compiled faster than what has several parts.
     return [jnp.asarray(_central(len(values))) @ values]
 
 
-def _differences(values: jax.Array, axis: int) -> jax.Array:
-    size = values.shape[axis]
+def differences(values: Any, axis: int) -> Any:
+    """The slope of an array of NumPy or JAX along an axis by central differences, of sixth order but for the three layers on each
+    side, where a lattice has nothing of its density: their error is not undone with what a splitting leaves."""
+    xp, size = numpy_or_jax(values), values.shape[axis]
 
-    def part(begin: int, end: int) -> jax.Array:
-        return jax.lax.slice_in_dim(values, begin, end, axis=axis)
+    def part(begin: int, end: int) -> Any:
+        return values[(slice(None),) * axis + (slice(begin, end),)]
 
-    first, last = part(1, 2) - part(0, 1), part(size - 1, size) - part(size - 2, size - 1)
-    return jnp.concatenate([first, 0.5 * (part(2, size) - part(0, size - 2)), last], axis=axis)
+    def central(begin: int, end: int, weights: Sequence[float]) -> Any:
+        apart = (w * (part(begin + k, end + k) - part(begin - k, end - k)) for k, w in enumerate(weights, 1))
+        return sum(apart, start=0.0)
+
+    inner = central(3, size - 3, SIXTH_ORDER)
+    near, far = central(1, 3, SECOND_ORDER), central(size - 3, size - 1, SECOND_ORDER)
+    ends = part(1, 2) - part(0, 1), part(size - 1, size) - part(size - 2, size - 1)
+    return xp.concatenate([ends[0], near, inner, far, ends[1]], axis=axis)
 
 
 def bends(values: jax.Array) -> tuple[list[jax.Array], list[list[jax.Array]]]:
@@ -62,7 +95,7 @@ def _central_twice(size: int) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def _central(size: int) -> np.ndarray:
-    return np.asarray(np.gradient(np.eye(size), axis=0))
+    return np.asarray(differences(np.eye(size), 0))
 
 
 def product(spread: jax.Array, a: Sequence[jax.Array], b: Sequence[jax.Array]) -> jax.Array:
@@ -70,32 +103,61 @@ def product(spread: jax.Array, a: Sequence[jax.Array], b: Sequence[jax.Array]) -
     return sum((spread[i, j] * p * q for i, p in enumerate(a) for j, q in enumerate(b)), start=jnp.zeros(()))
 
 
-def corrected(half: jax.Array, spread: jax.Array, length: Any) -> jax.Array:
-    """b/2 + tau grad b . G grad b / 48 for b/2 on a lattice in whose coordinates G is `spread`; where that is large, less."""
-    slope = slopes(half)
-    return made_up(half, length * product(spread, slope, slope))
+def corrected(log: jax.Array, spread: jax.Array, length: Any, share: Any, undone: Any) -> jax.Array:
+    """share b + undone tau grad b . G grad b on a lattice in whose coordinates G is `spread`; where that is large, less."""
+    slope = slopes(log)
+    return made_up(share * log, 12 * undone * length * product(spread, slope, slope))
 
 
-def made_up(half: Any, steepness: Any) -> Any:
-    """The same, where tau grad(b/2) . G grad(b/2) is known."""
+def made_up(log: Any, steepness: Any) -> Any:
+    """A logarithm and a twelfth of the `steepness`; where that is large, less.
+
+    Half of b is made up for Strang's first error where tau grad(b/2) . G grad(b/2) is the steepness.
+    """
     more = steepness / 12
-    return half + more / (1.0 + more)
+    return log + more / (1.0 + jnp.maximum(more, 0.0))
 
 
-class Left(NamedTuple):
-    """What the splitting of one interval leaves, relative to the density, and the rate at which the filter forgets."""
+class Terms(NamedTuple):
+    """Of what the errors of a splitting are made, for a density of which `growth` is the trace of G P^-1 and `turning` the rate
+    of the drift: the norm of [A, [b, A]]; the mean of g and its deviation; that of [[b, A], g] / 2, which is a function; and the
+    root of the mean square of the trace of (G b'')^2.  `third_spread` and `bent` are for the error of Chin's scheme alone.
 
-    error: jax.Array
-    forgets: jax.Array
+    An error of the mean is forgotten at the rate G P^-1 + f', averaged over the coordinates, which for a Kalman-Bucy filter is
+    its own rate.
+    """
+
+    second: Any
+    steep: Any
+    steep_spread: Any
+    third_spread: Any
+    bent: Any
+    growth: Any
+    turning: Any
+    forgets: Any
 
 
-def left(values: jax.Array, half: jax.Array, flow: Sequence[jax.Array], spread: jax.Array, length: Any) -> Left:
-    """The second error of the splitting, and the next one after the first, for the density `values` and b/2 on its lattice.
+def error(scheme: Scheme, terms: Terms, length: Any) -> Any:
+    """What a scheme leaves of an interval, relative to the density: what it does not undo, or what comes next after that.
+
+    A in a commutator is taken for what it does to a Gaussian of that variance, and a longer one for the one before times
+    `growth` and `turning`.
+    """
+    if scheme == STRANG:
+        first, first_spread = length / 24 * terms.steep, length / 24 * terms.steep_spread
+        beyond = first_spread * jnp.minimum(1.0, jnp.sqrt(first) + length * terms.growth)
+        return length**2 / 12 * terms.second + beyond
+    once, rate = np.sqrt(8.0) * terms.growth * terms.bent, terms.growth + terms.turning
+    third = length**2 / 2160 * terms.third_spread
+    return third + 7 / 8640 * length**3 * once + length**4 / 2880 * rate**2 * terms.second
+
+
+def terms(log: jax.Array, values: jax.Array, flow: Sequence[jax.Array], spread: jax.Array, scheme: Scheme) -> Terms:
+    """All of them where b is `log` and the density is `values` on a lattice.
 
     `flow` is the drift and `spread` G in the lattice's coordinates.  With L the backward operator, [A, [b, A]] has a part that is
     the function L L b, one in which the slopes of L b stand beside those of the density, and one in which the second derivatives
-    of b stand beside its own; each is taken for itself.  An error of the mean is
-    forgotten at the rate G P^-1 + f', averaged over the coordinates, which for a Kalman-Bucy filter is its own rate.
+    of b stand beside its own; each is taken for itself.
     """
     n = values.ndim
     total, mean, cov = comoving.moments(values)
@@ -108,21 +170,36 @@ def left(values: jax.Array, half: jax.Array, flow: Sequence[jax.Array], spread: 
         carried = sum((v * s for v, s in zip(flow, slope, strict=True)), start=jnp.zeros(()))
         return slope, bent, carried + 0.5 * jnp.trace(bent)
 
-    slope, bent, generator = generated(2 * half)
+    slope, bent, generator = generated(log)
     upward, _, twice = generated(generator)
     once = product(spread, upward, upward)
-    never = jnp.sum(bent * jnp.swapaxes(bent, 0, 1), axis=(0, 1))
-    first = length / 24 * product(spread, slope, slope)
+    twice_bent = jnp.sum(bent * jnp.swapaxes(bent, 0, 1), axis=(0, 1))
+    steep = product(spread, slope, slope)
+    functions = [twice, twice**2, once, twice_bent, steep, steep**2]
+    if scheme == CHIN:
+        along = jnp.tensordot(spread, jnp.stack(slope), axes=1)
+        third = sum((s * jnp.sum(row * along, axis=0) for s, row in zip(slope, bent, strict=True)), start=jnp.zeros(()))
+        functions += [twice_bent**2, third, third**2]
     apart = [z - mean[d] for d, z in enumerate(comoving.combined(np.eye(n), values.shape))]
     moved = [v * z for v in flow for z in apart]
     # All means by one product: what is compiled fast.
-    functions = jnp.stack([twice, twice**2, first, first**2, once, never, *moved]).reshape(6 + n * n, -1)
-    means = functions @ (values.reshape(-1) / total)
-    twice_spread, first_spread = (jnp.sqrt(jnp.maximum(means[k + 1] - means[k] ** 2, 0.0)) for k in (0, 2))
-    rest = twice_spread + 2 * jnp.sqrt(jnp.maximum(means[4], 0.0) * growth) + growth * jnp.sqrt(2 * jnp.maximum(means[5], 0.0))
-    beyond = first_spread * jnp.minimum(1.0, jnp.sqrt(means[2]) + length * growth)
-    forgets = (growth + jnp.trace(means[6:].reshape(n, n) @ narrow)) / n
-    return Left(length**2 / 12 * rest + beyond, forgets)
+    means = jnp.stack([*functions, *moved]).reshape(len(functions) + n * n, -1) @ (values.reshape(-1) / total)
+    turned = means[len(functions) :].reshape(n, n) @ narrow
+    turning = jnp.sqrt(jnp.sum(jnp.abs(turned * turned.T)))
+    return measured(means[: len(functions)], growth, turning, (growth + jnp.trace(turned)) / n)
+
+
+def measured(means: jax.Array, growth: Any, turning: Any, forgets: Any) -> Terms:
+    """Terms from the means of L L b and its square, |grad L b|^2, tr (G b'')^2, g, g^2, and where there are
+    more, of the square of the fourth, of [[b, A], g] / 2 and of its square."""
+
+    def root(square: Any) -> Any:
+        return jnp.sqrt(jnp.maximum(square, 0.0))
+
+    twice, upward, bend = root(means[1] - means[0] ** 2), root(means[2] * growth), growth * root(2 * means[3])
+    third, bent = (root(means[8] - means[7] ** 2), root(means[6])) if len(means) > 6 else (0.0, 0.0)
+    steep_spread = root(means[5] - means[4] ** 2)
+    return Terms(twice + 2 * upward + bend, means[4], steep_spread, third, bent, growth, turning, forgets)
 
 
 def added(before: Any, error: Any, forgets: Any, length: Any) -> jax.Array:

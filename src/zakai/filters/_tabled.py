@@ -88,7 +88,7 @@ class Tables:
         G = float(self.covariance(np.zeros(1), 0.0, theta)[0, 0]) / cell**2
 
         def slope(values: np.ndarray) -> np.ndarray:
-            return np.gradient(values, axis=-1)
+            return np.asarray(splitting.differences(values, values.ndim - 1))
 
         def backward(values: np.ndarray) -> np.ndarray:
             return f * slope(values) + 0.5 * G * slope(slope(values))
@@ -169,39 +169,38 @@ def likelihood(table: Table, factor: Whole, share: Any) -> Likelihood:
     return Likelihood(*(sum(share * w * table.terms[a, k] for a, w in enumerate(weights)) for k in range(5)))
 
 
-def corrected(b: Likelihood, length: Any) -> jax.Array:
-    """b/2 with the first error of the splitting undone: see `splitting.corrected`."""
-    return splitting.made_up(0.5 * b.log, 0.25 * length * b.slope**2)
+def corrected(b: Likelihood, length: Any, share: Any, undone: Any) -> jax.Array:
+    """See `splitting.corrected`."""
+    return splitting.made_up(share * b.log, 12 * undone * length * b.slope**2)
 
 
 class Told(NamedTuple):
     """Of the densities before and after a transition: the sum, mean and variance of the second, in cells, the worst of the shares
-    at the highest frequency and at the edges, and what the splitting left."""
+    at the highest frequency and at the edges, and what the splitting's errors are made of."""
 
     total: Any
     mean: Any
     variance: Any
     aliasing: Any
     edge: Any
-    left: splitting.Left
+    terms: splitting.Terms
 
 
-def told(table: Table, before: jax.Array, after: jax.Array, b: Likelihood, length: Any) -> Told:
-    """All of it by three products; what the splitting leaves is that of `splitting.left` for the likelihood b."""
-    first = length / 24 * b.slope**2
+def told(table: Table, before: jax.Array, after: jax.Array, b: Likelihood, scheme: splitting.Scheme) -> Told:
+    """All of it by three products; the terms are those of `splitting.terms` for the likelihood b."""
     sums, first_sums = table.rows @ after, table.rows @ before
     total, means = sums[0], sums / sums[0]
     shares = jnp.maximum(jnp.abs(means[3:5]), jnp.abs(first_sums[3:5]) / first_sums[0])
     mean = means[1]
     variance = means[2] - mean**2
-    growth = table.spread / variance
-    parts = jnp.stack([b.twice, b.twice**2, first, first**2, b.upward**2, b.bend**2])
-    of = parts @ (after / total)
-    squares = [of[1] - of[0] ** 2, of[3] - of[2] ** 2, of[4] * growth, 2 * of[5] * growth**2, of[2]]
-    twice, once, upward, bend, slope = jnp.sqrt(jnp.maximum(jnp.stack(squares), 0.0))
-    error = length**2 / 12 * (twice + 2 * upward + bend) + once * jnp.minimum(1.0, slope + length * growth)
-    forgets = growth + (means[6] - mean * means[5]) / variance
-    return Told(total, mean, variance, shares[0], shares[1], splitting.Left(error, forgets))
+    growth, turning = table.spread / variance, (means[6] - mean * means[5]) / variance
+    steep, twice_bent = b.slope**2, b.bend**2
+    functions = [b.twice, b.twice**2, b.upward**2, twice_bent, steep, steep**2]
+    if scheme == splitting.CHIN:
+        third = steep * b.bend
+        functions += [twice_bent**2, third, third**2]
+    terms = splitting.measured(jnp.stack(functions) @ (after / total), growth, jnp.abs(turning), growth + turning)
+    return Told(total, mean, variance, shares[0], shares[1], terms)
 
 
 def carried(table: Table, values: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from zakai.errors import InputError
 from zakai.filters import _lattice_choice as choice
+from zakai.filters._splitting import CHIN, STRANG, Scheme
 from zakai.kolmogorov.comoving import Field, axes_of
 from zakai.kolmogorov.finite_volume import TERMS
 from zakai.models.model import Model
@@ -31,6 +32,7 @@ MOST_POINTS = 2**20  # of lattices whose flow is looked at together
 FEW = {1: 128, 2: 8, 3: 4, 4: 4}  # parts of an interval beyond which the lattice had better follow the flow
 SPARE = 1.25  # how much wider than its density a window is, and
 WORST = {1: 8.0, 2: 3.0, 3: 2.0, 4: 2.0}  # how much more of both a run may ask for before it is cut into shorter ones
+CALMER = 0.5  # of the error of splitting that is allowed, below which a run may be taken with fewer transitions
 FINER = 1.15  # how much finer than the density needs: what may change within a run
 FOLLOWED = 1.9  # cells that a deviation has, and
 NEARER = 0.85  # of REACH, for a lattice that was laid where the reading will put the mass
@@ -41,11 +43,11 @@ REACH = 6.5  # deviations on each side that a lattice holds that is laid anew in
 class Shape(NamedTuple):
     """What a step is compiled for: `sizes` of the lattice and the way to take it.
 
-    An interval is split in `splits`, the transition of each of these stepped in `parts`: one, 0 for what the Room says, or a
-    number that JAX can differentiate.  `order` is that of the time stepping, 2 or 4.  With `follow` the basis moves with the flow
-    and is laid anew in every step; with `cross` the noise may couple axes of the lattice.  With `tabled` the lattice stands still
-    and the transition is a known matrix.  `operator` is "spectral", "finite-volume", of which `order` is the number of terms of
-    its series, or "characteristics".
+    An interval is split in `splits`, each of them by Strang's scheme or, with `chin`, by Chin's, and every transition of these is
+    stepped in `parts`: one, 0 for what the Room says, or a number that JAX can differentiate.  `order` is that of the time
+    stepping, 2 or 4.  With `follow` the basis moves with the flow and is laid anew in every step; with `cross` the noise may
+    couple axes of the lattice.  With `tabled` the lattice stands still and the transition is a known matrix.  `operator` is
+    "spectral", "finite-volume", of which `order` is the number of terms of its series, or "characteristics".
     """
 
     sizes: tuple[int, ...]
@@ -56,6 +58,12 @@ class Shape(NamedTuple):
     cross: bool = False
     tabled: bool = False
     operator: str = "spectral"
+    chin: bool = False
+
+    @property
+    def scheme(self) -> Scheme:
+        """How the likelihood of increments is split from the transition."""
+        return CHIN if self.chin else STRANG
 
 
 class Room(NamedTuple):
@@ -103,6 +111,7 @@ class Plan:
     cross: bool = False
     tabled: bool = False
     operator: str = "spectral"
+    chin: bool = False
     wider: float = 1.0
     finer: float = 1.0
     splitting: float = np.inf
@@ -119,12 +128,22 @@ class Plan:
     def shape(self) -> Shape:
         """The static part."""
         # Where the splits are not the user's they may change with every run.
-        given = self.fixed or self.splitting == np.inf
+        given = self.fixed or self.splitting == np.inf or not (self.chin or self.splits > 1)
         splits = self.splits if given else 0
         if self.tabled:
-            return Shape(self.sizes, splits, tabled=True)
+            return Shape(self.sizes, splits, tabled=True, chin=self.chin)
         parts = self.parts if self.fixed or self.parts == 1 else 0
-        return Shape(self.sizes, splits, parts, self.order, self.follow, self.cross, False, self.operator)
+        return Shape(self.sizes, splits, parts, self.order, self.follow, self.cross, False, self.operator, self.chin)
+
+    @property
+    def steps(self) -> int:
+        """In how many transitions an interval is taken."""
+        return self.splits * (len(self.scheme.shares) - 1)
+
+    @property
+    def scheme(self) -> Scheme:
+        """How the likelihood of increments is split from the transition."""
+        return self.shape.scheme
 
     @property
     def room(self) -> Room:
@@ -304,7 +323,10 @@ def more(plan: Plan, info: Any) -> Plan | None:
     if apart >= plan.splitting and finer == 1:
         if plan.splits >= MOST_SPLITS:
             return None
-        splits = plan.splits * 2 ** int(np.ceil(np.log2(np.clip((apart / plan.splitting) ** 0.5, 2, 64))))
+        if not plan.chin and plan.operator != "characteristics":
+            return replace(plan, chin=True, parts=1)
+        fewest = (apart / plan.splitting) ** (1 / plan.scheme.order)
+        splits = plan.splits * 2 ** int(np.ceil(np.log2(np.clip(fewest, 2, 64))))
         return replace(plan, splits=min(splits, MOST_SPLITS), parts=1)
     if finer == 1 and edge < plan.edge:
         return None
@@ -319,11 +341,13 @@ def more(plan: Plan, info: Any) -> Plan | None:
     return replace(plan, run=max(shorter, SHORTEST), finer=1.0, wider=1.0, follow=shorter < SHORTEST, order=4)
 
 
-def relaxed(plan: Plan, run: int, follow: bool) -> Plan:
+def relaxed(plan: Plan, run: int, follow: bool, coarser: float) -> Plan:
     """The plan for the next run: what the last one needed more of is given back step by step.
 
-    `run` and `follow` are those that a filter begins with.
+    `run` and `follow` are those that a filter begins with; `coarser` is what the error of splitting would have come to with the
+    next fewer transitions.
     """
+    fewer = coarser < CALMER * plan.splitting < np.inf
     return replace(
         plan,
         run=min(run, 2 * plan.run),
@@ -331,7 +355,8 @@ def relaxed(plan: Plan, run: int, follow: bool) -> Plan:
         wider=max(1.0, plan.wider / 1.2),
         finer=max(1.0, plan.finer / 1.2),
         parts=max(1, plan.parts * 2 // 3 if plan.operator == "characteristics" else plan.parts // 2),
-        splits=plan.splits if plan.splitting == np.inf else max(1, plan.splits // 2),
+        splits=max(1, plan.splits // 2) if fewer else plan.splits,
+        chin=plan.chin and not (fewer and plan.splits == 1),
     )
 
 
@@ -347,7 +372,7 @@ def timed(model: Model, plan: Plan, intervals: Any, rows: slice, fields: Field, 
         diagonal = np.einsum("rkii->rk", spread)
         couples = (spread.sum(axis=(2, 3)) - diagonal) > 1e-12 * diagonal
         plan = replace(plan, cross=plan.follow or bool(couples.any()))
-    tau = (intervals.stop[rows] - intervals.start[rows]).max() / plan.splits
+    tau = (intervals.stop[rows] - intervals.start[rows]).max() / plan.steps
     if plan.operator == "characteristics":
         rate = _turning(model, np.asarray(fields.centre), times)
         least = int(np.ceil(tau * rate / TURN)) if 0 < tau * rate < TURN * MOST_PARTS else 1

@@ -5,10 +5,10 @@ likelihood, all of it online:
 
     u <- exp(h'S^-1 dy - h'S^-1 h dt / 2) u        for increments;        u <- N(z; h, S) u        for a sample
 
-An increment acts in two halves around the transition (Strang's splitting, its first error undone), in as many parts of the
-interval as the tolerance asks for.  The transition is that of `zakai.kolmogorov.comoving`, spectrally accurate on a lattice that
-follows the mass.  S.-T. Yau and S.S.-T. Yau (2008); the likelihood is not inside the operator, so that no large factor is undone
-by another.
+An increment acts in two halves around the transition (Strang's splitting, its first error undone) or, where that leaves more
+than the tolerance allows, in three parts around two transitions (Chin's, of fourth order), in as many parts of the interval as
+it takes.  The transition is that of `zakai.kolmogorov.comoving`, spectrally accurate on a lattice that follows the mass.
+S.-T. Yau and S.S.-T. Yau (2008); the likelihood is not inside the operator, so that no large factor is undone by another.
 """
 
 from __future__ import annotations
@@ -60,14 +60,15 @@ def _system(of: Formulas) -> System:
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["field", "observed", "cut", "room", "error", "table"],
+    data_fields=["field", "observed", "cut", "room", "error", "coarser", "table"],
     meta_fields=["shape"],
 )
 @dataclass(frozen=True)
 class State:
     """The probabilities of the cells of a lattice, the plan in two parts, and h at the points, an array for each coordinate.
 
-    `error` estimates how far the density is from that of the equation, relative to itself.
+    `error` estimates how far the density is from that of the equation, relative to itself; `coarser` is the most that the error
+    of splitting would have come to in this run of steps with the next fewer transitions.
 
     `observed` is None where the lattice is laid anew in every step, and where it stands still with a `table`.  `cut` (2, n) says
     how the first lattice of this run of steps was cut out of the last of the run before.
@@ -79,6 +80,7 @@ class State:
     room: Room
     shape: Shape
     error: Any = 0.0
+    coarser: Any = 0.0
     table: Any = None
 
     LASTING = ("table",)
@@ -147,8 +149,8 @@ def prepare(
     reasons, the window, the cells and the steps in time, and in the long run because an increment's likelihood is split from
     the transition.  `operator` is "spectral", "finite-volume", which is positive and conserves mass whatever the cells, and of
     second order in them, or "characteristics", which is for weak noise and long intervals.  `substeps` splits each interval,
-    observation included, in equal parts, by default as many as the tolerance asks for.  `memory` is how many MiB lattices may
-    take, by default half of what the machine has free.
+    observation included, in equal parts by Strang's splitting; by default they are as many as the tolerance asks for, by Chin's
+    where one by Strang's is not enough.  `memory` is how many MiB lattices may take, by default half of what the machine has free.
     Raises InputError for another value.
     """
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 1e-9 <= tolerance <= 0.1:
@@ -259,7 +261,7 @@ def _looked_at(prepared: Prepared, field: Field, plan: Plan, time: float) -> Sta
     if not plan.follow:
         observed = prepared.system.observe(comoving.points_of(plan.sizes, field.centre, field.basis), time, prepared.theta)
     cut = jnp.asarray(_SAME(prepared.model.n))
-    return State(jax.tree.map(jnp.asarray, field), observed, cut, plan.room, plan.shape, jnp.zeros(()))
+    return State(jax.tree.map(jnp.asarray, field), observed, cut, plan.room, plan.shape, jnp.zeros(()), jnp.zeros(()))
 
 
 def _moments(field: Field) -> tuple[jax.Array, jax.Array]:
@@ -316,13 +318,14 @@ def _repeated(body: Callable[[Any, Any], Any], carry: Any, known: int, count: An
 
 
 def step(interval: Interval, state: State, observation: Whole) -> tuple[State, Info]:
-    """One interval: half of the likelihood, the transition, the other half, or all of it at the end."""
+    """One interval: parts of the likelihood with the transition between them, or all of it at the end."""
     if state.shape.tabled:
         return _tabled_step(interval, state, observation)
     system, plan, theta = interval.system, state.shape, interval.theta
     splits, parts = plan.splits or state.room.splits, plan.parts or state.room.parts
-    length = (interval.stop - interval.start) / splits
-    share = 0.5 * observation.inside / splits
+    length, share = (interval.stop - interval.start) / splits, observation.inside / splits
+    scheme = plan.scheme if system.continuous else splitting.STRANG
+    between = length / (len(scheme.shares) - 1)
     zero, still = jnp.zeros(()), jax.lax.stop_gradient
 
     def drift(x: jax.Array, t: Any) -> Sequence[jax.Array]:
@@ -342,7 +345,7 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
 
     def part(number: Any, time: Any, carry: Any, k: Any) -> Any:
         field, spent, cells = carry
-        tau = length / parts
+        tau = between / parts
         time = time + k * tau
         if plan.operator == "characteristics":
             left = 0 if system.continuous else jnp.asarray((splits - number) * parts - k - 1, int)
@@ -363,45 +366,59 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
         aliasing = jnp.maximum(resolution.aliasing(values), cells)
         return _Worst(aliasing, resolution.edge_mass(values), error * steep, lost, zero)
 
-    def split(carry: Any, k: Any) -> Any:
-        field, observed, log_mass, before, error, worst = carry
-        time = interval.start + k * length
-        half = _log_factor(observed, observation, share)
-        if system.continuous:
-            half = splitting.corrected(half, spread(comoving.inverse(field.basis), time), length)
-        values, gained, grown = _multiplied(field.values, half)
-        worst = worst.over(looked_at(values, comoving.LOST, before, grown))
-        carry = field._replace(values=values), before, zero
-        field, spent, cells = _repeated(partial(part, k, time), carry, plan.parts, parts)
-        points = field.points()
-        observed = system.observe(points, time + length, theta)
-        noise = comoving.noise(field.values)
-        # Only here: to cut tails in every part would make kinks, and these more noise.
-        values = field.values
-        if plan.operator != "characteristics":
-            values = jnp.where(values > noise * jnp.max(values), values, 0.0)
-        half = _log_factor(observed, observation, share)
+    def factor(field: Field, observed: Any, time: Any, share: Any, undone: Any) -> jax.Array:
+        if not system.continuous:
+            return jnp.zeros(plan.sizes)
         inverse = comoving.inverse(field.basis)
-        G = spread(inverse, time + length)
-        last = splitting.corrected(half, G, length) if system.continuous else half
-        if plan.splits == 1:
-            last = last + _log_factor(observed, observation, 1.0 - observation.inside)
-        values, more, grown = _multiplied(values, last)
-        f = drift(points, time + length)
-        flow = list(jnp.tensordot(inverse, jnp.stack(f), axes=1))
-        left = still(splitting.left(values, half, flow, G, length))
-        last_look = looked_at(values, noise, spent, grown, cells)
-        made = spent - before + last_look.aliasing + last_look.lost + OUTSIDE * last_look.edge
-        error = still(splitting.added(error, left.error + made, left.forgets, length))
-        worst = worst.over(last_look._replace(splitting=still(splitting.expected(left.error, left.forgets, length))))
-        return field._replace(values=values), observed, log_mass + gained + more, spent, error, worst
+        return splitting.corrected(logs(observed), spread(inverse, time), length, share, undone)
+
+    def logs(observed: Any) -> jax.Array:
+        return _log_factor(observed, observation, share)
+
+    def split(carry: Any, k: Any) -> Any:
+        field, observed, log_mass, before, error, coarser, worst = carry
+        begin = interval.start + k * length
+        shares, undone = np.array(scheme.factors).T
+        values, gained, grown = _multiplied(field.values, factor(field, observed, begin, shares[0], undone[0]))
+        worst = worst.over(looked_at(values, comoving.LOST, before, grown))
+
+        def multiplied(carry: Any, j: Any) -> Any:
+            """A part of the transition, then one of the likelihood."""
+            field, _, log_mass, spent, made, worst = carry
+            time = begin + j * between
+            field, now, cells = _repeated(partial(part, k, time), (field, spent, zero), plan.parts, parts)
+            observed = system.observe(field.points(), time + between, theta)
+            noise = comoving.noise(field.values)
+            # Only here: to cut tails in every part would make kinks, and these more noise.
+            values = field.values
+            if plan.operator != "characteristics":
+                values = jnp.where(values > noise * jnp.max(values), values, 0.0)
+            j = jnp.asarray(j, int)
+            last = factor(field, observed, time + between, jnp.asarray(shares)[j + 1], jnp.asarray(undone)[j + 1])
+            if plan.splits == 1:
+                at_end = _log_factor(observed, observation, 1.0 - observation.inside)
+                last = last + jnp.where(j == len(shares) - 2, 1.0, 0.0) * at_end
+            values, more, grown = _multiplied(values, last)
+            look = looked_at(values, noise, now, grown, cells)
+            made = jnp.maximum(made, look.aliasing + look.lost + OUTSIDE * look.edge)
+            return field._replace(values=values), observed, log_mass + more, now, made, worst.over(look)
+
+        carry = field._replace(values=values), observed, log_mass + gained, before, zero, worst
+        count = len(shares) - 1
+        field, observed, log_mass, spent, made, worst = _repeated(multiplied, carry, count, count)
+        inverse, end = comoving.inverse(field.basis), begin + length
+        flow = list(jnp.tensordot(inverse, jnp.stack(drift(field.points(), end)), axes=1))
+        terms = splitting.terms(logs(observed), field.values, flow, spread(inverse, end), scheme)
+        left, apart, fewer = _split_error(plan, splits, terms, length)
+        error = still(splitting.added(error, left + made + spent - before, terms.forgets, length))
+        worst = worst._replace(splitting=still(jnp.maximum(worst.splitting, apart)))
+        return field, observed, log_mass, spent, error, still(jnp.maximum(coarser, fewer)), worst
 
     field, observed = state.field, state.observed
     if observed is None:
         observed = system.observe(field.points(), interval.start, theta)
-    carry = (field, observed, observation.constant, zero, state.error, _Worst(zero, zero, zero, zero, zero))
-    carry = _repeated(split, carry, plan.splits, splits)
-    field, observed, log_mass, spent, error, worst = carry
+    carry = field, observed, observation.constant, zero, state.error, state.coarser, _Worst(zero, zero, zero, zero, zero)
+    field, observed, log_mass, spent, error, coarser, worst = _repeated(split, carry, plan.splits, splits)
     if plan.splits != 1:
         values, more, grown = _multiplied(field.values, _log_factor(observed, observation, 1.0 - observation.inside))
         field, log_mass = field._replace(values=values), log_mass + more
@@ -413,7 +430,20 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
         field, observed = comoving.relaid(field, state.room.reach), None
     missed = jnp.max(jnp.stack([figure / most for figure, most in zip(worst, state.room.allowed, strict=True)]))
     health = still(dict(zip(HEALTH, (*worst, missed, error), strict=True)))
-    return State(field, observed, state.cut, state.room, plan, error), Info(log_mass, mean, cov, health)
+    return State(field, observed, state.cut, state.room, plan, error, coarser), Info(log_mass, mean, cov, health)
+
+
+def _split_error(plan: Shape, splits: Any, terms: splitting.Terms, length: Any) -> tuple[Any, Any, Any]:
+    """What the splitting leaves of one of `splits` parts of an interval, what that comes to in the long run, and what it would
+    with the next fewer transitions."""
+
+    def in_the_long_run(error: Any) -> Any:
+        return splitting.expected(error, terms.forgets, length)
+
+    error = splitting.error(plan.scheme, terms, length)
+    apart = in_the_long_run(error)
+    fewest = in_the_long_run(splitting.error(splitting.STRANG, terms, length)) if plan.chin else jnp.zeros(())
+    return error, apart, jnp.where(splits > 1, 2**plan.scheme.order * apart, fewest)
 
 
 def _tabled_step(interval: Interval, state: State, observation: Whole) -> tuple[State, Info]:
@@ -424,35 +454,41 @@ def _tabled_step(interval: Interval, state: State, observation: Whole) -> tuple[
     share, zero = observation.inside / splits, jnp.zeros(())
     whole = tabled.likelihood(table, observation, 1.0)
     b = tabled.Likelihood(*(share * part for part in whole))
-    half, at_end = tabled.corrected(b, length), (1.0 - observation.inside) * whole.log
+    scheme = plan.scheme if increments else splitting.STRANG
+    first, *others = (tabled.corrected(b, length, *part) if increments else zero for part in scheme.factors)
+    at_end = (1.0 - observation.inside) * whole.log
 
     def split(carry: Any, k: Any) -> Any:
-        values, log_mass, error, _, _, worst = carry
-        most, top = jnp.max(values), zero
+        values, log_mass, error, coarser, _, _, worst = carry
+        before, most, lost = values, jnp.max(values), zero
         if increments:
-            values, top = _weighted(values, most, half)
-        before = values
-        values, noise, middle = tabled.carried(table, values)
-        last = jnp.where(k == splits - 1, 1.0, 0.0) * at_end
-        last = half + last if increments else last
-        values, more = _weighted(values, middle, last)
-        told = tabled.told(table, before, values, b, length)
-        # The transition lowers the maximum, so that what is lost of the tails before it is not less than this says.
-        first = comoving.LOST * most / middle if increments else zero
-        lost = jnp.maximum(first, noise * middle / jnp.max(values))
+            values, top = _weighted(values, most, first)
+            log_mass, lost = log_mass + top, zero + comoving.LOST
+        for j, part in enumerate(others):
+            before = values
+            values, noise, middle = tabled.carried(table, values)
+            # The transition lowers the maximum, so that what is lost of the tails before it is not less than this says.
+            lost, most = jnp.maximum(lost * most / middle, noise), middle
+            if j == len(others) - 1:
+                part = part + jnp.where(k == splits - 1, 1.0, 0.0) * at_end
+            values, top = _weighted(values, most, part)
+            log_mass = log_mass + top
+        lost = lost * most / jnp.max(values)
+        told = tabled.told(table, before, values, b, scheme)
+        left, apart, fewer = _split_error(plan, splits, told.terms, length)
         made = told.aliasing + lost + OUTSIDE * told.edge
-        error = splitting.added(error, told.left.error + made, told.left.forgets, length)
-        apart = splitting.expected(told.left.error, told.left.forgets, length)
+        error = splitting.added(error, left + made, told.terms.forgets, length)
+        coarser = jnp.maximum(coarser, fewer)
         # One array, for the compiler takes its time for each.
         worst = jnp.maximum(worst, jnp.stack([told.aliasing, told.edge, zero, lost, apart]))
-        return values / told.total, log_mass + top + more + jnp.log(told.total), error, told.mean, told.variance, worst
+        return values / told.total, log_mass + jnp.log(told.total), error, coarser, told.mean, told.variance, worst
 
-    carry = state.field.values, observation.constant, state.error, zero, zero, jnp.zeros(5)
-    values, log_mass, error, mean, variance, worst = _repeated(split, carry, plan.splits, splits)
+    carry = state.field.values, observation.constant, state.error, state.coarser, zero, zero, jnp.zeros(5)
+    values, log_mass, error, coarser, mean, variance, worst = _repeated(split, carry, plan.splits, splits)
     missed = jnp.max(worst / jnp.stack(state.room.allowed))
     centre, basis = state.field.centre, state.field.basis
     info = Info(log_mass, centre + basis[0] * mean, basis**2 * variance, dict(zip(HEALTH, (*worst, missed, error), strict=True)))
-    return replace(state, field=Field(values, centre, basis), error=error), info
+    return replace(state, field=Field(values, centre, basis), error=error, coarser=coarser), info
 
 
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
@@ -467,9 +503,9 @@ def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> S
 def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None) -> State | None:
     """`adapt` of states with a leading axis of records: one plan for all, the best that any of them needs, and one table."""
     model, plan, last = prepared.model, states.plan, np.asarray(states.cut)
-    fields = jax.tree.map(np.asarray, states.field)
+    fields, none = jax.tree.map(np.asarray, states.field), np.zeros(len(last))
     if info is None:
-        plan = window.relaxed(plan, _most(model.n, plan.operator), prepared.plan.follow)
+        plan = window.relaxed(plan, _most(model.n, plan.operator), prepared.plan.follow, float(np.max(states.coarser)))
         last = np.tile(_SAME(model.n), (len(last), 1, 1))
     elif window.healthy(info).all():
         return None
@@ -482,7 +518,7 @@ def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None
         cut, best, table = _lattice(prepared, fields, plan, rows, info)
         same = np.all(cut == last)
         if best == states.plan and same:
-            return replace(states, cut=last, table=table) if info is None else None
+            return replace(states, cut=last, table=table, coarser=none) if info is None else None
         # Sizes are few: what asks for a little more may get the same.
         if info is None or not same or best.shape != states.plan.shape or best.room.counts != states.plan.room.counts:
             plan = best
@@ -493,7 +529,7 @@ def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None
         points = fields.centre[:, None] + _index(plan.sizes) @ np.swapaxes(fields.basis, 1, 2)
         h = numpy_function(model.observation, model)(points, float(prepared.schedule.starts[rows.start]), prepared.theta)
         observed = tuple(h[..., i].reshape(len(cut), *plan.sizes) for i in range(model.m))
-    return State(fields, observed, cut, _room(plan, len(cut)), plan.shape, np.asarray(states.error), table)
+    return State(fields, observed, cut, _room(plan, len(cut)), plan.shape, np.asarray(states.error), none, table)
 
 
 def _lattice(prepared: Prepared, fields: Field, plan: Plan, rows: slice, info: Info | None) -> tuple[np.ndarray, Plan, Any]:
@@ -518,7 +554,7 @@ def _table(
     if tables is None:
         return None
     lengths = prepared.schedule.stops[rows] - prepared.schedule.starts[rows]
-    tau, theta = float(lengths[0]) / plan.splits, prepared.theta
+    tau, theta = float(lengths[0]) / plan.steps, prepared.theta
     enough = plan.tabled or len(lengths) >= tabled.FEWEST
     if plan.operator != "spectral" or not enough or np.ptp(lengths) > 1e-9 * tau or tabled.crossed(fields, tables, theta, tau):
         return None
@@ -578,7 +614,7 @@ def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State
     observed = None
     if not plan.follow:
         observed = prepared.system.observe(field.points(), float(prepared.schedule.starts[rows.start]), prepared.theta)
-    return State(field, observed, cut, plan.room, plan.shape, state.error)
+    return State(field, observed, cut, plan.room, plan.shape, state.error, state.coarser)
 
 
 def density(prepared: Prepared, state: State) -> GridDensity:
@@ -593,8 +629,8 @@ def density(prepared: Prepared, state: State) -> GridDensity:
 METHOD = Method(
     name="yau-yau",
     source="S.-T. Yau and S.S.-T. Yau 2008; likelihood online",
-    exactness="convergent: spectral in the lattice, of fourth order in the parts of a transition, of second order in the parts "
-    "of an interval for increments (Strang's splitting with its first error undone)",
+    exactness="convergent: spectral in the lattice, of fourth order in the parts of a transition and in those of an interval for "
+    "increments (Chin's splitting; with `substeps` Strang's with its first error undone, of second order)",
     theorem=theorem,
     options={"tolerance": 1e-4, "operator": "spectral", "substeps": None, "memory": None},
     prepare=prepare,
