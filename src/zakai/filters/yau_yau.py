@@ -150,7 +150,7 @@ def prepare(
     the transition.  `operator` is "spectral", "finite-volume", which is positive and conserves mass whatever the cells, and of
     second order in them, or "characteristics", which is for weak noise and long intervals.  `substeps` splits each interval,
     observation included, in equal parts by Strang's splitting; by default they are as many as the tolerance asks for, by Chin's
-    where one by Strang's is not enough.  `memory` is how many MiB lattices may take, by default half of what the machine has free.
+    where one by Strang's is not enough.  `memory` is how many MiB lattices may take, by default half of what the machine has.
     Raises InputError for another value.
     """
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 1e-9 <= tolerance <= 0.1:
@@ -229,7 +229,8 @@ def correct(prepared: Prepared, prior: Any, observation: Whole) -> tuple[State, 
 
 
 OPERATORS = "spectral", "finite-volume", "characteristics"
-OUTSIDE = 10.0  # what mass at the edges counts for: it is far from the mean
+NEAR_EDGE = 10.0  # what mass counts for that stands in the sixteenth of a lattice on each side, and
+OUTSIDE = window.REACH**2  # what mass in the outermost layers does: in the variance, so many deviations from the mean
 HEALTH = ("aliasing", "edge_mass", "time_error", "lost", "splitting", "missed", "error_estimate")
 
 
@@ -476,7 +477,7 @@ def _tabled_step(interval: Interval, state: State, observation: Whole) -> tuple[
         lost = lost * most / jnp.max(values)
         told = tabled.told(table, before, values, b, scheme)
         left, apart, fewer = _split_error(plan, splits, told.terms, length)
-        made = told.aliasing + lost + OUTSIDE * told.edge
+        made = told.aliasing + lost + NEAR_EDGE * told.edge
         error = splitting.added(error, left + made, told.terms.forgets, length)
         coarser = jnp.maximum(coarser, fewer)
         # One array, for the compiler takes its time for each.
