@@ -362,7 +362,15 @@ def _tried(coefficients, starts, arguments) -> int:
 
 def _states(coefficients, starts, arguments) -> int:
     """How many states the coefficients are for."""
-    return jax.eval_shape(coefficients, starts[0], jax.tree.map(lambda a: a[0], arguments)).matrix.shape[0]
+    leaves, structure = jax.tree.flatten(arguments)
+    return _states_of(coefficients, structure, tuple(leaf.shape[1:] for leaf in leaves))
+
+
+@lru_cache(maxsize=128)
+def _states_of(coefficients, structure, shapes) -> int:
+    """The same of an argument with arrays of these shapes; to trace the coefficients takes longer than a short flow."""
+    argument = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(shape, float) for shape in shapes])
+    return jax.eval_shape(coefficients, 0.0, argument).matrix.shape[0]
 
 
 class Substeps(NamedTuple):
