@@ -33,7 +33,12 @@ JOINT = 1.16  # standard deviation, in cells, from which the error of a sum is b
 ROOM = 64.0  # the longest rows of a slanted lattice, in sizes of an axis
 BASE = {1: 128, 2: 64, 3: 48}
 MOST = {1: 8192, 2: 1024, 3: 256}
+# A window that stands still serves a splitting, whose own error is larger than these.
+COARSEST_STILL = 0.88
+EDGE_STILL = 1e-10
+QUADRATURE_STILL = 5e-10
 STILL_ROOM = 12  # cells to each side of a window that is moved every few steps only
+STILL_WIDEST = 4.0  # the `window` up to which it is worth while
 FINE = {1: 2.0, 2: 2.0, 3: 1.2}  # by how much the first lattice is finer than it need be
 
 
@@ -274,8 +279,9 @@ def adapted(
     records = len(lattice.centre)
     same = np.tile(SAME, (records, 1))
     if info is not None:
-        more = replace(plan, still=False) if plan.still else _more(plan, info)
-        better = None if np.all(healthy(info, plan)) else more
+        better = None if np.all(healthy(info, plan)) else _more(plan, info)
+        if plan.still and better is not None and better.window > STILL_WIDEST:
+            better = replace(plan, still=False, window=Plan.window)
         if better is None:
             return None, None, same
         plan = better
@@ -335,13 +341,18 @@ def free_memory() -> int:
 def healthy(info: Any, plan: Plan) -> Any:
     """Which steps kept every bound; traced by JAX or not."""
     health = info.health
-    edge = EDGE_SHARPENED if plan.sharpen else EDGE
+    edge = EDGE_SHARPENED if plan.sharpen else _edge(plan)
     return (
         (abs(info.log_likelihood_increment) < np.inf)
         & (health["edge_mass"] < edge)
         & (health["resolution"] > plan.needed)
-        & (health["quadrature_error"] < QUADRATURE)
+        & (health["quadrature_error"] < (QUADRATURE_STILL if plan.still else QUADRATURE))
     )
+
+
+def _edge(plan: Plan) -> float:
+    """How much mass may stand at the edges of a window."""
+    return EDGE_STILL if plan.still else EDGE
 
 
 def _more(plan: Plan, info: Any) -> Plan | None:
@@ -371,7 +382,7 @@ def _more(plan: Plan, info: Any) -> Plan | None:
         return None if sizes == plan.sizes else replace(plan, sizes=sizes)
     finite = np.all(np.isfinite(info.log_likelihood_increment))
     coarse = not np.all(info.health["resolution"] > CELLS)
-    narrow = not np.all(info.health["edge_mass"] < EDGE) or not finite
+    narrow = not np.all(info.health["edge_mass"] < _edge(plan)) or not finite
     if plan.sizes[0] >= 2**17 or plan.cells > 300 or plan.window > 40:
         return None
     return replace(plan, cells=plan.cells * (2 if coarse else 1), window=plan.window * (1.6 if narrow else 1))
@@ -387,28 +398,47 @@ def _banded(
     # A window that moves along grows with the flow; a kernel between points that stand still has the variance map Sigma.
     along = np.concatenate([[1.0], np.cumprod(maps)])[: len(deviation)]
     growth = (1 / np.sqrt(maps) if plan.still else along) / deviation
-    widest = np.minimum(COARSEST / growth.max(), features(logs)[:, 0] * cell / plan.cells)
-    new_cell = np.where((0.8 * widest <= cell) & (cell <= widest), cell, 0.97 * widest)
+    coarsest = COARSEST_STILL if plan.still else COARSEST
+    widest = np.minimum(coarsest / growth.max(), features(logs)[:, 0] * cell / plan.cells)
+    if plan.still:
+        # The windows of all records stand on one lattice.
+        widest = np.full(len(cell), widest.min())
+    well = (0.8 * widest <= cell) & (cell <= widest)
+    if plan.still:
+        well = np.full(len(cell), np.all(well & (cell == cell[0])))
+    new_cell = np.where(well, cell, 0.97 * widest)
     taps = 16
     while taps * new_cell.min() * growth.min() < REACH:
         taps *= 2
     if plan.still:
         taps = 4 * int(np.ceil(REACH / (4 * new_cell.min() * growth.min())))
-    used = logs > _top(logs) + np.log(0.1 * EDGE)
+    used = logs > _top(logs) + np.log(0.1 * _edge(plan))
     first, last = used.argmax(axis=1), count - 1 - used[:, ::-1].argmax(axis=1)
-    span = (last - first + 1) * cell
+    middle, span = (first + last) // 2, (last - first + 1) * cell
+    if plan.still:
+        middle = _aligned(lattice, middle)
     size = rounded_up(plan.window * (span / new_cell).max() + 8 + (2 * STILL_ROOM if plan.still else 0))
-    if plan.banded and plan.sizes[0] >= size >= 0.6 * plan.sizes[0]:
+    if plan.banded and plan.sizes[0] >= size >= (0.8 if plan.still else 0.6) * plan.sizes[0]:
         size = plan.sizes[0]
     pairs = max(BASE[1], rounded_up(span.max() / (COARSEST * deviation.min())))
     if size * (12 + 0.2 * taps) > 3 * pairs**2:
         return None
     check(size)
-    cuts = np.stack([(first + last) // 2, new_cell / cell], axis=1)
+    cuts = np.stack([middle, new_cell / cell], axis=1)
     window = _resampled(logs, cuts[:, 0], cuts[:, 1], size)
     centre = lattice.centre + lattice.basis[:, :, 0] * (cuts[:, :1] - count // 2)
     lattice = Lattice(window, centre, lattice.basis * cuts[:, 1, None, None])
     return lattice, replace(plan, banded=True, sizes=(size,), taps=taps), cuts
+
+
+def _aligned(lattice: Lattice, middle: np.ndarray) -> np.ndarray:
+    """The points of the first lattice that are nearest to an index (records,) of each, as indices of each."""
+    centre, cell, half = lattice.centre[:, 0], lattice.basis[:, 0, 0], lattice.log_values.shape[1] // 2
+    at = centre + cell * (middle - half)
+    at = centre[0] + cell[0] * np.rint((at - centre[0]) / cell[0])
+    index = (at - centre) / cell + half
+    # Points of lattices that are one but for rounding are the same.
+    return np.where(np.abs(index - np.rint(index)) < 1e-6, np.rint(index), index)
 
 
 def composed(first: np.ndarray, second: np.ndarray, size: int) -> np.ndarray:
@@ -454,7 +484,7 @@ def _resampled(logs: np.ndarray, middle: np.ndarray, ratio: np.ndarray, size: in
     held = np.maximum(logs, top - 800.0)
     window = (1 - share) * np.take_along_axis(held, left, axis=1) + share * np.take_along_axis(held, left + 1, axis=1)
     window = np.where(window <= top - 799.0, -np.inf, window)
-    rows = np.flatnonzero(ratio != 1.0)
+    rows = np.flatnonzero((ratio != 1.0) | (middle % 1 != 0.0))
     if len(rows):
         value = _trigonometric(np.exp(logs[rows] - top[rows]), middle[rows, None], ratio[rows, None], size)
         good = value > 1e-11

@@ -77,8 +77,7 @@ class Method:
     Where nothing depends on time, `lasting(prepared, interval, rule, length)` makes of the only interval of a Prepared, and
     of its rule, those of a shorter one.  None: that is prepared like any other.
 
-    Runs.  `at_once` is the same method for a run whose steps need not be taken one by one again, as when they are differentiated.
-    A state that its `adapt` gives may have `together(state, intervals, observations, keep)`, traced by JAX, which gives what a
+    Runs.  A state that `adapt` gives may have `together(state, intervals, observations, keep)`, traced by JAX, which gives what a
     scan of `step` gives: the last state, and of every step its Info and, with `keep`, what is kept of its state.
 
     Early ends.  `healthy(info)` says, traced by JAX, whether steps kept their bounds.  A run then ends before the first that did
@@ -105,5 +104,4 @@ class Method:
     rule: Callable[..., Any] | None = None
     lasting: Callable[..., tuple[Any, Any]] | None = None
     fits: Callable[[Any, Info], Any] | None = None
-    at_once: Method | None = None
     bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)

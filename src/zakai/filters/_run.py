@@ -235,8 +235,6 @@ class Run:
     def all(self, progress: Callable[[int, int], None] | None, until: int | None = None) -> None:
         """Filter the whole record, or the first `until` of it, chunk by chunk."""
         method, count = self.setting.method, len(self.record.times)
-        if self.pieces is None:
-            method = method.at_once or method
         if self.state is None:
             self.start()
         # A run that goes on from where it was left finds the same chunks.

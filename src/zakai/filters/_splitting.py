@@ -13,6 +13,9 @@ exponential of
 
     tau A + b - tau^2 [[b, A], g] / 4320 - tau^3 (7 [A, [A, g]] / 8640 + [[b, A], [A, [b, A]]] / 2160)
               + tau^4 [A, [A, [A, [A, b]]]] / 2880 + ...
+
+With one state, where exp(tau A) is a filter between the points of a lattice that stands still, both are undone with most of what
+comes after them (`bridged`).
 """
 
 from __future__ import annotations
@@ -116,6 +119,45 @@ def made_up(log: Any, steepness: Any) -> Any:
     """
     more = steepness / 12
     return log + more / (1.0 + jnp.maximum(more, 0.0))
+
+
+class Half(NamedTuple):
+    """One half of the factor of an increment, with one state: its logarithm, and what stands beside it in the kernel."""
+
+    log: Any
+    bend: Any
+    twice: Any
+
+
+def bridged(half: Sequence[Any], spread: Any, tilt: Any) -> Half:
+    """One half of a factor as the kernel of its interval asks for it, from b/2 and its first four derivatives.
+
+    With its ends x and y given a path is a Brownian bridge X between them, of the variance V = G tau, and the likelihood is
+
+        E exp(int b(X_s) ds) = exp(E int b + Var int b / 2 + K3 / 6 + ...),  0 < s < 1,
+
+    where exp((b(x) + b(y)) / 2) is Strang's part and K3 the third cumulant.  To the second order in V, with d = x - y,
+
+        E int b = (b(x) + b(y)) / 2 + (V - d^2) S2 / 12 + (2 d^4 - 2 V d^2 + V^2) S4 / 240
+        Var int b = V S11 / 12 + V^2 (b''^2 / 180 + b' b''' / 60) - V d^2 (7 b''^2 / 360 + b' b''' / 60)
+        K3 = V^2 b'^2 b'' / 40
+
+    with S2, S4, S11 the means of b'', b'''' and b'^2 at x and y.  In the Hermite polynomials d^2 - V and d^4 - 6 V d^2 + 3 V^2,
+    whose means under the kernel are zero, what stands beside neither is a function: `log`.  `bend` at x and at y multiplies
+    the first of them and `twice` at x the second (`bent`).  A drift is in the gauge; the potential Q of the transition is with b
+    in the exponent, and what it has in common with b is here too: `tilt` is -tau Q'.  Corrections that are not small are bounded.
+    """
+    value, first, second, third, fourth = half
+    more = spread / 12 * (tilt * first + spread * (fourth / 4 + first * (first + tilt) * second / 5))
+    bend = second + spread * ((first + tilt / 2) * third / 5 - second**2 / 10 - fourth / 2)
+    twice = 2 * (fourth / 120 + second**2 / 144)
+    return Half(value + jnp.clip(spread * first**2 / 12 + more, -1.0, 1.0), bend, twice)
+
+
+def bent(weights: Any, steps: Any, spread: Any) -> tuple[Any, Any]:
+    """The `weights` of a Gaussian kernel at the distances `steps`, times the polynomials that `bend` and `twice` stand beside."""
+    square = steps**2
+    return weights * (spread - square) / 12, weights * (square**2 - 6 * spread * square + 3 * spread**2)
 
 
 class Terms(NamedTuple):

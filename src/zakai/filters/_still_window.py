@@ -8,15 +8,15 @@ makes of it a filter with the same taps at every point, between two factors that
 
     p'(x) = e^{after(x)} sum_y e^{-(x - y)^2 / (2 P11 Sigma)} e^{before(y)} p(y).
 
-They are multiplied with the factors of the observation, and h at the points is computed once for a whole run: a step is two
-exponentials, a filter, and one product that gives mass, mean, variance and what stands at the edges.  Everything is positive, so
+They are multiplied with the factors of the observation, and h at the points is in a table that outlasts the runs.  The factors of
+`LOOK` steps are made at once, then a step is a filter between two products, with the second error of the splitting undone on
+both sides, and one product gives mass, mean, variance and what stands at the edges for all of them.  Everything is positive, so
 that rounding loses no tail.  Every `LOOK` steps the window is laid over the mass anew, by whole cells, and its resolution is
 looked at.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from math import gcd
 from typing import Any, NamedTuple
 
@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
+from zakai.filters import _splitting as splitting
 from zakai.filters.observations import Factors
 from zakai.kolmogorov import lattice as lat
 from zakai.kolmogorov.flow import Flow, motion
@@ -61,14 +62,29 @@ def _around(polynomial: jax.Array, centre: jax.Array) -> jax.Array:
     return jnp.stack([constant + centre * (slope + centre * bend), slope + 2 * centre * bend, bend], axis=-1)
 
 
+class Table(NamedTuple):
+    """h on a lattice for windows to stand on: `h` (5, m, M) itself and its first four derivatives, at points that are a `cell`
+    apart, around `home`."""
+
+    home: Any
+    cell: Any
+    h: Any
+
+
+def place(table: Table, centre: Any) -> Any:
+    """Where on a table a window stands, in cells from its home."""
+    return jnp.rint((centre - table.home) / table.cell).astype(int)
+
+
 class Steps(NamedTuple):
     """What a run of K steps tells: for each step the `sums` (K, 4) of p, p i, p i^2 and of p at the edges, i an index from the
-    window's centre, which is at `place` (K,) in cells, before p is normalised, and if asked for this p, `values` (K, N); for each
-    look (L,) the narrowest feature in `cells`, that of its product with a kernel, `joint`, and how deep in its tails the mass
-    lies, `depth`."""
+    window's centre, which is at `place` (K,) in cells from the home of its table, the logarithm by which the sum of p grew,
+    `growth` (K,), and if asked for p itself, `values` (K, N); for each look (L,) the narrowest feature in `cells`, that of its
+    product with a kernel, `joint`, and how deep in its tails the mass lies, `depth`."""
 
     sums: Any
     place: Any
+    growth: Any
     values: Any
     cells: Any
     joint: Any
@@ -77,71 +93,94 @@ class Steps(NamedTuple):
 
 def moved(
     lattice: Lattice,
+    table: Table,
     flow: Flow,
+    turned: Any,
     given: Factors,
-    observe: Callable[[Any], Sequence[Any]],
-    corrected: Callable[..., Any],
+    own: Any,
     taps: int,
     keep: bool,
+    even: bool,
 ) -> tuple[jax.Array, Steps]:
     """K intervals, from the density on a lattice of N points: the values (N,) at the end and what is told on the way.
 
-    `observe` gives h at points (M, 1) and its slopes, an array for each; `corrected` makes up half of the logarithm of a
-    factor for the error of the splitting, from itself and the square of the first half's slope, times the transition's spread.
+    `turned` (K, 2) is by how much the gauge changed in an interval, from its linear term on.  `own` is the narrowest feature of
+    the density, in cells; `even` says that both halves of every factor are the same.
     """
-    size, cell, count = len(lattice.log_values), lattice.basis[0, 0], len(flow.map)
-    each = gcd(count, LOOK)
+    size, cell, count = len(lattice.log_values), table.cell, len(flow.map)
+    each, far = gcd(count, LOOK), (table.h.shape[-1] - size) // 2
     index = np.arange(size, dtype=float) - size // 2
     xi = cell * index
     outer = (np.minimum(np.arange(size), np.arange(size)[::-1]) < 2).astype(float)
     columns = np.stack([np.ones(size), index, index**2, outer], axis=1)
-    # As far as the window may come in a run.
-    wide = np.arange(3 * size, dtype=float) - size - size // 2
-    h = jnp.stack(observe(lattice.centre + (cell * wide)[:, None]))
     kernel = jax.vmap(kernel_of)(flow)
-    weights = cell * jnp.exp(-0.5 * (cell * np.arange(taps + 1)) ** 2 / kernel.variance[:, None])
-    slices = weights, kernel, flow.spread[:, 0, 0], given.before, given.after
+    steps, variance = cell * np.arange(taps + 1), kernel.variance[:, None]
+    weights = cell * jnp.exp(-0.5 * steps**2 / variance)
+    taps_of = weights, *splitting.bent(weights, steps, variance)
+    slices = taps_of, kernel, turned, given.before, given.after
+    still = jax.lax.stop_gradient  # of what only says where to look nothing is differentiated
 
-    def exponents(slices: Any, seen: Any) -> tuple[Any, Any]:
-        _, kernel, spread, first, last = slices
-        steepness = spread * _weighted(first, seen[1]) ** 2
-        return tuple(
-            p[0] + xi * (p[1] + xi * p[2]) + corrected(_weighted(linear, seen[0]), steepness)
-            for p, linear in ((kernel.before, first), (kernel.after, last))
-        )  # type: ignore[return-value]
+    def halves(slices: Any, seen: Any) -> tuple[splitting.Half, splitting.Half]:
+        """Those of some steps' factors, with arrays (steps, N)."""
+        _, kernel, turned, first, last = slices
+        slope, bend = (kernel.before + kernel.after)[:, 1:].T - turned.T
+        tilt = slope[:, None] + 2 * bend[:, None] * xi
+
+        def half(linear: Any) -> splitting.Half:
+            parts = [_weighted(linear.T[..., None], row) for row in seen]
+            return splitting.bridged(parts, kernel.variance[:, None], tilt)
+
+        # Made once, and not again by everything that asks for them.
+        before = jax.lax.optimization_barrier(half(first))
+        return before, before if even else jax.lax.optimization_barrier(half(last))
+
+    def on(polynomials: Any) -> jax.Array:
+        constant, slope, bend = polynomials.T[..., None]
+        return constant + xi * (slope + xi * bend)
 
     def look(carry: Any, slices: Any) -> tuple[Any, Any]:
-        p, mass, place, own = carry
+        p, at, own = carry
         used = (p > np.exp(-lat.SUPPORT) * jnp.max(p)).astype(float)
         shift = jnp.clip(jnp.rint(used @ index / jnp.sum(used)).astype(int), -(size // 4), size // 4)
-        shift = jnp.clip(shift, -size - place, size - place)
-        p, place = lat.slid(p, shift, 0.0), place + shift
-        seen = jnp.split(jax.lax.dynamic_slice_in_dim(h, size + place, size, axis=1), 2)
-        centre = lattice.centre[0] + cell * place
-        kernel = slices[1]
-        kernel = kernel._replace(before=_around(kernel.before, centre), after=_around(kernel.after, centre))
-        slices = slices[0], kernel, *slices[2:]
+        shift = jnp.clip(shift, -far - at, far - at)
+        p, at = lat.slid(p, shift, 0.0), at + shift
+        seen = jax.lax.dynamic_slice_in_dim(table.h, far + at, size, axis=2)
+        kernel, centre = slices[1], table.home + cell * at
+        kernel = Kernel(kernel.variance, _around(kernel.before, centre), _around(kernel.after, centre))
+        slope, bend = slices[2].T
+        slices = slices[0], kernel, jnp.stack([slope + 2 * centre * bend, bend], axis=1), *slices[3:]
+        first, last = halves(slices, seen)
+        before, after = on(slices[1].before), on(slices[1].after)
+        # An evidence far from one leaves no mark: at the highest point nothing grows.
+        top = jnp.argmax(p)
+        offset = still((first.log + last.log + before + after)[:, top, None])
+        factors = jnp.exp(first.log + before), jnp.exp(last.log + after - offset)
 
-        def step(carry: Any, slices: Any) -> tuple[Any, Any]:
-            p, mass = carry
-            before, after = exponents(slices, seen)
-            new = jnp.exp(after) * lat.filtered(p * (jnp.exp(before) / mass), slices[0])
-            sums = new @ columns
-            return (new, sums[0]), (sums, new if keep else None)
+        def step(p: Any, slices: Any) -> tuple[Any, Any]:
+            (before, after), (first, last, twice), (weights, once_bent, twice_bent) = slices
+            q = p * before
+            filters = (0, weights), (1, once_bent), (0, once_bent), (0, twice_bent)
+            spread, begin, end, ends = lat.filtered_all((q, first * q), filters)
+            # Nothing is made up for by more than there is.
+            p = after * jnp.clip(spread + begin + last * end + twice * ends, 0.5 * spread, 2.0 * spread)
+            return p, p
 
-        (p, mass), told = jax.lax.scan(step, (p, mass), slices)
-        end = lattice._replace(log_values=lat.log(p))
+        total = jnp.sum(p)
+        p, values = jax.lax.scan(step, p / total, (factors, (first.bend, last.bend, last.twice), slices[0]))
+        sums = values @ columns
+        logs = jnp.log(sums[:, 0])
+        growth = logs - jnp.concatenate([jnp.zeros(1), logs[:-1]]) + offset[:, 0]
+        end = still(lattice._replace(log_values=lat.log(p)))
         cells = lat.features(end)[0]
         joint = jax.lax.rsqrt(1.0 / jnp.minimum(own, cells) ** 2 + cell**2 / jnp.min(kernel.variance))
-        depth = lat.reach(end, end.log_values - exponents(jax.tree.map(lambda a: a[-1], slices), seen)[1])
-        return (p, mass, place, cells), (*told, jnp.broadcast_to(place, (each,)), cells, joint, depth)
+        depth = lat.reach(end, end.log_values - still(last.log + on(slices[1].after))[-1])
+        told = sums, jnp.broadcast_to(at, (each,)), growth, values if keep else None
+        return (p, at, cells), (told, cells, joint, depth)
 
-    first = jnp.exp(lattice.log_values)
-    carry = first, jnp.sum(first), jnp.zeros((), int), lat.features(lattice)[0]
+    start = place(table, lattice.centre[0])
     blocks = jax.tree.map(lambda a: a.reshape(count // each, each, *a.shape[1:]), slices)
-    (p, *_), (sums, kept, place, *looks) = jax.lax.scan(look, carry, blocks)
-    sums, kept, place = jax.tree.map(lambda a: a.reshape(count, *a.shape[2:]), (sums, kept, place))
-    return p, Steps(sums, place, kept, *looks)
+    (p, *_), (told, *looks) = jax.lax.scan(look, (jnp.exp(lattice.log_values), start, own), blocks)
+    return p, Steps(*jax.tree.map(lambda a: a.reshape(count, *a.shape[2:]), told), *looks)
 
 
 def _weighted(weights: Any, arrays: Any) -> Any:

@@ -9,6 +9,7 @@ and everything that a method needs of it is the affine Hamiltonian flow of each 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -40,6 +41,8 @@ class System:
         self.bare = yau.bare is not None
         # An h without time is the same at every reading.
         self.steady = not model.observation.has(model.t)
+        # Of a noise without time both halves of a factor are the same.
+        self.even = not model.observation_noise.has(model.t)
         # Without a gauge nothing need be evaluated.
         self.gauged = yau.form.potential != 0
         # Whether a half of the observation's factor stands at the start of an interval.
@@ -78,6 +81,17 @@ class System:
         h, slopes = jax.jvp(lambda x: list(self.observe(x, t, theta)), (x,), (jnp.ones_like(x),))
         return [*h, *slopes]
 
+    def observe_bent(self, x: Any, t: Any, theta: Any) -> jax.Array:
+        """h of one state and its first four derivatives at points (M, 1): (5, m, M)."""
+
+        def h(x: Any) -> Any:
+            return jnp.stack(self.observe(x, t, theta))
+
+        functions: list[Callable[[Any], Any]] = [h]
+        for _ in range(4):
+            functions.append(_slope(functions[-1]))
+        return jnp.stack([function(x) for function in functions])
+
     def coefficients(self, t: jax.Array, argument: tuple[jax.Array, jax.Array]) -> Coefficients:
         """The coefficients of the flow at time t; `argument` is (theta, inside), the coordinates that act inside."""
         theta, inside = argument
@@ -99,6 +113,10 @@ class System:
         constant = jnp.concatenate([rb[:, 0] - 0.5 * (c.T @ precision @ c)[:, 0], (precision @ c)[:, 0]])
         offset = jnp.hstack([l, jnp.zeros((len(l), self.inputs - 1))])
         return Coefficients(L, offset, G, Qb - 0.5 * gain @ C, linear, constant)
+
+
+def _slope(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda x: jax.jvp(function, (x,), (jnp.ones_like(x),))[1]
 
 
 @lru_cache(maxsize=32)

@@ -12,6 +12,7 @@ from threading import Lock
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
@@ -92,8 +93,7 @@ class _Alike:
             # Without a reading at the start, one prior gives one first state.
             run.start(first if first and not run.at_start and run.setting.prior is first.setting.prior else None)
             first = run
-        followed = self.method.adapt_many is not None and self.method.healthy is not None
-        self.round = ROUND if followed and len(runs) > MANY else self.total
+        self.round = ROUND if self.method.adapt_many is not None and len(runs) > MANY else self.total
 
     @property
     def done(self) -> bool:
@@ -150,7 +150,7 @@ def _together(runs: list[Run], lanes: int, count: _Count, until: int) -> None:
     if lanes == 1:
         return runs[0].all(count.of_one(runs[0].done), until)
     setting, total = runs[0].setting, len(runs[0].record.times)
-    method = setting.method.at_once or setting.method
+    method = setting.method
     states = [run.state for run in runs]
     alone: list[Run] = []
     for rows in setting.chunks(runs[0].data, int(runs[0].at_start), LANES):
@@ -212,7 +212,7 @@ class _Adapt:
         if info is None or (again is None) != (method.healthy is not None):
             return again
         if method.healthy is None:
-            lanes = zip(*(_lanes(each, self.count, 0) for each in (states, info)), strict=True)
+            lanes = zip(*(_lanes(each, self.count, 0) for each in (*_own([states]), info)), strict=True)
             asks = [method.adapt(prepared, state, rows, told) is not None for state, told in lanes]
         else:
             asks = ~np.asarray(method.healthy(info)).all(axis=1)
@@ -246,18 +246,25 @@ def _lanes(tree: Any, count: int, axis: int) -> list[Any]:
 
 @partial(jax.jit, static_argnums=(0, 1, 5))
 def _scan(step, healthy, states, intervals, observations, keep, limit):
-    together = getattr(states, "together", None)
-    if together is not None:
-        by_record = jax.vmap(lambda *of_one: together(*of_one, keep), (0, None, 1), (0, 1))
-        return *by_record(states, intervals, observations), limit[0]
+    # What the records have in common is there once.
+    names = getattr(type(states), "LASTING", ())
+    lasting = {name: getattr(states, name) for name in names}
+    if (together := getattr(states, "together", None)) is not None:
+        # A run that fits near the processor gains nothing by others beside it.
+        nothing = dict.fromkeys(names)
+
+        def one_after_another(of: tuple[Any, Any]) -> tuple[Any, Any]:
+            end, told = together(replace(of[0], **lasting), intervals, of[1], keep)
+            return replace(end, **nothing), told
+
+        given = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), observations)
+        ends, told = jax.lax.map(one_after_another, (replace(states, **nothing), given))
+        return ends, jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), told), limit[0]
+    axes = replace(jax.tree.map(lambda a: 0, states), **dict.fromkeys(names)) if names else 0
 
     def one_record(interval, state, observation):
         new, info = step(interval, state, observation)
         return new, (info, getattr(new, "kept", new) if keep else None)
-
-    # What the records have in common is there once.
-    names = getattr(type(states), "LASTING", ())
-    axes = replace(jax.tree.map(lambda a: 0, states), **dict.fromkeys(names)) if names else 0
 
     def one(carry, slices):
         return jax.vmap(one_record, (None, axes, 0), (axes, 0))(slices[0], carry, slices[1])

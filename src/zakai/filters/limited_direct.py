@@ -5,8 +5,8 @@ q the gauge u = e^phi v makes the Kolmogorov equation linear-quadratic, and its 
 Hamiltonian flow (`zakai.kolmogorov.flow`).  What remains is a sum over a lattice, whose error is watched and kept below 1e-11.
 
 Affine h with increments: y runs linearly between readings and the step is exact.  Nonlinear h: half of the observation's
-factor, the transition with -h'S^-1 h / 2 inside, the other half; with one state the first error of this splitting is undone.
-Samples: exact for every h.
+factor, the transition with -h'S^-1 h / 2 inside, the other half; with one state the errors of this splitting are undone, where
+the lattice stands still up to the fourth order in the interval (`_splitting`).  Samples: exact for every h.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ _SMOOTH = 1e-9  # of the mass of a prior, on every second point of its lattice
 
 
 @partial(
-    jax.tree_util.register_dataclass, data_fields=["lattice", "observed", "cells", "middle", "cut"], meta_fields=["plan"]
+    jax.tree_util.register_dataclass,
+    data_fields=["lattice", "observed", "cells", "middle", "cut", "table"],
+    meta_fields=["plan"],
 )
 @dataclass(frozen=True)
 class State:
@@ -56,7 +58,10 @@ class State:
     What the last step computed and the next one needs again is carried: h at the points, `observed`, an array for each
     coordinate, with one state its slopes behind, the narrowest feature in `cells` (n,), and the `middle` of the support (n,), an
     index from the centre. `cut` (2,) says how the first lattice of this run of steps was cut out of the last of the run before.
+    Of a lattice that stands still `table` holds h and its derivatives, and nothing is `observed`.
     """
+
+    LASTING = ("table",)
 
     lattice: Lattice
     observed: Any
@@ -64,11 +69,12 @@ class State:
     middle: Any
     cut: Any
     plan: choice.Plan
+    table: _still_window.Table | None = None
 
     @property
     def kept(self) -> State:
         """What a result keeps of the state."""
-        return replace(self, observed=None)
+        return replace(self, observed=None, table=None)
 
     @property
     def run_length(self) -> int:
@@ -329,7 +335,7 @@ def _looked_at(prepared: Prepared, lattice: Lattice, plan: choice.Plan, time: fl
     """
     system = prepared.system
     logs = np.asarray(lattice.log_values if own is None else own)
-    observed = _observed_at(system, lattice, time, prepared.theta) if system.halves else None
+    observed = _observed_at(system, lattice, time, prepared.theta) if system.halves and not plan.still else None
     return State(lattice, observed, choice.features(logs), choice.middle(logs), cut, plan)
 
 
@@ -358,18 +364,28 @@ def _log_factor(h: Sequence[jax.Array] | None, factor: Factors) -> Any:
     return value - 0.5 * sum(_linear(factor.energy[i], h) * values for i, values in enumerate(h[: len(factor.after)]))
 
 
-def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None, still: bool = False) -> State | None:
+def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None, still: bool = True) -> State | None:
     """The state to begin the intervals `rows` with: the window, the cell and the way to convolve."""
-    one = jax.tree.map(lambda a: np.asarray(a)[None], (state, info))
-    many = adapt_many(prepared, one[0], rows, one[1], still)
+    one = jax.tree.map(lambda a: np.asarray(a)[None], (replace(state, table=None), info))
+    many = adapt_many(prepared, one[0], rows, one[1], still, state.table)
+    if many is None:
+        return None
     # To take a part of JAX's arrays takes longer than all the rest.
-    return None if many is None else jax.tree.map(lambda a: np.asarray(a)[0], many)
+    return replace(jax.tree.map(lambda a: np.asarray(a)[0], replace(many, table=None)), table=many.table)
 
 
-def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None, still: bool = False) -> State | None:
+def adapt_many(
+    prepared: Prepared,
+    states: State,
+    rows: slice,
+    info: Info | None,
+    still: bool = True,
+    table: _still_window.Table | None = None,
+) -> State | None:
     """`adapt` of states with a leading axis of records: one plan for all, the largest that any of them needs.
 
-    With `still` the window stands still where it can: one kernel for every interval, factors at both ends, an h without time.
+    With `still` the windows, which are of one lattice, stand still where they can: one kernel for every interval, factors at both
+    ends, an h without time; their `table` may be known.
     """
     system = prepared.system
     still = still and system.halves and system.steady and not system.gauged and bool(prepared.schedule.inside[rows].all())
@@ -384,7 +400,28 @@ def adapt_many(prepared: Prepared, states: State, rows: slice, info: Info | None
         cut = choice.composed(np.asarray(states.cut), cut, own.log_values.shape[1])
     if lattice is None:
         return replace(states, plan=plan, cut=cut)
-    return _looked_at(prepared, lattice, plan, prepared.schedule.starts[rows.start], cut)
+    start = prepared.schedule.starts[rows.start]
+    laid = _looked_at(prepared, lattice, plan, start, cut)
+    return replace(laid, table=_table(prepared, lattice, start, table)) if plan.still else laid
+
+
+def _table(prepared: Prepared, lattice: Lattice, time: float, known: _still_window.Table | None = None) -> _still_window.Table:
+    """That for the windows of some records, which stand on one lattice; the one that is `known`, where it serves."""
+    centres, cell, size = lattice.centre.ravel(), lattice.basis.ravel()[0], lattice.log_values.shape[-1]
+    if known is not None and known.cell == cell and known.h.shape[-1] == 3 * size:
+        if abs(_still_window.place(known, centres[0])) <= size // 2:
+            return known
+    # With room for each to move, in few sizes.
+    windows = 3
+    if len(centres) > 1:
+        windows += int(np.ceil(np.abs(centres - centres[0]).max() / cell / size) * 2)
+    return _table_at(prepared.system, centres[0], cell, windows * size, time, prepared.theta)
+
+
+@partial(jax.jit, static_argnums=(0, 3))
+def _table_at(system, centre, cell, size, time, theta):
+    points = centre + cell * (np.arange(size) - size // 2)
+    return _still_window.Table(centre, cell, system.observe_bent(points[:, None], time, theta))
 
 
 def _fits(state: State, info: Info) -> Any:
@@ -393,18 +430,17 @@ def _fits(state: State, info: Info) -> Any:
 
 
 def _steps(state: State, intervals: Interval, observation: Factors, keep: bool) -> tuple[State, tuple[Info, Any]]:
-    """The steps of a run on a window that stands still; with `keep` the states of all."""
+    """The steps of a run on a window that stands still, with `keep` the states of all."""
+    assert state.table is not None
     system, plan, lattice = intervals.system, state.plan, state.lattice
-
-    def observe(x: jax.Array) -> Any:
-        return system.observe_sloped(x, intervals.start[0], intervals.theta[0])
-
     flow = jax.tree.map(lambda a: a[:, 0], intervals.flow)
-    last, told = _still_window.moved(lattice, flow, observation, observe, made_up, plan.taps, keep)
+    last, told = _still_window.moved(
+        lattice, state.table, flow, _turned(intervals), observation, state.cells[0], plan.taps, keep, system.even
+    )
     mass, first, second, outer = told.sums.T
     cell, count = lattice.basis[0, 0], len(mass)
     first, second = cell * first / mass, cell**2 * second / mass
-    centres = lattice.centre + cell * told.place[:, None]
+    centres = state.table.home + cell * told.place[:, None]
     cells, joint, depth = (jnp.repeat(a, count // len(a)) for a in (told.cells, told.joint, told.depth))
     health = {
         "edge_mass": outer / mass,
@@ -414,8 +450,8 @@ def _steps(state: State, intervals: Interval, observation: Factors, keep: bool) 
         "surprise": depth / _HELD_CUT,
     }
     variance = second - first**2
-    log_mass = jnp.log(mass) + observation.constant
-    info = Info(log_mass, centres + first[:, None], variance[:, None, None], health, jnp.ones((count, 2)))
+    growth = told.growth + observation.constant
+    info = Info(growth, centres + first[:, None], variance[:, None, None], health, jnp.ones((count, 2)))
 
     def laid(values: jax.Array, mass: jax.Array, centre: jax.Array, cells: jax.Array) -> State:
         moved = Lattice(lat.log(values) - jnp.log(cell * mass), centre, lattice.basis)
@@ -423,7 +459,20 @@ def _steps(state: State, intervals: Interval, observation: Factors, keep: bool) 
 
     end = laid(last, mass[-1], centres[-1], cells[-1])
     kept = jax.vmap(laid)(told.values, mass, centres, cells) if keep else None
-    return replace(end, observed=observe(end.lattice.points())), (info, kept)
+    return replace(end, table=state.table), (info, kept)
+
+
+def _turned(intervals: Interval) -> jax.Array:
+    """By how much phi changes in each interval, in the gauge e^phi that takes the drift L x + l out: (K, 2), in x and x^2."""
+    system = intervals.system
+    if not system.varying:
+        return jnp.zeros((len(intervals.start), 2))
+
+    def at(t: jax.Array, theta: jax.Array) -> jax.Array:
+        c = system.coefficients(t, (theta, jnp.ones(1)))
+        return jnp.stack([c.offset[0, 0], 0.5 * c.matrix[0, 0]]) / c.covariance[0, 0]
+
+    return jax.vmap(at)(intervals.stop, intervals.theta) - jax.vmap(at)(intervals.start, intervals.theta)
 
 
 def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State:
@@ -431,14 +480,19 @@ def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State
     cut = np.asarray(begin.cut)
     if np.array_equal(cut, choice.SAME):
         return replace(state, plan=begin.plan, cut=cut)
-    own = begin.lattice.log_values
+    own, start = begin.lattice.log_values, prepared.schedule.starts[rows.start]
     lattice = choice.cut_out(state.lattice, cut, own.size)
-    return _looked_at_one(prepared, lattice, begin.plan, prepared.schedule.starts[rows.start], cut, own)
+    laid = _looked_at_one(prepared, lattice, begin.plan, start, cut, own)
+    return replace(laid, table=_table(prepared, lattice, start)) if begin.plan.still else laid
 
 
 def step(interval: Interval, state: State, observation: Factors) -> tuple[State, Info]:
     """One interval: gauge, half factor, transition, half factor, gauge, normalise."""
     system, plan = interval.system, state.plan
+    if plan.still:
+        interval, observation = jax.tree.map(lambda a: a[None], (interval, observation))
+        new, (info, _) = _steps(state, interval, observation, False)
+        return new, jax.tree.map(lambda a: a[0], info)
     lattice, observed, cells = state.lattice, state.observed, state.cells
     if plan.banded:
         shift = jnp.clip(jnp.rint(state.middle[0]).astype(int), -(plan.sizes[0] // 4), plan.sizes[0] // 4)
@@ -587,11 +641,11 @@ def density(prepared: Prepared, state: State) -> GridDensity:
     )
 
 
-_STEPWISE = Method(
+METHOD = Method(
     name="limited-direct",
     source="Chen, Luo and Yau 2017, Theorems 1-3, corrected; x-coordinate form",
     exactness="exact between observations for every h in the class; for increments of nonlinear h, second order in the "
-    "interval for smooth paths (Strang's splitting, with one state its first error undone)",
+    "interval for smooth paths (Strang's splitting); fourth order with one state on a lattice that stands still",
     theorem=theorem,
     options={"kernel": "flow", "splitting": "strang", "order": None, "memory": None},
     prepare=prepare,
@@ -612,7 +666,4 @@ _STEPWISE = Method(
         "exponent": (600.0, "largest exponent of the gauge over the window; beyond 700 mass would be lost"),
         "surprise": (1.0, "how far into its tails the observation drives the density, as a share of the tails that were kept"),
     },
-)
-METHOD = replace(
-    _STEPWISE, at_once=replace(_STEPWISE, adapt=partial(adapt, still=True), adapt_many=partial(adapt_many, still=True))
 )

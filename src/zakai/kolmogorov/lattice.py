@@ -242,27 +242,34 @@ def slid(values: jax.Array, shift: jax.Array, fill: float) -> jax.Array:
 
 
 def filtered(values: jax.Array, weights: jax.Array) -> jax.Array:
-    """sum_j weights[|j|] values[i - j] over |j| <= taps, for `weights` (taps + 1,).
+    """sum_j weights[|j|] values[i - j] over |j| <= taps, for `weights` (taps + 1,)."""
+    return filtered_all((values,), ((0, weights),))[0]
+
+
+def filtered_all(values: Sequence[jax.Array], filters: Sequence[tuple[int, jax.Array]]) -> list[jax.Array]:
+    """`filtered` for each pair (which of the `values`, its weights), of one number of taps.
 
     A sum of shifted slices becomes one fused, vectorised loop, for many records at once too, where a convolution of the
     library does not; what is positive stays so.
     """
-    size, taps = values.shape[0], weights.shape[0] - 1
-    padded = jnp.pad(values, taps)
+    size, taps = values[0].shape[0], filters[0][1].shape[0] - 1
+    padded = [jnp.pad(each, taps) for each in values]
 
-    def add(total: jax.Array, first: Any, count: int) -> jax.Array:
+    def add(totals: list[jax.Array], first: Any, count: int) -> list[jax.Array]:
         for j in range(count):
-            left, right = (lax.dynamic_slice(padded, (start,), (size,)) for start in (taps - first - j, taps + first + j))
-            total = total + weights[first + j] * (left + right)
-        return total
+            starts = taps - first - j, taps + first + j
+            pairs = [[lax.dynamic_slice(each, (start,), (size,)) for start in starts] for each in padded]
+            both = [left + right for left, right in pairs]
+            totals = [total + weights[first + j] * both[k] for total, (k, weights) in zip(totals, filters, strict=True)]
+        return totals
 
     # Short filters are one loop; longer ones go in rounds, which keeps the program small.
     rounds, rest = divmod(taps, FUSED) if taps > 2 * FUSED else (0, taps)
-    total = add(weights[0] * values, 1, rest)
+    totals = add([weights[0] * values[k] for k, weights in filters], 1, rest)
     if rounds == 0:
-        return total
+        return totals
     starts = 1 + rest + FUSED * jnp.arange(rounds)
-    return lax.scan(lambda total, start: (add(total, start, FUSED), None), total, starts)[0]
+    return lax.scan(lambda totals, start: (add(totals, start, FUSED), None), totals, starts)[0]
 
 
 def move_banded(
