@@ -127,16 +127,13 @@ def moved(
         tilt = slope[:, None] + 2 * bend[:, None] * xi
 
         def half(linear: Any) -> splitting.Half:
-            parts = [_weighted(linear.T[..., None], row) for row in seen]
+            parts = [linear @ row for row in seen]
             return splitting.bridged(parts, kernel.variance[:, None], tilt)
 
-        # Made once, and not again by everything that asks for them.
-        before = jax.lax.optimization_barrier(half(first))
-        return before, before if even else jax.lax.optimization_barrier(half(last))
+        before = _made(half(first))
+        return before, before if even else _made(half(last))
 
-    def on(polynomials: Any) -> jax.Array:
-        constant, slope, bend = polynomials.T[..., None]
-        return constant + xi * (slope + xi * bend)
+    powers = jnp.stack([jnp.ones(size), xi, xi**2])
 
     def look(carry: Any, slices: Any) -> tuple[Any, Any]:
         p, at, own = carry
@@ -150,7 +147,7 @@ def moved(
         slope, bend = slices[2].T
         slices = slices[0], kernel, jnp.stack([slope + 2 * centre * bend, bend], axis=1), *slices[3:]
         first, last = halves(slices, seen)
-        before, after = on(slices[1].before), on(slices[1].after)
+        before, after = kernel.before @ powers, kernel.after @ powers
         # An evidence far from one leaves no mark: at the highest point nothing grows.
         top = jnp.argmax(p)
         offset = still((first.log + last.log + before + after)[:, top, None])
@@ -173,7 +170,7 @@ def moved(
         end = still(lattice._replace(log_values=lat.log(p)))
         cells = lat.features(end)[0]
         joint = jax.lax.rsqrt(1.0 / jnp.minimum(own, cells) ** 2 + cell**2 / jnp.min(kernel.variance))
-        depth = lat.reach(end, end.log_values - still(last.log + on(slices[1].after))[-1])
+        depth = lat.reach(end, end.log_values - still(last.log + after)[-1])
         told = sums, jnp.broadcast_to(at, (each,)), growth, values if keep else None
         return (p, at, cells), (told, cells, joint, depth)
 
@@ -183,6 +180,6 @@ def moved(
     return p, Steps(*jax.tree.map(lambda a: a.reshape(count, *a.shape[2:]), told), *looks)
 
 
-def _weighted(weights: Any, arrays: Any) -> Any:
-    """An elementwise sum, which is fused with what follows."""
-    return sum((weights[i] * array for i, array in enumerate(arrays)), start=jnp.zeros(()))
+def _made(arrays: Any) -> Any:
+    """The same arrays (rows, N).  A product is made once, where what is elementwise is made again by each that asks for it."""
+    return jax.tree.map(lambda array: np.eye(len(array)) @ array, arrays)
