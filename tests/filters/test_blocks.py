@@ -156,7 +156,7 @@ def test_two_spirals_are_one_system_of_two_states():
     state = ["x", "y"]
     model = zakai.Model(
         state=state, drift=["0", "0"], observation=[f"{s}*{f}({s})" for s in state for f in ("sin", "cos")],
-        prior=gaussian([0.5, 1.0], [0.5, 0.3]),
+        observation_kind="samples", prior=gaussian([0.5, 1.0], [0.5, 0.3]),
     )  # fmt: skip
     record = readings(model, gaps=False)
     blocks, one = zakai.filter(model, record), zakai.filter(model, record, "limited-direct")

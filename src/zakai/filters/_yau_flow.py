@@ -41,8 +41,8 @@ class System:
         self.bare = yau.bare is not None
         # An h without time is the same at every reading.
         self.steady = not model.observation.has(model.t)
-        # Of a noise without time both halves of a factor are the same.
-        self.even = not model.observation_noise.has(model.t)
+        # Where neither noise depends on time both halves of a factor are the same.
+        self.even = not (model.observation_noise.has(model.t) or model.covariance.has(model.t))
         # Without a gauge nothing need be evaluated.
         self.gauged = yau.form.potential != 0
         # Whether a half of the observation's factor stands at the start of an interval.

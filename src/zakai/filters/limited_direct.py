@@ -434,9 +434,9 @@ def _steps(state: State, intervals: Interval, observation: Factors, keep: bool) 
     assert state.table is not None
     system, plan, lattice = intervals.system, state.plan, state.lattice
     flow = jax.tree.map(lambda a: a[:, 0], intervals.flow)
-    last, told = _still_window.moved(
-        lattice, state.table, flow, _turned(intervals), observation, state.cells[0], plan.taps, keep, system.even
-    )
+    turned, lean = _changes(intervals)
+    given = observation._replace(before=(1 + lean) * observation.before, after=(1 - lean) * observation.after)
+    last, told = _still_window.moved(lattice, state.table, flow, turned, given, state.cells[0], plan.taps, keep, system.even)
     mass, first, second, outer = told.sums.T
     cell, count = lattice.basis[0, 0], len(mass)
     first, second = cell * first / mass, cell**2 * second / mass
@@ -462,17 +462,22 @@ def _steps(state: State, intervals: Interval, observation: Factors, keep: bool) 
     return replace(end, table=state.table), (info, kept)
 
 
-def _turned(intervals: Interval) -> jax.Array:
-    """By how much phi changes in each interval, in the gauge e^phi that takes the drift L x + l out: (K, 2), in x and x^2."""
+def _changes(intervals: Interval) -> tuple[jax.Array, jax.Array]:
+    """What the coefficients' change within each interval does to its splitting.
+
+    By how much phi changes, in the gauge e^phi that takes the drift L x + l out: (K, 2), in x and x^2.  And by what share the
+    first half of the factor is more than the second, (K, 1): where G grows, a path is longer near to where it began.
+    """
     system = intervals.system
     if not system.varying:
-        return jnp.zeros((len(intervals.start), 2))
+        return jnp.zeros((len(intervals.start), 2)), jnp.zeros((len(intervals.start), 1))
 
-    def at(t: jax.Array, theta: jax.Array) -> jax.Array:
+    def at(t: jax.Array, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
         c = system.coefficients(t, (theta, jnp.ones(1)))
-        return jnp.stack([c.offset[0, 0], 0.5 * c.matrix[0, 0]]) / c.covariance[0, 0]
+        return jnp.stack([c.offset[0, 0], 0.5 * c.matrix[0, 0]]) / c.covariance[0, 0], c.covariance[0]
 
-    return jax.vmap(at)(intervals.stop, intervals.theta) - jax.vmap(at)(intervals.start, intervals.theta)
+    (start, first), (stop, last) = (jax.vmap(at)(times, intervals.theta) for times in (intervals.start, intervals.stop))
+    return stop - start, (last - first) / (last + first) / 3
 
 
 def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State:
