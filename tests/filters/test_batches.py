@@ -38,9 +38,22 @@ def test_a_record_that_asks_for_a_larger_lattice_goes_on_by_itself(monkeypatch):
 
 
 @pytest.mark.slow
-def test_many_records_are_grouped_anew_by_where_their_densities_are(monkeypatch):
+def test_records_whose_steps_have_tables_are_filtered_by_themselves():
     model = zakai.Model(
         state=["x"], drift=["cos(x)"], observation=["x**3"], prior={"kind": "gaussian", "mean": [0.0], "cov": [0.2]}
+    )
+    times = 0.005 * np.arange(1, 101)
+    records = [zakai.simulate(model, times, seed=seed)[1] for seed in range(3)]
+    for record, result in zip(records, zakai.filter(model, records, "yau-yau"), strict=True):
+        alone = zakai.filter(model, record, "yau-yau")
+        assert np.array_equal(result.mean, alone.mean)
+        assert result.log_likelihood == alone.log_likelihood
+        assert np.array_equal(result.density(70).log_values, alone.density(70).log_values)
+
+
+def test_many_records_are_grouped_anew_by_where_their_densities_are(monkeypatch):
+    model = zakai.Model(
+        state=["x"], drift=["cos(x) + 1e-30*t"], observation=["x**3"], prior={"kind": "gaussian", "mean": [0.0], "cov": [0.2]}
     )
     times = 0.005 * np.arange(1, 101)
     records = [zakai.simulate(model, times, seed=seed)[1] for seed in range(8)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 import pytest
 
@@ -58,19 +59,19 @@ def test_what_a_table_tells_is_what_its_parts_say():
     factor = Whole(np.array([0.3, -0.2]), np.array([[0.1, 0.04], [0.04, 0.2]]), 0.0, 1.0)
     h = np.stack([x, x**2])
     log = factor.linear @ h - 0.5 * np.sum(h * (factor.energy @ h), axis=0)
-    b = tabled.likelihood(table, factor, 1.0)
-    assert np.allclose(b.log, log, atol=1e-14)
+    b = tabled.likelihood(table, jax.tree.map(lambda a: np.asarray(a)[None], factor), np.ones(1))
+    assert np.allclose(b.log[0], log, atol=1e-14)
     values = np.exp(-8 * (x - 0.5) ** 2)
     spread = np.array([[0.49 / cell**2]])
     for scheme in (splitting.STRANG, splitting.CHIN):
-        told = tabled.told(table, values[::-1], values, b, scheme)
+        told = tabled.told(table, values[None, ::-1], values[None], b, scheme)
         terms = splitting.terms(log, values, [(x - x**3) / cell], spread, scheme)
-        assert np.allclose(told.terms, terms, rtol=1e-9)
+        assert np.allclose([np.ravel(part) for part in told.terms], np.array(terms)[:, None], rtol=1e-9)
         for share, undone in scheme.factors:
             own, other = tabled.corrected(b, tau, share, undone), splitting.corrected(log, spread, tau, share, undone)
-            assert np.allclose(own, other, atol=1e-13)
+            assert np.allclose(own[0], other, atol=1e-13)
     mean = values @ z / values.sum()
-    assert np.allclose([told.mean, told.variance], [mean, values @ (z - mean) ** 2 / values.sum()], rtol=1e-12)
+    assert np.allclose([told.mean[0], told.variance[0]], [mean, values @ (z - mean) ** 2 / values.sum()], rtol=1e-12)
 
 
 def test_drift_that_flows_apart_where_the_ends_of_a_lattice_meet_does_not_grow():

@@ -67,7 +67,8 @@ class Method:
 
     Batches.  `init`, `observations` and `step` serve many records at once as they are.  A method with `adapt` has
     `adapt_many(prepared, states, rows, info)`: `states` and `info` have a leading axis of records, and all records get one
-    plan and arrays of one size.  None: records are filtered one by one.
+    plan and arrays of one size.  None: records are filtered one by one.  `alone(prepared)` says that this is faster for these
+    intervals.  None: it never is.
 
     One reading at a time.  `rule(prepared, data)` is what `observations` gives but for the values of the readings, a pytree whose
     slices are called with values (m,), zero where there is none: observations(prepared, data) is
@@ -78,7 +79,10 @@ class Method:
     of its rule, those of a shorter one.  None: that is prepared like any other.
 
     Runs.  A state that `adapt` gives may have `together(state, intervals, observations, keep)`, traced by JAX, which gives what a
-    scan of `step` gives: the last state, and of every step its Info and, with `keep`, what is kept of its state.
+    scan of `step` gives: the last state, and of every step its Info and, with `keep`, what is kept of its state.  Where steps
+    are healthy or not, one may have `some(intervals, state, observations)`, which gives the states and the Infos of a few steps
+    with a leading axis.  A class of states may name in `PLANNED` its fields that no step changes, and whose values are asked for
+    between runs: they stay as `adapt` gave them.
 
     Early ends.  `healthy(info)` says, traced by JAX, whether steps kept their bounds.  A run then ends before the first that did
     not, and where it took enough steps by then, the next run begins there: no step is taken twice.
@@ -100,6 +104,7 @@ class Method:
     resume: Callable[..., Any] | None = None
     correct_again: Callable[..., Any] | None = None
     adapt_many: Callable[..., Any] | None = None
+    alone: Callable[[Any], bool] | None = None
     healthy: Callable[[Info], Any] | None = None
     rule: Callable[..., Any] | None = None
     lasting: Callable[..., tuple[Any, Any]] | None = None

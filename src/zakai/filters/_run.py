@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+import math
+from collections import OrderedDict, defaultdict
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from dataclasses import replace
+from functools import cached_property
 from threading import Lock
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -22,6 +24,7 @@ from zakai.errors import InputError
 from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters.observations import Data, data_of, schedule_of
 from zakai.filters.results import FilterResult, versions
+from zakai.models.compile import jit_loop
 from zakai.models.model import Model
 from zakai.models.numeric import explain_nonfinite, numpy_function
 from zakai.records import Record
@@ -29,8 +32,10 @@ from zakai.records import Record
 CHUNK = 4096  # intervals that are prepared at once, at most
 CHUNK_BYTES = 512 * 2**20  # what is prepared for them, at most
 RUN = 256  # intervals between two looks at the lattice
+SOME = 16  # of them that are taken at once, where a method can
 TRIES = 16
 KEPT_BYTES = 512 * 2**20
+SMALL = 1024  # numbers in the largest array of a state, up to which its parts are not worth a thread
 
 _PREPARED: WeakKeyDictionary[Model, OrderedDict[Any, Any]] = WeakKeyDictionary()
 _LOCK = Lock()
@@ -69,7 +74,45 @@ def scanned(one: Callable[..., Any], state: Any, slices: Any) -> tuple[Any, Any]
     return state, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 5))
+class Scan:
+    """A compiled function scan(step, healthy, state, intervals, observations, keep, limit), the first two and `keep` static; two
+    threads may compile, but never the same.
+
+    `lanes` says that states have a leading axis of records.
+    """
+
+    def __init__(self, function: Callable[..., Any], lanes: bool = False):
+        self.function, self.lanes = function, lanes
+        self.compiled: dict[Hashable, Callable[..., Any]] = {}
+        self._compiling: defaultdict[Hashable, Lock] = defaultdict(Lock)
+
+    @cached_property
+    def _whole(self) -> Callable[..., Any]:
+        return jax.jit(self.function, static_argnums=(0, 1, 5))
+
+    @cached_property
+    def _part_by_part(self) -> Callable[..., Any]:
+        return jit_loop(self.function, (0, 1, 5))
+
+    def __call__(self, step: Any, healthy: Any, state: Any, intervals: Any, observations: Any, keep: bool, limit: Any) -> Any:
+        key = step, healthy, keep, shape_of((state, intervals, observations))
+        if (scan := self.compiled.get(key)) is not None:
+            return scan(step, healthy, state, intervals, observations, keep, limit)
+        with self._compiling[key]:
+            changed = replace(state, **dict.fromkeys(names)) if (names := getattr(type(state), "LASTING", ())) else state
+            small = max(math.prod(shape[self.lanes :]) for shape in shape_of(changed)[1]) <= SMALL
+            scan = self._part_by_part if small else self._whole
+            result = scan(step, healthy, state, intervals, observations, keep, limit)
+            self.compiled[key] = scan
+        return result
+
+
+def shape_of(tree: Any) -> tuple[Any, tuple[tuple[int, ...], ...]]:
+    """The structure of a pytree and the shapes of its arrays."""
+    return jax.tree.structure(tree), tuple(np.shape(leaf) for leaf in jax.tree.leaves(tree))
+
+
+@Scan
 def scan(step, healthy, state, intervals, observations, keep, limit):
     """Steps of a run: the last state; of every step its Info and, with `keep`, its state; and how many count.
 
@@ -80,9 +123,20 @@ def scan(step, healthy, state, intervals, observations, keep, limit):
     if together is not None:
         return *together(state, intervals, observations, keep), limit[0]
 
-    def one(carry, slices):
+    def told(states: Any, info: Info) -> Any:
+        return info, getattr(states, "kept", states) if keep else None
+
+    if (some := getattr(state, "some", None)) is not None:
+
+        def of_some(state: Any, slices: Any) -> Any:
+            states, info = some(slices[0], state, slices[1])
+            return states, told(states, info)
+
+        return taken_some(of_some, healthy, state, (intervals, observations), *limit)
+
+    def one(carry: Any, slices: Any) -> Any:
         new, info = step(slices[0], carry, slices[1])
-        return new, (info, getattr(new, "kept", new) if keep else None)
+        return new, told(new, info)
 
     return taken(one, healthy, state, (intervals, observations), *limit)
 
@@ -111,6 +165,37 @@ def taken(one: Callable[..., Any], healthy: Callable[[Info], Any] | None, state:
     start = jnp.zeros((), int), jnp.array(True), state, jnp.zeros((length, len(row)))
     k, _, state, rows = jax.lax.while_loop(lambda carry: carry[1] & (carry[0] < most), go, start)
     return state, jax.vmap(unravel)(rows), k
+
+
+def taken_some(
+    some: Callable[..., Any], healthy: Callable[[Info], Any], state: Any, slices: Any, most: Any, strict: Any, count: int = SOME
+) -> Any:
+    """`taken` by steps of which `count` are taken at once; what `some` gives has their number as its leading axis."""
+    length = len(jax.tree.leaves(slices)[0])
+    count = min(count, length)
+    whole = jax.tree.map(lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], -length % count, axis=0)]), slices)
+    names = getattr(type(state), "LASTING", ())
+    lasting = {name: getattr(state, name) for name in names}
+    nothing = dict.fromkeys(names)
+
+    def at(k: Any) -> Any:
+        return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, k, count), whole)
+
+    def go(carry: Any) -> Any:
+        k, _, state, rows = carry
+        # What was not well ends the run, so that every block but the last begins where the one before ended.
+        states, told = some(replace(state, **lasting), at(k))
+        well = jnp.all(healthy(told[0]).reshape(count, -1), axis=1) | jnp.logical_not(strict)
+        done = jnp.sum(jnp.cumprod(well & (k + np.arange(count) < most)))
+        state = jax.tree.map(lambda a, b: jnp.where(done > 0, a[jnp.maximum(done, 1) - 1], b), replace(states, **nothing), state)
+        rows = jax.tree.map(lambda a, b: jax.lax.dynamic_update_slice_in_dim(a, b, k, axis=0), rows, told)
+        return k + done, done == count, state, rows
+
+    told = jax.eval_shape(some, state, at(0))[1]
+    rows = jax.tree.map(lambda a: jnp.zeros((length + -length % count, *a.shape[1:]), a.dtype), told)
+    start = jnp.zeros((), int), jnp.array(True), replace(state, **nothing), rows
+    k, _, state, rows = jax.lax.while_loop(lambda carry: carry[1] & (carry[0] < most), go, start)
+    return replace(state, **lasting), rows, k
 
 
 def rows_of(tree: Any, rows: slice, length: int) -> Any:
@@ -183,7 +268,7 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
     strict = True
     for tries in range(TRIES + 2):
         end, told, taken = scan(method.step, method.healthy, begin, intervals, given, keep, (count, strict))
-        taken = int(taken)
+        end, taken = _as_planned(end, begin), int(taken)
         # The more was tried in vain, the less is enough.
         if not strict or (method.healthy is not None and taken >= max(1.0, enough * count / 2**tries)):
             break
@@ -199,9 +284,15 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
         there = _existing(told[0].log_likelihood_increment, taken)
         if 0 < there < taken:
             end, told, _ = scan(method.step, method.healthy, begin, intervals, given, keep, (there, strict))
-            taken = there
+            end, taken = _as_planned(end, begin), there
     info, kept = first_of(told, taken)
     return slice(part.start, part.start + taken), begin, end, info, kept
+
+
+def _as_planned(end: Any, begin: Any) -> Any:
+    """The end of a run with what no step changes as it was at the beginning: on the device it would have to be fetched."""
+    names = getattr(type(end), "PLANNED", ())
+    return replace(end, **{name: getattr(begin, name) for name in names}) if names else end
 
 
 def _existing(increments: Any, count: int) -> int:
@@ -290,6 +381,15 @@ class Run:
         """Whether the first reading is a sample at the start itself."""
         return self.data.stops[0] == self.setting.model.start
 
+    @property
+    def alone(self) -> bool:
+        """Whether the record had better be filtered by itself."""
+        method = self.setting.method
+        if method.alone is None:
+            return False
+        rows = next(self.setting.chunks(self.data, int(self.at_start)), None)
+        return rows is not None and method.alone(self.setting.prepared(self.data.part(rows)))
+
     def _first_interval(self) -> Data:
         first = self.data.part(slice(0, 1))
         if not self.at_start:
@@ -309,8 +409,12 @@ class Run:
         self.infos.append(info)
         if self.keep:
             self.states.append((self.done + 1, prepared, kept))
-            self.bytes += sum(leaf.nbytes for leaf in jax.tree.leaves(kept))
-            if self.bytes > self.most and not self.must_keep:
+            bytes_now = sum(leaf.nbytes for leaf in jax.tree.leaves(kept))
+            self.bytes += bytes_now
+            # What is not going to be kept to the end is not made either.
+            left = len(self.record.times) - self.done - len(info.log_likelihood_increment)
+            expected = self.bytes + left * bytes_now / len(info.log_likelihood_increment)
+            if expected > self.most and not self.must_keep:
                 self.keep, self.states = False, []
         self.done += len(info.log_likelihood_increment)
 

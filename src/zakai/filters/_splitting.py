@@ -250,6 +250,19 @@ def added(before: Any, error: Any, forgets: Any, length: Any) -> jax.Array:
     return jnp.sqrt(left**2 + 2 * ALIKE * left * error + error**2)
 
 
+def added_up(before: Any, errors: jax.Array, forgets: jax.Array, lengths: jax.Array, parts: Any) -> jax.Array:
+    """The errors (K,) of K densities one after another, the first of which had one `before`; each then made its own in every one
+    of `parts` of that length."""
+    # Those of the parts of one interval have as much in common as those of two intervals.
+    made = errors * jnp.sqrt(parts * (1 + ALIKE * (parts - 1)))
+
+    def add(before: Any, slices: Any) -> tuple[Any, Any]:
+        after = added(before, *slices)
+        return after, after
+
+    return jax.lax.scan(add, before, (made, forgets, lengths * parts))[1]
+
+
 def expected(error: Any, forgets: Any, length: Any) -> jax.Array:
     """What errors like this one come to in the long run."""
     kept = _kept(forgets, length)

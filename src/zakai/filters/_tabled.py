@@ -8,6 +8,7 @@ so that a density that comes back to where it was finds its table.
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from itertools import combinations_with_replacement
 from threading import Lock
 from typing import Any, NamedTuple
@@ -26,7 +27,9 @@ from zakai.kolmogorov.transition import transition
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 
-MOST = 384  # points, beyond which a product with a matrix costs more than a lattice that moves
+# Points: of few sizes few are compiled, with fewer a step is no faster, and with more a product with a matrix costs more than a
+# lattice that moves.
+SIZES = 64, 96, 192, 384
 FEWEST = 8  # steps that a table is made for
 TERMS = 9  # products of coordinates of h, beyond which a sum over all of them costs more than it saves
 LEVELS = 4  # widths of cells in an octave
@@ -139,8 +142,9 @@ def placed(fields: Field, measures: Extent, plan: Plan) -> tuple[float, float, i
     if own and centre - 0.5 * size * cell <= low and high <= centre + 0.5 * size * cell and 0.5 * widest <= cell <= widest:
         return centre, cell, size
     middle = 0.5 * (low + high)
-    size = window.rounded_up((high - low) / _near(middle, widest, size)[1] * (1 + 1 / PLACES), 1)
-    return (*_near(middle, widest, size), size) if size <= MOST else None
+    wanted = (high - low) / _near(middle, widest, size)[1] * (1 + 1 / PLACES)
+    enough = next((size for size in SIZES if size >= wanted), None)
+    return None if enough is None else (*_near(middle, widest, enough), enough)
 
 
 def crossed(fields: Field, tables: Tables, theta: np.ndarray, tau: float) -> bool:
@@ -153,7 +157,7 @@ def crossed(fields: Field, tables: Tables, theta: np.ndarray, tau: float) -> boo
 
 
 class Likelihood(NamedTuple):
-    """The logarithm b of a likelihood at the points, and of b what stands in the `terms` of a Table."""
+    """The logarithms b (K, N) of likelihoods at the points, and of b what stands in the `terms` of a Table."""
 
     log: Any
     slope: Any
@@ -162,21 +166,85 @@ class Likelihood(NamedTuple):
     twice: Any
 
 
-def likelihood(table: Table, factor: Whole, share: Any) -> Likelihood:
-    """share (linear . h - h'(energy) h / 2)."""
-    m = factor.linear.shape[-1]
-    weights = [*(factor.linear[i] for i in range(m)), *(-(0.5 if i == j else 1.0) * factor.energy[i, j] for i, j in _pairs(m))]
-    return Likelihood(*(sum(share * w * table.terms[a, k] for a, w in enumerate(weights)) for k in range(5)))
+def likelihood(table: Table, factors: Whole, share: Any) -> Likelihood:
+    """share (K,) times linear . h - h'(energy) h / 2."""
+    m = factors.linear.shape[-1]
+    weights = [*(factors.linear[:, i] for i in range(m))]
+    weights += [-(0.5 if i == j else 1.0) * factors.energy[:, i, j] for i, j in _pairs(m)]
+    shares = (share * jnp.stack(weights)).T
+    return Likelihood(*(shares @ table.terms[:, k] for k in range(5)))
 
 
 def corrected(b: Likelihood, length: Any, share: Any, undone: Any) -> jax.Array:
-    """See `splitting.corrected`."""
+    """See `splitting.corrected`; the length (K, 1)."""
     return splitting.made_up(share * b.log, 12 * undone * length * b.slope**2)
 
 
+class Passed(NamedTuple):
+    """What K steps leave but for the last factor: the values (K, N) `after` the last transition, of which the largest is one, and
+    `before` it; the logarithm by which `after` is too small, `gained` in this step; and what share of the maximum was `lost`."""
+
+    after: Any
+    before: Any
+    gained: Any
+    lost: Any
+
+
+def weighted(values: jax.Array, logs: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The values (..., N), of which the largest is one, times exp(logs - top), and top (...)."""
+    top = jnp.max(jnp.where(values > LOST, logs, -jnp.inf), axis=-1, keepdims=True)
+    # Where nothing of the density is left a factor may be as large as it likes.
+    return values * jnp.exp(jnp.minimum(logs - top, 0.0)), top[..., 0]
+
+
+def passed(table: Table, values: jax.Array, factors: Sequence[jax.Array], ends: jax.Array, splits: Any, known: int) -> Passed:
+    """K intervals in `splits` parts each, `known` if it is known to the compiler, from the values (N,).
+
+    Before each transition of a part stands one of the `factors` (K, N), their logarithms, and after the last one the last of
+    them, or where the interval ends with it, that of `ends`.  What ends a part is multiplied with what the next begins with.
+    """
+
+    def step(carry: Any, slices: Any) -> tuple[Any, Passed]:
+        values, ended = carry
+        (first, *middle, last), end = slices
+
+        def part(carry: Any, k: Any) -> Any:
+            values, _, gained, lost, worst = carry
+            logs = first + (ended if known == 1 else jnp.where(k == 0, ended, last))
+            for j, factor in enumerate((logs, *middle)):
+                before, top = weighted(values, factor)
+                moved = table.transition @ before
+                most = jnp.max(moved)
+                noise = jnp.maximum(LOST, -jnp.min(moved) / most)
+                # Of the tails below it rounding leaves nothing.
+                values = jnp.where(moved > noise * most, moved / most, 0.0)
+                # A part that has ended: what it lost is told at the maximum of the next.
+                worst = jnp.maximum(worst, lost / most) if j == 0 else worst
+                lost = jnp.maximum((LOST if j == 0 else lost) / most, noise)
+                gained = gained + top + jnp.log(most)
+            return values, before, gained, lost, worst
+
+        zero = jnp.zeros(())
+        values, before, gained, lost, worst = repeated(part, (values, values, zero, zero, zero), known, splits)
+        return (values, end), Passed(values, before, gained, jnp.stack([lost, worst]))
+
+    most = jnp.max(values)
+    _, told = jax.lax.scan(step, (values / most, jnp.zeros_like(values)), (tuple(factors), ends))
+    return told._replace(gained=told.gained.at[0].add(jnp.log(most)))
+
+
+def repeated(body: Callable[[Any, Any], Any], carry: Any, known: int, count: Any) -> Any:
+    """`body` of the carry and 0, 1, ... `count` times; `known` is the count, or 0 where it is not known to the compiler."""
+    if known == 1:
+        return body(carry, 0)
+    if known == 0:
+        return jax.lax.fori_loop(0, jnp.asarray(count, int), lambda k, carry: body(carry, k), carry)
+    return jax.lax.scan(lambda carry, k: (body(carry, k), None), carry, jnp.arange(float(known)))[0]
+
+
 class Told(NamedTuple):
-    """Of the densities before and after a transition: the sum, mean and variance of the second, in cells, the worst of the shares
-    at the highest frequency and at the edges, and what the splitting's errors are made of."""
+    """Of K densities before and after a transition: the sum, mean and variance of the second, in cells, the worst of the shares
+    at the highest frequency and at the edges, and what the splitting's errors are made of; arrays (K,)."""
 
     total: Any
     mean: Any
@@ -187,8 +255,8 @@ class Told(NamedTuple):
 
 
 def told(table: Table, before: jax.Array, after: jax.Array, b: Likelihood, scheme: splitting.Scheme) -> Told:
-    """All of it by three products; the terms are those of `splitting.terms` for the likelihood b."""
-    sums, first_sums = table.rows @ after, table.rows @ before
+    """All of it of densities (K, N) by a few products; the terms are those of `splitting.terms` for the likelihood b."""
+    sums, first_sums = table.rows @ after.T, table.rows @ before.T
     total, means = sums[0], sums / sums[0]
     shares = jnp.maximum(jnp.abs(means[3:5]), jnp.abs(first_sums[3:5]) / first_sums[0])
     mean = means[1]
@@ -199,13 +267,6 @@ def told(table: Table, before: jax.Array, after: jax.Array, b: Likelihood, schem
     if scheme == splitting.CHIN:
         third = steep * b.bend
         functions += [twice_bent**2, third, third**2]
-    terms = splitting.measured(jnp.stack(functions) @ (after / total), growth, jnp.abs(turning), growth + turning)
+    averages = jnp.stack([jnp.sum(function * after, axis=1) for function in functions]) / total
+    terms = splitting.measured(averages, growth, jnp.abs(turning), growth + turning)
     return Told(total, mean, variance, shares[0], shares[1], terms)
-
-
-def carried(table: Table, values: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The density after the transition, without the tails of which rounding leaves nothing; that noise; and the maximum."""
-    after = table.transition @ values
-    top = jnp.max(after)
-    noise = jnp.maximum(LOST, -jnp.min(after) / top)
-    return jnp.where(after > noise * top, after, 0.0), noise, top

@@ -23,7 +23,7 @@ from zakai.models.numeric import numpy_function
 
 LEAST = {1: 32, 2: 24, 3: 20, 4: 16}
 MOST = {1: 4096, 2: 512, 3: 128, 4: 48}
-RUNS = {1: 256, 2: 64, 3: 16, 4: 8}
+RUNS = {1: 512, 2: 64, 3: 16, 4: 8}
 BRIEF = 4  # a run of the characteristics: in how many parts an interval is stepped differs from one to the next
 SHORTEST = 8  # a run that must be shorter than this asks for a lattice that is laid anew in every step
 MOST_PARTS = 4096
@@ -120,15 +120,15 @@ class Plan:
     @classmethod
     def of(cls, shape: Shape, room: Room) -> Plan:
         """The plan that was divided into these; of the records of a batch that which has most room."""
-        told = {name: float(np.max(part)) for name, part in room._asdict().items()}
+        told = {name: max(np.ravel(part).tolist()) for name, part in room._asdict().items()}
         counts = {name: int(told[name]) for name in ("run", "splits", "parts")}
         return cls(**{**shape._asdict(), **told, **counts})
 
     @property
     def shape(self) -> Shape:
         """The static part."""
-        # Where the splits are not the user's they may change with every run.
-        given = self.fixed or self.splitting == np.inf or not (self.chin or self.splits > 1)
+        # Where the splits are not the user's they may change with every run, but mostly there is one.
+        given = self.fixed or self.splitting == np.inf or self.splits == 1
         splits = self.splits if given else 0
         if self.tabled:
             return Shape(self.sizes, splits, tabled=True, chin=self.chin)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -16,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
-from zakai.filters._run import RUN, Run, run_steps, size_of, taken
+from zakai.filters._run import RUN, Run, Scan, run_steps, shape_of, size_of, taken, taken_some
 from zakai.filters.observations import Data
 
 LANES = 32  # records that are filtered by one scan, at most: one that asks for a large lattice slows no more than these
@@ -93,7 +92,9 @@ class _Alike:
             # Without a reading at the start, one prior gives one first state.
             run.start(first if first and not run.at_start and run.setting.prior is first.setting.prior else None)
             first = run
-        self.round = ROUND if self.method.adapt_many is not None and len(runs) > MANY else self.total
+        self.alone = len(runs) > 1 and runs[0].alone
+        regrouped = self.method.adapt_many is not None and len(runs) > MANY and not self.alone
+        self.round = ROUND if regrouped else self.total
 
     @property
     def done(self) -> bool:
@@ -108,7 +109,8 @@ class _Alike:
         method = self.method
         starts: dict[Hashable, list[Run]] = {}
         for run in self.runs:
-            starts.setdefault(_shape(run.state) if method.adapt is None or method.adapt_many else id(run), []).append(run)
+            beside = (method.adapt is None or method.adapt_many) and not self.alone
+            starts.setdefault(shape_of(run.state) if beside else id(run), []).append(run)
         for alike in starts.values():
             n = alike[0].setting.model.n
             each = RUN * (8 * (n * n + n + 16) + (size_of(alike[0].state) if alike[0].keep else 0))
@@ -166,7 +168,7 @@ def _together(runs: list[Run], lanes: int, count: _Count, until: int) -> None:
             adapt, own = _Adapt(method, len(runs)), _own(states)
             together = _stacked([*given, *given[-1:] * fill], 1) if together is None else together
             part, begin, ends, info, kept = run_steps(
-                method, adapt if method.adapt_many else None, _scan_lanes, prepared, _stacked([*own, *own[-1:] * fill], 0),
+                method, adapt if method.adapt_many else None, _scan, prepared, _stacked([*own, *own[-1:] * fill], 0),
                 together, left, rows.stop == total, runs[0].keep, ENOUGH,
             )  # fmt: skip
             begins, states = (_lanes(each, len(runs), 0) for each in _own([begin, ends]))
@@ -229,10 +231,6 @@ def _own(states: list[Any]) -> list[Any]:
     return [replace(state, **dict.fromkeys(names)) for state in states] if names else states
 
 
-def _shape(tree: Any) -> Hashable:
-    return jax.tree.structure(tree), tuple(np.shape(leaf) for leaf in jax.tree.leaves(tree))
-
-
 def _stacked(trees: Sequence[Any], axis: int) -> Any:
     return jax.tree.map(lambda *arrays: np.stack([np.asarray(a) for a in arrays], axis=axis), *trees)
 
@@ -244,7 +242,7 @@ def _lanes(tree: Any, count: int, axis: int) -> list[Any]:
     return [jax.tree.unflatten(structure, [array[lane] for array in arrays]) for lane in range(count)]
 
 
-@partial(jax.jit, static_argnums=(0, 1, 5))
+@partial(Scan, lanes=True)
 def _scan(step, healthy, states, intervals, observations, keep, limit):
     # What the records have in common is there once.
     names = getattr(type(states), "LASTING", ())
@@ -261,6 +259,16 @@ def _scan(step, healthy, states, intervals, observations, keep, limit):
         ends, told = jax.lax.map(one_after_another, (replace(states, **nothing), given))
         return ends, jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), told), limit[0]
     axes = replace(jax.tree.map(lambda a: 0, states), **dict.fromkeys(names)) if names else 0
+    if (some := getattr(states, "some", None)) is not None:
+
+        def of_some(interval, state, observation):
+            new, info = some(interval, state, observation)
+            return replace(new, **dict.fromkeys(names)), (info, getattr(new, "kept", new) if keep else None)
+
+        def lanes(carry, slices):
+            return jax.vmap(of_some, (None, axes, 1), 1)(slices[0], carry, slices[1])
+
+        return taken_some(lanes, healthy, states, (intervals, observations), *limit, 1)
 
     def one_record(interval, state, observation):
         new, info = step(interval, state, observation)
@@ -270,18 +278,3 @@ def _scan(step, healthy, states, intervals, observations, keep, limit):
         return jax.vmap(one_record, (None, axes, 0), (axes, 0))(slices[0], carry, slices[1])
 
     return taken(one, healthy, states, (intervals, observations), *limit)
-
-
-_COMPILED: set[Hashable] = set()
-_COMPILING: defaultdict[Hashable, Lock] = defaultdict(Lock)
-
-
-def _scan_lanes(step, healthy, states, intervals, observations, keep, limit):
-    """`scan` of many records, with axes (steps, records, ...); two threads may compile, but never the same."""
-    key = (step, keep, _shape((states, intervals, observations)))
-    if key in _COMPILED:
-        return _scan(step, healthy, states, intervals, observations, keep, limit)
-    with _COMPILING[key]:
-        result = _scan(step, healthy, states, intervals, observations, keep, limit)
-        _COMPILED.add(key)
-    return result

@@ -84,6 +84,7 @@ class State:
     table: Any = None
 
     LASTING = ("table",)
+    PLANNED = ("cut", "room")
 
     @property
     def plan(self) -> Plan:
@@ -105,7 +106,12 @@ class State:
     @property
     def run_length(self) -> int:
         """How many steps to take before the lattice is looked at again."""
-        return self.plan.run
+        return int(np.max(self.room.run))
+
+    @property
+    def some(self) -> Callable[..., Any] | None:
+        """What takes several steps at once, where they can be."""
+        return _tabled_steps if self.shape.tabled else None
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["start", "stop", "theta"], meta_fields=["system"])
@@ -309,19 +315,13 @@ def _multiplied(values: jax.Array, logs: jax.Array) -> tuple[jax.Array, jax.Arra
     return after / total, jnp.log(total) + top, grown
 
 
-def _repeated(body: Callable[[Any, Any], Any], carry: Any, known: int, count: Any) -> Any:
-    """`body` of the carry and 0, 1, ... `count` times; `known` is the count, or 0 where it is not known to the compiler."""
-    if known == 1:
-        return body(carry, 0)
-    if known == 0:
-        return jax.lax.fori_loop(0, jnp.asarray(count, int), lambda k, carry: body(carry, k), carry)
-    return jax.lax.scan(lambda carry, k: (body(carry, k), None), carry, jnp.arange(float(known)))[0]
-
-
 def step(interval: Interval, state: State, observation: Whole) -> tuple[State, Info]:
     """One interval: parts of the likelihood with the transition between them, or all of it at the end."""
     if state.shape.tabled:
-        return _tabled_step(interval, state, observation)
+        one = jax.tree.map(lambda a: jnp.asarray(a)[None], (interval, observation))
+        states, info = _tabled_steps(one[0], state, one[1])
+        state, info = jax.tree.map(lambda a: a[0], (replace(states, table=None), info))
+        return replace(state, table=states.table), info
     system, plan, theta = interval.system, state.shape, interval.theta
     splits, parts = plan.splits or state.room.splits, plan.parts or state.room.parts
     length, share = (interval.stop - interval.start) / splits, observation.inside / splits
@@ -387,7 +387,7 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
             """A part of the transition, then one of the likelihood."""
             field, _, log_mass, spent, made, worst = carry
             time = begin + j * between
-            field, now, cells = _repeated(partial(part, k, time), (field, spent, zero), plan.parts, parts)
+            field, now, cells = tabled.repeated(partial(part, k, time), (field, spent, zero), plan.parts, parts)
             observed = system.observe(field.points(), time + between, theta)
             noise = comoving.noise(field.values)
             # Only here: to cut tails in every part would make kinks, and these more noise.
@@ -406,7 +406,7 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
 
         carry = field._replace(values=values), observed, log_mass + gained, before, zero, worst
         count = len(shares) - 1
-        field, observed, log_mass, spent, made, worst = _repeated(multiplied, carry, count, count)
+        field, observed, log_mass, spent, made, worst = tabled.repeated(multiplied, carry, count, count)
         inverse, end = comoving.inverse(field.basis), begin + length
         flow = list(jnp.tensordot(inverse, jnp.stack(drift(field.points(), end)), axes=1))
         terms = splitting.terms(logs(observed), field.values, flow, spread(inverse, end), scheme)
@@ -419,7 +419,7 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
     if observed is None:
         observed = system.observe(field.points(), interval.start, theta)
     carry = field, observed, observation.constant, zero, state.error, state.coarser, _Worst(zero, zero, zero, zero, zero)
-    field, observed, log_mass, spent, error, coarser, worst = _repeated(split, carry, plan.splits, splits)
+    field, observed, log_mass, spent, error, coarser, worst = tabled.repeated(split, carry, plan.splits, splits)
     if plan.splits != 1:
         values, more, grown = _multiplied(field.values, _log_factor(observed, observation, 1.0 - observation.inside))
         field, log_mass = field._replace(values=values), log_mass + more
@@ -447,49 +447,45 @@ def _split_error(plan: Shape, splits: Any, terms: splitting.Terms, length: Any) 
     return error, apart, jnp.where(splits > 1, 2**plan.scheme.order * apart, fewest)
 
 
-def _tabled_step(interval: Interval, state: State, observation: Whole) -> tuple[State, Info]:
-    """The same on a lattice that stands still, with its Table."""
-    plan, table, increments = state.shape, state.table, interval.system.continuous
+def _tabled_steps(intervals: Interval, state: State, observations: Whole) -> tuple[State, Info]:
+    """K steps of the same on a lattice that stands still, with its Table: the states and what is told, with a leading axis K.
+
+    Only what a step must know of the one before is in a loop; all the rest is done for all steps at once.
+    """
+    plan, table, increments = state.shape, state.table, intervals.system.continuous
     splits = plan.splits or state.room.splits
-    length = (interval.stop - interval.start) / splits
-    share, zero = observation.inside / splits, jnp.zeros(())
-    whole = tabled.likelihood(table, observation, 1.0)
-    b = tabled.Likelihood(*(share * part for part in whole))
+    lengths = (intervals.stop - intervals.start) / splits
+    share = observations.inside / splits
+    whole = tabled.likelihood(table, observations, 1.0)
+    b = tabled.Likelihood(*(share[:, None] * part for part in whole))
     scheme = plan.scheme if increments else splitting.STRANG
-    first, *others = (tabled.corrected(b, length, *part) if increments else zero for part in scheme.factors)
-    at_end = (1.0 - observation.inside) * whole.log
-
-    def split(carry: Any, k: Any) -> Any:
-        values, log_mass, error, coarser, _, _, worst = carry
-        before, most, lost = values, jnp.max(values), zero
-        if increments:
-            values, top = _weighted(values, most, first)
-            log_mass, lost = log_mass + top, zero + comoving.LOST
-        for j, part in enumerate(others):
-            before = values
-            values, noise, middle = tabled.carried(table, values)
-            # The transition lowers the maximum, so that what is lost of the tails before it is not less than this says.
-            lost, most = jnp.maximum(lost * most / middle, noise), middle
-            if j == len(others) - 1:
-                part = part + jnp.where(k == splits - 1, 1.0, 0.0) * at_end
-            values, top = _weighted(values, most, part)
-            log_mass = log_mass + top
-        lost = lost * most / jnp.max(values)
-        told = tabled.told(table, before, values, b, scheme)
-        left, apart, fewer = _split_error(plan, splits, told.terms, length)
-        made = told.aliasing + lost + NEAR_EDGE * told.edge
-        error = splitting.added(error, left + made, told.terms.forgets, length)
-        coarser = jnp.maximum(coarser, fewer)
-        # One array, for the compiler takes its time for each.
-        worst = jnp.maximum(worst, jnp.stack([told.aliasing, told.edge, zero, lost, apart]))
-        return values / told.total, log_mass + jnp.log(told.total), error, coarser, told.mean, told.variance, worst
-
-    carry = state.field.values, observation.constant, state.error, state.coarser, zero, zero, jnp.zeros(5)
-    values, log_mass, error, coarser, mean, variance, worst = _repeated(split, carry, plan.splits, splits)
-    missed = jnp.max(worst / jnp.stack(state.room.allowed))
+    nothing = jnp.zeros_like(b.log)
+    factors = [tabled.corrected(b, lengths[:, None], *part) if increments else nothing for part in scheme.factors]
+    ends = factors[-1] + (1.0 - observations.inside)[:, None] * whole.log
+    passed = tabled.passed(table, state.field.values, factors, ends, splits, plan.splits)
+    values, top = tabled.weighted(passed.after, ends)
+    told = tabled.told(table, passed.before, values, b, scheme)
+    lost, worst = passed.lost.T
+    lost = jnp.maximum(lost / jnp.max(values, axis=1), worst)
+    left, apart, fewer = _split_error(plan, splits, told.terms, lengths)
+    made = told.aliasing + lost + NEAR_EDGE * told.edge
+    grown = top + jnp.log(told.total)
+    log_mass = observations.constant + passed.gained + jnp.diff(grown, prepend=0.0)
+    error = splitting.added_up(state.error, left + made, told.terms.forgets, lengths, splits)
+    coarser = jnp.maximum(state.coarser, jax.lax.cummax(fewer))
+    zero = jnp.zeros_like(lost)
+    health = told.aliasing, told.edge, zero, lost, apart
+    missed = jnp.max(jnp.stack(health) / jnp.stack(state.room.allowed)[:, None], axis=0)
     centre, basis = state.field.centre, state.field.basis
-    info = Info(log_mass, centre + basis[0] * mean, basis**2 * variance, dict(zip(HEALTH, (*worst, missed, error), strict=True)))
-    return replace(state, field=Field(values, centre, basis), error=error, coarser=coarser), info
+    info = Info(
+        log_mass,
+        centre + basis[0] * told.mean[:, None],
+        basis**2 * told.variance[:, None, None],
+        dict(zip(HEALTH, (*health, missed, error), strict=True)),
+    )
+    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(lost), *jnp.shape(a))), replace(state, table=None))
+    field = every.field._replace(values=values / told.total[:, None])
+    return replace(every, field=field, error=error, coarser=coarser, table=table), info
 
 
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None) -> State | None:
@@ -554,10 +550,11 @@ def _table(
     tables = prepared.system.tables
     if tables is None:
         return None
-    lengths = prepared.schedule.stops[rows] - prepared.schedule.starts[rows]
-    tau, theta = float(lengths[0]) / plan.steps, prepared.theta
-    enough = plan.tabled or len(lengths) >= tabled.FEWEST
-    if plan.operator != "spectral" or not enough or np.ptp(lengths) > 1e-9 * tau or tabled.crossed(fields, tables, theta, tau):
+    tau = float(prepared.schedule.stops[rows.start] - prepared.schedule.starts[rows.start]) / plan.steps
+    enough, theta = plan.tabled or rows.stop - rows.start >= tabled.FEWEST, prepared.theta
+    if plan.operator != "spectral" or not enough or not _regular(prepared.schedule, rows):
+        return None
+    if tabled.crossed(fields, tables, theta, tau):
         return None
     place = tabled.placed(fields, measures, plan)
     table = None if place is None else tables.of(*place, tau, theta)
@@ -568,6 +565,17 @@ def _table(
     cut = np.stack([(centre - fields.centre[:, 0]) / old, cell / old], axis=1)[:, :, None]
     plan = replace(plan, sizes=(size,), tabled=True, order=2, parts=1, cross=False)
     return cut, plan, table
+
+
+def alone(prepared: Prepared) -> bool:
+    """Whether steps are taken with tables: then records that share nothing else need not share a lattice."""
+    spectral = prepared.plan.operator == "spectral"
+    return prepared.system.tables is not None and spectral and _regular(prepared.schedule, slice(None))
+
+
+def _regular(schedule: Schedule, rows: slice) -> bool:
+    lengths = schedule.stops[rows] - schedule.starts[rows]
+    return bool(np.ptp(lengths) <= 1e-9 * lengths[0])
 
 
 def _index(sizes: tuple[int, ...]) -> np.ndarray:
@@ -646,6 +654,7 @@ METHOD = Method(
     with_parameters=with_parameters,
     resume=resume,
     adapt_many=adapt_many,
+    alone=alone,
     healthy=window.healthy,
     bounds={
         "missed": (

@@ -26,7 +26,8 @@ _JAX = operations(jnp, jax.scipy.special.erf, sin=_trigonometry.sin, cos=_trigon
 
 
 # To hand a part of something small to another thread takes longer than the whole.
-ONE_THREAD = (("xla_cpu_scheduler_type", "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"), ("xla_cpu_multi_thread_eigen", False))
+PART_BY_PART = (("xla_cpu_scheduler_type", "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"),)
+ONE_THREAD = (*PART_BY_PART, ("xla_cpu_multi_thread_eigen", False))
 
 
 @lru_cache(maxsize=2)
@@ -44,6 +45,11 @@ def _known(options: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
 def jit_small(function: Callable[..., Any], static_argnums: int | tuple[int, ...] = ()) -> Any:
     """`jax.jit` for what takes microseconds."""
     return jax.jit(function, static_argnums=static_argnums, compiler_options=_known(ONE_THREAD))
+
+
+def jit_loop(function: Callable[..., Any], static_argnums: int | tuple[int, ...] = ()) -> Any:
+    """`jax.jit` for loops over steps that take microseconds, in which products may yet be large."""
+    return jax.jit(function, static_argnums=static_argnums, compiler_options=_known(PART_BY_PART))
 
 
 def jax_function(expressions: Any, model: Model, shape: Sequence[int] | None = None) -> JaxFunction:
