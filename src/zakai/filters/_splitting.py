@@ -52,6 +52,7 @@ CHIN = Scheme((1 / 6, 2 / 3, 1 / 6), (0.0, -1 / 72, 0.0), 4)
 SECOND_ORDER = (1 / 2,)
 SIXTH_ORDER = (45 / 60, -9 / 60, 1 / 60)
 ALIKE = 0.1  # how much the errors of different intervals have in common: between those of noise, 0, and those of one sign, 1
+THIN = 32  # points of an axis from which every second one will do
 LONGEST = 1e4  # intervals after which every error is taken for forgotten
 
 
@@ -158,6 +159,15 @@ def bent(weights: Any, steps: Any, spread: Any) -> tuple[Any, Any]:
     """The `weights` of a Gaussian kernel at the distances `steps`, times the polynomials that `bend` and `twice` stand beside."""
     square = steps**2
     return weights * (spread - square) / 12, weights * (square**2 - 6 * spread * square + 3 * spread**2)
+
+
+def thinned(sizes: Sequence[int]) -> tuple[tuple[slice, ...], np.ndarray]:
+    """Which points of a lattice are enough for `terms`, and how many cells they are apart along each axis.
+
+    Sums over every second point are off by what a density has at the highest frequency of all points.
+    """
+    apart = [2 if size >= THIN else 1 for size in sizes]
+    return tuple(slice(None, None, k) for k in apart), np.array(apart, dtype=float)
 
 
 class Terms(NamedTuple):

@@ -229,7 +229,7 @@ def fitted(
     span = (last - first + 3) * SPARE * plan.wider
     wanted = np.array([rounded_up(s, n) for s in (span / ratio).max(axis=0)])
     wanted = np.minimum(wanted, MOST[n])
-    wanted = np.where((wanted <= sizes) & (wanted > 0.55 * sizes), sizes, wanted)
+    wanted = np.where((wanted <= sizes) & (wanted > 0.7 * sizes), sizes, wanted)
     plan = replace(plan, sizes=tuple(int(s) for s in wanted))
     check(plan.sizes)
     middle = 0.5 * (first + last) - sizes // 2

@@ -370,6 +370,8 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
     def factor(field: Field, observed: Any, time: Any, share: Any, undone: Any) -> jax.Array:
         if not system.continuous:
             return jnp.zeros(plan.sizes)
+        if isinstance(undone, float) and undone == 0:
+            return share * logs(observed)
         inverse = comoving.inverse(field.basis)
         return splitting.corrected(logs(observed), spread(inverse, time), length, share, undone)
 
@@ -380,7 +382,7 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
         field, observed, log_mass, before, error, coarser, worst = carry
         begin = interval.start + k * length
         shares, undone = np.array(scheme.factors).T
-        values, gained, grown = _multiplied(field.values, factor(field, observed, begin, shares[0], undone[0]))
+        values, gained, grown = _multiplied(field.values, factor(field, observed, begin, *scheme.factors[0]))
         worst = worst.over(looked_at(values, comoving.LOST, before, grown))
 
         def multiplied(carry: Any, j: Any) -> Any:
@@ -407,9 +409,11 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
         carry = field._replace(values=values), observed, log_mass + gained, before, zero, worst
         count = len(shares) - 1
         field, observed, log_mass, spent, made, worst = tabled.repeated(multiplied, carry, count, count)
-        inverse, end = comoving.inverse(field.basis), begin + length
-        flow = list(jnp.tensordot(inverse, jnp.stack(drift(field.points(), end)), axes=1))
-        terms = splitting.terms(logs(observed), field.values, flow, spread(inverse, end), scheme)
+        thin, apart = splitting.thinned(plan.sizes)
+        inverse, end = comoving.inverse(field.basis * apart), begin + length
+        flow = list(jnp.tensordot(inverse, jnp.stack(drift(field.points()[thin], end)), axes=1))
+        log = logs([h[thin] for h in observed])
+        terms = splitting.terms(log, field.values[thin], flow, spread(inverse, end), scheme)
         left, apart, fewer = _split_error(plan, splits, terms, length)
         error = still(splitting.added(error, left + made + spent - before, terms.forgets, length))
         worst = worst._replace(splitting=still(jnp.maximum(worst.splitting, apart)))
