@@ -29,6 +29,7 @@ SHORTEST = 8  # a run that must be shorter than this asks for a lattice that is 
 MOST_PARTS = 4096
 MOST_SPLITS = 4096
 MOST_POINTS = 2**20  # of lattices whose flow is looked at together
+FEW_POINTS = 128  # of a lattice that is small
 FEW = {1: 128, 2: 8, 3: 4, 4: 4}  # parts of an interval beyond which the lattice had better follow the flow
 SPARE = 1.25  # how much wider than its density a window is, and
 WORST = {1: 8.0, 2: 3.0, 3: 2.0, 4: 2.0}  # how much more of both a run may ask for before it is cut into shorter ones
@@ -127,8 +128,9 @@ class Plan:
     @property
     def shape(self) -> Shape:
         """The static part."""
-        # Where the splits are not the user's they may change with every run, but mostly there is one.
-        given = self.fixed or self.splitting == np.inf or self.splits == 1
+        # Where the splits are not the user's they may change with every run, but mostly there is one, and on a small lattice a
+        # loop is a good part of the time.
+        given = self.fixed or self.splitting == np.inf or (self.splits == 1 and np.prod(self.sizes) <= FEW_POINTS)
         splits = self.splits if given else 0
         if self.tabled:
             return Shape(self.sizes, splits, tabled=True, chin=self.chin)
