@@ -307,7 +307,7 @@ def draw(path: str, rows: list[dict[str, Any]], which: str) -> None:
             axes.annotate(row["name"], (x, y), xytext=(5, 4 * up), **look)
     axes.set(xscale="log", yscale="log", xlabel="processor time per observation (microseconds)")
     axes.set(ylabel="rms distance from the optimal mean", title=f"{which} sensor: cost against accuracy")
-    axes.margins(0.15)  # room for the names
+    axes.margins(0.28, 0.25)  # room for the names
     axes.grid(alpha=0.3)
     axes.legend()
     figure.savefig(path, dpi=130)

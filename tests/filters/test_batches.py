@@ -51,6 +51,18 @@ def test_records_whose_steps_have_tables_are_filtered_by_themselves():
         assert np.array_equal(result.density(70).log_values, alone.density(70).log_values)
 
 
+def test_records_that_come_to_tables_on_the_way_share_them():
+    model = zakai.Model(
+        state=["x"], drift=["cos(x)"], observation=["x**3"], prior={"kind": "gaussian", "mean": [0.0], "cov": [0.2]}
+    )
+    times = np.cumsum([0.004] * 10 + [0.005] * 60)
+    records = [zakai.simulate(model, times, seed=seed)[1] for seed in range(3)]
+    for record, result in zip(records, zakai.filter(model, records, "yau-yau", keep="moments"), strict=True):
+        alone = zakai.filter(model, record, "yau-yau", keep="moments")
+        assert np.abs(result.mean - alone.mean).max() < 2e-5
+        assert abs(result.log_likelihood - alone.log_likelihood) < 2e-5
+
+
 def test_many_records_are_grouped_anew_by_where_their_densities_are(monkeypatch):
     model = zakai.Model(
         state=["x"], drift=["cos(x) + 1e-30*t"], observation=["x**3"], prior={"kind": "gaussian", "mean": [0.0], "cov": [0.2]}

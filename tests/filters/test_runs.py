@@ -9,6 +9,7 @@ import pytest
 import zakai
 from zakai.filters import _run
 from zakai.filters._protocol import Info
+from zakai.filters.yau_yau import METHOD
 
 CUBIC = dict(state=["x"], drift=["cos(x)"], observation=["x**3"], prior={"kind": "gaussian", "mean": [0.0], "cov": [[0.05]]})
 
@@ -39,6 +40,33 @@ def test_a_run_gives_the_state_before_the_first_step_that_is_not_well(healthy, m
     assert np.array_equal(np.asarray(info.mean)[:count], sums[:count])
     if count < most:
         assert float(info.mean[count]) == sums[count]  # what went wrong can be looked at
+
+
+def adding_some(state, slices):
+    """The same for several steps, with a leading axis."""
+    sums = state + jnp.cumsum(slices[0])
+    return sums, (Info(sums, sums, sums, {}), None)
+
+
+@pytest.mark.parametrize("count", [1, 2, 4, 6, 16])
+@pytest.mark.parametrize(("most", "strict"), [(6, True), (3, True), (5, True), (6, False), (5, False)])
+def test_several_steps_at_once_end_where_single_ones_end(count, most, strict):
+    given = well, jnp.zeros(()), (jnp.arange(6.0),), most, strict
+    end, (info, _), taken = _run.taken(adding, *given)
+    again, (info_again, _), taken_again = _run.taken_some(adding_some, *given, count)
+    assert int(taken_again) == int(taken) and float(again) == float(end)
+    told = min(int(taken) + 1, most)
+    assert np.array_equal(info_again.mean[:told], info.mean[:told])
+
+
+def test_densities_that_would_not_fit_are_given_up_after_the_first_run(monkeypatch):
+    model = zakai.Model(**CUBIC)
+    _, record = zakai.simulate(model, 0.005 * np.arange(1, 1101), seed=3)
+    kept = []
+    monkeypatch.setattr(_run, "scan", lambda *given, scan=_run.scan: kept.append(given[5]) or scan(*given))
+    run = _run.Run(_run.Setting(model, model.prior, METHOD, dict(METHOD.options)), record, None, most=2**16)
+    run.all(None)
+    assert not run.keep and kept[0] and not kept[-1] and sum(kept) <= 4
 
 
 @pytest.fixture

@@ -90,8 +90,32 @@ def test_what_depends_on_the_time_or_is_not_a_number_has_no_table():
 def test_a_state_that_comes_back_finds_its_table():
     model, _ = wells()
     record = zakai.simulate(model, 0.01 * np.arange(1, 2001), seed=1)[1]
-    zakai.filter(model, record, "yau-yau", keep="moments")
+    result = zakai.filter(model, record, "yau-yau", keep="moments")
+    # No window was so wide that the drift at its ends was too steep for a table.
+    assert np.nanmax(result.health["time_error"]) == 0
     tables = yau_yau._system(yau_yau.formulas(model)).tables
     made = len(tables.kept)
     zakai.filter(model, record, "yau-yau", keep="moments")
     assert 0 < made == len(tables.kept) < 40
+
+
+@pytest.mark.parametrize("splits", [1, 3])
+def test_a_number_of_parts_that_the_compiler_knows_changes_nothing(splits):
+    rng, size, count = np.random.default_rng(0), 64, 5
+    z = np.arange(size) - size // 2.0
+    model, _ = wells()
+    table = yau_yau.System(model).tables.of(0.0, 0.1, size, 0.01, model.theta())
+    values = np.exp(-0.1 * (z - 3) ** 2)
+    factors = [0.01 * rng.normal(size=(count, 1)) * z - 1e-4 * z**2 for _ in range(3)]
+    one, other = (tabled.passed(table, values, factors, 2 * factors[-1], splits, known) for known in (splits, 0))
+    for a, b in zip(one, other, strict=True):
+        assert np.allclose(a, b, rtol=1e-12, atol=1e-15)
+    # By the definition: no sum of logarithms, no part that is merged with the next.
+    plain = values
+    for k in range(count):
+        for part in range(splits):
+            plain = table.transition @ (plain * np.exp(factors[0][k]))
+            plain = table.transition @ (plain * np.exp(factors[1][k]))
+            plain = plain * np.exp((2.0 if part == splits - 1 else 1.0) * factors[2][k])
+    end = np.exp(np.sum(one.gained) + 2 * factors[2][-1]) * one.after[-1]
+    assert np.abs(end - plain).max() < 1e-11 * plain.max()

@@ -99,8 +99,7 @@ class Scan:
         if (scan := self.compiled.get(key)) is not None:
             return scan(step, healthy, state, intervals, observations, keep, limit)
         with self._compiling[key]:
-            changed = replace(state, **dict.fromkeys(names)) if (names := getattr(type(state), "LASTING", ())) else state
-            small = max(math.prod(shape[self.lanes :]) for shape in shape_of(changed)[1]) <= SMALL
+            small = max(math.prod(shape[self.lanes :]) for shape in shape_of(without_lasting(state))[1]) <= SMALL
             scan = self._part_by_part if small else self._whole
             result = scan(step, healthy, state, intervals, observations, keep, limit)
             self.compiled[key] = scan
@@ -174,9 +173,7 @@ def taken_some(
     length = len(jax.tree.leaves(slices)[0])
     count = min(count, length)
     whole = jax.tree.map(lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], -length % count, axis=0)]), slices)
-    names = getattr(type(state), "LASTING", ())
-    lasting = {name: getattr(state, name) for name in names}
-    nothing = dict.fromkeys(names)
+    lasting = state
 
     def at(k: Any) -> Any:
         return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, k, count), whole)
@@ -184,18 +181,30 @@ def taken_some(
     def go(carry: Any) -> Any:
         k, _, state, rows = carry
         # What was not well ends the run, so that every block but the last begins where the one before ended.
-        states, told = some(replace(state, **lasting), at(k))
+        states, told = some(with_lasting(state, lasting), at(k))
         well = jnp.all(healthy(told[0]).reshape(count, -1), axis=1) | jnp.logical_not(strict)
         done = jnp.sum(jnp.cumprod(well & (k + np.arange(count) < most)))
-        state = jax.tree.map(lambda a, b: jnp.where(done > 0, a[jnp.maximum(done, 1) - 1], b), replace(states, **nothing), state)
+        state = jax.tree.map(lambda a, b: jnp.where(done > 0, a[jnp.maximum(done, 1) - 1], b), without_lasting(states), state)
         rows = jax.tree.map(lambda a, b: jax.lax.dynamic_update_slice_in_dim(a, b, k, axis=0), rows, told)
         return k + done, done == count, state, rows
 
     told = jax.eval_shape(some, state, at(0))[1]
     rows = jax.tree.map(lambda a: jnp.zeros((length + -length % count, *a.shape[1:]), a.dtype), told)
-    start = jnp.zeros((), int), jnp.array(True), replace(state, **nothing), rows
+    start = jnp.zeros((), int), jnp.array(True), without_lasting(state), rows
     k, _, state, rows = jax.lax.while_loop(lambda carry: carry[1] & (carry[0] < most), go, start)
-    return replace(state, **lasting), rows, k
+    return with_lasting(state, lasting), rows, k
+
+
+def without_lasting(state: Any) -> Any:
+    """A state without what no step changes."""
+    names = getattr(type(state), "LASTING", ())
+    return replace(state, **dict.fromkeys(names)) if names else state
+
+
+def with_lasting(state: Any, given: Any) -> Any:
+    """A state with what no step changes as that which is `given` has it."""
+    names = getattr(type(state), "LASTING", ())
+    return replace(state, **{name: getattr(given, name) for name in names}) if names else state
 
 
 def rows_of(tree: Any, rows: slice, length: int) -> Any:

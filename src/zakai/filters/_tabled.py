@@ -138,13 +138,17 @@ def placed(fields: Field, measures: Extent, plan: Plan) -> tuple[float, float, i
     high = float(np.max(centres + cells * (last + spare - size // 2)))
     widest = float(np.min(cells * window.coarser(band, plan)))
     centre, cell = float(centres[0]), float(cells[0])
+    middle, span = 0.5 * (low + high), (high - low) * (1 + 1 / PLACES)
+    enough = next((size for size in SIZES if size >= span / _near(middle, widest, size)[1]), None)
     own = np.all(centres == centre) and np.all(cells == cell) and (centre, cell) == _near(centre, cell, size)
-    if own and centre - 0.5 * size * cell <= low and high <= centre + 0.5 * size * cell and 0.5 * widest <= cell <= widest:
+    own = own and centre - 0.5 * size * cell <= low and high <= centre + 0.5 * size * cell and 0.5 * widest <= cell <= widest
+    if own and (enough is None or size < 2 * enough):
         return centre, cell, size
-    middle = 0.5 * (low + high)
-    wanted = (high - low) / _near(middle, widest, size)[1] * (1 + 1 / PLACES)
-    enough = next((size for size in SIZES if size >= wanted), None)
-    return None if enough is None else (*_near(middle, widest, enough), enough)
+    if enough is None:
+        return None
+    # What there is too much of goes to the window and to the cells alike: far out a drift may be steep.
+    finer = _near(middle, np.sqrt(widest * span / enough), enough)
+    return (*(finer if finer[1] * enough >= span else _near(middle, widest, enough)), enough)
 
 
 def crossed(fields: Field, tables: Tables, theta: np.ndarray, tau: float) -> bool:

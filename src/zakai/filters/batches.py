@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 from threading import Lock
 from typing import Any
@@ -15,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
-from zakai.filters._run import RUN, Run, Scan, run_steps, shape_of, size_of, taken, taken_some
+from zakai.filters._run import RUN, Run, Scan, run_steps, shape_of, size_of, taken, taken_some, with_lasting, without_lasting
 from zakai.filters.observations import Data
 
 LANES = 32  # records that are filtered by one scan, at most: one that asks for a large lattice slows no more than these
@@ -227,8 +226,7 @@ class _Adapt:
 
 def _own(states: list[Any]) -> list[Any]:
     """States without what the records of a batch have in common; `adapt_many` gives it again."""
-    names = getattr(type(states[0]), "LASTING", ())
-    return [replace(state, **dict.fromkeys(names)) for state in states] if names else states
+    return [without_lasting(state) for state in states]
 
 
 def _stacked(trees: Sequence[Any], axis: int) -> Any:
@@ -244,26 +242,23 @@ def _lanes(tree: Any, count: int, axis: int) -> list[Any]:
 
 @partial(Scan, lanes=True)
 def _scan(step, healthy, states, intervals, observations, keep, limit):
-    # What the records have in common is there once.
-    names = getattr(type(states), "LASTING", ())
-    lasting = {name: getattr(states, name) for name in names}
     if (together := getattr(states, "together", None)) is not None:
         # A run that fits near the processor gains nothing by others beside it.
-        nothing = dict.fromkeys(names)
 
         def one_after_another(of: tuple[Any, Any]) -> tuple[Any, Any]:
-            end, told = together(replace(of[0], **lasting), intervals, of[1], keep)
-            return replace(end, **nothing), told
+            end, told = together(with_lasting(of[0], states), intervals, of[1], keep)
+            return without_lasting(end), told
 
         given = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), observations)
-        ends, told = jax.lax.map(one_after_another, (replace(states, **nothing), given))
+        ends, told = jax.lax.map(one_after_another, (without_lasting(states), given))
         return ends, jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), told), limit[0]
-    axes = replace(jax.tree.map(lambda a: 0, states), **dict.fromkeys(names)) if names else 0
+    # What the records have in common is there once.
+    axes = jax.tree.map(lambda a: 0, without_lasting(states))
     if (some := getattr(states, "some", None)) is not None:
 
         def of_some(interval, state, observation):
             new, info = some(interval, state, observation)
-            return replace(new, **dict.fromkeys(names)), (info, getattr(new, "kept", new) if keep else None)
+            return without_lasting(new), (info, getattr(new, "kept", new) if keep else None)
 
         def lanes(carry, slices):
             return jax.vmap(of_some, (None, axes, 1), 1)(slices[0], carry, slices[1])
