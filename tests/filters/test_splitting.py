@@ -113,4 +113,5 @@ def test_every_second_point_tells_the_same_errors():
         whole = splitting.terms(log, values, flow, spread, scheme)
         own = [part[thin] / step for part, step in zip(flow, apart, strict=True)]
         part = splitting.terms(log[thin], values[thin], own, spread / np.outer(apart, apart), scheme)
-        assert np.allclose(part, whole, rtol=1e-4)
+        # The differences are those of cells twice as wide.
+        assert np.allclose(part, whole, rtol=1e-3)
