@@ -35,6 +35,7 @@ RUN = 256  # intervals between two looks at the lattice
 SOME = 16  # of them that are taken at once, where a method can
 TRIES = 16
 KEPT_BYTES = 512 * 2**20
+SURELY = 3.0  # by how much a lattice of the first runs may be larger than those that follow
 SMALL = 1024  # numbers in the largest array of a state, up to which its parts are not worth a thread
 
 _PREPARED: WeakKeyDictionary[Model, OrderedDict[Any, Any]] = WeakKeyDictionary()
@@ -420,10 +421,10 @@ class Run:
             self.states.append((self.done + 1, prepared, kept))
             bytes_now = sum(leaf.nbytes for leaf in jax.tree.leaves(kept))
             self.bytes += bytes_now
-            # What is not going to be kept to the end is not made either.
+            # What is surely not going to be kept to the end is not made either.
             left = len(self.record.times) - self.done - len(info.log_likelihood_increment)
             expected = self.bytes + left * bytes_now / len(info.log_likelihood_increment)
-            if expected > self.most and not self.must_keep:
+            if (self.bytes > self.most or expected > SURELY * self.most) and not self.must_keep:
                 self.keep, self.states = False, []
         self.done += len(info.log_likelihood_increment)
 
