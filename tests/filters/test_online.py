@@ -296,3 +296,24 @@ def test_an_outlier_of_fifty_deviations_neither_breaks_nor_freezes_the_filter(ke
     assert [k for k, _ in refused] in ([], [20]) and all("not used" in text for _, text in refused)
     # After two units of time the system has come back.
     assert np.all(abs(estimate.mean - usual.mean) < 3 * np.sqrt(np.diag(usual.cov)))
+
+
+def test_a_lattice_that_is_as_large_as_it_was_is_looked_at_less_often():
+    """Readings that tell of nothing leave the lattice as it is; an outlier is met at once for all that."""
+    model = zakai.load_model("gallery:spiral-sensor")
+    online = zakai.online(model)
+    times = 0.01 * np.arange(1, 1201)
+    record = zakai.simulate(model, times, seed=5)[1]
+    lefts = []
+    for time, value in zip(times, record.values, strict=True):
+        online.update(time, value)
+        lefts.append(online.lives[0].now.left)
+    assert max(lefts) > 4 * 256
+    values = record.values.copy()
+    values[900] = [2.0, -2.0]
+    truth = zakai.filter(model, zakai.Record(times[:905], values[:905], "increments"))
+    other = zakai.online(model)
+    for time, value in zip(times[:905], values[:905], strict=True):
+        estimate = other.update(time, value)
+    assert np.allclose(estimate.mean, truth.mean[-1], rtol=0, atol=1e-8)
+    assert np.allclose(estimate.cov, truth.cov[-1], rtol=0, atol=1e-8)

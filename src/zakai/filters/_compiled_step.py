@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +20,8 @@ import numpy as np
 from zakai import _float64  # noqa: F401
 from zakai.filters._protocol import Info, Method
 from zakai.models.compile import jit_small
+
+FEW = 4  # numbers that are as easily told one by one
 
 
 class Layout(NamedTuple):
@@ -37,7 +39,7 @@ class Layout(NamedTuple):
     def of(cls, tree: Any) -> Layout:
         found, structure = jax.tree.flatten(tree)
         shapes, types = tuple(np.shape(leaf) for leaf in found), tuple(np.dtype(_type(leaf)).str for leaf in found)
-        return cls(structure, shapes, types, _apart(tree))
+        return cls(structure, shapes, types, _apart(_names(tree), structure))
 
     @classmethod
     def of_rows(cls, tree: Any) -> Layout:
@@ -58,12 +60,17 @@ class Layout(NamedTuple):
         return jax.tree.unflatten(self.tree, leaves)
 
 
-def _apart(tree: Any) -> tuple[bool, ...]:
-    """Of each array of a pytree whether it stands apart."""
-    names = getattr(type(tree), "LASTING", ())
+def _names(tree: Any) -> tuple[str, ...]:
+    return getattr(type(tree), "LASTING", ())
+
+
+@lru_cache(maxsize=256)
+def _apart(names: tuple[str, ...], structure: Any) -> tuple[bool, ...]:
+    """Of each array of a pytree whether it stands apart, in a field with one of the names."""
     if not names:
-        return (False,) * len(jax.tree.leaves(tree))
-    return tuple(bool(path) and getattr(path[0], "name", "") in names for path, _ in jax.tree_util.tree_leaves_with_path(tree))
+        return (False,) * structure.num_leaves
+    leaves = jax.tree_util.tree_leaves_with_path(jax.tree.unflatten(structure, range(structure.num_leaves)))
+    return tuple(bool(path) and getattr(path[0], "name", "") in names for path, _ in leaves)
 
 
 @lru_cache(maxsize=256)
@@ -75,7 +82,8 @@ def _places(shapes: tuple[tuple[int, ...], ...], apart: tuple[bool, ...]) -> tup
 
 def _divided(tree: Any) -> tuple[list[Any], tuple[Any, ...]]:
     """The arrays of a pytree that are laid in a vector, and those that stand apart."""
-    both = list(zip(jax.tree.leaves(tree), _apart(tree), strict=True))
+    found, structure = jax.tree.flatten(tree)
+    both = list(zip(found, _apart(_names(tree), structure), strict=True))
     return [leaf for leaf, apart in both if not apart], tuple(leaf for leaf, apart in both if apart)
 
 
@@ -104,11 +112,29 @@ class Laid(NamedTuple):
     @classmethod
     def of(cls, state: Any) -> Laid:
         # What goes into many calls is brought to the device once.
-        return cls(packed(state), Layout.of(state), tuple(map(jnp.asarray, _divided(state)[1])))
+        beside = (leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in _divided(state)[1])
+        return cls(packed(state), Layout.of(state), tuple(beside))
 
     @property
     def state(self) -> Any:
         return self.layout.unpacked(np.asarray(self.vector), self.lasting)
+
+
+def _joined(leaves: Sequence[Any]) -> jax.Array:
+    """Arrays as one vector.  Numbers that stand side by side are brought together first: by one loop, where each would have its
+    own."""
+    parts: list[Any] = []
+    for small, beside in groupby(leaves, lambda leaf: np.size(leaf) <= FEW):
+        rows = [jnp.ravel(leaf).astype(float) for leaf in beside]
+        parts += [_stacked([row[i] for row in rows for i in range(len(row))])] if small else rows
+    return jnp.concatenate(parts)
+
+
+def _stacked(numbers: Sequence[jax.Array]) -> jax.Array:
+    at, row = np.arange(len(numbers)), jnp.zeros(len(numbers))
+    for i, number in enumerate(numbers):
+        row = jnp.where(at == i, number, row)
+    return row
 
 
 class Step(NamedTuple):
@@ -166,8 +192,7 @@ def _compiled(step, fits, healthy, rigid: bool, state: Layout, inputs: Layout, v
         well = jnp.array(rigid) if fits is None and healthy is None else fits(new, info) if fits else healthy(info)
         # With the evidence and the mean all the rest is finite.
         finite = jnp.isfinite(info.log_likelihood_increment + jnp.sum(info.mean))
-        leaves = (*_divided(new)[0], *jax.tree.leaves(info), jnp.where(finite, well.astype(float), jnp.nan))
-        return jnp.concatenate([jnp.ravel(leaf).astype(float) for leaf in leaves])
+        return _joined([*_divided(new)[0], *jax.tree.leaves(info), jnp.where(finite, well.astype(float), jnp.nan)])
 
     lasting = tuple(np.zeros(*of[:2]) for of in zip(*state[1:], strict=True) if of[2])
     call = jit_small(one)

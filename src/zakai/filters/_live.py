@@ -19,6 +19,7 @@ AFTER_GAP = (
     "a path is read after a gap: the increment since the last reading of that coordinate acts as one factor at its end, which is "
     "exact only as the gaps shrink"
 )
+STEADY = 8  # how many times longer a run is after a look that left a lattice as large as it was
 
 
 class Moment(NamedTuple):
@@ -167,11 +168,14 @@ class Live:
         """The state on a lattice that was looked at, and how many steps may be taken on it."""
         state = laid.state
         run = getattr(state, "run_length", RUN)
-        rows = slice(row, min(row + run, block.key.number))
+        rows = slice(row, min(row + STEADY * run, block.key.number))
         adapt = self.setting.method.adapt
         assert adapt is not None
         state = adapt(block.prepared, state, rows, None)
-        return self._laid(state, block), getattr(state, "run_length", RUN)
+        new = self._laid(state, block)
+        run = getattr(state, "run_length", RUN)
+        # Every step tells whether it was well; a look is there to find that less would do.
+        return new, STEADY * run if new.layout == laid.layout else run
 
     def _tried(self, block: Block, row: int, own: Any, laid: Laid, given: np.ndarray, found: Any) -> Any:
         """One step from better lattices, until it is well or nothing better can be had; health then says so.

@@ -63,7 +63,7 @@ def _around(polynomial: jax.Array, centre: jax.Array) -> jax.Array:
 
 
 class Table(NamedTuple):
-    """h on a lattice for windows to stand on: `h` (5, m, M) itself and its first four derivatives, at points that are a `cell`
+    """h on a lattice for windows to stand on: `h` (m, 5, M) itself and its first four derivatives, at points that are a `cell`
     apart, around `home`."""
 
     home: Any
@@ -94,7 +94,7 @@ class Steps(NamedTuple):
 def moved(
     lattice: Lattice,
     table: Table,
-    flow: Flow,
+    kernel: Kernel,
     turned: Any,
     given: Factors,
     own: Any,
@@ -102,18 +102,15 @@ def moved(
     keep: bool,
     even: bool,
 ) -> tuple[jax.Array, Steps]:
-    """K intervals, from the density on a lattice of N points: the values (N,) at the end and what is told on the way.
+    """K intervals, each with its kernel, from the density on a lattice of N points: the values (N,) at the end and what is told
+    on the way.
 
     `turned` (K, 2) is by how much the gauge changed in an interval, from its linear term on.  `own` is the narrowest feature of
     the density, in cells; `even` says that both halves of every factor are the same.
     """
-    size, cell, count = len(lattice.log_values), table.cell, len(flow.map)
+    size, cell, count = len(lattice.log_values), table.cell, len(kernel.variance)
     each, far = gcd(count, LOOK), (table.h.shape[-1] - size) // 2
-    index = np.arange(size, dtype=float) - size // 2
-    xi = cell * index
-    outer = (np.minimum(np.arange(size), np.arange(size)[::-1]) < 2).astype(float)
-    columns = np.stack([np.ones(size), index, index**2, outer], axis=1)
-    kernel = jax.vmap(kernel_of)(flow)
+    xi, columns = cell * _index(size), _columns(size)
     steps, variance = cell * np.arange(taps + 1), kernel.variance[:, None]
     weights = cell * jnp.exp(-0.5 * steps**2 / variance)
     taps_of = weights, *splitting.bent(weights, steps, variance)
@@ -127,7 +124,7 @@ def moved(
         tilt = slope[:, None] + 2 * bend[:, None] * xi
 
         def half(linear: Any) -> splitting.Half:
-            parts = [linear @ row for row in seen]
+            parts = [linear @ seen[:, k] for k in range(5)]
             return splitting.bridged(parts, kernel.variance[:, None], tilt)
 
         before = _made(half(first))
@@ -137,15 +134,12 @@ def moved(
 
     def look(carry: Any, slices: Any) -> tuple[Any, Any]:
         p, at, own = carry
-        used = (p > np.exp(-lat.SUPPORT) * jnp.max(p)).astype(float)
-        shift = jnp.clip(jnp.rint(used @ index / jnp.sum(used)).astype(int), -(size // 4), size // 4)
-        shift = jnp.clip(shift, -far - at, far - at)
+        shift = _shift((p > np.exp(-lat.SUPPORT) * jnp.max(p)).astype(float), at, table)
         p, at = lat.slid(p, shift, 0.0), at + shift
         seen = jax.lax.dynamic_slice_in_dim(table.h, far + at, size, axis=2)
         kernel, centre = slices[1], table.home + cell * at
         kernel = Kernel(kernel.variance, _around(kernel.before, centre), _around(kernel.after, centre))
-        slope, bend = slices[2].T
-        slices = slices[0], kernel, jnp.stack([slope + 2 * centre * bend, bend], axis=1), *slices[3:]
+        slices = slices[0], kernel, _turned(slices[2], centre), *slices[3:]
         first, last = halves(slices, seen)
         before, after = kernel.before @ powers, kernel.after @ powers
         # An evidence far from one leaves no mark: at the highest point nothing grows.
@@ -154,16 +148,13 @@ def moved(
         factors = jnp.exp(first.log + before), jnp.exp(last.log + after - offset)
 
         def step(p: Any, slices: Any) -> tuple[Any, Any]:
-            (before, after), (first, last, twice), (weights, once_bent, twice_bent) = slices
+            (before, after), bend, last, taps_of = slices
             q = p * before
-            filters = (0, weights), (1, once_bent), (0, once_bent), (0, twice_bent)
-            spread, begin, end, ends = lat.filtered_all((q, first * q), filters)
-            # Nothing is made up for by more than there is.
-            p = after * jnp.clip(spread + begin + last * end + twice * ends, 0.5 * spread, 2.0 * spread)
+            p = after * _filtered(q, bend * q, last, taps_of)
             return p, p
 
         total = jnp.sum(p)
-        p, values = jax.lax.scan(step, p / total, (factors, (first.bend, last.bend, last.twice), slices[0]))
+        p, values = jax.lax.scan(step, p / total, (factors, first.bend, last, slices[0]))
         sums = values @ columns
         logs = jnp.log(sums[:, 0])
         growth = logs - jnp.concatenate([jnp.zeros(1), logs[:-1]]) + offset[:, 0]
@@ -178,6 +169,89 @@ def moved(
     blocks = jax.tree.map(lambda a: a.reshape(count // each, each, *a.shape[1:]), slices)
     (p, *_), (told, *looks) = jax.lax.scan(look, (jnp.exp(lattice.log_values), start, own), blocks)
     return p, Steps(*jax.tree.map(lambda a: a.reshape(count, *a.shape[2:]), told), *looks)
+
+
+class Stepped(NamedTuple):
+    """What one step leaves: the logarithms (N,) of a density whose largest value is one, and of what was only `spread`; the
+    `sums` (4,) of its values, as in Steps; and the logarithm by which it is too `small`."""
+
+    logs: Any
+    spread: Any
+    sums: Any
+    small: Any
+
+
+def stepped(
+    logs: jax.Array, at: Any, table: Table, kernel: Kernel, turned: Any, given: Factors, taps: int, even: bool
+) -> Stepped:
+    """One interval, from the logarithms (N,) of a density on the window `at` a place, in as few loops over its points as can be:
+    for a filter that is told its readings one by one.  All but `logs` is as in `moved`."""
+    size, cell = len(logs), table.cell
+    xi = cell * _index(size)
+    seen = jax.lax.dynamic_slice_in_dim(table.h, (table.h.shape[-1] - size) // 2 + at, size, axis=2)
+    centre = table.home + cell * at
+    before, after = _around(kernel.before, centre), _around(kernel.after, centre)
+    slope, bend = (before + after)[1:] - _turned(turned, centre)
+
+    def half(linear: jax.Array) -> splitting.Half:
+        parts = list((linear @ seen.reshape(len(linear), -1)).reshape(5, size))
+        return splitting.bridged(parts, kernel.variance, slope + 2 * bend * xi)
+
+    def polynomial(of: jax.Array) -> jax.Array:
+        return of[0] + xi * (of[1] + xi * of[2])
+
+    first = half(given.before)
+    last = first if even else half(given.after)
+    factor = last.log + polynomial(after)
+    # Of logarithms the largest is taken out, so that nothing overflows.
+    lifted = logs + first.log + polynomial(before)
+    top = jnp.max(lifted)
+    q = jnp.exp(lifted - top)
+    steps = cell * np.arange(taps + 1)
+    weights = cell * jnp.exp(-0.5 * steps**2 / kernel.variance)
+    spread = lat.log(_filtered(q, first.bend * q, last, (weights, *splitting.bent(weights, steps, kernel.variance))))
+    lowered = spread + factor
+    crest = jnp.max(lowered)
+    values = jnp.exp(lowered - crest)
+    return Stepped(lowered - crest, spread, _columns(size).T @ values, top + crest)
+
+
+def laid_anew(logs: jax.Array, at: jax.Array, table: Table) -> tuple[jax.Array, jax.Array]:
+    """A window laid over the mass, by whole cells: the logarithms (N,), of which the largest is zero, and its place."""
+    shift = _shift((logs > -lat.SUPPORT).astype(float), at, table)
+    return lat.slid(logs, shift, -jnp.inf), at + shift
+
+
+def _shift(used: jax.Array, at: jax.Array, table: Table) -> jax.Array:
+    """By how many cells a window moves to have what is used (N,) in its middle, as far as the table goes."""
+    size = len(used)
+    far = (table.h.shape[-1] - size) // 2
+    shift = jnp.clip(jnp.rint(used @ _index(size) / jnp.sum(used)).astype(int), -(size // 4), size // 4)
+    return jnp.clip(shift, -far - at, far - at)
+
+
+def _filtered(q: jax.Array, bent: jax.Array, last: splitting.Half, taps: tuple[Any, Any, Any]) -> jax.Array:
+    """What the kernel with its polynomials makes of q and of what is `bent` of it."""
+    weights, once, twice = taps
+    spread, begin, end, ends = lat.filtered_all((q, bent), ((0, weights), (1, once), (0, once), (0, twice)))
+    # Nothing is made up for by more than there is.
+    return jnp.clip(spread + begin + last.bend * end + last.twice * ends, 0.5 * spread, 2.0 * spread)
+
+
+def _index(size: int) -> np.ndarray:
+    return np.arange(size, dtype=float) - size // 2
+
+
+def _columns(size: int) -> np.ndarray:
+    """What p is multiplied with for its sums (N, 4)."""
+    outer = (np.minimum(np.arange(size), np.arange(size)[::-1]) < 2).astype(float)
+    return np.stack([np.ones(size), _index(size), _index(size) ** 2, outer], axis=1)
+
+
+def _turned(turned: jax.Array, centre: Any) -> jax.Array:
+    """The slope and the bend around a centre of a gauge that changed by `turned` (..., 2) x and x^2."""
+    slope, bend = jnp.moveaxis(turned, -1, 0)
+    return jnp.stack([slope + 2 * centre * bend, bend], axis=-1)
 
 
 def _made(arrays: Any) -> Any:

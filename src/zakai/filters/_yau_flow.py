@@ -47,6 +47,8 @@ class System:
         self.gauged = yau.form.potential != 0
         # Whether a half of the observation's factor stands at the start of an interval.
         self.halves = splitting == "strang" and not self.rates and model.observation_kind != "samples"
+        # Whether a lattice can stand still.
+        self.still = self.halves and self.steady and not self.gauged and self.n == 1
         self.potential = jax_field([yau.form.potential], model)
         self.observe = jax_field(model.observation, model)
         bare, full = yau.bare or yau.full, yau.full or yau.bare
@@ -82,7 +84,7 @@ class System:
         return [*h, *slopes]
 
     def observe_bent(self, x: Any, t: Any, theta: Any) -> jax.Array:
-        """h of one state and its first four derivatives at points (M, 1): (5, m, M)."""
+        """h of one state and its first four derivatives at points (M, 1): (m, 5, M)."""
 
         def h(x: Any) -> Any:
             return jnp.stack(self.observe(x, t, theta))
@@ -90,7 +92,7 @@ class System:
         functions: list[Callable[[Any], Any]] = [h]
         for _ in range(4):
             functions.append(_slope(functions[-1]))
-        return jnp.stack([function(x) for function in functions])
+        return jnp.stack([function(x) for function in functions], axis=1)
 
     def coefficients(self, t: jax.Array, argument: tuple[jax.Array, jax.Array]) -> Coefficients:
         """The coefficients of the flow at time t; `argument` is (theta, inside), the coordinates that act inside."""

@@ -37,7 +37,7 @@ from zakai.kolmogorov.flow import Flow
 from zakai.kolmogorov.lattice import Lattice
 from zakai.kolmogorov.power_series import TaylorData, power_series_kernels, taylor_data
 from zakai.kolmogorov.series_flow import flow_of_kernel
-from zakai.models.compile import jax_field
+from zakai.models.compile import jax_field, jit_small
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
 
@@ -48,7 +48,7 @@ _SMOOTH = 1e-9  # of the mass of a prior, on every second point of its lattice
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["lattice", "observed", "cells", "middle", "cut", "table"],
+    data_fields=["lattice", "observed", "cells", "middle", "cut", "looked", "table"],
     meta_fields=["plan"],
 )
 @dataclass(frozen=True)
@@ -58,7 +58,8 @@ class State:
     What the last step computed and the next one needs again is carried: h at the points, `observed`, an array for each
     coordinate, with one state its slopes behind, the narrowest feature in `cells` (n,), and the `middle` of the support (n,), an
     index from the centre. `cut` (2,) says how the first lattice of this run of steps was cut out of the last of the run before.
-    Of a lattice that stands still `table` holds h and its derivatives, and nothing is `observed`.
+    Of a lattice that stands still `table` holds h and its derivatives, nothing is `observed`, and `looked` (2,) says how many
+    steps ago its window was laid, and how deep in its tails the mass was then.
     """
 
     LASTING = ("table",)
@@ -68,6 +69,7 @@ class State:
     cells: Any
     middle: Any
     cut: Any
+    looked: Any
     plan: choice.Plan
     table: _still_window.Table | None = None
 
@@ -126,15 +128,27 @@ class Prepared:
         )
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["start", "stop", "flow", "theta"], meta_fields=["system"])
+class Still(NamedTuple):
+    """What a window that stands still is told of an interval: its kernel, by how much the gauge changes in it, (2,) in x and x^2,
+    and by what share the first half of its factor is more than the second, (1,): where G grows, a path is longer near to where it
+    began."""
+
+    kernel: _still_window.Kernel
+    turned: Any
+    lean: Any
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["start", "stop", "flow", "theta", "still"], meta_fields=["system"])
 @dataclass(frozen=True)
 class Interval:
-    """One interval: its ends, its flow in equal parts (parts, ...), the parameters, and the static system."""
+    """One interval: its ends, its flow in equal parts (parts, ...), the parameters, for a window that can stand still what it is
+    told, and the static system."""
 
     start: Any
     stop: Any
     flow: Flow
     theta: Any
+    still: Still | None
     system: System
 
 
@@ -185,7 +199,25 @@ def prepare(
 def _intervals(system: System, schedule: Schedule, flow: Flow, theta: Any) -> Interval:
     xp = np if isinstance(theta, np.ndarray) else jnp
     count = len(schedule.starts)
-    return Interval(schedule.starts, schedule.stops, flow, xp.broadcast_to(theta, (count, len(theta))), system)
+    thetas, still = xp.broadcast_to(theta, (count, len(theta))), None
+    if system.still and flow.map.shape[1] == 1:
+        still = _still(system, schedule.starts, schedule.stops, flow, thetas)
+        still = jax.tree.map(np.asarray, still) if xp is np else still
+    return Interval(schedule.starts, schedule.stops, flow, thetas, still, system)
+
+
+@partial(jit_small, static_argnums=0)
+def _still(system: System, starts: Any, stops: Any, flow: Flow, theta: Any) -> Still:
+    kernel = jax.vmap(_still_window.kernel_of)(jax.tree.map(lambda a: a[:, 0], flow))
+    if not system.varying:
+        return Still(kernel, jnp.zeros((len(starts), 2)), jnp.zeros((len(starts), 1)))
+
+    def at(t: jax.Array, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+        c = system.coefficients(t, (theta, jnp.ones(1)))
+        return jnp.stack([c.offset[0, 0], 0.5 * c.matrix[0, 0]]) / c.covariance[0, 0], c.covariance[0]
+
+    (start, first), (stop, last) = (jax.vmap(at)(times, theta) for times in (starts, stops))
+    return Still(kernel, stop - start, (last - first) / (last + first) / 3)
 
 
 def with_parameters(prepared: Prepared, theta: Any) -> Prepared:
@@ -296,10 +328,11 @@ def _start(prepared, prior, observation):
 
     with jax.ensure_compile_time_eval():
         # A density prior need not be normalised; the evidence is that of the reading alone.
-        first, before = choice.first_lattice(model, prior, None, prepared.spread if observation is None else None)
+        still = prepared.intervals.still is not None
+        first, before = choice.first_lattice(model, prior, None, prepared.spread if observation is None else None, still)
         lattice, after = first, before
         if observation is not None:
-            lattice, after = choice.first_lattice(model, prior, own_factor, prepared.spread)
+            lattice, after = choice.first_lattice(model, prior, own_factor, prepared.spread, still)
     if not traced:
         state = _looked_at_one(prepared, lattice, choice.first_plan(model), model.start, choice.SAME, lattice.log_values)
         return state, after - before
@@ -336,7 +369,7 @@ def _looked_at(prepared: Prepared, lattice: Lattice, plan: choice.Plan, time: fl
     system = prepared.system
     logs = np.asarray(lattice.log_values if own is None else own)
     observed = _observed_at(system, lattice, time, prepared.theta) if system.halves and not plan.still else None
-    return State(lattice, observed, choice.features(logs), choice.middle(logs), cut, plan)
+    return State(lattice, observed, choice.features(logs), choice.middle(logs), cut, np.zeros((len(logs), 2)), plan)
 
 
 def _looked_at_one(prepared: Prepared, lattice: Lattice, plan: choice.Plan, time: float, cut: Any, own: Any) -> State:
@@ -387,8 +420,7 @@ def adapt_many(
     With `still` the windows, which are of one lattice, stand still where they can: one kernel for every interval, factors at both
     ends, an h without time; their `table` may be known.
     """
-    system = prepared.system
-    still = still and system.halves and system.steady and not system.gauged and bool(prepared.schedule.inside[rows].all())
+    still = still and prepared.intervals.still is not None and bool(prepared.schedule.inside[rows].all())
     flow = prepared.intervals.flow
     own = jax.tree.map(np.asarray, states.lattice)
     lattice, plan, cut = choice.adapted(
@@ -408,8 +440,9 @@ def adapt_many(
 def _table(prepared: Prepared, lattice: Lattice, time: float, known: _still_window.Table | None = None) -> _still_window.Table:
     """That for the windows of some records, which stand on one lattice; the one that is `known`, where it serves."""
     centres, cell, size = lattice.centre.ravel(), lattice.basis.ravel()[0], lattice.log_values.shape[-1]
-    if known is not None and known.cell == cell and known.h.shape[-1] == 3 * size:
-        if abs(_still_window.place(known, centres[0])) <= size // 2:
+    if known is not None and float(known.cell) == cell and known.h.shape[-1] == 3 * size:
+        # In NumPy: one number on the device takes longer than all of this.
+        if abs(round((centres[0] - float(known.home)) / cell)) <= size // 2:
             return known
     # With room for each to move, in few sizes.
     windows = 3
@@ -433,10 +466,9 @@ def _steps(state: State, intervals: Interval, observation: Factors, keep: bool) 
     """The steps of a run on a window that stands still, with `keep` the states of all."""
     assert state.table is not None
     system, plan, lattice = intervals.system, state.plan, state.lattice
-    flow = jax.tree.map(lambda a: a[:, 0], intervals.flow)
-    turned, lean = _changes(intervals)
-    given = observation._replace(before=(1 + lean) * observation.before, after=(1 - lean) * observation.after)
-    last, told = _still_window.moved(lattice, state.table, flow, turned, given, state.cells[0], plan.taps, keep, system.even)
+    assert intervals.still is not None
+    kernel, turned, given = _still_factors(intervals.still, observation)
+    last, told = _still_window.moved(lattice, state.table, kernel, turned, given, state.cells[0], plan.taps, keep, system.even)
     mass, first, second, outer = told.sums.T
     cell, count = lattice.basis[0, 0], len(mass)
     first, second = cell * first / mass, cell**2 * second / mass
@@ -455,29 +487,53 @@ def _steps(state: State, intervals: Interval, observation: Factors, keep: bool) 
 
     def laid(values: jax.Array, mass: jax.Array, centre: jax.Array, cells: jax.Array) -> State:
         moved = Lattice(lat.log(values) - jnp.log(cell * mass), centre, lattice.basis)
-        return State(moved, None, cells[None], jnp.zeros(1), state.cut, plan)
+        return State(moved, None, cells[None], jnp.zeros(1), state.cut, jnp.zeros(2), plan)
 
     end = laid(last, mass[-1], centres[-1], cells[-1])
     kept = jax.vmap(laid)(told.values, mass, centres, cells) if keep else None
     return replace(end, table=state.table), (info, kept)
 
 
-def _changes(intervals: Interval) -> tuple[jax.Array, jax.Array]:
-    """What the coefficients' change within each interval does to its splitting.
+def _stepped(interval: Interval, state: State, observation: Factors) -> tuple[State, Info]:
+    """One step on a window that stands still."""
+    assert state.table is not None and interval.still is not None
+    system, plan, lattice, table = interval.system, state.plan, state.lattice, state.table
+    kernel, turned, given = _still_factors(interval.still, observation)
+    at, cell = _still_window.place(table, lattice.centre[0]), table.cell
+    new = _still_window.stepped(lattice.log_values, at, table, kernel, turned, given, plan.taps, system.even)
+    mass, first, second, outer = new.sums
+    mean, log_mass, centre = first / mass, jnp.log(cell * mass), table.home + cell * at
 
-    By how much phi changes, in the gauge e^phi that takes the drift L x + l out: (K, 2), in x and x^2.  And by what share the
-    first half of the factor is more than the second, (K, 1): where G grows, a path is longer near to where it began.
-    """
-    system = intervals.system
-    if not system.varying:
-        return jnp.zeros((len(intervals.start), 2)), jnp.zeros((len(intervals.start), 1))
+    end = Lattice(new.logs, lattice.centre, lattice.basis)
+    cells = lat.features(end, 0.0)
 
-    def at(t: jax.Array, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
-        c = system.coefficients(t, (theta, jnp.ones(1)))
-        return jnp.stack([c.offset[0, 0], 0.5 * c.matrix[0, 0]]) / c.covariance[0, 0], c.covariance[0]
+    def look() -> tuple[jax.Array, ...]:
+        logs, place = _still_window.laid_anew(new.logs, at, table)
+        return logs, place, jnp.stack([jnp.zeros(()), lat.reach(end, new.spread)])
 
-    (start, first), (stop, last) = (jax.vmap(at)(times, intervals.theta) for times in (intervals.start, intervals.stop))
-    return stop - start, (last - first) / (last + first) / 3
+    def as_it_is() -> tuple[jax.Array, ...]:
+        return new.logs, at, state.looked + np.array([1.0, 0.0])
+
+    logs, at, looked = jax.lax.cond(state.looked[0] + 1 >= _still_window.LOOK, look, as_it_is)
+    joint = jax.lax.rsqrt(1.0 / jnp.minimum(state.cells[0], cells[0]) ** 2 + cell**2 / kernel.variance)
+    health = {
+        "edge_mass": outer / mass,
+        "resolution": cells[0],
+        "quadrature_error": 2 * jnp.exp(-2 * jnp.pi**2 * joint**2),
+        "exponent": jnp.zeros(()),
+        "surprise": looked[1] / _HELD_CUT,
+    }
+    variance = cell**2 * (second / mass - mean**2)
+    growth = new.small + log_mass + observation.constant
+    info = Info(growth, (centre + cell * mean)[None], variance[None, None], health, jnp.ones(2))
+    moved = Lattice(logs - log_mass, (table.home + cell * at)[None], lattice.basis)
+    return replace(state, lattice=moved, cells=cells, looked=looked), info
+
+
+def _still_factors(still: Still, given: Factors) -> tuple[_still_window.Kernel, Any, Factors]:
+    """The kernel of one interval or many, the change of its gauge, and its halves of the factor."""
+    kernel, turned, lean = still
+    return kernel, turned, given._replace(before=(1 + lean) * given.before, after=(1 - lean) * given.after)
 
 
 def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State:
@@ -495,9 +551,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
     """One interval: gauge, half factor, transition, half factor, gauge, normalise."""
     system, plan = interval.system, state.plan
     if plan.still:
-        interval, observation = jax.tree.map(lambda a: a[None], (interval, observation))
-        new, (info, _) = _steps(state, interval, observation, False)
-        return new, jax.tree.map(lambda a: a[0], info)
+        return _stepped(interval, state, observation)
     lattice, observed, cells = state.lattice, state.observed, state.cells
     if plan.banded:
         shift = jnp.clip(jnp.rint(state.middle[0]).astype(int), -(plan.sizes[0] // 4), plan.sizes[0] // 4)
@@ -537,7 +591,8 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
     }
     need = jnp.append(jnp.maximum(worst.need, plan.needed / resolution), worst.room)
     kept = observed if system.halves else None
-    return State(lattice, kept, cells, summary.middle, state.cut, plan), Info(log_mass, summary.mean, summary.cov, health, need)
+    new = State(lattice, kept, cells, summary.middle, state.cut, state.looked, plan)
+    return new, Info(log_mass, summary.mean, summary.cov, health, need)
 
 
 class _Worst(NamedTuple):

@@ -188,10 +188,11 @@ def _wrapped_moments(lattice: Lattice, weights: jax.Array, angles: tuple[int, ..
     return mean, (weights[:, None] * deviation).T @ deviation
 
 
-def features(lattice: Lattice) -> jax.Array:
-    """The standard deviation, in cells, of the narrowest feature along each axis (n,), where the density matters."""
+def features(lattice: Lattice, top: Any = None) -> jax.Array:
+    """The standard deviation, in cells, of the narrowest feature along each axis (n,), where the density matters; `top` is the
+    largest logarithm, if that is known."""
     logs = lattice.log_values
-    matters = logs > jnp.max(logs) - 14.0
+    matters = logs > (jnp.max(logs) if top is None else top) - 14.0
     cells = []
     for axis in range(logs.ndim):
         middle = lax.slice_in_dim(logs, 1, -1, axis=axis)
