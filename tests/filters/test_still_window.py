@@ -49,6 +49,8 @@ def test_a_run_at_once_gives_the_numbers_of_its_steps(monkeypatch, moved):
     together = zakai.filter(SPIRAL, records, "limited-direct")
     assert moved
     monkeypatch.setattr(limited_direct.State, "together", None)
+    # What was compiled for a step is not traced again; this one is another.
+    monkeypatch.setattr(limited_direct, "METHOD", replace(limited_direct.METHOD, step=lambda *given: limited_direct.step(*given)))
     for one, other, record in zip(at_once, together, records, strict=True):
         stepwise = zakai.filter(SPIRAL, record, "limited-direct")
         same(one, stepwise)
@@ -86,6 +88,14 @@ def test_mass_that_leaves_the_window_is_followed_step_by_step(monkeypatch, moved
     stepwise = zakai.filter(model, record, "limited-direct")
     same(at_once, stepwise)
     assert at_once.warnings == stepwise.warnings
+
+
+def test_a_window_is_laid_over_the_mass_by_whole_cells():
+    index = np.arange(64) - 32
+    table = _still_window.Table(0.0, 0.5, np.zeros((1, 5, 192)))
+    logs, place = _still_window.laid_anew(-0.5 * ((index - 9) / 2.0) ** 2, np.array(3), table)
+    assert place == 12
+    assert np.allclose(logs[:52], -0.5 * (index[:52] / 2.0) ** 2)
 
 
 def test_where_readings_are_missing_or_h_depends_on_time_steps_are_taken_one_by_one(moved):
