@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import zakai
+from zakai.filters._live import Live
 from zakai.filters import _affine_system
 from zakai.models import compile
 
@@ -317,3 +318,23 @@ def test_a_lattice_that_is_as_large_as_it_was_is_looked_at_less_often():
         estimate = other.update(time, value)
     assert np.allclose(estimate.mean, truth.mean[-1], rtol=0, atol=1e-8)
     assert np.allclose(estimate.cov, truth.cov[-1], rtol=0, atol=1e-8)
+
+
+def test_a_first_lattice_serves_later_steps_too(monkeypatch):
+    """Far out the density is narrow: a cell that only just serves the first steps is not well later, and every step would be tried
+    again in vain."""
+    tried, own = [], Live._tried
+
+    def spied(live, *given):
+        tried.append(live.now.time)
+        return own(live, *given)
+
+    monkeypatch.setattr(Live, "_tried", spied)
+    model = zakai.load_model("gallery:spiral-sensor")
+    times = 0.01 * np.arange(1, 1001)
+    # Readings without noise of a state that goes from the prior's middle far out.
+    x = 0.1 + 17 * (times / 10) ** 2
+    record = zakai.Record(times, 0.01 * np.stack([x * np.sin(x), x * np.cos(x)], axis=1), "increments")
+    online = zakai.online(model)
+    warned = [bool(online.update(time, value).warnings) for time, value in zip(times, record.values, strict=True)]
+    assert len(tried) < 5 and not any(warned)

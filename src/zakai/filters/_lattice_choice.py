@@ -37,7 +37,7 @@ MOST = {1: 8192, 2: 1024, 3: 256}
 COARSEST_STILL = 0.88
 EDGE_STILL = 1e-10
 QUADRATURE_STILL = 5e-10
-SPARE = 0.97  # of the largest cell, so that later kernels may be narrower
+SPARE = 0.97  # of the largest cell of a window, for what comes to be narrower
 STILL_ROOM = 12  # cells to each side of a window that is moved every few steps only
 STILL_WIDEST = 4.0  # the `window` up to which it is worth while
 FINE = {1: 2.0, 2: 2.0, 3: 1.2}  # by how much the first lattice is finer than it need be
@@ -135,7 +135,7 @@ def first_lattice(
     axes, log_prior, box = prior_box(model, prior)
     widest = np.full(model.n, np.inf)
     if spread is not None and model.n == 1 and not model.periodic:
-        widest = _coarsest(still) / np.sqrt(np.diag(axes.T @ np.linalg.solve(spread, axes)))
+        widest = (SPARE * COARSEST_STILL if still else COARSEST) / np.sqrt(np.diag(axes.T @ np.linalg.solve(spread, axes)))
     factor = log_factor or (lambda x: np.zeros(x.shape[:-1]))
 
     def log_density(x: np.ndarray) -> np.ndarray:
@@ -322,11 +322,6 @@ def adapted(
     return None, replace(plan, banded=False, sizes=sizes, images=images, run=run, still=False), same
 
 
-def _coarsest(still: bool) -> float:
-    """The largest cell of a window, in kernel standard deviations."""
-    return COARSEST_STILL if still else COARSEST
-
-
 def check_memory(model: Model, sizes: tuple[int, ...], room: float, records: int, budget: int) -> None:
     """Raise InputError if a step on lattices of these sizes, one a record, needs more than `budget` bytes."""
     # The density, its points, h, the rows that are spread, and what a run of steps keeps.
@@ -409,7 +404,8 @@ def _banded(
     # A window that moves along grows with the flow; a kernel between points that stand still has the variance map Sigma.
     along = np.concatenate([[1.0], np.cumprod(maps)])[: len(deviation)]
     growth = (1 / np.sqrt(maps) if plan.still else along) / deviation
-    widest = np.minimum(_coarsest(plan.still) / growth.max(), features(logs)[:, 0] * cell / plan.cells)
+    coarsest = COARSEST_STILL if plan.still else COARSEST
+    widest = np.minimum(coarsest / growth.max(), features(logs)[:, 0] * cell / plan.cells)
     if plan.still:
         # The windows of all records stand on one lattice.
         widest = np.full(len(cell), widest.min())
