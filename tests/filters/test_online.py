@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import zakai
-from zakai.filters._live import Live
 from zakai.filters import _affine_system
+from zakai.filters._live import Live
 from zakai.models import compile
 
 WALK = dict(state=["x"], drift=["-x/2"], observation=["2*x"], prior={"kind": "gaussian", "mean": [0.3], "cov": [[2.0]]})
@@ -321,8 +321,8 @@ def test_a_lattice_that_is_as_large_as_it_was_is_looked_at_less_often():
 
 
 def test_a_first_lattice_serves_later_steps_too(monkeypatch):
-    """Far out the density is narrow: a cell that only just serves the first steps is not well later, and every step would be tried
-    again in vain."""
+    """Far out the density is narrow: a cell that only just serves the first steps is not well later, and every step would be
+    tried again in vain."""
     tried, own = [], Live._tried
 
     def spied(live, *given):
