@@ -37,7 +37,7 @@ from zakai.kolmogorov.flow import Flow
 from zakai.kolmogorov.lattice import Lattice
 from zakai.kolmogorov.power_series import TaylorData, power_series_kernels, taylor_data
 from zakai.kolmogorov.series_flow import flow_of_kernel
-from zakai.models.compile import jax_field, jit_small
+from zakai.models.compile import jax_field
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
 
@@ -206,7 +206,7 @@ def _intervals(system: System, schedule: Schedule, flow: Flow, theta: Any) -> In
     return Interval(schedule.starts, schedule.stops, flow, thetas, still, system)
 
 
-@partial(jit_small, static_argnums=0)
+@partial(jax.jit, static_argnums=0)
 def _still(system: System, starts: Any, stops: Any, flow: Flow, theta: Any) -> Still:
     kernel = jax.vmap(_still_window.kernel_of)(jax.tree.map(lambda a: a[:, 0], flow))
     if not system.varying:
