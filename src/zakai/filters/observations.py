@@ -145,12 +145,12 @@ def factor_rule(
     if rates:
         spans = np.where(inside, lengths, np.inf)
     elif splitting == "lie":
-        after = xp.where(whole, xp.linalg.inv(noise_end), 0.0)
+        after = xp.where(whole, _inverses(xp, noise_end), 0.0)
     elif whole.any():
-        before = xp.where(whole, 0.5 * xp.linalg.inv(noise_at(model, data.starts, theta)), 0.0)
-        after = xp.where(whole, 0.5 * xp.linalg.inv(noise_end), 0.0)
+        before = xp.where(whole, 0.5 * _inverses(xp, noise_at(model, data.starts, theta)), 0.0)
+        after = xp.where(whole, 0.5 * _inverses(xp, noise_end), 0.0)
     if remove and not rates and not whole.all():
-        energy = -xp.where(whole, 0.0, xp.linalg.inv(noise_end) * lengths[..., None])
+        energy = -xp.where(whole, 0.0, _inverses(xp, noise_end) * lengths[..., None])
     at_end = seen & ~inside if rates else seen & ~whole[:, 0]
     if at_end.any():
         more = _at_end(xp, model.observation_kind, data.elapsed, at_end, noise_end)
@@ -164,8 +164,17 @@ def noise_at(model: Model, times: np.ndarray, theta: Any) -> Any:
     """S (K, m, m) at the times (K,), for the parameters `theta` (p,), which JAX may trace."""
     m, origin = model.m, np.zeros(model.n)
     if isinstance(theta, np.ndarray):
-        return np.broadcast_to(numpy_function(model.observation_noise, model, (m, m))(origin, times, theta), (len(times), m, m))
+        # What does not depend on time is there once, in every row.
+        asked = times if model.observation_noise.has(model.t) else np.zeros(())
+        return np.broadcast_to(numpy_function(model.observation_noise, model, (m, m))(origin, asked, theta), (len(times), m, m))
     return jax.vmap(jax_function(model.observation_noise, model, (m, m)), (None, 0, None))(origin, jnp.asarray(times), theta)
+
+
+def _inverses(xp: Any, matrices: Any) -> Any:
+    """The inverses of matrices (K, m, m); where all rows are one, of that."""
+    if xp is np and len(matrices) and matrices.strides[0] == 0:
+        return np.broadcast_to(np.linalg.inv(matrices[0]), matrices.shape)
+    return xp.linalg.inv(matrices)
 
 
 class _AtEnd(NamedTuple):
