@@ -55,7 +55,8 @@ class Block(NamedTuple):
 
 
 class Clock(NamedTuple):
-    """How regularly readings came: `steps` equal ones since the time `since`; and the key of what was prepared for them."""
+    """How regularly readings came: `steps` equal ones since the time `since`; and the key of what was prepared for them.  With no
+    steps they came as the key says, from its start on."""
 
     since: float
     steps: int
@@ -110,21 +111,23 @@ class Ahead:
             if last is None or not same or not _close(stop, start + last.step, last.step):
                 last = Key(0.0, stop - start, 1, seen, elapsed)
                 clock = clock._replace(ahead=last)
-            return self._remembered(last), 0, clock
+            chunk = self.chunk
+            return chunk if chunk is not None and chunk.key is last else self._remembered(last), 0, clock
         since, steps, before, ahead, begun = clock
+        if elapsed is None:
+            row = self._row(ahead, start, stop, seen)
+            if row is not None and ahead is not None:
+                return self._ahead(ahead), row, clock if steps == 0 else Clock(ahead.start, 0, seen, ahead, True)
+        if steps == 0 and ahead is not None:
+            steps = round((start - since) / ahead.step)
         step = (start - since) / steps if steps else stop - start
         repeats = bool(steps) and seen == before and _close(stop, start + step, step)
         since, steps = (since, steps + 1) if repeats else (start, 1)
-        row = None
-        if elapsed is None:
-            row = self._row(ahead, start, stop, seen)
-            # Of the first interval it is supposed that others like it follow.
-            if row is None and (repeats or not begun):
-                ahead, row = self._many(Key(start, (stop - since) / steps, CHUNK, seen)), 0
-        clock = Clock(since, steps, seen, ahead, True)
-        if row is None or ahead is None:
-            return self._made(Key(start, stop - start, 1, seen, elapsed), (start, stop)), 0, clock
-        return self._ahead(ahead), row, clock
+        # Of the first interval it is supposed that others like it follow.
+        if elapsed is None and (repeats or not begun):
+            ahead = self._many(Key(start, (stop - since) / steps, CHUNK, seen))
+            return self._ahead(ahead), 0, Clock(ahead.start, 0, seen, ahead, True)
+        return self._made(Key(start, stop - start, 1, seen, elapsed), (start, stop)), 0, Clock(since, steps, seen, ahead, True)
 
     def again(self, key: Key, ends: tuple[float, float]) -> Block:
         """The block of a key once more, for an interval with these ends."""
@@ -161,8 +164,6 @@ class Ahead:
         return self.chunk
 
     def _remembered(self, key: Key) -> Block:
-        if self.chunk is not None and self.chunk.key is key:
-            return self.chunk
         block = self.kept.get(key)
         if block is None:
             block = self.kept[key] = self._shortened(key)

@@ -19,7 +19,7 @@ import numpy as np
 
 from zakai import _float64  # noqa: F401
 from zakai.filters._protocol import Info, Method
-from zakai.models.compile import jit_small
+from zakai.models.compile import jit_small, one_kernel
 
 FEW = 4  # numbers that are as easily told one by one
 
@@ -27,7 +27,8 @@ FEW = 4  # numbers that are as easily told one by one
 class Layout(NamedTuple):
     """How a pytree of arrays is laid in a vector of float64, which holds every number that a step is made of exactly.
 
-    Beside it stand the arrays that are `apart` (a flag for each): those in the fields that the pytree's class names in `LASTING`.
+    Beside it stand the arrays that are `apart` (a flag for each): those in the fields that the pytree's class names in `LASTING`,
+    but for a few numbers.
     """
 
     tree: Any
@@ -39,13 +40,19 @@ class Layout(NamedTuple):
     def of(cls, tree: Any) -> Layout:
         found, structure = jax.tree.flatten(tree)
         shapes, types = tuple(np.shape(leaf) for leaf in found), tuple(np.dtype(_type(leaf)).str for leaf in found)
-        return cls(structure, shapes, types, _apart(_names(tree), structure))
+        return cls(structure, shapes, types, _apart(_names(tree), structure, shapes))
 
     @classmethod
     def of_rows(cls, tree: Any) -> Layout:
         """That of one row of a pytree whose arrays have a leading axis."""
         whole = cls.of(tree)
         return whole._replace(shapes=tuple(shape[1:] for shape in whole.shapes))
+
+    @property
+    def zeros(self) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        """A vector and what stands apart, of no particular values."""
+        apart = (np.zeros(shape, kind) for shape, kind, beside in zip(*self[1:], strict=True) if beside)
+        return np.zeros(self.size), tuple(apart)
 
     @property
     def size(self) -> int:
@@ -65,12 +72,13 @@ def _names(tree: Any) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=256)
-def _apart(names: tuple[str, ...], structure: Any) -> tuple[bool, ...]:
-    """Of each array of a pytree whether it stands apart, in a field with one of the names."""
+def _apart(names: tuple[str, ...], structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[bool, ...]:
+    """Of each array of a pytree whether it stands apart: what is more than a few numbers in a field with one of the names."""
     if not names:
         return (False,) * structure.num_leaves
     leaves = jax.tree_util.tree_leaves_with_path(jax.tree.unflatten(structure, range(structure.num_leaves)))
-    return tuple(bool(path) and getattr(path[0], "name", "") in names for path, _ in leaves)
+    large = (math.prod(shape) > FEW for shape in shapes)
+    return tuple(much and getattr(path[0], "name", "") in names for (path, _), much in zip(leaves, large, strict=True))
 
 
 @lru_cache(maxsize=256)
@@ -83,7 +91,7 @@ def _places(shapes: tuple[tuple[int, ...], ...], apart: tuple[bool, ...]) -> tup
 def _divided(tree: Any) -> tuple[list[Any], tuple[Any, ...]]:
     """The arrays of a pytree that are laid in a vector, and those that stand apart."""
     found, structure = jax.tree.flatten(tree)
-    both = list(zip(found, _apart(_names(tree), structure), strict=True))
+    both = list(zip(found, _apart(_names(tree), structure, tuple(map(np.shape, found))), strict=True))
     return [leaf for leaf, apart in both if not apart], tuple(leaf for leaf, apart in both if apart)
 
 
@@ -93,7 +101,11 @@ def _type(leaf: Any) -> Any:
 
 def packed(tree: Any) -> np.ndarray:
     """A pytree as a vector, but for what stands apart."""
-    return np.concatenate([np.zeros(0), *(np.ravel(np.asarray(leaf)).astype(float) for leaf in _divided(tree)[0])])
+    return _flat(_divided(tree)[0])
+
+
+def _flat(leaves: Sequence[Any]) -> np.ndarray:
+    return np.concatenate([np.zeros(0), *(np.asarray(leaf, float).ravel() for leaf in leaves)])
 
 
 def packed_rows(tree: Any, count: int, room: int) -> np.ndarray:
@@ -111,9 +123,10 @@ class Laid(NamedTuple):
 
     @classmethod
     def of(cls, state: Any) -> Laid:
+        within, beside = _divided(state)
         # What goes into many calls is brought to the device once.
-        beside = (leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in _divided(state)[1])
-        return cls(packed(state), Layout.of(state), tuple(beside))
+        brought = (leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in beside)
+        return cls(_flat(within), Layout.of(state), tuple(brought))
 
     @property
     def state(self) -> Any:
@@ -131,7 +144,8 @@ def _joined(leaves: Sequence[Any]) -> jax.Array:
 
 
 def _stacked(numbers: Sequence[jax.Array]) -> jax.Array:
-    at, row = np.arange(len(numbers)), jnp.zeros(len(numbers))
+    # An array of the compiler's own: each that is given is brought to every call.
+    at, row = jax.lax.iota(int, len(numbers)), jnp.zeros(len(numbers))
     for i, number in enumerate(numbers):
         row = jnp.where(at == i, number, row)
     return row
@@ -176,6 +190,37 @@ class Told(NamedTuple):
         return self.verdict == 1.0
 
 
+def settled(laid: Laid) -> Laid:
+    """A state as its class' `settled` leaves it, where there is one."""
+    settle = _settling(laid.layout)
+    return laid if settle is None else settle(laid)
+
+
+@lru_cache(maxsize=128)
+def _settling(layout: Layout) -> Callable[[Laid], Laid] | None:
+    settle = getattr(layout.unpacked(*layout.zeros), "settled", None)
+    if settle is None:
+        return None
+    layouts: list[Layout] = []
+
+    def one(vector: Any, lasting: Any) -> tuple[Any, Any]:
+        new = settle(layout.unpacked(vector, lasting))
+        layouts[:] = [Layout.of(new)]
+        within, apart = _divided(new)
+        return _joined(within), apart
+
+    call = jit_small(one)
+    call.eval_shape(*layout.zeros)
+    (after,) = layouts
+    new = layout if after == layout else after
+
+    def again(laid: Laid) -> Laid:
+        vector, lasting = call(np.asarray(laid.vector)[: layout.size], laid.lasting)
+        return Laid(vector, new, lasting)
+
+    return again
+
+
 def compiled(method: Method, state: Layout, inputs: Layout, values: int) -> Step:
     """The step for a state and inputs of these layouts; `values` is how many a reading has."""
     return _compiled(method.step, method.fits, method.healthy, method.adapt is None, state, inputs, values)
@@ -184,19 +229,31 @@ def compiled(method: Method, state: Layout, inputs: Layout, values: int) -> Step
 @lru_cache(maxsize=128)
 def _compiled(step, fits, healthy, rigid: bool, state: Layout, inputs: Layout, values: int) -> Step:
     layouts: list[Layout] = []
+    small = False
 
     def one(vector: Any, given: Any, lasting: Any) -> Any:
+        nonlocal small
         interval, rule = inputs.unpacked(given[values:])
-        new, info = step(interval, state.unpacked(vector, lasting), rule(given[:values]))
+        begin = state.unpacked(vector, lasting)
+        small = getattr(begin, "small", False)
+        new, info = step(interval, begin, rule(given[:values]))
         layouts[:] = Layout.of(new), Layout.of(info)
         well = jnp.array(rigid) if fits is None and healthy is None else fits(new, info) if fits else healthy(info)
         # With the evidence and the mean all the rest is finite.
         finite = jnp.isfinite(info.log_likelihood_increment + jnp.sum(info.mean))
         return _joined([*_divided(new)[0], *jax.tree.leaves(info), jnp.where(finite, well.astype(float), jnp.nan)])
 
-    lasting = tuple(np.zeros(*of[:2]) for of in zip(*state[1:], strict=True) if of[2])
+    vector, lasting = state.zeros
+    given = vector, np.zeros(values + inputs.size), lasting
     call = jit_small(one)
     # The first call finds it traced.
-    call.eval_shape(np.zeros(state.size), np.zeros(values + inputs.size), lasting)
+    call.eval_shape(*given)
     after, info = layouts
+    if small:
+        whole = jit_small(one_kernel(one))
+        try:
+            whole(*given)
+            call = whole
+        except jax.errors.JaxRuntimeError:  # what does not fit into one kernel is many, as it would be
+            pass
     return Step(call, state, state if after == state else after, info, after.size)

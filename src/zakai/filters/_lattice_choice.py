@@ -267,6 +267,7 @@ def _search(model, log_prior, axes):
 def adapted(
     model: Model,
     lattice: Lattice,
+    cells: np.ndarray,
     plan: Plan,
     spreads: np.ndarray,
     maps: np.ndarray,
@@ -276,9 +277,10 @@ def adapted(
 ) -> tuple[Lattice | None, Plan | None, np.ndarray]:
     """A plan for a run of intervals of several records, their lattices if they change, and how these were cut out (records, 2).
 
-    The arrays of `lattice` and `info` have a leading axis of records.  The kernels have covariances `spreads` and move by `maps`
-    (K, parts, n, n).  With the `info` of a try: a better plan, or None where the try was good or nothing better can be had.
-    With `still` the first try is one with a window that stands still, where there is a window.
+    The arrays of `lattice` and `info` have a leading axis of records, as have the narrowest features `cells` (records, n).  The
+    kernels have covariances `spreads` and move by `maps` (K, parts, n, n).  With the `info` of a try: a better plan, or None
+    where the try was good or nothing better can be had.  With `still` the first try is one with a window that stands still,
+    where there is a window.
 
     Raises InputError if a lattice needs more than `budget` bytes.
     """
@@ -299,7 +301,7 @@ def adapted(
         def check(size: int) -> None:
             check_memory(model, (size,), plan.room, records, budget)
 
-        banded = _banded(lattice, plan, np.sqrt(spreads[:, 0, 0, 0]), np.abs(maps[:, 0, 0, 0]), check)
+        banded = _banded(lattice, cells[:, 0], plan, np.sqrt(spreads[:, 0, 0, 0]), np.abs(maps[:, 0, 0, 0]), check)
         if banded is not None:
             return banded
     sizes = plan.sizes if not plan.banded else (BASE[1],)
@@ -310,7 +312,7 @@ def adapted(
         if own:
             kernel = np.linalg.inv(spreads)
             kernel = np.einsum("rid,kpij,rjd->rkpd", lattice.basis, kernel, lattice.basis, optimize=True).max(axis=(0, 1, 2))
-            roomy = features(lattice.log_values).min(axis=0) > 3 * plan.needed
+            roomy = cells.min(axis=0) > 3 * plan.needed
             roomy &= (2.4 * np.sqrt(kernel) < COARSEST) | plan.sharpen
             sizes = tuple(max(s // 2, BASE[model.n]) if room else s for s, room in zip(sizes, roomy, strict=True))
         if model.n > 1:
@@ -395,8 +397,8 @@ def _more(plan: Plan, info: Any) -> Plan | None:
 
 
 def _banded(
-    lattice: Lattice, plan: Plan, deviation: np.ndarray, maps: np.ndarray, check: Callable[[int], None]
-) -> tuple[Lattice, Plan, np.ndarray] | None:
+    lattice: Lattice, cells: np.ndarray, plan: Plan, deviation: np.ndarray, maps: np.ndarray, check: Callable[[int], None]
+) -> tuple[Lattice | None, Plan, np.ndarray] | None:
     """The windows and the cells of a banded run, or None where summing over all pairs is cheaper; `check` may refuse a size."""
     logs = lattice.log_values
     count = logs.shape[1]
@@ -405,7 +407,7 @@ def _banded(
     along = np.concatenate([[1.0], np.cumprod(maps)])[: len(deviation)]
     growth = (1 / np.sqrt(maps) if plan.still else along) / deviation
     coarsest = COARSEST_STILL if plan.still else COARSEST
-    widest = np.minimum(coarsest / growth.max(), features(logs)[:, 0] * cell / plan.cells)
+    widest = np.minimum(coarsest / growth.max(), cells * cell / plan.cells)
     if plan.still:
         # The windows of all records stand on one lattice.
         widest = np.full(len(cell), widest.min())
@@ -413,23 +415,26 @@ def _banded(
     if plan.still:
         well = np.full(len(cell), np.all(well & (cell == cell[0])))
     new_cell = np.where(well, cell, SPARE * widest)
-    taps = 16
-    while taps * new_cell.min() * growth.min() < REACH:
-        taps *= 2
+    enough, taps = REACH / (new_cell.min() * growth.min()), 16
     if plan.still:
-        taps = 4 * int(np.ceil(REACH / (4 * new_cell.min() * growth.min())))
+        taps = 4 * int(np.ceil(enough / 4))
+    while not plan.still and taps < enough:
+        taps *= 2
     used = logs > _top(logs) + np.log(0.1 * _edge(plan))
     first, last = used.argmax(axis=1), count - 1 - used[:, ::-1].argmax(axis=1)
     middle, span = (first + last) // 2, (last - first + 1) * cell
     if plan.still:
         middle = _aligned(lattice, middle)
     size = rounded_up(plan.window * (span / new_cell).max() + 8 + (2 * STILL_ROOM if plan.still else 0))
-    if plan.banded and plan.sizes[0] >= size >= (0.8 if plan.still else 0.6) * plan.sizes[0]:
-        size = plan.sizes[0]
+    own = plan.banded and plan.sizes[0] >= size >= (0.8 if plan.still else 0.6) * plan.sizes[0]
+    size = plan.sizes[0] if own else size
     pairs = max(BASE[1], rounded_up(span.max() / (COARSEST * deviation.min())))
     if size * (12 + 0.2 * taps) > 3 * pairs**2:
         return None
     check(size)
+    if plan.still and own and size == count and np.all(well):
+        # Its steps lay the window over the mass by themselves.
+        return None, replace(plan, taps=taps), np.tile(SAME, (len(logs), 1))
     cuts = np.stack([middle, new_cell / cell], axis=1)
     window = _resampled(logs, cuts[:, 0], cuts[:, 1], size)
     centre = lattice.centre + lattice.basis[:, :, 0] * (cuts[:, :1] - count // 2)
@@ -439,6 +444,8 @@ def _banded(
 
 def _aligned(lattice: Lattice, middle: np.ndarray) -> np.ndarray:
     """The points of the first lattice that are nearest to an index (records,) of each, as indices of each."""
+    if len(middle) == 1:
+        return middle
     centre, cell, half = lattice.centre[:, 0], lattice.basis[:, 0, 0], lattice.log_values.shape[1] // 2
     at = centre + cell * (middle - half)
     at = centre[0] + cell[0] * np.rint((at - centre[0]) / cell[0])
@@ -481,20 +488,21 @@ def _resampled(logs: np.ndarray, middle: np.ndarray, ratio: np.ndarray, size: in
     Trigonometric interpolation is exact where the density is resolved; its rounding would drown the far tails, which are
     interpolated in the logarithm.
     """
-    count = logs.shape[1]
-    at = middle[:, None] + ratio[:, None] * (np.arange(size) - size // 2)
+    count, index = logs.shape[1], np.arange(size) - size // 2
+    at = middle[:, None] + ratio[:, None] * index
     inside = (at >= 0) & (at <= count - 1)
+    rows = np.flatnonzero((ratio != 1.0) | (middle % 1 != 0.0))
+    if not len(rows):
+        return np.where(inside, np.take_along_axis(logs, np.clip(at, 0, count - 1).astype(int), axis=1), -np.inf)
     left = np.clip(np.floor(at), 0, count - 2).astype(int)
     share = np.clip(at - left, 0.0, 1.0)
     top = _top(logs)
     held = np.maximum(logs, top - 800.0)
     window = (1 - share) * np.take_along_axis(held, left, axis=1) + share * np.take_along_axis(held, left + 1, axis=1)
     window = np.where(window <= top - 799.0, -np.inf, window)
-    rows = np.flatnonzero((ratio != 1.0) | (middle % 1 != 0.0))
-    if len(rows):
-        value = _trigonometric(np.exp(logs[rows] - top[rows]), middle[rows, None], ratio[rows, None], size)
-        good = value > 1e-11
-        window[rows] = np.where(good, np.log(np.where(good, value, 1.0)) + top[rows], window[rows])
+    value = _trigonometric(np.exp(logs[rows] - top[rows]), middle[rows, None], ratio[rows, None], size)
+    good = value > 1e-11
+    window[rows] = np.where(good, np.log(np.where(good, value, 1.0)) + top[rows], window[rows])
     return np.where(inside, window, -np.inf)
 
 

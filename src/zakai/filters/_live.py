@@ -11,7 +11,7 @@ from zakai import _float64  # noqa: F401
 from zakai.densities import Density
 from zakai.errors import InputError
 from zakai.filters._ahead import Ahead, Block, Clock, data_at
-from zakai.filters._compiled_step import Laid, Layout, Step, Told, compiled, packed
+from zakai.filters._compiled_step import Laid, Layout, Step, Told, compiled, packed, settled
 from zakai.filters._protocol import Info
 from zakai.filters._run import RUN, TRIES, Setting
 
@@ -19,6 +19,7 @@ AFTER_GAP = (
     "a path is read after a gap: the increment since the last reading of that coordinate acts as one factor at its end, which is "
     "exact only as the gaps shrink"
 )
+SETTLED = 16  # how many steps of a run are taken before a state is settled again
 STEADY = 8  # how many times longer a run is after a look that left a lattice as large as it was
 
 
@@ -50,6 +51,7 @@ class Live:
         self.setting, self.ahead = setting, Ahead(setting)
         self.kind, self.m = setting.model.observation_kind, setting.model.m
         method = setting.method
+        self.whole = (True,) * self.m  # what is seen where nothing is missing
         self.step: Step | None = None
         self.inputs: Layout | None = None
         self.adapts, self.path = method.adapt is not None, self.kind == "path"
@@ -66,7 +68,9 @@ class Live:
         With `look_only` nothing is prepared for what may follow.
         """
         now = self.now
-        seen = tuple([value == value for value in values])
+        # Of what is there the sum is a number.
+        total = sum(values)
+        seen = self.whole if total == total else tuple([value == value for value in values])
         elapsed, read, read_at = None, now.read, now.read_at
         notes: tuple[str, ...] = ()
         if self.path:
@@ -74,7 +78,7 @@ class Live:
             notes = (AFTER_GAP,) if elapsed is not None else ()
         elif self.kind == "rates":
             values = [value * (time - now.time) for value in values]
-        if False in seen:
+        if seen is not self.whole:
             values = [value if there else 0.0 for value, there in zip(values, seen, strict=True)]
         if time == now.time:
             return self._at_start(np.array(values), seen)
@@ -89,6 +93,8 @@ class Live:
         looks = self.adapts and (left == 0 or block is not now.block)
         if looks:
             laid, left = self._looked(block, row, laid)
+        elif self.adapts and left % SETTLED == 0:
+            laid = self._settled(laid, block)
         after, told = self._step(laid, block, given)
         verdict = told.verdict
         if self.adapts and verdict != 1.0:
@@ -161,7 +167,10 @@ class Live:
         return Laid.of(state) if self.adapts else self._laid(state, block)
 
     def _laid(self, state: Any, block: Block) -> Laid:
-        laid = Laid.of(state)
+        return self._settled(Laid.of(state), block)
+
+    def _settled(self, laid: Laid, block: Block) -> Laid:
+        laid = settled(laid)
         return compiled(self.setting.method, laid.layout, block.layout, self.m).begun(laid)
 
     def _looked(self, block: Block, row: int, laid: Laid) -> tuple[Laid, int]:

@@ -75,6 +75,9 @@ class Method:
     rule(prepared, data)(data.filled).  None: `observations` is asked for every reading.  `fits(state, info)`, traced by JAX, says
     of the step that gave them that `adapt` would find nothing to better.  None: `healthy` says it, or `adapt` is asked.  A class
     of states may name in `LASTING` (a tuple) its fields that no step changes, only `adapt`: they are not copied with every step.
+    A state may have `settled(state)`, traced by JAX, which lays it as its next steps had best find it: a live filter asks for it
+    at the beginning of a run and now and then within.  One that is `small` takes steps that are over about as soon as begun, and
+    that are products and sums of its points: they are compiled as one kernel.
     Where nothing depends on time, `lasting(prepared, interval, rule, length)` makes of the only interval of a Prepared, and
     of its rule, those of a shorter one.  None: that is prepared like any other.
 

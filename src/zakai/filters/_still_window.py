@@ -17,6 +17,7 @@ looked at.
 
 from __future__ import annotations
 
+from functools import partial
 from math import gcd
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ from zakai.filters.observations import Factors
 from zakai.kolmogorov import lattice as lat
 from zakai.kolmogorov.flow import Flow, motion
 from zakai.kolmogorov.lattice import Lattice
+from zakai.models.compile import one_kernel
 
 LOOK = 16  # steps
 
@@ -76,6 +78,11 @@ def place(table: Table, centre: Any) -> Any:
     return jnp.rint((centre - table.home) / table.cell).astype(int)
 
 
+def seen(table: Table, at: Any, size: int) -> Any:
+    """h and its derivatives (m, 5, size) on the window `at` a place."""
+    return jax.lax.dynamic_slice_in_dim(table.h, (table.h.shape[-1] - size) // 2 + at, size, axis=2)
+
+
 class Steps(NamedTuple):
     """What a run of K steps tells: for each step the `sums` (K, 4) of p, p i, p i^2 and of p at the edges, i an index from the
     window's centre, which is at `place` (K,) in cells from the home of its table, the logarithm by which the sum of p grew,
@@ -109,7 +116,7 @@ def moved(
     the density, in cells; `even` says that both halves of every factor are the same.
     """
     size, cell, count = len(lattice.log_values), table.cell, len(kernel.variance)
-    each, far = gcd(count, LOOK), (table.h.shape[-1] - size) // 2
+    each = gcd(count, LOOK)
     xi, columns = cell * _index(size), _columns(size)
     steps, variance = cell * np.arange(taps + 1), kernel.variance[:, None]
     weights = cell * jnp.exp(-0.5 * steps**2 / variance)
@@ -117,14 +124,14 @@ def moved(
     slices = taps_of, kernel, turned, given.before, given.after
     still = jax.lax.stop_gradient  # of what only says where to look nothing is differentiated
 
-    def halves(slices: Any, seen: Any) -> tuple[splitting.Half, splitting.Half]:
+    def halves(slices: Any, shown: Any) -> tuple[splitting.Half, splitting.Half]:
         """Those of some steps' factors, with arrays (steps, N)."""
         _, kernel, turned, first, last = slices
         slope, bend = (kernel.before + kernel.after)[:, 1:].T - turned.T
         tilt = slope[:, None] + 2 * bend[:, None] * xi
 
         def half(linear: Any) -> splitting.Half:
-            parts = [linear @ seen[:, k] for k in range(5)]
+            parts = [linear @ shown[:, k] for k in range(5)]
             return splitting.bridged(parts, kernel.variance[:, None], tilt)
 
         before = _made(half(first))
@@ -136,11 +143,11 @@ def moved(
         p, at, own = carry
         shift = _shift((p > np.exp(-lat.SUPPORT) * jnp.max(p)).astype(float), at, table)
         p, at = lat.slid(p, shift, 0.0), at + shift
-        seen = jax.lax.dynamic_slice_in_dim(table.h, far + at, size, axis=2)
+        shown = seen(table, at, size)
         kernel, centre = slices[1], table.home + cell * at
         kernel = Kernel(kernel.variance, _around(kernel.before, centre), _around(kernel.after, centre))
         slices = slices[0], kernel, _turned(slices[2], centre), *slices[3:]
-        first, last = halves(slices, seen)
+        first, last = halves(slices, shown)
         before, after = kernel.before @ powers, kernel.after @ powers
         # An evidence far from one leaves no mark: at the highest point nothing grows.
         top = jnp.argmax(p)
@@ -154,7 +161,7 @@ def moved(
             return p, p
 
         total = jnp.sum(p)
-        p, values = jax.lax.scan(step, p / total, (factors, first.bend, last, slices[0]))
+        p, values = one_kernel(partial(jax.lax.scan, step))(p / total, (factors, first.bend, last, slices[0]))
         sums = values @ columns
         logs = jnp.log(sums[:, 0])
         growth = logs - jnp.concatenate([jnp.zeros(1), logs[:-1]]) + offset[:, 0]
@@ -172,24 +179,23 @@ def moved(
 
 
 class Stepped(NamedTuple):
-    """What one step leaves: the logarithms (N,) of a density whose largest value is one, and of what was only `spread`; the
-    `sums` (4,) of its values, as in Steps; and the logarithm by which it is too `small`."""
+    """What one step leaves: the logarithms (N,) of a density whose largest value is one; the `sums` (5,) of its values, as in
+    Steps, and of them times how deep in the tails of what was only spread they are; and the logarithm by which it is too
+    `small`."""
 
     logs: Any
-    spread: Any
     sums: Any
     small: Any
 
 
 def stepped(
-    logs: jax.Array, at: Any, table: Table, kernel: Kernel, turned: Any, given: Factors, taps: int, even: bool
+    lattice: Lattice, seen: Any, kernel: Kernel, turned: Any, given: Factors, taps: int, even: bool
 ) -> Stepped:
-    """One interval, from the logarithms (N,) of a density on the window `at` a place, in as few loops over its points as can be:
-    for a filter that is told its readings one by one.  All but `logs` is as in `moved`."""
-    size, cell = len(logs), table.cell
+    """One interval, from the density on a lattice of N points of which `seen` is what a table shows, in as few loops over its
+    points as can be: for a filter that is told its readings one by one.  All else is as in `moved`."""
+    logs, centre, cell = lattice.log_values, lattice.centre[0], lattice.basis[0, 0]
+    size = len(logs)
     xi = cell * _index(size)
-    seen = jax.lax.dynamic_slice_in_dim(table.h, (table.h.shape[-1] - size) // 2 + at, size, axis=2)
-    centre = table.home + cell * at
     before, after = _around(kernel.before, centre), _around(kernel.after, centre)
     slope, bend = (before + after)[1:] - _turned(turned, centre)
 
@@ -213,12 +219,13 @@ def stepped(
     lowered = spread + factor
     crest = jnp.max(lowered)
     values = jnp.exp(lowered - crest)
-    return Stepped(lowered - crest, spread, _columns(size).T @ values, top + crest)
+    deep = jnp.where(values > 0, jnp.max(spread) - spread, 0.0) @ values
+    return Stepped(lowered - crest, jnp.append(_columns(size).T @ values, deep), top + crest)
 
 
 def laid_anew(logs: jax.Array, at: jax.Array, table: Table) -> tuple[jax.Array, jax.Array]:
-    """A window laid over the mass, by whole cells: the logarithms (N,), of which the largest is zero, and its place."""
-    shift = _shift((logs > -lat.SUPPORT).astype(float), at, table)
+    """A window laid over the mass, by whole cells: the logarithms (N,) of a density and its place."""
+    shift = _shift((logs > jnp.max(logs) - lat.SUPPORT).astype(float), at, table)
     return lat.slid(logs, shift, -jnp.inf), at + shift
 
 

@@ -48,7 +48,7 @@ _SMOOTH = 1e-9  # of the mass of a prior, on every second point of its lattice
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["lattice", "observed", "cells", "middle", "cut", "looked", "table"],
+    data_fields=["lattice", "observed", "cells", "middle", "cut", "table", "seen"],
     meta_fields=["plan"],
 )
 @dataclass(frozen=True)
@@ -58,25 +58,25 @@ class State:
     What the last step computed and the next one needs again is carried: h at the points, `observed`, an array for each
     coordinate, with one state its slopes behind, the narrowest feature in `cells` (n,), and the `middle` of the support (n,), an
     index from the centre. `cut` (2,) says how the first lattice of this run of steps was cut out of the last of the run before.
-    Of a lattice that stands still `table` holds h and its derivatives, nothing is `observed`, and `looked` (2,) says how many
-    steps ago its window was laid, and how deep in its tails the mass was then.
+    Of a lattice that stands still `table` holds h and its derivatives, what is `seen` of it by the window is what it shows where
+    that stands, if this is known, and nothing is `observed`.
     """
 
-    LASTING = ("table",)
+    LASTING = ("table", "seen")
 
     lattice: Lattice
     observed: Any
     cells: Any
     middle: Any
     cut: Any
-    looked: Any
     plan: choice.Plan
     table: _still_window.Table | None = None
+    seen: Any = None
 
     @property
     def kept(self) -> State:
         """What a result keeps of the state."""
-        return replace(self, observed=None, table=None)
+        return replace(self, observed=None, table=None, seen=None)
 
     @property
     def run_length(self) -> int:
@@ -87,6 +87,16 @@ class State:
     def together(self) -> Callable[..., Any] | None:
         """What takes all steps of a run together, where they can be."""
         return _steps if self.plan.still else None
+
+    @property
+    def small(self) -> bool:
+        """Whether a step is so short that one kernel had better take it."""
+        return self.plan.still
+
+    @property
+    def settled(self) -> Callable[..., Any] | None:
+        """What lays a window that stands still over the mass anew."""
+        return _settled if self.plan.still else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,7 +379,9 @@ def _looked_at(prepared: Prepared, lattice: Lattice, plan: choice.Plan, time: fl
     system = prepared.system
     logs = np.asarray(lattice.log_values if own is None else own)
     observed = _observed_at(system, lattice, time, prepared.theta) if system.halves and not plan.still else None
-    return State(lattice, observed, choice.features(logs), choice.middle(logs), cut, np.zeros((len(logs), 2)), plan)
+    # A window that stands still is not led by the middle of what it shows.
+    middle = np.zeros((len(logs), logs.ndim - 1)) if plan.still else choice.middle(logs)
+    return State(lattice, observed, choice.features(logs), middle, cut, plan)
 
 
 def _looked_at_one(prepared: Prepared, lattice: Lattice, plan: choice.Plan, time: float, cut: Any, own: Any) -> State:
@@ -399,7 +411,7 @@ def _log_factor(h: Sequence[jax.Array] | None, factor: Factors) -> Any:
 
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None, still: bool = True) -> State | None:
     """The state to begin the intervals `rows` with: the window, the cell and the way to convolve."""
-    one = jax.tree.map(lambda a: np.asarray(a)[None], (replace(state, table=None), info))
+    one = jax.tree.map(lambda a: np.asarray(a)[None], (replace(state, table=None, seen=None), info))
     many = adapt_many(prepared, one[0], rows, one[1], still, state.table)
     if many is None:
         return None
@@ -422,17 +434,18 @@ def adapt_many(
     """
     still = still and prepared.intervals.still is not None and bool(prepared.schedule.inside[rows].all())
     flow = prepared.intervals.flow
-    own = jax.tree.map(np.asarray, states.lattice)
+    own, cells = Lattice(*map(np.asarray, states.lattice)), np.asarray(states.cells)
     lattice, plan, cut = choice.adapted(
-        prepared.model, own, states.plan, flow.spread[rows], flow.map[rows], info, prepared.memory, still
+        prepared.model, own, cells, states.plan, flow.spread[rows], flow.map[rows], info, prepared.memory, still
     )
     if plan is None:
         return None
     if info is not None:
         cut = choice.composed(np.asarray(states.cut), cut, own.log_values.shape[1])
-    if lattice is None:
-        return replace(states, plan=plan, cut=cut)
     start = prepared.schedule.starts[rows.start]
+    if lattice is None:
+        laid = replace(states, plan=plan, cut=cut)
+        return replace(laid, table=_table(prepared, own, start, table)) if plan.still else laid
     laid = _looked_at(prepared, lattice, plan, start, cut)
     return replace(laid, table=_table(prepared, lattice, start, table)) if plan.still else laid
 
@@ -487,7 +500,7 @@ def _steps(state: State, intervals: Interval, observation: Factors, keep: bool) 
 
     def laid(values: jax.Array, mass: jax.Array, centre: jax.Array, cells: jax.Array) -> State:
         moved = Lattice(lat.log(values) - jnp.log(cell * mass), centre, lattice.basis)
-        return State(moved, None, cells[None], jnp.zeros(1), state.cut, jnp.zeros(2), plan)
+        return State(moved, None, cells[None], jnp.zeros(1), state.cut, plan)
 
     end = laid(last, mass[-1], centres[-1], cells[-1])
     kept = jax.vmap(laid)(told.values, mass, centres, cells) if keep else None
@@ -499,35 +512,34 @@ def _stepped(interval: Interval, state: State, observation: Factors) -> tuple[St
     assert state.table is not None and interval.still is not None
     system, plan, lattice, table = interval.system, state.plan, state.lattice, state.table
     kernel, turned, given = _still_factors(interval.still, observation)
-    at, cell = _still_window.place(table, lattice.centre[0]), table.cell
-    new = _still_window.stepped(lattice.log_values, at, table, kernel, turned, given, plan.taps, system.even)
-    mass, first, second, outer = new.sums
-    mean, log_mass, centre = first / mass, jnp.log(cell * mass), table.home + cell * at
-
-    end = Lattice(new.logs, lattice.centre, lattice.basis)
-    cells = lat.features(end, 0.0)
-
-    def look() -> tuple[jax.Array, ...]:
-        logs, place = _still_window.laid_anew(new.logs, at, table)
-        return logs, place, jnp.stack([jnp.zeros(()), lat.reach(end, new.spread)])
-
-    def as_it_is() -> tuple[jax.Array, ...]:
-        return new.logs, at, state.looked + np.array([1.0, 0.0])
-
-    logs, at, looked = jax.lax.cond(state.looked[0] + 1 >= _still_window.LOOK, look, as_it_is)
+    seen, cell = state.seen, lattice.basis[0, 0]
+    if seen is None:
+        seen = _still_window.seen(table, _still_window.place(table, lattice.centre[0]), lattice.log_values.size)
+    new = _still_window.stepped(lattice, seen, kernel, turned, given, plan.taps, system.even)
+    mass, first, second, outer, depth = new.sums
+    mean, log_mass = first / mass, jnp.log(cell * mass)
+    cells = lat.features(lattice._replace(log_values=new.logs), 0.0)
     joint = jax.lax.rsqrt(1.0 / jnp.minimum(state.cells[0], cells[0]) ** 2 + cell**2 / kernel.variance)
     health = {
         "edge_mass": outer / mass,
         "resolution": cells[0],
         "quadrature_error": 2 * jnp.exp(-2 * jnp.pi**2 * joint**2),
         "exponent": jnp.zeros(()),
-        "surprise": looked[1] / _HELD_CUT,
+        "surprise": depth / mass / _HELD_CUT,
     }
     variance = cell**2 * (second / mass - mean**2)
     growth = new.small + log_mass + observation.constant
-    info = Info(growth, (centre + cell * mean)[None], variance[None, None], health, jnp.ones(2))
-    moved = Lattice(logs - log_mass, (table.home + cell * at)[None], lattice.basis)
-    return replace(state, lattice=moved, cells=cells, looked=looked), info
+    info = Info(growth, lattice.centre + cell * mean, variance[None, None], health, jnp.ones(2))
+    moved = lattice._replace(log_values=new.logs - log_mass)
+    return replace(state, lattice=moved, cells=cells), info
+
+
+def _settled(state: State) -> State:
+    assert state.table is not None
+    lattice, table = state.lattice, state.table
+    logs, at = _still_window.laid_anew(lattice.log_values, _still_window.place(table, lattice.centre[0]), table)
+    lattice = lattice._replace(log_values=logs, centre=(table.home + table.cell * at)[None])
+    return replace(state, lattice=lattice, seen=_still_window.seen(table, at, logs.size))
 
 
 def _still_factors(still: Still, given: Factors) -> tuple[_still_window.Kernel, Any, Factors]:
@@ -538,10 +550,11 @@ def _still_factors(still: Still, given: Factors) -> tuple[_still_window.Kernel, 
 
 def resume(prepared: Prepared, state: State, rows: slice, begin: State) -> State:
     """The traced `state` on a lattice cut out of its own as that of `begin` was, with the same plan."""
-    cut = np.asarray(begin.cut)
+    cut, start = np.asarray(begin.cut), prepared.schedule.starts[rows.start]
     if np.array_equal(cut, choice.SAME):
-        return replace(state, plan=begin.plan, cut=cut)
-    own, start = begin.lattice.log_values, prepared.schedule.starts[rows.start]
+        laid = replace(state, plan=begin.plan, cut=cut)
+        return replace(laid, table=_table(prepared, state.lattice, start)) if begin.plan.still else laid
+    own = begin.lattice.log_values
     lattice = choice.cut_out(state.lattice, cut, own.size)
     laid = _looked_at_one(prepared, lattice, begin.plan, start, cut, own)
     return replace(laid, table=_table(prepared, lattice, start)) if begin.plan.still else laid
@@ -591,7 +604,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
     }
     need = jnp.append(jnp.maximum(worst.need, plan.needed / resolution), worst.room)
     kept = observed if system.halves else None
-    new = State(lattice, kept, cells, summary.middle, state.cut, state.looked, plan)
+    new = State(lattice, kept, cells, summary.middle, state.cut, plan)
     return new, Info(log_mass, summary.mean, summary.cov, health, need)
 
 

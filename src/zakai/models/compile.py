@@ -12,6 +12,7 @@ from zakai import _float64  # noqa: F401  (sets double precision before JAX is u
 
 import jax  # isort: skip
 import jax.numpy as jnp  # isort: skip
+from jax.experimental.xla_metadata import set_xla_metadata  # isort: skip
 import numpy as np
 
 from zakai.models import _trigonometry
@@ -50,6 +51,27 @@ def jit_small(function: Callable[..., Any], static_argnums: int | tuple[int, ...
 def jit_loop(function: Callable[..., Any], static_argnums: int | tuple[int, ...] = ()) -> Any:
     """`jax.jit` for loops over steps that take microseconds, in which products may yet be large."""
     return jax.jit(function, static_argnums=static_argnums, compiler_options=_known(PART_BY_PART))
+
+
+def one_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function, which within `jax.jit` becomes one kernel on a CPU: for what takes little more time than it takes to
+    start a kernel.
+
+    Products are plain loops then, and what a library of linear algebra does is not to be had.
+    """
+
+    def within(*args: Any) -> Any:
+        # What the function itself calls is as it would be.
+        with set_xla_metadata(inlineable="true", xla_cpu_small_call="false"):
+            return function(*args)
+
+    compiled = jax.jit(within)
+
+    def called(*args: Any) -> Any:
+        with set_xla_metadata(inlineable="false", xla_cpu_small_call="true"):
+            return compiled(*args)
+
+    return called if jax.default_backend() == "cpu" else function
 
 
 def jax_function(expressions: Any, model: Model, shape: Sequence[int] | None = None) -> JaxFunction:
