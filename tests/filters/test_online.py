@@ -299,8 +299,8 @@ def test_an_outlier_of_fifty_deviations_neither_breaks_nor_freezes_the_filter(ke
     assert np.all(abs(estimate.mean - usual.mean) < 3 * np.sqrt(np.diag(usual.cov)))
 
 
-def test_a_lattice_that_is_as_large_as_it_was_is_looked_at_less_often():
-    """Readings that tell of nothing leave the lattice as it is; an outlier is met at once for all that."""
+def test_after_the_first_run_a_lattice_is_looked_at_less_often():
+    """An outlier is met at once for all that."""
     model = zakai.load_model("gallery:spiral-sensor")
     online = zakai.online(model)
     times = 0.01 * np.arange(1, 1201)

@@ -155,7 +155,8 @@ class Step(NamedTuple):
     """A compiled step: `call(vector, inputs, lasting)` gives the vector of the new state, with what was told behind it.
 
     `inputs` is a row of a Block with the values of the reading, zero where there is none; `lasting` is what stands apart.
-    `state` is the layout before and `new` that after; `info` is that of the Info; the last number is its verdict.
+    `state` is the layout before and `new` that after; `info` is that of the Info.  The last number is the
+    verdict: one where the step kept what `adapt` looks at, zero where it did not, nan where nothing of the density was left.
     """
 
     call: Callable[[Any, np.ndarray, tuple[Any, ...]], Any]
@@ -163,10 +164,15 @@ class Step(NamedTuple):
     new: Layout
     info: Layout
     begin: int  # of what is told, in the vector
+    last: int  # byte of the vector, where the verdict begins
 
     def begun(self, laid: Laid) -> Laid:
         """A state that no step told of, with room for it."""
         return Laid(np.concatenate([laid.vector, np.zeros(self.info.size + 1)]), self.state, laid.lasting)
+
+    def told(self, after: Laid) -> Told:
+        """What it told of the state that it gave."""
+        return Told(np.asarray(after.vector), self.begin, self.info)
 
 
 class Told(NamedTuple):
@@ -181,13 +187,9 @@ class Told(NamedTuple):
         return self.layout.unpacked(self.vector[self.begin :])
 
     @property
-    def verdict(self) -> float:
-        """One where the step kept what `adapt` looks at, zero where it did not, nan where nothing of the density was left."""
-        return self.vector.item(-1)
-
-    @property
     def well(self) -> bool:
-        return self.verdict == 1.0
+        """Whether the step kept what `adapt` looks at."""
+        return self.vector.item(-1) == 1.0
 
 
 def settled(laid: Laid) -> Laid:
@@ -256,4 +258,4 @@ def _compiled(step, fits, healthy, rigid: bool, state: Layout, inputs: Layout, v
             call = whole
         except jax.errors.JaxRuntimeError:  # what does not fit into one kernel is many, as it would be
             pass
-    return Step(call, state, state if after == state else after, info, after.size)
+    return Step(call, state, state if after == state else after, info, after.size, 8 * (after.size + info.size))

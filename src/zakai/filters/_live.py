@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from struct import Struct
 from typing import Any, NamedTuple
 
 import jax
@@ -20,20 +21,23 @@ AFTER_GAP = (
     "exact only as the gaps shrink"
 )
 SETTLED = 16  # how many steps of a run are taken before a state is settled again
-STEADY = 8  # how many times longer a run is after a look that left a lattice as large as it was
+STEADY = 8  # how many times longer all runs are but the first
+
+_number = Struct("d").unpack_from
 
 
 class Moment(NamedTuple):
     """Everything that decides what a filter says next; it never changes, the next reading makes another.
 
-    `laid` holds the state, and behind it what was told of it; of the run of steps since the lattice was looked at `left` are
-    left, in `block`, whose interval now ended began and ended at `ends`.  `read` and `read_at` (m,) are the last values of a path
-    and their times.  `first` are samples at the start itself: what they make of the prior waits for the first interval.
+    `laid` holds the state, and behind it what the step `by` told of it, where `by` is not itself what was told; of the run of
+    steps since the lattice was looked at `left` are left, in `block`, whose interval now ended began and ended at `ends`.  `read`
+    and `read_at` (m,) are the last values of a path and their times.  `first` are samples at the start itself: what they make of
+    the prior waits for the first interval.
     """
 
     time: float
     laid: Laid | None
-    told: Told | None
+    by: Step | Told | None
     left: int
     block: Block | None
     ends: tuple[float, float]
@@ -42,6 +46,14 @@ class Moment(NamedTuple):
     read_at: tuple[float, ...]
     first: tuple[float, ...] | None
     notes: tuple[str, ...]
+
+    @property
+    def told(self) -> Told | None:
+        """What was told of the state."""
+        if not isinstance(self.by, Step):
+            return self.by
+        assert self.laid is not None
+        return self.by.told(self.laid)
 
 
 class Live:
@@ -55,8 +67,8 @@ class Live:
         self.step: Step | None = None
         self.inputs: Layout | None = None
         self.adapts, self.path = method.adapt is not None, self.kind == "path"
-        # The same numbers, in half of the time.
-        self.read: Any = np.frombuffer if jax.default_backend() == "cpu" else np.asarray
+        # On a CPU an array's memory can be read, in a third of the time.
+        self.near = jax.default_backend() == "cpu"
         start = float(setting.model.start)
         clock = Clock(start, 0, (), None, False)
         nothing = (0.0,) * self.m
@@ -95,22 +107,20 @@ class Live:
             laid, left = self._looked(block, row, laid)
         elif self.adapts and left % SETTLED == 0:
             laid = self._settled(laid, block)
-        after, told = self._step(laid, block, given)
-        verdict = told.verdict
+        after, verdict = self._step(laid, block, given)
         if self.adapts and verdict != 1.0:
             if not looks:
                 laid, left = self._looked(block, row, laid)
-                after, told = self._step(laid, block, given)
-            if not told.well:
-                after, told, left = self._tried(block, row, own.state, laid, given, (after, told, left))
-            verdict = told.verdict
+                after, verdict = self._step(laid, block, given)
+            if verdict != 1.0:
+                after, verdict, left = self._tried(block, row, own.state, laid, given, (after, verdict, left))
         if verdict != verdict:
             raise InputError(
                 f"{self.setting.model.source}: at t = {time:g} the reading leaves nothing of the density, or takes it "
                 "beyond what numbers can hold; it is not used"
             )
         ends = (now.time, time)
-        return Moment(time, after, told, left - 1, block, ends, clock, read, read_at, None, notes + block.notes)
+        return Moment(time, after, self.step, left - 1, block, ends, clock, read, read_at, None, notes + block.notes)
 
     def density(self, moment: Moment) -> Density:
         """The density at a moment."""
@@ -141,7 +151,7 @@ class Live:
         first = tuple(np.where(seen, reading, np.nan).tolist())
         notes = block.notes
         ends = (now.time, now.time + 1.0)
-        return now._replace(laid=Laid.of(state), told=told, block=block, ends=ends, first=first, notes=notes)
+        return now._replace(laid=Laid.of(state), by=told, block=block, ends=ends, first=first, notes=notes)
 
     def _corrected(self, block: Block, reading: np.ndarray, seen: tuple[bool, ...]) -> tuple[Any, Info]:
         method, start = self.setting.method, self.now.time
@@ -181,10 +191,10 @@ class Live:
         adapt = self.setting.method.adapt
         assert adapt is not None
         state = adapt(block.prepared, state, rows, None)
-        new = self._laid(state, block)
         run = getattr(state, "run_length", RUN)
-        # Every step tells whether it was well; a look is there to find that less would do.
-        return new, STEADY * run if new.layout == laid.layout else run
+        # Every step tells whether it was well; a look is there to find that less would do, which is mostly so after the prior.
+        begins = self.now.laid is None or self.now.first is not None
+        return self._laid(state, block), run if begins else STEADY * run
 
     def _tried(self, block: Block, row: int, own: Any, laid: Laid, given: np.ndarray, found: Any) -> Any:
         """One step from better lattices, until it is well or nothing better can be had; health then says so.
@@ -194,21 +204,24 @@ class Live:
         adapt = self.setting.method.adapt
         assert adapt is not None
         for _ in range(TRIES):
-            info = jax.tree.map(lambda a: np.asarray(a)[None], found[1].info)
+            assert self.step is not None
+            info = jax.tree.map(lambda a: np.asarray(a)[None], self.step.told(found[0]).info)
             begin = laid.state
             state = adapt(block.prepared, own.tried(begin) if hasattr(own, "tried") else begin, slice(row, row + 1), info)
             if state is None:
                 break
             laid = self._laid(state, block)
             found = (*self._step(laid, block, given), getattr(state, "run_length", RUN))
-            if found[1].well:
+            if found[1] == 1.0:
                 break
         return found
 
-    def _step(self, laid: Laid, block: Block, given: np.ndarray) -> tuple[Laid, Told]:
+    def _step(self, laid: Laid, block: Block, given: np.ndarray) -> tuple[Laid, float]:
+        """The state after a step, and the verdict on it."""
         step = self.step
         if step is None or laid.layout is not step.state or block.layout is not self.inputs:
             self.step = step = compiled(self.setting.method, laid.layout, block.layout, self.m)
             self.inputs = block.layout
         after = step.call(laid.vector, given, laid.lasting)
-        return Laid(after, step.new, laid.lasting), Told(self.read(after), step.begin, step.info)
+        verdict = _number(after, step.last)[0] if self.near else float(after[-1])
+        return Laid(after, step.new, laid.lasting), verdict

@@ -170,7 +170,7 @@ class Online:
         time = _number(time)
         if time > now:
             return time
-        begins = self.lives[0].now.told is None
+        begins = self.lives[0].now.by is None
         if time == now and begins and self.model.observation_kind == "samples":
             return time
         if begins:
@@ -226,7 +226,8 @@ class Estimate:
     @property
     def _infos(self) -> list[Any]:
         if self._info is None:
-            self._info = [moment.told.info if moment.told is not None else None for moment in self._moments]
+            told = [moment.told for moment in self._moments]
+            self._info = [one.info if one is not None else None for one in told]
         return self._info
 
     @property
