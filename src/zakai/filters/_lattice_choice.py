@@ -404,8 +404,8 @@ def _banded(
     count = logs.shape[1]
     cell = np.abs(lattice.basis[:, 0, 0])
     # A window that moves along grows with the flow; a kernel between points that stand still has the variance map Sigma.
-    along = np.concatenate([[1.0], np.cumprod(maps)])[: len(deviation)]
-    growth = (1 / np.sqrt(maps) if plan.still else along) / deviation
+    along = 1 / np.sqrt(maps) if plan.still else np.concatenate([[1.0], np.cumprod(maps)])[: len(deviation)]
+    growth = along / deviation
     coarsest = COARSEST_STILL if plan.still else COARSEST
     widest = np.minimum(coarsest / growth.max(), cells * cell / plan.cells)
     if plan.still:
