@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from threading import Thread
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import zakai
-from zakai.filters import _affine_system
+from zakai.filters import _affine_system, _ahead, _compiled_step
+from zakai.filters._ahead import Ahead
 from zakai.filters._live import Live
 from zakai.models import compile
 
@@ -87,6 +90,23 @@ def test_lengths_that_never_repeat_give_what_a_record_gives(kind):
 
 
 @pytest.mark.slow
+def test_intervals_are_prepared_many_at_once_while_readings_keep_to_their_step(monkeypatch):
+    model = zakai.Model(**TIMED)
+    times = 0.1 * np.arange(1, 31)
+    record = simulated(model, times)
+    expected = [estimate.mean for estimate in told(zakai.online(model), record)]
+    made, own = [], Ahead._made
+
+    def spied(ahead, key, *rest):
+        made.append(key.number)
+        return own(ahead, key, *rest)
+
+    monkeypatch.setattr(Ahead, "_made", spied)
+    monkeypatch.setattr(_ahead, "CHUNK", 8)
+    assert np.allclose([estimate.mean for estimate in told(zakai.online(model), record)], expected, rtol=0, atol=1e-12)
+    assert made == [1, 8] * 4  # the first of each two tells how much room one takes
+
+
 @pytest.mark.parametrize(
     ("drift", "method", "options"),
     [("tanh(x)", "benes", {}), ("-x/4", "hu-yau", {"choice": "theorem-6"})],
@@ -194,6 +214,33 @@ def test_a_compiler_that_does_not_know_an_option_is_not_given_it(monkeypatch):
     assert compile._known(compile.ONE_THREAD) == {}
     model = zakai.Model(**WALK, observation_kind="rates")  # which no other test here has compiled
     compare(model, simulated(model, UNIFORM), "extended-kalman-bucy")
+
+
+def test_one_kernel_gives_the_numbers_of_many():
+    def step(x, weights):
+        def one(x, weight):
+            y = jnp.exp(weight * x - jnp.max(x))
+            return y / jnp.sum(y), jnp.max(y)
+
+        return jax.lax.scan(one, x, weights)
+
+    x, weights = np.linspace(-1.0, 1.0, 50), np.linspace(0.5, 2.0, 9)
+    many, one = (jax.jit(f)(x, weights) for f in (step, compile.one_kernel(step)))
+    for a, b in zip(many, one, strict=True):
+        assert np.allclose(a, b, rtol=1e-14, atol=0)
+    if jax.default_backend() == "cpu":
+        assert "xla_cpu_small_call" in jax.jit(compile.one_kernel(step)).lower(x, weights).as_text()
+
+
+def test_a_step_that_does_not_fit_into_one_kernel_is_taken_for_all_that(monkeypatch):
+    """LAPACK cannot be called from within one."""
+    model = zakai.Model(**TWO, observation_kind="samples")
+    record = simulated(model, UNIFORM[:5])
+    expected = told(zakai.online(model, "kalman-bucy"), record)
+    monkeypatch.setattr(type(expected[-1]._moments[0].laid.state), "small", True, raising=False)
+    _compiled_step._compiled.cache_clear()
+    found = told(zakai.online(model, "kalman-bucy"), record)
+    assert [one.mean.tolist() for one in found] == [one.mean.tolist() for one in expected]
 
 
 def test_an_option_that_needs_all_times_is_refused():

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import zakai
+from zakai.filters import _compiled_step
 from zakai.records import checkpoint
 from zakai.records.checkpoint import read_checkpoint, write_checkpoint
 
@@ -157,6 +158,14 @@ def test_adaptive_filters_go_on_from_a_checkpoint_with_the_same_bits(tmp_path, k
     check_continuation(tmp_path, zakai.Model(**keys, observation_kind=kind), method, TIMES[:20], 6)
 
 
+def test_a_window_that_is_laid_anew_now_and_then_goes_on_with_the_same_bits(tmp_path):
+    model = zakai.load_model("gallery:spiral-sensor")
+    check_continuation(tmp_path, model, "limited-direct", 0.01 * np.arange(1, 61), 7)
+    online = zakai.online(model, "limited-direct")
+    online.update(0.01, [0.0, 0.0])
+    assert online.lives[0].now.laid.state.seen is not None
+
+
 @pytest.mark.parametrize(
     ("keys", "method", "fields"),
     [
@@ -181,6 +190,7 @@ def test_what_no_step_changes_stands_beside_the_vector_of_a_state_and_changes_no
     values = rng.standard_normal(len(TIMES))
     before, whole = run()
     monkeypatch.setattr(type(whole.state), "LASTING", fields, raising=False)
+    monkeypatch.setattr(_compiled_step, "FEW", 0)
     after, divided = run()
     assert after == before
     apart = [np.ravel(leaf) for field in fields for leaf in jax.tree.leaves(getattr(whole.state, field))]
@@ -230,7 +240,10 @@ def test_a_state_that_somebody_made_up_is_refused_and_nothing_of_it_is_run(tmp_p
         with pytest.raises(zakai.InputError, match="does not fit"):
             online.restore(path)
         assert told(online.last) == before
-    for lives in ([], None, [{}], [{**good["lives"][0], "clock": None}], [{**good["lives"][0], "block": [0, 1]}]):
+    (life,) = good["lives"]
+    start, step, number, *rest = life["block"]
+    blocks = [[0, 1], *([start, wrong, number, *rest] for wrong in (0.0, -1.0, 1e400, 1e300)), [start, step, 10**12, *rest]]
+    for lives in ([], None, [{}], [{**life, "clock": None}], *([{**life, "block": block}] for block in blocks)):
         write_checkpoint(path, {**good, "lives": lives}, arrays)
         with pytest.raises(zakai.InputError, match="does not fit"):
             online.restore(path)

@@ -118,14 +118,17 @@ def _affine_and_rest(field, x):
     """A field as matrix x + offset + rest, no term of the rest being affine."""
     n = len(x)
     matrix, offset, rest = sp.zeros(n, n), sp.zeros(n, 1), sp.zeros(n, 1)
+    own = set(x)
     for i in range(n):
+        constant, other = [], []  # added at once: of thousands of terms one by one each would be sorted into all before
         for function, coefficient in grouped(field[i], x).items():
-            if function in x:
+            if function in own:
                 matrix[i, x.index(function)] += coefficient
-            elif not function.has(*x):
-                offset[i] += coefficient * function
+            elif own.isdisjoint(function.free_symbols):
+                constant.append(coefficient * function)
             else:
-                rest[i] += coefficient * function
+                other.append(coefficient * function)
+        offset[i], rest[i] = sp.Add(*constant), sp.Add(*other)
     return matrix, offset, rest
 
 
@@ -145,15 +148,15 @@ def _potential(gradient: sp.MatrixBase, x: tuple[sp.Symbol, ...]) -> sp.Expr | N
 
 
 def _antiderivative(expression: sp.Expr, symbol: sp.Symbol, x: tuple[sp.Symbol, ...]) -> sp.Expr | None:
-    total = sp.Integer(0)
+    terms = []
     for function, coefficient in grouped(expression, x).items():
         part = _known_antiderivative(function, symbol)
         if part is None:
             part = sp.integrate(function, symbol, conds="none")
             if part.has(sp.Integral) or part.has(sp.Piecewise):
                 return None
-        total += coefficient * part
-    return total
+        terms.append(coefficient * part)
+    return sp.Add(*terms)
 
 
 def _known_antiderivative(function: sp.Expr, symbol: sp.Symbol) -> sp.Expr | None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from zakai.errors import InputError
-from zakai.filters._ahead import Clock, Key
+from zakai.filters._ahead import CHUNK, Clock, Key
 from zakai.filters._compiled_step import Laid, Layout, Told, compiled, packed
 from zakai.filters._live import Live, Moment
 
@@ -93,7 +93,7 @@ def restore(live: Live, said: Mapping[str, Any], arrays: list[np.ndarray]) -> Mo
     """The moment of a live filter out of words and arrays; it is not yet its own.  ValueError where they do not fit."""
     try:
         return _restored(live, said, arrays)
-    except (KeyError, IndexError, TypeError, AttributeError) as error:
+    except (KeyError, IndexError, TypeError, AttributeError, OverflowError, MemoryError) as error:
         raise ValueError(str(error)) from None
 
 
@@ -125,6 +125,8 @@ def _key(said: Any) -> Key | None:
     if said is None:
         return None
     start, step, number, seen, elapsed = said
+    if not (0 < float(step) < np.inf and 0 < int(number) <= CHUNK):
+        raise ValueError("no intervals")
     return Key(float(start), float(step), int(number), tuple(seen), None if elapsed is None else tuple(elapsed))
 
 
