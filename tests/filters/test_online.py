@@ -92,7 +92,8 @@ def test_lengths_that_never_repeat_give_what_a_record_gives(kind):
 @pytest.mark.slow
 def test_intervals_are_prepared_many_at_once_while_readings_keep_to_their_step(monkeypatch):
     model = zakai.Model(**TIMED)
-    times = 0.1 * np.arange(1, 31)
+    # One comes late, and those after it at the same distances again.
+    times = np.append(0.1 * np.arange(1, 13), 1.25 + 0.1 * np.arange(20))
     record = simulated(model, times)
     expected = [estimate.mean for estimate in told(zakai.online(model), record)]
     made, own = [], Ahead._made
@@ -104,7 +105,8 @@ def test_intervals_are_prepared_many_at_once_while_readings_keep_to_their_step(m
     monkeypatch.setattr(Ahead, "_made", spied)
     monkeypatch.setattr(_ahead, "CHUNK", 8)
     assert np.allclose([estimate.mean for estimate in told(zakai.online(model), record)], expected, rtol=0, atol=1e-12)
-    assert made == [1, 8] * 4  # the first of each two tells how much room one takes
+    # Of many the first tells how much room one takes.
+    assert made == [*[1, 8] * 2, 1, 1, *[1, 8] * 3]
 
 
 @pytest.mark.parametrize(
@@ -365,6 +367,19 @@ def test_after_the_first_run_a_lattice_is_looked_at_less_often():
         estimate = other.update(time, value)
     assert np.allclose(estimate.mean, truth.mean[-1], rtol=0, atol=1e-8)
     assert np.allclose(estimate.cov, truth.cov[-1], rtol=0, atol=1e-8)
+
+
+def test_a_window_follows_the_mass_and_tells_how_deep_in_its_tails_it_is():
+    model = zakai.load_model("gallery:spiral-sensor")
+    times = 0.01 * np.arange(1, 161)
+    record = zakai.simulate(model, times, seed=3)[1]
+    online = zakai.online(model)
+    estimates = told(online, record)
+    surprise = zakai.filter(model, record).health["surprise"]
+    for k in range(16, 161, 16):  # where a run looks at its own
+        assert np.isclose(estimates[k - 1].health["surprise"], surprise[k], rtol=1e-6, atol=0)
+    centres = [estimate._moments[0].laid.state.lattice.centre[0] for estimate in estimates]
+    assert len(set(centres)) > 5
 
 
 def test_a_first_lattice_serves_later_steps_too(monkeypatch):
