@@ -74,9 +74,14 @@ class Given(NamedTuple):
         return self.observation
 
 
+def _slack(time: float, step: float) -> float:
+    """By how much times that are the same may differ through rounding."""
+    return 1e-9 * step + 4 * math.ulp(time)
+
+
 def _close(time: float, expected: float, step: float) -> bool:
     """Whether two times are the same but for rounding."""
-    return abs(time - expected) <= 1e-9 * step + 4 * math.ulp(time)
+    return abs(time - expected) <= _slack(time, step)
 
 
 class Ahead:
@@ -141,9 +146,9 @@ class Ahead:
         row = round((start - key.start) / key.step)
         if not 0 <= row < key.number:
             return None
-        first = key.start + row * key.step
-        close = _close(start, first, key.step) and _close(stop, key.start + (row + 1) * key.step, key.step)
-        return row if close else None
+        slack = _slack(stop, key.step)
+        first, last = key.start + row * key.step, key.start + (row + 1) * key.step
+        return row if abs(start - first) <= slack and abs(stop - last) <= slack else None
 
     def _many(self, key: Key) -> Key:
         """The same key with as many intervals as can be prepared ahead: some time the coefficients may end to exist."""

@@ -110,8 +110,12 @@ def _flat(leaves: Sequence[Any]) -> np.ndarray:
 
 def packed_rows(tree: Any, count: int, room: int) -> np.ndarray:
     """A pytree whose arrays have a leading axis, as a matrix (count, room + size), with `room` for something in front."""
-    leaves = (np.asarray(leaf).reshape(count, -1).astype(float) for leaf in jax.tree.leaves(tree))
-    return np.concatenate([np.zeros((count, room)), *leaves], axis=1)
+    leaves = [np.asarray(leaf).reshape(count, -1) for leaf in jax.tree.leaves(tree)]
+    edges = np.cumsum([room, *(leaf.shape[1] for leaf in leaves)]).tolist()
+    rows = np.zeros((count, edges[-1]))
+    for (begin, end), leaf in zip(pairwise(edges), leaves, strict=True):
+        rows[:, begin:end] = leaf
+    return rows
 
 
 class Laid(NamedTuple):

@@ -9,6 +9,7 @@ is a factor on the density,
 from __future__ import annotations
 
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from zakai import _float64  # noqa: F401
 from zakai.filters._protocol import Schedule
 from zakai.models.compile import jax_function
 from zakai.models.model import Model
-from zakai.models.numeric import numpy_function
+from zakai.models.numeric import NumericFunction, numpy_function
 from zakai.records import Record
 
 
@@ -145,10 +146,12 @@ def factor_rule(
     if rates:
         spans = np.where(inside, lengths, np.inf)
     elif splitting == "lie":
-        after = xp.where(whole, _inverses(xp, noise_end), 0.0)
+        after = _where_whole(xp, whole, _inverses(xp, noise_end))
     elif whole.any():
-        before = xp.where(whole, 0.5 * _inverses(xp, noise_at(model, data.starts, theta)), 0.0)
-        after = xp.where(whole, 0.5 * _inverses(xp, noise_end), 0.0)
+        after = _where_whole(xp, whole, 0.5 * _inverses(xp, noise_end))
+        before = after
+        if not _is_one(xp, noise_end):
+            before = _where_whole(xp, whole, 0.5 * _inverses(xp, noise_at(model, data.starts, theta)))
     if remove and not rates and not whole.all():
         energy = -xp.where(whole, 0.0, _inverses(xp, noise_end) * lengths[..., None])
     at_end = seen & ~inside if rates else seen & ~whole[:, 0]
@@ -164,17 +167,36 @@ def noise_at(model: Model, times: np.ndarray, theta: Any) -> Any:
     """S (K, m, m) at the times (K,), for the parameters `theta` (p,), which JAX may trace."""
     m, origin = model.m, np.zeros(model.n)
     if isinstance(theta, np.ndarray):
+        noise, varies = _noise_of(model)
         # What does not depend on time is there once, in every row.
-        asked = times if model.observation_noise.has(model.t) else np.zeros(())
-        return np.broadcast_to(numpy_function(model.observation_noise, model, (m, m))(origin, asked, theta), (len(times), m, m))
+        return np.broadcast_to(noise(origin, times if varies else np.zeros(()), theta), (len(times), m, m))
     return jax.vmap(jax_function(model.observation_noise, model, (m, m)), (None, 0, None))(origin, jnp.asarray(times), theta)
+
+
+_NOISE: WeakKeyDictionary[Model, tuple[NumericFunction, bool]] = WeakKeyDictionary()
+
+
+def _noise_of(model: Model) -> tuple[NumericFunction, bool]:
+    """S as a function, made once for each model, and whether it depends on time."""
+    if model not in _NOISE:
+        noise = numpy_function(model.observation_noise, model, (model.m, model.m))
+        _NOISE[model] = noise, model.observation_noise.has(model.t)
+    return _NOISE[model]
+
+
+def _is_one(xp: Any, matrices: Any) -> bool:
+    """Whether matrices (K, ...) are one, which is there once."""
+    return xp is np and len(matrices) > 0 and matrices.strides[0] == 0
 
 
 def _inverses(xp: Any, matrices: Any) -> Any:
     """The inverses of matrices (K, m, m); where all rows are one, of that."""
-    if xp is np and len(matrices) and matrices.strides[0] == 0:
-        return np.broadcast_to(np.linalg.inv(matrices[0]), matrices.shape)
-    return xp.linalg.inv(matrices)
+    return np.broadcast_to(np.linalg.inv(matrices[0]), matrices.shape) if _is_one(xp, matrices) else xp.linalg.inv(matrices)
+
+
+def _where_whole(xp: Any, whole: np.ndarray, matrices: Any) -> Any:
+    """The matrices (K, m, m) of the intervals in which all acts inside, and zero of the others."""
+    return matrices if whole.all() else xp.where(whole, matrices, 0.0)
 
 
 class _AtEnd(NamedTuple):

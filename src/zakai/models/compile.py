@@ -27,7 +27,7 @@ _JAX = operations(jnp, jax.scipy.special.erf, sin=_trigonometry.sin, cos=_trigon
 
 
 # To hand a part of something small to another thread takes longer than the whole.
-PART_BY_PART = (("xla_cpu_scheduler_type", "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"),)
+PART_BY_PART = (("xla_cpu_scheduler_type", "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"), ("xla_cpu_prefer_vector_width", 512))
 ONE_THREAD = (*PART_BY_PART, ("xla_cpu_multi_thread_eigen", False))
 
 
