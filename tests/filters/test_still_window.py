@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 
+import jax
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -10,6 +11,7 @@ from scipy.linalg import expm
 import zakai
 from zakai.filters import _still_window, limited_direct
 from zakai.filters._splitting import bent, bridged
+from zakai.filters.observations import data_of, schedule_of
 
 SPIRAL = zakai.load_model("gallery:spiral-sensor")
 MOVING = replace(
@@ -88,6 +90,30 @@ def test_mass_that_leaves_the_window_is_followed_step_by_step(monkeypatch, moved
     stepwise = zakai.filter(model, record, "limited-direct")
     same(at_once, stepwise)
     assert at_once.warnings == stepwise.warnings
+
+
+def test_records_between_each_others_points_come_to_stand_on_one_lattice():
+    (record,) = increments(SPIRAL, 300)
+    prepared = limited_direct.prepare(SPIRAL, schedule_of(data_of(SPIRAL, record), True))
+    rows = slice(100, 110)
+    own = limited_direct.adapt(prepared, limited_direct.init(prepared, SPIRAL.prior), rows, None)
+    cell, lattice = own.lattice.basis[0, 0], own.lattice
+    apart = np.array([0.0, 0.5, 40.25]) * cell
+    states = jax.tree.map(lambda a: np.broadcast_to(a, (3, *np.shape(a))), replace(own, table=None, seen=None))
+    states = replace(states, lattice=states.lattice._replace(centre=lattice.centre + apart[:, None]))
+    given = limited_direct.density(prepared, own)
+    # With the cells that they have, and with finer ones.
+    for finer in (1.0, 2.0):
+        plan = replace(own.plan, cells=finer * own.cells[0] / 1.05)
+        many = limited_direct.adapt_many(prepared, replace(states, plan=plan), rows, None)
+        assert many.plan.still and (many.table.cell < cell) == (finer > 1)
+        (centres,) = many.lattice.centre.T
+        steps = (centres - many.table.home) / many.table.cell
+        assert np.allclose(steps, np.rint(steps), rtol=0, atol=1e-6)
+        for k in range(3):
+            moved = limited_direct.density(prepared, jax.tree.map(lambda a: a[k], replace(many, table=None)))  # noqa: B023
+            assert np.allclose(moved.mean() - apart[k], given.mean(), rtol=0, atol=1e-9)
+            assert np.allclose(moved.cov(), given.cov(), rtol=0, atol=1e-9)
 
 
 def test_a_window_is_laid_over_the_mass_by_whole_cells():

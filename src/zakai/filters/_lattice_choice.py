@@ -424,7 +424,7 @@ def _banded(
     first, last = used.argmax(axis=1), count - 1 - used[:, ::-1].argmax(axis=1)
     middle, span = (first + last) // 2, (last - first + 1) * cell
     if plan.still:
-        middle = _aligned(lattice, middle)
+        middle = _aligned(lattice, middle, new_cell[0])
     size = rounded_up(plan.window * (span / new_cell).max() + 8 + (2 * STILL_ROOM if plan.still else 0))
     own = plan.banded and plan.sizes[0] >= size >= (0.8 if plan.still else 0.6) * plan.sizes[0]
     size = plan.sizes[0] if own else size
@@ -432,8 +432,8 @@ def _banded(
     if size * (12 + 0.2 * taps) > 3 * pairs**2:
         return None
     check(size)
-    if plan.still and own and size == count and np.all(well):
-        # Its steps lay the window over the mass by themselves.
+    if plan.still and own and size == count and np.all(well) and np.all(middle % 1 == 0):
+        # Its steps lay the windows over the mass by themselves; records from other groups may stand between the points.
         return None, replace(plan, taps=taps), np.tile(SAME, (len(logs), 1))
     cuts = np.stack([middle, new_cell / cell], axis=1)
     window = _resampled(logs, cuts[:, 0], cuts[:, 1], size)
@@ -442,13 +442,14 @@ def _banded(
     return lattice, replace(plan, banded=True, sizes=(size,), taps=taps), cuts
 
 
-def _aligned(lattice: Lattice, middle: np.ndarray) -> np.ndarray:
-    """The points of the first lattice that are nearest to an index (records,) of each, as indices of each."""
+def _aligned(lattice: Lattice, middle: np.ndarray, new_cell: float) -> np.ndarray:
+    """The points, `new_cell` apart, with that at the index `middle[0]` of the first lattice among them, that are nearest to an
+    index (records,) of each, as indices of each."""
     if len(middle) == 1:
         return middle
     centre, cell, half = lattice.centre[:, 0], lattice.basis[:, 0, 0], lattice.log_values.shape[1] // 2
     at = centre + cell * (middle - half)
-    at = centre[0] + cell[0] * np.rint((at - centre[0]) / cell[0])
+    at = at[0] + new_cell * np.rint((at - at[0]) / new_cell)
     index = (at - centre) / cell + half
     # Points of lattices that are one but for rounding are the same.
     return np.where(np.abs(index - np.rint(index)) < 1e-6, np.rint(index), index)
