@@ -42,7 +42,6 @@ STILL_ROOM = 12  # cells to each side of a window that is moved every few steps 
 STILL_WIDEST = 4.0  # the `window` up to which it is worth while
 FINE = {1: 2.0, 2: 2.0, 3: 1.2}  # by how much the first lattice is finer than it need be
 
-
 ARRAYS = 24  # arrays of the size of the lattice that a step and what it keeps hold at once
 SAME = np.zeros(2)  # the cut of a lattice that was taken as it is
 
@@ -74,12 +73,12 @@ class Plan:
         return CELLS_SHARPENED if self.sharpen else CELLS
 
 
-def rounded_up(size: float, least: int = 64) -> int:
-    """The next number of the form 2^k (1 + j/4), from `least`: few shapes, few compilations."""
+def rounded_up(size: float, least: int = 64, parts: int = 4) -> int:
+    """The next number of the form 2^k (1 + j/parts), from `least`: few shapes, few compilations."""
     power = least
     while 2 * power < size:
         power *= 2
-    return next(power * (4 + j) // 4 for j in range(5) if power * (4 + j) // 4 >= size or j == 4)
+    return next(power * (parts + j) // parts for j in range(parts + 1) if power * (parts + j) // parts >= size or j == parts)
 
 
 def features(logs: np.ndarray) -> np.ndarray:
@@ -417,7 +416,7 @@ def _banded(
     new_cell = np.where(well, cell, SPARE * widest)
     enough, taps = REACH / (new_cell.min() * growth.min()), 16
     if plan.still:
-        taps = 4 * int(np.ceil(enough / 4))
+        taps = rounded_up(enough, 4, 2)
     while not plan.still and taps < enough:
         taps *= 2
     used = logs > _top(logs) + np.log(0.1 * _edge(plan))
@@ -425,7 +424,9 @@ def _banded(
     middle, span = (first + last) // 2, (last - first + 1) * cell
     if plan.still:
         middle = _aligned(lattice, middle, new_cell[0])
-    size = rounded_up(plan.window * (span / new_cell).max() + 8 + (2 * STILL_ROOM if plan.still else 0))
+    # A run on a window that stands still is soon over, and its compilation is not.
+    parts = 2 if plan.still else 4
+    size = rounded_up(plan.window * (span / new_cell).max() + 8 + (2 * STILL_ROOM if plan.still else 0), parts=parts)
     own = plan.banded and plan.sizes[0] >= size >= (0.8 if plan.still else 0.6) * plan.sizes[0]
     size = plan.sizes[0] if own else size
     pairs = max(BASE[1], rounded_up(span.max() / (COARSEST * deviation.min())))

@@ -33,6 +33,7 @@ CHUNK = 4096  # intervals that are prepared at once, at most
 CHUNK_BYTES = 512 * 2**20  # what is prepared for them, at most
 RUN = 256  # intervals between two looks at the lattice
 SOME = 16  # of them that are taken at once, where a method can
+WHOLE = 16  # steps of a run that is taken together, of which some may be more than count, and what is told of them nothing
 TRIES = 16
 KEPT_BYTES = 512 * 2**20
 SURELY = 3.0  # by how much a lattice of the first runs may be larger than those that follow
@@ -121,7 +122,7 @@ def scan(step, healthy, state, intervals, observations, keep, limit):
 
     together = getattr(state, "together", None)
     if together is not None:
-        return *together(state, intervals, observations, keep), limit[0]
+        return *together(state, intervals, observations, keep, limit[0]), limit[0]
 
     def told(states: Any, info: Info) -> Any:
         return info, getattr(states, "kept", states) if keep else None
@@ -266,18 +267,14 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
     """
     run = getattr(state, "run_length", RUN)
     count = min(run, rows.stop - rows.start)
-    # Few shapes, few compilations: a run that may end early is as long as any, and the short rest of a record that is taken to
-    # its end is padded to a power of two.
-    length = run
-    if method.healthy is None:
-        short = run > 64 and 2 * count <= run
-        length = (max(16, 2 ** int(np.ceil(np.log2(count)))) if short else run) if ends else count
     part = slice(rows.start, rows.start + count)
-    intervals, given = rows_of(prepared.intervals, part, length), rows_of(observations, part, length)
     begin = adapt(prepared, state, part, None) if adapt else state
-    strict = True
+    strict, length = True, 0
     for tries in range(TRIES + 2):
-        end, told, taken = scan(method.step, method.healthy, begin, intervals, given, keep, (count, strict))
+        if length != (length := _length(method, begin, count, run, ends)):
+            intervals, given = rows_of(prepared.intervals, part, length), rows_of(observations, part, length)
+        bare = getattr(begin, "bare", begin)
+        end, told, taken = scan(method.step, method.healthy, bare, intervals, given, keep, (count, strict))
         end, taken = _as_planned(end, begin), int(taken)
         # The more was tried in vain, the less is enough.
         if not strict or (method.healthy is not None and taken >= max(1.0, enough * count / 2**tries)):
@@ -293,10 +290,20 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
         # What comes after a number that does not exist is begun anew, from before it.
         there = _existing(told[0].log_likelihood_increment, taken)
         if 0 < there < taken:
-            end, told, _ = scan(method.step, method.healthy, begin, intervals, given, keep, (there, strict))
+            end, told, _ = scan(method.step, method.healthy, bare, intervals, given, keep, (there, strict))
             end, taken = _as_planned(end, begin), there
     info, kept = first_of(told, taken)
     return slice(part.start, part.start + taken), begin, end, info, kept
+
+
+def _length(method: Method, begin: Any, count: int, run: int, ends: bool) -> int:
+    """What a scan of `count` steps is padded to: few shapes, few compilations."""
+    if method.healthy is not None:
+        return run  # it may end early
+    if getattr(begin, "together", None) is not None and (ends or count % WHOLE == 0):
+        return max(count, begin.run_length)
+    short = run > 64 and 2 * count <= run
+    return (max(16, 2 ** int(np.ceil(np.log2(count)))) if short else run) if ends else count
 
 
 def _as_planned(end: Any, begin: Any) -> Any:
@@ -313,7 +320,7 @@ def _existing(increments: Any, count: int) -> int:
 
 def first_of(tree: Any, count: int) -> Any:
     """The first rows of every array of a pytree, copied: small pieces of memory of their own, not views of what JAX holds."""
-    return jax.tree.map(lambda a: np.array(a)[:count], tree)
+    return jax.tree.map(lambda a: np.array(np.asarray(a)[:count]), tree)
 
 
 class Run:

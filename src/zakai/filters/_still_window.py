@@ -108,12 +108,14 @@ def moved(
     taps: int,
     keep: bool,
     even: bool,
-) -> tuple[jax.Array, Steps]:
-    """K intervals, each with its kernel, from the density on a lattice of N points: the values (N,) at the end and what is told
-    on the way.
+    most: Any,
+) -> tuple[tuple[jax.Array, jax.Array, jax.Array], Steps]:
+    """K intervals, each with its kernel, from the density on a lattice of N points: at the end the values (N,), where the window
+    stands and the narrowest feature in cells; and what is told on the way.
 
     `turned` (K, 2) is by how much the gauge changed in an interval, from its linear term on.  `own` is the narrowest feature of
-    the density, in cells; `even` says that both halves of every factor are the same.
+    the density, in cells; `even` says that both halves of every factor are the same.  Of the steps `most` are taken, rounded up
+    to whole looks; what is told of the others is zero.
     """
     size, cell, count = len(lattice.log_values), table.cell, len(kernel.variance)
     each = gcd(count, LOOK)
@@ -172,10 +174,16 @@ def moved(
         told = sums, jnp.broadcast_to(at, (each,)), growth, values if keep else None
         return (p, at, cells), (told, cells, joint, depth)
 
+    def look_or_not(carry: Any, given: Any) -> tuple[Any, Any]:
+        first, slices = given
+        nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(look, carry, slices)[1])
+        return jax.lax.cond(first < most, look, lambda carry, _: (carry, nothing), carry, slices)
+
     start = place(table, lattice.centre[0])
     blocks = jax.tree.map(lambda a: a.reshape(count // each, each, *a.shape[1:]), slices)
-    (p, *_), (told, *looks) = jax.lax.scan(look, (jnp.exp(lattice.log_values), start, own), blocks)
-    return p, Steps(*jax.tree.map(lambda a: a.reshape(count, *a.shape[2:]), told), *looks)
+    begin = jnp.exp(lattice.log_values), start, own
+    end, (told, *looks) = jax.lax.scan(look_or_not, begin, (np.arange(0, count, each), blocks))
+    return end, Steps(*jax.tree.map(lambda a: a.reshape(count, *a.shape[2:]), told), *looks)
 
 
 class Stepped(NamedTuple):

@@ -114,7 +114,7 @@ class _Alike:
             n = alike[0].setting.model.n
             each = RUN * (8 * (n * n + n + 16) + (size_of(alike[0].state) if alike[0].keep else 0))
             most = max(1, min(LANES, LANE_BYTES // each))
-            if len(starts) > 1 and self.round < self.total:
+            if self.round < self.total:
                 size = min(most, FEW_LANES if len(alike) <= FEW_LANES else LANES)
             else:
                 parts = max(-(-len(alike) // most), min(os.cpu_count() or 1, len(alike) // WORTH_A_CORE))
@@ -167,7 +167,7 @@ def _together(runs: list[Run], lanes: int, count: _Count, until: int) -> None:
             adapt, own = _Adapt(method, len(runs)), _own(states)
             together = _stacked([*given, *given[-1:] * fill], 1) if together is None else together
             part, begin, ends, info, kept = run_steps(
-                method, adapt if method.adapt_many else None, _scan, prepared, _stacked([*own, *own[-1:] * fill], 0),
+                method, adapt if method.adapt_many else None, _of_lanes(len(runs)), prepared, _stacked([*own, *own[-1:] * fill], 0),
                 together, left, rows.stop == total, runs[0].keep, ENOUGH,
             )  # fmt: skip
             begins, states = (_lanes(each, len(runs), 0) for each in _own([begin, ends]))
@@ -240,21 +240,32 @@ def _lanes(tree: Any, count: int, axis: int) -> list[Any]:
     return [jax.tree.unflatten(structure, [array[lane] for array in arrays]) for lane in range(count)]
 
 
+def _of_lanes(count: int) -> Callable[..., Any]:
+    """The scan of some records, of which the first `count` are not only there to fill it."""
+    return lambda *given: _scan(*given[:-1], (*given[-1], count))
+
+
 @partial(Scan, lanes=True)
 def _scan(step, healthy, states, intervals, observations, keep, limit):
     if (together := getattr(states, "together", None)) is not None:
         # A run that fits near the processor gains nothing by others beside it.
 
-        def one_after_another(of: tuple[Any, Any]) -> tuple[Any, Any]:
-            end, told = together(with_lasting(of[0], states), intervals, of[1], keep)
+        def one_after_another(of: tuple[Any, Any, Any]) -> tuple[Any, Any]:
+            lane, state, given = of
+            # A lane that but fills the scan takes no step, and is told what the last of the others is.
+            most = jnp.where(lane < limit[2], limit[0], 0)
+            end, told = together(with_lasting(state, states), intervals, given, keep, most)
             return without_lasting(end), told
 
         given = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), observations)
-        ends, told = jax.lax.map(one_after_another, (without_lasting(states), given))
+        lanes = np.arange(len(jax.tree.leaves(given)[0]))
+        every = jax.lax.map(one_after_another, (lanes, without_lasting(states), given))
+        ends, told = jax.tree.map(lambda a: a[jnp.minimum(lanes, limit[2] - 1)], every)
         return ends, jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), told), limit[0]
-    # What the records have in common is there once.
-    axes = jax.tree.map(lambda a: 0, without_lasting(states))
     if (some := getattr(states, "some", None)) is not None:
+
+        # What the records have in common is there once.
+        axes = jax.tree.map(lambda a: 0, without_lasting(states))
 
         def of_some(interval, state, observation):
             new, info = some(interval, state, observation)
@@ -263,13 +274,13 @@ def _scan(step, healthy, states, intervals, observations, keep, limit):
         def lanes(carry, slices):
             return jax.vmap(of_some, (None, axes, 1), 1)(slices[0], carry, slices[1])
 
-        return taken_some(lanes, healthy, states, (intervals, observations), *limit, 1)
+        return taken_some(lanes, healthy, states, (intervals, observations), *limit[:2], 1)
 
     def one_record(interval, state, observation):
-        new, info = step(interval, state, observation)
-        return new, (info, getattr(new, "kept", new) if keep else None)
+        new, info = step(interval, with_lasting(state, states), observation)
+        return without_lasting(new), (info, getattr(new, "kept", new) if keep else None)
 
     def one(carry, slices):
-        return jax.vmap(one_record, (None, axes, 0), (axes, 0))(slices[0], carry, slices[1])
+        return jax.vmap(one_record, (None, 0, 0))(slices[0], carry, slices[1])
 
-    return taken(one, healthy, states, (intervals, observations), *limit)
+    return taken(one, healthy, without_lasting(states), (intervals, observations), *limit[:2])

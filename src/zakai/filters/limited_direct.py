@@ -63,6 +63,7 @@ class State:
     """
 
     LASTING = ("table", "seen")
+    PLANNED = ("plan",)
 
     lattice: Lattice
     observed: Any
@@ -87,6 +88,11 @@ class State:
     def together(self) -> Callable[..., Any] | None:
         """What takes all steps of a run together, where they can be."""
         return _steps if self.plan.still else None
+
+    @property
+    def bare(self) -> State:
+        """The state with nothing in its plan but what a step must know."""
+        return replace(self, plan=replace(self.plan, window=choice.Plan.window, cells=choice.Plan.cells, run=choice.Plan.run))
 
     @property
     def small(self) -> bool:
@@ -460,7 +466,7 @@ def _table(prepared: Prepared, lattice: Lattice, time: float, known: _still_wind
     # With room for each to move, in few sizes.
     windows = 3
     if len(centres) > 1:
-        windows += int(np.ceil(np.abs(centres - centres[0]).max() / cell / size) * 2)
+        windows += 2 * max(1, int(np.ceil(np.abs(centres - centres[0]).max() / cell / size)))
     return _table_at(prepared.system, centres[0], cell, windows * size, time, prepared.theta)
 
 
@@ -475,13 +481,15 @@ def _fits(state: State, info: Info) -> Any:
     return choice.healthy(info, state.plan)
 
 
-def _steps(state: State, intervals: Interval, observation: Factors, keep: bool) -> tuple[State, tuple[Info, Any]]:
-    """The steps of a run on a window that stands still, with `keep` the states of all."""
+def _steps(state: State, intervals: Interval, observation: Factors, keep: bool, most: Any) -> tuple[State, tuple[Info, Any]]:
+    """The steps of a run on a window that stands still, but for those after the first `most`; with `keep` the states of all."""
     assert state.table is not None
     system, plan, lattice = intervals.system, state.plan, state.lattice
     assert intervals.still is not None
     kernel, turned, given = _still_factors(intervals.still, observation)
-    last, told = _still_window.moved(lattice, state.table, kernel, turned, given, state.cells[0], plan.taps, keep, system.even)
+    (last, place, narrowest), told = _still_window.moved(
+        lattice, state.table, kernel, turned, given, state.cells[0], plan.taps, keep, system.even, most
+    )
     mass, first, second, outer = told.sums.T
     cell, count = lattice.basis[0, 0], len(mass)
     first, second = cell * first / mass, cell**2 * second / mass
@@ -502,7 +510,7 @@ def _steps(state: State, intervals: Interval, observation: Factors, keep: bool) 
         moved = Lattice(lat.log(values) - jnp.log(cell * mass), centre, lattice.basis)
         return State(moved, None, cells[None], jnp.zeros(1), state.cut, plan)
 
-    end = laid(last, mass[-1], centres[-1], cells[-1])
+    end = laid(last, jnp.sum(last), (state.table.home + cell * place)[None], narrowest)
     kept = jax.vmap(laid)(told.values, mass, centres, cells) if keep else None
     return replace(end, table=state.table), (info, kept)
 
