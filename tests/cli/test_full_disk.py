@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import errno
+import io
+import json
 import os
+import sys
 
 import pytest
 
@@ -51,3 +54,28 @@ def test_what_was_there_stays_and_nothing_half_written_is_left(zakai, fails_at, 
         assert answer.code == 130
     assert (tmp_path / output).read_text() == "old"
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("strict", [(), ("--strict",)], ids=["", "strict"])
+def test_a_stream_whose_checkpoint_cannot_be_saved_answers_the_line_and_ends(zakai, monkeypatch, tmp_path, strict):
+    lines = [json.dumps({"time": k / 10, "y": [k % 3 / 10]}) + "\n" for k in range(1, 7)]
+
+    def stream(count):
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO("".join(lines[:count]).encode())))
+        return zakai("stream", "model.toml", "--checkpoint", "state", "--checkpoint-every", "2", *strict)
+
+    whole = stream(6).out.splitlines()
+    (tmp_path / "state").unlink()
+    stream(2)
+    before, saved = sorted(path.name for path in tmp_path.iterdir()), (tmp_path / "state").read_bytes()
+    with monkeypatch.context() as patch:
+
+        def full(path):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        patch.setattr(writing, "_sync", full)
+        answer = stream(6)
+    assert answer.code == 2 and answer.out.splitlines() == whole[1:4]
+    assert answer.err == "error: state: cannot be written: No space left on device; choose another place or make room\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == before and (tmp_path / "state").read_bytes() == saved
+    assert stream(6).out.splitlines() == whole[1:]  # once there is room

@@ -76,25 +76,29 @@ class _Stream:
         for line in lines_of(sys.stdin.buffer, self.online.model.m):
             _interrupt.check()
             try:
-                self.take(line)
+                estimate = self.used(line)
             except InputError as error:
                 fault = f"line {line.number}: {error}"
                 if self.strict:
                     raise InputError(f"standard input: {fault}") from None
                 print(f"error: {' '.join(fault.split())}", file=sys.stderr, flush=True)
+                continue
+            if estimate is not None:
+                # First the answer, then the checkpoint: whatever ends the process, no line that a checkpoint knows is unanswered.
+                self.show(estimate)
+                if self.checkpoint is not None and self.accepted % self.save_every == 0:
+                    self.online.save(self.checkpoint, {"accepted": self.accepted})
 
-    def take(self, line: Line) -> None:
-        """Use one line; InputError where it cannot be used."""
+    def used(self, line: Line) -> Any:
+        """The estimate after a line, None where the checkpoint knows the line already; InputError where it cannot be used."""
         if line.fault is not None:
             raise InputError(line.fault)
         if self.skip_until is not None and isinstance(line.time, int | float) and line.time <= self.skip_until:
-            return  # the checkpoint knows it already
+            return None
         estimate = self.online.update(line.time, line.values)
         self.skip_until = None
         self.accepted += 1
-        if self.checkpoint is not None and self.accepted % self.save_every == 0:
-            self.online.save(self.checkpoint, {"accepted": self.accepted})
-        self.show(estimate)
+        return estimate
 
     def show(self, estimate: Any) -> None:
         """Print an estimate where it is due, and what is new of its warnings."""
