@@ -93,7 +93,7 @@ class _Stream:
         """The estimate after a line, None where the checkpoint knows the line already; InputError where it cannot be used."""
         if line.fault is not None:
             raise InputError(line.fault)
-        if self.skip_until is not None and isinstance(line.time, int | float) and line.time <= self.skip_until:
+        if self.skip_until is not None and line.time <= self.skip_until:
             return None
         estimate = self.online.update(line.time, line.values)
         self.skip_until = None

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any, BinaryIO, NamedTuple
 
 from zakai.errors import InputError
 
 LONGEST = 2**20  # bytes of a line
+MOST_DIGITS = 640  # of an integer: what Python always reads, however it is set
 _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 
 
@@ -25,8 +28,9 @@ class Line(NamedTuple):
 def lines_of(file: BinaryIO, m: int) -> Iterator[Line]:
     """The lines of a stream of observations, each as soon as it is there.
 
-    JSON lines are {"time": 0.1, "y": [0.5, null]}, of which other keys are left alone; a stream whose first line begins with
-    `time` is CSV, with m columns after that. Empty lines are passed over. No line is held in memory beyond a mebibyte.
+    JSON lines are {"time": 0.1, "y": [0.5, null]}, of which other keys are left alone, but none may stand twice; a stream
+    whose first line begins with `time` is CSV, with m columns after that. Empty lines are passed over. No line is held in
+    memory beyond a mebibyte.
 
     Arguments:
         file: bytes, as `sys.stdin.buffer`.
@@ -75,13 +79,55 @@ def _skip_rest(file: BinaryIO, content: bytes) -> None:
 
 def _json(text: str) -> tuple[Any, list[Any]]:
     try:
-        told = json.loads(text)
-    except (ValueError, RecursionError):
+        told = _DECODER.decode(text)
+    except json.JSONDecodeError:
         raise ValueError(f'{_quoted(text.strip())} is not JSON; expected {{"time": ..., "y": [...]}}') from None
+    except RecursionError:
+        raise ValueError(f"{_quoted(text.strip())} is nested too deep to be read as JSON") from None
     if not isinstance(told, dict) or "time" not in told or "y" not in told:
         raise ValueError(f'{_quoted(text.strip())} is not an object with "time" and "y"')
-    values = told["y"]
-    return told["time"], values if isinstance(values, list) else [values]
+    time, values = told["time"], told["y"] if isinstance(told["y"], list) else [told["y"]]
+    if not _is_number(time):
+        raise ValueError(f"the time is {_said(time)}; give a number")
+    for index, value in enumerate(values):
+        if value is not None and not _is_number(value):
+            raise ValueError(f"observation {index + 1} is {_said(value)}; give a number, or null where there is none")
+    return time, values
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and value not in (math.inf, -math.inf)
+
+
+def _said(value: Any) -> str:
+    """A value that is none we use, in the words of JSON."""
+    if isinstance(value, list | dict):
+        return "a list" if isinstance(value, list) else "an object"
+    if isinstance(value, float):
+        return "beyond the range of numbers"
+    text = json.dumps(value).replace("\x7f", "\\u007f")
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    told = dict(pairs)
+    if len(told) < len(pairs):
+        ((twice, _),) = Counter(name for name, _ in pairs).most_common(1)
+        raise ValueError(f"the key {_said(twice)} stands twice; which of the two is meant is not known")
+    return told
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > MOST_DIGITS:
+        raise ValueError(f"an integer of {len(digits)} characters is too long; the longest that is read has {MOST_DIGITS}")
+    return int(digits)
+
+
+def _no_number(name: str) -> None:
+    raise ValueError(f"{name} is no number of JSON; null says that nothing was observed")
+
+
+_DECODER = json.JSONDecoder(object_pairs_hook=_object, parse_int=_integer, parse_constant=_no_number)
 
 
 def _csv(text: str) -> tuple[Any, list[Any]]:
