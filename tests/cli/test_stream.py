@@ -55,7 +55,53 @@ def test_csv_is_read_as_json_lines_are(stream):
     assert stream(rows).out == stream(LINES).out
     assert stream([rows[0], "", "0.1,", "0.2,nan"]).out == stream(['{"time": 0.1, "y": [null]}', '{"time": 0.2, "y": null}']).out
     wrong = stream(["time,a,b", "1,2,3"])
-    assert wrong.code == 2 and "header of 3 columns" in wrong.err and wrong.err.count("\n") == 1
+    assert wrong.code == 2 and "line 1: 3 columns; the model needs time and 1" in wrong.err and wrong.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "first", ["Time,y1", "y1,time", "t,angle-1", "TIME;y1", "time\ty1", '"Time","y1"', "0.1,0.5", "\ufeffTime,y1\r"]
+)
+def test_a_stream_that_begins_like_csv_without_its_header_is_refused_once(stream, first):
+    answer = stream([first, "0.1,0.5", "0.2,0.6"])
+    assert answer.code == 2 and answer.out == "" and answer.err.count("\n") == 1
+    assert (
+        answer.err.startswith("error: standard input: line 1: ")
+        and "looks like CSV, whose first line must be a header" in answer.err
+    )
+    assert "first the column time, then 1 for" in answer.err
+    assert "line 3" in stream(["", "", first]).err
+
+
+FIRST = [
+    '0.05, "y": [0.5]}',  # a line that was cut off at its beginning, which is the least to be expected of a first line
+    "0.5]}",
+    "0.5, null]}",
+    '{"time": 0.05, "y": [0.5',
+    '{"time": 0.05, "y',
+    "[0.05, 0.5]",
+    "0.05",
+    "garbage",
+    "connected to the sensor, waiting",
+    "INFO: ready, waiting",
+    "a,,b",
+]
+
+
+@pytest.mark.parametrize("first", FIRST)
+def test_another_first_line_is_one_bad_line_before_lines_of_json(stream, first):
+    answer = stream([first, *LINES])
+    assert answer.code == 0 and answer.out == stream(LINES).out
+    assert answer.err.startswith("error: line 1: ") and answer.err.count("\n") == 1
+
+
+def test_our_own_names_of_columns_in_another_order_are_refused(stream, tmp_path):
+    model = (tmp_path / "model.toml").read_text().replace('observation = ["x"]', 'observation = ["x", "2*x"]')
+    (tmp_path / "two.toml").write_text(model)
+    answer = stream(["time,y2,y1", "0.1,0.5,0.6"], model="two.toml")
+    assert answer.code == 2 and answer.out == "" and answer.err.count("\n") == 1
+    assert answer.err.startswith("error: standard input: line 1: column 2 is y2, where y1 is read: columns are taken by their")
+    good = stream(["time,y1,y2", "0.1,0.5,0.6"], model="two.toml")
+    assert good.code == 0 and good.out == stream(["time,Y2,Y1", "0.1,0.5,0.6"], model="two.toml").out
 
 
 BAD = [

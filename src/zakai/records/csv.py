@@ -15,7 +15,7 @@ import numpy as np
 
 from zakai.errors import InputError
 from zakai.records.record import Record, early, first_fault
-from zakai.records.writing import shown
+from zakai.records.writing import default_names, shown
 
 LONGEST_LINE = 1 << 20  # characters: room for a thousand numbers with a thousand blanks each
 _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
@@ -26,11 +26,11 @@ _NO_TEXT = re.compile("[\ud800-\udfff]")
 def read_record(path: str | os.PathLike[str], model: Any) -> Record:
     """Read the observations of `model` from a CSV file.
 
-    The first line is a header: `time`, then one column for each of the model's m observations, of any names.
-    Every other line is one time and its m readings, in what the model's `observation_kind` says. Times
-    increase strictly, need not be regular, and begin after the model's `start` (samples: at or after). An
-    empty cell or `nan` is "not observed". The text is UTF-8; a byte-order mark, Windows line ends and blank
-    lines are accepted.
+    The first line is a header: `time`, then one column for each of the model's m observations in their order,
+    of any names, but not of y1 to ym in another order. Every other line is one time and its m readings, in
+    what the model's `observation_kind` says. Times increase strictly, need not be regular, and begin after the
+    model's `start` (samples: at or after). An empty cell or `nan` is "not observed". The text is UTF-8; a
+    byte-order mark, Windows line ends and blank lines are accepted.
 
     Arguments:
         path: the file.
@@ -131,18 +131,39 @@ def _parts(file: TextIO, source: str) -> Iterator[_Part]:
 def _header(source: str, line: str, m: int, what: str, expected: Sequence[str] | None) -> list[str]:
     if (fault := _not_text(line)) is not None:
         raise InputError(f"{source}: row 1: {fault}")
-    names = [name.strip() for name in _cells(line)]
+    names = header_names(line)
     if names[0] != "time":
         hint = " (is the header missing?)" if _NUMBER.fullmatch(names[0]) else ""
         fault = f"the first column is {_quoted(names[0])}; the header must begin with time{hint}"
         raise InputError(f"{source}: row 1: {fault}")
-    if len(names) != m + 1:
-        fault = f"{len(names)} columns; the model needs time and {m} {what}, {m + 1} columns in all"
+    if (fault := columns_fault(names, m, what, expected)) is not None:
         raise InputError(f"{source}: row 1: {fault}")
-    for name, wanted in zip(names[1:], expected or names[1:]):
-        if name != wanted:
-            raise InputError(f"{source}: row 1: a column is {_quoted(name)}; expected time, {', '.join(expected or ())}")
     return names
+
+
+def header_names(line: str) -> list[str]:
+    """The names of the columns that a header gives."""
+    return [name.strip() for name in _cells(line)]
+
+
+def columns_fault(names: Sequence[str], m: int, what: str, expected: Sequence[str] | None = None) -> str | None:
+    """What is wrong with the columns of a header, of which the first is the time, or None."""
+    if len(names) != m + 1:
+        return f"{len(names)} columns; the model needs time and {m} {what}, {m + 1} columns in all"
+    if expected is not None:
+        wrong = next((name for name, wanted in zip(names[1:], expected) if name != wanted), None)
+        return None if wrong is None else f"a column is {_quoted(wrong)}; expected time, {', '.join(expected)}"
+    # Columns are taken by their position; names that are all our own say which position was meant.
+    ours = default_names(m)
+    if sorted(names[1:]) != sorted(ours):
+        return None
+    for place, (name, wanted) in enumerate(zip(names[1:], ours), start=2):
+        if name != wanted:
+            return (
+                f"column {place} is {name}, where {wanted} is read: columns are taken by their position; put them in the order "
+                f"time, {', '.join(ours) if m <= 4 else f'{ours[0]} to {ours[-1]}'}, or give them other names"
+            )
+    return None
 
 
 def _fast(lines: list[str], columns: int) -> np.ndarray | None:

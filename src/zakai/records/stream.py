@@ -10,9 +10,12 @@ from collections.abc import Callable, Iterator
 from typing import Any, BinaryIO, NamedTuple
 
 from zakai.errors import InputError
+from zakai.records.csv import columns_fault, header_names
 
 LONGEST = 2**20  # bytes of a line
 MOST_DIGITS = 640  # of an integer: what Python always reads, however it is set
+_WORD = re.compile(r"[^\W\d][\w.-]*")
+_SEPARATOR = re.compile(r"[,;\t]")
 _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 
 
@@ -37,7 +40,7 @@ def lines_of(file: BinaryIO, m: int) -> Iterator[Line]:
         m: how many values an observation has.
 
     Raises:
-        InputError: the header of a CSV does not fit.
+        InputError: the header of a CSV does not fit, or what looks like CSV has none.
 
     Example:
         >>> import io
@@ -61,11 +64,9 @@ def lines_of(file: BinaryIO, m: int) -> Iterator[Line]:
         if not text.strip():
             continue
         if parse is None:
-            if text.split(",")[0].strip().strip('"') == "time":
-                _check_header(text, m)
-                parse = _csv
+            parse = _csv if _is_header(text, number, m) else _json
+            if parse is _csv:
                 continue
-            parse = _json
         try:
             yield Line(number, *parse(text))
         except ValueError as error:
@@ -140,12 +141,24 @@ def _csv(text: str) -> tuple[Any, list[Any]]:
     return float(cells[0]), [float(cell) if cell else None for cell in cells[1:]]
 
 
-def _check_header(text: str, m: int) -> None:
-    columns = len(text.split(","))
-    if columns != m + 1:
-        raise InputError(
-            f"standard input: line 1: a header of {columns} columns; the model needs time and {m} observations, {m + 1} in all"
-        )
+def _is_header(text: str, number: int, m: int) -> bool:
+    """Whether the first line of a stream is the header of a CSV, else it is JSON; InputError where the header is wrong."""
+    names = header_names(text.strip())
+    fault = None
+    if names[0] == "time":
+        fault = columns_fault(names, m, "observations")
+    elif _looks_like_csv(text):
+        header = f"whose first line must be a header: first the column time, then {m} for the observations, with commas between"
+        fault = f"{_quoted(text.strip())} looks like CSV, {header}"
+    if fault is not None:
+        raise InputError(f"standard input: line {number}: {fault}")
+    return names[0] == "time"
+
+
+def _looks_like_csv(text: str) -> bool:
+    """Whether a line is several words or numbers with separators between: no part of a line of JSON ends so, nor does prose."""
+    cells = [cell.strip().strip('"') for cell in _SEPARATOR.split(text.strip())]
+    return len(cells) > 1 and all(_WORD.fullmatch(cell) or _NUMBER.fullmatch(cell) for cell in cells)
 
 
 def _quoted(text: str) -> str:

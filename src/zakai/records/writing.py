@@ -83,8 +83,12 @@ def write_record(path: str | os.PathLike[str], record: Record, names: list[str] 
         ['time,range', '0.1,1.5', '0.3,']
     """
     m = record.values.shape[1]
-    names = [f"y{i + 1}" for i in range(m)] if names is None else list(names)
-    write_table(path, record.times, record.values, names)
+    write_table(path, record.times, record.values, default_names(m) if names is None else list(names))
+
+
+def default_names(m: int) -> list[str]:
+    """The names of the columns of m observations where no others are given."""
+    return [f"y{i + 1}" for i in range(m)]
 
 
 def write_table(path: str | os.PathLike[str], times: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
