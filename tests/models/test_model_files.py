@@ -96,6 +96,11 @@ FAULTS = [
     ("prior", '{kind = "gaussian", mean = [0, 0], cov = [[1, 2], [2, 1]]}', "cov: is not positive semidefinite"),
     ("prior", '{kind = "gaussian", mean = [0, 0], cov = [[1, 2], [0, 9]]}', "cov: is not symmetric"),
     ("prior", '{kind = "gaussian", mean = [0, 0], cov = [[1, 2]]}', "2 x 2"),
+    ("prior", '{kind = "gaussian", mean = [0, 0], cov = [1e308, 1]}', "cov: expected numbers of at most 1e+150 in size, got"),
+    ("prior", '{kind = "gaussian", mean = [0, 0], cov = [[1, 1e308], [-1e308, 1]]}', "cov: expected numbers of at most 1e+150"),
+    ("prior", '{kind = "gaussian", mean = [0, -1e151], cov = [1, 1]}', "mean: expected numbers of at most 1e+150"),
+    ("prior", '{kind = "gaussian", mean = [0, 0], cov = [[1e-300, 1e9], [1e9, 1e-300]]}', "cov: is not positive semidefinite"),
+    ("prior", f"{{{MIXTURE}, weights = [1e308, 1e308]}}", "weights: expected numbers of at most 1e+150"),
     ("prior", f"{{{MIXTURE}, weights = [1, -1]}}", "weights: expected a list of positive numbers"),
     ("prior", f"{{{MIXTURE}, weights = [1]}}", "means: expected 1 lists of 2 numbers"),
     ("prior", '{kind = "density", log_density = "-x**2 - t"}', "log_density: column 9: unknown name 't'"),
@@ -248,6 +253,11 @@ def test_decimals_of_a_file_are_exact_and_weights_are_normalised():
     model = read_model(text(parameters="{a = 0.1234567890123456789012345}", prior=prior), "file")
     assert model.parameters["a"] == sympy.Rational(1234567890123456789012345, 10**25)
     assert model.prior.weights.tolist() == [0.25, 0.75]
+
+
+def test_a_prior_at_the_bound_is_read_as_it_stands():
+    model = read_model(text(prior='{kind = "gaussian", mean = [1e150, 0], cov = [[1e150, 1e70], [1e70, 1e-10]]}'), "file")
+    assert model.prior.mean.tolist() == [1e150, 0] and model.prior.cov.tolist() == [[1e150, 1e70], [1e70, 1e-10]]
 
 
 def test_models_do_not_import_jax():

@@ -92,6 +92,8 @@ class DensityPrior:
 
 
 MOST_COMPONENTS = 10_000
+# Filters square means and covariances and add the squares; beyond this the sum is no longer a float64.
+LARGEST = 1e150
 Prior = GaussianPrior | MixturePrior | DensityPrior
 
 _KEYS = {"gaussian": ("mean", "cov"), "mixture": ("weights", "means", "covs"), "density": ("log_density",)}
@@ -138,7 +140,7 @@ def read_prior(keys: Any, n: int, read_formula: Callable[[str], sympy.Expr]) -> 
 
 def _read_gaussian(keys: Mapping[str, Any], n: int) -> GaussianPrior:
     with named("mean"):
-        mean = array(keys["mean"], (n,), f"a list of {n} numbers (one a state)")
+        mean = _numbers(keys["mean"], (n,), f"a list of {n} numbers (one a state)")
     with named("cov"):
         return GaussianPrior(mean, _read_covariance(keys["cov"], n))
 
@@ -146,13 +148,13 @@ def _read_gaussian(keys: Mapping[str, Any], n: int) -> GaussianPrior:
 def _read_mixture(keys: Mapping[str, Any], n: int) -> MixturePrior:
     with named("weights"):
         count = len(items(keys["weights"], None, "a list of positive numbers"))
-        weights = array(keys["weights"], (count,), "a list of positive numbers")
-        if count == 0 or not (weights > 0).all() or not np.isfinite(weights.sum()):
+        weights = _numbers(keys["weights"], (count,), "a list of positive numbers")
+        if count == 0 or not (weights > 0).all():
             raise InputError("expected a list of positive numbers, at least one")
         if count > MOST_COMPONENTS:
             raise InputError(f"expected at most {MOST_COMPONENTS} numbers, got {count}")
     with named("means"):
-        means = array(keys["means"], (count, n), f"{count} lists of {n} numbers (one list a component)")
+        means = _numbers(keys["means"], (count, n), f"{count} lists of {n} numbers (one list a component)")
     with named("covs"):
         tables = items(keys["covs"], count, f"{count} covariances (one a component), each {n} x {n} or {n} variances")
         covs = []
@@ -162,13 +164,22 @@ def _read_mixture(keys: Mapping[str, Any], n: int) -> MixturePrior:
     return MixturePrior(weights / weights.sum(), means, np.array(covs))
 
 
+def _numbers(value: Any, shape: tuple[int, ...], expected: str) -> np.ndarray:
+    """`array` of numbers that a filter can square."""
+    numbers = array(value, shape, expected)
+    if numbers.size and np.abs(numbers).max() > LARGEST:
+        largest = numbers.flat[np.abs(numbers).argmax()]
+        raise InputError(f"expected numbers of at most {LARGEST:g} in size, got {largest:g}")
+    return numbers
+
+
 def _read_covariance(value: Any, n: int) -> np.ndarray:
     expected = f"a {n} x {n} list of rows, or a list of {n} variances"
     rows = items(value, n, expected)
     if all(not isinstance(row, list | tuple | np.ndarray) for row in rows):
-        cov = np.diag(array(rows, (n,), expected))
+        cov = np.diag(_numbers(rows, (n,), expected))
     else:
-        cov = array(rows, (n, n), expected)
+        cov = _numbers(rows, (n, n), expected)
     if not is_symmetric(cov):
         raise InputError("is not symmetric")
     smallest = smallest_eigenvalue(cov)
