@@ -167,7 +167,8 @@ def _together(runs: list[Run], lanes: int, count: _Count, until: int) -> None:
             adapt, own = _Adapt(method, len(runs)), _own(states)
             together = _stacked([*given, *given[-1:] * fill], 1) if together is None else together
             part, begin, ends, info, kept = run_steps(
-                method, adapt if method.adapt_many else None, _of_lanes(len(runs)), prepared, _stacked([*own, *own[-1:] * fill], 0),
+                method, adapt if method.adapt_many else None, _of_lanes(len(runs)), prepared,
+                _stacked([*own, *own[-1:] * fill], 0),
                 together, left, rows.stop == total, runs[0].keep, ENOUGH,
             )  # fmt: skip
             begins, states = (_lanes(each, len(runs), 0) for each in _own([begin, ends]))
@@ -242,7 +243,11 @@ def _lanes(tree: Any, count: int, axis: int) -> list[Any]:
 
 def _of_lanes(count: int) -> Callable[..., Any]:
     """The scan of some records, of which the first `count` are not only there to fill it."""
-    return lambda *given: _scan(*given[:-1], (*given[-1], count))
+
+    def of_these(step, healthy, states, intervals, observations, keep, limit):
+        return _scan(step, healthy, states, intervals, observations, keep, (*limit, count))
+
+    return of_these
 
 
 @partial(Scan, lanes=True)
