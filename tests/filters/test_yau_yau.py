@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import zakai
 from references.kolmogorov import Box, propagate
@@ -228,3 +229,24 @@ def test_what_a_try_has_cut_away_is_there_for_the_next():
     record = zakai.Record(record.times[:10], record.values[:10], "samples")
     near, nearer = (zakai.filter(model, record, "yau-yau", keep="moments", tolerance=one) for one in (1e-8, 1e-9))
     assert np.abs(near.variance / nearer.variance - 1).max() <= 1e-7
+
+
+@pytest.mark.slow
+def test_a_reading_after_a_long_gap_that_contradicts_what_was_expected():
+    model = zakai.load_model("gallery:cubic-sensor")
+    result = zakai.filter(model, zakai.Record(np.array([1.0, 101.0]), np.array([[0.1], [0.1]]), "increments"), "yau-yau")
+    # The generator with the observation's potential by central differences, y running linearly through each gap.
+    x = np.linspace(-2.0, 4.0, 601)
+    step = x[1] - x[0]
+    drift = np.cos(x)
+    one = np.ones(600)
+    forward = (np.diag(one, 1) - 2 * np.eye(601) + np.diag(one, -1)) / (2 * step**2)
+    forward -= (np.diag(drift[1:], 1) - np.diag(drift[:-1], -1)) / (2 * step)
+    p = np.exp(-10 * x**2)
+    p /= p.sum()
+    for length, increments in zip((1.0, 100.0), result.log_likelihood_increments[1:], strict=True):
+        p = expm(length * (forward + np.diag(-0.5 * x**6 + x**3 * 0.1 / length))) @ p
+        assert abs(np.log(p.sum()) - increments) < 0.01
+        p /= p.sum()
+    assert abs(p @ x - result.mean[-1, 0]) < 1e-3 and abs(p @ x**2 - (p @ x) ** 2 - result.variance[-1, 0]) < 1e-3
+    assert not result.warnings

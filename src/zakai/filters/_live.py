@@ -117,7 +117,8 @@ class Live:
         if verdict != verdict:
             raise InputError(
                 f"{self.setting.model.source}: at t = {time:g} the reading leaves nothing of the density, or takes it "
-                "beyond what numbers can hold; it is not used"
+                "beyond what numbers can hold; it is not used. Where it ends a gap of many times the system's own time, say that "
+                "nothing was observed at that time, and go on from there"
             )
         ends = (now.time, time)
         return Moment(time, after, self.step, left - 1, block, ends, clock, read, read_at, None, notes + block.notes)

@@ -27,6 +27,7 @@ RUNS = {1: 512, 2: 64, 3: 16, 4: 8}
 BRIEF = 4  # a run of the characteristics: in how many parts an interval is stepped differs from one to the next
 SHORTEST = 8  # a run that must be shorter than this asks for a lattice that is laid anew in every step
 MOST_PARTS = 4096
+RESOLVED = 1e-3  # share of a density in its highest frequencies below which it is seen, if not yet resolved
 MOST_SPLITS = 4096
 MOST_POINTS = 2**20  # of lattices whose flow is looked at together
 FEW_POINTS = 128  # of a lattice that is small
@@ -322,7 +323,8 @@ def more(plan: Plan, info: Any) -> Plan | None:
         parts = 2.0 ** np.ceil(np.log2(np.clip((error / plan.stepping) ** 0.25, 2, 8)))
         return replace(plan, parts=int(plan.parts * parts))
     apart = health["splitting"].max()
-    if apart >= plan.splitting and finer == 1:
+    # One that leaves more of an error than there is density makes features of its own.
+    if apart >= plan.splitting and (finer == 1 or (apart > 1 and alias < RESOLVED)):
         if plan.splits >= MOST_SPLITS:
             return None
         if not plan.chin and plan.operator != "characteristics":

@@ -453,10 +453,12 @@ def parts_for(growth: float, states: int, inputs: int, what: str) -> int:
     Raises InputError where they are too many to be held; `what` is what the error calls the interval.
     """
     parts = np.ceil(growth / MOST_GROWTH)
-    if not parts * 8 * (2 * (states + inputs)) ** 2 <= MOST_BYTES:
+    too_long = parts * 8 * (2 * (states + inputs)) ** 2 / MOST_BYTES
+    if not too_long <= 1:
+        rows = f"{np.ceil(too_long):.0f} rows" if np.isfinite(too_long) else "rows"
         raise InputError(
             f"{what} is {growth:.3g} times as long as the system's own time, too long for this filter; check the unit of the "
-            "times, or give rows in between in which nothing is observed"
+            f"times, or give {rows} in between in which nothing is observed"
         )
     return max(1, int(parts))
 
