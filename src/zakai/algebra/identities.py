@@ -9,8 +9,10 @@ dozen random points is taken to be zero.  Everything else is undecided, and said
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import mpmath
 import sympy as sp
@@ -19,6 +21,8 @@ from sympy.core.function import AppliedUndef
 DIGITS = 60
 POINTS = 12
 SHORT = 160  # operations up to which the algebraic proof is tried
+LARGEST_ARGUMENT = 10**6  # of an exponential and its like
+MANY_TERMS = 5000  # of an expansion: more of them tell nobody anything
 
 _CIRCULAR = (sp.sin, sp.cos, sp.tan, sp.cot, sp.sec, sp.csc)
 _HYPERBOLIC = (sp.sinh, sp.cosh, sp.tanh, sp.coth, sp.sech, sp.csch)
@@ -33,6 +37,7 @@ _FUNCTIONS = {
     sp.Abs: abs,
     sp.sign: mpmath.sign,
 }
+_SLOW_GROWING = (sp.log, sp.Abs, sp.sign)
 _ENTIRE = (sp.sin, sp.cos, sp.sinh, sp.cosh, sp.tanh, sp.sech, sp.exp, sp.erf, sp.atan)
 
 
@@ -113,6 +118,12 @@ def evaluate(expression: sp.Expr, values: Mapping[sp.Symbol, mpmath.mpf], known:
             known[e] = compute(e)
         return known[e]
 
+    def within(argument: Any) -> Any:
+        # The exponential of an exponential of an exponential has more digits than any memory.
+        if abs(argument) > LARGEST_ARGUMENT:
+            raise OverflowError
+        return argument
+
     def compute(e: sp.Expr):
         if e.is_Rational:
             return mpmath.mpf(int(e.p)) / int(e.q)
@@ -123,9 +134,10 @@ def evaluate(expression: sp.Expr, values: Mapping[sp.Symbol, mpmath.mpf], known:
         if isinstance(e, sp.Mul):
             return mpmath.fprod(value(a) for a in e.args)
         if isinstance(e, sp.Pow):
-            return mpmath.power(value(e.base), int(e.exp) if e.exp.is_Integer else value(e.exp))
+            return mpmath.power(value(e.base), int(e.exp) if e.exp.is_Integer else within(value(e.exp)))
         if e.func in _FUNCTIONS:
-            return _FUNCTIONS[e.func](value(e.args[0]))
+            argument = value(e.args[0])
+            return _FUNCTIONS[e.func](argument if e.func in _SLOW_GROWING else within(argument))
         if e.is_number:
             return mpmath.mpmathify(e.evalf(mpmath.mp.dps))
         raise ValueError(e)  # an undetermined function
@@ -254,8 +266,11 @@ def _from_exponential(function: type, e: sp.Expr, unit: sp.Expr) -> sp.Expr:
 def normal_form(expression: sp.Expr, variables: Sequence[sp.Symbol]) -> sp.Expr:
     """Expanded, with tanh and cosh for hyperbolic and sin and cos for circular functions of the variables, sin at most once.
 
-    In this form most identities between them are gone: 1/cosh^2 is 1 - tanh^2, sin^2 is 1 - cos^2.
+    In this form most identities between them are gone: 1/cosh^2 is 1 - tanh^2, sin^2 is 1 - cos^2.  What would have too many
+    terms stays as it is.
     """
+    if terms_of(expression) >= MANY_TERMS:
+        return expression
 
     def of_variables(e: sp.Expr) -> bool:
         return isinstance(e, (*_CIRCULAR, *_HYPERBOLIC)) and e.has(*variables)
@@ -288,13 +303,34 @@ def normal_form(expression: sp.Expr, variables: Sequence[sp.Symbol]) -> sp.Expr:
     return sp.expand(sp.expand(basics).replace(power, reduced))
 
 
+def terms_of(expression: sp.Expr) -> int:
+    """How many terms an expression has when it is expanded, at most, as far as `MANY_TERMS`."""
+    if isinstance(expression, sp.Add):
+        return min(MANY_TERMS, sum(terms_of(part) for part in expression.args))
+    if isinstance(expression, sp.Mul):
+        count = 1
+        for part in expression.args:
+            count = min(MANY_TERMS, count * terms_of(part))
+        return count
+    if isinstance(expression, sp.Pow) and expression.exp.is_Integer and expression.exp > 0:
+        terms, power = terms_of(expression.base), int(expression.exp)
+        return MANY_TERMS if terms >= MANY_TERMS else min(MANY_TERMS, math.comb(terms + power - 1, power))
+    return 1
+
+
 def grouped(expression: sp.Expr, variables: Sequence[sp.Symbol]) -> dict[sp.Expr, sp.Expr]:
-    """The expanded expression as {function of the variables: coefficient that is free of them}."""
-    groups: dict[sp.Expr, sp.Expr] = {}
+    """The expanded expression as {function of the variables: coefficient that is free of them}.
+
+    One that would have too many terms is a single function.
+    """
+    if terms_of(expression) >= MANY_TERMS:
+        return {expression: sp.Integer(1)}
+    groups: dict[sp.Expr, list[sp.Expr]] = {}
     for term in sp.Add.make_args(sp.expand(expression)):
         coefficient, function = term.as_independent(*variables, as_Add=False)
-        groups[function] = groups.get(function, sp.Integer(0)) + coefficient
-    return {function: tidy(c) for function, c in groups.items() if is_zero(c) is not True}
+        groups.setdefault(function, []).append(coefficient)
+    sums = {function: sp.Add(*coefficients) for function, coefficients in groups.items()}
+    return {function: tidy(c) for function, c in sums.items() if is_zero(c) is not True}
 
 
 def tidy(expression: sp.Expr) -> sp.Expr:

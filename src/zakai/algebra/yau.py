@@ -16,8 +16,10 @@ from dataclasses import dataclass
 import sympy as sp
 
 from zakai.algebra._readable import readable
-from zakai.algebra.identities import grouped, is_quadratic, is_zero, normal_form, tidy
+from zakai.algebra.identities import MANY_TERMS, grouped, is_quadratic, is_zero, normal_form, terms_of, tidy
 from zakai.models.model import Model
+
+DEEPEST = 4  # functions inside of each other that are integrated
 
 
 @dataclass(frozen=True)
@@ -152,11 +154,21 @@ def _antiderivative(expression: sp.Expr, symbol: sp.Symbol, x: tuple[sp.Symbol, 
     for function, coefficient in grouped(expression, x).items():
         part = _known_antiderivative(function, symbol)
         if part is None:
+            if _nested(function, symbol) > DEEPEST or terms_of(function) > MANY_TERMS // 10:
+                return None
             part = sp.integrate(function, symbol, conds="none")
             if part.has(sp.Integral) or part.has(sp.Piecewise):
                 return None
         terms.append(coefficient * part)
     return sp.Add(*terms)
+
+
+def _nested(expression: sp.Expr, symbol: sp.Symbol) -> int:
+    """How many functions of the symbol stand inside of each other, at most."""
+    if not expression.has(symbol) or not expression.args:
+        return 0
+    own = isinstance(expression, sp.Function) or (expression.is_Pow and not expression.exp.is_Integer)
+    return int(own) + max(_nested(part, symbol) for part in expression.args)
 
 
 def _known_antiderivative(function: sp.Expr, symbol: sp.Symbol) -> sp.Expr | None:
@@ -214,6 +226,9 @@ def eta(model: Model) -> sp.Expr | None:
 def as_quadratic(q: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Quadratic | None, bool | None, str]:
     """-q/2 as a quadratic in x, whether q is one, and the expression that decided it."""
     n = len(x)
+    # To refute is soon done, and to expand may take long.
+    if terms_of(q) > MANY_TERMS // 10 and is_quadratic(q, x) is False:
+        return None, False, f"q contains {not_quadratic_part(q, x)}"
     quadratic = _read_off(q, x)
     if quadratic is not None:
         return quadratic, True, f"q = {short(str(quadratic_expression(quadratic, x)))}"
@@ -275,7 +290,7 @@ def short(text: str) -> str:
 def not_quadratic_part(q: sp.Expr, x: tuple[sp.Symbol, ...]) -> str:
     """The terms of q that are not quadratic in x, for a sentence."""
     terms = []
-    for function, coefficient in grouped(q, x).items():
+    for function, coefficient in grouped(q, x).items() if terms_of(q) <= MANY_TERMS // 10 else [(q, sp.Integer(1))]:
         if is_quadratic(function, x) is not True:
             terms.append(coefficient * function)
     return f"{short(str(sp.Add(*terms)))}, which is not quadratic in {', '.join(map(str, x))}"

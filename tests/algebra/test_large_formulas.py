@@ -1,0 +1,42 @@
+"""Short formulas whose expansions, integrals or values are without end: a stranger's file may hold them."""
+
+import pytest
+import sympy as sp
+
+import zakai
+from zakai.algebra.identities import evaluate, grouped, is_zero, terms_of
+
+X = sp.Symbol("x", real=True)
+
+
+@pytest.mark.parametrize(
+    "drift",
+    [
+        "exp(exp(exp(exp(exp(9*x)))))",
+        "sin(" * 16 + "x" + ")" * 16,
+        "(x + 1)**64*(x + 2)**64*(x + 3)**64*(x + 4)**64",
+    ],
+)
+def test_they_are_refuted_before_they_are_expanded(drift):
+    analysis = zakai.analyze(zakai.Model(state=["x"], drift=[drift], observation=["x"]))
+    assert False in [condition.holds for condition in analysis.methods["kalman-bucy"]]
+    assert analysis.recommended == "yau-yau"
+
+
+def test_a_linear_system_of_many_roots_is_linear():
+    drift = " + ".join(f"sqrt({k})*x" for k in range(2, 120))
+    assert zakai.analyze(zakai.Model(state=["x"], drift=[drift], observation=["x"])).recommended == "kalman-bucy"
+
+
+def test_an_exponential_without_digits_has_no_value():
+    assert evaluate(sp.exp(sp.exp(sp.exp(sp.exp(9 * X)))), {X: sp.Integer(1)}) is None
+    assert evaluate(sp.log(sp.exp(X)), {X: 900_000}) == 900_000
+    assert is_zero(sp.exp(X) ** 2 - sp.exp(2 * X))
+
+
+def test_terms_are_counted_before_they_are_made():
+    expression = (X + 1) ** 3 * (sp.sin(X) + X + 2)
+    assert terms_of(expression) == 4 * 3 >= len(sp.Add.make_args(sp.expand(expression)))
+    huge = (X + 1) ** 64 * (X + 2) ** 64 * (X + 3) ** 64
+    assert grouped(huge, [X]) == {huge: 1}
+    assert grouped(3 * X + 2 * X * sp.Symbol("a") + 1, [X]) == {X: 2 * sp.Symbol("a") + 3, sp.Integer(1): 1}
