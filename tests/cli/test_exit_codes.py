@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import jax
 import pytest
 
 from zakai import Model
@@ -123,6 +124,26 @@ def test_an_interruption_that_a_library_drops_is_seen_at_the_next_step(zakai, tm
     answer = zakai("filter", "model.toml", "record.csv", "-o", "result.nc")
     assert answer.code == 130 and answer.err.count("\n") == 1
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_an_interruption_waits_while_jax_is_at_work_but_not_for_ever(monkeypatch):
+    timers = []
+    monkeypatch.setattr(_interrupt, "_asked", False)
+    monkeypatch.setattr(_interrupt, "_timed", True)
+    monkeypatch.setattr(_interrupt.signal, "setitimer", lambda *given: timers.append(given), raising=False)
+
+    @jax.jit
+    def traced(x):
+        _interrupt._note(0, sys._getframe())
+        return x
+
+    traced(1.0)
+    assert len(timers) == 1 and _interrupt._asked
+    with pytest.raises(KeyboardInterrupt):
+        _interrupt._note(0, sys._getframe())
+    monkeypatch.setattr(_interrupt, "PATIENCE", -1.0)
+    with pytest.raises(KeyboardInterrupt):
+        traced(1)
 
 
 def process(*arguments: str, **more):
