@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import zakai as package
+from zakai.records.checkpoint import read_checkpoint, write_checkpoint
 from zakai.records.stream import LONGEST, lines_of
 
 COMMAND = [sys.executable, "-c", "import sys; from zakai.cli import main; sys.exit(main())", "stream", "model.toml"]
@@ -184,6 +185,17 @@ def test_a_restart_skips_what_the_checkpoint_knows_and_says_its_estimate_again(s
         (tmp_path / "state").write_bytes(content)
     late = stream([*LINES, LINES[2]], *saved)
     assert "line 13" in late.err and "late" in late.err
+
+
+@pytest.mark.parametrize("accepted", ["x", None, True, -1, 2.0, 10**30, [1]])
+def test_a_checkpoint_that_does_not_say_how_many_lines_it_knows_is_refused(stream, accepted):
+    assert stream(LINES[:3], "--checkpoint", "state").code == 0
+    about, arrays = read_checkpoint("state")
+    assert about["more"] == {"accepted": 3}
+    write_checkpoint("state", {**about, "more": {"accepted": accepted}}, arrays)
+    answer = stream(LINES, "--checkpoint", "state")
+    assert answer.code == 2 and answer.out == "" and answer.err.count("\n") == 1
+    assert "does not say how many observations" in answer.err
 
 
 def test_a_checkpoint_that_does_not_fit_is_refused(stream, tmp_path):

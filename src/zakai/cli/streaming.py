@@ -16,6 +16,7 @@ from zakai.cli.filtering import options_of
 from zakai.errors import InputError
 from zakai.models.files import load_model
 from zakai.records.stream import Line, lines_of
+from zakai.records.writing import shown
 
 FIELDS: dict[str, Callable[[Any], Any]] = {
     "time": lambda estimate: estimate.time,
@@ -68,7 +69,7 @@ class _Stream:
 
     def run(self) -> None:
         if self.checkpoint is not None and self.checkpoint.exists():
-            self.accepted = int(self.online.restore(self.checkpoint).get("accepted", 0))
+            self.accepted = _count(self.online.restore(self.checkpoint).get("accepted", 0), self.checkpoint)
             if self.accepted:
                 self.skip_until = self.online.time
                 self.show(self.online.last)
@@ -110,6 +111,13 @@ class _Stream:
         if self.accepted % self.every == 0:
             sys.stdout.write(json.dumps({name: FIELDS[name](estimate) for name in self.fields}, allow_nan=False) + "\n")
             sys.stdout.flush()
+
+
+def _count(said: Any, checkpoint: Path) -> int:
+    """How many observations a checkpoint says that it knows."""
+    if type(said) is not int or not 0 <= said < 2**53:
+        raise InputError(f"{shown(checkpoint)}: does not say how many observations it knows; remove it to begin anew")
+    return said
 
 
 def _wanted(fields: str) -> list[str]:

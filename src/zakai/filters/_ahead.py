@@ -140,6 +140,12 @@ class Ahead:
             return self._remembered(key)
         return self._ahead(key) if key.number > 1 else self._made(key, ends)
 
+    def row(self, key: Key, ends: tuple[float, float]) -> int | None:
+        """The row in the block of a key of the interval with these ends; None where it is none of them."""
+        if self.varying:
+            return self._row(key, *ends, key.seen)
+        return 0 if _close(ends[1], ends[0] + key.step, key.step) else None
+
     def _row(self, key: Key | None, start: float, stop: float, seen: tuple[bool, ...]) -> int | None:
         if key is None or key.seen != seen:
             return None

@@ -33,6 +33,10 @@ JOINT = 1.16  # standard deviation, in cells, from which the error of a sum is b
 ROOM = 64.0  # the longest rows of a slanted lattice, in sizes of an axis
 BASE = {1: 128, 2: 64, 3: 48}
 MOST = {1: 8192, 2: 1024, 3: 256}
+MOST_BANDED = 2**17  # points of a window, and taps
+WIDEST, FINEST = 40, 300  # the `window` and the `cells` from which on a plan gets no better
+MOST_IMAGES = 1024
+LONGEST_RUN = 256
 # A window that stands still serves a splitting, whose own error is larger than these.
 COARSEST_STILL = 0.88
 EDGE_STILL = 1e-10
@@ -71,6 +75,21 @@ class Plan:
     def needed(self) -> float:
         """The fewest cells that a standard deviation may have."""
         return CELLS_SHARPENED if self.sharpen else CELLS
+
+    @property
+    def possible(self) -> bool:
+        """Whether a plan that somebody tells of can be one of ours."""
+        return (
+            all(0 < size <= MOST_BANDED for size in self.sizes)
+            and 0 < self.taps <= MOST_BANDED
+            and sorted(set(self.angles)) == sorted(self.angles)
+            and all(0 <= angle < len(self.sizes) for angle in self.angles)
+            and 0 <= self.images <= MOST_IMAGES
+            and 0 < self.run <= LONGEST_RUN
+            and 1 <= self.window <= 2 * WIDEST
+            and 1 <= self.cells <= 2 * FINEST
+            and 0 < self.room <= 2 * ROOM
+        )
 
 
 def rounded_up(size: float, least: int = 64, parts: int = 4) -> int:
@@ -116,7 +135,7 @@ def first_plan(model: Model) -> Plan:
     """The plan before anything is known of the steps."""
     angles = tuple(model.state.index(name) for name in model.periodic)
     # What observations leave of a prior on two states is much smaller, so that the first runs are short.
-    return Plan(False, (BASE[model.n],) * model.n, angles=angles, run=256 if model.n == 1 else 2)
+    return Plan(False, (BASE[model.n],) * model.n, angles=angles, run=LONGEST_RUN if model.n == 1 else 2)
 
 
 def first_lattice(
@@ -390,7 +409,7 @@ def _more(plan: Plan, info: Any) -> Plan | None:
     finite = np.all(np.isfinite(info.log_likelihood_increment))
     coarse = not np.all(info.health["resolution"] > CELLS)
     narrow = not np.all(info.health["edge_mass"] < _edge(plan)) or not finite
-    if plan.sizes[0] >= 2**17 or plan.cells > 300 or plan.window > 40:
+    if plan.sizes[0] >= MOST_BANDED or plan.cells > FINEST or plan.window > WIDEST:
         return None
     return replace(plan, cells=plan.cells * (2 if coarse else 1), window=plan.window * (1.6 if narrow else 1))
 
@@ -520,8 +539,6 @@ def _trigonometric(values: np.ndarray, middle: np.ndarray, ratio: np.ndarray, si
     # 2 j k = j^2 + k^2 - (j - k)^2 turns the sum over k into a convolution.
     distance = np.arange(j[0] - k[-1], j[-1] - k[0] + 1)
     length = int(2 ** np.ceil(np.log2(count + len(distance))))
-    product = np.fft.fft(spectrum * np.exp(1j * angle * k**2), length) * np.fft.fft(
-        np.exp(-1j * angle * distance**2), length
-    )
+    product = np.fft.fft(spectrum * np.exp(1j * angle * k**2), length) * np.fft.fft(np.exp(-1j * angle * distance**2), length)
     convolved = np.fft.ifft(product)[:, count - 1 : count - 1 + size]
     return np.real(convolved * np.exp(1j * angle * j**2))

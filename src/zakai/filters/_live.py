@@ -84,10 +84,8 @@ class Live:
         total = sum(values)
         seen = self.whole if total == total else tuple([value == value for value in values])
         elapsed, read, read_at = None, now.read, now.read_at
-        notes: tuple[str, ...] = ()
         if self.path:
             elapsed, values, read, read_at = self._increments(time, values, seen)
-            notes = (AFTER_GAP,) if elapsed is not None else ()
         elif self.kind == "rates":
             values = [value * (time - now.time) for value in values]
         if seen is not self.whole:
@@ -121,7 +119,12 @@ class Live:
                 "nothing was observed at that time, and go on from there"
             )
         ends = (now.time, time)
-        return Moment(time, after, self.step, left - 1, block, ends, clock, read, read_at, None, notes + block.notes)
+        left -= self.adapts
+        return Moment(time, after, self.step, left, block, ends, clock, read, read_at, None, self.notes_of(block))
+
+    def notes_of(self, block: Block) -> tuple[str, ...]:
+        """What is to be said of what was read over an interval of a block."""
+        return ((AFTER_GAP,) if block.key.elapsed is not None else ()) + block.notes
 
     def density(self, moment: Moment) -> Density:
         """The density at a moment."""

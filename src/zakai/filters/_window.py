@@ -34,6 +34,7 @@ FEW_POINTS = 128  # of a lattice that is small
 FEW = {1: 128, 2: 8, 3: 4, 4: 4}  # parts of an interval beyond which the lattice had better follow the flow
 SPARE = 1.25  # how much wider than its density a window is, and
 WORST = {1: 8.0, 2: 3.0, 3: 2.0, 4: 2.0}  # how much more of both a run may ask for before it is cut into shorter ones
+MOST_ROOM = 1e3
 CALMER = 0.5  # of the error of splitting that is allowed, below which a run may be taken with fewer transitions
 FINER = 1.15  # how much finer than the density needs: what may change within a run
 FOLLOWED = 1.9  # cells that a deviation has, and
@@ -67,6 +68,16 @@ class Shape(NamedTuple):
         """How the likelihood of increments is split from the transition."""
         return CHIN if self.chin else STRANG
 
+    @property
+    def possible(self) -> bool:
+        """Whether a shape that somebody tells of can be one of ours."""
+        return (
+            0 <= self.splits <= MOST_SPLITS
+            and 0 <= self.parts <= 8 * MOST_PARTS
+            and self.order in (2, 4, *TERMS)
+            and self.operator in ("spectral", "finite-volume", "characteristics")
+        )
+
 
 class Room(NamedTuple):
     """What a step is told and not compiled for; `wider` and `finer` multiply SPARE and FINER for a run of `run` steps.
@@ -97,6 +108,14 @@ class Room(NamedTuple):
         """The most that may be of aliasing, of the mass in the outermost layers, of the error in time, of what is lost and of the
         error of splitting."""
         return 0.1 * self.tolerance, 0.01 * self.tolerance, 0.1 * self.tolerance, self.tolerance, self.splitting
+
+    @property
+    def possible(self) -> bool:
+        """Whether a room that somebody tells of can be one of ours."""
+        most = {"run": max(RUNS.values()), "splits": MOST_SPLITS, "parts": 8 * MOST_PARTS}
+        whole = all(1 <= (count := float(getattr(self, name))) <= least and count % 1 == 0 for name, least in most.items())
+        room = all(1 <= part <= MOST_ROOM for part in (self.wider, self.finer))
+        return whole and room and bool(0 < self.tolerance < 1 and 0 < self.splitting)
 
 
 @dataclass(frozen=True)

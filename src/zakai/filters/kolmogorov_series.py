@@ -104,6 +104,11 @@ class State:
     def run_length(self) -> int:
         return _RUN
 
+    @property
+    def possible(self) -> bool:
+        """Whether a state that somebody tells of can be one of ours."""
+        return 0 < self.substeps <= _MOST_SUBSTEPS
+
 
 class Interval(NamedTuple):
     """One interval: its ends, the number of its length, and the parameters."""

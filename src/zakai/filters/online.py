@@ -124,7 +124,7 @@ class Online:
         Raises InputError where the file cannot be written.
         """
         with self.lock:
-            parts = [saved(live) for live in self.lives]
+            parts = [saved(live.now) for live in self.lives]
         arrays = {f"{i}/{k}": array for i, (_, own) in enumerate(parts) for k, array in enumerate(own)}
         write_checkpoint(path, {**self._bound, "lives": [said for said, _ in parts], "more": dict(more or {})}, arrays)
 
@@ -140,11 +140,15 @@ class Online:
                 said = "" if what == "model" else f" ({_short(about.get(what))}, not {_short(own)})"
                 raise InputError(f"{shown(path)}: is the checkpoint of another {what}{said}; name another file, or remove it")
         try:
-            lives, more = about["lives"], dict(about["more"])
+            lives, more = about["lives"], about["more"]
             own_arrays = [[arrays[f"{i}/{k}"] for k in range(_count(arrays, i))] for i in range(len(self.lives))]
+            if not isinstance(more, dict) or sum(map(len, own_arrays)) != len(arrays):
+                raise ValueError
             with self.lock:
                 every = zip(self.lives, lives, own_arrays, strict=True)
                 moments = [restore(live, said, own) for live, said, own in every]
+                if len({moment.time for moment in moments}) != 1:
+                    raise ValueError
                 for live, moment in zip(self.lives, moments, strict=True):
                     live.now = moment
         except (KeyError, TypeError, ValueError):
@@ -343,5 +347,3 @@ def _counted(count: int) -> str:
 def _short(what: Any) -> str:
     text = ascii(what)
     return text if len(text) <= 40 else text[:37] + "..."
-
-

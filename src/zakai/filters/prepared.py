@@ -131,10 +131,11 @@ def _put_together(setting: Setting, said: list[Any], arrays: list[np.ndarray]) -
     """What was prepared for a setting; the functions in it are those that are prepared now for the first interval."""
     found: dict[Any, tuple[Schedule, Any]] = {}
     shared: Mapping[str, Any] = {}
+    numbered = iter(enumerate(arrays))
     for pair in said:
-        schedule = put_together(pair["tuple"][0], arrays, {})
+        schedule = put_together(pair["tuple"][0], numbered, {})
         if not shared:
             first = Schedule(*(part[:1] for part in schedule))
             shared = shared_by(setting.method.prepare(setting.model, first, **setting.options))
-        found[key_of(schedule)] = schedule, put_together(pair["tuple"][1], arrays, shared)
+        found[key_of(schedule)] = schedule, put_together(pair["tuple"][1], numbered, shared)
     return found

@@ -71,6 +71,11 @@ class State:
         """How many steps are taken at once."""
         return _RUNS[self.system.n]
 
+    @property
+    def possible(self) -> bool:
+        """Whether a state that somebody tells of can be one of ours."""
+        return 0 < self.parts <= _MOST_PARTS
+
 
 class Interval(NamedTuple):
     """One interval: its length, whether all coordinates are observed in it, the inverse (m, m) of the block of S of those that
