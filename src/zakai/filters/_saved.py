@@ -26,6 +26,7 @@ from zakai.records.record import LARGEST
 
 MOST_STEPS = 2**53
 ROUNDING = 1e-9  # of a covariance
+AGREES = 0.1  # share by which the moments that a step told and those of its density may differ: they are found in two ways
 NEGATIVE = ("negative_variance", "indefinite_cov")  # the figures that say that one has a negative variance
 
 
@@ -183,8 +184,16 @@ def _at_the_start(live: Live, said: Mapping[str, Any]) -> Moment:
 
 def _check_believable(live: Live, moment: Moment, row: int, info: Info) -> None:
     """ValueError where the state is no density with moments, or cannot be gone on with."""
-    density = live.density(moment)
-    for mean, cov in ((info.mean, info.cov), (density.mean(), density.cov())):
+    density, model = live.density(moment), live.setting.model
+    own, spread = density.mean(), density.cov()
+    apart = np.abs(np.asarray(info.mean) - own)
+    # Of an angle it is the way around the circle.
+    angles = np.array([name in model.periodic for name in model.state])
+    apart = np.where(angles, np.abs(np.angle(np.exp(1j * apart))), apart)
+    wide, least = np.abs(np.diagonal(spread)), ROUNDING * (1 + np.square(own))
+    _check(np.all(apart <= AGREES * np.sqrt(wide) + np.sqrt(least)))
+    _check(np.all(np.abs(np.diagonal(info.cov) - wide) <= AGREES * wide + least))
+    for mean, cov in ((info.mean, info.cov), (own, spread)):
         _check(np.isfinite(mean).all() and np.isfinite(cov).all())
         # Where rounding ate a variance, the figures of health say so.
         rounding = ROUNDING * (np.abs(cov).max() + np.square(mean).max())

@@ -90,6 +90,13 @@ class State:
         return _steps if self.plan.still else None
 
     @property
+    def possible(self) -> bool:
+        """Whether the narrowest features are about those of the density; of one record, outside of a compiled step."""
+        expected = choice.features(np.asarray(self.lattice.log_values)[None])[0]
+        about = (0.5 * expected < self.cells) & (self.cells < 2.0 * expected)
+        return bool(np.all(about | np.isinf(expected)))
+
+    @property
     def bare(self) -> State:
         """The state with nothing in its plan but what a step must know."""
         return replace(self, plan=replace(self.plan, window=choice.Plan.window, cells=choice.Plan.cells, run=choice.Plan.run))
