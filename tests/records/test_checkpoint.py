@@ -140,6 +140,13 @@ def test_a_filter_goes_on_from_a_checkpoint_with_the_same_bits(tmp_path, keys, m
     check_continuation(tmp_path, model, method, times, 5)
 
 
+@pytest.mark.parametrize("kind", ["increments", "path", "rates", "samples"])
+@pytest.mark.parametrize("keys", [WALK, TIMED])
+def test_a_filter_that_begins_before_zero_goes_on_with_the_same_bits(tmp_path, keys, kind):
+    model = zakai.Model(**keys, observation_kind=kind, start=-10.0)
+    check_continuation(tmp_path, model, "extended-kalman-bucy", TIMES[:12] - 10.0, 4)
+
+
 def test_a_filter_of_lengths_that_never_repeat_goes_on_with_the_same_bits(tmp_path):
     times = np.cumsum(np.random.default_rng(6).permutation(np.geomspace(0.1, 6.0, 12)))
     check_continuation(tmp_path, zakai.Model(**WALK, observation_kind="samples"), "kalman-bucy", times, 3)

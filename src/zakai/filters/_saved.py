@@ -217,7 +217,7 @@ def _key(live: Live, said: Any, time: float) -> Key | None:
     key = Key(_number(start), _number(step), _count(number, 1, CHUNK), _seen(seen, live.m), spans)
     _check(
         0 < key.step
-        and key.start <= time
+        and (key.start <= time or (key.start == 0.0 and not live.ahead.varying))
         and math.isfinite((time - key.start) / key.step)
         and (spans is None or (live.path and min(spans) >= 0))
     )

@@ -35,6 +35,7 @@ FEW = {1: 128, 2: 8, 3: 4, 4: 4}  # parts of an interval beyond which the lattic
 SPARE = 1.25  # how much wider than its density a window is, and
 WORST = {1: 8.0, 2: 3.0, 3: 2.0, 4: 2.0}  # how much more of both a run may ask for before it is cut into shorter ones
 MOST_ROOM = 1e3
+LONGEST_GAP = 2**40  # parts of an interval, of which nobody lives to see the end
 CALMER = 0.5  # of the error of splitting that is allowed, below which a run may be taken with fewer transitions
 FINER = 1.15  # how much finer than the density needs: what may change within a run
 FOLLOWED = 1.9  # cells that a deviation has, and
@@ -73,7 +74,7 @@ class Shape(NamedTuple):
         """Whether a shape that somebody tells of can be one of ours."""
         return (
             0 <= self.splits <= MOST_SPLITS
-            and 0 <= self.parts <= 8 * MOST_PARTS
+            and 0 <= self.parts <= LONGEST_GAP
             and self.order in (2, 4, *TERMS)
             and self.operator in ("spectral", "finite-volume", "characteristics")
         )
@@ -112,7 +113,7 @@ class Room(NamedTuple):
     @property
     def possible(self) -> bool:
         """Whether a room that somebody tells of can be one of ours."""
-        most = {"run": max(RUNS.values()), "splits": MOST_SPLITS, "parts": 8 * MOST_PARTS}
+        most = {"run": max(RUNS.values()), "splits": MOST_SPLITS, "parts": LONGEST_GAP}
         whole = all(1 <= (count := float(getattr(self, name))) <= least and count % 1 == 0 for name, least in most.items())
         room = all(1 <= part <= MOST_ROOM for part in (self.wider, self.finer))
         return whole and room and bool(0 < self.tolerance < 1 and 0 < self.splitting)
