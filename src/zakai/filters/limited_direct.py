@@ -424,6 +424,8 @@ def _log_factor(h: Sequence[jax.Array] | None, factor: Factors) -> Any:
 
 def adapt(prepared: Prepared, state: State, rows: slice, info: Info | None, still: bool = True) -> State | None:
     """The state to begin the intervals `rows` with: the window, the cell and the way to convolve."""
+    if info is not None and np.all(choice.healthy(info, state.plan)):
+        return None
     one = jax.tree.map(lambda a: np.asarray(a)[None], (replace(state, table=None, seen=None), info))
     many = adapt_many(prepared, one[0], rows, one[1], still, state.table)
     if many is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import sympy
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 COEFFICIENTS = ("diffusion", "process_noise", "observation_noise")
 WITHIN = 1024  # times inside of intervals at which noise is looked at
 
+_GOOD: WeakKeyDictionary[Model, set[str]] = WeakKeyDictionary()  # the noises of a model that are noise at all times
+
 
 def check_noise_at(model: Model, times: Any, keys: Sequence[str] = COEFFICIENTS) -> None:
     """Check that the noise of a model (or that of some `keys`) is noise at every given time.
@@ -33,11 +36,15 @@ def check_noise_at(model: Model, times: Any, keys: Sequence[str] = COEFFICIENTS)
         >>> check_noise_at(load_model("gallery:spiral-sensor"), [0.0, 10.0])
     """
     for key in keys:
-        problem = _problem(model, key, np.atleast_1d(np.asarray(times, dtype=float)))
+        if key in _GOOD.get(model, ()):
+            continue
+        problem, varies = _problem(model, key, np.atleast_1d(np.asarray(times, dtype=float))), getattr(model, key).has(model.t)
         if problem:
             index, words = problem
-            when = f" at t = {np.atleast_1d(times)[index]:.12g}" if getattr(model, key).has(model.t) else ""
+            when = f" at t = {np.atleast_1d(times)[index]:.12g}" if varies else ""
             raise InputError(f"{model.source}: {key}: {words[0]}{when}{words[1]}")
+        if not varies:
+            _GOOD.setdefault(model, set()).add(key)
 
 
 def check_noise_within(model: Model, times: np.ndarray) -> None:
