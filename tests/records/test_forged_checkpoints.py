@@ -90,7 +90,7 @@ def outcome(path, online, about, arrays):
     "name",
     [
         "kalman-bucy-1d",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("spiral-sensor", "cubic-sensor", "two blocks")),
+        pytest.param("spiral-sensor", marks=pytest.mark.slow),
     ],
 )
 def test_a_forged_checkpoint_is_refused_or_gone_on_from(tmp_path, name):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -114,10 +114,10 @@ class Prepared:
             for what, own in prepared._bound.items():
                 if about[what] != own:
                     raise InputError(f"{name}: was prepared for another {what}; prepare anew")
-            listed = [arrays[str(k)] for k in range(len(arrays))]
+            numbered = iter([(k, arrays[str(k)]) for k in range(len(arrays))])
             settings = {setting.model: setting for setting in prepared._plan.settings}
             for (of_one, found), said in zip(prepared._stored.items(), about["stored"], strict=True):
-                found.update(_put_together(settings[of_one], said, listed))
+                found.update(_put_together(settings[of_one], said, numbered))
         except (KeyError, IndexError, TypeError, ValueError, AttributeError):
             raise InputError(f"{name}: does not hold what zakai.prepare makes; prepare anew") from None
         return prepared
@@ -127,11 +127,11 @@ class Prepared:
         return {"model": self.model.text, "method": self.method, "options": self.options, "versions": versions()}
 
 
-def _put_together(setting: Setting, said: list[Any], arrays: list[np.ndarray]) -> dict[Any, tuple[Schedule, Any]]:
-    """What was prepared for a setting; the functions in it are those that are prepared now for the first interval."""
+def _put_together(setting: Setting, said: list[Any], numbered: Iterator[tuple[int, Any]]) -> dict[Any, tuple[Schedule, Any]]:
+    """What was prepared for a setting, of the next of the arrays; the functions in it are those that are prepared now for the
+    first interval."""
     found: dict[Any, tuple[Schedule, Any]] = {}
     shared: Mapping[str, Any] = {}
-    numbered = iter(enumerate(arrays))
     for pair in said:
         schedule = put_together(pair["tuple"][0], numbered, {})
         if not shared:
