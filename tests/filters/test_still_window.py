@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import expm
 
 import zakai
-from zakai.filters import _still_window, limited_direct
+from zakai.filters import _run, _still_window, limited_direct
 from zakai.filters._splitting import bent, bridged
 from zakai.filters.observations import data_of, schedule_of
 
@@ -191,3 +191,21 @@ def _error_of_one_interval(tau):
         return abs(means[0] - means[1])
 
     return error
+
+
+def test_the_steps_that_pad_a_run_change_neither_its_end_nor_what_was_told():
+    assert _run.WHOLE % _still_window.LOOK == 0
+    (record,) = increments(SPIRAL, 64)
+    data = data_of(SPIRAL, record)
+    prepared = limited_direct.prepare(SPIRAL, schedule_of(data, True))
+    given = limited_direct.observations(prepared, data)
+    begin = limited_direct.adapt(prepared, limited_direct.init(prepared, SPIRAL.prior), slice(0, 64), None)
+    short, (own, _) = jax.jit(begin.together, static_argnums=3)(
+        begin, *jax.tree.map(lambda a: a[:32], (prepared.intervals, given)), False, 32
+    )
+    padded, (told, _) = jax.jit(begin.together, static_argnums=3)(begin, prepared.intervals, given, False, 32)
+    whole, _ = jax.jit(begin.together, static_argnums=3)(begin, prepared.intervals, given, False, 64)
+    assert np.allclose(padded.lattice.log_values, short.lattice.log_values, rtol=0, atol=1e-9)
+    assert padded.lattice.centre == short.lattice.centre and not np.allclose(whole.cells, padded.cells, rtol=1e-6)
+    assert np.allclose(told.mean[:32], own.mean, rtol=0, atol=1e-12)
+    assert np.allclose(told.log_likelihood_increment[:32], own.log_likelihood_increment, rtol=0, atol=1e-12)
