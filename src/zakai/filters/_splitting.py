@@ -204,8 +204,10 @@ def error(scheme: Scheme, terms: Terms, length: Any) -> Any:
     return third + 7 / 8640 * length**3 * once + length**4 / 2880 * rate**2 * terms.second
 
 
-def terms(log: jax.Array, values: jax.Array, flow: Sequence[jax.Array], spread: jax.Array, scheme: Scheme) -> Terms:
-    """All of them where b is `log` and the density is `values` on a lattice.
+def terms(
+    log: jax.Array | None, values: jax.Array, flow: Sequence[jax.Array], spread: jax.Array, scheme: Scheme
+) -> Terms:
+    """All of them where b is `log`, or None where nothing is split, and the density is `values` on a lattice.
 
     `flow` is the drift and `spread` G in the lattice's coordinates.  With L the backward operator, [A, [b, A]] has a part that is
     the function L L b, one in which the slopes of L b stand beside those of the density, and one in which the second derivatives
@@ -215,6 +217,22 @@ def terms(log: jax.Array, values: jax.Array, flow: Sequence[jax.Array], spread: 
     total, mean, cov = comoving.moments(values)
     narrow = comoving.inverse(cov)
     growth = jnp.trace(spread @ narrow)
+    functions = [] if log is None else _functions(log, flow, spread, scheme)
+    apart = [z - mean[d] for d, z in enumerate(comoving.combined(np.eye(n), values.shape))]
+    moved = [v * z for v in flow for z in apart]
+    # All means by one product: what is compiled fast.
+    means = jnp.stack([*functions, *moved]).reshape(len(functions) + n * n, -1) @ (values.reshape(-1) / total)
+    turned = means[len(functions) :].reshape(n, n) @ narrow
+    turning = jnp.sqrt(jnp.sum(jnp.abs(turned * turned.T)))
+    forgets = (growth + jnp.trace(turned)) / n
+    if not functions:
+        zero = jnp.zeros(())
+        return Terms(zero, zero, zero, zero, zero, growth, turning, forgets)
+    return measured(means[: len(functions)], growth, turning, forgets)
+
+
+def _functions(log: jax.Array, flow: Sequence[jax.Array], spread: jax.Array, scheme: Scheme) -> list[jax.Array]:
+    """Those whose means `measured` takes, on a lattice."""
 
     def generated(function: jax.Array) -> tuple[list[jax.Array], jax.Array, jax.Array]:
         slope, second = bends(function)
@@ -232,13 +250,7 @@ def terms(log: jax.Array, values: jax.Array, flow: Sequence[jax.Array], spread: 
         along = jnp.tensordot(spread, jnp.stack(slope), axes=1)
         third = sum((s * jnp.sum(row * along, axis=0) for s, row in zip(slope, bent, strict=True)), start=jnp.zeros(()))
         functions += [twice_bent**2, third, third**2]
-    apart = [z - mean[d] for d, z in enumerate(comoving.combined(np.eye(n), values.shape))]
-    moved = [v * z for v in flow for z in apart]
-    # All means by one product: what is compiled fast.
-    means = jnp.stack([*functions, *moved]).reshape(len(functions) + n * n, -1) @ (values.reshape(-1) / total)
-    turned = means[len(functions) :].reshape(n, n) @ narrow
-    turning = jnp.sqrt(jnp.sum(jnp.abs(turned * turned.T)))
-    return measured(means[: len(functions)], growth, turning, (growth + jnp.trace(turned)) / n)
+    return functions
 
 
 def measured(means: jax.Array, growth: Any, turning: Any, forgets: Any) -> Terms:

@@ -412,7 +412,7 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
         thin, apart = splitting.thinned(plan.sizes)
         inverse, end = comoving.inverse(field.basis * apart), begin + length
         flow = list(jnp.tensordot(inverse, jnp.stack(drift(field.points()[thin], end)), axes=1))
-        log = logs([h[thin] for h in observed])
+        log = logs([h[thin] for h in observed]) if system.continuous else None
         terms = splitting.terms(log, field.values[thin], flow, spread(inverse, end), scheme)
         left, apart, fewer = _split_error(plan, splits, terms, length)
         error = still(splitting.added(error, left + made + spent - before, terms.forgets, length))

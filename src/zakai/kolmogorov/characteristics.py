@@ -14,7 +14,7 @@ reading is about to come, by its likelihood: what the reading will rule out need
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from itertools import product
 from typing import Any
@@ -61,8 +61,8 @@ def moved(
 
     # Noise before the flow and after it.
     before = 0.5 * tau * covariance(time)
-    _, whole, turned = _linearised(drift, covariance, start, time, tau)
-    after = _positive(whole - turned @ before @ turned.T)
+    added = _added(drift, covariance, start, cov_before, time, tau)
+    after = _positive(added[0])
     logs = _spread(_logs(field.values), field.basis, before, reach)
     fourth = _fourth(logs, weights)
 
@@ -79,12 +79,12 @@ def moved(
         return jnp.maximum(jnp.where(good, value, -jnp.inf), jnp.max(logs) - 60.0)
 
     result = read(end, STEPS)
-    some = end[(slice(None, None, _SPARSE),) * n]
-    heavy = jnp.exp(result - jnp.max(result))[(slice(None, None, _SPARSE),) * n]
-    paths = jnp.sum(heavy * jnp.minimum(jnp.abs(read(some, STEPS) - read(some, 2 * STEPS)), 1.0)) / jnp.sum(heavy)
+    sparse = (slice(None, None, _SPARSE),) * n
+    heavy = jnp.exp(result - jnp.max(result))[sparse]
+    paths = jnp.sum(heavy * jnp.minimum(jnp.abs(result[sparse] - read(end[sparse], 2 * STEPS)), 1.0)) / jnp.sum(heavy)
     result = _spread(result, basis, after, reach)
     volume = jnp.log(jnp.abs(jnp.linalg.det(basis) / jnp.linalg.det(field.basis)))
-    noise = _unlike(drift, covariance, start, cov_before, time, tau, after, cov + after)
+    noise = _unlike(added[1:] - after, cov + after)
     return Field(jnp.exp(result + volume), centre, basis), still(paths + noise), still(fourth)
 
 
@@ -102,30 +102,36 @@ def relaid(field: Field, sizes: tuple[int, ...], reach: Any) -> Field:
 def _path(drift: Drift, divergence: bool = True) -> Callable[[jax.Array, Any, Any, int], tuple[jax.Array, jax.Array]]:
     """Where paths from x lead in the time tau, which may be negative, and the integral of div f along them."""
 
-    def rate(x: jax.Array, t: Any) -> tuple[jax.Array, jax.Array]:
-        n = x.shape[-1]
+    def flow(x: Sequence[jax.Array], t: Any) -> list[jax.Array]:
+        return [jnp.broadcast_to(f, x[0].shape) for f in drift(jnp.stack(x, axis=-1), t)]
 
-        def flow(y: jax.Array) -> jax.Array:
-            return jnp.stack([jnp.broadcast_to(f, y.shape[:-1]) for f in drift(y, t)], axis=-1)
+    def rate(x: Sequence[jax.Array], t: Any) -> list[jax.Array]:
+        total = jnp.zeros(x[0].shape)
+        for d in range(len(x) if divergence else 0):
 
-        total = jnp.zeros(x.shape[:-1])
-        for d in range(n if divergence else 0):
-            total = total + jax.jvp(flow, (x,), (jnp.broadcast_to(np.eye(n)[d], x.shape),))[1][..., d]
-        return flow(x), total
+            def along_axis(coordinate: jax.Array, d: int = d) -> jax.Array:
+                return flow([*x[:d], coordinate, *x[d + 1 :]], t)[d]
+
+            total = total + jax.jvp(along_axis, (x[d],), (jnp.ones(x[d].shape),))[1]
+        return [*flow(x, t), total]
 
     def path(x: jax.Array, time: Any, tau: Any, steps: int) -> tuple[jax.Array, jax.Array]:
         h = tau / steps
 
-        def one(k: Any, carry: Any) -> Any:
-            x, total = carry
-            t = time + k * h
-            k1, a1 = rate(x, t)
-            k2, a2 = rate(x + 0.5 * h * k1, t + 0.5 * h)
-            k3, a3 = rate(x + 0.5 * h * k2, t + 0.5 * h)
-            k4, a4 = rate(x + h * k3, t + h)
-            return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), total + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        def one(k: Any, y: list[jax.Array]) -> list[jax.Array]:
+            def at(share: float, slope: Sequence[jax.Array]) -> list[jax.Array]:
+                moved = [a + share * h * b for a, b in zip(y[:-1], slope, strict=False)]
+                return rate(moved, time + (k + share) * h)
 
-        return lax.fori_loop(0, steps, one, (x, jnp.zeros(x.shape[:-1])))
+            k1 = rate(y[:-1], time + k * h)
+            k2 = at(0.5, k1)
+            k3 = at(0.5, k2)
+            k4 = at(1.0, k3)
+            return [a + h / 6 * (b + 2 * c + 2 * d + e) for a, b, c, d, e in zip(y, k1, k2, k3, k4, strict=True)]
+
+        # An array for each coordinate: stacked ones would be taken apart again at every stage.
+        *end, gathered = lax.fori_loop(0, steps, one, [*jnp.moveaxis(x, -1, 0), jnp.zeros(x.shape[:-1])])
+        return jnp.stack(end, axis=-1), gathered
 
     return path
 
@@ -156,15 +162,16 @@ def _linearised(drift: Drift, covariance: Covariance, x: jax.Array, time: Any, t
     return lax.fori_loop(0, STEPS, one, (x, jnp.zeros((n, n)), jnp.eye(n)))
 
 
-def _unlike(
-    drift: Drift, covariance: Covariance, mean: Any, cov: Any, time: Any, tau: Any, after: Any, scale: Any
-) -> jax.Array:
-    """How far what noise adds differs from point to point: at a deviation from the mean along each axis, relative to the
-    covariance at the end."""
+def _added(drift: Drift, covariance: Covariance, mean: Any, cov: Any, time: Any, tau: Any) -> jax.Array:
+    """What noise adds after the flow (1 + 2 n, n, n), along the paths from the mean and from a deviation to each side of it."""
     roots = jnp.linalg.cholesky(cov + 1e-300 * jnp.eye(len(mean))).T
-    ends = jnp.concatenate([mean + roots, mean - roots])
-    _, whole, turned = jax.vmap(lambda x: _linearised(drift, covariance, x, time, tau))(ends)
-    apart = whole - turned @ (0.5 * tau * covariance(time)) @ jnp.swapaxes(turned, 1, 2) - after
+    starts = jnp.concatenate([mean[None], mean + roots, mean - roots])
+    _, whole, turned = jax.vmap(lambda x: _linearised(drift, covariance, x, time, tau))(starts)
+    return whole - turned @ (0.5 * tau * covariance(time)) @ jnp.swapaxes(turned, 1, 2)
+
+
+def _unlike(apart: jax.Array, scale: Any) -> jax.Array:
+    """How far what noise adds differs from point to point, by `apart` (2 n, n, n), relative to the covariance at the end."""
     weight = comoving.inverse(scale)
     return 0.5 * jnp.mean(jnp.sqrt(jnp.maximum(jnp.einsum("aij,jk,akl,li->a", apart, weight, apart, weight), 0.0)))
 
@@ -273,7 +280,7 @@ def _spline(logs: jax.Array, z: jax.Array, reach: Any) -> jax.Array:
 
     def row(total: jax.Array, at: Any) -> tuple[jax.Array, None]:
         which, offset = at
-        line = sum(weights[-1][a] * table[place + offset + a] for a in range(4))
+        line = sum(weights[-1][a] * table.at[place + offset + a].get(mode="promise_in_bounds") for a in range(4))
         for d in range(n - 1):
             line = line * stacked[d][which[d]]
         return total + line, None
