@@ -1,6 +1,6 @@
 """Lorenz' system of 1963, sampled as by Sakov, Oliver and Bertino (2012): all three coordinates every .25, noise of variance 2.
 
-    python benchmarks/lorenz_63.py [--observations 1000] [--noise 0.05] [--tolerance 0.1] [--seed 1]
+    python benchmarks/lorenz_63.py [--observations 1000] [--noise 0.01] [--tolerance 0.1] [--seed 1]
 
 The truth is without process noise, by Runge and Kutta's formula with steps of .01; the model of the filter has the noise that
 its operator needs, `--noise` times the identity a unit of time.  Printed are the root mean square error over the three
@@ -61,7 +61,7 @@ def system(mean: np.ndarray, noise: float) -> zakai.Model:
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--observations", type=int, default=1000)
-    parser.add_argument("--noise", type=float, default=0.05)
+    parser.add_argument("--noise", type=float, default=0.01)
     parser.add_argument("--tolerance", type=float, default=0.1)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
