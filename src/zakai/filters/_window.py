@@ -434,8 +434,9 @@ def _speeds(model: Model, fields: Field, ratio: np.ndarray, times: np.ndarray, f
     index = np.stack(np.meshgrid(*axes_of(fields.values.shape[1:]), indexing="ij"), axis=-1).reshape(-1, n) / ratio[:, None]
     points = fields.centre[:, None] + index @ np.swapaxes(fields.basis, 1, 2)
     function = numpy_function(model.drift, model)
+    ends = times[[0, -1]] if model.t in model.drift.free_symbols else times[:1]
     with np.errstate(all="ignore"):
-        flow = np.where(matters, np.stack([function(points, t, theta) @ back for t in times[[0, -1]]]), 0.0)
+        flow = np.where(matters, np.stack([function(points, t, theta) @ back for t in ends]), 0.0)
     flow = flow - np.einsum("rp,rpi->ri", weights, flow[0])[:, None]
     apart = index - np.einsum("rp,rpi->ri", weights, index)[:, None]
     variance = np.einsum("rp,rpi->ri", weights, apart**2)

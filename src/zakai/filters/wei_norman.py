@@ -29,7 +29,8 @@ from zakai.filters import _lattice_choice as choice
 from zakai.filters._exponentials import STEP, System, system_of
 from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters.observations import Data, FactorRule, Factors, factor_rule, noise_at
-from zakai.kolmogorov import resolution, spectral
+from zakai.kolmogorov import spectral
+from zakai.kolmogorov.resolution import resolution_of
 from zakai.kolmogorov.spectral import Field, Generator
 from zakai.models.compile import jax_field
 from zakai.models.model import Model
@@ -190,7 +191,7 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
     # Where a coordinate is missing L_0 and the algebra are others: what is known of the observation acts inside, on the density.
     state = lax.cond(interval.whole, lambda: state, lambda: _formed(state))
     zero = jnp.zeros(())
-    health = _Health(resolution.aliasing(state.field.values), zero, zero, zero, zero)
+    health = _Health(resolution_of(state.field.values).aliasing, zero, zero, zero, zero)
     coefficients, directions = system.numbers(theta)
     rates = observation.inputs[1:]
 
@@ -209,10 +210,11 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
         ranging, exponent, density = _reach(field.values, logs)
         state = _driven(state, generator, density, shift, tau)
         far = jnp.max(jnp.abs(shift) / (field.cell * np.array(field.values.shape))) > _SHIFT
+        resolved = resolution_of(density)
         health = _Health(
-            jnp.maximum(health.aliasing, jnp.maximum(noise, resolution.aliasing(density))),
+            jnp.maximum(health.aliasing, jnp.maximum(noise, resolved.aliasing)),
             jnp.maximum(health.exponent, exponent),
-            jnp.maximum(health.edge, resolution.edge_mass(density)),
+            jnp.maximum(health.edge, resolved.edge_mass),
             jnp.maximum(health.surprise, jnp.max(jnp.abs(state.driven))),
             health.parts + 1,
         )
@@ -309,7 +311,7 @@ def _read(state: State, observation: Factors, health: _Health) -> tuple[State, _
     mean = lax.stop_gradient(spectral.moments(state.field)[1])
     driven = state.driven + (mean - before) / jnp.sqrt(jnp.diagonal(cov))
     health = health._replace(
-        aliasing=jnp.maximum(health.aliasing, resolution.aliasing(density)),
+        aliasing=jnp.maximum(health.aliasing, resolution_of(density).aliasing),
         exponent=jnp.maximum(health.exponent, exponent),
         surprise=jnp.maximum(health.surprise, jnp.max(jnp.abs(driven))),
     )

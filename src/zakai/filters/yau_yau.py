@@ -34,8 +34,10 @@ from zakai.filters._formulas import Formulas, formulas
 from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters._window import Plan, Room, Shape
 from zakai.filters.observations import Data, Whole, WholeRule, whole_rule
-from zakai.kolmogorov import characteristics, comoving, finite_volume, resolution
+from zakai.kolmogorov import characteristics, comoving, finite_volume
 from zakai.kolmogorov.comoving import Field
+from zakai.kolmogorov.reductions import highest, summed
+from zakai.kolmogorov.resolution import resolution_of
 from zakai.models.compile import jax_field, jax_function
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
@@ -300,7 +302,7 @@ class _Worst(NamedTuple):
 def _weighted(values: jax.Array, most: Any, logs: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The values, of which `most` is the largest, times exp(logs - top), and top."""
     still = jax.lax.stop_gradient
-    top = still(jnp.max(jnp.where(values > comoving.LOST * most, logs, -jnp.inf)))
+    top = still(highest(jnp.where(values > comoving.LOST * most, logs, -jnp.inf)))
     # Where nothing of the density is left a factor may be as large as it likes.
     return values * jnp.exp(logs - top - still(jnp.maximum(logs - top, 0.0))), top
 
@@ -308,11 +310,11 @@ def _weighted(values: jax.Array, most: Any, logs: jax.Array) -> tuple[jax.Array,
 def _multiplied(values: jax.Array, logs: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The values times exp(logs), summing to one; the logarithm of what they summed to; and that of the factor by which what
     stood in the tails has grown, relative to the maximum."""
-    most = jnp.max(values)
+    most = highest(values)
     after, top = _weighted(values, most, logs)
-    grown = jax.lax.stop_gradient(jnp.log(most / jnp.max(after)))
-    total = jnp.sum(after)
-    return after / total, jnp.log(total) + top, grown
+    grown = jax.lax.stop_gradient(jnp.log(most / highest(after)))
+    mass = summed(after)
+    return after / mass, jnp.log(mass) + top, grown
 
 
 def step(interval: Interval, state: State, observation: Whole) -> tuple[State, Info]:
@@ -364,8 +366,8 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
         lost = noise * jnp.exp(jnp.minimum(grown, 99.0))
         # The error of the characteristics is that of a logarithm, where the reading is going to put the mass.
         steep = 1.0 if plan.operator == "characteristics" else (1 + grown) ** 2.5
-        aliasing = jnp.maximum(resolution.aliasing(values), cells)
-        return _Worst(aliasing, resolution.edge_mass(values), error * steep, lost, zero)
+        aliasing, edge_mass = resolution_of(values)
+        return _Worst(jnp.maximum(aliasing, cells), edge_mass, error * steep, lost, zero)
 
     def factor(field: Field, observed: Any, time: Any, share: Any, undone: Any) -> jax.Array:
         if not system.continuous:
@@ -395,7 +397,7 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
             # Only here: to cut tails in every part would make kinks, and these more noise.
             values = field.values
             if plan.operator != "characteristics":
-                values = jnp.where(values > noise * jnp.max(values), values, 0.0)
+                values = jnp.where(values > noise * highest(values), values, 0.0)
             j = jnp.asarray(j, int)
             last = factor(field, observed, time + between, jnp.asarray(shares)[j + 1], jnp.asarray(undone)[j + 1])
             if plan.splits == 1:

@@ -24,6 +24,7 @@ import numpy as np
 from jax import lax
 
 from zakai import _float64  # noqa: F401
+from zakai.kolmogorov.reductions import highest, lowest, summed
 from zakai.kolmogorov.resolution import along
 
 LOST = 1e-14  # of the maximum: what rounding leaves
@@ -87,12 +88,14 @@ def _hartley(size: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def _circle(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The frequencies k >= 0 (size / 2 + 1,), cos(k i), sin(k i), and the transpose of both times the share of k and -k."""
+def _circle(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The frequencies k >= 0 (size / 2 + 1,); cos(k i) and sin(k i) beside each other, times the share of k and -k; and
+    (i - j) mod size."""
+    i = np.arange(size)
     k = 2 * np.pi * np.arange(size // 2 + 1) / size
-    cos, sin = np.cos(np.outer(np.arange(size), k)), np.sin(np.outer(np.arange(size), k))
     often = np.where((k == 0) | (np.arange(len(k)) == size // 2), 1.0, 2.0) / size
-    return k, cos, sin, np.concatenate([cos * often, sin * often], axis=1).T
+    waves = np.concatenate([np.cos(np.outer(i, k)) * often, np.sin(np.outer(i, k)) * often], axis=1)
+    return k, waves, (i[:, None] - i) % size
 
 
 def slope(values: jax.Array, axis: int) -> jax.Array:
@@ -100,19 +103,18 @@ def slope(values: jax.Array, axis: int) -> jax.Array:
     return along(jnp.asarray(derivative(values.shape[axis])), values, axis)
 
 
-class Transport(NamedTuple):
-    """exp(variance d^2/2 - shift d) along every axis: `variances` (n,) and `shifts` (n,), in cells."""
+class Transport:
+    """exp(variance d^2/2 - shift d) along every axis of a lattice: `variances` (n,) and `shifts` (n,), in cells."""
 
-    variances: Any
-    shifts: Any
+    def __init__(self, variances: Any, shifts: Any, sizes: Sequence[int]):
+        self.variances, self.shifts = variances, shifts
+        self.matrices = [self._matrix(d, size) for d, size in enumerate(sizes)] if len(sizes) > 1 else []
 
     def __call__(self, arrays: Sequence[jax.Array]) -> list[jax.Array]:
         """Several arrays, diffused and translated."""
-        sizes = arrays[0].shape
-        if len(sizes) == 1:
+        if not self.matrices:
             return [self._line(values) for values in arrays]
-        for d, size in enumerate(sizes):
-            matrix = self._matrix(d, size)
+        for d, matrix in enumerate(self.matrices):
             arrays = [along(matrix, values, d) for values in arrays]
         return list(arrays)
 
@@ -130,11 +132,11 @@ class Transport(NamedTuple):
         return jnp.matmul(hartley, decay * (cos * spectrum + sin * mirrored))
 
     def _matrix(self, d: int, size: int) -> jax.Array:
-        # The sum over k of decay cos(k (i - j - shift)), as one product.
-        k, cosines, sines, table = _circle(size)
+        # The sum over k of decay cos(k (i - j - shift)): an entry for every distance on the circle.
+        k, waves, distance = _circle(size)
         decay, cos, sin = self._decay(d, k)
-        cos, sin = decay * cos, decay * sin
-        return jnp.concatenate([cosines * cos + sines * sin, sines * cos - cosines * sin], axis=1) @ table
+        line = jnp.matmul(waves, jnp.concatenate([decay * cos, decay * sin]))
+        return line.at[distance].get(mode="promise_in_bounds")
 
 
 class Moments(NamedTuple):
@@ -203,15 +205,15 @@ def moved(
     """
     values, sizes, n = field.values, field.values.shape, field.values.ndim
     still = lax.stop_gradient  # the lattice is a choice: of its motion nothing is differentiated
-    weights = values / jnp.sum(values)
+    weights = values / summed(values)
     start = drift(field.points(), time)
     total, mean, cov = still(moments(values))
-    velocity = still(jnp.stack([jnp.sum(weights * f) for f in start]))
+    velocity = still(jnp.stack([summed(weights * f) for f in start]))
     back_to = inverse(field.basis)
     motion = jnp.zeros((n, n))
     if follow:
         apart = [z - mean[d] for d, z in enumerate(_views(sizes))]
-        slopes = still(jnp.stack([jnp.stack([jnp.sum(weights * f * z) for z in apart]) for f in start]))
+        slopes = still(jnp.stack([jnp.stack([summed(weights * f * z) for z in apart]) for f in start]))
         spread = back_to @ covariance(time) @ back_to.T
         motion = still((back_to @ slopes + 0.5 * spread) @ inverse(cov))
 
@@ -232,7 +234,7 @@ def moved(
     halves = [tau / 12 * jnp.diagonal(a + 4 * b + c) for a, b, c in (spreads[:3], spreads[2:])]
     taken = combined(motion, sizes)
     # Where rounding leaves nothing of the density there is nothing to move but noise, and the drift may be anything.
-    floor = (3 * noise(values) * still(jnp.max(values))) ** 2
+    floor = (3 * noise(values) * still(highest(values))) ** 2
 
     def residual(share: float) -> list[Any]:
         centre, basis, back = frame(share)
@@ -253,13 +255,13 @@ def moved(
     k1 = slope(residual(0.0), spreads[0], values)
     end_centre, end_basis, _ = frame(1.0)
     if order == 2:
-        a, b = Transport(halves[0] + halves[1], -mean)([values, k1])
+        a, b = Transport(halves[0] + halves[1], -mean, sizes)([values, k1])
         k2 = slope(residual(1.0), spreads[4], a + tau * b)
         # k2 - b is of second order in tau; what Heun's formula leaves is of third.
-        second = tau * jnp.sum(jnp.abs(k2 - b)) / total
+        second = tau * summed(jnp.abs(k2 - b)) / total
         return Field(a + 0.5 * tau * (b + k2), end_centre, end_basis), still(second**1.5 / 12)
     middle = residual(0.5)
-    first, second_half = (Transport(variances, -0.5 * mean) for variances in halves)
+    first, second_half = (Transport(variances, -0.5 * mean, sizes) for variances in halves)
     a, b = first([values, k1])
     k2 = slope(middle, spreads[2], a + 0.5 * tau * b)
     k3 = slope(middle, spreads[2], a + 0.5 * tau * k2)
@@ -268,7 +270,7 @@ def moved(
     (after,) = second_half([a + tau / 6 * b + tau / 3 * (k2 + k3)])
     after = after + tau / 6 * k4
     # k3 - k2 is of third order in tau; what the formula leaves is of fifth.
-    third = 4 * tau * jnp.sum(jnp.abs(k3 - k2)) / total
+    third = 4 * tau * summed(jnp.abs(k3 - k2)) / total
     error = still(third ** (5 / 3) / 120)
     return Field(after, end_centre, end_basis), error
 
@@ -335,4 +337,4 @@ def _shifted(values: jax.Array, axis: int, shift: jax.Array) -> jax.Array:
 
 def noise(values: jax.Array) -> jax.Array:
     """What is not known of the values, as a share of their maximum: what is negative is noise, as is what rounding leaves."""
-    return lax.stop_gradient(jnp.maximum(LOST, -jnp.min(values) / jnp.max(values)))
+    return lax.stop_gradient(jnp.maximum(LOST, -lowest(values) / highest(values)))
