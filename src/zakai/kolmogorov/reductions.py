@@ -19,22 +19,25 @@ def summed(values: jax.Array) -> jax.Array:
     """The sum of all values."""
     while values.ndim > 1:
         values = jnp.tensordot(np.ones(len(values)), values, 1)
-    return _folded(jnp.add, values)
+    return jnp.sum(values)
 
 
 def highest(values: jax.Array) -> jax.Array:
     """The largest of all values."""
-    return _folded(jnp.maximum, values)
+    return jnp.max(_folded(jnp.maximum, values))
 
 
 def lowest(values: jax.Array) -> jax.Array:
     """The smallest of all values."""
-    return _folded(jnp.minimum, values)
+    return jnp.min(_folded(jnp.minimum, values))
 
 
 def _folded(of_two: Callable[[jax.Array, jax.Array], jax.Array], values: jax.Array) -> jax.Array:
-    """The first half of an axis with the second, until nothing is left of it, and so on with the next axis."""
-    while values.ndim:
+    """The first half of an axis with the second, until nothing is left of it, and so on up to the last axis.
+
+    Of that every half would be a program of its own, with all that made the values in it, and compilation take minutes.
+    """
+    while values.ndim > 1:
         while (size := len(values)) > 1:
             half = size // 2
             both = of_two(values[:half], values[half : 2 * half])
