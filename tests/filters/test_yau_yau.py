@@ -9,6 +9,7 @@ from scipy.linalg import expm
 
 import zakai
 from references.kolmogorov import Box, propagate
+from zakai.filters import _run
 
 STANDARD = {"kind": "gaussian", "mean": [0.5], "cov": [1.0]}
 
@@ -250,3 +251,30 @@ def test_a_reading_after_a_long_gap_that_contradicts_what_was_expected():
         p /= p.sum()
     assert abs(p @ x - result.mean[-1, 0]) < 1e-3 and abs(p @ x**2 - (p @ x) ** 2 - result.variance[-1, 0]) < 1e-3
     assert not result.warnings
+
+
+@pytest.mark.slow
+def test_a_double_well_begun_far_out_is_soon_taken_in_few_parts(monkeypatch):
+    """Where the prior reaches to where the drift is steep, the first intervals need many parts; what comes after does not."""
+    model = zakai.Model(
+        state=["x"],
+        drift=["x - x**3"],
+        diffusion=[["0.7"]],
+        observation=["x"],
+        prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
+    )
+    _, record = zakai.simulate(model, 0.01 * np.arange(1, 601), seed=0)
+    transitions, scan = [], _run.scan
+
+    def counted(step, healthy, state, intervals, observations, keep, limit):
+        told = scan(step, healthy, state, intervals, observations, keep, limit)
+        transitions.append(int(told[2]) * float(state.room.splits) * float(state.room.parts))
+        return told
+
+    monkeypatch.setattr(_run, "scan", counted)
+    result = zakai.filter(model, record, "yau-yau", keep="moments")
+    assert sum(transitions) < 10 * 600 and not result.warnings
+    begun = zakai.Record(record.times[:100], record.values[:100], record.kind)
+    near = zakai.filter(model, begun, "yau-yau", keep="moments", tolerance=1e-6)
+    apart = (near.mean[1:, 0] - result.mean[1:101, 0]) / np.sqrt(near.variance[1:, 0])
+    assert np.abs(apart).max() < 1e-3

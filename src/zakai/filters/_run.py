@@ -273,13 +273,13 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
     for tries in range(TRIES + 2):
         if length != (length := _length(method, begin, count, run, ends)):
             intervals, given = rows_of(prepared.intervals, part, length), rows_of(observations, part, length)
-        bare = getattr(begin, "bare", begin)
-        end, told, taken = scan(method.step, method.healthy, bare, intervals, given, keep, (count, strict))
+        bare, most = getattr(begin, "bare", begin), min(count, getattr(begin, "worth_while", count))
+        end, told, taken = scan(method.step, method.healthy, bare, intervals, given, keep, (most, strict))
         end, taken = _as_planned(end, begin), int(taken)
         # The more was tried in vain, the less is enough.
-        if not strict or (method.healthy is not None and taken >= max(1.0, enough * count / 2**tries)):
+        if not strict or (method.healthy is not None and taken >= max(1.0, enough * most / 2**tries)):
             break
-        info = first_of(told[0], min(taken + 1, count))
+        info = first_of(told[0], min(taken + 1, most))
         tried = state.tried(begin) if hasattr(state, "tried") else begin
         again = adapt(prepared, tried, part, info) if adapt and tries < TRIES else None
         if again is None and (method.healthy is None or getattr(adapt, "ill", False) or taken > 0):

@@ -354,7 +354,9 @@ def more(plan: Plan, info: Any) -> Plan | None:
         return replace(plan, splits=min(splits, MOST_SPLITS), parts=1)
     if finer == 1 and edge < plan.edge:
         return None
-    plan = replace(plan, finer=plan.finer * min(1.1 * finer, 3.0), wider=plan.wider * (1.0 if edge < plan.edge else 1.35))
+    # What cells do not resolve is everywhere, at the edges too; and further out a drift may be steep.
+    narrow = edge >= plan.edge and (finer == 1 or edge > alias)
+    plan = replace(plan, finer=plan.finer * min(1.1 * finer, 3.0), wider=plan.wider * (1.35 if narrow else 1.0))
     room = 2.0 if plan.operator == "characteristics" else 4.0 if plan.follow or plan.tabled else 1.0
     room = 8.0 if plan.operator == "finite-volume" else room
     if plan.finer * plan.wider < WORST[n] * room:

@@ -111,6 +111,11 @@ class State:
         return int(np.max(self.room.run))
 
     @property
+    def worth_while(self) -> int:
+        """After how many of them to look again anyway: the more parts an interval has, the sooner they may be too many."""
+        return max(window.SHORTEST, int(self.run_length / (np.max(self.room.splits) * np.max(self.room.parts))))
+
+    @property
     def some(self) -> Callable[..., Any] | None:
         """What takes several steps at once, where they can be."""
         return _tabled_steps if self.shape.tabled else None
