@@ -33,10 +33,8 @@ def lowest(values: jax.Array) -> jax.Array:
 
 
 def _folded(of_two: Callable[[jax.Array, jax.Array], jax.Array], values: jax.Array) -> jax.Array:
-    """The first half of an axis with the second, until nothing is left of it, and so on up to the last axis.
-
-    Of that every half would be a program of its own, with all that made the values in it, and compilation take minutes.
-    """
+    """The first half of an axis with the second, until nothing is left of it, and so on up to the last axis, which is XLA's:
+    there is nothing beside it by which the halves of a long one could be vectorised."""
     while values.ndim > 1:
         while (size := len(values)) > 1:
             half = size // 2
