@@ -7,6 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from zakai.filters import _splitting as splitting
+from zakai.kolmogorov.differences import differences
 
 SIZE, CELL, G = 96, 0.125, 0.8
 X = CELL * (np.arange(SIZE) - SIZE // 2)
@@ -92,12 +93,12 @@ def test_differences_are_of_sixth_order_and_the_same_along_each_axis():
     x = np.linspace(-2.0, 2.0, 41)
     cell = x[1] - x[0]
     values = x**6 - 3 * x**2 + x
-    slope = splitting.differences(values, 0) / cell
+    slope = differences(values, 0) / cell
     assert np.allclose(slope[3:-3], (6 * x**5 - 6 * x + 1)[3:-3], rtol=0, atol=1e-11)
-    assert np.allclose(splitting.differences(x, 0), cell, rtol=1e-12)
+    assert np.allclose(differences(x, 0), cell, rtol=1e-12)
     plane = np.sin(x)[:, None] * values
     for one, other in zip(splitting.slopes(plane), (plane, plane.T), strict=True):
-        assert np.allclose(one, splitting.differences(other, 0) if other is plane else splitting.differences(other, 0).T, atol=0)
+        assert np.allclose(one, differences(other, 0) if other is plane else differences(other, 0).T, atol=0)
 
 
 def test_every_second_point_tells_the_same_errors():

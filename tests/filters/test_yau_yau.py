@@ -158,13 +158,21 @@ def test_a_reading_far_beyond_the_prior_is_not_passed_over_in_silence():
     assert result.warnings
 
 
-@pytest.mark.longest
 @pytest.mark.slow
-def test_finite_volumes_keep_their_tolerance_and_take_noise_across_their_axes():
-    model, record = linear("samples", 0.1, 1.0, 5)
-    result = zakai.filter(model, record, "yau-yau", operator="finite-volume", tolerance=1e-2)
+@pytest.mark.parametrize(
+    ("kind", "count", "tolerance"),
+    [("samples", 5, 1e-2), ("increments", 20, 1e-3), pytest.param("samples", 5, 1e-3, marks=pytest.mark.longest)],
+)
+def test_finite_volumes_keep_their_tolerance_and_estimate_their_error(kind, count, tolerance):
+    model, record = linear(kind, 0.1, 1.0, count)
+    result = zakai.filter(model, record, "yau-yau", operator="finite-volume", tolerance=tolerance)
     assert not result.warnings
-    assert distance(result, zakai.filter(model, record, "kalman-bucy")) < 1e-2
+    error = distance(result, zakai.filter(model, record, "kalman-bucy"))
+    assert error < tolerance and error < 10 * np.nanmax(result.health["error_estimate"])
+
+
+@pytest.mark.slow
+def test_finite_volumes_take_noise_across_their_axes():
     two = zakai.Model(
         state=["a", "b"], drift=["b", "-a"], process_noise=[["0.5", "0.2"], ["0.2", "1"]], observation=["a"],
         observation_kind="samples", observation_noise=[["0.3"]], prior={"kind": "gaussian", "mean": [0.5, 0], "cov": [0.3, 0.3]},

@@ -30,7 +30,7 @@ import numpy as np
 
 from zakai import _float64  # noqa: F401
 from zakai.kolmogorov import comoving
-from zakai.kolmogorov.numpy_or_jax import numpy_or_jax
+from zakai.kolmogorov.differences import differences
 
 
 class Scheme(NamedTuple):
@@ -49,37 +49,18 @@ class Scheme(NamedTuple):
 
 STRANG = Scheme((1 / 2, 1 / 2), (1 / 48, 1 / 48), 2)
 CHIN = Scheme((1 / 6, 2 / 3, 1 / 6), (0.0, -1 / 72, 0.0), 4)
-SECOND_ORDER = (1 / 2,)
-SIXTH_ORDER = (45 / 60, -9 / 60, 1 / 60)
 ALIKE = 0.1  # how much the errors of different intervals have in common: between those of noise, 0, and those of one sign, 1
 THIN = 32  # points of an axis from which every second one will do
 LONGEST = 1e4  # intervals after which every error is taken for forgotten
 
 
 def slopes(values: jax.Array) -> list[jax.Array]:
-    """The slope of an array along each of its axes, a cell the unit; see `differences`."""
+    """The slope of an array along each of its axes, a cell the unit; that of the outermost layers, which is less exact, is not
+    undone with what a splitting leaves."""
     if values.ndim > 1:
         return [differences(values, d) for d in range(values.ndim)]
     # A product is compiled faster than what has several parts.
     return [jnp.asarray(_central(len(values))) @ values]
-
-
-def differences(values: Any, axis: int) -> Any:
-    """The slope of an array of NumPy or JAX along an axis by central differences, of sixth order but for the three layers on each
-    side, where a lattice has nothing of its density: their error is not undone with what a splitting leaves."""
-    xp, size = numpy_or_jax(values), values.shape[axis]
-
-    def part(begin: int, end: int) -> Any:
-        return values[(slice(None),) * axis + (slice(begin, end),)]
-
-    def central(begin: int, end: int, weights: Sequence[float]) -> Any:
-        apart = (w * (part(begin + k, end + k) - part(begin - k, end - k)) for k, w in enumerate(weights, 1))
-        return sum(apart, start=0.0)
-
-    inner = central(3, size - 3, SIXTH_ORDER)
-    near, far = central(1, 3, SECOND_ORDER), central(size - 3, size - 1, SECOND_ORDER)
-    ends = part(1, 2) - part(0, 1), part(size - 1, size) - part(size - 2, size - 1)
-    return xp.concatenate([ends[0], near, inner, far, ends[1]], axis=axis)
 
 
 def bends(values: jax.Array) -> tuple[list[jax.Array], list[list[jax.Array]]]:

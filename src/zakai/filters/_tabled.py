@@ -23,6 +23,7 @@ from zakai.filters import _window as window
 from zakai.filters._window import Extent, Plan
 from zakai.filters.observations import Whole
 from zakai.kolmogorov.comoving import LOST, Field, axes_of
+from zakai.kolmogorov.differences import differences
 from zakai.kolmogorov.transition import transition
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
@@ -91,7 +92,7 @@ class Tables:
         G = float(self.covariance(np.zeros(1), 0.0, theta)[0, 0]) / cell**2
 
         def slope(values: np.ndarray) -> np.ndarray:
-            return np.asarray(splitting.differences(values, values.ndim - 1))
+            return np.asarray(differences(values, values.ndim - 1))
 
         def backward(values: np.ndarray) -> np.ndarray:
             return f * slope(values) + 0.5 * G * slope(slope(values))

@@ -358,7 +358,11 @@ def more(plan: Plan, info: Any) -> Plan | None:
     narrow = edge >= plan.edge and (finer == 1 or edge > alias)
     plan = replace(plan, finer=plan.finer * min(1.1 * finer, 3.0), wider=plan.wider * (1.35 if narrow else 1.0))
     room = 2.0 if plan.operator == "characteristics" else 4.0 if plan.follow or plan.tabled else 1.0
-    room = 8.0 if plan.operator == "finite-volume" else room
+    if plan.operator == "finite-volume":
+        # The cells must be small for a single step already: a shorter run is no way out.
+        room = 64.0
+        if not narrow and min(plan.sizes) == MOST[n]:
+            return None
     if plan.finer * plan.wider < WORST[n] * room:
         return plan
     shorter = plan.run // 4

@@ -98,11 +98,6 @@ def _circle(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return k, waves, (i[:, None] - i) % size
 
 
-def slope(values: jax.Array, axis: int) -> jax.Array:
-    """The derivative of the trigonometric interpolant along an axis, in cells."""
-    return along(jnp.asarray(derivative(values.shape[axis])), values, axis)
-
-
 class Transport:
     """exp(variance d^2/2 - shift d) along every axis of a lattice: `variances` (n,) and `shifts` (n,), in cells."""
 

@@ -11,6 +11,9 @@ import numpy as np
 
 from zakai import _float64  # noqa: F401
 
+LAYERS = 2  # cells on each side that are the outermost layers, and
+OUTERMOST = 1 / 48  # the share of an axis that they are at least: what a few of many cells hold says little of what lies beyond
+
 
 def along(matrix: Any, values: jax.Array, axis: int) -> jax.Array:
     """A matrix applied to one axis of an array."""
@@ -21,7 +24,7 @@ def along(matrix: Any, values: jax.Array, axis: int) -> jax.Array:
 
 class Resolution(NamedTuple):
     """The `aliasing`, how much of the density is at the highest frequency of an axis, relative to its mass: of a resolved one
-    nothing; and the share of the mass in the two outermost layers, the `edge_mass`."""
+    nothing; and the share of the mass in the outermost layers, the `edge_mass`."""
 
     aliasing: jax.Array
     edge_mass: jax.Array
@@ -42,6 +45,6 @@ def resolution_of(values: jax.Array) -> Resolution:
 
 @lru_cache(maxsize=64)
 def _rows(size: int) -> np.ndarray:
-    """Whose products with a line are its sum, what is at the highest frequency, and its two outermost values on each side."""
-    index = np.arange(size)
-    return np.stack([np.ones(size), 1.0 - 2.0 * (index % 2), np.minimum(index, index[::-1]) < 2])
+    """Whose products with a line are its sum, what is at the highest frequency, and its outermost values on each side."""
+    index, outer = np.arange(size), max(LAYERS, int(size * OUTERMOST))
+    return np.stack([np.ones(size), 1.0 - 2.0 * (index % 2), np.minimum(index, index[::-1]) < outer])
