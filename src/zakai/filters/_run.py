@@ -90,7 +90,7 @@ class Scan:
 
     @cached_property
     def _whole(self) -> Callable[..., Any]:
-        return jax.jit(self.function, static_argnums=(0, 1, 5))
+        return jax.jit(self.function, static_argnums=(0, 1, 5), compiler_options={"xla_cpu_prefer_vector_width": 512})
 
     @cached_property
     def _part_by_part(self) -> Callable[..., Any]:

@@ -366,9 +366,9 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
             field, error = comoving.moved(field, drift, covariance, time, tau, plan.order, plan.follow, plan.cross)
         return field, spent + error, cells
 
-    def looked_at(values: jax.Array, noise: Any, error: Any, grown: Any, cells: Any = 0.0) -> _Worst:
+    def looked_at(values: jax.Array, noise: Any, error: Any, grown: Any, cells: Any = 0.0, tails: Any = 0.0) -> _Worst:
         # Noise is the same everywhere; what a formula of order four leaves is a polynomial of degree five times the density.
-        lost = noise * jnp.exp(jnp.minimum(grown, 99.0))
+        lost = jnp.maximum(noise * jnp.exp(jnp.minimum(grown, 99.0)), tails)
         # The error of the characteristics is that of a logarithm, where the reading is going to put the mass.
         steep = 1.0 if plan.operator == "characteristics" else (1 + grown) ** 2.5
         aliasing, edge_mass = resolution_of(values)
@@ -400,16 +400,18 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
             observed = system.observe(field.points(), time + between, theta)
             noise = comoving.noise(field.values)
             # Only here: to cut tails in every part would make kinks, and these more noise.
-            values = field.values
+            values, tails = field.values, zero
             if plan.operator != "characteristics":
                 values = jnp.where(values > noise * highest(values), values, 0.0)
+                # The squared deviations, each a share of those of a Gaussian where its density is that of the noise.
+                tails = jnp.abs(1.0 - summed(values) / summed(field.values)) * jnp.log(1.0 / noise) * 2 / system.n
             j = jnp.asarray(j, int)
             last = factor(field, observed, time + between, jnp.asarray(shares)[j + 1], jnp.asarray(undone)[j + 1])
             if plan.splits == 1:
                 at_end = _log_factor(observed, observation, 1.0 - observation.inside)
                 last = last + jnp.where(j == len(shares) - 2, 1.0, 0.0) * at_end
             values, more, grown = _multiplied(values, last)
-            look = looked_at(values, noise, now, grown, cells)
+            look = looked_at(values, noise, now, grown, cells, tails)
             made = jnp.maximum(made, look.aliasing + look.lost + OUTSIDE * look.edge)
             return field._replace(values=values), observed, log_mass + more, now, made, worst.over(look)
 
@@ -671,7 +673,8 @@ METHOD = Method(
         "missed": (
             1.0,
             "by what factor the tolerance was missed: aliasing (a tenth of it is allowed), edge_mass (a hundredth), time_error "
-            "(a tenth), lost, the share of the maximum below which tails were lost when an observation came to need them, or "
+            "(a tenth), lost, the share of the maximum below which tails were lost when an observation came to need them or of "
+            "the variance that went with them, or "
             "splitting, what the splitting of increments from the transition comes to in the long run",
         ),
     },
