@@ -97,3 +97,22 @@ def test_mass_stays_whatever_the_drift():
     field = gaussian(np.array([0.3]), np.array([[0.5]]), 64, np.array([[0.2]]))
     end, _ = comoving.moved(field, lambda x, t: (jnp.sin(3 * x[..., 0]) - t,), lambda t: jnp.array([[1.0]]), 0.5, 0.01)
     assert np.isclose(jnp.sum(end.values), jnp.sum(field.values), rtol=1e-13)
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_a_lattice_that_is_aligned_with_the_coordinates_gives_the_same(order):
+    def drift(x, t):
+        return [jnp.cos(x[..., 1]) - x[..., 0], jnp.sin(x[..., 0]) * (1.0 + t) + 0.0 * x[..., 1]]
+
+    def noise(t):
+        return jnp.diag(jnp.array([1.0 + t, 0.5]))
+
+    index = np.stack(np.meshgrid(np.arange(24.0) - 12, np.arange(36.0) - 18, indexing="ij"))
+    values = jnp.exp(-(index[0] ** 2 / 14 + (index[1] - 2) ** 2 / 40))
+    field = Field(values, jnp.array([0.3, -1.0]), jnp.diag(jnp.array([0.2, 0.1])))
+    results = [comoving.moved(field, drift, noise, 0.5, 0.02, order, aligned=own) for own in (False, True)]
+    (turned, error), (aligned, same) = results
+    np.testing.assert_allclose(aligned.values, turned.values, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(aligned.centre, turned.centre, rtol=1e-14)
+    assert float(same) == pytest.approx(float(error), rel=1e-6)
+    assert np.asarray(field.points()[1::2, ::3]).shape == field.points(aligned=True)[1::2, ::3].shape == (12, 12, 2)

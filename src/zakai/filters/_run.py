@@ -24,7 +24,7 @@ from zakai.errors import InputError
 from zakai.filters._protocol import Info, Method, Schedule
 from zakai.filters.observations import Data, data_of, schedule_of
 from zakai.filters.results import FilterResult, versions
-from zakai.models.compile import jit_loop
+from zakai.models.compile import jit_large, jit_loop
 from zakai.models.model import Model
 from zakai.models.numeric import explain_nonfinite, numpy_function
 from zakai.records import Record
@@ -37,7 +37,7 @@ WHOLE = 16  # steps of a run that is taken together, of which some may be more t
 TRIES = 16
 KEPT_BYTES = 512 * 2**20
 SURELY = 3.0  # by how much a lattice of the first runs may be larger than those that follow
-SMALL = 1024  # numbers in the largest array of a state, up to which its parts are not worth a thread
+SMALL = 8192  # numbers in the largest array of a state, up to which its parts are not worth a thread
 
 _PREPARED: WeakKeyDictionary[Model, OrderedDict[Any, Any]] = WeakKeyDictionary()
 _LOCK = Lock()
@@ -90,7 +90,7 @@ class Scan:
 
     @cached_property
     def _whole(self) -> Callable[..., Any]:
-        return jax.jit(self.function, static_argnums=(0, 1, 5), compiler_options={"xla_cpu_prefer_vector_width": 512})
+        return jit_large(self.function, (0, 1, 5))
 
     @cached_property
     def _part_by_part(self) -> Callable[..., Any]:

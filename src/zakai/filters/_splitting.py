@@ -31,6 +31,7 @@ import numpy as np
 from zakai import _float64  # noqa: F401
 from zakai.kolmogorov import comoving
 from zakai.kolmogorov.differences import differences
+from zakai.kolmogorov.resolution import along
 
 
 class Scheme(NamedTuple):
@@ -57,20 +58,17 @@ LONGEST = 1e4  # intervals after which every error is taken for forgotten
 def slopes(values: jax.Array) -> list[jax.Array]:
     """The slope of an array along each of its axes, a cell the unit; that of the outermost layers, which is less exact, is not
     undone with what a splitting leaves."""
-    if values.ndim > 1:
-        return [differences(values, d) for d in range(values.ndim)]
-    # A product is compiled faster than what has several parts.
-    return [jnp.asarray(_central(len(values))) @ values]
+    # Products with a matrix: what has several parts, as differences have, takes longer, and longer to compile.
+    return [along(_central(size), values, d) for d, size in enumerate(values.shape)]
 
 
 def bends(values: jax.Array) -> tuple[list[jax.Array], list[list[jax.Array]]]:
     """The slopes and the second derivatives of an array."""
-    if values.ndim > 1:
-        slope = slopes(values)
-        return slope, [slopes(s) for s in slope]
-    # One product is compiled in half of the time that two take.
-    both = jnp.asarray(_central_twice(len(values))) @ values
-    return [both[: len(values)]], [[both[len(values) :]]]
+    n, sizes = values.ndim, values.shape
+    both = [jnp.split(along(_central_twice(size), values, d), 2, axis=d) for d, size in enumerate(sizes)]
+    slope = [first for first, _ in both]
+    mixed = {(d, e): along(_central(sizes[e]), slope[d], e) for e in range(n) for d in range(e)}
+    return slope, [[both[d][1] if d == e else mixed[min(d, e), max(d, e)] for e in range(n)] for d in range(n)]
 
 
 @lru_cache(maxsize=64)
@@ -215,21 +213,25 @@ def terms(
 def _functions(log: jax.Array, flow: Sequence[jax.Array], spread: jax.Array, scheme: Scheme) -> list[jax.Array]:
     """Those whose means `measured` takes, on a lattice."""
 
-    def generated(function: jax.Array) -> tuple[list[jax.Array], jax.Array, jax.Array]:
+    n = len(flow)
+
+    def total(parts: Any) -> jax.Array:
+        return sum(parts, start=jnp.zeros(()))
+
+    def generated(function: jax.Array) -> tuple[list[jax.Array], list[list[jax.Array]], jax.Array]:
         slope, second = bends(function)
-        bent = jnp.tensordot(spread, jnp.stack([jnp.stack(row) for row in second]), axes=1)
-        carried = sum((v * s for v, s in zip(flow, slope, strict=True)), start=jnp.zeros(()))
-        return slope, bent, carried + 0.5 * jnp.trace(bent)
+        bent = [[total(spread[i, k] * second[k][j] for k in range(n)) for j in range(n)] for i in range(n)]
+        return slope, bent, total(v * s for v, s in zip(flow, slope, strict=True)) + 0.5 * total(bent[i][i] for i in range(n))
 
     slope, bent, generator = generated(log)
     upward, _, twice = generated(generator)
     once = product(spread, upward, upward)
-    twice_bent = jnp.sum(bent * jnp.swapaxes(bent, 0, 1), axis=(0, 1))
+    twice_bent = total(bent[i][j] * bent[j][i] for i in range(n) for j in range(n))
     steep = product(spread, slope, slope)
     functions = [twice, twice**2, once, twice_bent, steep, steep**2]
     if scheme == CHIN:
-        along = jnp.tensordot(spread, jnp.stack(slope), axes=1)
-        third = sum((s * jnp.sum(row * along, axis=0) for s, row in zip(slope, bent, strict=True)), start=jnp.zeros(()))
+        ahead = [total(spread[j, k] * slope[k] for k in range(n)) for j in range(n)]
+        third = total(slope[i] * bent[i][j] * ahead[j] for i in range(n) for j in range(n))
         functions += [twice_bent**2, third, third**2]
     return functions
 

@@ -63,6 +63,7 @@ class Shape(NamedTuple):
     tabled: bool = False
     operator: str = "spectral"
     chin: bool = False
+    aligned: bool = False
 
     @property
     def scheme(self) -> Scheme:
@@ -138,6 +139,7 @@ class Plan:
     finer: float = 1.0
     splitting: float = np.inf
     fixed: bool = False
+    aligned: bool = False
 
     @classmethod
     def of(cls, shape: Shape, room: Room) -> Plan:
@@ -156,7 +158,8 @@ class Plan:
         if self.tabled:
             return Shape(self.sizes, splits, tabled=True, chin=self.chin)
         parts = self.parts if self.fixed or self.parts == 1 else 0
-        return Shape(self.sizes, splits, parts, self.order, self.follow, self.cross, False, self.operator, self.chin)
+        aligned = self.aligned and not self.follow
+        return Shape(self.sizes, splits, parts, self.order, self.follow, self.cross, False, self.operator, self.chin, aligned)
 
     @property
     def steps(self) -> int:
@@ -402,6 +405,8 @@ def timed(model: Model, plan: Plan, intervals: Any, rows: slice, fields: Field, 
         diagonal = np.einsum("rkii->rk", spread)
         couples = (spread.sum(axis=(2, 3)) - diagonal) > 1e-12 * diagonal
         plan = replace(plan, cross=plan.follow or bool(couples.any()))
+    if model.n > 1:
+        plan = replace(plan, aligned=plan.operator == "spectral" and not np.any(basis[:, ~np.eye(model.n, dtype=bool)]))
     tau = (intervals.stop[rows] - intervals.start[rows]).max() / plan.steps
     if plan.operator == "characteristics":
         rate = _turning(model, np.asarray(fields.centre), times)

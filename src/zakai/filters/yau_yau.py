@@ -363,7 +363,9 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
         if plan.operator == "finite-volume":
             field, error = finite_volume.moved(field, drift, covariance, time, tau, plan.order)
         else:
-            field, error = comoving.moved(field, drift, covariance, time, tau, plan.order, plan.follow, plan.cross)
+            field, error = comoving.moved(
+                field, drift, covariance, time, tau, plan.order, plan.follow, plan.cross, plan.aligned
+            )
         return field, spent + error, cells
 
     def looked_at(values: jax.Array, noise: Any, error: Any, grown: Any, cells: Any = 0.0, tails: Any = 0.0) -> _Worst:
@@ -397,7 +399,7 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
             field, _, log_mass, spent, made, worst = carry
             time = begin + j * between
             field, now, cells = tabled.repeated(partial(part, k, time), (field, spent, zero), plan.parts, parts)
-            observed = system.observe(field.points(), time + between, theta)
+            observed = system.observe(field.points(plan.aligned), time + between, theta)
             noise = comoving.noise(field.values)
             # Only here: to cut tails in every part would make kinks, and these more noise.
             values, tails = field.values, zero
@@ -420,7 +422,7 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
         field, observed, log_mass, spent, made, worst = tabled.repeated(multiplied, carry, count, count)
         thin, apart = splitting.thinned(plan.sizes)
         inverse, end = comoving.inverse(field.basis * apart), begin + length
-        flow = list(jnp.tensordot(inverse, jnp.stack(drift(field.points()[thin], end)), axes=1))
+        flow = list(jnp.tensordot(inverse, jnp.stack(drift(field.points(plan.aligned)[thin], end)), axes=1))
         log = logs([h[thin] for h in observed]) if system.continuous else None
         terms = splitting.terms(log, field.values[thin], flow, spread(inverse, end), scheme)
         left, apart, fewer = _split_error(plan, splits, terms, length)
@@ -430,7 +432,7 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
 
     field, observed = state.field, state.observed
     if observed is None:
-        observed = system.observe(field.points(), interval.start, theta)
+        observed = system.observe(field.points(plan.aligned), interval.start, theta)
     carry = field, observed, observation.constant, zero, state.error, state.coarser, _Worst(zero, zero, zero, zero, zero)
     field, observed, log_mass, spent, error, coarser, worst = tabled.repeated(split, carry, plan.splits, splits)
     if plan.splits != 1:

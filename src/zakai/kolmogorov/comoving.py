@@ -41,9 +41,28 @@ class Field(NamedTuple):
     centre: Any
     basis: Any
 
-    def points(self) -> jax.Array:
-        """The points (*sizes, n)."""
-        return points_of(self.values.shape, self.centre, self.basis)
+    def points(self, aligned: bool = False) -> Any:
+        """The points (*sizes, n); `Points` of a lattice whose axes are `aligned` with the coordinates."""
+        return points_of(self.values.shape, self.centre, self.basis, aligned)
+
+
+class Points:
+    """The points of a lattice whose axes are aligned with the coordinates, an array for each: `points[..., i]` has length one
+    along all axes but its own, so that a function of one coordinate takes its time on a line and not on the whole lattice.
+
+    Of all else that an array (*sizes, n) can do there is its `shape`, and slices of the lattice.
+    """
+
+    def __init__(self, coordinates: Sequence[Any]):
+        self.coordinates = list(coordinates)
+        self.shape = (*(x.shape[d] for d, x in enumerate(coordinates)), len(coordinates))
+
+    def __getitem__(self, key: tuple[Any, ...]) -> Any:
+        if key[0] is Ellipsis:
+            return self.coordinates[key[1]]
+        n = len(self.coordinates)
+        own = [tuple(part if a == d else slice(None) for a, part in enumerate(key)) for d in range(n)]
+        return Points([x[of] for x, of in zip(self.coordinates, own, strict=True)])
 
 
 def axes_of(sizes: Sequence[int]) -> list[np.ndarray]:
@@ -58,12 +77,14 @@ def _view(axis: Any, d: int, n: int) -> Any:
 def combined(matrix: Any, sizes: Sequence[int]) -> list[Any]:
     """The n components of `matrix` z, arrays (*sizes)."""
     n = len(sizes)
-    views = [_view(axis, d, n) for d, axis in enumerate(axes_of(sizes))]
+    views = _views(sizes)
     return [sum(matrix[i, d] * views[d] for d in range(n)) for i in range(n)]
 
 
-def points_of(sizes: Sequence[int], centre: Any, basis: Any) -> jax.Array:
-    """centre + basis z (*sizes, n)."""
+def points_of(sizes: Sequence[int], centre: Any, basis: Any, aligned: bool = False) -> Any:
+    """centre + basis z (*sizes, n), or `Points` where the basis is diagonal."""
+    if aligned:
+        return Points([centre[d] + basis[d, d] * z for d, z in enumerate(_views(sizes))])
     return centre + jnp.stack(combined(basis, sizes), axis=-1)
 
 
@@ -192,16 +213,18 @@ def moved(
     order: int = 4,
     follow: bool = False,
     cross: bool = False,
+    aligned: bool = False,
 ) -> tuple[Field, jax.Array]:
     """The density after the time `tau`, on the lattice that moved with it; and an estimate of the relative error in time.
 
     `drift(x, t)` gives n arrays for x (*sizes, n), `covariance(t)` is G (n, n); `order` is 2 or 4.  With `follow` the basis moves
-    too.  With `cross` the covariance may couple axes of the lattice; without, it must not.
+    too.  With `cross` the covariance may couple axes of the lattice; without, it must not.  With `aligned` the basis is diagonal,
+    and `drift` is given `Points`; not with `follow`.
     """
     values, sizes, n = field.values, field.values.shape, field.values.ndim
     still = lax.stop_gradient  # the lattice is a choice: of its motion nothing is differentiated
     weights = values / summed(values)
-    start = drift(field.points(), time)
+    start = drift(field.points(aligned), time)
     total, mean, cov = still(moments(values))
     velocity = still(jnp.stack([summed(weights * f) for f in start]))
     back_to = inverse(field.basis)
@@ -233,9 +256,9 @@ def moved(
 
     def residual(share: float) -> list[Any]:
         centre, basis, back = frame(share)
-        f = start if share == 0 else drift(points_of(sizes, centre, basis), time + share * tau)
+        f = start if share == 0 else drift(points_of(sizes, centre, basis, aligned), time + share * tau)
         apart = [f[i] - velocity[i] for i in range(n)]
-        flows = [sum(back[d, i] * apart[i] for i in range(n)) for d in range(n)]
+        flows = [sum(back[d, i] * apart[i] for i in ([d] if aligned else range(n))) for d in range(n)]
         return [flow - part for flow, part in zip(flows, taken, strict=True)] if follow else flows
 
     def slope(flows: list[Any], spread: jax.Array, u: jax.Array) -> jax.Array:

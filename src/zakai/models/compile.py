@@ -26,12 +26,14 @@ JaxFunction = Callable[[Any, Any, Any], jax.Array]
 _JAX = operations(jnp, jax.scipy.special.erf, sin=_trigonometry.sin, cos=_trigonometry.cos)
 
 
+# Half of what a processor can do at once, unless it is asked for all.
+WIDE = (("xla_cpu_prefer_vector_width", 512),)
 # To hand a part of something small to another thread takes longer than the whole.
-PART_BY_PART = (("xla_cpu_scheduler_type", "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"), ("xla_cpu_prefer_vector_width", 512))
+PART_BY_PART = (*WIDE, ("xla_cpu_scheduler_type", "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"))
 ONE_THREAD = (*PART_BY_PART, ("xla_cpu_multi_thread_eigen", False))
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=3)
 def _known(options: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
     """These options of the CPU's compiler, or none where it is another's or they are those of another version."""
     if jax.default_backend() != "cpu":
@@ -51,6 +53,11 @@ def jit_small(function: Callable[..., Any], static_argnums: int | tuple[int, ...
 def jit_loop(function: Callable[..., Any], static_argnums: int | tuple[int, ...] = ()) -> Any:
     """`jax.jit` for loops over steps that take microseconds, in which products may yet be large."""
     return jax.jit(function, static_argnums=static_argnums, compiler_options=_known(PART_BY_PART))
+
+
+def jit_large(function: Callable[..., Any], static_argnums: int | tuple[int, ...] = ()) -> Any:
+    """`jax.jit` for loops over steps whose parts are worth a thread."""
+    return jax.jit(function, static_argnums=static_argnums, compiler_options=_known(WIDE))
 
 
 def one_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
