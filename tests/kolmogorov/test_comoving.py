@@ -116,3 +116,36 @@ def test_a_lattice_that_is_aligned_with_the_coordinates_gives_the_same(order):
     np.testing.assert_allclose(aligned.centre, turned.centre, rtol=1e-14)
     assert float(same) == pytest.approx(float(error), rel=1e-6)
     assert np.asarray(field.points()[1::2, ::3]).shape == field.points(aligned=True)[1::2, ::3].shape == (12, 12, 2)
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_along_an_axis_without_noise_the_lattice_goes_by_whole_cells(order):
+    flow, noise = np.array([[0.0, 1.0], [-1.0, -0.2]]), np.diag([0.0, 0.5])
+    mean, cov, until, steps = np.array([0.5, 3.0]), np.diag([0.3, 0.2]), 0.2, 16
+
+    def drift(x, t):
+        return [x[..., 1] + 0.0 * x[..., 0], -x[..., 0] - 0.2 * x[..., 1]]
+
+    # The mean is 3.4 cells and 1.6 from the centre.
+    cell = np.sqrt(np.diag(cov)) / 2.4
+    field = gaussian([0.0, 0.0], cov, 48, np.diag(cell))
+    start = field._replace(values=jnp.roll(field.values, (3, 2), (0, 1)), centre=jnp.asarray(mean - cell * [3, 2]))
+    fields = []
+    for quiet in ((), (0,)):
+        step = jax.jit(
+            lambda field, quiet=quiet: comoving.moved(
+                field, drift, lambda t: jnp.asarray(noise), 0.0, until / steps, order, aligned=True, quiet=quiet
+            )[0]
+        )
+        field = start
+        for _ in range(steps):
+            field = step(field)
+        fields.append(field)
+    both = expm(until * np.block([[flow, noise], [np.zeros((2, 2)), -flow.T]]))
+    there = both[:2, :2]
+    for field in fields:
+        found, near = moments(field), 1e-6 if order == 4 else 1e-3
+        np.testing.assert_allclose(found[0], there @ mean, rtol=0, atol=near)
+        np.testing.assert_allclose(found[1], there @ cov @ there.T + both[:2, 2:] @ there.T, rtol=0, atol=near)
+    # The mean is at most half of a cell from the centre before a step, and further by what the step makes of it.
+    assert abs(np.asarray(comoving.moments(fields[1].values).mean)[0]) < 0.6

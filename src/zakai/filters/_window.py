@@ -64,6 +64,7 @@ class Shape(NamedTuple):
     operator: str = "spectral"
     chin: bool = False
     aligned: bool = False
+    quiet: tuple[int, ...] = ()
 
     @property
     def scheme(self) -> Scheme:
@@ -140,6 +141,7 @@ class Plan:
     splitting: float = np.inf
     fixed: bool = False
     aligned: bool = False
+    quiet: tuple[int, ...] = ()
 
     @classmethod
     def of(cls, shape: Shape, room: Room) -> Plan:
@@ -158,8 +160,8 @@ class Plan:
         if self.tabled:
             return Shape(self.sizes, splits, tabled=True, chin=self.chin)
         parts = self.parts if self.fixed or self.parts == 1 else 0
-        aligned = self.aligned and not self.follow
-        return Shape(self.sizes, splits, parts, self.order, self.follow, self.cross, False, self.operator, self.chin, aligned)
+        shape = Shape(self.sizes, splits, parts, self.order, self.follow, self.cross, False, self.operator, self.chin)
+        return shape._replace(aligned=True, quiet=self.quiet) if self.aligned and not self.follow else shape
 
     @property
     def steps(self) -> int:
@@ -406,7 +408,9 @@ def timed(model: Model, plan: Plan, intervals: Any, rows: slice, fields: Field, 
         couples = (spread.sum(axis=(2, 3)) - diagonal) > 1e-12 * diagonal
         plan = replace(plan, cross=plan.follow or bool(couples.any()))
     if model.n > 1:
-        plan = replace(plan, aligned=plan.operator == "spectral" and not np.any(basis[:, ~np.eye(model.n, dtype=bool)]))
+        aligned = plan.operator == "spectral" and not np.any(basis[:, ~np.eye(model.n, dtype=bool)])
+        quiet = tuple(d for d in range(model.n) if aligned and model.covariance.row(d).is_zero_matrix)
+        plan = replace(plan, aligned=aligned, quiet=quiet)
     tau = (intervals.stop[rows] - intervals.start[rows]).max() / plan.steps
     if plan.operator == "characteristics":
         rate = _turning(model, np.asarray(fields.centre), times)

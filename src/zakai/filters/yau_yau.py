@@ -364,7 +364,7 @@ def step(interval: Interval, state: State, observation: Whole) -> tuple[State, I
             field, error = finite_volume.moved(field, drift, covariance, time, tau, plan.order)
         else:
             field, error = comoving.moved(
-                field, drift, covariance, time, tau, plan.order, plan.follow, plan.cross, plan.aligned
+                field, drift, covariance, time, tau, plan.order, plan.follow, plan.cross, plan.aligned, plan.quiet
             )
         return field, spent + error, cells
 

@@ -120,17 +120,19 @@ def _circle(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 class Transport:
-    """exp(variance d^2/2 - shift d) along every axis of a lattice: `variances` (n,) and `shifts` (n,), in cells."""
+    """exp(variance d^2/2 - shift d) along every axis of a lattice: `variances` (n,) and `shifts` (n,), in cells, zero along those
+    in `quiet`."""
 
-    def __init__(self, variances: Any, shifts: Any, sizes: Sequence[int]):
+    def __init__(self, variances: Any, shifts: Any, sizes: Sequence[int], quiet: Sequence[int] = ()):
         self.variances, self.shifts = variances, shifts
-        self.matrices = [self._matrix(d, size) for d, size in enumerate(sizes)] if len(sizes) > 1 else []
+        loud = [d for d in range(len(sizes)) if d not in quiet]
+        self.matrices = {d: self._matrix(d, sizes[d]) for d in loud} if len(sizes) > 1 else {}
 
     def __call__(self, arrays: Sequence[jax.Array]) -> list[jax.Array]:
         """Several arrays, diffused and translated."""
         if not self.matrices:
             return [self._line(values) for values in arrays]
-        for d, matrix in enumerate(self.matrices):
+        for d, matrix in self.matrices.items():
             arrays = [along(matrix, values, d) for values in arrays]
         return list(arrays)
 
@@ -214,18 +216,22 @@ def moved(
     follow: bool = False,
     cross: bool = False,
     aligned: bool = False,
+    quiet: Sequence[int] = (),
 ) -> tuple[Field, jax.Array]:
     """The density after the time `tau`, on the lattice that moved with it; and an estimate of the relative error in time.
 
     `drift(x, t)` gives n arrays for x (*sizes, n), `covariance(t)` is G (n, n); `order` is 2 or 4.  With `follow` the basis moves
     too.  With `cross` the covariance may couple axes of the lattice; without, it must not.  With `aligned` the basis is diagonal,
-    and `drift` is given `Points`; not with `follow`.
+    and `drift` is given `Points`; not with `follow`.  Along the axes in `quiet`, which no noise moves, the lattice goes with
+    the mean flow and by whole cells, since a translation by a part of one would be all that is left to do; only with `aligned`.
     """
     values, sizes, n = field.values, field.values.shape, field.values.ndim
     still = lax.stop_gradient  # the lattice is a choice: of its motion nothing is differentiated
     weights = values / summed(values)
     start = drift(field.points(aligned), time)
     total, mean, cov = still(moments(values))
+    by_cells = {d: jnp.round(mean[d]) for d in quiet}
+    mean = jnp.stack([jnp.zeros(()) if d in quiet else mean[d] for d in range(n)]) if quiet else mean
     velocity = still(jnp.stack([summed(weights * f) for f in start]))
     back_to = inverse(field.basis)
     motion = jnp.zeros((n, n))
@@ -272,14 +278,21 @@ def moved(
 
     k1 = slope(residual(0.0), spreads[0], values)
     end_centre, end_basis, _ = frame(1.0)
+
+    def at_end(u: jax.Array) -> Field:
+        centre = end_centre
+        for d, cells in by_cells.items():
+            u, centre = jnp.roll(u, -cells.astype(int), axis=d), centre + end_basis[:, d] * cells
+        return Field(u, centre, end_basis)
+
     if order == 2:
-        a, b = Transport(halves[0] + halves[1], -mean, sizes)([values, k1])
+        a, b = Transport(halves[0] + halves[1], -mean, sizes, quiet)([values, k1])
         k2 = slope(residual(1.0), spreads[4], a + tau * b)
         # k2 - b is of second order in tau; what Heun's formula leaves is of third.
         second = tau * summed(jnp.abs(k2 - b)) / total
-        return Field(a + 0.5 * tau * (b + k2), end_centre, end_basis), still(second**1.5 / 12)
+        return at_end(a + 0.5 * tau * (b + k2)), still(second**1.5 / 12)
     middle = residual(0.5)
-    first, second_half = (Transport(variances, -0.5 * mean, sizes) for variances in halves)
+    first, second_half = (Transport(variances, -0.5 * mean, sizes, quiet) for variances in halves)
     a, b = first([values, k1])
     k2 = slope(middle, spreads[2], a + 0.5 * tau * b)
     k3 = slope(middle, spreads[2], a + 0.5 * tau * k2)
@@ -290,7 +303,7 @@ def moved(
     # k3 - k2 is of third order in tau; what the formula leaves is of fifth.
     third = 4 * tau * summed(jnp.abs(k3 - k2)) / total
     error = still(third ** (5 / 3) / 120)
-    return Field(after, end_centre, end_basis), error
+    return at_end(after), error
 
 
 def _views(sizes: Sequence[int]) -> list[np.ndarray]:
