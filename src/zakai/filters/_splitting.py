@@ -212,7 +212,6 @@ def terms(
 
 def _functions(log: jax.Array, flow: Sequence[jax.Array], spread: jax.Array, scheme: Scheme) -> list[jax.Array]:
     """Those whose means `measured` takes, on a lattice."""
-
     n = len(flow)
 
     def total(parts: Any) -> jax.Array:

@@ -130,7 +130,7 @@ class Transport:
 
     def __call__(self, arrays: Sequence[jax.Array]) -> list[jax.Array]:
         """Several arrays, diffused and translated."""
-        if not self.matrices:
+        if arrays[0].ndim == 1:
             return [self._line(values) for values in arrays]
         for d, matrix in self.matrices.items():
             arrays = [along(matrix, values, d) for values in arrays]
