@@ -116,3 +116,18 @@ def test_every_second_point_tells_the_same_errors():
         part = splitting.terms(log[thin], values[thin], own, spread / np.outer(apart, apart), scheme)
         # The differences are those of cells twice as wide.
         assert np.allclose(part, whole, rtol=1e-3)
+
+
+def test_second_derivatives_of_a_plane_are_those_of_its_formula():
+    x, y = np.meshgrid(0.1 * np.arange(30), 0.2 * np.arange(24), indexing="ij")
+    slope, second = splitting.bends(np.sin(x) * np.exp(-0.3 * y))
+    decay = np.exp(-0.3 * y)
+    known = [
+        [-np.sin(x) * decay * 0.01, -0.3 * np.cos(x) * decay * 0.02],
+        [-0.3 * np.cos(x) * decay * 0.02, 0.09 * np.sin(x) * decay * 0.04],
+    ]
+    inside = slice(6, -6), slice(6, -6)
+    assert np.allclose(slope[1][inside], (-0.3 * np.sin(x) * decay * 0.2)[inside], rtol=0, atol=1e-9)
+    for i in range(2):
+        for j in range(2):
+            assert np.allclose(second[i][j][inside], known[i][j][inside], rtol=0, atol=1e-9)
