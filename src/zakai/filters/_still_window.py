@@ -17,7 +17,7 @@ looked at.
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Sequence
 from math import gcd
 from typing import Any, NamedTuple
 
@@ -119,58 +119,68 @@ def moved(
     """
     size, cell, count = len(lattice.log_values), table.cell, len(kernel.variance)
     each = gcd(count, LOOK)
-    xi, columns = cell * _index(size), _columns(size)
-    steps, variance = cell * np.arange(taps + 1), kernel.variance[:, None]
-    weights = cell * jnp.exp(-0.5 * steps**2 / variance)
-    taps_of = weights, *splitting.bent(weights, steps, variance)
-    slices = taps_of, kernel, turned, given.before, given.after
+    xi, columns = cell * jnp.asarray(_index(size)), _columns(size)
+    apart, variance = cell * np.arange(taps + 1), kernel.variance[:, None]
+    weights = cell * jnp.exp(-0.5 * apart**2 / variance)
+    taps_of = weights, *splitting.bent(weights, apart, variance)
+    slices = (kernel, turned, given.before, given.after), taps_of
     still = jax.lax.stop_gradient  # of what only says where to look nothing is differentiated
 
-    def halves(slices: Any, shown: Any) -> tuple[splitting.Half, splitting.Half]:
-        """Those of some steps' factors, with arrays (steps, N)."""
-        _, kernel, turned, first, last = slices
-        slope, bend = (kernel.before + kernel.after)[:, 1:].T - turned.T
-        tilt = slope[:, None] + 2 * bend[:, None] * xi
+    def halves(slices: Any, shown: Any, xi: Any) -> tuple[splitting.Half, splitting.Half]:
+        """Those of one step's factor, with the polynomials of its kernel, at `xi`, where a table has `shown` (m, 5, ...)."""
+        kernel, turned, before, after = slices
+        slope, bend = (kernel.before + kernel.after)[1:] - turned
 
         def half(linear: Any) -> splitting.Half:
-            parts = [linear @ shown[:, k] for k in range(5)]
-            return splitting.bridged(parts, kernel.variance[:, None], tilt)
+            parts = [sum(linear[i] * shown[i, k] for i in range(len(shown))) for k in range(5)]
+            return splitting.bridged(parts, kernel.variance, slope + 2 * bend * xi)
 
-        before = _made(half(first))
-        return before, before if even else _made(half(last))
+        def with_polynomial(half: splitting.Half, of: Any) -> splitting.Half:
+            return half._replace(log=half.log + (of[0] + xi * (of[1] + xi * of[2])))
 
-    powers = jnp.stack([jnp.ones(size), xi, xi**2])
+        first = half(before)
+        last = first if even else half(after)
+        return with_polynomial(first, kernel.before), with_polynomial(last, kernel.after)
+
+    def steps(p: Any, slices: Any, taps_of: Any, shown: Any) -> tuple[Any, Any, Any, Any]:
+        """Those between two looks: the last density, the logarithm of what it was multiplied with last, all densities and by
+        how much each was made smaller."""
+        # An evidence far from one leaves no mark: at the highest point nothing grows.
+        top = jnp.argmax(p)
+        first, last = jax.vmap(lambda one: halves(one, shown[:, :, top], xi[top]))(slices)
+        offset = still(first.log + last.log)
+
+        def step(carry: Any, slices: Any) -> tuple[Any, Any]:
+            p, _, *rooms = carry
+            slices, taps_of, offset = slices
+            first, last = halves(slices, shown, xi)
+            q = p * jnp.exp(first.log)
+            inner = q, first.bend * q
+            # Written into the middle of zeros: to pad is to ask at every point whether there is one, which is not vectorised.
+            rooms = [jax.lax.dynamic_update_slice(room, each, (taps,)) for room, each in zip(rooms, inner, strict=True)]
+            p = jnp.exp(last.log - offset) * _filtered(rooms, last, taps_of)
+            return (p, last.log, *rooms), p
+
+        zeros = jnp.zeros(size + 2 * taps)
+        (p, multiplied, *_), values = jax.lax.scan(step, (p, p, zeros, zeros), (slices, taps_of, offset))
+        return p, multiplied, values, offset
 
     def look(carry: Any, slices: Any) -> tuple[Any, Any]:
         p, at, own = carry
         shift = _shift((p > np.exp(-lat.SUPPORT) * jnp.max(p)).astype(float), at, table)
         p, at = lat.slid(p, shift, 0.0), at + shift
-        shown = seen(table, at, size)
-        kernel, centre = slices[1], table.home + cell * at
+        (kernel, turned, *given), taps_of = slices
+        centre = table.home + cell * at
         kernel = Kernel(kernel.variance, _around(kernel.before, centre), _around(kernel.after, centre))
-        slices = slices[0], kernel, _turned(slices[2], centre), *slices[3:]
-        first, last = halves(slices, shown)
-        before, after = kernel.before @ powers, kernel.after @ powers
-        # An evidence far from one leaves no mark: at the highest point nothing grows.
-        top = jnp.argmax(p)
-        offset = still((first.log + last.log + before + after)[:, top, None])
-        factors = jnp.exp(first.log + before), jnp.exp(last.log + after - offset)
-
-        def step(p: Any, slices: Any) -> tuple[Any, Any]:
-            (before, after), bend, last, taps_of = slices
-            q = p * before
-            p = after * _filtered(q, bend * q, last, taps_of)
-            return p, p
-
-        total = jnp.sum(p)
-        p, values = one_kernel(partial(jax.lax.scan, step))(p / total, (factors, first.bend, last, slices[0]))
+        slices = kernel, _turned(turned, centre), *given
+        p, multiplied, values, offset = one_kernel(steps)(p / jnp.sum(p), slices, taps_of, seen(table, at, size))
         sums = values @ columns
         logs = jnp.log(sums[:, 0])
-        growth = logs - jnp.concatenate([jnp.zeros(1), logs[:-1]]) + offset[:, 0]
+        growth = logs - jnp.concatenate([jnp.zeros(1), logs[:-1]]) + offset
         end = still(lattice._replace(log_values=lat.log(p)))
         cells = lat.features(end)[0]
         joint = jax.lax.rsqrt(1.0 / jnp.minimum(own, cells) ** 2 + cell**2 / jnp.min(kernel.variance))
-        depth = lat.reach(end, end.log_values - still(last.log + after)[-1])
+        depth = lat.reach(end, end.log_values - still(multiplied))
         told = sums, jnp.broadcast_to(at, (each,)), growth, values if keep else None
         return (p, at, cells), (told, cells, joint, depth)
 
@@ -223,7 +233,8 @@ def stepped(
     q = jnp.exp(lifted - top)
     steps = cell * np.arange(taps + 1)
     weights = cell * jnp.exp(-0.5 * steps**2 / kernel.variance)
-    spread = lat.log(_filtered(q, first.bend * q, last, (weights, *splitting.bent(weights, steps, kernel.variance))))
+    rooms = [jnp.pad(each, taps) for each in (q, first.bend * q)]
+    spread = lat.log(_filtered(rooms, last, (weights, *splitting.bent(weights, steps, kernel.variance))))
     lowered = spread + factor
     crest = jnp.max(lowered)
     values = jnp.exp(lowered - crest)
@@ -245,10 +256,10 @@ def _shift(used: jax.Array, at: jax.Array, table: Table) -> jax.Array:
     return jnp.clip(shift, -far - at, far - at)
 
 
-def _filtered(q: jax.Array, bent: jax.Array, last: splitting.Half, taps: tuple[Any, Any, Any]) -> jax.Array:
-    """What the kernel with its polynomials makes of q and of what is `bent` of it."""
+def _filtered(rooms: Sequence[jax.Array], last: splitting.Half, taps: tuple[Any, Any, Any]) -> jax.Array:
+    """What the kernel with its polynomials makes of q and of what is `bent` of it, both with room for all taps at each end."""
     weights, once, twice = taps
-    spread, begin, end, ends = lat.filtered_all((q, bent), ((0, weights), (1, once), (0, once), (0, twice)))
+    spread, begin, end, ends = lat.filtered_all(rooms, ((0, weights), (1, once), (0, once), (0, twice)))
     # Nothing is made up for by more than there is.
     return jnp.clip(spread + begin + last.bend * end + last.twice * ends, 0.5 * spread, 2.0 * spread)
 
@@ -267,8 +278,3 @@ def _turned(turned: jax.Array, centre: Any) -> jax.Array:
     """The slope and the bend around a centre of a gauge that changed by `turned` (..., 2) x and x^2."""
     slope, bend = jnp.moveaxis(turned, -1, 0)
     return jnp.stack([slope + 2 * centre * bend, bend], axis=-1)
-
-
-def _made(arrays: Any) -> Any:
-    """The same arrays (rows, N).  A product is made once, where what is elementwise is made again by each that asks for it."""
-    return jax.tree.map(lambda array: np.eye(len(array)) @ array, arrays)

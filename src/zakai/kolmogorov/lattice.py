@@ -244,17 +244,18 @@ def slid(values: jax.Array, shift: jax.Array, fill: float) -> jax.Array:
 
 def filtered(values: jax.Array, weights: jax.Array) -> jax.Array:
     """sum_j weights[|j|] values[i - j] over |j| <= taps, for `weights` (taps + 1,)."""
-    return filtered_all((values,), ((0, weights),))[0]
+    return filtered_all((jnp.pad(values, weights.shape[0] - 1),), ((0, weights),))[0]
 
 
-def filtered_all(values: Sequence[jax.Array], filters: Sequence[tuple[int, jax.Array]]) -> list[jax.Array]:
-    """`filtered` for each pair (which of the `values`, its weights), of one number of taps.
+def filtered_all(padded: Sequence[jax.Array], filters: Sequence[tuple[int, jax.Array]]) -> list[jax.Array]:
+    """`filtered` for each pair (which of the values, its weights), of one number of taps, of values `padded` with as many zeros
+    on both sides.
 
     A sum of shifted slices becomes one fused, vectorised loop, for many records at once too, where a convolution of the
     library does not; what is positive stays so.
     """
-    size, taps = values[0].shape[0], filters[0][1].shape[0] - 1
-    padded = [jnp.pad(each, taps) for each in values]
+    taps = filters[0][1].shape[0] - 1
+    size = padded[0].shape[0] - 2 * taps
 
     def add(totals: list[jax.Array], first: Any, count: int) -> list[jax.Array]:
         for j in range(count):
@@ -266,7 +267,8 @@ def filtered_all(values: Sequence[jax.Array], filters: Sequence[tuple[int, jax.A
 
     # Short filters are one loop; longer ones go in rounds, which keeps the program small.
     rounds, rest = divmod(taps, FUSED) if taps > 2 * FUSED else (0, taps)
-    totals = add([weights[0] * values[k] for k, weights in filters], 1, rest)
+    middle = [lax.dynamic_slice(each, (taps,), (size,)) for each in padded]
+    totals = add([weights[0] * middle[k] for k, weights in filters], 1, rest)
     if rounds == 0:
         return totals
     starts = 1 + rest + FUSED * jnp.arange(rounds)
