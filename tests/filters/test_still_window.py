@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import expm
 
 import zakai
-from zakai.filters import _run, _still_window, limited_direct
+from zakai.filters import _lattice_choice, _run, _still_window, limited_direct
 from zakai.filters._splitting import bent, bridged
 from zakai.filters.observations import data_of, schedule_of
 
@@ -104,7 +104,7 @@ def test_records_between_each_others_points_come_to_stand_on_one_lattice():
     given = limited_direct.density(prepared, own)
     # With the cells that they have, and with finer ones.
     for finer in (1.0, 2.0):
-        plan = replace(own.plan, cells=finer * own.cells[0] / 1.05)
+        plan = replace(own.plan, cells=finer * own.cells[0] / 1.25)
         many = limited_direct.adapt_many(prepared, replace(states, plan=plan), rows, None)
         assert many.plan.still and (many.table.cell < cell) == (finer > 1)
         (centres,) = many.lattice.centre.T
@@ -200,12 +200,58 @@ def test_the_steps_that_pad_a_run_change_neither_its_end_nor_what_was_told():
     prepared = limited_direct.prepare(SPIRAL, schedule_of(data, True))
     given = limited_direct.observations(prepared, data)
     begin = limited_direct.adapt(prepared, limited_direct.init(prepared, SPIRAL.prior), slice(0, 64), None)
-    short, (own, _) = jax.jit(begin.together, static_argnums=3)(
-        begin, *jax.tree.map(lambda a: a[:32], (prepared.intervals, given)), False, 32
-    )
-    padded, (told, _) = jax.jit(begin.together, static_argnums=3)(begin, prepared.intervals, given, False, 32)
-    whole, _ = jax.jit(begin.together, static_argnums=3)(begin, prepared.intervals, given, False, 64)
+    together = jax.jit(begin.together, static_argnums=3)
+    short, (own, _), _ = together(begin, *jax.tree.map(lambda a: a[:32], (prepared.intervals, given)), False, 32, True)
+    padded, (told, _), taken = together(begin, prepared.intervals, given, False, 32, True)
+    whole, _, _ = together(begin, prepared.intervals, given, False, 64, True)
+    assert taken == 32
     assert np.allclose(padded.lattice.log_values, short.lattice.log_values, rtol=0, atol=1e-9)
     assert padded.lattice.centre == short.lattice.centre and not np.allclose(whole.cells, padded.cells, rtol=1e-6)
     assert np.allclose(told.mean[:32], own.mean, rtol=0, atol=1e-12)
     assert np.allclose(told.log_likelihood_increment[:32], own.log_likelihood_increment, rtol=0, atol=1e-12)
+
+
+def test_the_part_of_a_window_on_which_steps_are_taken_does_not_show(monkeypatch):
+    (record,) = increments(SPIRAL, 640, seeds=(5,))
+    sizes, own = [], _still_window.seen
+
+    def spied(table, at, size):
+        sizes.append(size)
+        return own(table, at, size)
+
+    monkeypatch.setattr(_still_window, "seen", spied)
+    on_parts = zakai.filter(SPIRAL, record, "limited-direct")
+    assert len(set(sizes)) > 2
+    monkeypatch.setattr(_still_window, "SHARES", ())
+    # What was compiled is not traced again; this one is another.
+    monkeypatch.setattr(_run, "scan", _run.Scan(_run.scan.function))
+    on_all = zakai.filter(SPIRAL, record, "limited-direct")
+    same(on_parts, on_all, close=1e-9)
+
+
+def test_a_run_ends_before_the_steps_that_its_window_does_not_serve(monkeypatch):
+    # What is seen of the state grows with it, so that the density gets narrower.
+    model = zakai.Model(
+        state=["x"], drift=["0.5*x"], observation=["x*sin(x)", "x*cos(x)"], observation_kind="increments",
+        prior={"kind": "gaussian", "mean": [1.0], "cov": [[0.1]]},
+    )  # fmt: skip
+    records = increments(model, 350, seeds=(5, 6, 7))
+    took, own = [], _run.run_steps
+
+    def spied(*rest):
+        run = own(*rest)
+        took.append(run[0].stop - run[0].start)
+        return run
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_run, "run_steps", spied)
+        alone = [zakai.filter(model, record, "limited-direct") for record in records]
+    assert len(took) > len(records) and all(steps % _still_window.LOOK == 0 for steps in took[:1])
+    together = zakai.filter(model, records, "limited-direct")
+    # Runs so short that each finds its window.
+    monkeypatch.setattr(_lattice_choice, "STILL_RUN", _still_window.LOOK)
+    for one, other, record in zip(alone, together, records, strict=True):
+        short = zakai.filter(model, record, "limited-direct")
+        same(one, short, close=1e-8)
+        same(other, short, close=1e-8)
+        assert not one.warnings and not other.warnings and not short.warnings

@@ -6,7 +6,7 @@ that a feature grew narrower than a few cells, it is tried again with a larger w
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,11 +37,13 @@ MOST_BANDED = 2**17  # points of a window, and taps
 WIDEST, FINEST = 40, 300  # the `window` and the `cells` from which on a plan gets no better
 MOST_IMAGES = 1024
 LONGEST_RUN = 256
+STILL_RUN = 1024  # steps on a window that stands still, which end where it serves no more
 # A window that stands still serves a splitting, whose own error is larger than these.
 COARSEST_STILL = 0.88
 EDGE_STILL = 1e-10
 QUADRATURE_STILL = 5e-10
 SPARE = 0.97  # of the largest cell of a window, for what comes to be narrower
+NARROWER = 1.15  # by what factor a feature may come to be narrower before a window that stands still serves no more
 STILL_ROOM = 12  # cells to each side of a window that is moved every few steps only
 STILL_WIDEST = 4.0  # the `window` up to which it is worth while
 FINE = {1: 2.0, 2: 2.0, 3: 1.2}  # by how much the first lattice is finer than it need be
@@ -366,10 +368,14 @@ def free_memory() -> int:
 
 def healthy(info: Any, plan: Plan) -> Any:
     """Which steps kept every bound; traced by JAX or not."""
-    health = info.health
+    return well(info.log_likelihood_increment, info.health, plan)
+
+
+def well(increment: Any, health: Mapping[str, Any], plan: Plan) -> Any:
+    """The same, from what they added to the log-likelihood and their health."""
     edge = EDGE_SHARPENED if plan.sharpen else _edge(plan)
     return (
-        (abs(info.log_likelihood_increment) < np.inf)
+        (abs(increment) < np.inf)
         & (health["edge_mass"] < edge)
         & (health["resolution"] > plan.needed)
         & (health["quadrature_error"] < (QUADRATURE_STILL if plan.still else QUADRATURE))
@@ -425,7 +431,7 @@ def _banded(
     along = 1 / np.sqrt(maps) if plan.still else np.concatenate([[1.0], np.cumprod(maps)])[: len(deviation)]
     growth = along / deviation
     coarsest = COARSEST_STILL if plan.still else COARSEST
-    widest = np.minimum(coarsest / growth.max(), cells * cell / plan.cells)
+    widest = np.minimum(coarsest / growth.max(), cells * cell / plan.cells / (NARROWER if plan.still else 1.0))
     if plan.still:
         # The windows of all records stand on one lattice.
         widest = np.full(len(cell), widest.min())
@@ -435,7 +441,7 @@ def _banded(
     new_cell = np.where(well, cell, SPARE * widest)
     enough, taps = REACH / (new_cell.min() * growth.min()), 16
     if plan.still:
-        taps = rounded_up(enough, 4, 2)
+        taps = rounded_up(enough, 4)
     while not plan.still and taps < enough:
         taps *= 2
     used = logs > _top(logs) + np.log(0.1 * _edge(plan))
@@ -443,10 +449,10 @@ def _banded(
     middle, span = (first + last) // 2, (last - first + 1) * cell
     if plan.still:
         middle = _aligned(lattice, middle, new_cell[0])
-    # A run on a window that stands still is soon over, and its compilation is not.
-    parts = 2 if plan.still else 4
-    size = rounded_up(plan.window * (span / new_cell).max() + 8 + (2 * STILL_ROOM if plan.still else 0), parts=parts)
-    own = plan.banded and plan.sizes[0] >= size >= (0.8 if plan.still else 0.6) * plan.sizes[0]
+    wanted = plan.window * (span / new_cell).max() + 8
+    # Steps on a window that stands still take the part of it that they need, and its compilation takes longer than they do.
+    size = rounded_up(wanted + 2 * STILL_ROOM, BASE[1], 1) if plan.still else rounded_up(wanted)
+    own = plan.banded and plan.sizes[0] >= size >= (0.5 if plan.still else 0.6) * plan.sizes[0]
     size = plan.sizes[0] if own else size
     pairs = max(BASE[1], rounded_up(span.max() / (COARSEST * deviation.min())))
     if size * (12 + 0.2 * taps) > 3 * pairs**2:

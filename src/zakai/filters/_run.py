@@ -122,7 +122,7 @@ def scan(step, healthy, state, intervals, observations, keep, limit):
 
     together = getattr(state, "together", None)
     if together is not None:
-        return *together(state, intervals, observations, keep, limit[0]), limit[0]
+        return together(state, intervals, observations, keep, *limit)
 
     def told(states: Any, info: Info) -> Any:
         return info, getattr(states, "kept", states) if keep else None
@@ -265,24 +265,30 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
     `enough` of its steps ends there.  Gives the rows that were taken, the state they began with, the state they ended with, and
     what `scan` tells of each.
     """
-    run = getattr(state, "run_length", RUN)
-    count = min(run, rows.stop - rows.start)
-    part = slice(rows.start, rows.start + count)
-    begin = adapt(prepared, state, part, None) if adapt else state
+    run, count, begin = 0, 0, state
+    while count < min(getattr(begin, "run_length", RUN), rows.stop - rows.start):
+        run = getattr(begin, "run_length", RUN)
+        count = min(run, rows.stop - rows.start)
+        part = slice(rows.start, rows.start + count)
+        begin = adapt(prepared, state, part, None) if adapt else state
     strict, length = True, 0
     for tries in range(TRIES + 2):
-        if length != (length := _length(method, begin, count, run, ends)):
-            intervals, given = rows_of(prepared.intervals, part, length), rows_of(observations, part, length)
-        bare, most = getattr(begin, "bare", begin), min(count, getattr(begin, "worth_while", count))
+        most = min(count, getattr(begin, "run_length", count), getattr(begin, "worth_while", count))
+        if length != (length := _length(method, begin, most, run, ends)):
+            some = slice(part.start, min(part.stop, part.start + length))
+            intervals, given = rows_of(prepared.intervals, some, length), rows_of(observations, some, length)
+        bare = getattr(begin, "bare", begin)
         end, told, taken = scan(method.step, method.healthy, bare, intervals, given, keep, (most, strict))
-        end, taken = _as_planned(end, begin), int(taken)
+        end, taken = as_planned(end, begin), int(taken)
         # The more was tried in vain, the less is enough.
-        if not strict or (method.healthy is not None and taken >= max(1.0, enough * most / 2**tries)):
+        together = getattr(begin, "together", None) is not None and not scan.lanes
+        early = method.healthy is not None or together
+        if not strict or (early and taken >= max(1.0, enough * most / 2**tries)):
             break
-        info = first_of(told[0], min(taken + 1, most))
+        info = first_of(told[0], min(taken + (begin.look if together else 1), most))
         tried = state.tried(begin) if hasattr(state, "tried") else begin
         again = adapt(prepared, tried, part, info) if adapt and tries < TRIES else None
-        if again is None and (method.healthy is None or getattr(adapt, "ill", False) or taken > 0):
+        if again is None and (not early or getattr(adapt, "ill", False) or taken > 0):
             break
         # Where nothing better can be had the run is taken as it is, and its health says so.
         begin, strict = (begin, False) if again is None else (again, True)
@@ -291,7 +297,7 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
         there = _existing(told[0].log_likelihood_increment, taken)
         if 0 < there < taken:
             end, told, _ = scan(method.step, method.healthy, bare, intervals, given, keep, (there, strict))
-            end, taken = _as_planned(end, begin), there
+            end, taken = as_planned(end, begin), there
     info, kept = first_of(told, taken)
     return slice(part.start, part.start + taken), begin, end, info, kept
 
@@ -306,7 +312,7 @@ def _length(method: Method, begin: Any, count: int, run: int, ends: bool) -> int
     return (max(16, 2 ** int(np.ceil(np.log2(count)))) if short else run) if ends else count
 
 
-def _as_planned(end: Any, begin: Any) -> Any:
+def as_planned(end: Any, begin: Any) -> Any:
     """The end of a run with what no step changes as it was at the beginning: on the device it would have to be fetched."""
     names = getattr(type(end), "PLANNED", ())
     return replace(end, **{name: getattr(begin, name) for name in names}) if names else end

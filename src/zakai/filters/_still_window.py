@@ -11,13 +11,14 @@ makes of it a filter with the same taps at every point, between two factors that
 They are multiplied with the factors of the observation, and h at the points is in a table that outlasts the runs.  The factors of
 `LOOK` steps are made at once, then a step is a filter between two products, with the second error of the splitting undone on
 both sides, and one product gives mass, mean, variance and what stands at the edges for all of them.  Everything is positive, so
-that rounding loses no tail.  Every `LOOK` steps the window is laid over the mass anew, by whole cells, and its resolution is
-looked at.
+that rounding loses no tail.  Every `LOOK` steps the window is laid over the mass anew, by whole cells, its resolution is looked
+at, and the next steps are taken on the part of it that holds the mass.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from math import gcd
 from typing import Any, NamedTuple
 
@@ -34,6 +35,9 @@ from zakai.kolmogorov.lattice import Lattice
 from zakai.models.compile import one_kernel
 
 LOOK = 16  # steps
+DEEP = 28.0  # units of the logarithm to which the tails are kept
+ROOM = 14  # cells that the mass may move to either side between two looks
+SHARES = (0.4375, 0.5)  # of a window, of which the steps between two looks take the smallest that holds the mass
 
 
 class Kernel(NamedTuple):
@@ -109,17 +113,18 @@ def moved(
     keep: bool,
     even: bool,
     most: Any,
-) -> tuple[tuple[jax.Array, jax.Array, jax.Array], Steps]:
+    well: Callable[[Any, Any, Any, Any], Any],
+) -> tuple[tuple[jax.Array, jax.Array, jax.Array], Any, Steps]:
     """K intervals, each with its kernel, from the density on a lattice of N points: at the end the values (N,), where the window
-    stands and the narrowest feature in cells; and what is told on the way.
+    stands and the narrowest feature in cells; how many steps were taken; and what is told on the way.
 
     `turned` (K, 2) is by how much the gauge changed in an interval, from its linear term on.  `own` is the narrowest feature of
     the density, in cells; `even` says that both halves of every factor are the same.  Of the steps `most` are taken, rounded up
-    to whole looks; what is told of the others is zero.
+    to whole looks, or those before the first look in which `well`, of `growth`, `sums`, `cells` and `joint`, does not hold for
+    all; what is told of those after it is zero.
     """
     size, cell, count = len(lattice.log_values), table.cell, len(kernel.variance)
     each = gcd(count, LOOK)
-    xi, columns = cell * jnp.asarray(_index(size)), _columns(size)
     apart, variance = cell * np.arange(taps + 1), kernel.variance[:, None]
     weights = cell * jnp.exp(-0.5 * apart**2 / variance)
     taps_of = weights, *splitting.bent(weights, apart, variance)
@@ -146,7 +151,7 @@ def moved(
         """Those between two looks: the last density, the logarithm of what it was multiplied with last, all densities and by
         how much each was made smaller."""
         # An evidence far from one leaves no mark: at the highest point nothing grows.
-        top = jnp.argmax(p)
+        top, xi = jnp.argmax(p), cell * jnp.asarray(_index(len(p)))
         first, last = jax.vmap(lambda one: halves(one, shown[:, :, top], xi[top]))(slices)
         offset = still(first.log + last.log)
 
@@ -161,39 +166,59 @@ def moved(
             p = jnp.exp(last.log - offset) * _filtered(rooms, last, taps_of)
             return (p, last.log, *rooms), p
 
-        zeros = jnp.zeros(size + 2 * taps)
+        zeros = jnp.zeros(len(p) + 2 * taps)
         (p, multiplied, *_), values = jax.lax.scan(step, (p, p, zeros, zeros), (slices, taps_of, offset))
         return p, multiplied, values, offset
 
-    def look(carry: Any, slices: Any) -> tuple[Any, Any]:
-        p, at, own = carry
-        shift = _shift((p > np.exp(-lat.SUPPORT) * jnp.max(p)).astype(float), at, table)
-        p, at = lat.slid(p, shift, 0.0), at + shift
+    def within(part: int, p: Any, at: Any, own: Any, slices: Any) -> tuple[Any, Any]:
+        """The steps between two looks on the middle `part` of the window, outside of which there is nothing."""
         (kernel, turned, *given), taps_of = slices
-        centre = table.home + cell * at
+        around, centre = (size - part) // 2, table.home + cell * at
         kernel = Kernel(kernel.variance, _around(kernel.before, centre), _around(kernel.after, centre))
         slices = kernel, _turned(turned, centre), *given
-        p, multiplied, values, offset = one_kernel(steps)(p / jnp.sum(p), slices, taps_of, seen(table, at, size))
-        sums = values @ columns
+        p = p[around : around + part]
+        p, multiplied, values, offset = one_kernel(steps)(p / jnp.sum(p), slices, taps_of, seen(table, at, part))
+        sums = values @ _columns(part)
         logs = jnp.log(sums[:, 0])
         growth = logs - jnp.concatenate([jnp.zeros(1), logs[:-1]]) + offset
         end = still(lattice._replace(log_values=lat.log(p)))
         cells = lat.features(end)[0]
         joint = jax.lax.rsqrt(1.0 / jnp.minimum(own, cells) ** 2 + cell**2 / jnp.min(kernel.variance))
         depth = lat.reach(end, end.log_values - still(multiplied))
-        told = sums, jnp.broadcast_to(at, (each,)), growth, values if keep else None
-        return (p, at, cells), (told, cells, joint, depth)
+        values = jnp.pad(values, ((0, 0), (around, around))) if keep else None
+        return jnp.pad(p, around), (sums, growth, values, cells, joint, depth)
+
+    def look(carry: Any, slices: Any) -> tuple[Any, Any]:
+        p, at, own, taken, _ = carry
+        first, slices = slices
+        shift, reach = _shift(p > np.exp(-DEEP) * jnp.max(p), at, table)
+        new, moved = lat.slid(p, shift, 0.0), at + shift
+        parts = _parts(size)
+        which = jnp.sum(reach + ROOM > np.array(parts[:-1]) // 2)
+        new, (sums, growth, values, cells, joint, depth) = jax.lax.switch(
+            which, [partial(within, part) for part in parts], new, moved, own, slices
+        )
+        good = jnp.all(well(growth, sums, cells, joint) | (first + np.arange(each) >= most))
+        told = sums, jnp.broadcast_to(moved, (each,)), growth, values
+        carry = *jax.tree.map(partial(jnp.where, good), (new, moved, cells), (p, at, own)), taken + good * each, good
+        return carry, (told, cells, joint, depth)
 
     def look_or_not(carry: Any, given: Any) -> tuple[Any, Any]:
-        first, slices = given
-        nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(look, carry, slices)[1])
-        return jax.lax.cond(first < most, look, lambda carry, _: (carry, nothing), carry, slices)
+        return jax.lax.cond((given[0] < most) & carry[-1], look, lambda carry, _: (carry, nothing), carry, given)
 
-    start = place(table, lattice.centre[0])
+    start, zero, zeros = place(table, lattice.centre[0]), jnp.zeros(()), jnp.zeros(each)
+    told = jnp.zeros((each, 4)), jnp.zeros(each, int), zeros, jnp.zeros((each, size)) if keep else None
+    nothing = told, zero, zero, zero
     blocks = jax.tree.map(lambda a: a.reshape(count // each, each, *a.shape[1:]), slices)
-    begin = jnp.exp(lattice.log_values), start, own
-    end, (told, *looks) = jax.lax.scan(look_or_not, begin, (np.arange(0, count, each), blocks))
-    return end, Steps(*jax.tree.map(lambda a: a.reshape(count, *a.shape[2:]), told), *looks)
+    begin = jnp.exp(lattice.log_values), start, own, jnp.zeros((), int), jnp.array(True)
+    (*end, taken, _), (told, *looks) = jax.lax.scan(look_or_not, begin, (np.arange(0, count, each), blocks))
+    told = jax.tree.map(lambda a: a.reshape(count, *a.shape[2:]), told)
+    return tuple(end), jnp.minimum(taken, most), Steps(*told, *looks)
+
+
+def _parts(size: int) -> list[int]:
+    """The parts of a window on which steps can be taken."""
+    return sorted({16 * round(size * share / 16) for share in SHARES} | {size})
 
 
 class Stepped(NamedTuple):
@@ -244,16 +269,19 @@ def stepped(
 
 def laid_anew(logs: jax.Array, at: jax.Array, table: Table) -> tuple[jax.Array, jax.Array]:
     """A window laid over the mass, by whole cells: the logarithms (N,) of a density and its place."""
-    shift = _shift((logs > jnp.max(logs) - lat.SUPPORT).astype(float), at, table)
+    shift, _ = _shift(logs > jnp.max(logs) - lat.SUPPORT, at, table)
     return lat.slid(logs, shift, -jnp.inf), at + shift
 
 
-def _shift(used: jax.Array, at: jax.Array, table: Table) -> jax.Array:
-    """By how many cells a window moves to have what is used (N,) in its middle, as far as the table goes."""
-    size = len(used)
+def _shift(used: jax.Array, at: jax.Array, table: Table) -> tuple[jax.Array, jax.Array]:
+    """By how many cells a window moves to have what is used (N,) in its middle, as far as the table goes; and how far that
+    reaches from there."""
+    size, index = len(used), _index(used.size).astype(int)
     far = (table.h.shape[-1] - size) // 2
-    shift = jnp.clip(jnp.rint(used @ _index(size) / jnp.sum(used)).astype(int), -(size // 4), size // 4)
-    return jnp.clip(shift, -far - at, far - at)
+    low, high = jnp.min(jnp.where(used, index, size)), jnp.max(jnp.where(used, index, -size))
+    shift = jnp.clip((low + high) // 2, -(size // 4), size // 4)
+    shift = jnp.clip(shift, -far - at, far - at)
+    return shift, jnp.maximum(high - shift, shift - low)
 
 
 def _filtered(rooms: Sequence[jax.Array], last: splitting.Half, taps: tuple[Any, Any, Any]) -> jax.Array:

@@ -14,7 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from zakai import _float64  # noqa: F401
-from zakai.filters._run import RUN, Run, Scan, run_steps, shape_of, size_of, taken, taken_some, with_lasting, without_lasting
+from zakai.filters._run import (
+    RUN,
+    WHOLE,
+    Run,
+    Scan,
+    as_planned,
+    run_steps,
+    shape_of,
+    size_of,
+    taken,
+    taken_some,
+    with_lasting,
+    without_lasting,
+)
 from zakai.filters.observations import Data
 
 LANES = 32  # records that are filtered by one scan, at most: one that asks for a large lattice slows no more than these
@@ -22,6 +35,7 @@ FEW_LANES = 8  # what a scan of few records is made for: two sizes, few compilat
 LANE_BYTES = 256 * 2**20  # what they give in one run of steps, at most
 WORTH_A_CORE = 16  # records
 ENOUGH = 1 / 16  # the share of a run after which a look at all lattices costs less than wider ones
+RUN_AT_ONCE = 1024  # steps of a record, where one record is filtered after another
 ROUND = RUN  # observations after which many records are grouped anew
 MANY = 4 * LANES  # records
 HOLDS = 4.0  # deviations on each side of a mean that a lattice holds, about
@@ -61,7 +75,7 @@ def filter_all(runs: Sequence[Run], progress: Callable[[int, int], None] | None)
     alike = [_Alike(runs) for runs in _alike(runs)]
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         while left := [records for records in alike if not records.done]:
-            groups = [(*group, records.until()) for records in left for group in records.groups()]
+            groups = [group for records in left for group in records.groups()]
             for done in [pool.submit(_together, group, size, count, until) for group, size, until in groups]:
                 done.result()
 
@@ -99,28 +113,28 @@ class _Alike:
     def done(self) -> bool:
         return all(run.done == self.total for run in self.runs)
 
-    def until(self) -> int:
-        """Where the next round ends."""
-        return min(self.total, min(run.done for run in self.runs) // self.round * self.round + self.round)
-
-    def groups(self) -> Iterator[tuple[list[Run], int]]:
-        """What is filtered by one scan, and how many records that scan is made for: few sizes, few compilations."""
+    def groups(self) -> Iterator[tuple[list[Run], int, int]]:
+        """What is filtered by one scan, how many records that scan is made for (few sizes, few compilations), and how far."""
         method = self.method
         starts: dict[Hashable, list[Run]] = {}
         for run in self.runs:
             beside = (method.adapt is None or method.adapt_many) and not self.alone
-            starts.setdefault(shape_of(run.state) if beside else id(run), []).append(run)
+            if run.done < self.total:
+                starts.setdefault((run.done, shape_of(run.state)) if beside else id(run), []).append(run)
         for alike in starts.values():
             n = alike[0].setting.model.n
-            each = RUN * (8 * (n * n + n + 16) + (size_of(alike[0].state) if alike[0].keep else 0))
+            at_once = hasattr(type(alike[0].state), "together")
+            each = (RUN_AT_ONCE if at_once else RUN) * (8 * (n * n + n + 16) + (size_of(alike[0].state) if alike[0].keep else 0))
             most = max(1, min(LANES, LANE_BYTES // each))
             if self.round < self.total:
-                size = min(most, FEW_LANES if len(alike) <= FEW_LANES else LANES)
+                # Where one record is filtered after another those that are not there take no time.
+                size = min(most, FEW_LANES if len(alike) <= FEW_LANES and not at_once else LANES)
             else:
                 parts = max(-(-len(alike) // most), min(os.cpu_count() or 1, len(alike) // WORTH_A_CORE))
                 size = -(-len(alike) // max(1, parts))
+            until = min(self.total, alike[0].done // self.round * self.round + self.round)
             together = _near(alike, size) if alike[0].infos else (alike[k : k + size] for k in range(0, len(alike), size))
-            yield from ((group, size) for group in together)
+            yield from ((group, size, until) for group in together)
 
 
 def _near(runs: list[Run], most: int) -> Iterator[list[Run]]:
@@ -144,7 +158,8 @@ def _near(runs: list[Run], most: int) -> Iterator[list[Run]]:
 
 
 def _together(runs: list[Run], lanes: int, count: _Count, until: int) -> None:
-    """Filter a group of records as far as `until`; a scan that is made for more `lanes` repeats the last of them.
+    """Filter a group of records as far as `until`, or farther if a run of steps is longer; a scan that is made for more `lanes`
+    repeats the last of them.
 
     A record that alone asks for a larger lattice leaves the group and goes on by itself.
     """
@@ -158,6 +173,8 @@ def _together(runs: list[Run], lanes: int, count: _Count, until: int) -> None:
         if rows.stop <= runs[0].done:
             continue
         prepared = setting.prepared(runs[0].data.part(rows))
+        if getattr(prepared, "at_once", False) and _at_once(runs, lanes, prepared, rows, until, count):
+            return
         given = _observations(method, prepared, [run.data.part(rows) for run in runs])
         together = None
         stop = min(rows.stop, until)
@@ -167,7 +184,7 @@ def _together(runs: list[Run], lanes: int, count: _Count, until: int) -> None:
             adapt, own = _Adapt(method, len(runs)), _own(states)
             together = _stacked([*given, *given[-1:] * fill], 1) if together is None else together
             part, begin, ends, info, kept = run_steps(
-                method, adapt if method.adapt_many else None, _of_lanes(len(runs)), prepared,
+                method, adapt if method.adapt_many else None, _scan, prepared,
                 _stacked([*own, *own[-1:] * fill], 0),
                 together, left, rows.stop == total, runs[0].keep, ENOUGH,
             )  # fmt: skip
@@ -190,6 +207,45 @@ def _together(runs: list[Run], lanes: int, count: _Count, until: int) -> None:
         run.state = state
     for run in alone:
         run.all(count.of_one(run.done), until)
+
+
+def _at_once(runs: list[Run], lanes: int, prepared: Any, rows: slice, until: int, count: _Count) -> bool:
+    """One run of steps of each record of a group, one after another, each as far as it is well; or nothing where such a run
+    cannot be.  A record that has taken no step goes on by itself."""
+    method, done = runs[0].setting.method, runs[0].done - rows.start
+    assert method.adapt_many is not None and method.rule is not None
+    filled = [*runs, *runs[-1:] * (lanes - len(runs))]
+    states = _stacked(_own([run.state for run in filled]), 0)
+    for stop in (done + RUN_AT_ONCE, until - rows.start):
+        part = slice(done, min(rows.stop - rows.start, stop))
+        begin = method.adapt_many(prepared, states, part, None)
+        if begin is not None and begin.together is not None:
+            break
+    else:
+        return False
+    most, ends = part.stop - done, rows.start + part.stop == len(runs[0].record.times)
+    # What comes after the last row does not count: one shape, one compilation.
+    length = RUN_AT_ONCE if ends or most % WHOLE == 0 else most
+    steps = np.minimum(np.arange(done, done + length), part.stop - 1)
+    intervals, rule = jax.tree.map(
+        lambda array: np.asarray(array)[steps], (prepared.intervals, method.rule(prepared, runs[0].data.part(rows)))
+    )
+    values = np.stack([run.data.part(rows).filled[steps] for run in filled])
+    given = jax.tree.map(lambda all, one: np.broadcast_to(all, (lanes, *one.shape)), rule(values), rule(values[0]))
+    ends, told, taken = _one_after_another(
+        method.step, method.healthy, begin.bare, intervals, given, runs[0].keep, (most, len(runs))
+    )
+    begins, ends = (_lanes(without_lasting(each), len(runs), 0) for each in (begin, as_planned(ends, begin)))
+    told, took = jax.tree.map(np.asarray, told), np.asarray(taken).tolist()
+    for lane, (run, first, end) in enumerate(zip(runs, begins, ends, strict=True)):
+        if took[lane] > 0:
+            run.take(prepared, first, *jax.tree.map(lambda array: np.array(array[lane, : took[lane]]), told))  # noqa: B023
+            run.state = end
+            count.add(took[lane])
+    for run, steps_taken in zip(runs, took, strict=False):
+        if steps_taken == 0:
+            run.all(count.of_one(run.done), rows.start + part.stop)
+    return True
 
 
 def _observations(method: Any, prepared: Any, data: Sequence[Data]) -> list[Any]:
@@ -241,32 +297,26 @@ def _lanes(tree: Any, count: int, axis: int) -> list[Any]:
     return [jax.tree.unflatten(structure, [array[lane] for array in arrays]) for lane in range(count)]
 
 
-def _of_lanes(count: int) -> Callable[..., Any]:
-    """The scan of some records, of which the first `count` are not only there to fill it."""
+@partial(Scan, lanes=True)
+def _one_after_another(step, healthy, states, intervals, observations, keep, limit):
+    """Runs that fit near the processor gain nothing by others beside them.
 
-    def of_these(step, healthy, states, intervals, observations, keep, limit):
-        return _scan(step, healthy, states, intervals, observations, keep, (*limit, count))
+    Gives the last states, what is told of each step and how many were taken, each with a leading axis of records.  A lane that
+    but fills the scan, after the first `limit[1]`, takes no step.
+    """
 
-    return of_these
+    def one(of: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+        lane, state, given = of
+        most = jnp.where(lane < limit[1], limit[0], 0)
+        end, told, taken = states.together(with_lasting(state, states), intervals, given, keep, most, True)
+        return without_lasting(end), told, taken
+
+    lanes = np.arange(len(jax.tree.leaves(observations)[0]))
+    return jax.lax.map(one, (lanes, without_lasting(states), observations))
 
 
 @partial(Scan, lanes=True)
 def _scan(step, healthy, states, intervals, observations, keep, limit):
-    if (together := getattr(states, "together", None)) is not None:
-        # A run that fits near the processor gains nothing by others beside it.
-
-        def one_after_another(of: tuple[Any, Any, Any]) -> tuple[Any, Any]:
-            lane, state, given = of
-            # A lane that but fills the scan takes no step, and is told what the last of the others is.
-            most = jnp.where(lane < limit[2], limit[0], 0)
-            end, told = together(with_lasting(state, states), intervals, given, keep, most)
-            return without_lasting(end), told
-
-        given = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), observations)
-        lanes = np.arange(len(jax.tree.leaves(given)[0]))
-        every = jax.lax.map(one_after_another, (lanes, without_lasting(states), given))
-        ends, told = jax.tree.map(lambda a: a[jnp.minimum(lanes, limit[2] - 1)], every)
-        return ends, jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), told), limit[0]
     if (some := getattr(states, "some", None)) is not None:
 
         # What the records have in common is there once.
@@ -279,7 +329,7 @@ def _scan(step, healthy, states, intervals, observations, keep, limit):
         def lanes(carry, slices):
             return jax.vmap(of_some, (None, axes, 1), 1)(slices[0], carry, slices[1])
 
-        return taken_some(lanes, healthy, states, (intervals, observations), *limit[:2], 1)
+        return taken_some(lanes, healthy, states, (intervals, observations), *limit, 1)
 
     def one_record(interval, state, observation):
         new, info = step(interval, with_lasting(state, states), observation)
@@ -288,4 +338,4 @@ def _scan(step, healthy, states, intervals, observations, keep, limit):
     def one(carry, slices):
         return jax.vmap(one_record, (None, 0, 0))(slices[0], carry, slices[1])
 
-    return taken(one, healthy, without_lasting(states), (intervals, observations), *limit[:2])
+    return taken(one, healthy, without_lasting(states), (intervals, observations), *limit)

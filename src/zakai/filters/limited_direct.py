@@ -82,7 +82,12 @@ class State:
     @property
     def run_length(self) -> int:
         """How many steps to take before the lattice is looked at again."""
-        return self.plan.run
+        return choice.STILL_RUN if self.plan.still else self.plan.run
+
+    @property
+    def look(self) -> int:
+        """How many steps are taken before their health is looked at, where they are taken together."""
+        return _still_window.LOOK
 
     @property
     def together(self) -> Callable[..., Any] | None:
@@ -131,6 +136,11 @@ class Prepared:
     memory: int
     # The first state of the last prior, which many records share, and what its lattice leaves of the mass.
     first: dict[int, tuple[Any, State, float]] = field(init=False, default_factory=dict)
+
+    @property
+    def at_once(self) -> bool:
+        """Whether many records had better be filtered one after another, each for a run of steps."""
+        return self.intervals.still is not None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -468,15 +478,14 @@ def adapt_many(
 def _table(prepared: Prepared, lattice: Lattice, time: float, known: _still_window.Table | None = None) -> _still_window.Table:
     """That for the windows of some records, which stand on one lattice; the one that is `known`, where it serves."""
     centres, cell, size = lattice.centre.ravel(), lattice.basis.ravel()[0], lattice.log_values.shape[-1]
-    if known is not None and float(known.cell) == cell and known.h.shape[-1] == 3 * size:
+    if known is not None and float(known.cell) == cell and known.h.shape[-1] >= 3 * size:
         # In NumPy: one number on the device takes longer than all of this.
         if abs(round((centres[0] - float(known.home)) / cell)) <= size // 2:
             return known
     # With room for each to move, in few sizes.
-    windows = 3
-    if len(centres) > 1:
-        windows += 2 * max(1, int(np.ceil(np.abs(centres - centres[0]).max() / cell / size)))
-    return _table_at(prepared.system, centres[0], cell, windows * size, time, prepared.theta)
+    windows = 3 + 2 * np.abs(centres - centres[0]).max() / cell / size
+    most = 2 ** int(np.ceil(np.log2(windows * size)))
+    return _table_at(prepared.system, centres[0], cell, most, time, prepared.theta)
 
 
 @partial(jax.jit, static_argnums=(0, 3))
@@ -490,30 +499,40 @@ def _fits(state: State, info: Info) -> Any:
     return choice.healthy(info, state.plan)
 
 
-def _steps(state: State, intervals: Interval, observation: Factors, keep: bool, most: Any) -> tuple[State, tuple[Info, Any]]:
-    """The steps of a run on a window that stands still, but for those after the first `most`; with `keep` the states of all."""
+def _steps(
+    state: State, intervals: Interval, observation: Factors, keep: bool, most: Any, strict: Any
+) -> tuple[State, tuple[Info, Any], Any]:
+    """The steps of a run on a window that stands still, but for those after the first `most`, and if it is `strict` for those
+    from a look on that was not well; with `keep` the states of all; and how many were taken."""
     assert state.table is not None
     system, plan, lattice = intervals.system, state.plan, state.lattice
     assert intervals.still is not None
     kernel, turned, given = _still_factors(intervals.still, observation)
-    (last, place, narrowest), told = _still_window.moved(
-        lattice, state.table, kernel, turned, given, state.cells[0], plan.taps, keep, system.even, most
+
+    def health(sums: jax.Array, cells: jax.Array, joint: jax.Array) -> dict[str, jax.Array]:
+        return {
+            "edge_mass": sums[:, 3] / sums[:, 0],
+            "resolution": cells,
+            "quadrature_error": 2 * jnp.exp(-2 * jnp.pi**2 * joint**2),
+        }
+
+    def well(growth: jax.Array, sums: jax.Array, cells: jax.Array, joint: jax.Array) -> jax.Array:
+        return jnp.logical_not(strict) | choice.well(growth, health(sums, cells, joint), plan)
+
+    (last, place, narrowest), taken, told = _still_window.moved(
+        lattice, state.table, kernel, turned, given, state.cells[0], plan.taps, keep, system.even, most, well
     )
-    mass, first, second, outer = told.sums.T
+    mass, first, second, _ = told.sums.T
     cell, count = lattice.basis[0, 0], len(mass)
     first, second = cell * first / mass, cell**2 * second / mass
     centres = state.table.home + cell * told.place[:, None]
     cells, joint, depth = (jnp.repeat(a, count // len(a)) for a in (told.cells, told.joint, told.depth))
-    health = {
-        "edge_mass": outer / mass,
-        "resolution": cells,
-        "quadrature_error": 2 * jnp.exp(-2 * jnp.pi**2 * joint**2),
-        "exponent": jnp.zeros(count),
-        "surprise": depth / _HELD_CUT,
-    }
+    rest = {"exponent": jnp.zeros(count), "surprise": depth / _HELD_CUT}
     variance = second - first**2
     growth = told.growth + observation.constant
-    info = Info(growth, centres + first[:, None], variance[:, None, None], health, jnp.ones((count, 2)))
+    info = Info(
+        growth, centres + first[:, None], variance[:, None, None], health(told.sums, cells, joint) | rest, jnp.ones((count, 2))
+    )
 
     def laid(values: jax.Array, mass: jax.Array, centre: jax.Array, cells: jax.Array) -> State:
         moved = Lattice(lat.log(values) - jnp.log(cell * mass), centre, lattice.basis)
@@ -521,7 +540,7 @@ def _steps(state: State, intervals: Interval, observation: Factors, keep: bool, 
 
     end = laid(last, jnp.sum(last), (state.table.home + cell * place)[None], narrowest)
     kept = jax.vmap(laid)(told.values, mass, centres, cells) if keep else None
-    return replace(end, table=state.table), (info, kept)
+    return replace(end, table=state.table), (info, kept), taken
 
 
 def _stepped(interval: Interval, state: State, observation: Factors) -> tuple[State, Info]:
