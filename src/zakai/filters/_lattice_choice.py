@@ -87,7 +87,7 @@ class Plan:
             and sorted(set(self.angles)) == sorted(self.angles)
             and all(0 <= angle < len(self.sizes) for angle in self.angles)
             and 0 <= self.images <= MOST_IMAGES
-            and 0 < self.run <= LONGEST_RUN
+            and 0 < self.run <= STILL_RUN
             and 1 <= self.window <= 2 * WIDEST
             and 1 <= self.cells <= 2 * FINEST
             and 0 < self.room <= 2 * ROOM
@@ -133,11 +133,12 @@ def _top(logs: np.ndarray) -> np.ndarray:
     return logs.max(axis=tuple(range(1, logs.ndim)), keepdims=True)
 
 
-def first_plan(model: Model) -> Plan:
-    """The plan before anything is known of the steps."""
+def first_plan(model: Model, still: bool) -> Plan:
+    """The plan before anything is known of the steps, the first of which may be on a window that stands `still`."""
     angles = tuple(model.state.index(name) for name in model.periodic)
     # What observations leave of a prior on two states is much smaller, so that the first runs are short.
-    return Plan(False, (BASE[model.n],) * model.n, angles=angles, run=LONGEST_RUN if model.n == 1 else 2)
+    run = (STILL_RUN if still else LONGEST_RUN) if model.n == 1 else 2
+    return Plan(False, (BASE[model.n],) * model.n, angles=angles, run=run)
 
 
 def first_lattice(
@@ -314,7 +315,7 @@ def adapted(
             return None, None, same
         plan = better
     else:
-        plan = replace(plan, still=still)
+        plan = replace(plan, still=still, run=min(plan.run, LONGEST_RUN))
     one_line = model.n == 1 and not plan.angles and maps.shape[1] == 1
     if one_line and lattice.log_values[0].size > 1:
 

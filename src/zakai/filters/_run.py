@@ -34,6 +34,7 @@ CHUNK_BYTES = 512 * 2**20  # what is prepared for them, at most
 RUN = 256  # intervals between two looks at the lattice
 SOME = 16  # of them that are taken at once, where a method can
 WHOLE = 16  # steps of a run that is taken together, of which some may be more than count, and what is told of them nothing
+SHORT = 1 / 16  # of a run that is taken together: what is worth while
 TRIES = 16
 KEPT_BYTES = 512 * 2**20
 SURELY = 3.0  # by how much a lattice of the first runs may be larger than those that follow
@@ -265,25 +266,27 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
     `enough` of its steps ends there.  Gives the rows that were taken, the state they began with, the state they ended with, and
     what `scan` tells of each.
     """
-    run, count, begin = 0, 0, state
-    while count < min(getattr(begin, "run_length", RUN), rows.stop - rows.start):
-        run = getattr(begin, "run_length", RUN)
+    count, begin = 0, state
+    while count < min(run := getattr(begin, "run_length", RUN), rows.stop - rows.start):
         count = min(run, rows.stop - rows.start)
         part = slice(rows.start, rows.start + count)
         begin = adapt(prepared, state, part, None) if adapt else state
-    strict, length = True, 0
+    strict, shape = True, (0, False)
     for tries in range(TRIES + 2):
-        most = min(count, getattr(begin, "run_length", count), getattr(begin, "worth_while", count))
-        if length != (length := _length(method, begin, most, run, ends)):
-            some = slice(part.start, min(part.stop, part.start + length))
-            intervals, given = rows_of(prepared.intervals, some, length), rows_of(observations, some, length)
-        bare = getattr(begin, "bare", begin)
+        run, together = getattr(begin, "run_length", RUN), getattr(begin, "together", None) is not None
+        count = min(count, run)
+        if shape != (shape := (_length(method, begin, count, run, ends), together)):
+            some = slice(part.start, part.start + count)
+            intervals = begin.needed(prepared.intervals) if together else prepared.intervals
+            intervals, given = rows_of(intervals, some, shape[0]), rows_of(observations, some, shape[0])
+        bare, most = getattr(begin, "bare", begin), min(count, getattr(begin, "worth_while", count))
         end, told, taken = scan(method.step, method.healthy, bare, intervals, given, keep, (most, strict))
         end, taken = as_planned(end, begin), int(taken)
         # The more was tried in vain, the less is enough.
-        together = getattr(begin, "together", None) is not None and not scan.lanes
-        early = method.healthy is not None or together
-        if not strict or (early and taken >= max(1.0, enough * most / 2**tries)):
+        early = method.healthy is not None or (together and not scan.lanes)
+        # Such a run has lost nothing by ending early but the time to begin the next.
+        share = min(enough, SHORT) if together else enough
+        if not strict or (early and taken >= max(1.0, share * most / 2**tries)):
             break
         info = first_of(told[0], min(taken + (begin.look if together else 1), most))
         tried = state.tried(begin) if hasattr(state, "tried") else begin
@@ -407,11 +410,18 @@ class Run:
     @property
     def alone(self) -> bool:
         """Whether the record had better be filtered by itself."""
-        method = self.setting.method
-        if method.alone is None:
-            return False
+        prepared, method = self._first_prepared, self.setting.method
+        return prepared is not None and method.alone is not None and method.alone(prepared)
+
+    @property
+    def at_once(self) -> bool:
+        """Whether many records had better be filtered one after another, each for a run of steps."""
+        return getattr(self._first_prepared, "at_once", False)
+
+    @property
+    def _first_prepared(self) -> Any:
         rows = next(self.setting.chunks(self.data, int(self.at_start)), None)
-        return rows is not None and method.alone(self.setting.prepared(self.data.part(rows)))
+        return None if rows is None else self.setting.prepared(self.data.part(rows))
 
     def _first_interval(self) -> Data:
         first = self.data.part(slice(0, 1))

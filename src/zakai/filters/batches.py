@@ -105,7 +105,7 @@ class _Alike:
             # Without a reading at the start, one prior gives one first state.
             run.start(first if first and not run.at_start and run.setting.prior is first.setting.prior else None)
             first = run
-        self.alone = len(runs) > 1 and runs[0].alone
+        self.alone, self.at_once = len(runs) > 1 and runs[0].alone, runs[0].at_once
         regrouped = self.method.adapt_many is not None and len(runs) > MANY and not self.alone
         self.round = ROUND if regrouped else self.total
 
@@ -120,15 +120,15 @@ class _Alike:
         for run in self.runs:
             beside = (method.adapt is None or method.adapt_many) and not self.alone
             if run.done < self.total:
-                starts.setdefault((run.done, shape_of(run.state)) if beside else id(run), []).append(run)
+                starts.setdefault((run.done, run.keep, shape_of(run.state)) if beside else id(run), []).append(run)
         for alike in starts.values():
             n = alike[0].setting.model.n
-            at_once = hasattr(type(alike[0].state), "together")
-            each = (RUN_AT_ONCE if at_once else RUN) * (8 * (n * n + n + 16) + (size_of(alike[0].state) if alike[0].keep else 0))
+            each = 8 * (n * n + n + 16) + (size_of(alike[0].state) if alike[0].keep else 0)
+            each *= RUN_AT_ONCE if self.at_once else RUN
             most = max(1, min(LANES, LANE_BYTES // each))
             if self.round < self.total:
                 # Where one record is filtered after another those that are not there take no time.
-                size = min(most, FEW_LANES if len(alike) <= FEW_LANES and not at_once else LANES)
+                size = min(most, FEW_LANES if len(alike) <= FEW_LANES and not self.at_once else LANES)
             else:
                 parts = max(-(-len(alike) // most), min(os.cpu_count() or 1, len(alike) // WORTH_A_CORE))
                 size = -(-len(alike) // max(1, parts))
@@ -223,12 +223,12 @@ def _at_once(runs: list[Run], lanes: int, prepared: Any, rows: slice, until: int
             break
     else:
         return False
-    most, ends = part.stop - done, rows.start + part.stop == len(runs[0].record.times)
+    most, last = part.stop - done, rows.start + part.stop == len(runs[0].record.times)
     # What comes after the last row does not count: one shape, one compilation.
-    length = RUN_AT_ONCE if ends or most % WHOLE == 0 else most
+    length = RUN_AT_ONCE if last or most % WHOLE == 0 else most
     steps = np.minimum(np.arange(done, done + length), part.stop - 1)
     intervals, rule = jax.tree.map(
-        lambda array: np.asarray(array)[steps], (prepared.intervals, method.rule(prepared, runs[0].data.part(rows)))
+        lambda array: np.asarray(array)[steps], (begin.needed(prepared.intervals), method.rule(prepared, runs[0].data.part(rows)))
     )
     values = np.stack([run.data.part(rows).filled[steps] for run in filled])
     given = jax.tree.map(lambda all, one: np.broadcast_to(all, (lanes, *one.shape)), rule(values), rule(values[0]))

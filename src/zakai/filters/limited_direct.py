@@ -94,6 +94,10 @@ class State:
         """What takes all steps of a run together, where they can be."""
         return _steps if self.plan.still else None
 
+    def needed(self, intervals: Interval) -> Interval:
+        """Of intervals what steps that are taken together ask for."""
+        return replace(intervals, start=None, stop=None, flow=None, theta=None)
+
     @property
     def possible(self) -> bool:
         """Whether the narrowest features are about those of the density; of one record, outside of a compiled step."""
@@ -179,7 +183,7 @@ class Interval:
 
     start: Any
     stop: Any
-    flow: Flow
+    flow: Any
     theta: Any
     still: Still | None
     system: System
@@ -366,16 +370,15 @@ def _start(prepared, prior, observation):
         lattice, after = first, before
         if observation is not None:
             lattice, after = choice.first_lattice(model, prior, own_factor, prepared.spread, still)
+    plan, own = choice.first_plan(model, still), lattice.log_values
     if not traced:
-        state = _looked_at_one(prepared, lattice, choice.first_plan(model), model.start, choice.SAME, lattice.log_values)
-        return state, after - before
+        return _looked_at_one(prepared, lattice, plan, model.start, choice.SAME, own), after - before
     prior_on = partial(_prior_again, prepared, prior)
     before = lat.summary(first._replace(log_values=prior_on(first))).log_mass
     logs = prior_on(lattice)
     if observation is not None:
         logs = logs + log_factor(lattice.points(), observation, prepared.theta)
     after = lat.summary(lattice._replace(log_values=logs)).log_mass
-    plan, own = choice.first_plan(model), lattice.log_values
     lattice = lattice._replace(log_values=logs - after)
     return _looked_at_one(prepared, lattice, plan, model.start, choice.SAME, own), after - before
 
