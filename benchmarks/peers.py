@@ -301,10 +301,10 @@ def draw(path: str, rows: list[dict[str, Any]], which: str) -> None:
         xs, ys = [row["us_per_observation"] for row in own], [row["rms_distance"] for row in own]
         axes.scatter(xs, ys, c=colour, marker=marker, label=library, s=36)
         for row, x, y in zip(own, xs, ys, strict=True):
-            # Names of neighbours go up and down in turn.
-            up = 1 if own.index(row) % 2 == 0 else -1
-            look = dict(textcoords="offset points", fontsize=7, color=colour, rotation=25 * up, va="bottom" if up > 0 else "top")
-            axes.annotate(row["name"], (x, y), xytext=(5, 4 * up), **look)
+            # Names of neighbours go in four directions in turn.
+            turn = (30, -25, 65, -60)[sum(other < x for other in xs) % 4]
+            look = dict(textcoords="offset points", fontsize=7, color=colour, rotation=turn, va="bottom" if turn > 0 else "top")
+            axes.annotate(row["name"], (x, y), xytext=(5, 4 if turn > 0 else -4), **look)
     axes.set(xscale="log", yscale="log", xlabel="processor time per observation (microseconds)")
     axes.set(ylabel="rms distance from the optimal mean", title=f"{which} sensor: cost against accuracy")
     axes.margins(0.28, 0.25)  # room for the names

@@ -213,20 +213,22 @@ def test_the_steps_that_pad_a_run_change_neither_its_end_nor_what_was_told():
 
 def test_the_part_of_a_window_on_which_steps_are_taken_does_not_show(monkeypatch):
     (record,) = increments(SPIRAL, 640, seeds=(5,))
-    sizes, own = [], _still_window.seen
+    sizes, own, scan = [], _still_window.seen, _run.scan.function
 
     def spied(table, at, size):
         sizes.append(size)
         return own(table, at, size)
 
     monkeypatch.setattr(_still_window, "seen", spied)
-    # What was compiled is not traced again; this one is another.
-    monkeypatch.setattr(_run, "scan", _run.Scan(_run.scan.function))
+    # What was compiled is not traced again; these are others.
+    monkeypatch.setattr(_run, "scan", _run.Scan(lambda *given: scan(*given)))
     on_parts = zakai.filter(SPIRAL, record, "limited-direct")
     assert len(set(sizes)) > 2
+    sizes.clear()
     monkeypatch.setattr(_still_window, "SHARES", ())
-    monkeypatch.setattr(_run, "scan", _run.Scan(_run.scan.function))
+    monkeypatch.setattr(_run, "scan", _run.Scan(lambda *given: scan(*given)))
     on_all = zakai.filter(SPIRAL, record, "limited-direct")
+    assert len(set(sizes)) == 1
     same(on_parts, on_all, close=1e-9)
 
 
