@@ -301,10 +301,12 @@ def draw(path: str, rows: list[dict[str, Any]], which: str) -> None:
         xs, ys = [row["us_per_observation"] for row in own], [row["rms_distance"] for row in own]
         axes.scatter(xs, ys, c=colour, marker=marker, label=library, s=36)
         for row, x, y in zip(own, xs, ys, strict=True):
-            # Names of neighbours go in four directions in turn.
-            turn = (30, -25, 65, -60)[sum(other < x for other in xs) % 4]
+            # The names of those that stand near each other fan out, the highest upwards.
+            apart = [(abs(np.log10(u / x)), abs(np.log10(v / y)), -v, u) for u, v in zip(xs, ys, strict=True)]
+            near = sorted(at for along, away, *at in apart if along < 0.2 and away < 1.0)
+            turn = np.linspace(30, -45, max(2, len(near)))[near.index([-y, x])]
             look = dict(textcoords="offset points", fontsize=7, color=colour, rotation=turn, va="bottom" if turn > 0 else "top")
-            axes.annotate(row["name"], (x, y), xytext=(5, 4 if turn > 0 else -4), **look)
+            axes.annotate(row["name"], (x, y), xytext=(5, 4 if turn > 0 else -4), rotation_mode="anchor", **look)
     axes.set(xscale="log", yscale="log", xlabel="processor time per observation (microseconds)")
     axes.set(ylabel="rms distance from the optimal mean", title=f"{which} sensor: cost against accuracy")
     axes.margins(0.28, 0.25)  # room for the names

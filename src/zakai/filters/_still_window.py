@@ -90,13 +90,13 @@ def seen(table: Table, at: Any, size: int) -> Any:
 class Steps(NamedTuple):
     """What a run of K steps tells: for each step the `sums` (K, 4) of p, p i, p i^2 and of p at the edges, i an index from the
     window's centre, which is at `place` (K,) in cells from the home of its table, the logarithm by which the sum of p grew,
-    `growth` (K,), and if asked for p itself, `values` (K, N); for each look (L,) the narrowest feature in `cells`, that of its
-    product with a kernel, `joint`, and how deep in its tails the mass lies, `depth`."""
+    `growth` (K,), and if asked for the `logs` (K, N) of p itself; for each look (L,) the narrowest feature in `cells`, that of
+    its product with a kernel, `joint`, and how deep in its tails the mass lies, `depth`."""
 
     sums: Any
     place: Any
     growth: Any
-    values: Any
+    logs: Any
     cells: Any
     joint: Any
     depth: Any
@@ -179,14 +179,15 @@ def moved(
         p = p[around : around + part]
         p, multiplied, values, offset = one_kernel(steps)(p / jnp.sum(p), slices, taps_of, seen(table, at, part))
         sums = values @ _columns(part)
-        logs = jnp.log(sums[:, 0])
-        growth = logs - jnp.concatenate([jnp.zeros(1), logs[:-1]]) + offset
+        masses = jnp.log(sums[:, 0])
+        growth = masses - jnp.concatenate([jnp.zeros(1), masses[:-1]]) + offset
         end = still(lattice._replace(log_values=lat.log(p)))
         cells = lat.features(end)[0]
         joint = jax.lax.rsqrt(1.0 / jnp.minimum(own, cells) ** 2 + cell**2 / jnp.min(kernel.variance))
         depth = lat.reach(end, end.log_values - still(multiplied))
-        values = jnp.pad(values, ((0, 0), (around, around))) if keep else None
-        return jnp.pad(p, around), (sums, growth, values, cells, joint, depth)
+        # The logarithms of what is nothing are known.
+        logs = jnp.pad(lat.log(values), ((0, 0), (around, around)), constant_values=-jnp.inf) if keep else None
+        return jnp.pad(p, around), (sums, growth, logs, cells, joint, depth)
 
     def look(carry: Any, slices: Any) -> tuple[Any, Any]:
         p, at, own, taken, _ = carry
@@ -195,11 +196,11 @@ def moved(
         new, moved = lat.slid(p, shift, 0.0), at + shift
         parts = _parts(size)
         which = jnp.sum(reach + ROOM > np.array(parts[:-1]) // 2)
-        new, (sums, growth, values, cells, joint, depth) = jax.lax.switch(
+        new, (sums, growth, logs, cells, joint, depth) = jax.lax.switch(
             which, [partial(within, part) for part in parts], new, moved, own, slices
         )
         good = jnp.all(well(growth, sums, cells, joint) | (first + np.arange(each) >= most))
-        told = sums, jnp.broadcast_to(moved, (each,)), growth, values
+        told = sums, jnp.broadcast_to(moved, (each,)), growth, logs
         carry = *jax.tree.map(partial(jnp.where, good), (new, moved, cells), (p, at, own)), taken + good * each, good
         return carry, (told, cells, joint, depth)
 

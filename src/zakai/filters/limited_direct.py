@@ -537,12 +537,12 @@ def _steps(
         growth, centres + first[:, None], variance[:, None, None], health(told.sums, cells, joint) | rest, jnp.ones((count, 2))
     )
 
-    def laid(values: jax.Array, mass: jax.Array, centre: jax.Array, cells: jax.Array) -> State:
-        moved = Lattice(lat.log(values) - jnp.log(cell * mass), centre, lattice.basis)
+    def laid(logs: jax.Array, mass: jax.Array, centre: jax.Array, cells: jax.Array) -> State:
+        moved = Lattice(logs - jnp.log(cell * mass), centre, lattice.basis)
         return State(moved, None, cells[None], jnp.zeros(1), state.cut, plan)
 
-    end = laid(last, jnp.sum(last), (state.table.home + cell * place)[None], narrowest)
-    kept = jax.vmap(laid)(told.values, mass, centres, cells) if keep else None
+    end = laid(lat.log(last), jnp.sum(last), (state.table.home + cell * place)[None], narrowest)
+    kept = jax.vmap(laid)(told.logs, mass, centres, cells) if keep else None
     return replace(end, table=state.table), (info, kept), taken
 
 
