@@ -87,3 +87,22 @@ def test_the_gradient_agrees_with_central_differences(name):
     for derivative, parameter in zip(gradient, keys["parameters"], strict=True):
         wide, narrow = ((at(parameter, h) - at(parameter, -h)) / (2 * h) for h in (2e-3, 1e-3))
         assert derivative == pytest.approx((4 * narrow - wide) / 3, abs=1e-6, rel=1e-7)
+
+
+@pytest.mark.slow
+def test_a_window_that_stands_still_follows_the_mass_of_other_parameters():
+    def filtered(a, record):
+        model = zakai.Model(
+            state=["x"], drift=["a"], observation=["x*sin(x)", "x*cos(x)"], observation_kind="increments",
+            parameters={"a": a}, prior={"kind": "gaussian", "mean": [0.1], "cov": [[3.0]]},
+        )  # fmt: skip
+        return model, (record and zakai.filter(model, record, "limited-direct", keep="moments"))
+
+    model, _ = filtered(3.0, None)
+    _, record = zakai.simulate(model, 0.01 * np.arange(1, 701), seed=1)
+    value, gradient = jax.value_and_grad(log_likelihood(model, record, "limited-direct", parameters=["a"]))(jnp.array([3.0]))
+    (_, low), (_, own), (_, high) = (filtered(a, record) for a in (3.0 - 1e-3, 3.0, 3.0 + 1e-3))
+    # Far beyond what one window holds.
+    assert np.ptp(own.mean) > 15
+    assert value == pytest.approx(own.log_likelihood, abs=1e-9)
+    assert gradient[0] == pytest.approx((high.log_likelihood - low.log_likelihood) / 2e-3, rel=1e-4)

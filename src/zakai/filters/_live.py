@@ -14,13 +14,12 @@ from zakai.errors import InputError
 from zakai.filters._ahead import Ahead, Block, Clock, data_at
 from zakai.filters._compiled_step import Laid, Layout, Step, Told, compiled, packed, settled
 from zakai.filters._protocol import Info
-from zakai.filters._run import RUN, TRIES, Setting
+from zakai.filters._run import RUN, SETTLED, TRIES, Setting
 
 AFTER_GAP = (
     "a path is read after a gap: the increment since the last reading of that coordinate acts as one factor at its end, which is "
     "exact only as the gaps shrink"
 )
-SETTLED = 16  # how many steps of a run are taken before a state is settled again
 STEADY = 8  # how many times longer all runs are but the first
 
 _number = Struct("d").unpack_from

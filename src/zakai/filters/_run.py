@@ -35,6 +35,7 @@ RUN = 256  # intervals between two looks at the lattice
 SOME = 16  # of them that are taken at once, where a method can
 WHOLE = 16  # steps of a run that is taken together, of which some may be more than count, and what is told of them nothing
 SHORT = 1 / 16  # of a run that is taken together: what is worth while
+SETTLED = 16  # single steps of a run that are taken before a state is settled again
 TRIES = 16
 KEPT_BYTES = 512 * 2**20
 SURELY = 3.0  # by how much a lattice of the first runs may be larger than those that follow

@@ -17,7 +17,7 @@ import numpy as np
 
 from zakai import _float64  # noqa: F401
 from zakai.errors import ConditionError, InputError
-from zakai.filters._run import Piece, Run, Setting, scanned
+from zakai.filters._run import SETTLED, Piece, Run, Setting, scanned
 from zakai.filters.driver import check_noise, check_records, planned
 from zakai.filters.results import FilterResult
 from zakai.models._definite import ROUNDING
@@ -178,7 +178,7 @@ def _merged(piece: Piece) -> list[tuple[slice, Any]]:
 def _advance(step, state, intervals, observations, count):
     """The last state of a run and its log-likelihood; to differentiate, a step is computed again and only states are kept.
 
-    With `count` only so many of the steps are taken.
+    With `count` only so many of the steps are taken.  A state that has `settled` is settled every few steps.
     """
     again = jax.checkpoint(step, prevent_cse=False)
 
@@ -190,7 +190,15 @@ def _advance(step, state, intervals, observations, count):
         k, *rest = slices
         return jax.lax.cond(k < count, one, lambda carry, _: (carry, jnp.zeros(())), carry, rest)
 
-    if count is None:
+    def one_now_and_then_settled(carry, slices):
+        k, *rest = slices
+        return one(jax.lax.cond(k % SETTLED == 0, settle, lambda state: state, carry), rest)
+
+    settle = getattr(state, "settled", None)
+    if settle is not None:
+        steps = jnp.arange(len(jax.tree.leaves(intervals)[0]))
+        state, increments = jax.lax.scan(one_now_and_then_settled, settle(state), (steps, intervals, observations))
+    elif count is None:
         state, increments = scanned(one, state, (intervals, observations))
     else:
         length = len(jax.tree.leaves(intervals)[0])
