@@ -451,9 +451,11 @@ def _banded(
     if plan.still:
         middle = _aligned(lattice, middle, new_cell[0])
     wanted = plan.window * (span / new_cell).max() + 8
-    # Steps on a window that stands still take the part of it that they need, and its compilation takes longer than they do.
-    size = rounded_up(wanted + 2 * STILL_ROOM, parts=2) if plan.still else rounded_up(wanted)
-    own = plan.banded and plan.sizes[0] >= size >= (0.8 if plan.still else 0.6) * plan.sizes[0]
+    # Runs on a window that stands still take the part of it that they need, and its compilation takes longer than they do; but a
+    # live filter takes all of it, at every step.
+    many = len(logs) > 1
+    size = rounded_up(wanted + 2 * STILL_ROOM, BASE[1], 1 if many else 2) if plan.still else rounded_up(wanted)
+    own = plan.banded and plan.sizes[0] >= size >= ((0.5 if many else 0.8) if plan.still else 0.6) * plan.sizes[0]
     size = plan.sizes[0] if own else size
     pairs = max(BASE[1], rounded_up(span.max() / (COARSEST * deviation.min())))
     if size * (12 + 0.2 * taps) > 3 * pairs**2:

@@ -25,6 +25,11 @@ STEADY = 8  # how many times longer all runs are but the first
 _number = Struct("d").unpack_from
 
 
+def run_of(state: Any) -> int:
+    """After how many steps, taken one by one, the lattice is looked at again for the first time."""
+    return min(getattr(state, "run_length", RUN), RUN)
+
+
 class Moment(NamedTuple):
     """Everything that decides what a filter says next; it never changes, the next reading makes another.
 
@@ -189,12 +194,12 @@ class Live:
     def _looked(self, block: Block, row: int, laid: Laid) -> tuple[Laid, int]:
         """The state on a lattice that was looked at, and how many steps may be taken on it."""
         state = laid.state
-        run = getattr(state, "run_length", RUN)
+        run = run_of(state)
         rows = slice(row, min(row + STEADY * run, block.key.number))
         adapt = self.setting.method.adapt
         assert adapt is not None
         state = adapt(block.prepared, state, rows, None)
-        run = getattr(state, "run_length", RUN)
+        run = run_of(state)
         # Every step tells whether it was well; a look is there to find that less would do, which is mostly so after the prior.
         begins = self.now.laid is None or self.now.first is not None
         return self._laid(state, block), run if begins else STEADY * run
@@ -214,7 +219,7 @@ class Live:
             if state is None:
                 break
             laid = self._laid(state, block)
-            found = (*self._step(laid, block, given), getattr(state, "run_length", RUN))
+            found = (*self._step(laid, block, given), run_of(state))
             if found[1] == 1.0:
                 break
         return found

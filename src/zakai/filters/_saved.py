@@ -19,9 +19,8 @@ import numpy as np
 
 from zakai.filters._ahead import CHUNK, Clock, Key
 from zakai.filters._compiled_step import Laid, Layout, Told, compiled, packed
-from zakai.filters._live import STEADY, Live, Moment
+from zakai.filters._live import STEADY, Live, Moment, run_of
 from zakai.filters._protocol import Info
-from zakai.filters._run import RUN
 from zakai.records.record import LARGEST
 
 MOST_STEPS = 2**53
@@ -165,7 +164,7 @@ def _restored(live: Live, said: Mapping[str, Any], arrays: list[np.ndarray]) -> 
     if not live.adapts:
         first = Layout.of(begun_with)
         _check(laid.layout == first or laid.layout == compiled(live.setting.method, first, block.layout, live.m).new)
-    longest = STEADY * getattr(state, "run_length", RUN) if live.adapts else 1
+    longest = STEADY * run_of(state) if live.adapts else 1
     left = _count(said["left"], 0, longest - 1)
     moment = Moment(time, step.begun(laid), told, left, block, ends, clock, read, read_at, None, live.notes_of(block))
     _check_believable(live, moment, row, info)

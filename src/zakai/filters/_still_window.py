@@ -37,7 +37,7 @@ from zakai.models.compile import one_kernel
 LOOK = 16  # steps
 DEEP = 28.0  # units of the logarithm to which the tails are kept
 ROOM = 14  # cells that the mass may move to either side between two looks
-SHARES = (0.4375, 0.625, 0.875)  # of a window, of which the steps between two looks take the smallest that holds the mass
+SHARES = (0.4375, 0.5, 0.625)  # of a window, of which the steps between two looks take the smallest that holds the mass
 
 
 class Kernel(NamedTuple):
