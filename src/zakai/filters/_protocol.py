@@ -81,13 +81,14 @@ class Method:
     Where nothing depends on time, `lasting(prepared, interval, rule, length)` makes of the only interval of a Prepared, and
     of its rule, those of a shorter one.  None: that is prepared like any other.
 
-    Runs.  A state that `adapt` gives may have `together(state, intervals, observations, keep, count)`, traced by JAX, which gives
-    what a scan of `step` gives: the state after `count` steps, rounded up to whole sixteens, and of every step its Info and, with
-    `keep`, what is kept of its state; of those that were not taken, anything.  `bare` is the state with nothing static in it
-    but what a step must know.  Where steps
-    are healthy or not, one may have `some(intervals, state, observations)`, which gives the states and the Infos of a few steps
-    with a leading axis.  A class of states may name in `PLANNED` its fields that no step changes, and whose values are asked for
-    between runs: they stay as `adapt` gave them.
+    Runs.  A state that `adapt` gives may have `together(state, intervals, observations, keep, count, strict)`, traced by JAX,
+    which gives what a scan of `step` gives: the state after `count` steps, rounded up to whole sixteens; of every step its Info
+    and, with `keep`, what is kept of its state, of those that were not taken anything; and how many were taken: if it is `strict`
+    those before the first that was not well, which is found out every `look` steps.  `needed(intervals)` is what it asks for of
+    them.  Where a Prepared is `at_once` many records are filtered by it one after another.  `bare` is the state with nothing
+    static in it but what a step must know.  Where steps are healthy or not, one may have `some(intervals, state, observations)`,
+    which gives the states and the Infos of a few steps with a leading axis.  A class of states may name in `PLANNED` its fields
+    that no step changes, and whose values are asked for between runs: they stay as `adapt` gave them.
 
     Early ends.  `healthy(info)` says, traced by JAX, whether steps kept their bounds.  A run then ends before the first that did
     not, and where it took enough steps by then, the next run begins there: no step is taken twice.

@@ -294,8 +294,9 @@ def run_steps(method, adapt, scan, prepared, state, observations, rows: slice, e
         again = adapt(prepared, tried, part, info) if adapt and tries < TRIES else None
         if again is None and (not early or getattr(adapt, "ill", False) or taken > 0):
             break
-        # Where nothing better can be had the run is taken as it is, and its health says so.
+        # Where nothing better can be had the run is taken as it is, and its health says so; a short one, if it can be.
         begin, strict = (begin, False) if again is None else (again, True)
+        count = min(count, 4 * begin.look) if together and not strict else count
     if not strict:
         # What comes after a number that does not exist is begun anew, from before it.
         there = _existing(told[0].log_likelihood_increment, taken)
