@@ -8,10 +8,10 @@ makes of it a filter with the same taps at every point, between two factors that
 
     p'(x) = e^{after(x)} sum_y e^{-(x - y)^2 / (2 P11 Sigma)} e^{before(y)} p(y).
 
-They are multiplied with the factors of the observation, and h at the points is in a table that outlasts the runs.  The factors of
-`LOOK` steps are made at once, then a step is a filter between two products, with the second error of the splitting undone on
-both sides, and one product gives mass, mean, variance and what stands at the edges for all of them.  Everything is positive, so
-that rounding loses no tail.  Every `LOOK` steps the window is laid over the mass anew, by whole cells, its resolution is looked
+They are multiplied with the factors of the observation, and h at the points is in a table that outlasts the runs.  A step makes
+its factors where it uses them, and is a filter between two products, with the second error of the splitting undone on both
+sides; one product gives mass, mean, variance and what stands at the edges for `LOOK` steps.  Everything is positive, so that
+rounding loses no tail.  Every `LOOK` steps the window is laid over the mass anew, by whole cells, its resolution is looked
 at, and the next steps are taken on the part of it that holds the mass.
 """
 
@@ -35,7 +35,7 @@ from zakai.kolmogorov.lattice import Lattice
 from zakai.models.compile import one_kernel
 
 LOOK = 16  # steps
-DEEP = 28.0  # units of the logarithm to which the tails are kept
+DEEP = 28.0  # how deep, in units of the logarithm, the tails are kept where they are cut: at 1e-13
 ROOM = 14  # cells that the mass may move to either side between two looks
 SHARES = (0.4375, 0.5, 0.625)  # of a window, of which the steps between two looks take the smallest that holds the mass
 

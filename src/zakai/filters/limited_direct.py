@@ -42,7 +42,7 @@ from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
 
 # How deep, in units of the logarithm, the tails are kept: where they are cut at 1e-13, and where only rounding ends them.
-_HELD_CUT, _HELD = 28.0, 60.0
+_HELD_CUT, _HELD = _still_window.DEEP, 60.0
 _SMOOTH = 1e-9  # of the mass of a prior, on every second point of its lattice
 
 
