@@ -45,7 +45,8 @@ QUADRATURE_STILL = 5e-10
 SPARE = 0.97  # of the largest cell of a window, for what comes to be narrower
 NARROWER = 1.15  # by what factor a feature may come to be narrower before a window that stands still serves no more
 STILL_ROOM = 12  # cells to each side of a window that is moved every few steps only
-STILL_WIDEST = 4.0  # the `window` up to which it is worth while
+WIDE, STILL_WIDEST = 1.7, 16.0  # the `window` from which on it is looked at after every step, and up to which it is worth while
+LEAST_REACH = 7.0  # standard deviations beyond which a Gaussian has less than EDGE_STILL
 FINE = {1: 2.0, 2: 2.0, 3: 1.2}  # by how much the first lattice is finer than it need be
 
 ARRAYS = 24  # arrays of the size of the lattice that a step and what it keeps hold at once
@@ -77,6 +78,11 @@ class Plan:
     def needed(self) -> float:
         """The fewest cells that a standard deviation may have."""
         return CELLS_SHARPENED if self.sharpen else CELLS
+
+    @property
+    def wide(self) -> bool:
+        """Whether the mass moves far in a step, on a window that stands still."""
+        return self.still and self.window >= WIDE
 
     @property
     def possible(self) -> bool:
@@ -294,14 +300,14 @@ def adapted(
     maps: np.ndarray,
     info: Any,
     budget: int,
-    still: bool = False,
+    drift: Callable[[Any], Any] | None = None,
 ) -> tuple[Lattice | None, Plan | None, np.ndarray]:
     """A plan for a run of intervals of several records, their lattices if they change, and how these were cut out (records, 2).
 
     The arrays of `lattice` and `info` have a leading axis of records, as have the narrowest features `cells` (records, n).  The
     kernels have covariances `spreads` and move by `maps` (K, parts, n, n).  With the `info` of a try: a better plan, or None
-    where the try was good or nothing better can be had.  With `still` the first try is one with a window that stands still,
-    where there is a window.
+    where the try was good or nothing better can be had.  With `drift`, which tells by how much what is at x (..., 1) moves in
+    each interval, the first try is one with a window that stands still, where there is a window.
 
     Raises InputError if a lattice needs more than `budget` bytes.
     """
@@ -315,14 +321,16 @@ def adapted(
             return None, None, same
         plan = better
     else:
-        plan = replace(plan, still=still, run=min(plan.run, LONGEST_RUN))
+        # Mass does not move far for ever.
+        window = Plan.window if plan.wide else plan.window
+        plan = replace(plan, still=drift is not None, window=window, run=min(plan.run, LONGEST_RUN))
     one_line = model.n == 1 and not plan.angles and maps.shape[1] == 1
     if one_line and lattice.log_values[0].size > 1:
 
         def check(size: int) -> None:
             check_memory(model, (size,), plan.room, records, budget)
 
-        banded = _banded(lattice, cells[:, 0], plan, np.sqrt(spreads[:, 0, 0, 0]), np.abs(maps[:, 0, 0, 0]), check)
+        banded = _banded(lattice, cells[:, 0], plan, np.sqrt(spreads[:, 0, 0, 0]), np.abs(maps[:, 0, 0, 0]), drift, check)
         if banded is not None:
             return banded
     sizes = plan.sizes if not plan.banded else (BASE[1],)
@@ -422,7 +430,13 @@ def _more(plan: Plan, info: Any) -> Plan | None:
 
 
 def _banded(
-    lattice: Lattice, cells: np.ndarray, plan: Plan, deviation: np.ndarray, maps: np.ndarray, check: Callable[[int], None]
+    lattice: Lattice,
+    cells: np.ndarray,
+    plan: Plan,
+    deviation: np.ndarray,
+    maps: np.ndarray,
+    drift: Callable[[Any], Any] | None,
+    check: Callable[[int], None],
 ) -> tuple[Lattice | None, Plan, np.ndarray] | None:
     """The windows and the cells of a banded run, or None where summing over all pairs is cheaper; `check` may refuse a size."""
     logs = lattice.log_values
@@ -440,16 +454,19 @@ def _banded(
     if plan.still:
         well = np.full(len(cell), np.all(well & (cell == cell[0])))
     new_cell = np.where(well, cell, SPARE * widest)
-    enough, taps = REACH / (new_cell.min() * growth.min()), 16
-    if plan.still:
-        taps = rounded_up(enough, 4)
-    while not plan.still and taps < enough:
-        taps *= 2
     used = logs > _top(logs) + np.log(0.1 * _edge(plan))
     first, last = used.argmax(axis=1), count - 1 - used[:, ::-1].argmax(axis=1)
     middle, span = (first + last) // 2, (last - first + 1) * cell
+    enough, taps = REACH / (new_cell.min() * growth.min()), 16
     if plan.still:
+        assert drift is not None
+        # The kernel reaches as far as what drifts goes, but for less than `_edge`.
+        ends = lattice.centre + cell[:, None] * (np.stack([first, last], axis=1) - count // 2)
+        drifting = np.abs(drift(ends[..., None])).max() / new_cell.min()
+        taps = rounded_up(max(enough, LEAST_REACH / REACH * enough + drifting), 4)
         middle = _aligned(lattice, middle, new_cell[0])
+    while not plan.still and taps < enough:
+        taps *= 2
     wanted = plan.window * (span / new_cell).max() + 8
     # Runs on a window that stands still take the part of it that they need, and its compilation takes longer than they do; but a
     # live filter takes all of it, at every step.

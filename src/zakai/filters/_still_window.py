@@ -112,6 +112,7 @@ def moved(
     taps: int,
     keep: bool,
     even: bool,
+    wide: bool,
     most: Any,
     well: Callable[[Any, Any, Any, Any], Any],
 ) -> tuple[tuple[jax.Array, jax.Array, jax.Array], Any, Steps]:
@@ -119,12 +120,13 @@ def moved(
     stands and the narrowest feature in cells; how many steps were taken; and what is told on the way.
 
     `turned` (K, 2) is by how much the gauge changed in an interval, from its linear term on.  `own` is the narrowest feature of
-    the density, in cells; `even` says that both halves of every factor are the same.  Of the steps `most` are taken, rounded up
-    to whole looks, or those before the first look in which `well`, of `growth`, `sums`, `cells` and `joint`, does not hold for
-    all; what is told of those after it is zero.
+    the density, in cells; `even` says that both halves of every factor are the same; a window is `wide` for mass that moves far
+    in one step: there is a look at every one, which is taken on all of the window.  Of the steps `most` are taken, rounded up to
+    whole looks, or those before the first look in which `well`, of `growth`, `sums`, `cells` and `joint`, does not hold for all;
+    what is told of those after it is zero.
     """
     size, cell, count = len(lattice.log_values), table.cell, len(kernel.variance)
-    each = gcd(count, LOOK)
+    each = 1 if wide else gcd(count, LOOK)
     apart, variance = cell * np.arange(taps + 1), kernel.variance[:, None]
     weights = cell * jnp.exp(-0.5 * apart**2 / variance)
     taps_of = weights, *splitting.bent(weights, apart, variance)
@@ -147,6 +149,10 @@ def moved(
         last = first if even else half(after)
         return with_polynomial(first, kernel.before), with_polynomial(last, kernel.after)
 
+    def multiplied(p: Any, log: Any) -> Any:
+        # Far from the mass, where a wide window has nothing, the logarithm may be any number.
+        return jnp.where(p > 0, p * jnp.exp(log), 0.0) if wide else p * jnp.exp(log)
+
     def steps(p: Any, slices: Any, taps_of: Any, shown: Any) -> tuple[Any, Any, Any, Any]:
         """Those between two looks: the last density, the logarithm of what it was multiplied with last, all densities and by
         how much each was made smaller."""
@@ -159,16 +165,16 @@ def moved(
             p, _, *rooms = carry
             slices, taps_of, offset = slices
             first, last = halves(slices, shown, xi)
-            q = p * jnp.exp(first.log)
+            q = multiplied(p, first.log)
             inner = q, first.bend * q
             # Written into the middle of zeros: to pad is to ask at every point whether there is one, which is not vectorised.
             rooms = [jax.lax.dynamic_update_slice(room, each, (taps,)) for room, each in zip(rooms, inner, strict=True)]
-            p = jnp.exp(last.log - offset) * _filtered(rooms, last, taps_of)
+            p = multiplied(_filtered(rooms, last, taps_of), last.log - offset)
             return (p, last.log, *rooms), p
 
         zeros = jnp.zeros(len(p) + 2 * taps)
-        (p, multiplied, *_), values = jax.lax.scan(step, (p, p, zeros, zeros), (slices, taps_of, offset))
-        return p, multiplied, values, offset
+        (p, lifted, *_), values = jax.lax.scan(step, (p, p, zeros, zeros), (slices, taps_of, offset))
+        return p, lifted, values, offset
 
     def within(part: int, p: Any, at: Any, own: Any, slices: Any) -> tuple[Any, Any]:
         """The steps between two looks on the middle `part` of the window, outside of which there is nothing."""
@@ -179,6 +185,8 @@ def moved(
         p = p[around : around + part]
         p, multiplied, values, offset = one_kernel(steps)(p / jnp.sum(p), slices, taps_of, seen(table, at, part))
         sums = values @ _columns(part)
+        lost = beyond(kernel, cell * sums[:, 1] / sums[:, 0], cell * taps)
+        sums = sums.at[:, 3].set(jnp.maximum(sums[:, 3], lost * sums[:, 0]))
         masses = jnp.log(sums[:, 0])
         growth = masses - jnp.concatenate([jnp.zeros(1), masses[:-1]]) + offset
         end = still(lattice._replace(log_values=lat.log(p)))
@@ -194,7 +202,7 @@ def moved(
         first, slices = slices
         shift, reach = _shift(p > np.exp(-DEEP) * jnp.max(p), at, table)
         new, moved = lat.slid(p, shift, 0.0), at + shift
-        parts = _parts(size)
+        parts = [size] if wide else _parts(size)
         which = jnp.sum(reach + ROOM > np.array(parts[:-1]) // 2)
         new, (sums, growth, logs, cells, joint, depth) = jax.lax.switch(
             which, [partial(within, part) for part in parts], new, moved, own, slices
@@ -266,6 +274,26 @@ def stepped(
     values = jnp.exp(lowered - crest)
     deep = jnp.where(values > 0, jnp.max(spread) - spread, 0.0) @ values
     return Stepped(lowered - crest, jnp.append(_columns(size).T @ values, deep), top + crest)
+
+
+def drift(kernel: Kernel, x: Any) -> Any:
+    """By how much what was at x moves in an interval; NumPy or JAX."""
+    return -kernel.variance * (kernel.before[..., 1] + 2 * kernel.before[..., 2] * x)
+
+
+def beyond(kernel: Kernel, x: Any, reach: Any) -> Any:
+    """The share of what was at x that moves farther than the taps of a kernel `reach`, about; for one interval or many."""
+    return jnp.exp(-0.5 * jnp.maximum(reach - jnp.abs(drift(kernel, x)), 0.0) ** 2 / kernel.variance)
+
+
+def left_over(kernel: Kernel, given: Factors, table: Table, mean: Any) -> Any:
+    """The last that `splitting.bridged` makes up for, at the mean of a density after the interval, as a logarithm: more than what
+    is left; for one interval or many."""
+    at = place(table, mean) + table.h.shape[-1] // 2
+    weights = given.before + given.after
+    bent, fourth = (jnp.sum(weights * table.h[:, k, at].T, axis=-1) for k in (2, 4))
+    square = drift(kernel, mean) ** 2
+    return jnp.abs(fourth) * (square + kernel.variance) ** 2 / 240 + (kernel.variance * bent) ** 2 / 180
 
 
 def laid_anew(logs: jax.Array, at: jax.Array, table: Table) -> tuple[jax.Array, jax.Array]:

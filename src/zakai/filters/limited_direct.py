@@ -87,7 +87,7 @@ class State:
     @property
     def look(self) -> int:
         """How many steps are taken before their health is looked at, where they are taken together."""
-        return _still_window.LOOK
+        return 1 if self.plan.wide else _still_window.LOOK
 
     @property
     def together(self) -> Callable[..., Any] | None:
@@ -108,7 +108,8 @@ class State:
     @property
     def bare(self) -> State:
         """The state with nothing in its plan but what a step must know."""
-        return replace(self, plan=replace(self.plan, window=choice.Plan.window, cells=choice.Plan.cells, run=choice.Plan.run))
+        window = choice.WIDE if self.plan.wide else choice.Plan.window
+        return replace(self, plan=replace(self.plan, window=window, cells=choice.Plan.cells, run=choice.Plan.run))
 
     @property
     def small(self) -> bool:
@@ -463,8 +464,12 @@ def adapt_many(
     still = still and prepared.intervals.still is not None and bool(prepared.schedule.inside[rows].all())
     flow = prepared.intervals.flow
     own, cells = Lattice(*map(np.asarray, states.lattice)), np.asarray(states.cells)
+    drift = None
+    if still:
+        assert prepared.intervals.still is not None
+        drift = partial(_still_window.drift, jax.tree.map(lambda a: a[rows], prepared.intervals.still.kernel))
     lattice, plan, cut = choice.adapted(
-        prepared.model, own, cells, states.plan, flow.spread[rows], flow.map[rows], info, prepared.memory, still
+        prepared.model, own, cells, states.plan, flow.spread[rows], flow.map[rows], info, prepared.memory, drift
     )
     if plan is None:
         return None
@@ -523,18 +528,22 @@ def _steps(
         return jnp.logical_not(strict) | choice.well(growth, health(sums, cells, joint), plan)
 
     (last, place, narrowest), taken, told = _still_window.moved(
-        lattice, state.table, kernel, turned, given, state.cells[0], plan.taps, keep, system.even, most, well
+        lattice, state.table, kernel, turned, given, state.cells[0], plan.taps, keep, system.even, plan.wide, most, well
     )
     mass, first, second, _ = told.sums.T
     cell, count = lattice.basis[0, 0], len(mass)
     first, second = cell * first / mass, cell**2 * second / mass
     centres = state.table.home + cell * told.place[:, None]
     cells, joint, depth = (jnp.repeat(a, count // len(a)) for a in (told.cells, told.joint, told.depth))
-    rest = {"exponent": jnp.zeros(count), "surprise": depth / _HELD_CUT}
-    variance = second - first**2
+    mean, variance = centres + first[:, None], second - first**2
+    rest = {
+        "exponent": jnp.zeros(count),
+        "splitting": _still_window.left_over(kernel, given, state.table, mean[:, 0]),
+        "surprise": depth / _HELD_CUT,
+    }
     growth = told.growth + observation.constant
     info = Info(
-        growth, centres + first[:, None], variance[:, None, None], health(told.sums, cells, joint) | rest, jnp.ones((count, 2))
+        growth, mean, variance[:, None, None], health(told.sums, cells, joint) | rest, jnp.ones((count, 2))
     )
 
     def laid(logs: jax.Array, mass: jax.Array, centre: jax.Array, cells: jax.Array) -> State:
@@ -560,10 +569,11 @@ def _stepped(interval: Interval, state: State, observation: Factors) -> tuple[St
     cells = lat.features(lattice._replace(log_values=new.logs), 0.0)
     joint = jax.lax.rsqrt(1.0 / jnp.minimum(state.cells[0], cells[0]) ** 2 + cell**2 / kernel.variance)
     health = {
-        "edge_mass": outer / mass,
+        "edge_mass": jnp.maximum(outer / mass, _still_window.beyond(kernel, lattice.centre[0] + cell * mean, cell * plan.taps)),
         "resolution": cells[0],
         "quadrature_error": 2 * jnp.exp(-2 * jnp.pi**2 * joint**2),
         "exponent": jnp.zeros(()),
+        "splitting": _still_window.left_over(kernel, given, table, lattice.centre[0] + cell * mean),
         "surprise": depth / mass / _HELD_CUT,
     }
     variance = cell**2 * (second / mass - mean**2)
@@ -639,12 +649,33 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
         "resolution": jnp.min(resolution),
         "quadrature_error": 2 * jnp.exp(-2 * jnp.pi**2 * worst.joint**2),
         "exponent": worst.exponent,
+        "splitting": _left_over(interval, observation, state.lattice, state.cells) if system.halves else zero,
         "surprise": worst.surprise,
     }
     need = jnp.append(jnp.maximum(worst.need, plan.needed / resolution), worst.room)
     kept = observed if system.halves else None
     new = State(lattice, kept, cells, summary.middle, state.cut, plan)
     return new, Info(log_mass, summary.mean, summary.cov, health, need)
+
+
+def _left_over(interval: Interval, observation: Factors, lattice: Lattice, cells: jax.Array) -> jax.Array:
+    """By how much the exponent of an increment's likelihood, that of the mean of h on the way of the flow, is off where the ends
+    of the way stand for it: at most, of the centre and of the points one standard deviation from it."""
+    lattice = jax.lax.stop_gradient(lattice)
+    apart = jnp.where(jnp.array(lattice.sizes) > 1, cells, 0.0) * lattice.basis
+    first = lattice.centre + jnp.concatenate([jnp.zeros((1, len(cells))), apart.T, -apart.T])
+    weights = observation.before + observation.after
+
+    def carried(x: jax.Array, of: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        return x @ of[0].T + of[1] @ observation.inputs, None
+
+    def exponent(x: jax.Array, t: jax.Array) -> Any:
+        return _linear(weights, interval.system.observe(x, t, interval.theta))
+
+    last, _ = jax.lax.scan(carried, first, (interval.flow.map, interval.flow.shift))
+    ends = 0.5 * (exponent(first, interval.start) + exponent(last, interval.stop))
+    middle = exponent(0.5 * (first + last), 0.5 * (interval.start + interval.stop))
+    return jnp.max(jnp.abs(middle - ends)) * 2 / 3  # by Simpson's rule
 
 
 class _Worst(NamedTuple):
@@ -776,6 +807,7 @@ METHOD = Method(
         "edge_mass": (1e-9, "probability in the outermost cells of the window"),
         "quadrature_error": (1e-9, "error of a lattice sum that replaces an integral"),
         "exponent": (600.0, "largest exponent of the gauge over the window; beyond 700 mass would be lost"),
+        "splitting": (1e-3, "how far the ends of an interval are from telling what was seen between them, as a logarithm"),
         "surprise": (1.0, "how far into its tails the observation drives the density, as a share of the tails that were kept"),
     },
 )
