@@ -128,6 +128,26 @@ def test_a_way_of_which_the_ends_do_not_tell_is_said():
     assert any(said.startswith("splitting exceeded 0.001") for said in result.warnings)
 
 
+@pytest.mark.slow
+def test_what_the_ends_do_not_tell_is_the_same_where_there_is_another_state(monkeypatch):
+    seen = ["x*sin(x)", "x*cos(x)"]
+    one = zakai.Model(
+        state=["x"], drift=["-3*x"], observation=seen, observation_kind="increments",
+        prior={"kind": "gaussian", "mean": [20.0], "cov": [[0.01]]},
+    )  # fmt: skip
+    two = zakai.Model(
+        state=["x", "y"], drift=["-3*x", "-y"], observation=[*seen, "y"], observation_kind="increments",
+        prior={"kind": "gaussian", "mean": [20.0, 0.0], "cov": [[0.01, 0.0], [0.0, 0.01]]},
+    )  # fmt: skip
+    (record,) = increments(one, 12)
+    both = zakai.Record(record.times, np.column_stack([record.values, np.zeros(12)]), "increments")
+    monkeypatch.setattr(limited_direct, "METHOD", MOVING)
+    alone = zakai.filter(one, record, "limited-direct").health["splitting"][1:]
+    beside = zakai.filter(two, both, "limited-direct").health["splitting"][1:]
+    # Their lattices have not the same centres.
+    assert np.allclose(beside, alone, rtol=0.1) and alone.min() > 1e-3
+
+
 def test_records_between_each_others_points_come_to_stand_on_one_lattice():
     (record,) = increments(SPIRAL, 300)
     prepared = limited_direct.prepare(SPIRAL, schedule_of(data_of(SPIRAL, record), True))
