@@ -459,10 +459,9 @@ def _banded(
     middle, span = (first + last) // 2, (last - first + 1) * cell
     enough, taps = REACH / (new_cell.min() * growth.min()), 16
     if plan.still:
-        assert drift is not None
         # The kernel reaches as far as what drifts goes, but for less than `_edge`.
         ends = lattice.centre + cell[:, None] * (np.stack([first, last], axis=1) - count // 2)
-        drifting = np.abs(drift(ends[..., None])).max() / new_cell.min()
+        drifting = np.abs(drift(ends[..., None])).max() / new_cell.min() if drift else 0.0
         taps = rounded_up(max(enough, LEAST_REACH / REACH * enough + drifting), 4)
         middle = _aligned(lattice, middle, new_cell[0])
     while not plan.still and taps < enough:

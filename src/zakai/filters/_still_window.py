@@ -289,6 +289,7 @@ def beyond(kernel: Kernel, x: Any, reach: Any) -> Any:
 def left_over(kernel: Kernel, given: Factors, table: Table, mean: Any) -> Any:
     """The last that `splitting.bridged` makes up for, at the mean of a density after the interval, as a logarithm: more than what
     is left; for one interval or many."""
+    kernel, given, table, mean = jax.lax.stop_gradient((kernel, given, table, mean))
     at = place(table, mean) + table.h.shape[-1] // 2
     weights = given.before + given.after
     bent, fourth = (jnp.sum(weights * table.h[:, k, at].T, axis=-1) for k in (2, 4))

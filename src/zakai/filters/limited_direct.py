@@ -346,6 +346,7 @@ def correct(prepared: Prepared, prior: Any, observation: Factors) -> tuple[State
         "resolution": jnp.min(state.cells),
         "quadrature_error": zero,
         "exponent": zero,
+        "splitting": zero,
         "surprise": zero,
     }
     return state, Info(log_mass, summary.mean, summary.cov, health, jnp.append(choice.CELLS / state.cells, 1.0))
@@ -661,7 +662,8 @@ def step(interval: Interval, state: State, observation: Factors) -> tuple[State,
 def _left_over(interval: Interval, observation: Factors, lattice: Lattice, cells: jax.Array) -> jax.Array:
     """By how much the exponent of an increment's likelihood, that of the mean of h on the way of the flow, is off where the ends
     of the way stand for it: at most, of the centre and of the points one standard deviation from it."""
-    lattice = jax.lax.stop_gradient(lattice)
+    # Of a figure of health nothing is differentiated, least of all where h may not exist.
+    interval, observation, lattice = jax.lax.stop_gradient((interval, observation, lattice))
     apart = jnp.where(jnp.array(lattice.sizes) > 1, cells, 0.0) * lattice.basis
     first = lattice.centre + jnp.concatenate([jnp.zeros((1, len(cells))), apart.T, -apart.T])
     weights = observation.before + observation.after
