@@ -7,13 +7,11 @@ EXAMPLE := examples/wind-vane
 # A half-made environment or stamp would look finished to the next run.
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow longest clean
+.PHONY: help demo test clean
 
 help:
 	@echo "make demo    filter a year of real wind directions; draws $(EXAMPLE)/out/wind-vane.html"
-	@echo "make test    linter, type checker and the fast tests"
-	@echo "make slow    the tests that take minutes"
-	@echo "make longest what takes the better part of a minute by itself"
+	@echo "make test    linter, type checker and all tests"
 	@echo "make clean   remove the environment and everything that was generated"
 
 # The stamps say which extras the environment holds; they are older than pyproject.toml when it must be brought up to date.
@@ -37,16 +35,10 @@ demo: .venv/.plots
 	@echo "Open $(EXAMPLE)/out/wind-vane.html in a browser; $(EXAMPLE)/out/wind-vane.png shows ten days of it."
 
 test: .venv/.dev
-	$(BIN)/ruff check .
-	$(BIN)/mypy src
-	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not slow"
-
-# pytest says 5 when no test is marked slow, which is no failure.
-slow: .venv/.dev
-	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "slow and not longest" || [ $$? -eq 5 ]
-
-longest: .venv/.dev
-	$(BIN)/python -m pytest -q -n auto --dist worksteal -m longest
+	@began=$$(date +%s); \
+	$(BIN)/ruff check . && $(BIN)/mypy src && $(BIN)/mypy --strict src/zakai/methods src/zakai/engine && \
+	$(BIN)/python -m pytest -q -n auto --dist worksteal && \
+	echo "make test took $$(( $$(date +%s) - began )) s"
 
 clean:
 	rm -rf .venv build dist $(EXAMPLE)/out .pytest_cache .mypy_cache .ruff_cache .jax_cache .hypothesis

@@ -2,8 +2,8 @@
 
     python benchmarks/batch.py [--records 1000] [--observations 1000] [--method auto]
 
-Both are measured in one process after a first call that compiles, everything in the calls counted; that the results are
-the same is checked.  Expected with two cores: at most half of the time.
+Both are measured in one process after a first call, everything in the calls counted; the results must be
+the same.  Expected with two cores: at most half of the time.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def main() -> None:
     record = zakai.Record(EVERY * np.arange(1, given.observations + 1), readings, "samples")
     begin, cpu = time.perf_counter(), time.process_time()
     result = zakai.filter(
-        system(first, given.noise), record, "yau-yau", operator="characteristics", tolerance=given.tolerance, keep="moments"
+        system(first, given.noise), record, "yau-yau", tolerance=given.tolerance, keep="moments"
     )
     seconds, cpu = time.perf_counter() - begin, time.process_time() - cpu
     errors = np.sqrt(np.mean((result.mean[1:] - states) ** 2, axis=1))

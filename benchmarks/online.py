@@ -1,14 +1,12 @@
-"""The latency of one observation of a live filter, in process, after a warm-up.
+"""The latency of one observation of an online filter, in process, after a warm-up.
 
     python benchmarks/online.py [--observations 1000000] [--systems spiral kalman] [--watch]
 
 The spiral sensor (one state, time-varying, a new filter every 1,000 observations) by the method that `auto` takes, and a
-Kalman-Bucy filter of four states.  Settings:
-JAX runs computations on the CPU in the calling thread (`jax_cpu_enable_async_dispatch` off), one thread each for linear algebra
-(OMP_NUM_THREADS=1), and the garbage of the warm-up is frozen (`gc.freeze()`).  Percentiles in microseconds are printed as JSON;
-the first observation of a new filter, which prepares those that follow, is none of them, and stands beside them.
-With `--watch` each tenth of the observations is printed too, with the memory of the process and the largest distance of the mass
-of the density from one: a soak.  Expected: median at most 30, 99.9 % at most 1,000; memory flat within 5 %, time within 10 %.
+Kalman-Bucy filter of four states.  Linear algebra has one thread (OMP_NUM_THREADS=1), and the garbage of the warm-up is frozen
+(`gc.freeze()`).  Percentiles in microseconds are printed as JSON; the first observation of a new filter is reported separately.
+With `--watch` each tenth of the observations is printed too, with the memory of the process and the largest difference of the
+mass of the density from one.  Expected: median at most 30, 99.9 % at most 1,000; memory constant within 5 %, time within 10 %.
 """
 
 from __future__ import annotations
@@ -24,12 +22,9 @@ import resource
 import time
 from typing import Any
 
-import jax
 import numpy as np
 
 import zakai
-
-jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 WARM = 5000
 BATCH = 10_000
@@ -89,7 +84,7 @@ def measure(name: str, count: int, watch: bool) -> dict[str, Any]:
     online, source = zakai.online(model), readings(name, step)
     online.update(step, next(source))
     first = time.perf_counter() - begin
-    # Filled and looked at once, that what this script takes itself is there from the first observation on.
+    # Filled and read once, so that the memory of this script is allocated before the first observation.
     elapsed, parts = np.full(count, 0.0), []
     np.median(elapsed[: count // 10 + 1])
     clock = time.perf_counter_ns
@@ -107,7 +102,6 @@ def measure(name: str, count: int, watch: bool) -> dict[str, Any]:
             continue
         elapsed[done] = clock() - begun
         if watch and (done + 1) % max(1, count // 10) == 0:
-            # What this script takes itself is there whenever memory is looked at.
             part, mass = np.median(elapsed[done + 1 - count // 10 : done + 1]) / 1e3, mass_error(online)
             held = round(memory(), 1)
             parts.append({"median": round(float(part), 2), "MiB": held, "mass": mass})

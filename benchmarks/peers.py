@@ -31,6 +31,7 @@ import numpy as np
 from scipy.linalg import solve_banded
 
 import zakai
+from zakai.peers import _float64  # noqa: F401
 from zakai.studies._grid_optimal import grid_optimal
 from zakai.studies.chen_luo_yau_2017 import euler_paths
 

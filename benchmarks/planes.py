@@ -3,8 +3,8 @@ alone.
 
     python benchmarks/planes.py [--observations 2000] [--repeats 5] [--seed 0]
 
-Printed for each are the lattice at the end, the median time of an observation when nothing is left to compile, and how far the
-means are from those of a run at a tolerance of 1e-7, in deviations: the root of the mean of the squares, and the largest.
+Printed for each are the grid, the median time of an observation after a first call, and the differences of the means from those
+at a tolerance of 1e-7, in deviations: root mean square and largest.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def figures(model: zakai.Model, step: float, count: int, repeats: int, seed: int
     begun = zakai.Record(record.times[:50], record.values[:50], record.kind)
     density = zakai.filter(model, begun, "yau-yau").density(-1)
     return {
-        "lattice after 50 observations": list(np.shape(density.log_values)),
+        "grid after 50 observations": list(np.shape(density.log_values)),
         "ms_per_observation": round(float(np.median(taken)), 4),
         "rms_distance": float(f"{np.sqrt(np.mean(apart**2)):.2g}"),
         "largest_distance": float(f"{np.abs(apart).max():.2g}"),

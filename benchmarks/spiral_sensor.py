@@ -36,7 +36,7 @@ def main() -> None:
     first = timed(records[0])
     same = [timed(records[0]) for _ in range(arguments.repeats)]
     for record in records[1:]:
-        timed(record)  # a record may need a window of a size that was not compiled before
+        timed(record)
     other = [timed(record) for record in records[1:]]
     figures = {
         "observations": count,

@@ -17,7 +17,7 @@ import time
 import numpy as np
 
 import zakai
-from zakai.filters.driver import filter_from
+from zakai.engine.driver import filter_from
 
 
 def model(components: int) -> zakai.Model:

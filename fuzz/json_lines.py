@@ -4,8 +4,8 @@ import io
 from types import SimpleNamespace
 
 from fuzz.oracle import value_or_one_line
+from zakai.engine.online import Online, _number
 from zakai.errors import InputError
-from zakai.filters.online import Online, _number
 from zakai.records.stream import Line, lines_of
 
 _ONLINE = Online.__new__(Online)

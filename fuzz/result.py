@@ -20,8 +20,8 @@ from multiprocessing.connection import Connection
 import h5py
 
 from fuzz.oracle import value_or_one_line
+from zakai.engine.results import FilterResult, result_of
 from zakai.errors import InputError
-from zakai.filters.results import FilterResult, result_of
 from zakai.records import _hdf5
 
 SECONDS = 0.2  # of the process, for a small file; some milliseconds are usual, and `load_result` gives it more

@@ -9,8 +9,8 @@ import numpy as np
 
 from fuzz.oracle import value_or_one_line
 from fuzz.result import check_result
+from zakai.engine.results import result_of
 from zakai.errors import InputError
-from zakai.filters.results import result_of
 
 NAMES = ("time", "state", "state_", "mean", "variance", "cov", "log_likelihood_increment", "edge_weight", "\u202e", "x" * 300)
 ATTRIBUTES = ("method", "why", "model", "warnings", "log_likelihood", "scale_factor", "_FillValue", "coordinates", "description")

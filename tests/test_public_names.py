@@ -18,17 +18,31 @@ def in_a_fresh_process(code: str) -> str:
 
 def test_importing_zakai_loads_nothing_heavy():
     heavy = in_a_fresh_process(
-        "import sys, zakai; print([name for name in ('jax', 'numpy', 'scipy', 'sympy', 'xarray') if name in sys.modules])"
+        "import sys, zakai\n"
+        "print([name for name in ('jax', 'numba', 'numpy', 'scipy', 'sympy', 'xarray') if name in sys.modules])"
     )
     assert heavy.strip() == "[]"
 
 
-def test_a_model_is_analysed_and_simulated_and_records_are_read_without_jax():
+def test_a_model_is_analysed_and_simulated_and_records_are_read_without_a_compiler():
     in_a_fresh_process(
         "import sys, zakai\n"
         "model = zakai.load_model('gallery:kalman-bucy-2d')\n"
         "print(zakai.analyze(model)); zakai.analyze(model).to_json(); zakai.analyze(model).to_latex()\n"
         "zakai.simulate(model, [0.1, 0.2], seed=0); zakai.Record; zakai.read_record\n"
+        "assert not {'jax', 'numba'} & set(sys.modules)"
+    )
+
+
+@pytest.mark.parametrize("method", ["kalman-bucy", "yau-yau"])
+def test_a_record_is_filtered_online_and_fitted_without_jax(method):
+    in_a_fresh_process(
+        "import sys, zakai\n"
+        "model = zakai.load_model('gallery:kalman-bucy-1d')\n"
+        "_, record = zakai.simulate(model, [0.1, 0.2, 0.3], seed=0)\n"
+        f"result = zakai.filter(model, record, '{method}'); result.density(-1).quantile([0.1, 0.9])\n"
+        f"zakai.online(model, method='{method}').update(0.1, record.values[0])\n"
+        f"zakai.log_likelihood(model, record, method='{method}')\n"
         "assert 'jax' not in sys.modules"
     )
 

@@ -6,8 +6,7 @@
     record = zakai.read_record("observations.csv", model)
     result = zakai.filter(model, record)
 
-Each public name is loaded when it is first used, so that `import zakai` and `zakai.analyze` never wait for JAX.
-Numerical work is done in double precision: the first numerical import sets JAX's `jax_enable_x64`.
+Each public name is loaded when it is first used, so that `import zakai` is quick.
 """
 
 from __future__ import annotations
@@ -24,23 +23,23 @@ _PUBLIC = {
     "analyze": "zakai.algebra.analysis",
     "Record": "zakai.records",
     "read_record": "zakai.records",
-    "filter": "zakai.filters.driver",
-    "FilterResult": "zakai.filters.results",
-    "prepare": "zakai.filters.prepared",
-    "Prepared": "zakai.filters.prepared",
-    "online": "zakai.filters.online",
-    "Estimate": "zakai.filters.online",
-    "log_likelihood": "zakai.filters.likelihood",
-    "fit": "zakai.filters.fit",
-    "Fit": "zakai.filters.fit",
-    "load_result": "zakai.filters.results",
+    "filter": "zakai.engine.driver",
+    "FilterResult": "zakai.engine.results",
+    "prepare": "zakai.engine.prepared",
+    "Prepared": "zakai.engine.prepared",
+    "online": "zakai.engine.online",
+    "Estimate": "zakai.engine.online",
+    "log_likelihood": "zakai.engine.likelihood",
+    "fit": "zakai.engine.fit",
+    "Fit": "zakai.engine.fit",
+    "load_result": "zakai.engine.results",
     "Density": "zakai.densities",
     "ZakaiError": "zakai.errors",
     "InputError": "zakai.errors",
     "ConditionError": "zakai.errors",
 }
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [*_PUBLIC, "__version__"]  # noqa: PLE0604
 
 

@@ -21,44 +21,44 @@ class Entry(NamedTuple):
 
 METHODS = {
     "kalman-bucy": Entry(
-        "zakai.filters.kalman_bucy",
+        "zakai.methods.kalman_bucy",
         "exact for linear systems in any number of states, whatever the prior; singular noise is allowed",
     ),
     "benes": Entry(
-        "zakai.filters.benes",
+        "zakai.methods.benes",
         "exact for affine h and a drift L x + l + G grad log cosh(q.x + delta), in any number of states",
     ),
     "hu-yau": Entry(
-        "zakai.filters.hu_yau",
+        "zakai.methods.hu_yau",
         "exact for affine h and a drift L x + l + G grad F whose eta is quadratic, whatever the prior",
     ),
     "limited-direct": Entry(
-        "zakai.filters.limited_direct",
+        "zakai.methods.limited_direct",
         "exact between observations for time-varying Yau systems whose q is quadratic, in one to three states",
     ),
     "general-direct": Entry(
-        "zakai.filters.general_direct",
+        "zakai.methods.general_direct",
         "a Gaussian sum for time-varying Yau systems of any dimension; exact where h is affine and v0 a Gaussian sum",
     ),
     "gaussian-sum": Entry(
-        "zakai.filters.gaussian_sum",
-        "the same for systems that do not depend on time (the survey's Algorithm 2); only when it is asked for",
+        "zakai.methods.gaussian_sum",
+        "the same for systems that do not depend on time (the survey's Algorithm 2); only when it is named",
     ),
     "wei-norman": Entry(
-        "zakai.filters.wei_norman",
-        "for finite estimation algebras in one to three states, exp(t L0) on a lattice; only when it is asked for",
+        "zakai.methods.wei_norman",
+        "for finite estimation algebras in one to three states, exp(t L0) on a grid; only when it is named",
     ),
     "yau-yau": Entry(
-        "zakai.filters.yau_yau",
-        "convergent for any smooth system in one to four states: the Kolmogorov equation on a lattice that moves",
+        "zakai.methods.yau_yau",
+        "convergent for any smooth system in one to four states: the Kolmogorov equation on a grid that follows the density",
     ),
     "kolmogorov-series": Entry(
-        "zakai.filters.kolmogorov_series",
-        "convergent for one state and any smooth f without time: the explicit series of the kernel; only when it is asked for",
+        "zakai.methods.kolmogorov_series",
+        "convergent for one state and any smooth f without time: the explicit series of the kernel; only when it is named",
     ),
     "extended-kalman-bucy": Entry(
-        "zakai.filters.extended_kalman_bucy",
-        "approximate for any smooth system: linearised at the mean, one Gaussian; only when it is asked for",
+        "zakai.methods.extended_kalman_bucy",
+        "approximate for any smooth system: linearised at the mean, one Gaussian; only when it is named",
     ),
 }
 # Filters of other libraries, to compare with: never taken by "auto", and each needs the extra `peers`.

@@ -100,7 +100,6 @@ def test_the_page_and_the_json_show_the_block():
     assert "nothing of the state is observed" in str(zakai.analyze(zakai.load_model("gallery:silent-double-well")))
 
 
-@pytest.mark.slow
 def test_the_filter_of_the_block_is_that_of_the_whole():
     drift, noise = ["x1 + x2", "x1 - 2*x2", "3*x3 + 2*x1 - x2"], [["1", "0.3", "0.2"], ["0.3", "2", "0.5"], ["0.2", "0.5", "1"]]
     cov = [[1.0, 0.2, 0.1], [0.2, 0.5, 0.3], [0.1, 0.3, 2.0]]

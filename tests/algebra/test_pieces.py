@@ -24,7 +24,6 @@ def model(formula):
     return zakai.Model(state=["x"], drift=["0"], observation=[formula], observation_kind="samples", prior=prior)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("formula", IN_PIECES)
 def test_a_formula_that_is_affine_in_pieces_is_not_affine(formula):
     system = model(formula)

@@ -39,7 +39,6 @@ def test_twenty_random_systems_have_proofs_that_stand():
     assert [seed for seed in range(20) if not has_a_proof_that_stands(seed)] == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("hundred", range(10))
 def test_a_thousand_random_systems_have_proofs_that_stand(hundred):
     assert [seed for seed in range(100 * hundred, 100 * hundred + 100) if not has_a_proof_that_stands(seed)] == []
@@ -55,7 +54,6 @@ def test_the_algebras_of_some_random_systems_are_the_same_in_other_coordinates()
     assert [seed for seed in range(2000, 2015) if not agrees_in_other_coordinates(seed)] == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("part", range(4))
 def test_the_algebras_of_two_hundred_random_systems_are_the_same_in_other_coordinates(part):
     assert [seed for seed in range(2000 + 50 * part, 2050 + 50 * part) if not agrees_in_other_coordinates(seed)] == []

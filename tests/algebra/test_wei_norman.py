@@ -157,7 +157,7 @@ SOLVED = {
 
 @pytest.mark.parametrize("robust", [True, False])
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("Benes, 2", "Benes, 3"))) for name in SOLVED]
+    "name", SOLVED
 )
 def test_the_product_solves_the_equation(name, robust):
     model = SOLVED[name]
@@ -166,7 +166,7 @@ def test_the_product_solves_the_equation(name, robust):
     assert max(map(abs, residuals(model, equations(model), robust, values))) < 1e-40
 
 
-@pytest.mark.parametrize("seed", [seed if seed < 6 else pytest.param(seed, marks=pytest.mark.slow) for seed in range(60)])
+@pytest.mark.parametrize("seed", [seed if seed < 6 else seed for seed in range(60)])
 def test_the_product_solves_the_equation_of_a_random_system_in_random_coordinates(seed):
     model = conjugated(polynomial_system(seed), seed)
     if estimation_algebra(model).verdict == "finite":

@@ -1,6 +1,5 @@
 """A system that falls into blocks, from the command."""
 
-import pytest
 
 BLOCKS = """
 name = "sensors"
@@ -33,7 +32,6 @@ def test_a_prior_that_couples_the_blocks_is_seen(zakai, tmp_path):
     assert "auto takes: blocks: limited-direct, kalman-bucy" in told and "(a, b) by limited-direct; (p, v) by kalman-bucy" in told
 
 
-@pytest.mark.slow
 def test_a_system_of_blocks_is_filtered_stored_and_reported(zakai, tmp_path):
     (tmp_path / "blocks.toml").write_text(BLOCKS)
     (tmp_path / "blocks.csv").write_text(RECORD)

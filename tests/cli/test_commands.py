@@ -99,3 +99,30 @@ def test_an_option_of_a_study_reaches_it_and_another_is_refused(zakai):
     ):
         answer = zakai("reproduce", "cubic-sensor", "--option", option)
         assert answer.code == 2 and said in answer.err and len(answer.err.splitlines()) == 1
+
+
+def test_a_stored_result_is_a_netcdf_file_for_other_programs_too(zakai):
+    import xarray
+
+    assert zakai("filter", "gallery:kalman-bucy-1d", "record.csv", "-o", "r.nc").code == 0
+    with xarray.open_dataset("r.nc", engine="h5netcdf") as stored:
+        result = package.load_result("r.nc")
+        assert stored["mean"].dims == ("time", "state") and stored["state"].values.tolist() == ["x"]
+        np.testing.assert_array_equal(stored["cov"].values, result.cov)
+        assert stored.attrs["method"] == "kalman-bucy" and stored.attrs["log_likelihood"] == result.log_likelihood
+        assert set(result.to_dataset().variables) == set(stored.variables)
+
+
+def test_health_figures_of_version_0_1_are_read_by_their_new_names(zakai, tmp_path):
+    import xarray
+
+    from zakai.records import save_dataset
+
+    assert zakai("filter", "model.toml", "record.csv", "-o", "new.nc", "--method", "kalman-bucy").code == 0
+    old = package.load_result("new.nc").to_dataset()
+    for name in ("missed", "surprise", "resolution"):
+        old[name] = xarray.DataArray(np.arange(4.0), dims="time")
+    save_dataset(old, "old.nc")
+    health = package.load_result("old.nc").health
+    assert {"tolerance_ratio", "tail_depth", "std_in_spacings"} <= set(health) and "missed" not in health
+    assert health["tail_depth"].tolist() == [0.0, 1.0, 2.0, 3.0]

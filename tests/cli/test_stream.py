@@ -219,7 +219,6 @@ def fed(process, lines):
     process.stdin.flush()
 
 
-@pytest.mark.slow
 def test_a_killed_stream_goes_on_with_the_same_bits_and_an_interrupted_one_says_130(stream, tmp_path):
     whole = stream(LINES).out.splitlines()
     start = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=tmp_path)

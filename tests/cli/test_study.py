@@ -32,7 +32,6 @@ def study(zakai, tmp_path):
     return run
 
 
-@pytest.mark.slow
 def test_a_study_prints_a_line_for_every_method_and_writes_its_folder(study, tmp_path):
     answer = study()
     assert answer.code == 0 and answer.err == ""

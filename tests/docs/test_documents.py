@@ -19,12 +19,9 @@ from zakai.models.files import read_model
 DOCUMENTS = sorted(path.relative_to(ROOT).as_posix() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 
 
-LONG = [f"docs/{name}.md" for name in ("fit", "estimation-algebras", "yau-yau", "blocks", "kolmogorov-series")]
-
-
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in DOCUMENTS if blocks(name, "python")],
+    [name for name in DOCUMENTS if blocks(name, "python")],
 )
 def test_the_python_of_a_document_runs_and_prints_what_is_shown(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -93,14 +90,13 @@ def test_every_key_of_a_model_file_is_in_its_page():
     assert sorted(rows) == sorted(KEYS)
 
 
-@pytest.mark.slow
 def test_the_method_that_contributing_adds_works_as_it_stands_there(monkeypatch):
     theorem, entry, method, registry, test = (block.code for block in blocks("CONTRIBUTING.md", "python"))
-    name = "continuous-discrete-kalman"
+    name = "finite-volume"
 
     names = dict(vars(theorems))
     exec(compile(theorem, "CONTRIBUTING.md", "exec"), names)
-    monkeypatch.setattr(theorems, "continuous_discrete_kalman", names["continuous_discrete_kalman"], raising=False)
+    monkeypatch.setattr(theorems, "finite_volume", names["finite_volume"], raising=False)
     monkeypatch.setattr(theorems, "THEOREMS", {**theorems.THEOREMS, **eval(f"{{{entry}}}", names)})
 
     entries = eval(f"{{{registry}}}", vars(_registry))
@@ -114,9 +110,9 @@ def test_the_method_that_contributing_adds_works_as_it_stands_there(monkeypatch)
     exec(compile(test, "CONTRIBUTING.md", "exec"), tests)
     for function in [value for key, value in tests.items() if key.startswith("test_")]:
         function()
-    with pytest.raises(zakai.ConditionError, match="it fails that the observations are samples"):
-        model = zakai.load_model("gallery:kalman-bucy-1d")
-        zakai.filter(model, zakai.Record([0.1], [0.2], "increments"), name)
+    with pytest.raises(zakai.ConditionError, match="it fails that no coefficient depends on t"):
+        model = zakai.load_model("gallery:spiral-sensor")
+        zakai.filter(model, zakai.Record([0.1], [[0.2, 0.1]], "increments"), name)
 
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", *DOCUMENTS])

@@ -6,14 +6,13 @@ equation without data; as printed a term that depends on t alone is left, which 
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 import pytest
 import sympy
 from sympy import Function, Matrix, Symbol, symbols
 
 import zakai
-from zakai.filters import _one_shot
+from zakai.methods import _one_shot
 
 t = Symbol("t", real=True)
 X = Matrix(symbols("x1 x2", real=True))
@@ -114,7 +113,6 @@ def test_the_double_bracket_of_lemma_1_is_a_function_and_has_no_operator_in_it()
     assert sympy.expand(double - right * generator(u).doit()) != 0
 
 
-@pytest.mark.slow
 def test_the_running_code_has_the_wrong_evidence_with_14_as_printed(monkeypatch):
     model = zakai.Model(
         state=["x"],
@@ -132,9 +130,6 @@ def test_the_running_code_has_the_wrong_evidence_with_14_as_printed(monkeypatch)
         return -0.5 * b_rate @ inner + a @ b_rate - (k.D.T @ inner).sum() + 0.5 * b @ k.N @ b + 0.5 * k.e @ b
 
     monkeypatch.setattr(_one_shot, "c_rate", printed_rate)
-    jax.clear_caches()
     wrong = zakai.filter(model, record, "hu-yau", form="one-shot")
     assert np.abs(wrong.mean - exact.mean).max() <= 1e-12
     assert abs(wrong.log_likelihood - exact.log_likelihood) >= 1e-3
-    monkeypatch.undo()
-    jax.clear_caches()

@@ -15,9 +15,9 @@ from sympy import Function, Matrix, Rational, Symbol, diff, exp, eye, symbols
 
 from references.flow import flow_kernel
 from references.systems import planar
-from zakai.kolmogorov import power_series, schroedinger
-from zakai.kolmogorov.power_series import power_series_kernel, taylor_data
-from zakai.kolmogorov.taylor import apply, cauchy
+from zakai.methods import _power_series as power_series
+from zakai.methods._power_series import power_series_kernel, taylor_data
+from zakai.methods._taylor import apply, cauchy
 
 t = Symbol("t", real=True)
 x1, x2 = symbols("x1 x2", real=True)
@@ -200,7 +200,7 @@ def error(names):
     [
         (power_series, "_next_D", printed_D, "DEs", "ABC"),
         (power_series, "_next_E", printed_E, "E", "ABCDs"),
-        (schroedinger, "shift_rate", printed_shift_rate, "DEs", "ABC"),
+        (power_series, "shift_rate", printed_shift_rate, "DEs", "ABC"),
     ],
     ids=["D (56)", "E (57)", "b (27)"],
 )
@@ -216,7 +216,7 @@ def test_the_kernel_is_right_as_corrected_and_wrong_as_printed(
 
 def residuals():
     """The largest coefficient of t^v, v < 12, that the series leave of the equations (48) and (49)."""
-    z = schroedinger.schroedinger(data())
+    z = power_series.schroedinger(data())
     A, B, _, D, E, _ = power_series._recursion(z)
     left_D, left_E = [], []
     for v in range(12):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from zakai.kolmogorov.flow import Coefficients, flows, move_gaussian
+from zakai.numerics.families import gaussians, move
+from zakai.numerics.flow import Coefficients, at, integrate
 
 N = 2
 LENGTH = 0.4
@@ -21,17 +21,13 @@ def system(t, constant):
     return L, np.array([0.4, -0.3 + s]), G, Q, np.array([0.2, 0.5]), 0.3 - s
 
 
-def flow(constant):
-    def coefficients(t, _):
-        s = 0.0 if constant else t
-        L = jnp.array([[0.3, -1.0 + s], [0.8, -0.4]])
-        G = jnp.array([[1.0, 0.3], [0.3, 0.7 + 0.5 * s]])
-        Q = -jnp.array([[0.9, 0.2], [0.2, 0.5 + s]])
-        l, p = jnp.array([[0.4], [-0.3 + s]]), jnp.array([[0.2], [0.5]])
-        return Coefficients(L, l, G, Q, p, jnp.array([0.3 - s]))
+def transition(constant):
+    def coefficients(times, rows):
+        parts = zip(*(system(t, constant) for t in times), strict=True)
+        L, l, G, Q, p, r = (np.array(part) for part in parts)
+        return Coefficients(L, l[:, :, None], G, Q, p[:, :, None], r[:, None])
 
-    both = flows(coefficients, np.zeros(1), np.array([LENGTH]), np.zeros(1))
-    return type(both)(*(a[0] for a in both))
+    return at(integrate(coefficients, [0.0], [LENGTH], constant).transition, 0)
 
 
 def exponents(constant, printed=False):
@@ -56,7 +52,8 @@ def exponents(constant, printed=False):
 
 def difference(constant, printed=False):
     (m, P), A, b, c = exponents(constant, printed)
-    mean, cov, log_mass = (np.asarray(a) for a in move_gaussian(flow(constant), m, P, np.ones(1)))
+    moved = move(gaussians(np.zeros(1), m[None], P[None]), transition(constant), np.ones(1), True)
+    mean, cov, log_mass = moved.mean[0], moved.cov[0], moved.log_mass[0]
     inverse = np.linalg.inv(cov)
     level = log_mass - 0.5 * mean @ inverse @ mean - 0.5 * np.linalg.slogdet(2 * np.pi * cov)[1]
     return max(np.abs(A + 0.5 * inverse).max(), np.abs(b - inverse @ mean).max(), abs(c - level))

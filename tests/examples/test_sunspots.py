@@ -23,7 +23,6 @@ def plain(record: zakai.Record, values: dict[str, float]) -> tuple[np.ndarray, n
     return module.grid_filter(record.times, record.values[:, 0], values)
 
 
-@pytest.mark.slow
 def test_three_centuries_of_sunspots_agree_with_bayes_rule_on_the_circle():
     model = zakai.load_model(FOLDER / "sunspots.toml")
     record = zakai.read_record(FOLDER / "observations.csv", model)

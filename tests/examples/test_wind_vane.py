@@ -37,7 +37,6 @@ def angle_between(direction: np.ndarray, mean: np.ndarray) -> np.ndarray:
     return np.abs(np.angle(direction * np.exp(-1j * mean)))
 
 
-@pytest.mark.slow
 def test_two_weeks_of_wind_agree_with_bayes_rule_on_the_circle():
     model = zakai.load_model(FOLDER / "wind-vane.toml")
     record = first_hours(model, 300)
@@ -52,7 +51,6 @@ def test_two_weeks_of_wind_agree_with_bayes_rule_on_the_circle():
     assert angle_between(direction, result.mean[1:, 0])[1:].max() < 1e-8
 
 
-@pytest.mark.slow
 def test_an_angle_and_a_rate_agree_with_bayes_rule_on_a_grid_of_both():
     model = zakai.load_model("gallery:wind-vane-rate")
     record = first_hours(model, 30)
@@ -73,8 +71,6 @@ def test_the_model_files_hold_the_most_likely_parameters_that_the_comparison_fou
             assert float(parameters[name]) == pytest.approx(RESULTS["direct"][name], abs=0.002)
 
 
-@pytest.mark.longest
-@pytest.mark.slow
 def test_over_the_year_the_direct_method_forecasts_better_than_the_extended_kalman_filter():
     year = script("compare").Year()
     # The direct method's likelihood is smooth: at its maximum a step to any side loses. The extended Kalman filter's is rough and
@@ -89,8 +85,6 @@ def test_over_the_year_the_direct_method_forecasts_better_than_the_extended_kalm
     assert scores["direct"] > scores["extended_kalman"] + 2000
 
 
-@pytest.mark.longest
-@pytest.mark.slow
 def test_over_the_year_particles_agree_within_their_own_scatter(monkeypatch):
     compare = script("compare")
     monkeypatch.setattr(compare, "PARTICLES", 10_000)

@@ -26,7 +26,6 @@ def test_a_sampled_linear_system_is_filtered_exactly_but_for_the_substeps(name):
     assert (apart(zakai.filter(linear("samples"), record, name, substeps=8), filtered(record)) < 2e-5).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("scheme", "order"), [("midpoint", 2), ("euler", 1)])
 def test_the_order_of_the_substeps_is_as_it_is_said(scheme, order):
     record = readings(linear("samples"), TIMES, gaps=True)
@@ -35,7 +34,6 @@ def test_the_order_of_the_substeps_is_as_it_is_said(scheme, order):
     assert np.log2(coarse / fine) == pytest.approx(order, abs=0.2)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
 def test_increments_of_a_linear_system_are_exact_to_first_order_in_the_interval(name):
     model = linear("increments")
@@ -97,7 +95,6 @@ def over_seeds(record: zakai.Record, name: str, size: int, seeds: int) -> list[z
     return [zakai.filter(model, record, name, seed=seed, substeps=4, keep="moments", **sized) for seed in range(seeds)]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SIZES)
 def test_sampling_peers_come_to_the_exact_posterior_as_one_over_the_root_of_their_size(name):
     record = readings(linear("samples"), TIMES, gaps=True)
@@ -114,7 +111,6 @@ def test_sampling_peers_come_to_the_exact_posterior_as_one_over_the_root_of_thei
     assert np.mean([run.cov[1:] for run in runs], axis=0) == pytest.approx(cov, abs=0.03)
 
 
-@pytest.mark.slow
 def test_the_likelihood_of_the_particle_filter_is_unbiased():
     record = readings(linear("increments"), TIMES / 8, gaps=True)
     exact = filtered(record)[2].sum()

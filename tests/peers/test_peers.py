@@ -91,7 +91,6 @@ def test_the_particle_filter_is_the_same_again_with_its_seed():
     assert np.allclose(first.density(-1).cov(), first.cov[-1], rtol=0, atol=1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ukf", "particle"])
 def test_many_records_give_what_each_gives_alone(name):
     model, options = spiral("increments"), FEW.get(name, {})
@@ -103,7 +102,7 @@ def test_many_records_give_what_each_gives_alone(name):
         assert np.isclose(many.log_likelihood, alone.log_likelihood, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["ekf", pytest.param("enkf", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["ekf", "enkf"])
 def test_what_was_not_observed_is_as_if_there_were_no_such_sensor(name):
     model, options = linear("samples"), FEW.get(name, {})
     values = readings(model, TIMES).values.copy()
@@ -122,7 +121,6 @@ def test_what_was_not_observed_is_as_if_there_were_no_such_sensor(name):
     assert np.allclose(result.log_likelihood_increments, alone.log_likelihood_increments, rtol=0, atol=tolerance)
 
 
-@pytest.mark.slow
 def test_increments_paths_and_rates_say_the_same():
     record = readings(spiral("increments"), TIMES, gaps=False)
     expected = zakai.filter(spiral("increments"), record, "ukf")
@@ -133,7 +131,6 @@ def test_increments_paths_and_rates_say_the_same():
         assert np.isclose(result.log_likelihood, expected.log_likelihood, rtol=0, atol=1e-8)
 
 
-@pytest.mark.slow
 def test_every_way_of_resampling_gives_one_posterior_and_says_how_often():
     model = spiral("increments")
     record = readings(model, TIMES)
@@ -144,7 +141,6 @@ def test_every_way_of_resampling_gives_one_posterior_and_says_how_often():
         assert np.allclose(result.mean, results[0].mean, rtol=0, atol=0.1)
 
 
-@pytest.mark.slow
 def test_a_collapse_of_the_particles_is_said():
     model = zakai.Model(observation_kind="samples", **(SPIRAL | {"observation_noise": [["1e-6", "0"], ["0", "1e-6"]]}))
     result = zakai.filter(model, readings(model, TIMES), "particle", **FEW["particle"])
@@ -152,7 +148,6 @@ def test_a_collapse_of_the_particles_is_said():
     assert any("few particles carry the weight" in said for said in result.warnings)
 
 
-@pytest.mark.slow
 def test_without_process_noise_the_copies_are_counted_as_one():
     model = zakai.Model(observation_kind="samples", **(SPIRAL | {"process_noise": [["0"]]}))
     record = readings(model, np.arange(1, 81) / 4)
@@ -173,7 +168,7 @@ def test_a_filter_that_lost_the_state_is_said():
     assert well.warnings == []
 
 
-@pytest.mark.parametrize("name", ["ekf", pytest.param("particle", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["ekf", "particle"])
 def test_a_sample_at_the_start_and_an_angle_are_taken(name):
     model = zakai.Model(
         state=["a"], drift=["1"], observation=["cos(a)", "sin(a)"], observation_kind="samples", periodic=["a"],

@@ -88,10 +88,7 @@ def outcome(path, online, about, arrays):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "kalman-bucy-1d",
-        pytest.param("spiral-sensor", marks=pytest.mark.slow),
-    ],
+    ["kalman-bucy-1d", "spiral-sensor"],
 )
 def test_a_forged_checkpoint_is_refused_or_gone_on_from(tmp_path, name):
     path = tmp_path / "state"
@@ -99,7 +96,7 @@ def test_a_forged_checkpoint_is_refused_or_gone_on_from(tmp_path, name):
     assert outcome(path, online, about, arrays) == "read"
     found = Counter()
     rng = np.random.default_rng(1)
-    for place in places({key: about[key] for key in ("method", "options", "lives", "more")}):
+    for place in places({key: about[key] for key in ("method", "options", "filters", "more")}):
         words = [WORDS[i] for i in rng.permutation(len(WORDS))[: 3 if name == "kalman-bucy-1d" else 1]]
         found.update(outcome(path, online, put(about, place, word), arrays) for word in words)
     for key, array in arrays.items():
@@ -120,20 +117,15 @@ def test_what_is_no_moment_of_the_filter_is_refused_word_by_word(tmp_path):
     before = online.time, online.last.mean.tolist()
     wrong = {
         ("time",): [np.nan, np.inf, -1.0, 0, "x", 1e300],
-        ("left",): [-1, 1, 10**30, 0.0, None],
-        ("ends",): [[0.0] * 10, [0.05, 0.04], [0.04, 0.05, 0.06], [0.04], [0.03, 0.05], [0.04, np.nan]],
-        ("block", 1): [0.02, np.nan, -0.01, 1],
-        ("clock",): [[], [0.0, -1, [], None, False], [np.nan, 0, [], None, False], [0.0, 10**30, [], None, False]],
-        ("read",): [[], [np.nan], [1.0], ["0"]],
-        ("well",): [1, None],
+        ("values",): [[], [np.nan], [1.0], ["0"]],
+        ("times",): [[], [np.nan], [1.0], ["0"]],
+        ("info",): [None, [], [{"array": 0}], 0.0],
+        ("health",): [None, [], {"x": "y"}, {"x": [1.0]}],
         ("notes",): [["\x1b[2J"], "x"],
-        ("state", "fields", "log_error", "array"): [-1, 4, 8, 10, True, 9.0, None],
-        ("state", "fields", "log_error"): [None, {"array": 8}, {"array": 10}, 0.0, {"tuple": [{"array": 9}]}],
-        ("told", "fields", "health", "dict"): [{}, {"edge_weight": {"array": 15}}],
     }
     for place, words in wrong.items():
         for word in words:
-            write_checkpoint(path, put(about, ("lives", 0, *place), word), arrays)
+            write_checkpoint(path, put(about, ("filters", 0, *place), word), arrays)
             with pytest.raises(zakai.InputError, match="does not fit"):
                 online.restore(path)
     for changed in ({**arrays, "more": np.zeros(1)}, {**arrays, "0/19": np.zeros(1)}, dict(list(arrays.items())[:-1])):
@@ -149,7 +141,7 @@ def test_blocks_that_are_not_at_one_time_are_refused(tmp_path):
     online.save(path)
     later, later_arrays = read_checkpoint(path)
     mixed = {key: (arrays if key.startswith("0/") else later_arrays)[key] for key in arrays}
-    write_checkpoint(path, {**about, "lives": [about["lives"][0], later["lives"][1]]}, mixed)
+    write_checkpoint(path, {**about, "filters": [about["filters"][0], later["filters"][1]]}, mixed)
     with pytest.raises(zakai.InputError, match="does not fit"):
         online.restore(path)
 
@@ -166,8 +158,8 @@ def test_before_the_first_interval_a_checkpoint_says_what_the_filter_knows_or_is
     fresh = zakai.online(online.model, "extended-kalman-bucy")
     fresh.restore(path)
     assert fresh.last.mean.tolist() == expected and fresh.time == 0
-    for place in places(about["lives"], ("lives",)):
+    for place in places(about["filters"], ("filters",)):
         for word in (None, -1, "x"):
             changed = put(about, place, word)
             if json.dumps(changed) != json.dumps(about):
-                assert outcome(path, fresh, changed, arrays) in (["refused", "read"] if "first" in place else ["refused"])
+                assert outcome(path, fresh, changed, arrays) == "refused"

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import xarray
 
+from zakai.engine.results import load_result
 from zakai.errors import InputError
-from zakai.filters.results import load_result
 from zakai.records import load_dataset, save_dataset
 
 

@@ -2,7 +2,6 @@ import subprocess
 import sys
 
 import numpy as np
-import pytest
 
 from zakai.records import Record, write_record
 
@@ -24,7 +23,6 @@ print(len(record), kilobytes // 1024)
 """
 
 
-@pytest.mark.slow
 def test_a_million_rows_are_read_in_seconds_and_little_memory(tmp_path):
     values = np.random.default_rng(0).normal(size=(1_000_000, 2))
     values[::7, 1] = np.nan

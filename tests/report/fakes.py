@@ -76,7 +76,7 @@ def fake_result(
         warnings=list(warnings),
         health={
             "edge_mass": np.concatenate([[0.0], 10.0 ** random.uniform(-17, -12, observations)]),
-            "resolution": 2.6 + 0.5 * random.standard_normal(count) ** 2,
+            "std_in_spacings": 2.6 + 0.5 * random.standard_normal(count) ** 2,
             "discarded_mass": np.zeros(count),
         },
         why="f = L x + l + G grad phi with q quadratic: Theorem 3 holds; the cheapest exact method.",

@@ -90,8 +90,6 @@ def test_the_table_and_the_pictures_are_in_the_folder(small, capsys):
 
 
 
-@pytest.mark.longest
-@pytest.mark.slow
 def test_the_direct_method_is_optimal_and_the_ekf_far_from_it_on_whole_paths():
     study = study_module.run(paths=24)
     assert_bands(study)

@@ -38,10 +38,10 @@ def limited_direct(model: Model) -> tuple[Condition, ...]:
     conditions = [
         determined(model),
         Condition(
-            "the state has at most three coordinates, so that the density fits on a lattice",
+            "the state has at most three coordinates, so that the density fits on a grid",
             model.n <= 3,
             f"n = {model.n}",
-            "the lattice of this method",
+            "the grid of this method",
         ),
     ]
     if conditions[0].holds is not True:
@@ -153,17 +153,14 @@ def smooth_system(model: Model) -> tuple[Condition, ...]:
 
 @lru_cache(maxsize=64)
 def any_smooth_system(model: Model) -> tuple[Condition, ...]:
-    """Any smooth system whose density fits on a lattice."""
+    """Any smooth system whose density fits on a grid."""
     return (
         determined(model),
         Condition(
-            "the state has at most four coordinates, so that the density fits on a lattice",
+            "the state has at most four coordinates, so that the density fits on a grid",
             model.n <= 4,
             f"n = {model.n}",
-            "the lattice of this method",
-        ),
-        Condition(
-            "no coordinate is an angle", not model.periodic, f"periodic = {list(model.periodic)}", "the lattice of this method"
+            "the grid of this method",
         ),
     )
 
@@ -190,8 +187,8 @@ def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
         ),
         definite_covariance(model),
         Condition("f is smooth", not bent, f"f contains {short(str(bent[0]))}" if bent else "no absolute value", source),
-        Condition("there is one state", model.n == 1, f"n = {model.n}", "the lattice of this method"),
-        Condition("the state is no angle", not model.periodic, f"periodic: {list(model.periodic)}", "the lattice of this method"),
+        Condition("there is one state", model.n == 1, f"n = {model.n}", "the grid of this method"),
+        Condition("the state is no angle", not model.periodic, f"periodic: {list(model.periodic)}", "the grid of this method"),
     )
 
 

@@ -7,27 +7,25 @@ import os
 import sys
 from collections.abc import Sequence
 
-from zakai import _compiled
 from zakai.cli import _interrupt
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command with these arguments, by default those of the process; the exit code.
+    """Run the command with these arguments, by default those of the process, and return the exit code.
 
-    0 done; 2 the input is wrong; 3 no method holds, or not the one that was asked for; 130 interrupted.  A bug of ours is
-    any other exception, and leaves with its traceback (1).
+    0 success; 2 wrong input; 3 no method holds, or not the requested one; 130 interrupted.  Any other exception is a bug and
+    leaves with its traceback (1).
     """
     if arguments is None:
-        # What is imported stays: to look for garbage among it, again and again, takes a tenth of the start.
+        # Imported modules stay: repeated searches for garbage among them take a tenth of the start-up time.
         gc.set_threshold(50_000, 20, 100)
         _interrupt.watch()
-        _compiled.keep()
     try:
         return _run(arguments)
     except KeyboardInterrupt:
         print("interrupted; nothing half-written was left behind", file=sys.stderr, flush=True)
         if arguments is None and "jax" in sys.modules:
-            os._exit(130)  # JAX may still be compiling, and would take an orderly exit for a crash
+            os._exit(130)  # JAX, in a filter of another library, may still be compiling and reports an orderly exit as a crash
         return 130
     except BrokenPipeError:
         _discard_output()  # the reader closed the pipe, which is no error
@@ -41,7 +39,7 @@ def _run(arguments: Sequence[str] | None) -> int:
     from zakai.errors import ZakaiError
 
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # a terminal that has no letter for phi still gets an answer
+        if hasattr(stream, "reconfigure"):  # a terminal without Greek letters prints question marks
             stream.reconfigure(errors="replace")
     try:
         code = app(arguments, prog_name="zakai", standalone_mode=False)
@@ -53,14 +51,14 @@ def _run(arguments: Sequence[str] | None) -> int:
     except typer.Abort:
         raise KeyboardInterrupt from None
     except SystemExit as leaving:
-        # Typer leaves with 1 where the reader of a pipe is gone.
+        # Typer exits with 1 where the reader of a pipe is gone.
         if isinstance(leaving.__context__, BrokenPipeError):
             raise BrokenPipeError from None
         raise
     except BrokenPipeError:
         raise
     except OSError as error:
-        # What is written to a file says so itself; what has no name is the output of print.
+        # An error of a file has a name; without one it comes from print.
         if error.filename is not None:
             raise
         _discard_output()
@@ -68,7 +66,7 @@ def _run(arguments: Sequence[str] | None) -> int:
     except ZakaiError as error:
         return _refused(str(error), error.exit_code)
     except Exception as error:
-        # A wrong usage, in every version of Typer and Click: the only errors that can format themselves.
+        # Wrong usage, in every version of Typer and Click: only these errors format themselves.
         if not hasattr(error, "format_message"):
             raise
         return _refused(f"{error.format_message()} (zakai --help says how)", 2)
@@ -80,5 +78,5 @@ def _refused(message: str, code: int) -> int:
 
 
 def _discard_output() -> None:
-    """What Python would still flush at its end goes nowhere."""
+    """Discard what Python would flush at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""What a command checks of its files before the long work begins."""
+"""Checks of the files of a command before the long work begins."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ from zakai.records.writing import shown
 
 
 def check_outputs(outputs: list[Path | None], inputs: list[Path | str | None]) -> None:
-    """Refuse an output that cannot be written, that is also an input, or that is named twice."""
+    """Check the outputs of a command.
+
+    Raises:
+        InputError: an output cannot be written, is also an input, or is named twice.
+    """
     seen = {os.path.realpath(path): "is also an input" for path in inputs if path is not None}
     for path in outputs:
         if path is None:

@@ -1,8 +1,7 @@
-"""Ctrl-C that is not lost, and that breaks nothing.
+"""Ctrl-C that is neither ignored nor breaks a library.
 
-Python raises KeyboardInterrupt wherever the program happens to be.  Where that is a callback of a library, of JAX while it
-compiles for example, it is dropped there, or the library comes down.  So it is also noted, and asked for at every step of long
-work; and while JAX is at work it waits a little.
+Python raises KeyboardInterrupt wherever the program is.  In a callback of a library, for example in a compiler, it is dropped or
+makes the library fail.  Therefore it is also recorded, and checked at every step of long work; while a compiler runs it waits.
 """
 
 from __future__ import annotations
@@ -12,9 +11,10 @@ import threading
 import time
 from types import FrameType
 
-AGAIN = 2.0  # seconds after which an interruption that nobody heard is asked for again
-SOON = 0.05  # the same of one that waits for JAX
-PATIENCE = 5.0  # seconds that it waits at most
+COMPILERS = ("jax", "jaxlib", "numba", "llvmlite")
+AGAIN = 2.0  # seconds after which an interruption without effect is raised again
+SOON = 0.05  # the same for one that waits for a compiler
+PATIENCE = 5.0  # the longest wait in seconds
 
 _asked = False
 _since = 0.0
@@ -23,7 +23,7 @@ _timed = False
 
 
 def watch() -> None:
-    """Note the interruptions of this process, unless somebody else already looks after them."""
+    """Record the interruptions of this process, unless another handler is installed."""
     global _asked, _timed
     _asked = False
     if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -34,7 +34,7 @@ def watch() -> None:
 
 
 def insist() -> None:
-    """Ask again and again: for what waits for its input, where no step comes at which `check` is asked."""
+    """Raise repeatedly: for a program that waits for input and calls `check` too rarely."""
     global _insists
     _insists = _timed
 
@@ -43,7 +43,7 @@ def _note(_: int = 0, frame: FrameType | None = None) -> None:
     global _asked, _since
     _since = _since if _asked else time.monotonic()
     _asked = True
-    if _timed and _within_jax(frame) and time.monotonic() - _since < PATIENCE:
+    if _timed and _within_compiler(frame) and time.monotonic() - _since < PATIENCE:
         signal.setitimer(signal.ITIMER_REAL, SOON)
         return
     if _insists:
@@ -51,9 +51,9 @@ def _note(_: int = 0, frame: FrameType | None = None) -> None:
     raise KeyboardInterrupt
 
 
-def _within_jax(frame: FrameType | None) -> bool:
+def _within_compiler(frame: FrameType | None) -> bool:
     while frame is not None:
-        if frame.f_globals.get("__name__", "").partition(".")[0] in ("jax", "jaxlib"):
+        if frame.f_globals.get("__name__", "").partition(".")[0] in COMPILERS:
             return True
         frame = frame.f_back
     return False

@@ -1,4 +1,4 @@
-"""A progress bar on a terminal, and silence everywhere else."""
+"""A progress bar on a terminal; nothing is printed elsewhere."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from zakai.cli import _interrupt
 
 @contextmanager
 def progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A function of (done, total), to be called at every step of long work: it draws on stderr where somebody looks."""
+    """Yield a function of (done, total) to call at every step of long work; on a terminal it draws on stderr."""
     if not sys.stderr.isatty():
         yield lambda done, total: _interrupt.check()
         return

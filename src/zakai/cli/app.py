@@ -1,4 +1,4 @@
-"""The commands and their arguments; what each does is in a module of its own, imported when it runs."""
+"""The commands and their arguments; the module of a command is imported when it runs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _show_version(asked: bool) -> None:
 @app.callback(invoke_without_command=True)
 def _root(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Say the version.")] = False,
+    version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")] = False,
 ) -> None:
     if context.invoked_subcommand is None:
         print(context.get_help())
@@ -41,10 +41,10 @@ def analyze(
     json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
     latex: Annotated[bool, typer.Option("--latex", help="As LaTeX.")] = False,
 ) -> None:
-    """Say from the equations alone which methods hold for a system, and why."""
-    from zakai.cli import looking
+    """Decide from the equations alone which methods hold for a system, and why."""
+    from zakai.cli import inspecting
 
-    looking.analyze(model, json, latex)
+    inspecting.analyze(model, json, latex)
 
 
 @app.command()
@@ -84,13 +84,13 @@ def stream(
     model: _Model,
     method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
     option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
-    checkpoint: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the state there, and go on from it.")] = None,
+    checkpoint: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the state there, and continue from it.")] = None,
     checkpoint_every: Annotated[int | None, typer.Option(metavar="N", min=1, help="Save after every N observations.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Stop at the first line that cannot be used.")] = False,
     every: Annotated[int, typer.Option(metavar="N", min=1, help="Print every Nth estimate.")] = 1,
     fields: Annotated[str, typer.Option(metavar="a,b", help="What to print: time, mean, cov, interval, ...")] = "",
 ) -> None:
-    """Filter observations as they come: JSON lines or CSV on standard input, one line of JSON out for each."""
+    """Filter observations as they arrive: JSON lines or CSV on standard input, one line of JSON out for each."""
     from zakai.cli import streaming
 
     streaming.stream(model, method, option or [], checkpoint, checkpoint_every, strict, every, fields)
@@ -98,12 +98,12 @@ def stream(
 
 @app.command()
 def methods(
-    model: Annotated[str | None, typer.Argument(metavar="[MODEL]", help="Say which hold for this model.")] = None,
+    model: Annotated[str | None, typer.Argument(metavar="[MODEL]", help="Print which hold for this model.")] = None,
 ) -> None:
-    """List the methods; for a model, say of each whether it holds."""
-    from zakai.cli import looking
+    """List the methods; for a model, print whether each holds."""
+    from zakai.cli import inspecting
 
-    looking.methods(model)
+    inspecting.methods(model)
 
 
 @app.command()
@@ -111,19 +111,19 @@ def gallery(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Print the file of this model.")] = None,
 ) -> None:
     """List the models that come with zakai, or print one of them."""
-    from zakai.cli import looking
+    from zakai.cli import inspecting
 
-    looking.gallery(name)
+    inspecting.gallery(name)
 
 
 @app.command()
 def study(
     file: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="Which models, methods and seeds.")],
-    folder: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Where it goes, and is gone on with.")],
+    folder: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="The results, or a study to continue.")],
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run it on the workers of a Dask scheduler.")] = None,
     processes: Annotated[int | None, typer.Option(metavar="N", help="Run it in N processes.")] = None,
 ) -> None:
-    """Run many records through many methods; a study that was interrupted goes on where it was."""
+    """Filter many records by many methods; an interrupted study continues where it stopped."""
     from zakai.cli import studying
 
     studying.study(file, folder, scheduler, processes)
@@ -137,7 +137,7 @@ def reproduce(
         list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the study, such as paths=5; repeatable.")
     ] = None,
 ) -> None:
-    """Run a published experiment again, and print what is published beside ours."""
+    """Run a published experiment again, and print the published figures beside the new ones."""
     from zakai.cli import studying
 
     studying.reproduce(name, folder, option or [])

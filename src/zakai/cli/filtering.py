@@ -27,7 +27,7 @@ def filter(
     truth_path: Path | None,
     report: Path | None,
 ) -> None:
-    """Filter a record; write the result and the report.  Whatever can be refused is refused before the work begins."""
+    """Filter a record, and write the result and the report; wrong input is refused before the work begins."""
     check_outputs([output, report], [source, record_path, truth_path])
     options = options_of(settings)
     if report is not None:
@@ -39,10 +39,10 @@ def filter(
     record = read_record(record_path, model)
     truth = None if truth_path is None else _truth(truth_path, model, record)
 
-    from zakai.filters.driver import filter as run
+    from zakai.engine.driver import filter as run
 
     with progress("filtering") as advance:
-        # Only the report looks at the densities.
+        # Only the report uses the densities.
         result = run(model, record, method, keep=None if report else "moments", progress=advance, **options)
     for warning in result.warnings:
         print(f"warning: {warning}", file=sys.stderr)
@@ -74,7 +74,7 @@ def _truth(path: Path, model: Any, record: Record) -> Truth:
 
 
 def options_of(settings: list[str]) -> dict[str, Any]:
-    """KEY=VALUE as keywords: numbers, true, false and none by their meaning, anything else as text."""
+    """Return KEY=VALUE as keywords: numbers, true, false and none by their meaning, anything else as text."""
     options: dict[str, Any] = {}
     for setting in settings:
         key, equals, text = setting.partition("=")

@@ -39,7 +39,7 @@ def stream(
     every: int,
     fields: str,
 ) -> None:
-    """Filter the lines of standard input; one line of JSON out for each.  What can be refused is refused before the first."""
+    """Filter the lines of standard input, and print a line of JSON for each; wrong arguments are refused before the first."""
     if checkpoint is None and checkpoint_every is not None:
         raise InputError("--checkpoint-every: needs --checkpoint FILE")
     wanted = _wanted(fields)
@@ -47,18 +47,13 @@ def stream(
     options = options_of(settings)
     model = load_model(source)
 
-    import jax
+    from zakai.engine.online import online
 
-    from zakai import _float64  # noqa: F401
-    from zakai.filters.online import online
-
-    # An observation is answered before the next is read: that another thread computes would only be waited for.
-    jax.config.update("jax_cpu_enable_async_dispatch", False)
     _Stream(online(model, method, **options), wanted, every, checkpoint, checkpoint_every or 1, strict).run()
 
 
 class _Stream:
-    """A live filter between standard input and standard output."""
+    """An online filter between standard input and standard output."""
 
     def __init__(self, online: Any, fields: list[str], every: int, checkpoint: Path | None, save_every: int, strict: bool):
         self.online, self.fields, self.every, self.strict = online, fields, every, strict
@@ -85,13 +80,17 @@ class _Stream:
                 print(f"error: {' '.join(fault.split())}", file=sys.stderr, flush=True)
                 continue
             if estimate is not None:
-                # First the answer, then the checkpoint: whatever ends the process, no line that a checkpoint knows is unanswered.
+                # First the answer, then the checkpoint: every line that a checkpoint has used was answered.
                 self.show(estimate)
                 if self.checkpoint is not None and self.accepted % self.save_every == 0:
                     self.online.save(self.checkpoint, {"accepted": self.accepted})
 
     def used(self, line: Line) -> Any:
-        """The estimate after a line, None where the checkpoint knows the line already; InputError where it cannot be used."""
+        """Return the estimate after a line, or None where the checkpoint has used the line already.
+
+        Raises:
+            InputError: the line cannot be used.
+        """
         if line.fault is not None:
             raise InputError(line.fault)
         if self.skip_until is not None and line.time <= self.skip_until:
@@ -102,7 +101,7 @@ class _Stream:
         return estimate
 
     def show(self, estimate: Any) -> None:
-        """Print an estimate where it is due, and what is new of its warnings."""
+        """Print an estimate if it is one of every N, and its new warnings."""
         for warning in estimate.warnings:
             kind = _NUMBERS.sub("0", warning)
             if kind not in self.warned:
@@ -114,7 +113,7 @@ class _Stream:
 
 
 def _count(said: Any, checkpoint: Path) -> int:
-    """How many observations a checkpoint says that it knows."""
+    """Return the number of observations that a checkpoint has used."""
     if type(said) is not int or not 0 <= said < 2**53:
         raise InputError(f"{shown(checkpoint)}: does not say how many observations it knows; remove it to begin anew")
     return said
@@ -129,7 +128,7 @@ def _wanted(fields: str) -> list[str]:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers as JSON can say them: null for what is none."""
+    """Return numbers as JSON holds them, with null for non-finite values."""
     if isinstance(value, list):
         return [_plain(part) for part in value]
     return value if math.isfinite(value) else None

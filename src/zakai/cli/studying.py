@@ -26,7 +26,7 @@ def reproduce(name: str, folder: Path | None, settings: list[str]) -> None:
 
 
 def study(file: Path, folder: Path, scheduler: str | None, processes: int | None) -> None:
-    """Run a study, or go on with it; print its table."""
+    """Run a study, or continue it, and print its table."""
     from zakai.studies.specification import read_study
     from zakai.studies.study import run_study
 
@@ -40,7 +40,7 @@ def study(file: Path, folder: Path, scheduler: str | None, processes: int | None
 
 
 def _pictures(outcome: Any) -> list[str]:
-    """The names of the pictures and of the page, where what draws them is installed."""
+    """Write the pictures and the page if the libraries that draw them are installed; return their names."""
     from zakai.report.study_page import write_study
 
     try:

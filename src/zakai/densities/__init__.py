@@ -1,4 +1,4 @@
-"""What a belief is: Gaussian mixtures, densities on a lattice, points, products of independent blocks, behind one protocol."""
+"""Conditional densities: Gaussian mixtures, densities on a grid, weighted points, products of blocks; one protocol."""
 
 from zakai.densities._density import Density
 from zakai.densities.gaussian import GaussianMixture

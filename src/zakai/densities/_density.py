@@ -1,4 +1,4 @@
-"""What every conditional density can do, whatever it is made of."""
+"""The protocol of conditional densities, and what its implementations share."""
 
 from __future__ import annotations
 
@@ -40,7 +40,11 @@ class Density(Protocol):
 
 
 def coordinate_numbers(names: tuple[str, ...], coordinates: int | str | Sequence[int | str]) -> list[int]:
-    """The numbers of the coordinates that are given by names or numbers."""
+    """Return the numbers of coordinates that are given by names or numbers.
+
+    Raises:
+        InputError: There is no such coordinate, or one is given twice.
+    """
     wanted = [coordinates] if isinstance(coordinates, int | str | np.integer) else list(coordinates)
     numbers = []
     for one in wanted:
@@ -58,7 +62,7 @@ def coordinate_numbers(names: tuple[str, ...], coordinates: int | str | Sequence
 
 
 def as_states(x: object, n: int) -> np.ndarray:
-    """Points (..., n), or of one coordinate (...) too."""
+    """Return points (..., n); for one coordinate (...) is accepted too."""
     points = np.asarray(x, float)
     if n == 1 and points.shape[-1:] != (1,):
         points = points[..., None]
@@ -68,14 +72,14 @@ def as_states(x: object, n: int) -> np.ndarray:
 
 
 def sample_size(count: object) -> int:
-    """How many draws are asked for, checked."""
+    """Return the number of draws, checked."""
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 0:
         raise InputError(f"sample: count is {count!r}; expected a whole number from 0")
     return int(count)
 
 
 def generator(key: object) -> np.random.Generator:
-    """NumPy's generator from an integer, a generator, or a JAX key."""
+    """Return NumPy's generator from an integer, a generator, or a JAX key."""
     if isinstance(key, np.random.Generator):
         return key
     if isinstance(key, int | np.integer):
@@ -87,12 +91,12 @@ def generator(key: object) -> np.random.Generator:
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:
-    """An angle in (-pi, pi]."""
+    """Return an angle in (-pi, pi]."""
     return np.pi - np.mod(np.pi - np.asarray(angle, float), 2.0 * np.pi)
 
 
 def probabilities(q: Sequence[float]) -> np.ndarray:
-    """The probabilities asked for, checked."""
+    """Return probabilities, checked."""
     wanted = np.atleast_1d(np.asarray(q, float))
     if not np.all((wanted >= 0.0) & (wanted <= 1.0)):
         raise InputError("quantile: probabilities lie between 0 and 1")

@@ -9,7 +9,7 @@ import numpy as np
 
 from zakai.densities._density import as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 
-_AT_ONCE = 2**21  # points times components that are worked on together
+_AT_ONCE = 2**21  # points times components in one array
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class GaussianMixture:
     periodic: tuple[bool, ...]
 
     @classmethod
-    def gaussian(cls, mean, cov, names, periodic) -> GaussianMixture:
-        """A single Gaussian with mean (n,) and covariance (n, n)."""
+    def gaussian(cls, mean: np.ndarray, cov: np.ndarray, names: tuple[str, ...], periodic: tuple[bool, ...]) -> GaussianMixture:
+        """Return a single Gaussian with mean (n,) and covariance (n, n)."""
         return cls(np.ones(1), np.asarray(mean)[None], np.asarray(cov)[None], names, periodic)
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
@@ -40,7 +40,7 @@ class GaussianMixture:
         return np.concatenate(parts or [np.zeros(0)]).reshape(x.shape[:-1])
 
     def _log_density(self, points: np.ndarray) -> np.ndarray:
-        # A live filter can do without, and would wait for it.
+        # SciPy takes long to import, and an online filter does not need it.
         from scipy.linalg import solve_triangular
         from scipy.special import logsumexp
 
@@ -61,15 +61,15 @@ class GaussianMixture:
         return np.where(sign > 0, value, -np.inf)
 
     def _shared(self) -> list[slice]:
-        """Runs of components that share a covariance."""
+        """Return runs of consecutive components that share a covariance."""
         ends = np.flatnonzero(np.any(self.covs[1:] != self.covs[:-1], axis=(1, 2))) + 1
         return [slice(a, b) for a, b in zip([0, *ends], [*ends, len(self.covs)], strict=True)]
 
-    def _difference(self, x, mean):
+    def _difference(self, x: np.ndarray, mean: np.ndarray) -> np.ndarray:
         difference = x - mean
-        return np.where(self.periodic, wrap(difference), difference)
+        return np.asarray(np.where(self.periodic, wrap(difference), difference))
 
-    def _windings(self, cov):
+    def _windings(self, cov: np.ndarray) -> np.ndarray:
         turns = [
             np.arange(-k, k + 1) * 2 * np.pi
             for k in (
@@ -77,19 +77,18 @@ class GaussianMixture:
                 for i, angle in enumerate(self.periodic)
             )
         ]
-        return np.stack(np.meshgrid(*turns, indexing="ij"), axis=-1).reshape(-1, len(turns))
+        return np.asarray(np.stack(np.meshgrid(*turns, indexing="ij"), axis=-1).reshape(-1, len(turns)))
 
     def mean(self) -> np.ndarray:
         plain = self.weights @ self.means
         damping = np.exp(-0.5 * np.diagonal(self.covs, axis1=1, axis2=2))
         circular = np.angle(self.weights @ (damping * np.exp(1j * self.means)))
-        return np.where(self.periodic, circular, plain)
+        return np.asarray(np.where(self.periodic, circular, plain))
 
     def cov(self) -> np.ndarray:
         deviation = self._difference(self.means, self.mean())
-        return np.einsum("k,kij->ij", self.weights, self.covs) + np.einsum(
-            "k,ki,kj->ij", self.weights, deviation, deviation
-        )
+        within = np.einsum("k,kij->ij", self.weights, self.covs)
+        return np.asarray(within + np.einsum("k,ki,kj->ij", self.weights, deviation, deviation))
 
     def mode(self) -> np.ndarray:
         heaviest = np.argsort(-self.weights)[:256]
@@ -131,7 +130,7 @@ class GaussianMixture:
         out[wanted == 0.0], out[wanted == 1.0] = -np.inf, np.inf
         return out
 
-    def marginal(self, coordinates) -> GaussianMixture:
+    def marginal(self, coordinates: int | str | Sequence[int | str]) -> GaussianMixture:
         keep = coordinate_numbers(self.names, coordinates)
         return GaussianMixture(
             self.weights,

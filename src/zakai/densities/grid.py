@@ -105,7 +105,32 @@ class GridDensity:
         with np.errstate(divide="ignore", invalid="ignore"):
             result = level + np.log(np.where(total > 0, total, np.nan))
         result = np.where(np.isfinite(result), result, level)
+        result = np.where(deep, self._bounded(logs, nearest, index, level, result), result)
         return np.where(inside & (level > floor), result, -np.inf)
+
+    def _bounded(
+        self, logs: np.ndarray, nearest: np.ndarray, index: np.ndarray, level: np.ndarray, result: np.ndarray
+    ) -> np.ndarray:
+        """The result in the far tails where it is near the parabola through the neighbours, else the parabola.
+
+        The sum is wrong there where the density ends at the edge of the lattice.
+        """
+        shape = np.array(logs.shape)
+        local, change = level.copy(), np.full(len(level), 0.02)
+        for axis, size in enumerate(shape):
+            distance = index[:, axis] + size // 2 - nearest[:, axis]
+            if self._closed[axis]:
+                distance = distance - size * np.round(distance / size)
+            sides = []
+            for step in (-1, 1):
+                beside = nearest.copy()
+                beside[:, axis] += step
+                beside[:, axis] = np.mod(beside[:, axis], size) if self._closed[axis] else np.clip(beside[:, axis], 0, size - 1)
+                sides.append(logs[tuple(beside.T)] - level)
+            slope, curvature = 0.5 * (sides[1] - sides[0]), sides[0] + sides[1]
+            local += distance * slope + 0.5 * distance**2 * curvature
+            change += 0.1 * (np.abs(slope) + np.abs(curvature))
+        return np.where(np.abs(result - local) <= change, result, local)
 
     def _interpolate_three(self, index: np.ndarray) -> np.ndarray:
         """The sinc interpolant for three axes, one after the other; below 1e-10 of the maximum, linear in the logarithm."""

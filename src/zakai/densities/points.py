@@ -1,4 +1,4 @@
-"""Weighted points: what filters that sample believe."""
+"""Weighted points: the density of filters that sample."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class PointMasses:
 
     def mean(self) -> np.ndarray:
         circular = np.angle(self.weights @ np.exp(1j * self.points))
-        return np.where(self.periodic, circular, self.weights @ self.points)
+        return np.asarray(np.where(self.periodic, circular, self.weights @ self.points))
 
     def cov(self) -> np.ndarray:
         deviation = self._deviations
-        return (self.weights[:, None] * deviation).T @ deviation
+        return np.asarray((self.weights[:, None] * deviation).T @ deviation)
 
     @cached_property
     def _deviations(self) -> np.ndarray:
@@ -48,7 +48,11 @@ class PointMasses:
 
     @cached_property
     def smoothed(self) -> GaussianMixture:
-        """The kernels around the points; InputError where these lie on one point, line or plane."""
+        """Return the kernels around the points.
+
+        Raises:
+            InputError: The points lie on one point, line or plane.
+        """
         n, mean, cov = len(self.names), self.mean(), self.cov()
         try:
             np.linalg.cholesky(cov)
@@ -79,7 +83,7 @@ class PointMasses:
             out[:, i] = values[order[np.minimum(np.searchsorted(total, wanted * total[-1]), len(order) - 1)], i]
         return out
 
-    def marginal(self, coordinates) -> PointMasses:
+    def marginal(self, coordinates: int | str | Sequence[int | str]) -> PointMasses:
         keep = coordinate_numbers(self.names, coordinates)
         names, periodic = tuple(self.names[i] for i in keep), tuple(self.periodic[i] for i in keep)
         return PointMasses(self.weights, self.points[:, keep], names, periodic)

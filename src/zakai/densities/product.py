@@ -12,9 +12,9 @@ from zakai.densities._density import Density, as_states, coordinate_numbers, gen
 
 @dataclass(frozen=True, repr=False)
 class ProductDensity:
-    """p(x) = prod_b p_b(x_b): `parts` are the densities p_b, `places` the coordinates of the whole that each is about.
+    """p(x) = prod_b p_b(x_b): `parts` are the densities p_b, `places` the coordinates of each in the whole.
 
-    A part may name its coordinates otherwise; what counts is their order.
+    The coordinates of a part may have other names; their order counts.
     """
 
     parts: Sequence[Density]
@@ -66,7 +66,7 @@ class ProductDensity:
         return renamed(parts[0], names) if len(parts) == 1 else ProductDensity(tuple(parts), tuple(places), names, periodic)
 
     def _vector(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Arrays (..., n_b) of the blocks as one (..., n)."""
+        """Return arrays (..., n_b) of the blocks as one (..., n)."""
         whole = np.empty((*np.shape(parts[0])[:-1], len(self.names)))
         for part, place in zip(parts, self.places, strict=True):
             whole[..., place] = part
@@ -74,9 +74,9 @@ class ProductDensity:
 
 
 def renamed(density: Density, names: tuple[str, ...]) -> Density:
-    """The same density with other names of its coordinates."""
+    """Return the same density with other names of its coordinates."""
     if density.names == names:
         return density
     if is_dataclass(density) and any(field.name == "names" for field in fields(density)):
-        return replace(density, names=names)  # type: ignore[type-var]
+        return replace(density, names=names)
     return ProductDensity((density,), (tuple(range(len(names))),), names, density.periodic)

@@ -23,7 +23,34 @@ def _erf(x: Any) -> Any:
     return erf(x)
 
 
-_NUMPY = operations(np, _erf)
+REAL = operations(np, _erf)
+
+
+def _inexact(values: Any) -> np.ndarray:
+    values = np.asarray(values)
+    return values if values.dtype == complex else np.asarray(values, dtype=float)
+
+
+def _sign(values: Any) -> Any:
+    return np.sign(np.real(values))
+
+
+def _absolute(values: Any) -> Any:
+    return np.where(np.real(values) < 0, -values, values)
+
+
+def _complex_erf(values: Any) -> Any:
+    slope = 2.0 / np.sqrt(np.pi) * np.exp(-(np.real(values) ** 2))
+    return _erf(np.real(values)) + 1j * slope * np.imag(values)
+
+
+def _complex_log_cosh(values: Any) -> Any:
+    size = _absolute(values)
+    return size + np.log1p(np.exp(-2.0 * size)) - np.log(2.0)
+
+
+# Functions that keep a derivative by the complex step, to first order in the imaginary part.
+COMPLEX = operations(np, _complex_erf, abs=_absolute, sign=_sign, logcosh=_complex_log_cosh)
 
 
 def flattened(expressions: Any, shape: Sequence[int] | None = None) -> tuple[list[sympy.Expr], tuple[int, ...]]:
@@ -52,7 +79,8 @@ def numpy_function(expressions: Any, model: Model, shape: Sequence[int] | None =
 
     `expressions` is a list or Matrix in the model's state, t and parameters; `shape` is the shape of one
     value (the Matrix' own by default). f takes x (..., n), t (...) and theta (p,) and broadcasts them; what
-    does not exist is nan. Raises InputError for an undetermined function.
+    does not exist is nan. Complex arguments give complex values, for derivatives by the complex step. Raises InputError for an
+    undetermined function.
 
         >>> from zakai.models import load_model
         >>> model = load_model("gallery:benes")
@@ -64,11 +92,12 @@ def numpy_function(expressions: Any, model: Model, shape: Sequence[int] | None =
     program = program_of(flat, model)
 
     def function(x: Any, t: Any, theta: Any) -> np.ndarray:
-        x, t, theta = (np.asarray(a, dtype=float) for a in (x, t, theta))
+        x, t, theta = (_inexact(a) for a in (x, t, theta))
         batch = np.broadcast_shapes(x.shape[:-1], t.shape, theta.shape[:-1])
+        derivative = np.iscomplexobj(x) or np.iscomplexobj(t) or np.iscomplexobj(theta)
         with np.errstate(all="ignore"):
-            values = program.run(x, t, theta, _NUMPY)
-        result = np.empty((*batch, len(flat)))
+            values = program.run(x, t, theta, COMPLEX if derivative else REAL)
+        result = np.empty((*batch, len(flat)), complex if derivative else float)
         for column, slot in enumerate(program.outputs):
             result[..., column] = values[slot]
         return result.reshape((*batch, *shape))
@@ -108,7 +137,7 @@ def explain_nonfinite(model: Model, key: str, expressions: Any, x: Any, t: float
     for index, expr in enumerate(flat):
         program = program_of([expr], model)
         with np.errstate(all="ignore"):
-            values = program.run(x, np.float64(t), model.theta(), _NUMPY)
+            values = program.run(x, np.float64(t), model.theta(), REAL)
         if np.isfinite(values[program.outputs[0]]):
             continue
         place = key + "".join(f"[{i}]" for i in np.unravel_index(index, shape))

@@ -1,13 +1,13 @@
-"""dynamax' filters, imported so that JAX stays as it is: dynamax sets the precision of all matrix products to "float32"."""
+"""dynamax' filters, imported without their side effect: dynamax sets the precision of all of JAX's matrix products."""
 
 from __future__ import annotations
 
 from importlib import import_module
 from types import ModuleType
 
-import jax
+from zakai.peers import _float64  # noqa: F401
 
-from zakai import _float64  # noqa: F401
+import jax  # isort: skip
 
 
 def _imported(*names: str) -> tuple[ModuleType, ...]:

@@ -1,37 +1,40 @@
-"""What the two peers with one Gaussian have in common: dynamax' predict and condition, over an interval and at its end."""
+"""The shared part of the two filters with one Gaussian: dynamax' predict and condition, over an interval and at its end."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from tensorflow_probability.substrates.jax.distributions import MultivariateNormalFullCovariance
 
-from zakai import _float64  # noqa: F401
 from zakai.densities import GaussianMixture
 from zakai.densities._density import wrap
-from zakai.filters._moments import prior_moments
-from zakai.filters._protocol import Info, Schedule
-from zakai.filters.observations import Data
+from zakai.methods._protocol import Info
 from zakai.models.model import Model
+from zakai.models.prior import GaussianPrior, MixturePrior
+from zakai.peers import _float64  # noqa: F401
 from zakai.peers._translation import (
     DIVERGED,
     DOUBTFUL,
     Innovations,
     Interval,
+    Observation,
     Prepared,
-    Reading,
     System,
+    compiled,
+    grid_of,
     in_deviations,
     innovations,
-    readings,
     system_of,
+    wrapped,
 )
+from zakai.records.schedule import Schedule
 
+import jax  # isort: skip
+import jax.numpy as jnp  # isort: skip
+from tensorflow_probability.substrates.jax.distributions import MultivariateNormalFullCovariance  # isort: skip
+
+NO_DIRECTION = 1e-9  # length of the mean vector of an angle that has no mean direction
 BOUNDS = {
     "indefinite_cov": (1e-9, "the covariance has a negative eigenvalue (its share of the largest), or is not finite"),
     "innovation_excess": (DOUBTFUL, DIVERGED),
@@ -40,8 +43,11 @@ FIRST_ORDER = "of first order in the interval for increments, and in a substep o
 
 
 class Rule(NamedTuple):
-    """How the library moves a Gaussian: `predict(mean, cov, function, noise)` is that of function(x) + N(0, noise),
-    `condition(mean, cov, function, value)` that of x given value = function(x) + N(0, I)."""
+    """How the library moves a Gaussian.
+
+    `predict(mean, cov, function, noise)` is the Gaussian of function(x) + N(0, noise); `condition(mean, cov, function, value)`
+    that of x given value = function(x) + N(0, I).
+    """
 
     predict: Callable[..., tuple[Any, Any]]
     condition: Callable[..., tuple[Any, Any]]
@@ -55,44 +61,46 @@ class State(NamedTuple):
     sums: Innovations
 
 
-def prepared_by(rule: Rule, model: Model, schedule: Schedule, scheme: str, substeps: int) -> Prepared:
-    """The intervals with their static settings."""
-    system = system_of(model, scheme, substeps, rule)
-    theta = np.tile(model.theta(), (len(schedule.starts), 1))
-    return Prepared(
-        model, system, schedule, model.theta(), Interval(schedule.starts, schedule.stops, theta, None, system)
-    )
-
-
-def with_parameters(prepared: Prepared, theta: Any) -> Prepared:
-    """The same intervals with other values of the parameters."""
-    intervals = replace(prepared.intervals, theta=jnp.tile(theta, (len(prepared.schedule.starts), 1)))
-    return replace(prepared, theta=theta, intervals=intervals)
-
-
-def observations(prepared: Prepared, data: Data) -> Reading:
-    """The white readings of all intervals."""
-    return readings(prepared, data)
+def prepared_by(rule: Rule, model: Model, schedule: Schedule, theta: np.ndarray, scheme: str, substeps: int) -> Prepared:
+    """Return the intervals with their static settings."""
+    return Prepared.of(model, system_of(model, scheme, substeps, rule), schedule, theta)
 
 
 def init(prepared: Prepared, prior: Any) -> State:
-    """The prior's mean and covariance."""
+    """Return the prior's mean and covariance."""
     return State(*prior_moments(prepared.model, prior, prepared.theta), Innovations())
 
 
-def correct(prepared: Prepared, prior: Any, observation: Reading) -> tuple[State, Info]:
-    """The prior after a sample at the start itself."""
-    reading = jax.tree.map(lambda a: a[0], observation)
-    return _conditioned(prepared.system, init(prepared, prior), reading, prepared.model.start, prepared.theta)
+def prior_moments(model: Model, prior: Any, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean (n,) and the covariance (n, n) of a prior.
+
+    An angle has its mean direction, 0 where there is none (uniform: variance pi^2 / 3), and wrapped deviations.
+    """
+    periodic = np.array([name in model.periodic for name in model.state])
+    if isinstance(prior, GaussianPrior):
+        return wrapped(model, prior.mean), np.array(prior.cov)
+    if isinstance(prior, MixturePrior):
+        mixture = GaussianMixture(prior.weights, prior.means, prior.covs, model.state, tuple(periodic))
+        return mixture.mean(), mixture.cov()
+    grid = grid_of(model, prior, theta)
+    points = grid.offsets.reshape(-1, model.n)
+    weights = np.exp(grid.log_values.ravel() - grid.log_values.max())
+    weights = weights / weights.sum()
+    turned = np.where(periodic, points, 0.0)
+    cosine, sine = weights @ np.cos(turned), weights @ np.sin(turned)
+    directed = np.hypot(cosine, sine) > NO_DIRECTION
+    mean = np.where(periodic, np.where(directed, np.arctan2(sine, cosine), -grid.centre), weights @ points)
+    deviation = points - mean
+    deviation = np.where(periodic, wrap(deviation), deviation)
+    return wrapped(model, grid.centre + mean), np.einsum("k,ki,kj->ij", weights, deviation, deviation)
 
 
-def step(interval: Interval, state: State, observation: Reading) -> tuple[State, Info]:
-    """One interval, substep by substep, and then what is read at its end."""
-    system, theta = interval.system, interval.theta
-    length = (interval.stop - interval.start) / system.substeps
+def _advanced(system: System, interval: Interval, state: State, observation: Observation) -> tuple[State, Info]:
+    """Advance a state over an interval, substep by substep, and condition it on what is observed at the end."""
+    length, theta = interval.length / system.substeps, interval.theta
     predict = system.rule.predict
 
-    def part(index: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+    def substep(index: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
         t = interval.start + index * length
         G = system.covariance(jnp.zeros(system.n), system.noise_time(t, length), theta)
         carry = predict(*carry, lambda x: system.before_noise(x, t, length, theta), length * G)
@@ -100,26 +108,28 @@ def step(interval: Interval, state: State, observation: Reading) -> tuple[State,
             return carry
         return predict(*carry, lambda x: system.after_noise(x, t, length, theta), jnp.zeros_like(G))
 
-    moments = (jnp.asarray(state.mean, float), jnp.asarray(state.cov, float))
-    mean, cov = jax.lax.fori_loop(0, system.substeps, part, moments)
-    return _conditioned(system, State(mean, cov, state.sums), observation, interval.stop, theta)
+    count = jnp.where(interval.length > 0, system.substeps, 0)
+    mean, cov = jax.lax.fori_loop(0, count, substep, (state.mean, state.cov))
+    return _conditioned(system, mean, cov, state.sums, observation, interval.stop, theta)
 
 
-def _conditioned(system: System, state: State, reading: Reading, t: Any, theta: Any) -> tuple[State, Info]:
-    """The Gaussian given what is read, with the evidence and the size of the innovation."""
+def _conditioned(
+    system: System, mean: Any, cov: Any, sums: Innovations, observation: Observation, t: Any, theta: Any
+) -> tuple[State, Info]:
+    """Return the Gaussian given the observation, the evidence and the size of the innovation."""
 
     def h(x: Any) -> Any:
-        return reading.whiten @ system.observation(x, t, theta)
+        return observation.whiten @ system.observation(x, t, theta)
 
-    unit, nothing = jnp.eye(system.m), jnp.zeros(system.m)
-    expected, spread = system.rule.predict(state.mean, state.cov, h, unit)
-    evidence = MultivariateNormalFullCovariance(expected, spread).log_prob(reading.values)
-    evidence = evidence - MultivariateNormalFullCovariance(nothing, unit).log_prob(reading.values) + reading.constant
-    mean, cov = system.rule.condition(state.mean, state.cov, h, reading.values)
+    unit, zero = jnp.eye(system.m), jnp.zeros(system.m)
+    expected, spread = system.rule.predict(mean, cov, h, unit)
+    evidence = MultivariateNormalFullCovariance(expected, spread).log_prob(observation.values)
+    evidence = evidence - MultivariateNormalFullCovariance(zero, unit).log_prob(observation.values) + observation.constant
+    mean, cov = system.rule.condition(mean, cov, h, observation.values)
     if system.angles:
-        turning = np.isin(np.arange(system.n), system.angles)
-        mean = jnp.where(turning, jnp.pi - jnp.mod(jnp.pi - mean, 2 * jnp.pi), mean)
-    sums = innovations(state.sums, reading, expected, spread)
+        periodic = np.isin(np.arange(system.n), system.angles)
+        mean = jnp.where(periodic, jnp.pi - jnp.mod(jnp.pi - mean, 2 * jnp.pi), mean)
+    sums = innovations(sums, observation, expected, spread)
     values = cov[0] if system.n == 1 else jnp.linalg.eigvalsh(cov)
     size = jnp.max(jnp.abs(values))
     indefinite = jnp.where(size > 0, jnp.maximum(-jnp.min(values), 0.0) / size, 0.0)
@@ -128,9 +138,18 @@ def _conditioned(system: System, state: State, reading: Reading, t: Any, theta: 
     return State(mean, cov, sums), Info(evidence, mean, cov, health)
 
 
+step, segment = compiled(_advanced, 64)
+
+
 def density(prepared: Prepared, state: State) -> GaussianMixture:
-    """The Gaussian, wrapped where a coordinate is an angle."""
+    """Return the Gaussian, wrapped where a coordinate is an angle."""
     model = prepared.model
     periodic = tuple(name in model.periodic for name in model.state)
-    mean = np.asarray(state.mean)
-    return GaussianMixture.gaussian(np.where(periodic, wrap(mean), mean), np.asarray(state.cov), model.state, periodic)
+    return GaussianMixture.gaussian(wrapped(model, state.mean), state.cov, model.state, periodic)
+
+
+def valid(prepared: Prepared, state: State) -> bool:
+    """Return whether the arrays of a state fit the model."""
+    n = prepared.model.n
+    return state.mean.shape == (n,) and state.cov.shape == (n, n)
+

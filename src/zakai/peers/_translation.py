@@ -1,38 +1,42 @@
 """A system in continuous time as the discrete-time model that filters of other libraries take.
 
-Between readings an interval is cut into `substeps`; one of length d from t is a map and a Gaussian noise,
+Between observations an interval is divided into `substeps`; one of length d from t is a map and a Gaussian noise,
 
     scheme "euler"       x -> x + f(x, t) d + noise,  noise ~ N(0, G(t) d)                    first order in d
     scheme "midpoint"    half of the flow of f, noise ~ N(0, G(t + d/2) d), the other half    second order in d, in law
 
-where half of the flow is one step of the explicit midpoint rule.  An increment dy = h dt + dw over a time T is the reading
-dy / T = h(x) + noise of covariance S / T, taken at the end of its interval, which is first order in the interval; a sample is
-what it is.  What is read is whitened, so that every library sees z = h(x) + N(0, I): of R = L L', the block of the coordinates
-that were observed, z is L^-1 times the reading.  A coordinate that was not observed has z = 0 and h = 0 there, which says
-nothing of the state.
+where half of the flow is one step of the explicit midpoint rule.  An increment dy = h dt + dw over a time T is the observation
+dy / T = h(x) + noise of covariance S / T at the end of its interval, which is first order in the interval; a sample is used as
+it is.  Observations are whitened, so that every library receives z = h(x) + N(0, I): with R = L L' the covariance of the observed
+coordinates, z is L^-1 times the observation.  An unobserved coordinate has z = 0 and h = 0, which carries no information.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from zakai import _float64  # noqa: F401
+from zakai.densities._density import wrap
 from zakai.errors import InputError
-from zakai.filters._formulas import Formulas, formulas
-from zakai.filters._protocol import Schedule
-from zakai.filters.observations import Data, noise_at
-from zakai.models.compile import compile_model
+from zakai.methods._protocol import Info, Infos
 from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
+from zakai.models.prior import DensityPrior
+from zakai.numerics.prior_grid import PriorGrid, prior_grid
+from zakai.peers import _float64  # noqa: F401
+from zakai.peers._jax_functions import jax_function
+from zakai.records.schedule import Schedule
+
+import jax  # isort: skip
+import jax.numpy as jnp  # isort: skip
 
 SCHEMES = ("midpoint", "euler")
-# Squared innovations are summed with a memory of 500 observations. The sum is in doubt beyond so many of the standard
-# deviations that it has by chance, of no less than 25 coordinates: one rare reading is no divergence.
+# The sums of squared innovations forget over 500 observations.  They are reported where they exceed what is expected by so many
+# of their standard deviations, which are taken as those of at least 25 coordinates: one rare observation is no divergence.
 MEMORY, LEAST, DOUBTFUL = 500, 25, 4.5
 DIVERGED = (
     "the innovations are larger than the filter's own variance says, by so many standard deviations of their running sum: "
@@ -41,90 +45,100 @@ DIVERGED = (
 
 
 class System:
-    """The formulas of a model compiled for a peer; `rule` holds the peer's own static settings."""
+    """The formulas of a model as JAX functions; `rule` holds the static settings of a filter."""
 
     def __init__(self, model: Model, scheme: str, substeps: int, rule: Any):
-        compiled = compile_model(model)
-        self.drift, self.observation, self.covariance = compiled.drift, compiled.observation, compiled.covariance
+        self.drift, self.observation = jax_function(model.drift, model), jax_function(model.observation, model)
+        self.covariance = jax_function(model.covariance, model, (model.n, model.n))
         self.scheme, self.substeps, self.rule = scheme, substeps, rule
         self.n, self.m = model.n, model.m
         self.angles = tuple(model.state.index(name) for name in model.periodic)
         self.noiseless = model.covariance.is_zero_matrix is True
 
     def half_flow(self, x: Any, t: Any, length: Any, theta: Any) -> Any:
-        """Half a substep of the drift by the explicit midpoint rule, from `t` on; `length` is that of the substep."""
+        """Return x after half a substep of the drift from `t`, by the explicit midpoint rule; `length` is that of the substep."""
         middle = x + 0.25 * length * self.drift(x, t, theta)
         return x + 0.5 * length * self.drift(middle, t + 0.25 * length, theta)
 
     def before_noise(self, x: Any, t: Any, length: Any, theta: Any) -> Any:
-        """What the drift does to a state (n,) in a substep before its noise comes."""
+        """Return a state (n,) moved by the drift of a substep before its noise."""
         if self.scheme == "euler":
             return x + length * self.drift(x, t, theta)
         return self.half_flow(x, t, length, theta)
 
     def after_noise(self, x: Any, t: Any, length: Any, theta: Any) -> Any:
-        """What the drift does in a substep after its noise came."""
+        """Return a state (n,) moved by the drift of a substep after its noise."""
         return x if self.scheme == "euler" else self.half_flow(x, t + 0.5 * length, length, theta)
 
     def noise_time(self, t: Any, length: Any) -> Any:
-        """The time at which G is taken in a substep from `t`."""
+        """Return the time at which G is evaluated in a substep from `t`."""
         return t if self.scheme == "euler" else t + 0.5 * length
 
 
+@dataclass(frozen=True)
+class _Formulas:
+    """A model, equal to every other with the same formulas: what is compiled for one serves them all."""
+
+    key: Hashable
+    model: Model = field(compare=False, repr=False)
+
+
 @lru_cache(maxsize=32)
-def _system(of: Formulas, scheme: str, substeps: int, rule: Any) -> System:
-    return System(of.model, scheme, substeps, rule)
+def _system(formulas: _Formulas, scheme: str, substeps: int, rule: Any) -> System:
+    return System(formulas.model, scheme, substeps, rule)
 
 
 def system_of(model: Model, scheme: str, substeps: int, rule: Any) -> System:
-    """The compiled formulas, one object for all models that have them; InputError for a scheme or a number of substeps."""
+    """Return the compiled formulas, one object for all models that have them.
+
+    Raises:
+        InputError: an unknown scheme or number of substeps.
+    """
     if scheme not in SCHEMES:
         raise InputError(f'option scheme: "{scheme}" is neither "midpoint" nor "euler"')
-    return _system(formulas(model), scheme, whole_number("substeps", substeps, 1), rule)
+    matrices = (model.drift, model.diffusion, model.process_noise, model.observation, model.observation_noise)
+    names = (model.state, model.parameter_symbols, model.periodic, model.functions, model.observation_kind)
+    return _system(_Formulas((names, matrices), model), scheme, whole_number("substeps", substeps, 1), rule)
 
 
 def whole_number(option: str, value: Any, least: int, most: int = 10**9) -> int:
-    """The value of an option that counts something; InputError for another one."""
+    """Return the value of an option that counts something.
+
+    Raises:
+        InputError: it is not a whole number from `least` to `most`.
+    """
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
         raise InputError(f"option {option}: {value!r} is not a whole number from {least} to {most}")
     return int(value)
 
 
-def real_number(option: str, value: Any, what: str, fits: Any) -> float:
-    """The value of an option that measures something; InputError, with `what` it must be, for another one."""
+def real_number(option: str, value: Any, what: str, fits: Callable[[Any], Any]) -> float:
+    """Return the value of an option that measures something.
+
+    Raises:
+        InputError: it is no number, or does not satisfy `fits`, which `what` describes.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not fits(value):
         raise InputError(f"option {option}: {value!r} is not {what}")
     return float(value)
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["start", "stop", "theta", "roots"], meta_fields=["system"])
-@dataclass(frozen=True)
-class Interval:
-    """One interval: its ends, the parameters (p,), and, for peers that draw, a root of the noise of each substep."""
+class Interval(NamedTuple):
+    """One interval: its ends and its length, the parameters (p,), and for filters that draw a root of each substep's noise."""
 
     start: Any
     stop: Any
+    length: Any
     theta: Any
     roots: Any
-    system: System
 
 
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """The intervals, and for peers that draw the seed, which is not compiled in; nothing else is known without data."""
+class Observation(NamedTuple):
+    """A white observation.
 
-    model: Model
-    system: System
-    schedule: Schedule
-    theta: Any
-    intervals: Interval
-    seed: int = 0
-    notes: tuple[str, ...] = ()
-
-
-class Reading(NamedTuple):
-    """White readings: `values` (m,), `whiten` (m, m) with z = whiten (h + noise), how many were `seen`, and the logarithm of
-    their density under pure noise, or zero where a record's evidence is relative to that (all but samples)."""
+    `values` (m,); `whiten` (m, m) with z = whiten (h + noise); `seen`, the number of observed coordinates; `constant`, the
+    logarithm of the density under pure noise for samples, and zero for increments, whose evidence is relative to that.
+    """
 
     values: Any
     whiten: Any
@@ -132,46 +146,140 @@ class Reading(NamedTuple):
     constant: Any
 
 
-def readings(prepared: Prepared, data: Data) -> Reading:
-    """What `step` is given for each interval; a singular covariance was refused with the model."""
-    theta, model = prepared.theta, prepared.model
-    xp: Any = np if isinstance(theta, np.ndarray) else jnp
-    seen = ~np.isnan(data.values)
-    values, noise = np.where(seen, data.values, 0.0), noise_at(model, data.stops, theta)
-    if model.observation_kind != "samples":
-        spans = np.where(seen, data.elapsed, 1.0)
-        values = values / spans
-        # Increments that end together share the noise of the time that they have in common.
-        noise = noise * (np.minimum(spans[:, :, None], spans[:, None, :]) / (spans[:, :, None] * spans[:, None, :]))
-    both = seen[:, :, None] & seen[:, None, :]
-    alone = np.eye(values.shape[1]) * ~seen[:, None, :]
-    factor = xp.linalg.cholesky(xp.where(both, noise, 0.0) + alone)
-    whiten = xp.where(both, xp.linalg.inv(factor), 0.0)
-    white = xp.einsum("kij,kj->ki", whiten, values)
-    count = seen.sum(axis=1).astype(float)
-    constant = xp.zeros(len(white))
-    if model.observation_kind == "samples":
-        log_volume = xp.log(xp.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
-        constant = -0.5 * (white**2).sum(axis=1) - log_volume - 0.5 * np.log(2 * np.pi) * count
-    return Reading(white, whiten, count, constant)
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """The intervals of a schedule, and what whitens their observations.
+
+    `spans` (K, m), the times over which observed increments were gathered, else one; `whiten` (K, m, m); `constants` (K,), the
+    logarithms of the volumes of the noise of samples; `roots` (K, substeps, n, r).
+    """
+
+    model: Model
+    system: System
+    theta: np.ndarray
+    schedule: Schedule
+    lengths: np.ndarray
+    spans: np.ndarray
+    whiten: np.ndarray
+    constants: np.ndarray
+    roots: np.ndarray | None = None
+    seed: int = 0
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, model: Model, system: System, schedule: Schedule, theta: np.ndarray, **more: Any) -> Prepared:
+        """Return what is prepared for a schedule."""
+        seen, count = schedule.seen, len(schedule)
+        noise = np.broadcast_to(
+            numpy_function(model.observation_noise, model, (model.m, model.m))(np.zeros(model.n), schedule.stops, theta),
+            (count, model.m, model.m),
+        )
+        spans = np.ones(seen.shape)
+        if model.observation_kind != "samples":
+            spans = np.where(seen, schedule.elapsed, 1.0)
+            # Increments that end together share the noise of the time that they have in common.
+            noise = noise * (np.minimum(spans[:, :, None], spans[:, None, :]) / (spans[:, :, None] * spans[:, None, :]))
+        both = seen[:, :, None] & seen[:, None, :]
+        factor = np.linalg.cholesky(np.where(both, noise, 0.0) + np.eye(model.m) * ~seen[:, None, :])
+        whiten = np.where(both, np.linalg.inv(factor), 0.0)
+        constants = np.zeros(count)
+        if model.observation_kind == "samples":
+            log_volume = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+            constants = -log_volume - 0.5 * np.log(2 * np.pi) * seen.sum(axis=1)
+        return cls(model, system, theta, schedule, schedule.lengths, spans, whiten, constants, **more)
+
+    def intervals(self, rows: slice) -> Interval:
+        """Return intervals with a leading axis."""
+        starts, roots = self.schedule.starts[rows], None if self.roots is None else self.roots[rows]
+        return Interval(starts, self.schedule.stops[rows], self.lengths[rows], np.tile(self.theta, (len(starts), 1)), roots)
+
+    def observations(self, rows: slice, values: np.ndarray) -> Observation:
+        """Return what is observed at the ends of intervals, with a leading axis."""
+        whiten, constants = self.whiten[rows], self.constants[rows]
+        white = (whiten @ (values / self.spans[rows])[:, :, None])[:, :, 0]
+        if self.model.observation_kind == "samples":
+            constants = constants - 0.5 * (white[:, None, :] @ white[:, :, None])[:, 0, 0]
+        return Observation(white, whiten, self.schedule.seen[rows].sum(axis=1).astype(float), constants)
+
+
+def grid_of(model: Model, prior: DensityPrior, theta: np.ndarray) -> PriorGrid:
+    """Return a grid that resolves a prior given by the logarithm of its density."""
+    log_density = numpy_function([prior.log_density], model, ())
+    periodic = [name in model.periodic for name in model.state]
+    source = f"{model.source}: prior: log_density"
+    return prior_grid(lambda x: log_density(x, model.start, theta), model.n, periodic, tolerance=1e-9, source=source)
+
+
+def wrapped(model: Model, points: np.ndarray) -> np.ndarray:
+    """Return points (..., n) with angles in (-pi, pi]."""
+    return np.where([name in model.periodic for name in model.state], wrap(points), points)
+
+
+Advance = Callable[[System, Interval, Any, Observation], tuple[Any, Info]]
+
+
+def compiled(advance: Advance, size: int) -> tuple[Callable[..., tuple[Any, Info]], Callable[..., tuple[list[Any], Infos]]]:
+    """Return `step` and `segment` of a method from the function that advances a state over one interval.
+
+    Both call one compiled loop of at most `size` intervals, whose number is an argument: it is compiled once for the formulas of
+    a model and the sizes of a state, and a record gives the same bits as its observations one by one.
+    """
+
+    @partial(jax.jit, static_argnums=0)
+    def loop(system: System, count: Any, intervals: Interval, state: Any, observations: Observation) -> Any:
+        def at(k: Any) -> tuple[Interval, Observation]:
+            return jax.tree.map(lambda parts: parts[k], (intervals, observations))
+
+        def one(k: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+            interval, observation = at(k)
+            new = advance(system, interval, carry[0], observation)
+            return new[0], jax.tree.map(lambda kept, value: kept.at[k].set(value), carry[1], new)
+
+        shapes = jax.eval_shape(lambda now: advance(system, at(0)[0], now, at(0)[1]), state)
+        kept = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), shapes)
+        return jax.lax.fori_loop(0, count, one, (state, kept))[1]
+
+    def padded(parts: np.ndarray) -> np.ndarray:
+        return np.concatenate([parts, np.repeat(parts[-1:], size - len(parts), axis=0)]) if len(parts) < size else parts
+
+    def segment(prepared: Prepared, rows: slice, state: Any, values: np.ndarray) -> tuple[list[Any], Infos]:
+        states: list[Any] = []
+        infos: list[Info] = []
+        for first in range(rows.start, rows.stop, size):
+            part = slice(first, min(first + size, rows.stop))
+            count = part.stop - part.start
+            given = prepared.intervals(part), prepared.observations(part, values[first - rows.start :][:count])
+            intervals, observations = jax.tree.map(padded, given)
+            state = jax.tree.map(np.asarray, state)
+            found = jax.tree.map(np.asarray, loop(prepared.system, count, intervals, state, observations))
+            states.extend(jax.tree.map(lambda leaf, k=k: leaf[k], found[0]) for k in range(count))
+            infos.append(jax.tree.map(lambda leaf, count=count: leaf[:count], found[1]))
+            state = states[-1]
+        return states, Infos(*jax.tree.map(lambda *parts: np.concatenate(parts), *infos))
+
+    def step(prepared: Prepared, k: int, state: Any, values: np.ndarray) -> tuple[Any, Info]:
+        states, infos = segment(prepared, slice(k, k + 1), state, values[None])
+        return states[0], Info(*jax.tree.map(lambda leaf: leaf[0], tuple(infos)))
+
+    return step, segment
 
 
 class Innovations(NamedTuple):
-    """Running sums of the normalised squared innovations, less one per coordinate, and of the variance they have by chance."""
+    """Sums of the normalised squared innovations minus their expectation, and of their variances."""
 
     excess: Any = 0.0
     variance: Any = 0.0
 
 
-def innovations(sums: Innovations, reading: Reading, mean: Any, cov: Any) -> Innovations:
-    """The sums after a reading whose predicted white value has `mean` (m,) and `cov` (m, m)."""
-    residual = reading.values - mean
+def innovations(sums: Innovations, observation: Observation, mean: Any, cov: Any) -> Innovations:
+    """Return the sums after an observation whose predicted white value has `mean` (m,) and `cov` (m, m)."""
+    residual = observation.values - mean
     squared = jnp.sum(residual**2 / cov[0, 0] if len(residual) == 1 else residual * jnp.linalg.solve(cov, residual))
     keep = 1.0 - 1.0 / MEMORY
     # A chi-square variable has twice its degrees of freedom as its variance.
-    return Innovations(keep * sums.excess + squared - reading.seen, keep**2 * sums.variance + 2.0 * reading.seen)
+    return Innovations(keep * sums.excess + squared - observation.seen, keep**2 * sums.variance + 2.0 * observation.seen)
 
 
 def in_deviations(sums: Innovations) -> Any:
-    """The excess in standard deviations of chance."""
+    """Return the excess in standard deviations."""
     return sums.excess / jnp.sqrt(sums.variance + 2.0 * LEAST)

@@ -10,84 +10,56 @@ observations unperturbed; the ensemble then loses more variance than Bayes' rule
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from cuthbert.ensemble_kalman.ensemble_kalman_filter import EnKFState, build_filter
 
-from zakai import _float64  # noqa: F401
 from zakai.algebra.theorems import smooth_system as theorem
 from zakai.densities import PointMasses
-from zakai.filters._protocol import Info, Method, Schedule
+from zakai.methods._protocol import Info, Method
 from zakai.models.model import Model
-from zakai.peers._sampling import draws, moments, moved, observations, prepared_by, start_interval
+from zakai.peers import _float64  # noqa: F401
+from zakai.peers._sampling import draws, first_key, moments, moved, prepared_by
 from zakai.peers._translation import (
     DIVERGED,
     DOUBTFUL,
     Innovations,
     Interval,
+    Observation,
     Prepared,
-    Reading,
+    System,
+    compiled,
     in_deviations,
     innovations,
     real_number,
     whole_number,
 )
+from zakai.records.schedule import Schedule
+
+import jax  # isort: skip
+import jax.numpy as jnp  # isort: skip
+from cuthbert.ensemble_kalman.ensemble_kalman_filter import EnKFState, build_filter  # isort: skip
 
 
 class State(NamedTuple):
-    """The `key` of the draws to come, the `members` (N, n) and the running sums of the innovations."""
+    """The `key` of the next draws, the `members` (N, n) and the running sums of the innovations."""
 
     key: Any
     members: Any
     sums: Innovations
 
-    @property
-    def kept(self) -> Kept:
-        """What is kept of each step."""
-        return Kept(self.members)
-
-
-class Kept(NamedTuple):
-    """The members (N, n)."""
-
-    members: Any
-
 
 class Rule(NamedTuple):
-    """The static settings: how many members, and by how much deviations are stretched."""
+    """The static settings: the number of members, and the factor by which deviations are inflated, minus one."""
 
     members: int
     inflation: float
 
 
-def _dynamics(inputs: tuple[Interval, Reading]) -> Any:
-    return lambda x, key: moved(inputs[0], key, x)
-
-
-def _observation(inputs: tuple[Interval, Reading]) -> Any:
-    interval, reading = inputs
-
-    def h(x: Any) -> Any:
-        return reading.whiten @ interval.system.observation(x, interval.stop, interval.theta)
-
-    return h, jnp.eye(interval.system.m), reading.values
-
-
-@lru_cache(maxsize=32)
-def _filter(rule: Rule, n: int) -> Any:
-    """cuthbert's filter; it asks `init_sample` for nothing but the shape of a member."""
-    return build_filter(
-        lambda key: jnp.zeros(n), _dynamics, _observation, rule.members, rule.inflation, store_predicted_ensemble=True
-    )
-
-
 def prepare(
     model: Model,
     schedule: Schedule,
+    theta: np.ndarray,
     *,
     members: int = 100,
     seed: int = 0,
@@ -95,71 +67,94 @@ def prepare(
     scheme: str = "midpoint",
     substeps: int = 1,
 ) -> Prepared:
-    """The intervals with the noise of each substep.
+    """Return what is known of the intervals without data.
 
-    `members` are drawn from `seed` on; `inflation` stretches deviations from the mean by 1 + `inflation` at each forecast;
-    each interval is cut into `substeps` equal parts by `scheme`, "midpoint" or "euler". Raises InputError for another value.
+    Args:
+        model: the system.
+        schedule: its K intervals.
+        theta: values of the parameters (p,).
+        members: size of the ensemble.
+        seed: of the draws.
+        inflation: at each forecast the deviations from the mean are multiplied by 1 + `inflation`.
+        scheme: "midpoint" or "euler".
+        substeps: equal parts of each interval.
+
+    Raises:
+        InputError: another value of an option.
     """
     inflation = real_number("inflation", inflation, "a number from 0", lambda value: 0 <= value < np.inf)
     rule = Rule(whole_number("members", members, 2), inflation)
-    return prepared_by(rule, model, schedule, scheme, substeps, seed)
+    return prepared_by(rule, model, schedule, theta, scheme, substeps, seed)
 
 
 def init(prepared: Prepared, prior: Any) -> State:
-    """Draws of the prior."""
-    rule = prepared.system.rule
-    key = np.asarray(jax.random.key_data(jax.random.key(prepared.seed)))
-    return State(key, draws(prepared.model, prior, prepared.seed, rule.members), Innovations())
+    """Return draws of the prior."""
+    return State(first_key(prepared), draws(prepared, prior, prepared.system.rule.members), Innovations())
 
 
-def correct(prepared: Prepared, prior: Any, observation: Reading) -> tuple[State, Info]:
-    """The prior after a sample at the start itself."""
-    return step(start_interval(prepared), init(prepared, prior), jax.tree.map(lambda a: a[0], observation))
+def _advanced(system: System, interval: Interval, state: State, observation: Observation) -> tuple[State, Info]:
+    """Advance an ensemble over an interval: cuthbert's forecast and analysis, and their health."""
+    rule, key = system.rule, jax.random.wrap_key_data(state.key)
 
+    def h(x: Any) -> Any:
+        return observation.whiten @ system.observation(x, interval.stop, interval.theta)
 
-def step(interval: Interval, state: State, observation: Reading) -> tuple[State, Info]:
-    """One interval: cuthbert's forecast and analysis; and the health of them."""
-    system = interval.system
-    rule, inputs = system.rule, (interval, observation)
-    key = jax.random.wrap_key_data(jnp.asarray(state.key))
-    peer = _filter(rule, system.n)
-    members = jnp.asarray(state.members)
-    before = EnKFState(key, members, None, jnp.array(0.0), members)
+    # cuthbert asks the first function for nothing but the shape of a member.
+    peer = build_filter(
+        lambda key: jnp.zeros(system.n),
+        lambda inputs: lambda x, key: moved(system, interval, key, x),
+        lambda inputs: (h, jnp.eye(system.m), observation.values),
+        rule.members,
+        rule.inflation,
+        store_predicted_ensemble=True,
+    )
+    inputs = jnp.zeros(())
+    before = EnKFState(key, state.members, inputs, jnp.array(0.0), state.members)
     after = peer.filter_combine(before, peer.filter_prepare(inputs, key=key))
 
     equal = jnp.full(rule.members, 1.0 / rule.members)
     mean, cov = moments(equal, after.ensemble, system.angles)
-    expected, spread = moments(equal, jax.vmap(_observation(inputs)[0])(after.predicted_ensemble), ())
+    expected, spread = moments(equal, jax.vmap(h)(after.predicted_ensemble), ())
     sums = innovations(state.sums, observation, expected, spread * rule.members / (rule.members - 1) + jnp.eye(system.m))
     pure_noise = -0.5 * jnp.sum(observation.values**2) - 0.5 * system.m * jnp.log(2 * jnp.pi)
     evidence = after.log_normalizing_constant - pure_noise + observation.constant
-    health = {
-        "smallest_deviation": jnp.sqrt(jnp.min(jnp.diag(cov))),
-        "innovation_excess": in_deviations(sums),
-    }
+    health = {"smallest_deviation": jnp.sqrt(jnp.min(jnp.diag(cov))), "innovation_excess": in_deviations(sums)}
     return State(jax.random.key_data(after.key), after.ensemble, sums), Info(evidence, mean, cov, health)
 
 
-def density(prepared: Prepared, state: State | Kept) -> PointMasses:
-    """The members, all of one weight."""
-    model, points = prepared.model, np.asarray(state.members)
+step, segment = compiled(_advanced, 8)
+
+
+def density(prepared: Prepared, state: State) -> PointMasses:
+    """Return the members, with equal weights."""
+    model, points = prepared.model, state.members
     periodic = tuple(name in model.periodic for name in model.state)
     return PointMasses(np.full(len(points), 1.0 / len(points)), points, model.state, periodic)
 
 
-METHOD = Method(
+def valid(prepared: Prepared, state: State) -> bool:
+    """Return whether the arrays of a state fit the model and the options."""
+    return state.key.shape == first_key(prepared).shape and state.members.shape == (
+        prepared.system.rule.members,
+        prepared.model.n,
+    )
+
+
+METHOD: Method[Prepared, State] = Method(
     name="enkf",
     source="cuthbert, ensemble Kalman filter (Evensen 1994; Sanz-Alonso, Stuart and Taeb 2018, algorithm 10.2)",
-    exactness="approximate: the posterior is taken for an affine function of the forecast; for a linear system convergent in "
+    exactness="approximate: the posterior is taken as an affine function of the forecast; for a linear system convergent in "
     "1 / sqrt(members), up to an error of first order in the interval for increments, and in a substep of second (midpoint) or "
     "first (euler)",
     theorem=theorem,
     options={"members": 100, "seed": 0, "inflation": 0.0, "scheme": "midpoint", "substeps": 1},
     prepare=prepare,
     init=init,
-    correct=correct,
-    observations=observations,
     step=step,
+    segment=segment,
     density=density,
+    state=State,
     bounds={"innovation_excess": (DOUBTFUL, DIVERGED)},
+    differentiable=False,
+    valid=valid,
 )

@@ -2,7 +2,7 @@
 
     resample     if the effective sample size 1 / sum w_i^2 is below `ess_threshold` N
     propagate    x_i ~ the law of the discretised system after the interval, from x_i
-    weigh        log w_i += z . h(x_i) - |h(x_i)|^2 / 2 for what is read, white: z = h + N(0, I)
+    weight       log w_i += z . h(x_i) - |h(x_i)|^2 / 2 for a white observation z = h + N(0, I)
 
 (Gordon, Salmond and Smith 1993; Chopin and Papaspiliopoulos 2020, algorithm 10.1, as in cuthbert.smc.particle_filter.)  The
 estimate is that of the weighted particles, before the next resampling.  The estimate of the likelihood is unbiased, that of its
@@ -11,42 +11,48 @@ logarithm is not.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from cuthbert.smc.particle_filter import ParticleFilterState, build_filter
-from cuthbertlib.resampling import ess_decorator, killing, multinomial, systematic
-from cuthbertlib.smc.ess import log_ess
 
-from zakai import _float64  # noqa: F401
 from zakai.algebra.theorems import smooth_system as theorem
 from zakai.densities import PointMasses
 from zakai.errors import InputError
-from zakai.filters._protocol import Info, Method, Schedule
+from zakai.methods._protocol import Info, Method
 from zakai.models.model import Model
-from zakai.peers._sampling import draws, moments, moved, observations, prepared_by, start_interval
+from zakai.peers import _float64  # noqa: F401
+from zakai.peers._sampling import draws, first_key, moments, moved, prepared_by
 from zakai.peers._translation import (
     DIVERGED,
     DOUBTFUL,
     Innovations,
     Interval,
+    Observation,
     Prepared,
-    Reading,
+    System,
+    compiled,
     in_deviations,
     innovations,
     real_number,
     whole_number,
 )
+from zakai.records.schedule import Schedule
+
+import jax  # isort: skip
+import jax.numpy as jnp  # isort: skip
+from cuthbert.smc.particle_filter import ParticleFilterState, build_filter  # isort: skip
+from cuthbertlib.resampling import ess_decorator, killing, multinomial, systematic  # isort: skip
+from cuthbertlib.smc.ess import log_ess  # isort: skip
 
 RESAMPLING = {"systematic": systematic, "multinomial": multinomial, "killing": killing}
 
 
 class State(NamedTuple):
-    """The `key` of the draws to come, `particles` (N, n), `log_weights` (N,), the running sums of the innovations, and, where
-    nothing but the start is random, which of the first particles each descends from."""
+    """The weighted particles.
+
+    `key` of the next draws, `particles` (N, n), `log_weights` (N,), the running sums of the innovations, and `family` (N,): where
+    nothing but the start is random, the first particle from which each descends, else None.
+    """
 
     key: Any
     particles: Any
@@ -54,52 +60,19 @@ class State(NamedTuple):
     sums: Innovations
     family: Any
 
-    @property
-    def kept(self) -> Kept:
-        """What is kept of each step."""
-        return Kept(self.particles, self.log_weights)
-
-
-class Kept(NamedTuple):
-    """The weighted particles."""
-
-    particles: Any
-    log_weights: Any
-
 
 class Rule(NamedTuple):
-    """The static settings: how many particles, resampled how and when."""
+    """The static settings: the number of particles, and how and when they are resampled."""
 
     particles: int
     resampling: str
     ess_threshold: float
 
 
-def _propagate(key: Any, x: Any, inputs: tuple[Interval, Reading]) -> Any:
-    return moved(inputs[0], key, x)
-
-
-def _white(inputs: tuple[Interval, Reading], x: Any) -> Any:
-    """The white observation (m,) of a state at the end of the interval."""
-    interval, reading = inputs
-    return reading.whiten @ interval.system.observation(x, interval.stop, interval.theta)
-
-
-def _log_potential(before: Any, x: Any, inputs: tuple[Interval, Reading]) -> Any:
-    h = _white(inputs, x)
-    return inputs[1].values @ h - 0.5 * h @ h
-
-
-@lru_cache(maxsize=32)
-def _filter(rule: Rule, n: int) -> Any:
-    """cuthbert's filter; it asks `init_sample` for nothing but the shape of a particle."""
-    resample = ess_decorator(RESAMPLING[rule.resampling].resampling, rule.ess_threshold)
-    return build_filter(lambda key: jnp.zeros(n), _propagate, _log_potential, rule.particles, resample)
-
-
 def prepare(
     model: Model,
     schedule: Schedule,
+    theta: np.ndarray,
     *,
     particles: int = 1000,
     seed: int = 0,
@@ -108,11 +81,21 @@ def prepare(
     scheme: str = "midpoint",
     substeps: int = 1,
 ) -> Prepared:
-    """The intervals with the noise of each substep.
+    """Return what is known of the intervals without data.
 
-    `particles` are drawn from `seed` on; `resampling` is "systematic", "multinomial" or "killing", done where the effective
-    sample size is below the share `ess_threshold` of them; each interval is cut into `substeps` equal parts by `scheme`,
-    "midpoint" or "euler". Raises InputError for another value.
+    Args:
+        model: the system.
+        schedule: its K intervals.
+        theta: values of the parameters (p,).
+        particles: number of particles.
+        seed: of the draws.
+        resampling: "systematic", "multinomial" or "killing".
+        ess_threshold: resample where the effective sample size is below this share of the particles.
+        scheme: "midpoint" or "euler".
+        substeps: equal parts of each interval.
+
+    Raises:
+        InputError: another value of an option.
     """
     if resampling not in RESAMPLING:
         raise InputError(f'option resampling: "{resampling}" is none of {", ".join(RESAMPLING)}')
@@ -120,69 +103,89 @@ def prepare(
     rule = Rule(whole_number("particles", particles, 2), resampling, share)
     notes: tuple[str, ...] = ()
     if model.covariance.is_zero_matrix is True:
-        notes = (
-            "the system has no process noise: particles that are resampled stay copies of each other, whose number only falls",
-        )
-    return prepared_by(rule, model, schedule, scheme, substeps, seed, notes)
+        notes = ("the system has no process noise: resampled particles stay copies of each other, whose number only falls",)
+    return prepared_by(rule, model, schedule, theta, scheme, substeps, seed, notes)
 
 
 def init(prepared: Prepared, prior: Any) -> State:
-    """Draws of the prior, all of one weight."""
-    rule = prepared.system.rule
-    first = draws(prepared.model, prior, prepared.seed, rule.particles)
-    family = np.arange(rule.particles) if prepared.system.noiseless else None
-    key = np.asarray(jax.random.key_data(jax.random.key(prepared.seed)))
-    return State(key, first, np.full(rule.particles, -np.log(rule.particles)), Innovations(), family)
+    """Return draws of the prior, with equal weights."""
+    count = prepared.system.rule.particles
+    first = draws(prepared, prior, count)
+    family = np.arange(count) if prepared.system.noiseless else None
+    return State(first_key(prepared), first, np.full(count, -np.log(count)), Innovations(), family)
 
 
-def correct(prepared: Prepared, prior: Any, observation: Reading) -> tuple[State, Info]:
-    """The prior after a sample at the start itself."""
-    return step(start_interval(prepared), init(prepared, prior), jax.tree.map(lambda a: a[0], observation))
+def _advanced(system: System, interval: Interval, state: State, observation: Observation) -> tuple[State, Info]:
+    """Advance the particles over an interval: cuthbert's resampling, propagation and weights, and their health."""
+    rule = system.rule
+    own, following = jax.random.split(jax.random.wrap_key_data(state.key))
 
+    def h(x: Any) -> Any:
+        return observation.whiten @ system.observation(x, interval.stop, interval.theta)
 
-def step(interval: Interval, state: State, observation: Reading) -> tuple[State, Info]:
-    """One interval: cuthbert's resampling, propagation and weights; and the health of them."""
-    system = interval.system
-    rule, inputs = system.rule, (interval, observation)
-    own, following = jax.random.split(jax.random.wrap_key_data(jnp.asarray(state.key)))
-    weights, particles = jnp.asarray(state.log_weights), jnp.asarray(state.particles)
-    peer = _filter(rule, system.n)
-    before = ParticleFilterState(own, particles, weights, jnp.arange(rule.particles), None, jnp.array(0.0))
+    def log_potential(before: Any, x: Any, inputs: Any) -> Any:
+        value = h(x)
+        return observation.values @ value - 0.5 * value @ value
+
+    # cuthbert asks the first function for nothing but the shape of a particle.
+    peer = build_filter(
+        lambda key: jnp.zeros(system.n),
+        lambda key, x, inputs: moved(system, interval, key, x),
+        log_potential,
+        rule.particles,
+        ess_decorator(RESAMPLING[rule.resampling].resampling, rule.ess_threshold),
+    )
+    inputs = jnp.zeros(())
+    before = ParticleFilterState(
+        own, state.particles, state.log_weights, jnp.arange(rule.particles), inputs, jnp.array(0.0)
+    )
     after = peer.filter_combine(before, peer.filter_prepare(inputs, key=following))
 
     log_weights = after.log_weights - jax.nn.logsumexp(after.log_weights)
     share = jnp.exp(log_weights)
     mean, cov = moments(share, after.particles, system.angles)
-    h = jax.vmap(_white, (None, 0))(inputs, after.particles)
-    predicted = jax.nn.softmax(after.log_weights - h @ observation.values + 0.5 * jnp.sum(h**2, axis=1))
-    expected, spread = moments(predicted, h, ())
+    seen = jax.vmap(h)(after.particles)
+    predicted = jax.nn.softmax(after.log_weights - seen @ observation.values + 0.5 * jnp.sum(seen**2, axis=1))
+    expected, spread = moments(predicted, seen, ())
     sums = innovations(state.sums, observation, expected, spread + jnp.eye(system.m))
     family, parts = None, share
     if state.family is not None:
-        family = jnp.asarray(state.family)[after.ancestor_indices]
+        family = state.family[after.ancestor_indices]
         parts = jnp.zeros(rule.particles).at[family].add(share)
     effective = 1.0 / jnp.sum(parts**2)
     health = {
         "effective_sample_size": effective,
         "monte_carlo_error": 1.0 / jnp.sqrt(effective),
-        "resampled": (log_ess(weights) < jnp.log(rule.ess_threshold * rule.particles)).astype(float),
+        "resampled": (log_ess(state.log_weights) < jnp.log(rule.ess_threshold * rule.particles)).astype(float),
         "innovation_excess": in_deviations(sums),
     }
-    key = jax.random.key_data(after.key)
     evidence = after.log_normalizing_constant + observation.constant
-    return State(key, after.particles, log_weights, sums, family), Info(evidence, mean, cov, health)
+    return State(jax.random.key_data(after.key), after.particles, log_weights, sums, family), Info(evidence, mean, cov, health)
 
 
-def density(prepared: Prepared, state: State | Kept) -> PointMasses:
-    """The weighted particles."""
+step, segment = compiled(_advanced, 8)
+
+
+def density(prepared: Prepared, state: State) -> PointMasses:
+    """Return the weighted particles."""
     model = prepared.model
-    weights = np.exp(np.asarray(state.log_weights))
-    return PointMasses(
-        weights / weights.sum(), np.asarray(state.particles), model.state, tuple(name in model.periodic for name in model.state)
-    )
+    weights = np.exp(state.log_weights)
+    periodic = tuple(name in model.periodic for name in model.state)
+    return PointMasses(weights / weights.sum(), state.particles, model.state, periodic)
 
 
-METHOD = Method(
+def valid(prepared: Prepared, state: State) -> bool:
+    """Return whether the arrays of a state fit the model and the options."""
+    count = prepared.system.rule.particles
+    if state.family is None or not prepared.system.noiseless:
+        family = state.family is None and not prepared.system.noiseless
+    else:
+        family = state.family.shape == (count,) and bool(np.all((state.family >= 0) & (state.family < count)))
+    shapes = state.key.shape, state.particles.shape, state.log_weights.shape
+    return family and shapes == (first_key(prepared).shape, (count, prepared.model.n), (count,))
+
+
+METHOD: Method[Prepared, State] = Method(
     name="particle",
     source="cuthbert, particle filter (Gordon, Salmond and Smith 1993; Chopin and Papaspiliopoulos 2020, algorithm 10.1)",
     exactness="convergent: in 1 / sqrt(particles), up to an error of first order in the interval for increments, and in a "
@@ -193,10 +196,10 @@ METHOD = Method(
     },
     prepare=prepare,
     init=init,
-    correct=correct,
-    observations=observations,
     step=step,
+    segment=segment,
     density=density,
+    state=State,
     bounds={
         "monte_carlo_error": (
             0.3,
@@ -204,4 +207,6 @@ METHOD = Method(
         ),
         "innovation_excess": (DOUBTFUL, DIVERGED),
     },
+    differentiable=False,
+    valid=valid,
 )  # fmt: skip

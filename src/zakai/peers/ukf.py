@@ -4,9 +4,9 @@
     weights of the mean: lambda / (n + lambda), then 1 / (2 (n + lambda)); of the covariance the first has 1 - alpha^2 + beta more
 
 (Saerkka 2013, algorithm 5.14).  dynamax' own defaults, alpha = sqrt 3, beta = 2, kappa = 1, put the points sqrt(3 n + 3)
-deviations away, twice as far as a Gaussian reaches.  Here alpha = 1 and beta = 0, so that both sets of weights are one, and kappa
-= 3 - n as long as that is not negative, which matches the fourth moment of a Gaussian along each axis (Julier and Uhlmann 1997);
-for more than three states kappa = 0, the cubature rule (Arasaratnam and Haykin 2009), whose weights are never negative.
+deviations away, twice as far as a Gaussian reaches.  Here alpha = 1 and beta = 0, so that both sets of weights are the same.
+kappa is 3 - n where that is not negative, which matches the fourth moment of a Gaussian along each axis (Julier and Uhlmann
+1997); for more than three states it is 0, the cubature rule (Arasaratnam and Haykin 2009), whose weights are never negative.
 """
 
 from __future__ import annotations
@@ -14,23 +14,24 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from zakai import _float64  # noqa: F401
 from zakai.algebra.theorems import smooth_system as theorem
 from zakai.errors import InputError
-from zakai.filters._protocol import Method, Schedule
+from zakai.methods._protocol import Method
 from zakai.models.model import Model
 from zakai.peers import _gaussian
 from zakai.peers._dynamax import inference_ukf as dynamax
 from zakai.peers._gaussian import Rule, State
 from zakai.peers._translation import Prepared, real_number
+from zakai.records.schedule import Schedule
+
+import jax.numpy as jnp  # isort: skip
 
 
 @lru_cache(maxsize=32)
 def _rule(n: int, alpha: float, beta: float, kappa: float) -> Rule:
-    """dynamax' functions with the weights of `n` states."""
+    """Return dynamax' functions with the weights of `n` states."""
     scale = dynamax._compute_lambda(alpha, kappa, n)
     weights = tuple(np.asarray(one) for one in dynamax._compute_weights(n, alpha, beta, scale))
 
@@ -47,6 +48,7 @@ def _rule(n: int, alpha: float, beta: float, kappa: float) -> Rule:
 def prepare(
     model: Model,
     schedule: Schedule,
+    theta: np.ndarray,
     *,
     alpha: float = 1.0,
     beta: float = 0.0,
@@ -54,45 +56,47 @@ def prepare(
     scheme: str = "midpoint",
     substeps: int = 1,
 ) -> Prepared:
-    """The intervals with the parameters of the sigma points.
+    """Return what is known of the intervals without data.
 
-    `alpha` > 0, `beta` and `kappa` > -n (by default 3 - n, at least 0) place and weigh the points; each interval is cut into
-    `substeps` equal parts; `scheme` is "midpoint" or "euler". Raises InputError for another value.
+    Args:
+        model: the system.
+        schedule: its K intervals.
+        theta: values of the parameters (p,).
+        alpha: spread of the sigma points, positive.
+        beta: additional weight of the first point in the covariance.
+        kappa: second spread of the sigma points, above -n; by default 3 - n, at least 0.
+        scheme: "midpoint" or "euler".
+        substeps: equal parts of each interval.
+
+    Raises:
+        InputError: another value of an option.
     """
     n = model.n
     alpha = real_number("alpha", alpha, "a positive number", lambda value: 0 < value < np.inf)
     beta = real_number("beta", beta, "a finite number", np.isfinite)
     kappa = max(3.0 - n, 0.0) if kappa is None else kappa
     kappa = real_number("kappa", kappa, f"a number above -{n}, the number of states", lambda value: -n < value < np.inf)
-    return _gaussian.prepared_by(_rule(n, alpha, beta, kappa), model, schedule, scheme, substeps)
+    return _gaussian.prepared_by(_rule(n, alpha, beta, kappa), model, schedule, theta, scheme, substeps)
 
 
 def init(prepared: Prepared, prior: Any) -> State:
-    """The prior's mean and covariance; InputError where sigma points cannot be placed."""
+    """Return the prior's mean and covariance.
+
+    Raises:
+        InputError: the covariance is singular, so that sigma points cannot be placed.
+    """
     state = _gaussian.init(prepared, prior)
-    if isinstance(state.cov, np.ndarray) and not _definite(state.cov):
+    try:
+        np.linalg.cholesky(state.cov)
+    except np.linalg.LinAlgError:
         raise InputError(
             f"{prepared.model.source}: prior: its covariance is singular, and ukf places its points by the Cholesky factor; "
             "give every state a small variance, or take ekf"
-        )
+        ) from None
     return state
 
 
-def _definite(cov: np.ndarray) -> bool:
-    try:
-        np.linalg.cholesky(cov)
-    except np.linalg.LinAlgError:
-        return False
-    return True
-
-
-def correct(prepared: Prepared, prior: Any, observation: Any) -> Any:
-    """The prior after a sample at the start itself."""
-    init(prepared, prior)
-    return _gaussian.correct(prepared, prior, observation)
-
-
-METHOD = Method(
+METHOD: Method[Prepared, State] = Method(
     name="ukf",
     source="dynamax, unscented Kalman filter (Saerkka 2013, algorithm 5.14; Julier and Uhlmann 1997)",
     exactness=f"approximate: moments through sigma points; for a linear system {_gaussian.FIRST_ORDER}",
@@ -100,10 +104,11 @@ METHOD = Method(
     options={"alpha": 1.0, "beta": 0.0, "kappa": None, "scheme": "midpoint", "substeps": 1},
     prepare=prepare,
     init=init,
-    correct=correct,
-    observations=_gaussian.observations,
     step=_gaussian.step,
+    segment=_gaussian.segment,
     density=_gaussian.density,
-    with_parameters=_gaussian.with_parameters,
+    state=State,
     bounds=_gaussian.BOUNDS,
+    differentiable=False,
+    valid=_gaussian.valid,
 )

@@ -104,7 +104,7 @@ def _versions(result: Any) -> str:
 
 def _installed() -> dict[str, str]:
     found = {}
-    for name in ("zakai", "jax", "numpy", "sympy", "plotly"):
+    for name in ("zakai", "numba", "numpy", "sympy", "plotly"):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""What the figures of a run mean, in words: one verdict, and one explanation for each figure of health."""
+"""The verdict on a run in words, and an explanation of each health figure."""
 
 from __future__ import annotations
 
@@ -8,44 +8,52 @@ import numpy as np
 
 from zakai.report.heatmap import state_names
 
-_MOST_STATES = 12  # whose errors are told one by one
+_MOST_STATES = 12  # states whose errors are listed one by one
 
-# Figures that say the same for every method: what they are, and the bound where it is not the method's own.
+# Figures with the same meaning for every method: the explanation, and the bound where the method has none of its own.
 _HEALTH: dict[str, tuple[str, float | None]] = {
     "edge_mass": (
-        "Probability in the outermost cells of the window on which the density is computed: what may have "
-        "been lost "
-        "beyond it. Rounding is about 1e-16; above the bound the window cut off part of the posterior.",
+        "Probability at the edges of the grid, an estimate of the probability beyond it. Rounding is about 1e-16; above the "
+        "bound the grid cuts off part of the posterior.",
         1e-9,
     ),
     "discarded_mass": (
-        "Probability thrown away when small parts of the density were dropped. Its sum over the record bounds the error.",
+        "Probability of the small parts of the density that were dropped. Its sum over the record bounds the error.",
         1e-6,
     ),
     "quadrature_error": (
-        "Relative error made by replacing an integral over the state by a sum over the lattice.",
+        "Relative error of replacing an integral over the state by a sum over the grid.",
         1e-9,
     ),
-    "resolution": (
-        "Cells of the lattice in a standard deviation of the narrowest feature of the density. The more "
-        "the better: "
-        "above 2 the density is resolved to many digits, below 1 it is too narrow for its lattice.",
+    "std_in_spacings": (
+        "Smallest standard deviation along an axis, in grid spacings. Above 2 the density is resolved to many digits; below 1 "
+        "it is too narrow for its grid.",
         1.0,
     ),
-    "exponent": (
-        "Largest exponent, over the window, of the factor that separates the density from what is computed. "
-        "Beyond 700 a double-precision number underflows and mass would be lost.",
+    "gauge_exponent": (
+        "Largest exponent, over the grid, of the factor between the density and the function that is computed. Beyond 700 a "
+        "double-precision number underflows and mass is lost.",
         600.0,
     ),
+    "tolerance_ratio": ("Estimated error of the step, relative to the tolerance that was asked for.", 1.0),
+    "tail_truncation": ("Part of the tails that the representation of the density does not hold.", None),
+    "tail_depth": (
+        "Nats below the maximum of the prediction at which the observation is. An observation far in the tail uses a part of "
+        "the density that is known with fewer digits.",
+        None,
+    ),
+    "splitting_error": ("Estimated error of separating the motion of the state from the observation in one interval.", None),
+    "negative_mass": ("Probability of the parts of the computed density that are negative.", None),
+    "error_estimate": ("Estimated error of the mean, in standard deviations of the posterior.", None),
     "effective_sample_size": (
-        "The number of equally weighted particles that would carry the same information: low means few of them count.",
+        "The number of equally weighted particles with the same information: low means that few of them count.",
         None,
     ),
 }
 
 
 def health_words(result: Any, name: str) -> str:
-    """One explanation of a figure of health: the one known here, or else the method's own."""
+    """Return the explanation of a health figure: the common one, else that of the method."""
     if name in _HEALTH:
         return _HEALTH[name][0]
     own = (getattr(result, "bounds", None) or {}).get(name)
@@ -54,13 +62,13 @@ def health_words(result: Any, name: str) -> str:
 
 
 def health_bound(result: Any, name: str) -> float | None:
-    """The value beyond which a reader should worry, if there is one: the method's, or else the usual one."""
+    """Return the bound of a health figure, if there is one: that of the method, else the common one."""
     own = (getattr(result, "bounds", None) or {}).get(name)
     return float(own[0]) if own else _HEALTH.get(name, ("", None))[1]
 
 
 def health_span(values: Any) -> str:
-    """The middle and the extremes of a figure over the run."""
+    """Return the range and the median of a figure over the run."""
     finite = np.asarray(values, dtype=float)
     finite = finite[np.isfinite(finite)]
     if finite.size == 0:
@@ -71,27 +79,27 @@ def health_span(values: Any) -> str:
 
 
 def spoken(name: str) -> str:
-    """A variable's name as a phrase: `mass_at_edge` is "mass at edge"."""
+    """Return a variable's name as a phrase: `mass_at_edge` is "mass at edge"."""
     return name.replace("_", " ")
 
 
 def signed(number: str) -> str:
-    """A formatted number with a true minus sign."""
+    """Return a formatted number with a typographic minus sign."""
     return number.replace("-", "−")
 
 
 def count(number: int, noun: str) -> str:
-    """The number with its noun, in the plural where it must be."""
+    """Return the number with its noun, in the plural where needed."""
     return f"{number:,} {noun}" + ("" if number == 1 else "s")
 
 
 def exactness(result: Any) -> str:
-    """What the method promises, if the result says it: exact, convergent or approximate."""
+    """Return the kind of the method, if the result states it: exact, convergent or approximate."""
     return str(result.attributes.get("exactness", ""))
 
 
 def verdict(result: Any) -> str:
-    """In a sentence or two: which method, how much data, how likely, whether anything went wrong, how exact."""
+    """Return one or two sentences: method, amount of data, likelihood, warnings, exactness."""
     observations = len(result.times) - 1
     by_blocks = getattr(result, "blocks", ())
     text = f"The method {result.method}"
@@ -110,9 +118,7 @@ def verdict(result: Any) -> str:
 
 
 def errors(result: Any, error: np.ndarray | None) -> list[tuple[str, str]]:
-    """Root mean squared error of each mean, where the truth is known: (label, figure) pairs for the page's
-    head.
-    """
+    """Return (label, figure) pairs for the page's head: the root mean squared error of each mean where the truth is known."""
     facts: list[tuple[str, str]] = []
     if error is None:
         return facts

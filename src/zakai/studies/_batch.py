@@ -14,9 +14,9 @@ import numpy as np
 import xarray
 
 from zakai import _registry
+from zakai.engine.driver import filter as run_filter
+from zakai.engine.results import FilterResult, versions
 from zakai.errors import InputError
-from zakai.filters.driver import filter as run_filter
-from zakai.filters.results import FilterResult, versions
 from zakai.models.files import read_model
 from zakai.models.model import Model
 from zakai.models.simulate import simulate

@@ -16,8 +16,8 @@ from typing import Any
 
 import xarray
 
+from zakai.engine.results import versions
 from zakai.errors import InputError
-from zakai.filters.results import versions
 from zakai.records.writing import atomic_write, shown
 from zakai.studies.specification import Study
 

@@ -18,21 +18,16 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtr
 
-from zakai import _float64  # noqa: F401
+from zakai.engine.driver import filter_from
 from zakai.errors import InputError
-from zakai.filters import extended_kalman_bucy
-from zakai.filters.driver import filter_from
-from zakai.filters.observations import data_of, schedule_of
 from zakai.models.files import load_model
-from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior
 from zakai.records import Record
 from zakai.studies._chen_luo_yau_2017_text import text_of
+from zakai.studies._extended_kalman import extended_kalman
 from zakai.studies._grid_optimal import grid_optimal
 from zakai.studies._published import Comparison, Pictures, Progress, by_chance, comparison_lines, whole_number, write_figures
 
@@ -130,8 +125,8 @@ def run(
     wide = max(40.0, np.abs(states).max() + 8, (np.abs(first) + 7 * np.sqrt(variances)[:, None]).max())
     for name, half_width in (("grid-optimal", wide), ("grid-cut", CUT)):
         means[name] = grid_optimal(_drift, _observation, increments, STEP, first, variances, half_width, work.add)
-    means["ekf-euler"], lost = _extended(model, times, increments, first, variances, "euler")
-    means["ekf-stable"], _ = _extended(model, times, increments, first, variances, "stable")
+    means["ekf-euler"], lost = _extended(increments, first, variances, stable=False)
+    means["ekf-stable"], _ = _extended(increments, first, variances, stable=True)
 
     figures = _figures(settings, states, means, lost) | {"paths": paths, "steps": steps, "seed": seed, "grid": wide}
     figures["comparisons"] = [asdict(one) for one in _comparisons(figures)]
@@ -151,6 +146,10 @@ def _drift(x: np.ndarray, t: float) -> np.ndarray:
 
 def _observation(x: np.ndarray) -> np.ndarray:
     return np.stack([x * np.sin(x), x * np.cos(x)], axis=-1)
+
+
+def _slope(x: np.ndarray) -> np.ndarray:
+    return np.stack([np.sin(x) + x * np.cos(x), np.cos(x) - x * np.sin(x)], axis=-1)
 
 
 def euler_paths(rng: np.random.Generator, paths: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
@@ -176,26 +175,11 @@ def _direct(model, times, increments, first, variances, one) -> np.ndarray:
     return means
 
 
-def _extended(model: Model, times, increments, first, variances, riccati) -> tuple[np.ndarray, np.ndarray]:
-    """The extended Kalman-Bucy filters, all at once: means, and where a variance was lost."""
-    method = extended_kalman_bucy.METHOD
-    data = data_of(model, Record(times, increments[0], "increments"))
-    prepared = method.prepare(model, schedule_of(data, True), riccati=riccati, substeps=1)
-    observed = method.observations(prepared, data).inside
-
-    def one(mean, variance, values):
-        def step(state, slices):
-            interval, reading = slices
-            state, _ = method.step(interval, state, extended_kalman_bucy.Observation(reading, None))
-            return state, (state.mean[0], state.cov[0, 0])
-
-        start = extended_kalman_bucy.State(mean[None], variance[None, None])
-        return jax.lax.scan(step, start, (prepared.intervals, observed._replace(values=values)))[1]
-
-    paths = jax.vmap(one, in_axes=(0, None, 0))
-    means, covs = jax.jit(jax.vmap(paths, in_axes=(0, 0, None)))(first, jnp.asarray(variances), increments / STEP)
-    lost = ~np.all((np.asarray(covs) >= 0) & np.isfinite(np.asarray(means)), axis=-1)
-    return np.concatenate([first[..., None], np.asarray(means)], axis=-1), lost
+def _extended(increments: np.ndarray, first: np.ndarray, variances: np.ndarray, stable: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return the means of the extended Kalman-Bucy filters, and where a variance was lost."""
+    return extended_kalman(
+        _drift, lambda x, t: np.full_like(x, t / 40), _observation, _slope, increments, STEP, first, variances, stable
+    )
 
 
 def _figures(settings, states, means, lost) -> dict[str, Any]:

@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai import _float64  # noqa: F401
+from zakai.engine.driver import filter as filter_record
 from zakai.errors import InputError
-from zakai.filters.driver import filter as filter_record
 from zakai.models.files import load_model
 from zakai.models.simulate import simulate
 from zakai.records import Record

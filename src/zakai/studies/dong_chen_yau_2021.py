@@ -15,9 +15,8 @@ import numpy as np
 import sympy as sp
 from scipy.integrate import solve_ivp
 
-from zakai import _float64  # noqa: F401
 from zakai.algebra.analysis import analyze
-from zakai.filters.driver import filter as filter_record
+from zakai.engine.driver import filter as filter_record
 from zakai.models.files import load_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function

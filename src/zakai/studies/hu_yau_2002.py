@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from zakai import _float64  # noqa: F401
-from zakai.filters.driver import filter as filter_record
-from zakai.filters.results import FilterResult
+from zakai.engine.driver import filter as filter_record
+from zakai.engine.results import FilterResult
 from zakai.models.model import Model
 from zakai.models.simulate import simulate
 from zakai.studies._drawing import INK, OURS, PALE, SERIES, new_figure, plain
@@ -62,7 +61,7 @@ def _scalar(drift: str, noise: str = "1") -> dict[str, Any]:
     }  # fmt: skip
 
 
-ALL = tuple((form, choice) for form in ("stepwise", "one-shot") for choice in ("theorem-4", "theorem-5", "theorem-6"))
+ALL = tuple((form, theorem) for form in ("stepwise", "one-shot") for theorem in ("theorem-4", "theorem-5", "theorem-6"))
 SYSTEMS = {
     "Benes": System(_scalar("tanh(x)"), np.tanh, lambda x: x, np.eye(1), _two_peaks, (14.0, 256), ALL),
     "Kalman-Bucy": System(
@@ -118,10 +117,10 @@ def run(
             system.drift, system.observation, system.covariance, system.prior, times, record.values, *system.box
         )
         work.add()
-        for form, choice in system.forms[:forms]:
-            result = filter_record(model, record, "hu-yau", form=form, choice=choice)
+        for form, theorem in system.forms[:forms]:
+            result = filter_record(model, record, "hu-yau", form=form, theorem=theorem)
             density, evidence = distances(converged, result)
-            what = f"{name}: {choice.replace('-', ' ').capitalize()}, {form}"
+            what = f"{name}: {theorem.replace('-', ' ').capitalize()}, {form}"
             comparisons.append(
                 by_computation(f"{what}: error of the density", "0", f"{density:.1e}", density <= EXACT, "digits are lost")
             )

@@ -1,7 +1,7 @@
-"""What an observation says that the filter did not expect: innovations and their normalised square, NIS.
+"""Innovations and their normalised square, NIS.
 
-From one reading to the next the Gaussian with the filter's mean m and covariance P moves by the linearised equations, together
-with what will be observed,
+Between two observations the Gaussian with the filter's mean m and covariance P moves by the linearised equations, together with
+the integral of the observation,
 
     dm = f dt,   da = h dt,   d Sigma = (A Sigma + Sigma A' + diag(G, S)) dt,   A = (F 0; H 0),   F = df/dx, H = dh/dx at m,
 
@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from zakai.filters.observations import Data, data_of
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.records import Record
+from zakai.records.schedule import Schedule, schedule_of
 from zakai.studies.metrics import mahalanobis
 
 _STEP = 0.1  # of the Runge-Kutta steps, in units of 1/|A|
@@ -25,7 +25,7 @@ _LATE = 1 + 1e-9
 
 
 class Innovations:
-    """The innovations of one model's records, from what a filter said."""
+    """The innovations of records of one model, from the moments of a filter."""
 
     def __init__(self, model: Model):
         n, m = model.n, model.m
@@ -38,26 +38,31 @@ class Innovations:
         self.noise = numpy_function(model.observation_noise, model, (m, m))
 
     def __call__(self, record: Record, mean: np.ndarray, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The innovations (K, m) and their covariances (K, m, m), from `mean` (K+1, n) and `cov` (K+1, n, n), the prior first.
+        """Return the innovations (K, m) and their covariances (K, m, m).
 
-        nan where nothing was observed, or an increment was gathered over more than its interval.
+        They are NaN where nothing was observed, or an increment was gathered over more than its interval.
+
+        Args:
+            record: K observations.
+            mean: means of the filter (K+1, n), the prior first.
+            cov: their covariances (K+1, n, n).
         """
-        data = data_of(self.model, record)
+        schedule, values = schedule_of(self.model, record)
         n, m = self.model.n, self.model.m
         with np.errstate(invalid="ignore", over="ignore"):
-            x, sigma = self._moved(data, np.asarray(mean, float)[:-1], np.asarray(cov, float)[:-1])
+            x, sigma = self._moved(schedule, np.asarray(mean, float)[:-1], np.asarray(cov, float)[:-1])
             if record.kind == "samples":
-                slope = self.slope(x[:, :n], data.stops, self.theta)
-                expected = self.observation(x[:, :n], data.stops, self.theta)
-                spread = slope @ sigma[:, :n, :n] @ np.swapaxes(slope, 1, 2) + self.noise(x[:, :n], data.stops, self.theta)
+                slope = self.slope(x[:, :n], schedule.stops, self.theta)
+                expected = self.observation(x[:, :n], schedule.stops, self.theta)
+                spread = slope @ sigma[:, :n, :n] @ np.swapaxes(slope, 1, 2) + self.noise(x[:, :n], schedule.stops, self.theta)
                 late = np.zeros((len(x), m), bool)
             else:
                 expected, spread = x[:, n:], sigma[:, n:, n:]
-                late = data.elapsed > _LATE * (data.stops - data.starts)[:, None]
-        return np.where(late, np.nan, data.values - expected), spread
+                late = schedule.elapsed > _LATE * (schedule.stops - schedule.starts)[:, None]
+        return np.where(late | ~schedule.seen, np.nan, values - expected), spread
 
     def nis(self, record: Record, mean: np.ndarray, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """nu' S^-1 nu (K,), and how many coordinates were observed (K,), the degrees of freedom of its chi-square law.
+        """Return nu' S^-1 nu (K,), and the number of observed coordinates (K,), the degrees of freedom of its chi-square law.
 
         For a filter of a linear system with the right model it is chi-square with m degrees and independent from time to time
         (Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2); for a curved h it is that to first order.
@@ -69,20 +74,20 @@ class Innovations:
         count = seen.sum(axis=1)
         return np.where(count > 0, value, np.nan), count
 
-    def _moved(self, data: Data, mean: np.ndarray, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(x, y) and their covariance at the ends of the intervals, by the classical Runge-Kutta method."""
+    def _moved(self, schedule: Schedule, mean: np.ndarray, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (x, y) and their covariance at the ends of the intervals, by the classical Runge-Kutta method."""
         n, m, K = self.model.n, self.model.m, len(mean)
         z = np.concatenate([mean, np.zeros((K, m))], axis=1)
         sigma = np.zeros((K, n + m, n + m))
         sigma[:, :n, :n] = cov
-        lengths = data.stops - data.starts
-        size = np.abs(self._matrix(mean, data.starts)).sum(axis=2).max(axis=1) * lengths
+        lengths = schedule.stops - schedule.starts
+        size = np.abs(self._matrix(mean, schedule.starts)).sum(axis=2).max(axis=1) * lengths
         finite = size[np.isfinite(size)]
         steps = int(np.clip(np.ceil(finite.max(initial=0.0) / _STEP), 1, _MOST_STEPS))
         z[np.nan_to_num(size, nan=np.inf) > 10 * _STEP * _MOST_STEPS] = np.nan  # stiffer than this method can follow
         d = lengths / steps
         for j in range(steps):
-            t = data.starts + j * d
+            t = schedule.starts + j * d
             z1, s1 = self._rates(z, sigma, t)
             z2, s2 = self._rates(z + 0.5 * d[:, None] * z1, sigma + 0.5 * d[:, None, None] * s1, t + 0.5 * d)
             z3, s3 = self._rates(z + 0.5 * d[:, None] * z2, sigma + 0.5 * d[:, None, None] * s2, t + 0.5 * d)

@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai import _float64  # noqa: F401
-from zakai.filters.driver import filter as filter_record
+from zakai.engine.driver import filter as filter_record
 from zakai.models.model import Model
 from zakai.records import Record
 from zakai.studies._drawing import INK, SERIES, TRUTH, new_figure, plain

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from zakai import _registry
+from zakai.engine.driver import check_noise, check_records, planned
+from zakai.engine.results import versions
 from zakai.errors import ConditionError, InputError
-from zakai.filters.driver import check_noise, check_records, planned
-from zakai.filters.results import versions
 from zakai.models import _entries
 from zakai.models._errors import did_you_mean, echo, listing, named
 from zakai.models.clock import clock
@@ -36,7 +36,7 @@ OF_TRUTH = ("squared-error", "nees", "crps", "pit", "log-score")
 METRICS = (*OF_TRUTH, "nis", "distance", "hellinger")
 OF_REFERENCE = ("distance", "hellinger")
 BATCH = 25
-MOST_TOGETHER = 31  # records of one scan, whatever the machine: the driver divides more of them by the number of cores
+MOST_TOGETHER = 31  # records of a batch
 MOST_RUNS, MOST_POINTS, MOST_DENSITIES = 1_000_000, 10_000, 1000
 MOST_METHODS, MOST_RECORDS, MOST_BATCHES = 100, 10_000, 1_000_000
 MOST_NUMBERS = 100_000_000  # of the observations of one record, or of its states
@@ -416,7 +416,7 @@ def _numbers(keys: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _check(study: Study, model: Model, first: bool) -> None:
-    """Whether every method holds for the model, and, once, takes the values of its options, before anything runs."""
+    """Check that every method holds for the model, and, once, that it accepts its options, before anything runs."""
     times = times_of(study, model)
     record = Record(times, np.zeros((len(times), model.m)), model.observation_kind)
     check_records(model, record)
@@ -429,7 +429,7 @@ def _check(study: Study, model: Model, first: bool) -> None:
             check_noise([plan], [record])
             if first and entry.options:
                 for run in plan.runs(record, "moments"):
-                    run.setting.prepared(run.data.part(slice(0, 1)))
+                    run.setting.prepared(run.schedule.part(slice(0, 1)))
 
 
 def times_of(study: Study, model: Model) -> np.ndarray:

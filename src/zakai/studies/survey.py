@@ -15,11 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai import _float64  # noqa: F401
 from zakai.algebra.analysis import analyze
 from zakai.algebra.conditions import all_hold
-from zakai.filters.driver import filter as filter_record
-from zakai.filters.results import FilterResult
+from zakai.engine.driver import filter as filter_record
+from zakai.engine.results import FilterResult
 from zakai.models.model import Model
 from zakai.models.simulate import simulate
 from zakai.studies._drawing import INK, PALE, SERIES, new_figure, plain
@@ -45,11 +44,11 @@ class Direct(NamedTuple):
 
 _FITTED = {"reduction": "algorithm-1", "alpha": ALPHA, "components": 20}
 METHODS = {
-    "1: Theorem 1, one shot": Direct("hu-yau", {"choice": "survey-1", "form": "one-shot"}, "exact"),
+    "1: Theorem 1, one shot": Direct("hu-yau", {"theorem": "survey-1", "form": "one-shot"}, "exact"),
     "1: stepwise": Direct("hu-yau", {}, "exact"),
     "2: Algorithms 1 and 2": Direct("gaussian-sum", _FITTED, f"{ALPHA:g} at a fit"),
     "2: fitted once": Direct("gaussian-sum", {}, f"{ALPHA:g} at a fit"),
-    "3: Algorithm 3, power series": Direct("limited-direct", {"kernel": "power-series", "splitting": "lie"}, "exact", True),
+    "3: Algorithm 3": Direct("limited-direct", {"splitting": "lie"}, "exact", True),
     "4: Algorithm 4": Direct("general-direct", _FITTED, f"{ALPHA:g} at a fit"),
     "4: fitted once": Direct("general-direct", {}, f"{ALPHA:g} at a fit"),
 }

@@ -1,0 +1,60 @@
+"""The commands analyze, methods and gallery."""
+
+from __future__ import annotations
+
+import textwrap
+
+from zakai import _registry
+from zakai.errors import InputError
+
+
+def analyze(source: str, json: bool, latex: bool) -> None:
+    """Print the analysis of a model."""
+    from zakai.algebra.analysis import analyze
+    from zakai.models.files import load_model
+
+    if json and latex:
+        raise InputError("--json and --latex: give one of them")
+    analysis = analyze(load_model(source))
+    print(analysis.to_json() if json else analysis.to_latex() if latex else analysis)
+
+
+def methods(source: str | None) -> None:
+    """Print the methods and, for a model, whether each holds and what fails."""
+    if source is None:
+        _columns([(name, entry.summary) for name, entry in _registry.METHODS.items()])
+        print(f"\nauto takes the first that holds of: {', '.join(_registry.AUTO)}")
+        print(f"\npeers, filters of other libraries to compare with; pip install 'zakai[{_registry.EXTRA}]':")
+        _columns([(name, entry.summary) for name, entry in _registry.PEERS.items()])
+        return
+    from zakai.algebra.analysis import analyze
+    from zakai.algebra.conditions import all_hold
+    from zakai.models.files import load_model
+
+    analysis = analyze(load_model(source))
+    rows = []
+    for name, conditions in analysis.methods.items():
+        held = all_hold(conditions)
+        open_ones = [c for c in conditions if c.holds is held]
+        verdict = {True: "holds", False: "fails: ", None: "undecided: "}[held]
+        rows.append((name, verdict + ("" if held else f"{open_ones[0].statement} ({open_ones[0].evidence})")))
+    _columns(rows)
+    print(f"\nauto takes: {analysis.recommended or 'none, for none that it tries holds'}")
+    if analysis.division is not None:
+        print(textwrap.fill(analysis.division.why, 110, break_on_hyphens=False))
+
+
+def gallery(name: str | None) -> None:
+    """Print the names of the gallery, or one file of it."""
+    from zakai.models import gallery
+
+    if name is not None:
+        print(gallery.text(name.removeprefix("gallery:")), end="")
+        return
+    _columns([(name, gallery.describe(name)) for name in gallery.names()])
+
+
+def _columns(rows: list[tuple[str, str]]) -> None:
+    width = max(len(name) for name, _ in rows) + 2
+    for name, words in rows:
+        print(textwrap.fill(words, 110, initial_indent=name.ljust(width), subsequent_indent=" " * width, break_long_words=False))

@@ -1,0 +1,178 @@
+"""The driver: one call from a model and a record to the posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from typing import Any, overload
+
+import numpy as np
+
+from zakai.engine.batch import filter_all
+from zakai.engine.loop import KEPT_BYTES, Progress
+from zakai.engine.plan import Plan, plan_of
+from zakai.engine.results import FilterResult
+from zakai.errors import InputError
+from zakai.models._errors import named
+from zakai.models.checks import check_noise_at, check_noise_within
+from zakai.models.model import Model
+from zakai.records import Record
+
+
+@overload
+def filter(
+    model: Model, record: Record, method: str = ..., *, keep: str | None = ..., progress: Progress | None = ..., **options: Any
+) -> FilterResult: ...
+@overload
+def filter(
+    model: Model,
+    record: Sequence[Record],
+    method: str = ...,
+    *,
+    keep: str | None = ...,
+    progress: Progress | None = ...,
+    **options: Any,
+) -> list[FilterResult]: ...
+def filter(
+    model: Model,
+    record: Record | Sequence[Record],
+    method: str = "auto",
+    *,
+    keep: str | None = None,
+    progress: Progress | None = None,
+    **options: Any,
+) -> FilterResult | list[FilterResult]:
+    """Return the conditional density of the state given the record, at every time of the record.
+
+    Args:
+        model: the system, with a prior.
+        record: K observations of the model's kind, or a list of records, which are filtered on the threads of the machine.
+        method: a method's name, or "auto", the first that holds for this system. A system that falls into independent blocks is
+            filtered block by block, each by the best method for it.
+        keep: "densities", "moments", or None: densities up to 512 MiB in all.
+        progress: called with the number of observations done and K.
+        **options: options of the method.
+
+    Returns:
+        A FilterResult, or a list of them for a list of records.
+
+    Raises:
+        InputError: a wrong record or option.
+        ConditionError: the method's theorem does not hold.
+
+    Example:
+
+        model = zakai.load_model("gallery:spiral-sensor")
+        truth, record = zakai.simulate(model, np.arange(0.01, 1.0, 0.01))
+        result = zakai.filter(model, record)
+        result.mean[-1], result.density(-1).quantile([0.025, 0.975])
+    """
+    return _filter(model, record, None, method, keep, progress, options)
+
+
+@overload
+def filter_from(prior: Any, model: Model, record: Record, method: str = ..., **options: Any) -> FilterResult: ...
+@overload
+def filter_from(
+    prior: Sequence[Any], model: Model, record: Sequence[Record], method: str = ..., **options: Any
+) -> list[FilterResult]: ...
+def filter_from(
+    prior: Any, model: Model, record: Record | Sequence[Record], method: str = "auto", **options: Any
+) -> FilterResult | list[FilterResult]:
+    """Return what `filter` returns for another prior than the model's, moments only.
+
+    For lists of equally many priors and records a list of results. A result has no model, since none has this prior; the
+    method is chosen for the model's own.
+    """
+    results = _filter(model, record, prior, method, "moments", None, options)
+    for result in results if isinstance(results, list) else [results]:
+        result.model = None
+    return results
+
+
+def _filter(
+    model: Model,
+    record: Record | Sequence[Record],
+    prior: Any,
+    method: str,
+    keep: str | None,
+    progress: Progress | None,
+    options: Mapping[str, Any],
+) -> FilterResult | list[FilterResult]:
+    many = isinstance(record, list | tuple)
+    if many and not record:
+        return []
+    records: list[Any] = list(record) if many else [record]  # type: ignore[arg-type]
+    priors = list(prior) if many and isinstance(prior, list | tuple) else [prior] * len(records)
+    if len(priors) != len(records):
+        raise InputError(f"filter_from: {len(priors)} priors do not go with {len(records)} records; give one for each")
+    check_records(model, record)
+    plans = {key: planned(model, own, method, options) for key, own in {id(own): own for own in priors}.items()}
+    check_noise(plans.values(), records)
+    results = filter_planned([plans[id(own)] for own in priors], records, keep, progress)
+    return results if many else results[0]
+
+
+def filter_planned(
+    plans: Sequence[Plan], records: Sequence[Record], keep: str | None, progress: Progress | None
+) -> list[FilterResult]:
+    """Return the result of every record by its plan."""
+    if keep not in (None, "densities", "moments"):
+        raise InputError(f'keep: "{keep}" is neither "densities" nor "moments"')
+    runs = [plan.runs(one, keep, KEPT_BYTES / len(records)) for plan, one in zip(plans, records, strict=True)]
+    flat = [run for of_one in runs for run in of_one]
+    filter_all(flat, progress, len(flat) / len(records))
+    results = []
+    for plan, one, of_one in zip(plans, records, runs, strict=True):
+        results.append(plan.result(of_one))
+        results[-1].record = one
+    return results
+
+
+def planned(model: Model, prior: Any, method: str, options: Mapping[str, Any], by_value: bool = True) -> Plan:
+    """Return how a system is filtered from a prior; None stands for the model's own."""
+    return plan_of(model, model.prior if prior is None else prior, method, options, by_value)
+
+
+def check_noise(plans: Iterable[Plan], records: Sequence[Record]) -> None:
+    """Raise InputError unless every noise is a covariance at the times of the records and between them."""
+    times = {one.times.tobytes(): one.times for one in records}
+    models = {id(setting.model): setting.model for plan in plans for setting in plan.settings}
+    for part in models.values():
+        together = np.unique(np.concatenate([[part.start], *times.values()]))
+        check_noise_at(part, together)
+        check_noise_within(part, together)
+
+
+def check_records(model: Model, record: Record | Sequence[Record]) -> None:
+    """Raise InputError unless the model and the record, or every record of a list, go together."""
+    records: list[Any] = list(record) if isinstance(record, list | tuple) else [record]
+    for index, one in enumerate(records):
+        for given, kind, how in ((model, Model, "zakai.load_model"), (one, Record, "zakai.read_record")):
+            if not isinstance(given, kind):
+                raise InputError(f"filter: expected a {kind.__name__}, got a {type(given).__name__}; {how} reads one from a file")
+        with named(f"records[{index}]") if isinstance(record, list | tuple) else nullcontext():
+            _check(model, one)
+
+
+def check_model(model: Model) -> None:
+    """Raise InputError unless the model can be filtered."""
+    if not isinstance(model, Model):
+        raise InputError(f"expected a Model, got a {type(model).__name__}; zakai.load_model reads one from a file")
+    if model.prior is None:
+        raise InputError(f"{model.source}: prior: the table is missing; it is needed to filter")
+    if model.functions:
+        raise InputError(f"{model.source}: functions: a model with undetermined functions can be analysed and not filtered")
+
+
+def _check(model: Model, record: Record) -> None:
+    check_model(model)
+    if record.kind != model.observation_kind:
+        raise InputError(
+            f"record: its kind is {record.kind}, but {model.source} observes {model.observation_kind} (observation_kind)"
+        )
+    if record.values.shape[1] != model.m:
+        raise InputError(f"record: it has {record.values.shape[1]} columns of observations, but {model.source} has {model.m}")
+    first = record.times[0]
+    if first < model.start or (first == model.start and record.kind != "samples"):
+        raise InputError(f"record: row 1: time {first:g} is not after the start {model.start:g} of {model.source}")

@@ -1,0 +1,214 @@
+"""The loop over the observations of one record: the only one, whether moments, densities or derivatives are wanted."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from zakai.algebra.conditions import Condition
+from zakai.densities import Density
+from zakai.engine.results import FilterResult, versions, warnings_of_run
+from zakai.engine.setting import KEPT, Setting
+from zakai.errors import InputError
+from zakai.methods._protocol import Info, Infos
+from zakai.models.numeric import explain_nonfinite, numpy_function
+from zakai.records import Record
+from zakai.records.noise import notes_on_noise
+from zakai.records.schedule import ROUNDING, Schedule, schedule_of
+
+CHUNK = 1024  # intervals that are prepared together, at most
+PIECE = 128  # intervals between two reports of progress
+KEPT_BYTES = 512 * 2**20  # of densities that are kept by default
+LONG = 10.0  # seconds of work that are announced
+SURE = 1.0  # seconds after which the rest can be estimated
+
+_LOG = logging.getLogger("zakai")
+Progress = Callable[[int, int], None]
+
+
+def advance(setting: Setting, prepared: Any, rows: slice, state: Any, values: np.ndarray) -> tuple[list[Any], Infos]:
+    """Advance a state over the intervals `rows` of what is prepared; `values` (rows, m) are their observations.
+
+    Returns the state after each interval and what the steps report.
+    """
+    method = setting.method
+    if method.segment is not None:
+        return method.segment(prepared, rows, state, values)
+    states, infos = [], []
+    for k, value in zip(range(rows.start, rows.stop), values, strict=True):
+        state, info = method.step(prepared, k, state, value)
+        states.append(state)
+        infos.append(info)
+    return states, stacked(infos)
+
+
+def stacked(infos: Sequence[Info]) -> Infos:
+    """Return the reports of single steps as arrays with a leading axis."""
+    return Infos(
+        np.array([info.log_likelihood_increment for info in infos]),
+        np.array([info.mean for info in infos]),
+        np.array([info.cov for info in infos]),
+        {name: np.array([info.health[name] for info in infos]) for name in infos[0].health},
+    )
+
+
+def joined(parts: Sequence[Infos]) -> Infos:
+    """Return the reports of consecutive segments as one."""
+    health = {name: np.concatenate([part.health[name] for part in parts]) for name in parts[0].health}
+    increments, means, covs = (np.concatenate([part[i] for part in parts]) for i in range(3))
+    return Infos(increments, means, covs, health)
+
+
+def size_of(state: Any) -> int:
+    """Return the bytes of the arrays of a state."""
+    return sum(np.asarray(part).nbytes for part in state)
+
+
+class Run:
+    """One record on its way through one method."""
+
+    def __init__(self, setting: Setting, record: Record, keep: str | None, most: float = KEPT_BYTES):
+        self.setting, self.record, self.most = setting, record, most
+        self.schedule, self.values = schedule_of(setting.model, record)
+        self.keep, self.must_keep = keep != "moments", keep == "densities"
+        self.empty, self.state = setting.begin()
+        self.first = self.state
+        self.states: list[Any] = [self.state]
+        self.parts: list[Infos] = []
+        self.notes: dict[str, None] = dict.fromkeys(
+            [*_after_gaps(self.schedule), *notes_on_noise(setting.model, self.schedule), *self.empty.notes]
+        )
+        self.bytes = 0
+        self.done = 0
+
+    def all(self, progress: Progress | None = None) -> None:
+        """Filter the rest of the record."""
+        count, began, announced = len(self.schedule), time.monotonic(), False
+        while self.done < count:
+            chunk = slice(self.done, min(self.done + CHUNK, count))
+            prepared = self.setting.prepared(self.schedule.part(chunk))
+            self.notes.update(dict.fromkeys(prepared.notes))
+            for first in range(chunk.start, chunk.stop, PIECE):
+                last = min(first + PIECE, chunk.stop)
+                rows = slice(first - chunk.start, last - chunk.start)
+                with np.errstate(all="ignore"):  # what is not finite is reported below
+                    states, infos = advance(self.setting, prepared, rows, self.state, self.values[first:last])
+                self._explain(infos)
+                self._take(states, infos)
+                if progress is not None:
+                    progress(self.done, count)
+                spent = time.monotonic() - began
+                if not announced and spent > SURE:
+                    announced = self._announce(spent, count)
+
+    def prepare(self) -> None:
+        """Prepare the chunks of the record that are remembered."""
+        for first in range(0, min(len(self.schedule), KEPT * CHUNK), CHUNK):
+            self.setting.prepared(self.schedule.part(slice(first, min(first + CHUNK, len(self.schedule)))))
+
+    def _announce(self, spent: float, count: int) -> bool:
+        """Say once that the rest takes long, and what would shorten it."""
+        left = spent / self.done * (count - self.done)
+        if left > LONG:
+            name, shorter = self.setting.method.name, self.setting.method.shorter
+            _LOG.warning("%s: %d more observations take about %.0f s; to shorten it, %s", name, count - self.done, left, shorter)
+        return True
+
+    def _take(self, states: list[Any], infos: Infos) -> None:
+        self.state = states[-1]
+        self.parts.append(infos)
+        self.done += len(states)
+        if not self.keep:
+            return
+        self.states.extend(states)
+        self.bytes += sum(map(size_of, states))
+        # Densities that will not fit are not kept to begin with.
+        if self.bytes / self.done * len(self.schedule) > self.most and not self.must_keep:
+            self.keep, self.states = False, self.states[:1]
+
+    def _explain(self, infos: Infos) -> None:
+        """Raise InputError where a formula is not finite on a density that was lost."""
+        bad = ~np.isfinite(infos.log_likelihood_increment)
+        if not bad.any():
+            return
+        model, k = self.setting.model, int(np.argmax(bad))
+        stop = float(self.schedule.stops[self.done + k])
+        density = self.setting.method.density(self.empty, self.state)
+        centre, width = density.mean(), np.sqrt(np.maximum(np.diagonal(density.cov()), 0.0))
+        if not np.isfinite(centre).all() or not np.isfinite(width).all():
+            return
+        points = centre + np.linspace(-8.0, 8.0, 257)[:, None, None] * np.diag(width)
+        points = points.reshape(-1, model.n)
+        for key in ("drift", "observation"):
+            values = numpy_function(getattr(model, key), model)(points, stop, self.setting.theta.real)
+            wrong = ~np.isfinite(values).all(axis=-1)
+            if wrong.any():
+                reason = explain_nonfinite(model, key, getattr(model, key), points[wrong][0], stop)
+                raise InputError(f"{model.source}: {reason}, which the density reaches")
+
+    def prior_moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean (n,) and the covariance (n, n) at the start."""
+        first = self.setting.method.density(self.empty, self.first)
+        return first.mean(), first.cov()
+
+    def density(self, index: int) -> Density:
+        """Return the density at an index of the result."""
+        return self.setting.method.density(self.empty, self.states[index])
+
+    def result(
+        self,
+        why: str,
+        considered: Mapping[str, tuple[Condition, ...]],
+        prior_moments: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> FilterResult:
+        """Return the result; the moments of a prior that many runs share are computed once."""
+        model, method = self.setting.model, self.setting.method
+        first_mean, first_cov = self.prior_moments() if prior_moments is None else prior_moments
+        infos = joined(self.parts)
+        cov = np.concatenate([first_cov[None], infos.cov])
+        kept = len(self.states) == len(self.schedule) + 1
+        result = FilterResult(
+            times=np.concatenate([[model.start], self.record.times]),
+            mean=np.concatenate([first_mean[None], infos.mean]),
+            variance=np.diagonal(cov, axis1=1, axis2=2),
+            log_likelihood_increments=np.concatenate([[0.0], infos.log_likelihood_increment]),
+            health={name: np.concatenate([[np.nan], values]) for name, values in infos.health.items()},
+            warnings=[],
+            method=method.name,
+            why=why,
+            model=model,
+            record=self.record,
+            conditions=considered,
+            bounds=method.bounds,
+            state=model.state,
+            attributes={"source": method.source, "exactness": method.exactness, **versions()},
+            _cov=cov,
+            _density=self.density if kept else None,
+            _no_density=self._no_density(),
+        )
+        result.warnings.extend([*self.notes, *warnings_of_run(result)])
+        return result
+
+    def _no_density(self) -> str:
+        if self.bytes and not self.keep:
+            return (
+                f"the densities of {len(self.schedule)} steps were not kept: they need more than "
+                f'{self.most / 2**20:.3g} MiB; keep="densities" keeps them all'
+            )
+        return 'the densities were not kept; keep="densities" keeps them'
+
+
+def _after_gaps(schedule: Schedule) -> list[str]:
+    """Return a sentence where an increment was gathered over more than its interval."""
+    late = np.any(schedule.elapsed > (1 + ROUNDING) * (schedule.stops - schedule.starts)[:, None], axis=1)
+    if not late.any():
+        return []
+    return [
+        f"at {int(late.sum())} of {len(late)} times a path is observed after a gap: the increment since the last observation of "
+        "that coordinate acts as one factor at its end, which is exact only as the gaps shrink, and omits the noise that it "
+        "shares with other coordinates observed in between"
+    ]

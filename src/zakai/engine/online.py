@@ -1,0 +1,344 @@
+"""The online filter: one observation in, one estimate out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from functools import lru_cache
+from statistics import NormalDist
+from threading import RLock
+from typing import Any
+
+import numpy as np
+
+from zakai.densities import Density, ProductDensity
+from zakai.densities.product import renamed
+from zakai.engine.blocks import SMALLEST_IS_WORST
+from zakai.engine.checkpoint import restored, stored
+from zakai.engine.driver import check_model, planned
+from zakai.engine.feed import Feed, Moment
+from zakai.engine.plan import ByBlocks
+from zakai.engine.results import versions, warnings_of_step
+from zakai.errors import InputError
+from zakai.models.checks import check_noise_at
+from zakai.models.model import Model
+from zakai.models.prior import GaussianPrior
+from zakai.records.checkpoint import read_checkpoint, write_checkpoint
+from zakai.records.record import LARGEST
+from zakai.records.writing import shown
+
+
+def online(model: Model, method: str = "auto", **options: Any) -> Online:
+    """Return a filter that receives one observation at a time, and gives the estimate after it.
+
+    Its estimates are those of `zakai.filter` for the same record, to the bit.
+
+    Args:
+        model: the system, with a prior.
+        method: a method's name, or "auto", as for `zakai.filter`.
+        **options: options of the method.
+
+    Raises:
+        InputError: a wrong model or option.
+        ConditionError: the method's theorem does not hold.
+
+    Example:
+
+        online = zakai.online(zakai.load_model("gallery:spiral-sensor"))
+        estimate = online.update(0.01, [0.02, -0.01])
+        estimate.mean, estimate.interval()
+    """
+    return Online(model, method, options)
+
+
+class Online:
+    """A filter online: `update` with an observation, `predict` without one.
+
+    Several of them do not disturb each other, in threads neither; one that several threads share serves them one after the other.
+    """
+
+    def __init__(self, model: Model, method: str, options: dict[str, Any]):
+        check_model(model)
+        if options.get("form") == "one-shot":
+            raise InputError('option form: "one-shot" needs all times from the start on; an online filter takes "stepwise"')
+        plan = planned(model, None, method, options)
+        self.model, self.options = model, options
+        self.blocks: Any = plan.division.blocks if isinstance(plan, ByBlocks) else None
+        self.method = plan.division.method if isinstance(plan, ByBlocks) else plan.setting.method.name
+        self.why = plan.division.why if isinstance(plan, ByBlocks) else plan.why
+        check_noise_at(model, [model.start])
+        self.feeds = tuple(Feed(setting) for setting in plan.settings)
+        self.lock = RLock()
+        self._columns = [list(block.observations) for block in self.blocks] if self.blocks else None
+
+    def __repr__(self) -> str:
+        return f"Online({self.method} of {self.model.source}, at t = {self.time:g})"
+
+    @property
+    def time(self) -> float:
+        """The time of the last observation, or the model's start."""
+        return self.feeds[0].now.time
+
+    def update(self, time: float, value: Any) -> Estimate:
+        """Return the estimate after an observation.
+
+        Args:
+            time: later than that of the last observation, or for samples the model's start itself.
+            value: (m,), of the model's `observation_kind`; NaN or None where a coordinate was not observed. A number is accepted
+                where m is one.
+
+        Raises:
+            InputError: a value or a time that cannot be used; the filter then stays as it was.
+        """
+        values = self._values(value)
+        with self.lock:
+            time = self._time(time)
+            try:
+                moments = tuple(feed.moved(time, part) for feed, part in zip(self.feeds, self._divided(values), strict=True))
+            except (MemoryError, OverflowError):
+                fault = f"the time from {self.time:g} to {time:g} is too long for this filter; check its unit"
+                raise InputError(f"update: {fault}") from None
+            for feed, moment in zip(self.feeds, moments, strict=True):
+                feed.now = moment
+        return Estimate(self, moments)
+
+    def predict(self, time: float) -> Estimate:
+        """Return the estimate at a later time, or now, if nothing is observed until then; the filter stays as it was."""
+        with self.lock:
+            time = _number(time)
+            if time == self.time:
+                return self.last
+            if not time > self.time:
+                raise InputError(f"predict: the time {time!r} is before {self.time!r}, the time of the filter")
+            nothing = self._divided([np.nan] * self.model.m)
+            return Estimate(self, tuple(feed.moved(time, part) for feed, part in zip(self.feeds, nothing, strict=True)))
+
+    @property
+    def last(self) -> Estimate:
+        """The estimate after the last observation, before the first the prior."""
+        with self.lock:
+            return Estimate(self, tuple(feed.now for feed in self.feeds))
+
+    def save(self, path: str | os.PathLike[str], more: Mapping[str, Any] | None = None) -> None:
+        """Write a checkpoint, atomically: all that decides what the filter reports next, and `more` that JSON can hold.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        with self.lock:
+            parts = [stored(feed.now) for feed in self.feeds]
+        arrays = {f"{i}/{k}": array for i, (_, own) in enumerate(parts) for k, array in enumerate(own)}
+        write_checkpoint(path, {**self._bound, "filters": [said for said, _ in parts], "more": dict(more or {})}, arrays)
+
+    def restore(self, path: str | os.PathLike[str]) -> dict[str, Any]:
+        """Go on from a checkpoint of a filter of the same model, method, options and versions, with the same numbers to the bit.
+
+        Returns what was stored with it.
+
+        Raises:
+            InputError: the checkpoint is damaged, or that of another filter; this one then stays as it was.
+        """
+        about, arrays = read_checkpoint(path)
+        for what, own in self._bound.items():
+            if about.get(what) != own:
+                said = "" if what == "model" else f" ({_short(about.get(what))}, not {_short(own)})"
+                raise InputError(f"{shown(path)}: is the checkpoint of another {what}{said}; name another file, or remove it")
+        try:
+            filters, more = about["filters"], about["more"]
+            own_arrays = [[arrays[f"{i}/{k}"] for k in range(_count(arrays, i))] for i in range(len(self.feeds))]
+            if not isinstance(more, dict) or sum(map(len, own_arrays)) != len(arrays):
+                raise ValueError
+            with self.lock:
+                every = zip(self.feeds, filters, own_arrays, strict=True)
+                moments = [restored(feed, said, own) for feed, said, own in every]
+                if len({moment.time for moment in moments}) != 1:
+                    raise ValueError
+                for feed, moment in zip(self.feeds, moments, strict=True):
+                    feed.now = moment
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"{shown(path)}: the checkpoint does not fit this filter; remove it to begin anew") from None
+        return more
+
+    @property
+    def _bound(self) -> dict[str, Any]:
+        """What a checkpoint belongs to."""
+        options = {name: self.options[name] for name in sorted(self.options)}
+        return {"model": self.model.text, "method": self.method, "options": options, "versions": versions()}
+
+    def _divided(self, values: list[float]) -> list[list[float]]:
+        """Return the observations of each block; a block without sensors has one that is never observed."""
+        if self._columns is None:
+            return [values]
+        return [[values[i] for i in columns] or [np.nan] for columns in self._columns]
+
+    def _time(self, time: Any) -> float:
+        now = self.feeds[0].now.time
+        if type(time) is float and now < time <= LARGEST:
+            return float(time)
+        time = _number(time)
+        if time > now:
+            return float(time)
+        begins = self.feeds[0].now.info is None
+        if time == now and begins and self.model.observation_kind == "samples":
+            return float(time)
+        if begins:
+            raise InputError(f"update: the time {time!r} must be after the model's start {now!r}")
+        if time == now:
+            raise InputError(f"update: the time {time!r} repeats that of the last observation")
+        raise InputError(f"update: the time {time!r} is late by {now - time:g}: the last observation was at {now!r}")
+
+    def _values(self, value: Any) -> list[float]:
+        m = self.model.m
+        # The common case, a list of floats, is checked without conversions.
+        if type(value) is list and len(value) == m and all([type(one) is float and -LARGEST <= one <= LARGEST for one in value]):
+            return value
+        if isinstance(value, list | tuple):
+            values = [np.nan if one is None else one for one in value]
+        else:
+            values = np.atleast_1d(np.nan if value is None else value).tolist()
+        if len(values) != m:
+            raise InputError(f"update: {_counted(len(values))} where {self.model.source} has {_counted(m)} of observations")
+        for index, one in enumerate(values):
+            if isinstance(one, np.floating | np.integer):
+                values[index] = one = float(one)
+            if isinstance(one, bool) or not isinstance(one, float | int):
+                raise InputError(f"update: observation {index + 1} is {_short(one)}; give a number, or nan where there is none")
+            if abs(one) > LARGEST:
+                raise InputError(
+                    f"update: observation {index + 1} is {_short(one)}; values must be finite and at most {LARGEST:g} in size"
+                )
+        return [float(one) for one in values]
+
+
+class Estimate:
+    """The posterior at a time: its moments, the health of the step, and the whole density."""
+
+    __slots__ = ("_online", "_moments", "_density")
+
+    def __init__(self, online: Online, moments: tuple[Moment, ...]):
+        self._online, self._moments = online, moments
+        self._density: Density | None = None
+
+    def __repr__(self) -> str:
+        names = self._online.model.state
+        deviations = np.sqrt(np.maximum(np.diag(self.cov), 0.0))
+        parts = (f"{name} = {mean:.6g} +- {deviation:.3g}" for name, mean, deviation in zip(names, self.mean, deviations))
+        return f"Estimate(t = {self.time:g}: {', '.join(parts)})"
+
+    @property
+    def time(self) -> float:
+        """The time of the estimate."""
+        return self._moments[0].time
+
+    @property
+    def mean(self) -> np.ndarray:
+        """The mean of the state (n,)."""
+        means = [self._part(i).mean() if one.info is None else one.info.mean for i, one in enumerate(self._moments)]
+        if self._online.blocks is None:
+            return means[0]
+        mean = np.empty(self._online.model.n)
+        for block, part in zip(self._online.blocks, means, strict=True):
+            mean[list(block.states)] = part
+        return mean
+
+    @property
+    def cov(self) -> np.ndarray:
+        """The covariance of the state (n, n)."""
+        covs = [self._part(i).cov() if one.info is None else one.info.cov for i, one in enumerate(self._moments)]
+        if self._online.blocks is None:
+            return covs[0]
+        cov = np.zeros((self._online.model.n,) * 2)
+        for block, part in zip(self._online.blocks, covs, strict=True):
+            cov[np.ix_(block.states, block.states)] = part
+        return cov
+
+    @property
+    def log_likelihood_increment(self) -> float:
+        """What the observation adds to the log-likelihood; zero where there was none."""
+        return sum(float(one.info.log_likelihood_increment) for one in self._moments if one.info is not None)
+
+    @property
+    def health(self) -> dict[str, float]:
+        """The health figures of the step, of blocks the worst."""
+        worst: dict[str, float] = {}
+        for moment in self._moments:
+            for name, figure in ({} if moment.info is None else moment.info.health).items():
+                choose = min if name in SMALLEST_IS_WORST else max
+                worst[name] = choose(float(figure), worst[name]) if name in worst else float(figure)
+        return worst
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for every bound that this step exceeded, and for what else is to be known of it."""
+        said: dict[str, None] = {}
+        for feed, moment in zip(self._online.feeds, self._moments, strict=True):
+            said.update(dict.fromkeys(moment.notes))
+            if moment.info is not None:
+                said.update(dict.fromkeys(warnings_of_step(moment.info.health, feed.setting.method.bounds)))
+        return tuple(said)
+
+    @property
+    def density(self) -> Density:
+        """The conditional density of the state."""
+        if self._density is None:
+            online, parts = self._online, [self._part(i) for i in range(len(self._moments))]
+            if online.blocks is None:
+                self._density = parts[0]
+            else:
+                model, blocks = online.model, online.blocks
+                named = [renamed(part, block.names) for part, block in zip(parts, blocks, strict=True)]
+                angles = tuple(name in model.periodic for name in model.state)
+                self._density = ProductDensity(named, tuple(block.states for block in blocks), model.state, angles)
+        return self._density
+
+    def interval(self, probability: float = 0.95) -> np.ndarray:
+        """Return the credible interval of each coordinate (n, 2): half of the rest lies outside on each side."""
+        if not 0 < probability < 1:
+            raise InputError(f"interval: the probability {probability!r} must be between 0 and 1")
+        tail = 0.5 * (1 - probability)
+        online, found = self._online, np.empty((self._online.model.n, 2))
+        for i, (feed, moment) in enumerate(zip(online.feeds, self._moments, strict=True)):
+            info = moment.info
+            if info is not None and _is_gaussian(feed):
+                half = _deviations(1 - tail) * np.sqrt(np.maximum(info.cov.diagonal(), 0.0))
+                part = np.array([info.mean - half, info.mean + half]).T
+            else:
+                part = self._part(i).quantile([tail, 1 - tail]).T
+            found[slice(None) if online.blocks is None else list(online.blocks[i].states)] = part
+        return found
+
+    def _part(self, index: int) -> Density:
+        return self._online.feeds[index].density(self._moments[index])
+
+
+@lru_cache(maxsize=8)
+def _deviations(probability: float) -> float:
+    return NormalDist().inv_cdf(probability)
+
+
+def _is_gaussian(feed: Feed) -> bool:
+    """Return whether the density is a Gaussian at all times."""
+    name, prior = feed.setting.method.name, feed.setting.prior
+    return name == "extended-kalman-bucy" or (name == "kalman-bucy" and isinstance(prior, GaussianPrior))
+
+
+def _count(arrays: Mapping[str, Any], index: int) -> int:
+    """Return how many arrays belong to one of the blocks."""
+    return sum(name.startswith(f"{index}/") for name in arrays)
+
+
+def _number(time: Any) -> float:
+    if isinstance(time, bool) or not isinstance(time, float | int | np.floating | np.integer):
+        raise InputError(f"the time is {_short(time)}; give a number")
+    if not -LARGEST <= time <= LARGEST:
+        raise InputError(f"the time is {_short(time)}; times must be finite and at most {LARGEST:g} in size")
+    return float(time)
+
+
+def _counted(count: int) -> str:
+    return f"{count} column" if count == 1 else f"{count} columns"
+
+
+def _short(what: Any) -> str:
+    text = ascii(what)
+    return text if len(text) <= 40 else text[:37] + "..."

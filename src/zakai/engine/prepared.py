@@ -1,0 +1,122 @@
+"""Offline work by itself: the method is chosen, and every interval prepared, before any observation is known."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from zakai.engine.driver import check_model, check_noise, check_records, filter_planned
+from zakai.engine.loop import Progress
+from zakai.engine.plan import plan_of
+from zakai.engine.results import FilterResult, versions
+from zakai.errors import InputError
+from zakai.models.files import read_model
+from zakai.models.model import Model
+from zakai.records import Record
+from zakai.records.checkpoint import read_checkpoint, write_checkpoint
+from zakai.records.writing import shown
+
+KIND = "prepared"
+
+
+def prepare(model: Model, times: Any, method: str = "auto", **options: Any) -> Prepared:
+    """Do what can be done before any observation is known.
+
+    Args:
+        model: the system, with a prior.
+        times: (K,), when all coordinates will be observed, or a Record with those times and gaps.
+        method: as for `filter`.
+        **options: as for `filter`.
+
+    Raises:
+        InputError: wrong times or a wrong option.
+        ConditionError: the method's theorem does not hold.
+
+    Example:
+
+        model = zakai.load_model("gallery:spiral-sensor")
+        prepared = zakai.prepare(model, np.arange(0.01, 1.0, 0.01))
+        prepared.save("spiral-sensor.prepared")
+        truth, record = zakai.simulate(model, np.arange(0.01, 1.0, 0.01))
+        result = zakai.Prepared.load("spiral-sensor.prepared").filter(record)
+    """
+    check_model(model)
+    record = times if isinstance(times, Record) else _unobserved(model, times)
+    check_records(model, record)
+    return Prepared(model, method, options, record)
+
+
+def _unobserved(model: Model, times: Any) -> Record:
+    try:
+        times = np.asarray(times, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"prepare: the times are a {type(times).__name__}; give a vector of numbers or a Record") from None
+    if times.ndim != 1 or not len(times):
+        raise InputError(f"prepare: the times have the shape {times.shape}; give a vector of at least one")
+    return Record(times, np.zeros((len(times), model.m)), model.observation_kind)
+
+
+class Prepared:
+    """What `prepare` did, and `filter` with it.
+
+    The choice of the method and the transitions of every interval; for other times, or other gaps, `filter` prepares what it does
+    not find here.  A file of it holds the model, the method, the options and the times: preparing again takes less time than
+    reading stored transitions.
+    """
+
+    def __init__(self, model: Model, method: str, options: Mapping[str, Any], record: Record):
+        self.model, self.method, self.options, self.record = model, method, dict(options), record
+        self._plan = plan_of(model, model.prior, method, self.options)
+        check_noise([self._plan], [record])
+        for run in self._plan.runs(record, "moments"):
+            run.prepare()
+
+    def __repr__(self) -> str:
+        return f"Prepared({self.method} of {self.model.source})"
+
+    def filter(self, record: Record, *, keep: str | None = None, progress: Progress | None = None) -> FilterResult:
+        """Return what `zakai.filter` returns for this model, method and options, to the bit."""
+        check_records(self.model, record)
+        check_noise([self._plan], [record])
+        return filter_planned([self._plan], [record], keep, progress)[0]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it to a file, atomically.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        about = {**self._bound, "source": self.model.source}
+        write_checkpoint(path, about, {"times": self.record.times, "seen": ~np.isnan(self.record.values)}, KIND)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], model: Model | None = None) -> Prepared:
+        """Read what was saved; with a `model`, only if it was prepared for that one.
+
+        Raises:
+            InputError: the file is damaged, holds something else, or belongs to another model or to other versions.
+        """
+        about, arrays = read_checkpoint(path, KIND)
+        name = shown(path)
+        try:
+            text, source, method, options = (about[key] for key in ("model", "source", "method", "options"))
+            model = read_model(text, source) if model is None else model
+            check_model(model)
+            for what, own in {"model": model.text, "versions": versions()}.items():
+                if about[what] != own:
+                    raise InputError(f"{name}: was prepared for another {what}; prepare anew")
+            if arrays["seen"].dtype != bool or arrays["seen"].shape != (len(arrays["times"]), model.m):
+                raise ValueError
+            values = np.where(arrays["seen"], 0.0, np.nan)
+            record = Record(arrays["times"], values, model.observation_kind)
+            check_records(model, record)
+            return cls(model, method, options, record)
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError):
+            raise InputError(f"{name}: does not hold what zakai.prepare makes; prepare anew") from None
+
+    @property
+    def _bound(self) -> dict[str, Any]:
+        return {"model": self.model.text, "method": self.method, "options": self.options, "versions": versions()}

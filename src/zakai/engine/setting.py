@@ -1,0 +1,74 @@
+"""What is filtered by what, and what is prepared for it."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from threading import Lock
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from zakai.methods._protocol import Method
+from zakai.models.model import Model
+from zakai.records.schedule import Schedule
+
+KEPT = 8  # schedules whose preparation is kept for each model
+
+_PREPARED: WeakKeyDictionary[Model, OrderedDict[Any, Any]] = WeakKeyDictionary()
+_LOCK = Lock()
+
+
+class Setting(NamedTuple):
+    """A model, the prior to begin with, the method and its options.
+
+    `theta` (p,) are the values of the parameters; `autonomous`: nothing depends on where an interval begins.
+    """
+
+    model: Model
+    prior: Any
+    method: Method[Any, Any]
+    options: Mapping[str, Any]
+    theta: np.ndarray
+    autonomous: bool
+
+    @classmethod
+    def of(cls, model: Model, prior: Any, method: Method[Any, Any], options: Mapping[str, Any]) -> Setting:
+        """Return the setting with the model's own parameters."""
+        parts = (model.drift, model.diffusion, model.process_noise, model.observation, model.observation_noise)
+        depends = any(part.has(model.t) for part in parts) or (method.absolute is not None and method.absolute(options))
+        return cls(model, prior, method, options, model.theta(), not depends)
+
+    def at(self, theta: np.ndarray | None) -> Setting:
+        """Return the setting with other values of the parameters; None stands for these."""
+        return self if theta is None else self._replace(theta=theta)
+
+    def prepared(self, schedule: Schedule) -> Any:
+        """Return what the method prepares for a schedule, kept for the last schedules of each model.
+
+        Of a model that does not depend on t every interval begins at zero, so that equal lengths are prepared equally.
+        """
+        schedule = schedule.from_zero() if self.autonomous else schedule
+        key = (
+            self.method.name,
+            tuple(sorted(self.options.items())),
+            self.theta.tobytes(),
+            *(np.ascontiguousarray(part).tobytes() for part in schedule),
+        )
+        with _LOCK:
+            kept = _PREPARED.setdefault(self.model, OrderedDict())
+            if key in kept:
+                kept.move_to_end(key)
+                return kept[key]
+        prepared = self.method.prepare(self.model, schedule, self.theta, **self.options)
+        with _LOCK:
+            kept[key] = prepared
+            while len(kept) > KEPT:
+                kept.popitem(last=False)
+        return prepared
+
+    def begin(self) -> tuple[Any, Any]:
+        """Return what is prepared for no interval, and the state at the model's start."""
+        prepared = self.prepared(Schedule.empty(self.model.m))
+        return prepared, self.method.init(prepared, self.prior)

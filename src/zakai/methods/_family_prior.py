@@ -1,0 +1,362 @@
+"""A prior as families of Gaussians: v_0 = e^-phi sigma_0, with nodes only along the directions on which phi depends.
+
+A Gaussian component is, given z = D x, still Gaussian, so that only v_0(z) = N(z; D m, D P D') e^-phi is put on nodes.  Where
+phi is asymptotically linear, e^-phi N is again a Gaussian, and a component that is wide against the region where phi bends
+(the kink) is first written as a sum of narrower ones, level by level: their weights, themselves Gaussian, are known exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.errors import InputError
+from zakai.methods._gauge import Gauge, Tilts, lifted
+from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
+from zakai.models.prior import DensityPrior, GaussianPrior
+from zakai.numerics.complex_step import is_complex, log_determinant, log_sum_exp
+from zakai.numerics.families import Family, gaussians
+from zakai.numerics.nodes import NodeGrid, resolve, signed_logs
+from zakai.numerics.prior_grid import prior_grid
+from zakai.numerics.transition import Array
+
+TOLERANCE = 1e-12
+_MOST_NODES = {1: 2**13, 2: 2**15, 3: 2**17}
+_REACH = 8.6  # standard deviations to which a Gaussian is followed: there it is 1e-16 of its maximum
+_NARROWER = 4.0  # by how much the Gaussians of one level are narrower than those before
+_SPACING = 0.186  # their spacing, in standard deviations of what they make up: flat to 1e-14
+
+
+class Prior(NamedTuple):
+    """The families of v_0 (leading axis J), with for each node the logarithm of the error that its place brings, and whether
+    it is at the edge; `error` is the largest error relative to the maximum of the prior."""
+
+    families: Family
+    log_error: Any
+    edge: Any
+    error: float
+
+
+class Nodes(NamedTuple):
+    """A part of v_0(z): nodes z (N, k), their covariance W (k, k), log |w|, signs, and what `Prior` holds."""
+
+    points: Any
+    cov: Any
+    log_weights: Any
+    signs: Any
+    log_error: Any
+    edge: Any
+
+
+def prior_families(gauge: Gauge, model: Model, prior: Any) -> Prior:
+    """Return the families of a prior; where the nodes are follows from the real parts of the parameters."""
+    if isinstance(prior, DensityPrior):
+        return _from_density(gauge, model, prior)
+    if isinstance(prior, GaussianPrior):
+        weights, means, covs = np.ones(1), prior.mean[None], prior.cov[None]
+    else:
+        weights, means, covs = prior.weights, prior.means, prior.covs
+    means = means - gauge.origin
+    if gauge.trivial:
+        nothing = np.zeros((len(weights), 1))
+        return Prior(gaussians(np.log(weights), means, covs), nothing - np.inf, nothing, 0.0)
+    own, tilts = gauge.real().at_one(model.start), gauge.at_one(model.start)
+    tilts = tilts._replace(directions=_like(own.directions, tilts.directions))
+    parts, worst = [], 0.0
+    for weight, mean, cov in zip(np.log(weights), means, covs, strict=True):
+        plan = _GaussianPlan(gauge, model, own, mean, cov)
+        worst = max(worst, plan.error)
+        for nodes in plan.nodes(tilts):
+            parts.append((_conditional(plan, tilts.directions, nodes, weight), nodes))
+    return _joined(parts, worst)
+
+
+def _like(own: Array, directions: Array) -> Array:
+    """Return directions that span the same as `directions`, along which a state moves as along `own`."""
+    if not is_complex(directions):
+        return directions
+    return np.linalg.solve(directions @ np.linalg.pinv(own), directions)
+
+
+def _conditional(plan: _GaussianPlan, directions: Any, nodes: Nodes, log_mass: Any) -> Family:
+    """The family of sum_i w_i N(z; z_i, W) N(x | z), x given z being that of N(mean, cov)."""
+    gain = plan.gain(directions)
+    centre = directions @ plan.mean
+    narrowed = plan.cov - gain @ (directions @ plan.cov @ directions.T - nodes.cov) @ gain.T
+    k = len(centre)
+    return Family(
+        nodes.points - centre,
+        nodes.log_weights,
+        nodes.signs,
+        plan.mean,
+        0.5 * (narrowed + narrowed.T),
+        gain,
+        np.zeros(k),
+        np.zeros((k, k)),
+        np.asarray(log_mass, float),
+    )
+
+
+def _joined(parts: list[tuple[Family, Nodes]], error: float) -> Prior:
+    """Return all parts with as many nodes each, those that are added without weight."""
+    most = max(len(family.log_weights) for family, _ in parts)
+
+    def padded(array: Array, value: float) -> Array:
+        return np.concatenate([array, np.full((most - len(array), *array.shape[1:]), value)])
+
+    families = [
+        family._replace(
+            nodes=padded(family.nodes, 0.0), log_weights=padded(family.log_weights, -np.inf), signs=padded(family.signs, 1.0)
+        )
+        for family, _ in parts
+    ]
+    log_error = np.stack([padded(nodes.log_error, -np.inf) for _, nodes in parts])
+    edge = np.stack([padded(nodes.edge, 0.0) for _, nodes in parts])
+    return Prior(Family(*(np.stack(arrays) for arrays in zip(*families, strict=True))), log_error, edge, error)
+
+
+def _edge(sizes: tuple[int, ...]) -> np.ndarray:
+    """One at the outermost two layers of a grid."""
+    index = np.stack(np.meshgrid(*[np.arange(s) for s in sizes], indexing="ij"), axis=-1)
+    outside = (index < 2) | (index >= np.array(sizes) - 2)
+    return np.asarray(np.any(outside & (np.array(sizes) > 1), axis=-1), float).ravel()
+
+
+@dataclass(frozen=True)
+class _Level:
+    """Gaussians of standard deviation `width` at `points` (N,) that make up those before; `near` (N,) are written anew."""
+
+    points: np.ndarray
+    spacing: float
+    width: float
+    near: np.ndarray
+
+
+class _GaussianPlan:
+    """Where the nodes of one Gaussian component are, decided for the model's own parameters; they move with D mean."""
+
+    def __init__(self, gauge: Gauge, model: Model, tilts: Tilts, mean: np.ndarray, cov: np.ndarray):
+        self.gauge, self.model, self.mean, self.cov = gauge, model, mean, cov
+        directions = tilts.directions
+        self.centre = directions @ mean
+        spread = directions @ cov @ directions.T
+        values, vectors = np.linalg.eigh(spread)
+        wide = values > 1e-14 * max(values.max(), 1e-300)
+        self.vectors = vectors[:, wide]
+        self.levels: list[_Level] = []
+        self.kink = self._kink(tilts) if gauge.exact and gauge.count == 1 else None
+        self.tilted: int | None = None
+        low, high = (self.centre[0] - _REACH * np.sqrt(spread[0, 0]), self.centre[0] + _REACH * np.sqrt(spread[0, 0]))
+        if self.kink is not None and wide.any():
+            ends = (low, high)
+            low, high = self._split(float(self.centre[0]), float(np.sqrt(spread[0, 0])))
+            if not self.levels and low < self.kink[1] and high > self.kink[0]:
+                low, high = ends
+            elif not self.kink[0] < high or not low < self.kink[1]:
+                self.tilted, self.grid, self.error = (0 if high <= self.kink[0] else 1), None, 0.0
+                return
+        if gauge.count == 1:
+            sizes: tuple[int, ...] = (49 if wide.any() else 1,)
+            basis = np.array([[(high - low) / (sizes[0] - 1)]]) if wide.any() else np.ones((1, 1))
+            origin = np.array([low]) if wide.any() else self.centre
+        else:
+            sizes = tuple(41 if w else 1 for w in wide)
+            basis = vectors * np.where(wide, 2 * _REACH * np.sqrt(np.maximum(values, 0.0)) / 40, 1.0)
+            origin = self.centre - basis @ np.where(wide, 20.0, 0.0)
+        scale = self._potential(self.gauge.real(), tilts)
+        self.grid, self.error = resolve(
+            lambda z: self._log_u(z, tilts) - scale(z),
+            scale,
+            NodeGrid(origin, basis, sizes),
+            TOLERANCE,
+            _MOST_NODES[gauge.count],
+        )
+        if not np.isfinite(self.error):
+            raise InputError(f"{model.source}: prior: e^phi is not finite, or zero, where the prior is; give a narrower prior")
+
+    def _kink(self, tilts: Tilts) -> tuple[float, float]:
+        """Outside of these z one exponential is all of e^phi, to 1e-16."""
+        along, logs = _along(tilts), tilts.logs
+        assert logs is not None
+        self.order = np.argsort(along)
+        low, high = np.inf, -np.inf
+        for side in (0, -1):
+            first = self.order[side]
+            for other in np.delete(np.arange(len(along)), first):
+                if along[other] == along[first]:
+                    continue
+                where = (37.0 + logs[other] - logs[first] + np.log(len(along))) / (along[first] - along[other])
+                low, high = (min(low, where), high) if side == 0 else (low, max(high, where))
+        gaps = np.diff(np.sort(along))
+        self.gap = float(np.max(along) - np.min(along)) if gaps.size else 0.0
+        return low, high
+
+    def _split(self, mean: float, width: float) -> tuple[float, float]:
+        """The levels of a component that is wide against the kink, and the ends of what is left to the last grid."""
+        low, high = mean - self._margin(width), mean + self._margin(width)
+        assert self.kink is not None
+        while width * self.gap > 8.0 and low < self.kink[1] and high > self.kink[0]:
+            before, width = width, width / _NARROWER
+            spacing = _SPACING * before
+            reach = (mean - _REACH * before, mean + _REACH * before) if not self.levels else (low, high)
+            points = np.arange(np.floor(reach[0] / spacing), np.ceil(reach[1] / spacing) + 1) * spacing
+            near = (points + self._margin(width) > self.kink[0]) & (points - self._margin(width) < self.kink[1])
+            self.levels.append(_Level(points, spacing, width, near))
+            low, high = points[near][0] - _REACH * width, points[near][-1] + _REACH * width
+            low, high = min(low, self.kink[0]), max(high, self.kink[1])
+        return low, high
+
+    def _margin(self, width: float) -> float:
+        """How far from the kink a Gaussian must be for one exponential to be all of e^phi in it, tilted by the others too."""
+        return max(_REACH * width, 0.5 * self.gap * width**2)
+
+    def gain(self, directions: Any) -> Any:
+        """What x follows z by, (n, k): P D'V (V'D P D'V)^-1 V', where V spans what has width."""
+        across = self.cov @ directions.T @ self.vectors
+        return across @ np.linalg.inv(self.vectors.T @ directions @ across) @ self.vectors.T
+
+    def _shift(self, tilts: Tilts) -> Any:
+        """By how much the nodes are elsewhere than for the model's own parameters."""
+        return tilts.directions @ self.mean - self.centre
+
+    def _potential(self, gauge: Gauge, tilts: Tilts) -> Callable[[Any], Any]:
+        def phi(z: Array) -> Array:
+            if self.vectors.shape[1] < len(z[0]):
+                # Where z has no width there may be no x; that of the mean is meant.
+                centre = tilts.directions @ self.mean
+                z = centre + (z - centre) @ self.gain(tilts.directions).T @ tilts.directions.T
+            x = lifted(tilts.directions, z)
+            if tilts.slopes is not None:
+                return log_sum_exp(x @ tilts.slopes.T + tilts.logs)
+            return gauge.potential(x, self.model.start)
+
+        return phi
+
+    def _source(self, tilts: Tilts) -> tuple[Any, Any, Any]:
+        """(points, log-weights, covariance) of the Gaussians of z that the last grid is to represent."""
+        directions = tilts.directions
+        points, logs = (directions @ self.mean)[None], np.zeros(1)
+        cov = self.vectors.T @ (directions @ self.cov @ directions.T) @ self.vectors
+        for level in self.levels:
+            logs = self._weights(level, self._shift(tilts), points, logs, cov)[level.near]
+            points, cov = level.points[level.near][:, None] + self._shift(tilts), np.array([[level.width**2]])
+        return points, logs, cov
+
+    def _weights(self, level: _Level, shift: Any, points: Any, logs: Any, cov: Any) -> Any:
+        """The log-weights of a level's Gaussians, of those at `points` that they make up."""
+        variance = cov[0, 0] - level.width**2
+        away = (level.points + shift)[:, None] - points[:, 0]
+        each = logs - 0.5 * away**2 / variance - 0.5 * np.log(2 * np.pi * variance)
+        return log_sum_exp(each) + np.log(level.spacing)
+
+    def _log_u(self, z: Any, tilts: Tilts) -> Any:
+        points, logs, cov = self._source(tilts)
+        if not len(cov):
+            return np.zeros(len(z))
+        away = (z[:, None] - points) @ self.vectors
+        each = logs - 0.5 * ((away @ np.linalg.inv(cov)) * away).sum(axis=-1)
+        return log_sum_exp(each) - 0.5 * log_determinant(2 * np.pi * cov)
+
+    def nodes(self, tilts: Tilts) -> Iterator[Nodes]:
+        """The parts of v_0(z) for the parameters theta."""
+        shift = self._shift(tilts)
+        points, logs = (tilts.directions @ self.mean)[None], np.zeros(1)
+        cov = self.vectors.T @ (tilts.directions @ self.cov @ tilts.directions.T) @ self.vectors
+        # The outermost Gaussians are those of the first level, or what they are written as.
+        ends = np.array([True, True])
+        for level in self.levels:
+            weights = self._weights(level, shift, points, logs, cov)
+            points, logs, cov = (level.points + shift)[:, None], weights, np.array([[level.width**2]])
+            edge = np.zeros(len(level.points))
+            edge[:2], edge[-2:] = ends
+            ends = ends & level.near[[0, -1]]
+            far = ~level.near
+            if far.any():
+                assert self.kink is not None
+                left = level.points[far] < 0.5 * sum(self.kink)
+                which = np.where(left, self.order[0], self.order[-1])
+                yield self._tilted(tilts, points[far], logs[far], cov, which, edge[far])
+            points, logs = points[level.near], logs[level.near]
+        if self.grid is None:
+            which = self.order[[0 if self.tilted == 0 else -1]]
+            yield self._tilted(tilts, points, logs, cov, which, np.zeros(1))
+            return
+        z = self.grid.points() + shift
+        phi = self._potential(self.gauge, tilts)(z)
+        log_u = self._log_u(z, tilts)
+        edge = _edge(self.grid.sizes)
+        if self.levels:
+            edge[:2], edge[-2:] = ends
+        yield _represented(self.grid, z, log_u, phi, self.error, edge)
+
+    def _tilted(self, tilts: Tilts, points: Any, log_weights: Any, cov: Any, which: np.ndarray, edge: np.ndarray) -> Nodes:
+        """Gaussians that lie where one exponential, `which`, is all of e^phi: e^{-q z} N(z; s, W) / c."""
+        along, variance = _along(tilts)[which], cov[0, 0]
+        assert tilts.logs is not None
+        logs = log_weights - along * points[:, 0] + 0.5 * along**2 * variance - tilts.logs[which]
+        nothing = np.full(len(edge), -np.inf)
+        return Nodes(points - (along * variance)[:, None], cov, logs, np.ones(len(edge)), nothing, edge)
+
+
+def _along(tilts: Tilts) -> Any:
+    """The slopes (K,) in z, of one direction."""
+    assert tilts.slopes is not None
+    return tilts.slopes @ tilts.directions[0] / (tilts.directions[0] @ tilts.directions[0])
+
+
+def _represented(grid: NodeGrid, z: Array, log_u: Array, phi: Array, error: float, edge: Array) -> Nodes:
+    """Return the nodes of u e^-phi from both at the points z of a grid."""
+    logs = log_u - phi
+    top = np.max(logs.real)
+    log_weights, signs = signed_logs(grid.weights(np.exp(logs - top)))
+    spacing = np.log(np.abs(np.linalg.det(grid.basis)))
+    log_error = np.log(max(error, 1e-16)) + np.max(log_u.real) - phi.real + spacing
+    return Nodes(z, grid.covariance, log_weights + top, signs, log_error, edge)
+
+
+def _from_density(gauge: Gauge, model: Model, prior: DensityPrior) -> Prior:
+    """Return nodes in all coordinates."""
+    function = numpy_function(prior.log_density, model)
+    theta, origin, start = gauge.theta, gauge.origin, model.start
+
+    def log_u(z: Array, values: Array) -> Array:
+        return function(z + origin, start, values)
+
+    def phi(z: Array, own: Gauge) -> Array:
+        return np.zeros(z.shape[:-1]) if gauge.trivial else own.potential(z, start)
+
+    name = f"{model.source}: prior: log_density"
+    found = prior_grid(lambda z: log_u(z, theta.real), model.n, tolerance=TOLERANCE, aligned=False, source=name)
+    sizes = np.array(found.log_values.shape)
+    basis, centre = found.basis, found.centre
+    # As many points as the narrowest feature along an axis needs.
+    finer = np.clip(_narrowest(found.log_values.real) / 2.5, 0.1, 1e3)
+    spacings = np.maximum(np.ceil((sizes - 1) / finer), 8).astype(int)
+    grid = NodeGrid(centre - basis @ (sizes // 2), basis * ((sizes - 1) / spacings), tuple(int(c) + 1 for c in spacings))
+    real = gauge.real()
+    grid, error = resolve(
+        lambda z: log_u(z, theta.real) - phi(z, real), lambda z: phi(z, real), grid, TOLERANCE, _MOST_NODES[model.n]
+    )
+    z = grid.points()
+    nodes = _represented(grid, z, log_u(z, theta), phi(z, gauge), error, _edge(grid.sizes))
+    n, middle = model.n, z[len(z) // 2]
+    none = np.zeros(n), np.zeros((n, n)), np.zeros(())
+    family = Family(z - middle, nodes.log_weights, nodes.signs, middle, grid.covariance, np.eye(n), *none)
+    return _joined([(family, nodes)], max(error, found.error))
+
+
+def _narrowest(log_values: Array) -> Array:
+    """Return the standard deviation (n,), in grid spacings, of the narrowest feature along each axis, from the curvature."""
+    found = []
+    matters = log_values > log_values.max() - 14.0
+    for axis in range(log_values.ndim):
+        moved, used = np.moveaxis(log_values, axis, 0), np.moveaxis(matters, axis, 0)[1:-1]
+        with np.errstate(invalid="ignore"):
+            curvature = 2 * moved[1:-1] - moved[:-2] - moved[2:]
+        largest = np.max(np.where(used & np.isfinite(curvature), curvature, 0.0), initial=1e-12)
+        found.append(1.0 / np.sqrt(largest))
+    return np.array(found)

@@ -1,0 +1,285 @@
+"""The filter of a linear-quadratic system with affine observations: families of Gaussians, every step exact.
+
+Kalman-Bucy, Benes and Hu-Yau are this filter for phi = 0, phi = log cosh and any phi that leaves the potential quadratic.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from threading import Lock
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from zakai.densities import Density, GaussianMixture
+from zakai.errors import InputError
+from zakai.methods._affine_system import AffineSystem, Ends, Setup, affine_system_of, ends_of
+from zakai.methods._family_prior import prior_families
+from zakai.methods._gauge import Gauge, Posterior, Tilts, posterior, tilts_at
+from zakai.methods._gauged_density import GaugedDensity
+from zakai.methods._protocol import Info
+from zakai.models.model import Model
+from zakai.models.prior import GaussianPrior, MixturePrior
+from zakai.numerics.families import Family, exponents, log_terms, move, observe, weigh
+from zakai.numerics.flow import Transition
+from zakai.numerics.transition import Array, transposed
+from zakai.records.schedule import Schedule
+
+_KEPT = 8  # values of the parameters for which a model's setup is kept
+
+BOUNDS: Mapping[str, tuple[float, str]] = {
+    "negative_variance": (1e-9, "a variance below zero, as a share of the largest: rounding exceeds the smallest variance"),
+    "representation_error": (1e-8, "error of the prior's nodes, relative to the posterior"),
+    "edge_weight": (1e-8, "weight of the outermost nodes: the posterior reaches beyond the prior's nodes"),
+    "gauge_error": (1e-8, "error of the sums over the directions of the gauge"),
+}
+
+
+class State(NamedTuple):
+    """The families of v, or of e^S v, relative to the origin (`zakai.numerics.families.Family`), normalised so that
+    u = e^phi v has mass one; the `time`; for each node the logarithm of the error of the prior's representation and whether it is
+    at the edge, (J, N)."""
+
+    nodes: Array
+    log_weights: Array
+    signs: Array
+    mean: Array
+    cov: Array
+    response: Array
+    tilt: Array
+    curvature: Array
+    log_mass: Array
+    log_error: Array
+    edge: Array
+    time: float
+
+    @property
+    def families(self) -> Family:
+        """The families."""
+        return Family(*self[:9])
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What is known without data: for every interval the transition, whether it `weighs`, its `ends`, and the gauge there."""
+
+    model: Model
+    setup: Setup
+    gauge: Gauge
+    lengths: Array
+    stops: Array
+    frequencies: Array
+    transitions: list[Transition]
+    weighs: list[bool]
+    ends: Ends
+    tilts: Tilts
+    notes: tuple[str, ...]
+
+
+_SETUPS: WeakKeyDictionary[Model, OrderedDict[Any, tuple[Setup, Gauge]]] = WeakKeyDictionary()
+_LOCK = Lock()
+
+
+def setup_of(model: Model, theta: Array, kind: type[AffineSystem]) -> tuple[Setup, Gauge]:
+    """Return what does not depend on the schedule, kept for the last values of the parameters."""
+    key = (kind, theta.dtype, theta.tobytes())
+    with _LOCK:
+        kept = _SETUPS.setdefault(model, OrderedDict())
+        if key not in kept:
+            prior = model.prior
+            # The coordinates are relative to where the state begins.
+            origin = np.array(prior.mean) if isinstance(prior, GaussianPrior | MixturePrior) else np.zeros(model.n)
+            system = affine_system_of(model, kind)
+            kept[key] = Setup(system, theta, origin), Gauge(model, theta, origin)
+            while len(kept) > _KEPT:
+                kept.popitem(last=False)
+        return kept[key]
+
+
+def prepare(model: Model, schedule: Schedule, theta: Array, kind: type[AffineSystem] = AffineSystem) -> Prepared:
+    """Return the transition of every interval; `kind` is the equation, that of v by default."""
+    setup, gauge = setup_of(model, np.asarray(theta), kind)
+    transitions, notes = setup.transitions(schedule)
+    lengths = schedule.stops - schedule.starts
+    slope, intercept, noise = setup.observation(schedule.stops)
+    sampled = model.observation_kind == "samples"
+    # A rate is an increment over its interval.
+    inside = schedule.inside & (not sampled)
+    frequencies = np.where(inside, 1.0, 0.0) / np.where(inside, lengths[:, None], 1.0)
+    ends = ends_of(model.observation_kind, schedule, slope, intercept, noise)
+    weighs = [bool(one.information.any() or one.vector.any()) for one in transitions]
+    tilts = gauge.at(schedule.stops)
+    return Prepared(model, setup, gauge, lengths, schedule.stops, frequencies, transitions, weighs, ends, tilts, notes)
+
+
+@np.errstate(all="ignore")
+def init(prepared: Prepared, prior: Any) -> State:
+    """Return the state at the model's start."""
+    model, setup, gauge = prepared.model, prepared.setup, prepared.gauge
+    found = prior_families(gauge, model, prior)
+    families = found.families
+    log_mass = posterior(gauge, gauge.at_one(model.start), model.start, families).log_mass
+    families = families._replace(log_mass=families.log_mass - log_mass)
+    quadratic = setup.system.quadratic(setup.theta, setup.origin)
+    if quadratic is not None:
+        families = times_gauge(families, quadratic, 1.0)
+        _check_normalisable(model, families.cov)
+    return State(*families, found.log_error, found.edge, float(model.start))
+
+
+def times_gauge(families: Family, quadratic: tuple[Array, Array], sign: float) -> Family:
+    """Return the families times e^{sign S}, S = -x'K x / 2 - k.x."""
+    matrix, slope = quadratic
+    return weigh(families, sign * matrix, -sign * slope, 0.0)
+
+
+def _check_normalisable(model: Model, covs: Array) -> None:
+    """Raise InputError where e^S grows faster than the prior decays."""
+    # At the limit the covariances are infinite.
+    if not (np.isfinite(covs).all() and np.all(np.linalg.eigvalsh(covs.real) >= 0)):
+        raise InputError(
+            f'{model.source}: option theorem: with "theorem-6" e^S outgrows the prior, so that e^S v is no density; '
+            'take theorem="theorem-4" or a narrower prior'
+        )
+
+
+def move_families(prepared: Prepared, k: int, families: Family, inputs: Array) -> Family:
+    """Return the families after the transition of interval k."""
+    if prepared.lengths[k] == 0:
+        return families
+    return move(families, prepared.transitions[k], inputs, prepared.weighs[k])
+
+
+def inputs_of(prepared: Prepared, k: int, values: Array) -> Array:
+    """Return e = (1, rates of y) in interval k."""
+    inputs = np.empty(1 + len(values))
+    inputs[0] = 1.0
+    inputs[1:] = values * prepared.frequencies[k]
+    return inputs
+
+
+def observe_end(ends: Ends, k: int, families: Family, values: Array) -> Family:
+    """Return the families times the factor of what is observed at the end of interval k."""
+    if not len(ends.rows[k]):
+        return families
+    white = ends.whiten[k].dot(values)
+    residual, slope = white - ends.intercept[k], ends.slope[k]
+    constant = ends.constant[k]
+    for row in ends.rows[k]:
+        families = observe(families, slope[row], residual[row])
+        if ends.relative:
+            constant = constant + 0.5 * white[row] ** 2
+    return families._replace(log_mass=families.log_mass + constant)
+
+
+@np.errstate(all="ignore")
+def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
+    """Advance one interval: the transition, with the rates of y inside; what is observed at its end; normalise."""
+    families = move_families(prepared, k, state.families, inputs_of(prepared, k, values))
+    families = observe_end(prepared.ends, k, families, values)
+    moved = State(*families, state.log_error, state.edge, float(prepared.stops[k]))
+    gauge, setup = prepared.gauge, prepared.setup
+    if gauge.trivial and len(families.log_mass) == 1 and not families.nodes.shape[2]:
+        log_mass, mean, cov = families.log_mass[0], families.mean[0], families.cov[0]
+        health = _no_nodes(cov)
+        unit = np.zeros(1)
+    else:
+        quadratic = setup.system.quadratic(setup.theta, setup.origin)
+        own = families if quadratic is None else times_gauge(families, quadratic, -1.0)
+        found = posterior(gauge, tilts_at(prepared.tilts, k), prepared.stops[k], own)
+        log_mass, mean, cov = found.log_mass, found.mean, found.cov
+        health = health_of(moved, own, found)
+        unit = families.log_mass - log_mass
+    return moved._replace(log_mass=unit), Info(log_mass, mean + setup.origin, cov, health)
+
+
+def _no_nodes(cov: Array) -> dict[str, float]:
+    variances = cov.diagonal().real.tolist()
+    negative = max(0.0, -min(variances)) / max(max(map(abs, variances)), 1e-300)
+    return {"negative_variance": negative, "representation_error": 0.0, "edge_weight": 0.0, "gauge_error": 0.0}
+
+
+def health_of(state: State, families: Family, found: Posterior) -> dict[str, float]:
+    """Return the health of the posterior of `families`, which are not yet normalised; `state` has the errors of the nodes."""
+    health = _no_nodes(found.cov)
+    if families.nodes.shape[2] == 0:
+        return health
+    # The effect of an error of the prior's representation on the posterior, wherever it was made.
+    log_mass = np.real(found.log_mass)
+    gained = exponents(families).real
+    tilt = np.max(found.logs.real - (families.log_weights.real + gained)[:, :, None], axis=2)
+    tilt = np.where(np.isfinite(tilt), tilt, -np.inf)
+    shares = np.sum(np.exp(found.logs.real - log_mass), axis=2)
+    return health | {
+        "representation_error": float(np.sum(np.exp(state.log_error + gained - log_mass + tilt))),
+        "edge_weight": float(np.sum(shares * state.edge)),
+        "gauge_error": found.doubt,
+    }
+
+
+def density(prepared: Prepared, state: State) -> Density:
+    """Return the posterior: a mixture of Gaussians where e^phi is a sum of exponentials, else by its formula."""
+    setup = prepared.setup
+    quadratic = setup.system.quadratic(setup.theta.real, setup.origin)
+    families = Family(*(array.real for array in state.families))
+    families = families if quadratic is None else times_gauge(families, quadratic, -1.0)
+    return density_of(prepared.model, prepared.gauge.real(), state.time, families)
+
+
+def density_of(model: Model, gauge: Gauge, time: float, families: Family) -> Density:
+    """Return e^phi times the families, normalised."""
+    found = posterior(gauge, gauge.at_one(time), time, families)
+    weights = found.signs * np.exp(found.logs - found.log_mass)
+    moved = families.nodes @ transposed(families.response)
+    means = found.centres[:, None] + moved[:, :, None] + gauge.origin
+    # A density without width in some direction, as of a known start, is on no grid.
+    if not gauge.exact and np.all(np.linalg.eigvalsh(families.cov)[:, 0] > 1e-14 * np.trace(families.cov, axis1=1, axis2=2)):
+        return _gauged(model, gauge, time, families, found, np.abs(weights), means)
+    covs = np.broadcast_to(found.covs[:, None, None], (*weights.shape, model.n, model.n))
+    used = weights != 0.0
+    return GaussianMixture(weights[used], means[used], covs[used], model.state, (False,) * model.n)
+
+
+def _gauged(
+    model: Model, gauge: Gauge, time: float, families: Family, found: Posterior, shares: Array, points: Array
+) -> GaugedDensity:
+    """Return e^phi v by its formula; `shares` (J, N, E) at `points` (J, N, E, n) are where its mass is."""
+    logs = log_terms(families)
+    weights = families.signs * np.exp(logs - logs.max())
+    means = families.mean[:, None] + families.nodes @ transposed(families.response) + gauge.origin
+    covs = np.broadcast_to(families.cov[:, None], (*weights.shape, model.n, model.n))
+    used, mass = weights != 0.0, weights.sum()
+    bare = GaussianMixture(weights[used] / mass, means[used], covs[used], model.state, (False,) * model.n)
+    scale = logs.max() + np.log(mass) - float(found.log_mass)
+    # A Gaussian is followed to ten deviations, where it is e^-50 of its maximum: its points end at nine.
+    rest, own = (np.sqrt(np.maximum(np.diagonal(c, axis1=1, axis2=2), 0.0)) for c in (found.covs, families.cov))
+    margins = np.broadcast_to((10.0 * rest + own)[:, None, None], points.shape)
+    near = shares >= np.exp(-50.0) * shares.max()
+    return GaugedDensity(
+        bare,
+        lambda x: gauge.potential(x - gauge.origin, time) + scale,
+        found.mean + gauge.origin,
+        found.cov,
+        points[near],
+        margins[near],
+    )
+
+
+def valid(prepared: Prepared, state: State) -> bool:
+    """Return whether the arrays of a state fit together."""
+    count, n = state.mean.shape
+    nodes, k = state.nodes.shape[1:]
+    each, arrays = (count, nodes), [np.asarray(part) for part in state[:11]]
+    shapes = [(*each, k), each, each, (count, n), (count, n, n), (count, n, k), (count, k), (count, k, k), (count,), each, each]
+    return (
+        n == prepared.model.n
+        and count >= 1
+        and nodes >= 1
+        and k <= n
+        and all(part.shape == shape for part, shape in zip(arrays, shapes, strict=True))
+        and bool(np.isin(state.signs, (-1.0, 1.0)).all())
+        and not any(np.isnan(part).any() for part in arrays)
+    )

@@ -1,0 +1,241 @@
+"""One state on a grid: what `yau-yau` and `limited-direct` share.
+
+Inside an interval the density obeys the DMZ equation with y linear between observations,
+
+    u_t = G u'' / 2 - (f u)' + (h'S^-1 dy/dt - h'S^-1 h / 2) u,
+
+for the coordinates whose increment belongs to just this interval; samples, and increments gathered over more than the interval,
+are factors at its end.  The equation is solved on a grid that follows the density (`numerics/line_window.py`): spectrally
+accurate in x, and in time by the exponential of the operator, which is exact where no coefficient depends on t, and by
+Magnus' series of fourth order in adaptive substeps elsewhere.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from zakai.densities import GridDensity
+from zakai.errors import InputError
+from zakai.methods import _line_fast as fast
+from zakai.methods._line_moves import Report, propagated
+from zakai.methods._line_system import NOISE, Prepared, State, system_of
+from zakai.methods._line_update import exponential_factor, factor_at_end
+from zakai.methods._protocol import Info, Infos
+from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
+from zakai.models.prior import DensityPrior, GaussianPrior
+from zakai.numerics import line_window as lw
+from zakai.numerics.line_channel import Channel, around, chosen
+from zakai.numerics.line_posterior import multiplied
+from zakai.numerics.prior_grid import mixture_log_density, prior_grid
+from zakai.records.schedule import Schedule
+
+Array = Any
+
+
+def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: float) -> Prepared:
+    """Return what `step` needs for the intervals of a schedule.
+
+    Raises:
+        InputError: the tolerance is not a number from 1e-12 to .1.
+    """
+    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 1e-12 <= tolerance <= 0.1:
+        raise InputError(f"option tolerance: {tolerance!r} must be a number from 1e-12 to 0.1")
+    system = system_of(model)
+    # A sample may lead deep into the tails, where a small error counts; increments do not.
+    negligible = 1e-13 if system.samples else float(np.clip(1e-6 * tolerance, 1e-13, 1e-10))
+    generous = lw.LARGEST if system.samples and not system.moving else 96
+    lengths, inside = schedule.lengths, schedule.inside
+    return Prepared(model, schedule, theta, system, float(tolerance), lengths, inside, negligible, generous, float(tolerance))
+
+
+def init(prepared: Prepared, prior: Any) -> State:
+    """Return the prior on a grid that fits it."""
+    model, closed = prepared.model, bool(prepared.model.periodic)
+    if isinstance(prior, DensityPrior):
+        function, log_density = numpy_function([prior.log_density], model, (1,)), None
+
+        def evaluate(points: Array) -> Array:
+            return function(points, model.start, prepared.theta)[..., 0]
+
+        grid = prior_grid(lambda points: evaluate(points).real, 1, [closed])
+        low, high = (float(grid.points[i, 0]) for i in (0, -1))
+        logs, spacing = grid.log_values, float(grid.basis[0, 0])
+    else:
+        if isinstance(prior, GaussianPrior):
+            weights, means, covs = np.ones(1), prior.mean[None], prior.cov[None]
+        else:
+            weights, means, covs = prior.weights, prior.means, prior.covs
+        deviations = np.sqrt(covs[:, 0, 0])
+        if np.any(deviations <= 1e-14 * np.abs(means[:, 0])):
+            raise InputError("prior: a variance is zero; a grid needs a density, so give it a small variance")
+        log_density = mixture_log_density(weights, means, covs, [closed])
+        low, high = float(np.min(means[:, 0] - 7.8 * deviations)), float(np.max(means[:, 0] + 7.8 * deviations))
+        spacing = float(deviations.min()) / 3.0
+    if closed:
+        size = lw.size_for(2 * np.pi / min(spacing * 0.95, 2 * np.pi / 64))
+        window = lw.Window(0.0, 0.0, 2 * np.pi / size, size, True, 1.0)
+    else:
+        origin = 0.5 * (low + high)
+        window = lw.Window(origin, 0.0, spacing, 0, False, spacing)
+        window = lw.quantized(window, low - origin, high - origin, spacing, margin=0.0, most=lw.SIZES[-1])
+    for _ in range(8):
+        if log_density is None:
+            points = window.points[:, None]
+            logs = evaluate(np.pi - np.mod(np.pi - points, 2 * np.pi) if closed else points)
+            logs = np.where(np.isnan(logs.real), -np.inf, logs)
+        else:
+            logs = log_density(np.array([window.origin]), window.offsets[:, None])
+        values = np.exp(logs - np.max(logs.real))
+        values = values / np.sum(values)
+        look = lw.figures(values, closed)
+        new = lw.fitted(look, window, lw.SIZES[-1])
+        if new == window:
+            break
+        window = new
+    return _state(values, window, max(0.0, look.aliasing - 1e-12))
+
+
+def _state(values: Array, window: lw.Window, error: float) -> State:
+    return State(values, window.origin, window.centre, window.spacing, window.unit, window.closed, float(error))
+
+
+def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
+    """Return the state after interval k and the observation at its stop, and the report."""
+    if prepared.fast[k]:
+        found = fast.run(prepared, slice(k, k + 1), state, observed[None])
+        if found is not None:
+            return found[0][0], fast.one_of(found[1], 0)
+    # Attempts that overflow are taken again in shorter substeps.
+    with np.errstate(all="ignore"):
+        return _step(prepared, k, state, observed)
+
+
+def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[list[State], Infos]:
+    """Return the states after the intervals of a slice, and their reports."""
+    states: list[State] = []
+    parts: list[Infos] = []
+    k = rows.start
+    while k < rows.stop:
+        last = k
+        while last < rows.stop and prepared.fast[last]:
+            last += 1
+        found = None
+        if last > k:
+            found = fast.run(prepared, slice(k, last), state, observed[k - rows.start : last - rows.start])
+        if found is not None:
+            states += found[0]
+            parts.append(found[1])
+        else:
+            with np.errstate(all="ignore"):
+                state, info = _step(prepared, k, state, observed[k - rows.start])
+            states.append(state)
+            parts.append(_alone(info))
+        k, state = rows.start + len(states), states[-1]
+    health = {name: np.concatenate([part.health[name] for part in parts]) for name in parts[0].health}
+    increments, means, covs = (np.concatenate([part[i] for part in parts]) for i in range(3))
+    return states, Infos(increments, means, covs, health)
+
+
+def _alone(info: Info) -> Infos:
+    health = {name: np.array([value]) for name, value in info.health.items()}
+    return Infos(np.array([info.log_likelihood_increment]), info.mean[None], info.cov[None], health)
+
+
+def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
+    schedule, length = prepared.schedule, float(prepared.lengths[k])
+    values, window, report, look = np.asarray(state.values), state.window, Report(), None
+    inside = prepared.inside[k]
+    if prepared.lie and not inside.all():
+        inside = np.zeros_like(inside)
+    before, gained = lw.moments(values, window), 0.0
+    if length > 0:
+        rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
+        start = float(schedule.starts[k])
+        kernel = _kernel(prepared, k, window, rates, report)
+        values, window, gained, look = propagated(prepared, values, window, start, length, inside, rates, kernel, report)
+    predicted, floor = lw.moments(values, window), NOISE + report.aliasing + report.edge
+    at_end = schedule.seen[k] & ~inside
+    if at_end.any() or (prepared.lie and inside.any()):
+        if at_end.any():
+            likelihood = factor_at_end(prepared, k, at_end, observed, window)
+        else:
+            likelihood = exponential_factor(prepared, k, observed)
+        result = multiplied(values, window, likelihood, max(1e-10, 1e-3 * prepared.tolerance))
+        values, window, gained = result.values, result.window, gained + result.log_mass
+        report.depth, report.growth = result.depth, result.growth
+        look = lw.figures(values, window.closed, prepared.negligible)
+        report.density(look)
+    mean, variance = lw.moments(values, window)
+    made = 2.0 * report.aliasing + 10.0 * report.edge + report.time + 10.0 * report.negative
+    made += min(floor * report.growth, 1.0)
+    error = made + state.error * forgetting(before[1], predicted[1], variance, spread(prepared, k, length))
+    spacings = float(np.sqrt(max(variance.real, 0.0))) / window.spacing
+    look = lw.figures(values, window.closed, prepared.negligible) if look is None else look
+    new = lw.fitted(look, window, prepared.largest, prepared.generous)
+    health = {
+        "error_estimate": error,
+        "tolerance_ratio": made / prepared.promised,
+        "edge_mass": report.edge,
+        "negative_mass": report.negative,
+        "aliasing": report.aliasing,
+        "time_error": report.time,
+        "tail_depth": report.depth / prepared.deepest,
+        "std_in_spacings": spacings,
+    }
+    moved = lw.resampled(values, window, new)
+    if new is not window and new != window:
+        moved = moved / np.sum(moved)
+    mean = window.origin + mean
+    if window.closed:
+        mean = mean - 2 * np.pi * np.ceil((mean.real - np.pi) / (2 * np.pi))
+    return _state(moved, new, error), Info(gained, np.array([mean]), np.array([[variance]]), health)
+
+
+def _kernel(prepared: Prepared, k: int, window: lw.Window, rates: np.ndarray, report: Report) -> Channel | None:
+    """Return the Gaussian kernel of interval k, for x relative to the origin of the window, if there is one."""
+    kernels = prepared.kernels
+    if kernels is None or window.closed or kernels.place[k] < 0:
+        return None
+    place = int(kernels.place[k])
+    report.time += float(kernels.errors[place])
+    return around(chosen(kernels.channels, place, np.concatenate([np.ones(1), rates])), window.origin - kernels.origin)
+
+
+def forgetting(before: Any, predicted: Any, after: Any, spread: float) -> float:
+    """Return what is left of an old relative error after a step, from the variances: that of an error of the mean in deviations.
+
+    `spread` is the integral of G over the interval, which counts where the observation acts inside.
+    """
+    ratio = np.sqrt(max(before.real * after.real, 0.0)) / max(predicted.real, 1e-300)
+    return float(np.clip(ratio * np.exp(-min(0.5 * spread / max(before.real, 1e-300), 5.0)), 0.3, 1.0))
+
+
+def spread(prepared: Prepared, k: int, length: float) -> float:
+    """Return about the integral of G over interval k where increments act inside."""
+    if not prepared.inside[k].any():
+        return 0.0
+    middle = float(prepared.schedule.starts[k]) + 0.5 * length
+    return length * float(prepared.system.covariance(np.zeros(1), middle, prepared.theta)[0, 0].real)
+
+
+def valid(prepared: Prepared, state: State) -> bool:
+    """Return whether the parts of a state fit together."""
+    values = np.asarray(state.values)
+    numbers = np.array([state.origin, state.centre, state.spacing, state.unit, state.error], float)
+    if values.ndim != 1 or not 8 <= len(values) <= lw.SIZES[-1] or not np.isfinite(numbers).all():
+        return False
+    if bool(state.closed) != bool(prepared.model.periodic) or not (state.spacing > 0 and state.unit > 0):
+        return False
+    return bool(np.isfinite(values).all() and values.real.sum() > 0)
+
+
+def density(prepared: Prepared, state: State) -> GridDensity:
+    """Return the density of a state."""
+    with np.errstate(divide="ignore"):
+        logs = np.log(np.maximum(np.asarray(state.values).real, 0.0))
+    window = state.window
+    names = prepared.model.state
+    return GridDensity(logs, np.array([window.origin + window.centre]), np.array([[window.spacing]]), names, (window.closed,))

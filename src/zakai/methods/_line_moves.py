@@ -1,0 +1,306 @@
+"""The density of one state after an interval: attempts on a grid, in substeps, until one is accurate.
+
+    u_t = G u'' / 2 - (f u)' + (h'S^-1 dy/dt - h'S^-1 h / 2) u
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.methods._line_system import Prepared, finite, spectral, tables
+from zakai.methods._line_yau import moved
+from zakai.numerics import line_window as lw
+from zakai.numerics.line_channel import Channel
+from zakai.numerics.line_operator import exponential_action, generator
+from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS, panels
+
+Array = Any
+
+EDGE = 1e-11  # density at the outermost points, relative to the maximum
+GROWTH = 12.0  # largest growth by the potential in one substep where there is no mass, as a logarithm
+GROSS = 1e-4  # spectrum at the highest frequencies from which a shorter substep is taken at once
+MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
+MOST_SUBSTEPS = 4000
+
+
+class Report:
+    """The worst health figures within one step."""
+
+    def __init__(self) -> None:
+        self.aliasing = self.edge = self.time = self.depth = self.growth = self.negative = 0.0
+        self.spacings = np.inf
+
+    def density(self, look: lw.Figures) -> None:
+        """Note the figures of a density."""
+        self.aliasing = max(self.aliasing, look.aliasing)
+        self.negative = max(self.negative, look.negative)
+        self.edge = max(self.edge, look.left, look.right)
+
+
+def propagated(
+    prepared: Prepared,
+    values: Array,
+    window: lw.Window,
+    start: float,
+    length: float,
+    inside: np.ndarray,
+    rates: np.ndarray,
+    kernel: Channel | None,
+    report: Report,
+) -> tuple[Array, lw.Window, Any, lw.Figures | None]:
+    """Return the density after an interval, its grid, the logarithm of its mass, and its figures."""
+    system, negligible, look = prepared.system, prepared.negligible, None
+    gained: Any = 0.0
+    rough, resolved = max(1e-10, 1e-3 * prepared.tolerance), 30.0 * negligible
+    if kernel is not None and prepared.yau is not None:
+        direct = moved(prepared.yau, kernel, values, window, start, start + length, prepared.theta, negligible, rough)
+        if direct is not None:
+            report.density(direct.look)
+            mass = np.sum(direct.values)
+            return direct.values / mass, direct.window, np.log(mass) + direct.offset, direct.look
+    bounds = [(0.0, length)]
+    if system.varying:
+        bounds = _panels(prepared, values, window, start, length, inside, report)
+    stack = bounds[::-1]
+    substeps = 0
+    while stack:
+        first, last = stack.pop()
+        substeps += 1
+        if not np.isfinite(values.real).all():
+            return values, window, np.float64(np.nan), look
+        while True:
+            attempt = _attempt(prepared, values, window, start, first, last, inside, rates)
+            total = float(np.sum(attempt.values.real))
+            lost = not 1e-250 < total < 1e6 or (not inside.any() and abs(total - 1.0) > 1e-3)
+            split = (attempt.split or lost) and last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
+            if split:
+                break
+            look = lw.figures(attempt.values, window.closed, negligible)
+            coarse = look.aliasing > resolved and (look.aliasing > rough or not look.rough)
+            bound = max(EDGE, 4.0 * look.aliasing)
+            left, right = look.left > bound, look.right > bound
+            if not (left or right or coarse):
+                break
+            new = window
+            smooth = lw.figures(values, window.closed, negligible).aliasing < 0.1 * rough
+            if look.aliasing > GROSS and smooth:
+                new = window  # what such an attempt shows of the edges is not the density
+            elif left or right:
+                new = lw.enlarged(new, left, right)
+            if coarse and window.size < lw.LARGEST and not (look.aliasing > GROSS and smooth):
+                new = lw.refined(new)
+            if new.size <= lw.LARGEST and new != window:
+                values = lw.resampled(values, window, new)
+                window = new
+                continue
+            # The grid is as large as it may be: take a shorter substep, unless that does not help.
+            helps = smooth and look.aliasing > rough and (not look.rough or look.aliasing > GROSS)
+            split = (left or right or helps) and last - first > 1e-12 * length
+            split = split and substeps + len(stack) < MOST_SUBSTEPS
+            break
+        if split:
+            if attempt.split and attempt.error > 0:  # the error of Magnus' series falls as the fifth power of the length
+                count = int(np.clip(np.ceil(1.1 * (attempt.error / (MAGNUS * prepared.tolerance)) ** 0.2), 2, 16))
+                ends = first + (last - first) * np.arange(1, count) / count
+                stack += list(zip([first, *ends], [*ends, last], strict=True))[::-1]
+            else:
+                middle = first + (last - first) * (0.25 if last - first > 1e-3 * length else 0.0625)
+                stack += [(middle, last), (first, middle)]
+            new = lw.fitted(lw.figures(values, window.closed, negligible), window)
+            values, window = lw.resampled(values, window, new), new
+            continue
+        assert look is not None
+        report.density(look)
+        report.time += attempt.error
+        values = np.where(attempt.values.real > 0, attempt.values, 0.0)
+        mass = np.sum(values)
+        values = values / mass
+        gained = gained + np.log(mass) + attempt.offset
+        if stack:
+            new = lw.fitted(look, window)
+            values, window = lw.resampled(values, window, new), new
+    if substeps >= MOST_SUBSTEPS:
+        report.time = np.inf
+    return values, window, gained, look
+
+
+class _Attempt(NamedTuple):
+    """The density after a substep, times exp(-offset); its error; whether a shorter substep is needed."""
+
+    values: Array
+    offset: Any
+    error: float
+    split: bool
+
+
+def _attempt(
+    prepared: Prepared,
+    values: Array,
+    window: lw.Window,
+    start: float,
+    first: float,
+    last: float,
+    inside: np.ndarray,
+    rates: np.ndarray,
+) -> _Attempt:
+    """Return the density after the part from start + first to start + last of an interval."""
+    system, length = prepared.system, last - first
+    closed, spacing = window.closed, window.spacing
+    if not system.varying:
+        known = tables(prepared, window)
+        if not inside.any():
+            decomposed = spectral(prepared, window)
+            if decomposed is not None:
+                found, error = decomposed(values, length)
+                # Tails that were cut off are jumps in the gauge of the decomposition, which show at the highest frequencies.
+                smooth = lw.figures(found, closed, prepared.negligible).aliasing <= 30.0 * prepared.negligible
+                if error < max(1e-11, 1e-5 * prepared.tolerance) and smooth:
+                    return _Attempt(found, 0.0, error, False)
+            matrix = length * generator(closed, spacing, known.covariance, known.drift)
+            return _Attempt(*_without_offset(matrix, values), False)
+        potential, constant = _potential(known.observation, _precision(prepared, start, inside), rates, values)
+        potential, constant = length * potential, length * constant
+        offset, split = _offset(potential, values)
+        if split:
+            return _Attempt(values, 0.0, 0.0, True)
+        matrix = generator(closed, spacing, length * known.covariance, length * known.drift, potential - offset)
+        found, error = exponential_action(matrix, values)
+        return _Attempt(found, offset + constant, error, False)
+    return _magnus(prepared, values, window, start, first, last, inside, rates)
+
+
+def _without_offset(matrix: Array, values: Array) -> tuple[Array, float, float]:
+    found, error = exponential_action(matrix, values)
+    return found, 0.0, error
+
+
+def _magnus(
+    prepared: Prepared,
+    values: Array,
+    window: lw.Window,
+    start: float,
+    first: float,
+    last: float,
+    inside: np.ndarray,
+    rates: np.ndarray,
+) -> _Attempt:
+    """Two exponentials of moments of the coefficients over the substep: the commutator-free Magnus integrator of order four,
+
+        exp(B0 / 2 + 2 B1 / tau) exp(B0 / 2 - 2 B1 / tau),   B0 = int L dt,   B1 = int (t - middle) L dt.
+    """
+    length = last - first
+    times = start + first + length * GAUSS_NODES
+    drift, covariance, potential, constant = _coefficients(prepared, window, times, inside, rates, values)
+    zeroth, moment = length * GAUSS_WEIGHTS, 2.0 * length * GAUSS_WEIGHTS * (GAUSS_NODES - 0.5)
+    early, late = 0.5 * zeroth - moment, 0.5 * zeroth + moment
+    offset, split = _offset(zeroth @ potential, values)
+    if split or (early @ covariance).real < 0 or (late @ covariance).real < 0:
+        return _Attempt(values, 0.0, 0.0, True)
+    closed, spacing = window.closed, window.spacing
+    shift = np.full(window.size, offset / 2)
+    first_half, second_half = (
+        generator(closed, spacing, w @ covariance, w @ drift, w @ potential - shift) for w in (early, late)
+    )
+    total, difference = (first_half + second_half).real, (second_half - first_half).real
+    now = values.real
+    # The part of third order that two exponentials contain; what they omit is of fifth order, with a factor that was measured.
+    commutator = 0.25 * (total @ (difference @ now) - difference @ (total @ now))
+    error = 5.0 * float(np.sum(np.abs(commutator))) ** (5.0 / 3.0)
+    if error > MAGNUS * prepared.tolerance:
+        return _Attempt(values, 0.0, error, True)
+    middle, one = exponential_action(first_half, values)
+    found, two = exponential_action(second_half, middle)
+    return _Attempt(found, offset + zeroth @ constant, error + one + two, False)
+
+
+def _coefficients(
+    prepared: Prepared, window: lw.Window, times: np.ndarray, inside: np.ndarray, rates: np.ndarray, values: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return f (T, N), G (T,), V less a constant (T, N) and the constant (T,)."""
+    system, theta = prepared.system, prepared.theta
+    points = window.points[:, None]
+    if system.moving:
+        drift = finite(system.drift(points, times[:, None], theta)[..., 0])
+        covariance = system.covariance(np.zeros((len(times), 1)), times, theta)[:, 0, 0]
+    else:
+        known = tables(prepared, window)
+        drift = np.broadcast_to(known.drift, (len(times), window.size))
+        covariance = np.broadcast_to(known.covariance, len(times))
+    if not inside.any():
+        return drift, covariance, np.zeros((len(times), window.size)), np.zeros(len(times))
+    if system.steady_observation and system.steady_noise:
+        h = tables(prepared, window).observation
+        value, constant = _potential(h, _precision(prepared, times, inside), rates, values)
+        return drift, covariance, np.broadcast_to(value, (len(times), len(value))), np.full(len(times), constant)
+    if system.steady_observation:
+        h = np.broadcast_to(tables(prepared, window).observation, (len(times), system.m, window.size))
+    else:
+        h = np.moveaxis(system.observation(points, times[:, None], theta), -1, 1)
+    precision = np.broadcast_to(_precision(prepared, times, inside), (len(times), system.m, system.m))
+    potentials, constants = zip(*[_potential(*pair, rates, values) for pair in zip(h, precision, strict=True)], strict=True)
+    return drift, covariance, np.stack(potentials), np.array(constants)
+
+
+def _precision(prepared: Prepared, times: Any, inside: np.ndarray) -> Array:
+    """Return the inverse of the block of S of the coordinates that act inside, zero elsewhere, (..., m, m)."""
+    system = prepared.system
+    both = inside[:, None] & inside
+
+    def make(times: Any) -> Array:
+        noise = system.noise(np.zeros((*np.shape(times), 1)), times, prepared.theta)
+        return np.where(both, np.linalg.inv(np.where(both, noise, 0.0) + np.diag(1.0 * ~inside)), 0.0)
+
+    if system.steady_noise:
+        return prepared.once(("inside", inside.tobytes()), lambda: make(prepared.model.start))
+    return make(times)
+
+
+def _potential(h: Array, precision: Array, rates: np.ndarray, values: Array) -> tuple[Array, Any]:
+    """Return h'S^-1 (dy/dt - h / 2) less its value at the maximum of the density (N,), and that value.
+
+    Large numbers cancel before they are squared.  Where h has no value the potential is a large negative number.
+    """
+    centre = finite(h[:, int(np.argmax(values.real))])
+    rest, weighted = h - centre[:, None], precision @ (rates - centre)
+    with np.errstate(all="ignore"):
+        value = np.sum(finite(rest) * (weighted[:, None] - 0.5 * (precision @ finite(rest))), axis=0)
+    value = np.where(np.isfinite(h.real).all(axis=0) & (value.real > -1e8), value, -1e8)
+    return value, centre @ (precision @ (rates - 0.5 * centre))
+
+
+def _offset(potential: Array, values: Array) -> tuple[float, bool]:
+    """Return the largest integral of V where there is mass, and whether it grows too much where there is none."""
+    mass = values.real > 1e-6 * values.real.max()
+    if not mass.any() or not np.isfinite(potential.real).all():
+        return 0.0, False
+    top = float(np.max(potential.real[mass]))
+    return top, bool(np.max(potential.real) > top + GROWTH)
+
+
+def _panels(
+    prepared: Prepared, values: Array, window: lw.Window, start: float, length: float, inside: np.ndarray, report: Report
+) -> list[tuple[float, float]]:
+    """Return parts of the interval in each of which the coefficients are polynomials of time, nearly."""
+    system, theta = prepared.system, prepared.theta.real
+    look = lw.figures(values, window.closed)
+    first, last = look.first, look.last
+    x = window.points[np.unique(np.linspace(first, last, 7).astype(int))]
+
+    def coefficients(times: Array) -> Array:
+        t = start + times
+        columns = []
+        if system.moving:
+            columns.append(system.drift(x[:, None], t[:, None], theta)[..., 0])
+            columns.append(system.covariance(np.zeros((len(t), 1)), t, theta)[:, 0])
+        if inside.any() and not system.steady_observation:
+            columns.append(system.observation(x[:, None], t[:, None], theta)[..., inside].reshape(len(t), -1))
+        if inside.any() and not system.steady_noise:
+            noise = system.noise(np.zeros((len(t), 1)), t, theta)[:, inside][..., inside]
+            columns.append(np.linalg.inv(noise).reshape(len(t), -1))
+        return finite(np.concatenate(columns, axis=1)) if columns else np.zeros((len(t), 1))
+
+    found = panels(coefficients, 0.0, length)
+    report.time += found.error
+    return found.bounds

@@ -1,0 +1,75 @@
+"""The factors of observations at the end of an interval, for one state."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from zakai.methods._line_system import Prepared, System, tables
+from zakai.numerics import line_window as lw
+from zakai.numerics.complex_step import log_determinant
+from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS, panels
+from zakai.numerics.line_posterior import Gaussian
+
+Array = Any
+
+
+def factor_at_end(prepared: Prepared, k: int, at_end: np.ndarray, observed: np.ndarray, window: lw.Window) -> Gaussian:
+    """Return the likelihood of the samples, or of the increments that were gathered over more than the interval."""
+    system, theta, stop = prepared.system, prepared.theta, float(prepared.schedule.stops[k])
+    rows = np.flatnonzero(at_end)
+    if system.samples:
+        spans = np.ones(len(rows))
+        precision, constant = _sample_noise(prepared, stop, at_end)
+    else:
+        spans = prepared.schedule.elapsed[k, rows]
+        precision = np.linalg.inv(shared_noise(system, theta, stop, spans, rows))
+        constant = 0.5 * observed[rows] @ precision @ observed[rows]
+
+    def evaluate(points: Array) -> Array:
+        return system.observation(points[:, None], stop, theta)[:, rows].T * spans[:, None]
+
+    known = None
+    if system.steady_observation:
+        h = tables(prepared, window).observation
+        known = window, (h if len(rows) == len(h) and system.samples else h[rows] * spans[:, None])
+    return Gaussian(evaluate, observed[rows], precision, constant, known=known)
+
+
+def _sample_noise(prepared: Prepared, stop: float, at_end: np.ndarray) -> tuple[Array, Any]:
+    """Return the precision of the observed coordinates of a sample, and the logarithm of the density's constant."""
+    system, rows = prepared.system, np.flatnonzero(at_end)
+
+    def make() -> tuple[Array, Any]:
+        noise = system.noise(np.zeros(1), stop, prepared.theta)[np.ix_(rows, rows)]
+        return np.linalg.inv(noise), -0.5 * (log_determinant(noise) + np.log(2 * np.pi) * len(rows))
+
+    found: tuple[Array, Any] = prepared.once(("noise", at_end.tobytes()), make) if system.steady_noise else make()
+    return found
+
+
+def exponential_factor(prepared: Prepared, k: int, observed: np.ndarray) -> Gaussian:
+    """Return exp(h'S^-1 dy) of the order of factors of the papers, all of it at the end of the interval."""
+    system, theta, stop = prepared.system, prepared.theta, float(prepared.schedule.stops[k])
+    precision = np.linalg.inv(system.noise(np.zeros(1), stop, theta))
+
+    def evaluate(points: Array) -> Array:
+        return system.observation(points[:, None], stop, theta).T
+
+    return Gaussian(evaluate, observed, precision, 0.0, linear=True)
+
+
+def shared_noise(system: System, theta: np.ndarray, stop: float, spans: np.ndarray, rows: np.ndarray) -> Array:
+    """Return the covariance of increments that end together: the integral of S over the time that two have in common."""
+    common = np.minimum(spans[:, None], spans)
+    if system.steady_noise:
+        return system.noise(np.zeros(1), stop, theta)[np.ix_(rows, rows)] * common
+    total = np.zeros((len(rows), len(rows)), complex if np.iscomplexobj(theta) else float)
+    for span in np.unique(spans):
+        pieces = panels(lambda t: system.noise(np.zeros((len(t), 1)), t, theta.real).reshape(len(t), -1), stop - span, stop)
+        for first, last in pieces.bounds:
+            times = first + (last - first) * GAUSS_NODES
+            part = system.noise(np.zeros((len(times), 1)), times, theta)[:, rows[:, None], rows]
+            total = np.where(common == span, total + np.tensordot(GAUSS_WEIGHTS * (last - first), part, axes=1), total)
+    return total

@@ -1,0 +1,101 @@
+"""The shape that every method has.
+
+A method is one module with one `METHOD`, which names plain functions:
+
+    prepare(model, schedule, theta, **options) -> Prepared     offline: sees no data
+    init(prepared, prior) -> State                             the prior at the model's start
+    step(prepared, k, state, values) -> (State, Info)          interval k of the schedule, and the observation at its stop
+    density(prepared, state) -> Density
+
+Rules:
+
+* A `Prepared` has the attribute `notes`, sentences for the warnings of a result.  `prepare` works for an empty schedule; `init`
+  and `density` depend on the model, theta and the options only, never on the schedule.
+* What is prepared for an interval depends on that interval alone, to the last bit: a record, a batch and an online filter
+  prepare different schedules and must agree.  Where the model does not depend on t, it depends on the length of the interval
+  only (`schedule.lengths`), not on where it begins.
+* `step` is a pure function of its arguments; many threads call it at once.  It handles intervals of length zero (a sample at the
+  start), unobserved coordinates (`schedule.seen`), and increments gathered over more than the interval (`schedule.elapsed`).
+  `values` (m,) are zero where nothing is observed.
+* A `State` is a NamedTuple of arrays, numbers, booleans, strings and tuples of these: a checkpoint stores its fields.
+* With `differentiable`, `theta` (p,) may be complex: the imaginary part of the log-likelihood is then its derivative
+  (`numerics/complex_step.py`).  Decisions (grids, substeps) are taken by the real parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+
+from zakai.algebra.conditions import Condition
+from zakai.densities import Density
+from zakai.models.model import Model
+
+
+class Info(NamedTuple):
+    """What one step reports: the increment of the log-likelihood, `mean` (n,), `cov` (n, n), and the health figures."""
+
+    log_likelihood_increment: Any
+    mean: np.ndarray
+    cov: np.ndarray
+    health: Mapping[str, float]
+
+
+class Infos(NamedTuple):
+    """What K steps report: an Info with a leading axis of K."""
+
+    log_likelihood_increment: np.ndarray
+    mean: np.ndarray
+    cov: np.ndarray
+    health: Mapping[str, np.ndarray]
+
+
+class Prepared(Protocol):
+    """What is known without data."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the warnings of a result."""
+
+
+P = TypeVar("P", bound=Prepared)
+S = TypeVar("S")
+
+
+@dataclass(frozen=True)
+class Method(Generic[P, S]):
+    """One filter: its functions, and what is said of it.
+
+    `options` are the keyword arguments of `prepare` with their defaults.  `bounds` gives for a health figure the bound above
+    which a result warns, and the words of the warning.  `state` is the class of the states.  `shorter` says what shortens a long
+    run, as in "this takes about 40 s; to shorten it, raise the tolerance".
+
+    Optional: `absolute(options)` says whether what is prepared for an interval depends on where it begins, although the model
+    does not depend on t.
+
+    Optional: `valid(prepared, state)` says whether the arrays of a state fit together; it is asked of a state that was read from
+    a file, before any kernel receives it.
+
+    Optional: `segment(prepared, rows, state, values)` advances the intervals of a slice in one compiled loop that calls the same
+    kernel as `step`, and returns the states after each step and their Infos.
+    """
+
+    name: str
+    source: str
+    exactness: str
+    theorem: Callable[[Model], tuple[Condition, ...]]
+    options: Mapping[str, Any]
+    prepare: Callable[..., P]
+    init: Callable[[P, Any], S]
+    step: Callable[[P, int, S, np.ndarray], tuple[S, Info]]
+    density: Callable[[P, S], Density]
+    state: type[S]
+    bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    differentiable: bool = True
+    shorter: str = "give fewer observations"
+    absolute: Callable[[Mapping[str, Any]], bool] | None = None
+    valid: Callable[[P, S], bool] | None = None
+    segment: Callable[[P, slice, S, np.ndarray], tuple[list[S], Infos]] | None = None

@@ -1,0 +1,172 @@
+"""The filters of Hu and Yau (2002): f = G grad F + l with affine l, affine h, and eta quadratic; any initial density.
+
+With S, H and P as in Theorems 4 to 6, u~ = e^{S - F} sigma, taken along (b, a, c), solves a linear equation without data,
+
+    u~_t = 1/2 G:Hess u~ - H.grad u~ - P u~,     u~(0) = e^{S - F} sigma_0,
+    Theorem 4: S = 0, H = l     Theorem 5: S = F, H = f     Theorem 6: G grad S = -l, H = 0, P = eta / 2,
+
+and the survey of Chen and Dong, Theorem 1, is Theorem 5 with G = I.  `form="stepwise"` starts anew at every observation and is
+stable over any time; Theorems 4 and 5 then are one method, for e^F cancels.  `form="one-shot"` is the papers' own: see
+`_one_shot`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from zakai.algebra.exact_theorems import hu_yau as condition
+from zakai.algebra.gauges import affine_system
+from zakai.algebra.identities import all_zero
+from zakai.densities import Density
+from zakai.errors import InputError
+from zakai.methods import _gaussian_families as families
+from zakai.methods import _one_shot as one_shot
+from zakai.methods._affine_system import AffineSystem
+from zakai.methods._protocol import Info, Method
+from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
+from zakai.numerics.flow import Coefficients
+from zakai.numerics.transition import Array, transposed
+from zakai.records.schedule import Schedule
+
+THEOREMS = ("theorem-4", "theorem-5", "theorem-6", "survey-1")
+Prepared = families.Prepared | one_shot.Prepared
+State = one_shot.State
+
+
+class WithoutDrift(AffineSystem):
+    """The equation of e^S v with G grad S = -(L x + l): no drift, and the potential -(q + (L x + l)'G^-1 (L x + l) - tr L)/2."""
+
+    def coefficients(self, times: Array, theta: Array, origin: Array, inside: Array) -> Coefficients:
+        """Return the coefficients at times (J,)."""
+        c = super().coefficients(times, theta, origin, inside)
+        n, first = c.matrix.shape[1], np.arange(c.constant.shape[1]) == 0
+        slope = np.linalg.solve(c.covariance, np.concatenate([c.matrix, c.offset[:, :, :1]], axis=2))
+        backward, end = transposed(c.matrix), slope[:, :, n:]
+        trace = np.trace(c.matrix, axis1=1, axis2=2)
+        energy = (transposed(c.offset[:, :, :1]) @ end)[:, 0, 0]
+        return Coefficients(
+            0.0 * c.matrix,
+            0.0 * c.offset,
+            c.covariance,
+            c.quadratic - 0.5 * backward @ slope[:, :, :n],
+            c.linear - backward @ end * first,
+            c.constant + 0.5 * (trace - energy)[:, None] * first,
+        )
+
+    def quadratic(self, theta: Array, origin: Array) -> tuple[Array, Array] | None:
+        """Return K (n, n) and k (n,) of S = -x'K x / 2 - k.x; the coefficients are constant."""
+        key = (theta.tobytes(), origin.tobytes())
+        if key not in self.kept_quadratics:
+            L, l, G, *_ = self.letters(np.zeros(1), theta, origin)
+            slope = np.linalg.solve(G[0], np.concatenate([L[0], l[0]], axis=1))
+            n = len(slope)
+            self.kept_quadratics.clear()
+            self.kept_quadratics[key] = 0.5 * (slope[:, :n] + slope[:, :n].T), slope[:, n]
+        return self.kept_quadratics[key]
+
+
+def prepare(
+    model: Model, schedule: Schedule, theta: Array, *, form: str = "stepwise", theorem: str = "theorem-4", tolerance: float = 1e-6
+) -> Prepared:
+    """Return the transition of every interval.
+
+    Args:
+        model: A model for which the theorem holds.
+        schedule: The intervals.
+        theta: The parameters (p,).
+        form: "stepwise", or "one-shot" from the start on, which is refused once eps exp(2 mu t), its error relative to the size
+            of the statistics, exceeds `tolerance`, mu being their largest growth rate; the error in nats is
+            `health["lost_digits"]`.
+        theorem: Whose S, H and P are used: "theorem-4", "theorem-5", "theorem-6" or "survey-1".
+        tolerance: Bound on the error of "one-shot".
+
+    Raises:
+        InputError: an option does not fit.
+    """
+    if form not in ("stepwise", "one-shot"):
+        raise InputError(f'option form: "{form}" is neither "stepwise" nor "one-shot"')
+    if theorem not in THEOREMS:
+        raise InputError(f'option theorem: "{theorem}" is none of {", ".join(THEOREMS)}')
+    if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not tolerance > 0:
+        raise InputError(f"option tolerance: {tolerance!r} is not a positive number")
+    _check_theorem(model, theorem, np.asarray(theta).real)
+    kind = WithoutDrift if theorem == "theorem-6" else AffineSystem
+    if form == "stepwise":
+        return families.prepare(model, schedule, theta, kind)
+    return one_shot.prepare(model, schedule, theta, kind, tolerance)
+
+
+def _check_theorem(model: Model, theorem: str, theta: Array) -> None:
+    system = affine_system(model)
+    assert system is not None
+    G, form = model.covariance, system[0]
+    if theorem == "survey-1" and all_zero(list(G - sp.eye(model.n))) is not True:
+        raise InputError(
+            f'{model.source}: option theorem: "survey-1" is stated for G = I, but G = {G.tolist()}; take "theorem-5"'
+        )
+    if theorem == "theorem-6":
+        entries = numpy_function(G, model, G.shape)(np.zeros(model.n), model.start, theta)
+        if np.linalg.matrix_rank(entries) < model.n:
+            raise InputError(f'{model.source}: option theorem: "theorem-6" needs a G that has an inverse; take "theorem-4"')
+        # G^-1 D is symmetric if and only if D G is.
+        product = form.matrix * G
+        varying = any(entry.has(model.t) for entry in (*G, *form.matrix, *form.offset))
+        if all_zero(list(product - product.T)) is not True or varying:
+            raise InputError(
+                f'{model.source}: option theorem: "theorem-6" needs constant coefficients and a symmetric G^-1 D; '
+                'take "theorem-4"'
+            )
+
+
+def init(prepared: Prepared, prior: Any) -> State:
+    """Return the state at the model's start."""
+    return one_shot.init(prepared, prior)
+
+
+def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
+    """Advance one interval; nothing cancels in the stepwise form."""
+    if isinstance(prepared, one_shot.Prepared):
+        return one_shot.step(prepared, k, state, values)
+    moved, info = families.step(prepared, k, families.State(*state[:12]), values)
+    return State(*moved, *state[12:]), info._replace(health={"lost_digits": 0.0, **info.health})
+
+
+def density(prepared: Prepared, state: State) -> Density:
+    """Return the posterior."""
+    if isinstance(prepared, one_shot.Prepared):
+        return one_shot.density(prepared, state)
+    return families.density(prepared, families.State(*state[:12]))
+
+
+def valid(prepared: Prepared, state: State) -> bool:
+    """Return whether the arrays of a state fit together."""
+    base = prepared.base if isinstance(prepared, one_shot.Prepared) else prepared
+    n, m = base.model.n, base.model.m
+    return families.valid(base, families.State(*state[:12])) and [np.shape(part) for part in state[12:15]] == [(n,), (n,), (m,)]
+
+
+BOUNDS: Mapping[str, tuple[float, str]] = {
+    **families.BOUNDS,
+    "lost_digits": (1e-6, 'rounding of the evidence in nats, as the statistics of one shot cancel; take form="stepwise"'),
+}
+
+METHOD: Method[Prepared, State] = Method(
+    name="hu-yau",
+    source="Hu and Yau 2002, Theorems 3 to 6, corrected; any prior: Makowski 1986",
+    exactness="exact for y that is linear between observations, and for samples; the prior to 1e-12",
+    theorem=condition,
+    options={"form": "stepwise", "theorem": "theorem-4", "tolerance": 1e-6},
+    prepare=prepare,
+    init=init,
+    step=step,
+    density=density,
+    state=State,
+    bounds=BOUNDS,
+    absolute=lambda options: bool(options["form"] == "one-shot"),
+    valid=valid,
+)

@@ -1,0 +1,97 @@
+"""The direct method for time-varying Yau systems, on a grid, in one to three states.
+
+Chen, Luo and Yau (2017), Theorems 1 to 3, corrected and freed of Assumption 2: for f = L x + l + G grad phi and a quadratic q the
+gauge u = e^phi v makes the Kolmogorov equation linear-quadratic, so that its kernel is Gaussian for any interval.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from zakai.algebra.theorems import limited_direct
+from zakai.errors import InputError
+from zakai.methods import _line
+from zakai.methods._line_system import State
+from zakai.methods._line_yau import power_series_of, yau_line_of
+from zakai.methods._protocol import Method
+from zakai.methods.yau_yau import BOUNDS, density, init, segment, step, valid
+from zakai.models.model import Model
+from zakai.models.prior import GaussianPrior, MixturePrior
+from zakai.records.schedule import Schedule
+
+
+def prepare(
+    model: Model,
+    schedule: Schedule,
+    theta: np.ndarray,
+    *,
+    kernel: str = "flow",
+    splitting: str = "strang",
+    order: int | None = None,
+    tolerance: float | None = None,
+) -> Any:
+    """Return what is prepared for a schedule.
+
+    Args:
+        model: one to three states.
+        schedule: the intervals.
+        theta: parameters (p,).
+        kernel: how the Gaussian kernel of an interval is computed: "flow", the affine Hamiltonian flow, or "power-series",
+            Theorem 3, with intervals divided where the series does not converge.  The series has no inputs: increments of an
+            affine h act as those of a nonlinear h.
+        splitting: of increments with nonlinear h.  "strang", the default: with one state the equation with y linear between
+            observations is solved to the tolerance, with more the observation acts in two halves.  "lie" is the order of the
+            papers, the transition with -h'S^-1 h / 2 inside and then exp(h'S^-1 dy).
+        order: power of the length of an interval after which the series is cut, without dividing the interval; by default the
+            first that leaves a remainder below 1e-13.
+        tolerance: bound on the error of a step: of the mean in standard deviations and of the log-likelihood; by default 1e-7
+            for one state, with substeps for 1e-9.
+
+    Raises:
+        InputError: another word, a tolerance that is out of range, or an order that is no whole number from 1.
+        ConditionError: with the series, a singular G, or a coefficient that is not analytic in time.
+    """
+    if kernel not in ("flow", "power-series"):
+        raise InputError(f'option kernel: "{kernel}" is neither "flow" nor "power-series"')
+    if splitting not in ("strang", "lie"):
+        raise InputError(f'option splitting: "{splitting}" is neither "strang" nor "lie"')
+    series = kernel == "power-series"
+    if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1 or not series):
+        raise InputError(f'option order: {order!r} must be a whole number from 1, and needs kernel="power-series"')
+    if model.n > 1:
+        from zakai.methods import _space
+
+        options: dict[str, Any] = {"splitting": splitting, "tolerance": tolerance, "kernel": kernel, "order": order}
+        return _space.prepare_direct(model, schedule, theta, **options)
+    prepared = _line.prepare(model, schedule, theta, 1e-9 if tolerance is None else tolerance)
+    prepared.promised = 1e-7 if tolerance is None else prepared.tolerance
+    yau, lie = yau_line_of(model), splitting == "lie"
+    prior = model.prior
+    origin = float(prior.mean[0]) if isinstance(prior, GaussianPrior | MixturePrior) else 0.0
+    inside = prepared.inside & (prepared.inside.all(axis=1, keepdims=True) if lie else True)
+    power_series = power_series_of(model, order) if series else None
+    prepared.kernels = yau.kernels(schedule.starts, prepared.lengths, inside, theta, lie, origin, power_series)
+    prepared.yau, prepared.lie, prepared.generous = yau, lie, 128
+    prepared.origin, prepared.series = origin, power_series
+    return prepared
+
+
+METHOD: Method[Any, Any] = Method(
+    name="limited-direct",
+    source="Chen, Luo and Yau 2017, Theorems 1-3, corrected; x-coordinate form",
+    exactness="exact between observations for every h in the class; increments with y linear between observations, with one "
+    "state to the tolerance, with more by a symmetric splitting where h is nonlinear",
+    theorem=limited_direct,
+    options={"kernel": "flow", "splitting": "strang", "order": None, "tolerance": None},
+    prepare=prepare,
+    init=init,
+    step=step,
+    density=density,
+    state=State,
+    bounds=BOUNDS,
+    shorter="raise the option tolerance",
+    valid=valid,
+    segment=segment,
+)

@@ -1,0 +1,109 @@
+"""The on-and-offline filter of Yau and Yau for any smooth system, in one to four states.
+
+Between observations the density obeys the Kolmogorov forward equation, which knows no data; what is observed multiplies it, or,
+for increments with y linear between observations, acts inside of the equation.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from zakai.algebra.theorems import any_smooth_system
+from zakai.methods import _line
+from zakai.methods._line_system import State
+from zakai.methods._protocol import Info, Infos, Method
+from zakai.models.model import Model
+from zakai.records.schedule import Schedule
+
+BOUNDS = {
+    "tolerance_ratio": (
+        1.0,
+        "by what factor the tolerance was missed: by the spectrum at the highest frequencies of the grid, mass at its edges or "
+        "below zero, the integration over time, or errors that an observation enlarges in the tails",
+    ),
+    "tail_depth": (1.0, "depth in the tails of the prediction to which an observation leads, divided by the accurate depth"),
+}
+
+
+def module_of(model: Model) -> Any:
+    """Return the module with `prepare`, `init`, `step`, `density` and `valid` for the model's number of states."""
+    if model.n == 1:
+        return _line
+    from zakai.methods import _space
+
+    return _space
+
+
+def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: float | None = None) -> Any:
+    """Return what is prepared for a schedule.
+
+    Args:
+        model: one to four states.
+        schedule: the intervals.
+        theta: parameters (p,).
+        tolerance: bound on the error of a step: of the mean in standard deviations and of the log-likelihood; by default 1e-5
+            for one state, 1e-3 for more.
+
+    Raises:
+        InputError: the tolerance is out of range.
+    """
+    if model.n > 1:
+        return module_of(model).prepare(model, schedule, theta, tolerance=tolerance)
+    return _line.prepare(model, schedule, theta, 1e-5 if tolerance is None else tolerance)
+
+
+def init(prepared: Any, prior: Any) -> Any:
+    """Return the prior on a grid."""
+    return module_of(prepared.model).init(prepared, prior)
+
+
+def step(prepared: Any, k: int, state: Any, values: np.ndarray) -> tuple[Any, Info]:
+    """Return the state after interval k and its observation, and the report."""
+    result: tuple[Any, Info] = module_of(prepared.model).step(prepared, k, state, values)
+    return result
+
+
+def segment(prepared: Any, rows: slice, state: Any, values: np.ndarray) -> tuple[list[Any], Infos]:
+    """Return the states after the intervals of a slice, and their reports."""
+    module = module_of(prepared.model)
+    if module is _line:
+        return _line.segment(prepared, rows, state, values)
+    states, infos = [], []
+    for k, observed in zip(range(rows.start, rows.stop), values, strict=True):
+        state, info = module.step(prepared, k, state, observed)
+        states.append(state)
+        infos.append(info)
+    health = {name: np.array([info.health[name] for info in infos]) for name in infos[0].health}
+    increments, means, covs = (np.array([info[i] for info in infos]) for i in range(3))
+    return states, Infos(increments, means, covs, health)
+
+
+def density(prepared: Any, state: Any) -> Any:
+    """Return the density of a state."""
+    return module_of(prepared.model).density(prepared, state)
+
+
+def valid(prepared: Any, state: Any) -> bool:
+    """Return whether the arrays of a state fit together."""
+    return bool(module_of(prepared.model).valid(prepared, state))
+
+
+METHOD: Method[Any, Any] = Method(
+    name="yau-yau",
+    source="S.-T. Yau and S.S.-T. Yau 2008; likelihood online",
+    exactness="convergent: spectral in x; with one state exact in time where no coefficient depends on t, and of fourth order in "
+    "adaptive substeps elsewhere",
+    theorem=any_smooth_system,
+    options={"tolerance": None},
+    prepare=prepare,
+    init=init,
+    step=step,
+    density=density,
+    state=State,
+    bounds=BOUNDS,
+    shorter="raise the option tolerance",
+    valid=valid,
+    segment=segment,
+)

@@ -1,0 +1,1 @@
+"""Numerical kernels that know no model: flows, grids, propagators, quadrature, complex-step derivatives."""

@@ -1,0 +1,140 @@
+"""Transitions over any time as compositions of short kernels of the heat series, on one grid.
+
+    p(t + d) = K(r) K(c)^m p(t),      d = r + m c
+
+The powers K(c)^(2^i) are kept as matrices where m is large, so that every interval costs the remainder and a few products.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numba import complex128, float64, int64
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import kernel
+from zakai.numerics.dyadic_grid import Grid
+
+SHORTEST = 1.34  # grid spacings in the standard deviation of the shortest kernel
+KEPT = 12  # short kernels of other lengths
+Array = NDArray[Any]
+
+
+@kernel([float64[::1](float64[:, ::1], float64[::1], int64), complex128[::1](complex128[:, ::1], complex128[::1], int64)])
+def repeated_band(bands: Any, values: Any, count: int) -> Any:
+    """Return the vector after `count` products with a banded matrix.
+
+        out_i = sum_e bands_ei values_(i + e - b),        e = 0, ..., 2 b
+
+    Args:
+        bands: (2 b + 1, N).
+        values: (N,).
+        count: the number of products.
+    """
+    width, size = bands.shape
+    reach = width // 2
+    now = np.zeros(size + 2 * reach, values.dtype)
+    now[reach : reach + size] = values
+    after = np.empty(size, values.dtype)
+    for _ in range(count):
+        after[:] = 0.0
+        for e in range(width):
+            band, shifted = bands[e], now[e : e + size]
+            for i in range(size):
+                after[i] += band[i] * shifted[i]
+        now[reach : reach + size] = after
+    return now[reach : reach + size].copy()
+
+
+class Series(Protocol):
+    """What is known of a short kernel: its covariance G per unit of time, (1, 1), and its values on a grid."""
+
+    @property
+    def covariance(self) -> Array:
+        """G."""
+
+    def banded(self, spacing: float, t: float, form: str = "log") -> Array:
+        """Return the kernel of a time t times the spacing, (2 b + 1, N), for the differences -b, ..., b of grid points."""
+
+
+class Kernel(NamedTuple):
+    """A short kernel by `bands` (2 b + 1, N), band e from the sources i + e - b; `defects` (N,) of the columns' masses."""
+
+    bands: Array
+    defects: Array
+
+
+class Kernels:
+    """The kernels on one grid, made when they are needed; `base` is the length whose powers are kept."""
+
+    def __init__(self, heat: Series, grid: Grid, form: str):
+        self.heat, self.grid, self.form = heat, grid, form
+        self.base = 2 * (SHORTEST * grid.spacing) ** 2 / float(heat.covariance[0, 0].real)
+        self._short: dict[float, Kernel] = {}
+        self._powers: dict[tuple[float, int], Array] = {}
+
+    def short(self, t: float) -> Kernel:
+        """Return the kernel of a time t as one series, its columns scaled to mass one."""
+        kernel = self._short.get(t)
+        if kernel is None:
+            if len(self._short) >= KEPT:
+                self._short.clear()
+            kernel = self._short[t] = self._made(t)
+        return kernel
+
+    def _made(self, t: float) -> Kernel:
+        columns = self.heat.banded(self.grid.spacing, t, self.form)
+        with np.errstate(invalid="ignore", over="ignore"):
+            mass = columns.sum(axis=0)
+            # A series that is of no use at a point, as where the drift is too fast for it, carries nothing from there.
+            good = (np.abs(mass) < 1e100) & ((mass.real > 1e-100) if self.form == "log" else True)
+        # The sum changes its sign, so that its columns may have any mass.
+        columns = np.where(good, columns, 0.0) / (np.where(good, mass, 1.0) if self.form == "log" else 1.0)
+        reach, size = len(columns) // 2, columns.shape[1]
+        padded = np.concatenate([np.zeros((len(columns), reach)), columns, np.zeros((len(columns), reach))], axis=1)
+        bands = np.stack([padded[2 * reach - e, e : e + size] for e in range(2 * reach + 1)])
+        return Kernel(bands, np.where(good, np.abs(np.where(good, mass.real, 1.0) - 1.0), 1.0))
+
+    def power(self, t: float, i: int) -> Array:
+        """Return the matrix of 2^i kernels of a time t."""
+        found = self._powers.get((t, i))
+        if found is None:
+            if i:
+                half = self.power(t, i - 1)
+                found = half @ half
+            else:
+                bands, size = self.short(t).bands, self.grid.size
+                reach = len(bands) // 2
+                matrix = np.zeros((size, size + 2 * reach), bands.dtype)
+                rows = np.arange(size)
+                for e, band in enumerate(bands):
+                    matrix[rows, rows + e] = band
+                found = matrix[:, reach : reach + size].copy()
+            self._powers[t, i] = found
+        return found
+
+    def repeated(self, values: Array, t: float, count: int) -> Array:
+        """Apply `count` kernels of a time t."""
+        if 100 * count < self.grid.size**2 * count.bit_length():  # fewer operations than powers of a matrix take
+            bands = self.short(t).bands
+            return np.asarray(repeated_band(bands, values.astype(np.result_type(bands, values)), count))
+        for i in range(count.bit_length()):
+            if count >> i & 1:
+                values = self.power(t, i) @ values
+        return values
+
+    def moved(self, values: Array, t: float, substeps: int | None) -> tuple[Array, Array, float]:
+        """Return the values after a time t, the same with kernels twice as long, and the defect of the kernels' mass."""
+        if substeps is None:
+            count = max(int(t / self.base) - 1, 0)
+            rest = t - count * self.base
+            fine, coarse = self.repeated(values, 0.5 * rest, 2), self.repeated(values, rest, 1)
+            if count:
+                fine, coarse = self.repeated(fine, 0.5 * self.base, 2 * count), self.repeated(coarse, self.base, count)
+            one, total = self.short(rest), count + 1
+        else:
+            one, total = self.short(t / substeps), substeps
+            coarse = self.repeated(values, t / substeps, substeps)
+            fine = self.repeated(values, 0.5 * t / substeps, 2 * substeps)
+        return fine, coarse, float(total * (one.defects @ values.real) / values.real.sum())

@@ -1,0 +1,183 @@
+"""The Kolmogorov operator of one state on a uniform grid, and its exponential.
+
+    L u = G u'' / 2 - (f u)' + V u
+
+with the derivatives of the sinc interpolant on the line and of the trigonometric interpolant on the circle: spectrally
+accurate, exact in time for every interval.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numba import complex128, float64
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import kernel
+
+Array = NDArray[Any]
+
+_TERMS = 40
+_PART = 3.0  # norm up to which one Taylor series is summed
+_DENSE = 130.0  # norm times this, above size^2, from which the exponential is computed as a matrix
+
+
+@lru_cache(maxsize=64)
+def derivatives(size: int, closed: bool) -> tuple[Array, Array]:
+    """Return the matrices (size, size) of d/dx and d^2/dx^2 for the spacing one (line) or 2 pi / size (circle)."""
+    offset = np.subtract.outer(np.arange(size), np.arange(size))
+    sign = np.where(offset % 2 == 0, 1.0, -1.0)
+    safe = np.where(offset == 0, 1, offset)
+    if closed:
+        half = np.pi * safe / size
+        first = 0.5 * sign / np.tan(half)
+        second = -0.5 * sign / np.sin(half) ** 2
+        diagonal = -(size**2) / 12.0 - 1.0 / 6.0
+    else:
+        first, second, diagonal = sign / safe, -2.0 * sign / safe**2, -(np.pi**2) / 3.0
+    first = np.where(offset == 0, 0.0, first)
+    second = np.where(offset == 0, diagonal, second)
+    first.setflags(write=False)
+    second.setflags(write=False)
+    return first, second
+
+
+def generator(closed: bool, spacing: float, covariance: Any, drift: Array, potential: Array | None = None) -> Array:
+    """Return L (N, N) for G, f (N,) and V (N,), or integrals over time of these."""
+    size = len(drift)
+    first, second = derivatives(size, closed)
+    scale = 1.0 if closed else spacing
+    matrix = (0.5 * covariance / scale**2) * second - first * (drift / scale)
+    if potential is not None:
+        matrix[np.arange(size), np.arange(size)] += potential
+    return np.asarray(matrix)
+
+
+_SIGNATURES = [
+    float64[::1](float64[:, ::1], float64[::1], float64, float64),
+    complex128[::1](complex128[:, ::1], complex128[::1], float64, float64),
+]
+
+
+@kernel(_SIGNATURES)
+def _taylor(matrix: Array, vector: Array, shift: float, norm: float) -> Array:
+    """exp(matrix + shift) vector, by Taylor series in equal parts; `norm` bounds that of the matrix."""
+    parts = max(1, int(np.ceil(norm / _PART)))
+    total = vector.copy()
+    size = total.shape[0]
+    factor = np.exp(shift / parts)
+    for _ in range(parts):
+        term = total.copy()
+        largest = 0.0
+        for i in range(size):
+            largest = max(largest, abs(total[i].real))
+        for k in range(1, _TERMS):
+            term = np.dot(matrix, term)
+            scale = 1.0 / (parts * k)
+            change = 0.0
+            for i in range(size):
+                term[i] *= scale
+                total[i] += term[i]
+                change = max(change, abs(term[i].real))
+            if change < 1e-17 * largest:
+                break
+        for i in range(size):
+            total[i] *= factor
+    return total
+
+
+def norm_of(matrix: Array) -> float:
+    """Return the norm of the real part as an operator on probabilities: the largest sum of moduli of a column."""
+    return float(np.abs(matrix.real).sum(axis=0).max())
+
+
+def exponential_action(matrix: Array, vector: Array) -> tuple[Array, float]:
+    """Return exp(matrix) vector, and an estimate of its relative rounding error.
+
+    Args:
+        matrix: (N, N), real, or complex with an infinitesimal imaginary part.
+        vector: (N,).
+    """
+    size = len(vector)
+    if np.iscomplexobj(matrix) != np.iscomplexobj(vector):
+        matrix, vector = matrix.astype(complex), vector.astype(complex)
+    shift = float(np.trace(matrix.real)) / size
+    centred = matrix - shift * np.eye(size)
+    norm = norm_of(centred)
+    if not np.isfinite(norm):
+        return np.full_like(vector, np.nan), np.inf
+    if norm * _DENSE <= size**2:
+        return _taylor(np.ascontiguousarray(centred), np.ascontiguousarray(vector), shift, norm), 1e-16 * (1.0 + norm)
+    squarings = int(np.ceil(np.log2(norm))) + 1
+    powers = min(squarings, 4)
+    transition = exponential(centred * 0.5**squarings) * np.exp(shift * 0.5**squarings)
+    for _ in range(squarings - powers):
+        transition = transition @ transition
+    for _ in range(2**powers):
+        vector = transition @ vector
+    return vector, 1e-16 * 2.0**squarings
+
+
+def exponential(matrix: Array) -> Array:
+    """Return exp(matrix) for a norm of at most one half, by a Taylor polynomial of degree 15 (Paterson and Stockmeyer)."""
+    one = np.eye(len(matrix))
+    second = matrix @ matrix
+    third = second @ matrix
+    fourth = second @ second
+    c = _INVERSE_FACTORIALS
+    total: Any = 0.0
+    for k in (12, 8, 4, 0):
+        block = c[k] * one + c[k + 1] * matrix + c[k + 2] * second + c[k + 3] * third
+        total = block if k == 12 else fourth @ total + block
+    return np.asarray(total)
+
+
+_INVERSE_FACTORIALS = 1.0 / np.cumprod(np.concatenate([[1.0], np.arange(1.0, 16.0)]))
+
+
+class Spectral:
+    """exp(tau L) for every tau where L is similar to a symmetric operator: u = exp(phi) v with G phi' = f,
+
+        v_t = G v'' / 2 - (f^2 / G + f') / 2 v = -H v,      exp(tau L) = e^phi U exp(-tau lambda) U' e^-phi.
+    """
+
+    def __init__(self, closed: bool, spacing: float, covariance: Any, potential: Array, gauge: Array):
+        """Decompose H.
+
+        Args:
+            covariance: G.
+            potential: (f^2 / G + f') / 2 at the points (N,).
+            gauge: phi (N,).
+        """
+        size = len(potential)
+        second = derivatives(size, closed)[1]
+        operator = -(0.5 * covariance / (1.0 if closed else spacing) ** 2) * second + np.diag(potential)
+        self.rates, self.modes = np.linalg.eigh(operator.real)
+        self.change = self.modes.T @ operator.imag @ self.modes if np.iscomplexobj(operator) else None
+        self.scale = np.exp(gauge - gauge.real.max())
+        self.largest = 1.0
+
+    def __call__(self, values: Array, length: float) -> tuple[Array, float]:
+        """Return exp(length L) values, and an estimate of its rounding error relative to its maximum."""
+        with np.errstate(all="ignore"):
+            inner = values / self.scale
+        reach = float(np.sqrt(np.sum(inner.real**2)))
+        if not np.isfinite(reach):
+            return values, np.inf
+        decay = np.exp(-length * self.rates)
+        coefficients = self.modes.T @ inner
+        moved = decay * coefficients
+        if self.change is not None:
+            # First order in the change of H: the divided differences of the exponential.
+            apart = self.rates[:, None] - self.rates
+            same = np.abs(apart) * length < 1e-6
+            quotient = np.where(
+                same, -length * np.sqrt(np.outer(decay, decay)), (decay[:, None] - decay) / np.where(same, 1.0, apart)
+            )
+            moved = moved + 1j * ((quotient * self.change) @ coefficients.real)
+        found = self.scale * (self.modes @ moved)
+        top = float(np.max(found.real))
+        growth = max(1.0, float(decay.max()))
+        return found, 4e-16 * reach * growth / top if top > 0 else np.inf

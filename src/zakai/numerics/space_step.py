@@ -1,0 +1,321 @@
+"""The Kolmogorov forward equation over an interval, in substeps on grids that follow the mass, with an estimate of the error.
+
+A substep is the symmetric splitting of `space_transport`, of order two.  Taken once and in two halves it gives an estimate of its
+error and, extrapolated in the logarithm, a result of order four.  Short intervals whose error is known to be small from
+earlier ones are taken in single substeps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai.numerics.space_grid import Grid, checks, deviations_in_spacings, moments, narrowest, padded
+from zakai.numerics.space_transport import (
+    Characteristics,
+    Dynamics,
+    Factor,
+    Linearisation,
+    characteristics,
+    linearised,
+    runge_kutta,
+    steps_needed,
+    transported,
+)
+from zakai.numerics.space_window import LEAST, Bounds, adjusted, enlargement, fitted_grid, padded_sizes
+
+Array = NDArray[Any]
+Potential = Callable[[Grid, float, float, bool], Factor]  # at the start (False) or the end (True) of a substep
+SUPPORT = 400  # points that are moved to see where a density goes
+TRIES = 7
+MARGIN = 0.03  # of the bounds, for a grid of short steps
+INTERPOLATED = 3e-6  # tails of the spectrum below which they may be made by interpolation
+MOST_PARTS = 512
+MOST_ENLARGED = 4.0  # times its own width that a grid may need for the noise of a substep
+NEGLIGIBLE = 1e-40  # of the maximum
+CHECKED = 64  # intervals after which the error of single substeps is measured again
+_EXTRAPOLATED = 0.5  # the error that extrapolation leaves, as a multiple of difference^(5/3)
+
+
+class Field(NamedTuple):
+    """A density `values` (*sizes), but for exp(`log_scale`), on a grid."""
+
+    values: Array
+    grid: Grid
+    log_scale: Any
+
+    @property
+    def log_mass(self) -> Any:
+        """The logarithm of the integral."""
+        return np.log(self.values.sum() * abs(np.linalg.det(self.grid.basis))) + self.log_scale
+
+
+class Control(NamedTuple):
+    """What is known of the error of a substep: `rate`, the error of a single one of length one (it grows as the cube), measured
+    for substeps of length `measured`, `age` intervals ago."""
+
+    rate: float
+    measured: float
+    age: int
+
+
+class Report(NamedTuple):
+    """The errors of an interval, relative to the density: of the splitting in time, of interpolation, at the edges, in the tails
+    of the spectrum, and the negative mass."""
+
+    splitting: float
+    interpolation: float
+    edges: float
+    tails: float
+    negative: float
+
+    def worst(self, other: Report) -> Report:
+        """Return the total of the errors of methods, and the largest of those of grids."""
+        return Report(
+            self.splitting + other.splitting,
+            # The error of interpolation changes its sign with the phase of a point between two others.
+            float(np.hypot(self.interpolation, other.interpolation)),
+            max(self.edges, other.edges),
+            max(self.tails, other.tails),
+            max(self.negative, other.negative),
+        )
+
+
+NOTHING = Report(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class _Move(NamedTuple):
+    """The linearised system, the steps of the characteristics and the target grid of a substep."""
+
+    linear: Linearisation
+    steps: int
+    target: Grid
+
+
+class Stepper:
+    """Substeps of one interval; `cache` keeps characteristics of grids and lengths that come again (autonomous systems)."""
+
+    def __init__(self, dynamics: Dynamics, bounds: Bounds, tolerance: float, cache: dict[Any, Any] | None):
+        self.dynamics, self.bounds, self.tolerance, self.cache = dynamics, bounds, tolerance, cache
+
+    def _characteristics(self, source: Grid, target: Grid, t0: float, t1: float, steps: int) -> Characteristics:
+        def make() -> Characteristics:
+            return characteristics(self.dynamics, source, target, t0, t1, steps, self.bounds.periodic)
+
+        if self.cache is None:
+            return make()
+        key = (
+            source.centre.tobytes(), source.basis.tobytes(), source.sizes,
+            target.centre.tobytes(), target.basis.tobytes(), target.sizes, t1 - t0, steps,
+        )  # fmt: skip
+        found = self.cache.get(key)
+        if found is None:
+            found = make()
+            if len(self.cache) > 32 or sum(len(v.log_volume) for v in list(self.cache.values())) > 400_000:
+                self.cache.clear()
+            self.cache[key] = found
+        return found
+
+    def _move(self, field: Field, t0: float, t1: float, potential: Potential | None) -> _Move:
+        """Choose the target grid of a substep by moving points of the density."""
+        grid, tau = field.grid, t1 - t0
+        m = moments(field.values, grid)
+        mean = grid.centre + m.mean
+        drift = self.dynamics.drift
+        with np.errstate(all="ignore"):
+            end = mean + runge_kutta(drift, mean[None], t0, t1, 1)[0, :-1]
+            jacobian = 0.5 * (self.dynamics.jacobian(mean, t0) + self.dynamics.jacobian(end, t1))
+        if not np.all(np.isfinite(jacobian)):
+            jacobian = np.zeros_like(jacobian)
+        linear = linearised(jacobian, *self.dynamics.noise(t0, t1), tau, grid.basis)
+        real = field.values.real
+        found = checks(real, grid, self.bounds.edge)
+        narrow, widths = narrowest(real, grid, m.cov.real, self.bounds.tail)
+        support = self._support(real)
+        offsets = grid.offsets[support]
+        logs = np.log(real.reshape(-1)[support] / real.max())
+        x = grid.centre + offsets
+        steps = steps_needed(self._real(), x, t0, t1, grid.basis, 0.05 * self.tolerance * np.exp(-0.5 * logs))
+        moved = runge_kutta(self._real().drift, x, t0, t1, steps)
+        good = np.isfinite(moved).all(axis=1)
+        if not good.any():
+            return _Move(linear, steps, grid)
+        offsets, logs, moved = offsets[good], logs[good], moved[good]
+        noise = linear.noise.real
+        shift = np.abs(moved[:, :-1] @ np.linalg.inv(grid.basis).T).max()
+        spreads = np.diagonal(noise) / np.maximum(np.diagonal(m.cov.real), 1e-300)
+        holds = bool(np.all(found.edges <= 0.5 * self.bounds.edge) and np.all(found.tails <= 0.5 * self.bounds.tail))
+        short = shift < 1.5 and spreads.max() < 0.2
+        if short and holds and self._fits(found.used, widths, grid):
+            return _Move(linear, steps, grid)
+        # A grid that can stay for many short steps is worth more points.
+        spare = MARGIN if short and spreads.max() < 0.05 else 1.0
+        bounds = self.bounds._replace(edge=spare * self.bounds.edge, tail=spare * self.bounds.tail)
+        target = fitted_grid(offsets + moved[:, :-1], logs, grid.centre, noise, narrow, bounds, grid)
+        return _Move(linear, steps, target)
+
+    def _real(self) -> Dynamics:
+        """The dynamics without derivatives, for decisions."""
+
+        def drift(x: Array, t: Any) -> Array:
+            return np.asarray(self.dynamics.drift(x, t).real)
+
+        return self.dynamics._replace(drift=drift)
+
+    def _support(self, real: Array) -> Array:
+        """Return the numbers of some points that cover the support of a density."""
+        stride = max(1, int(np.ceil((real.size / (4.0 * SUPPORT)) ** (1 / real.ndim))))
+        used = np.zeros(real.shape, bool)
+        used[tuple(slice(s // 2 % stride, None, stride) for s in real.shape)] = True
+        used &= real > MARGIN * self.bounds.edge * real.max()
+        used.flat[int(np.argmax(real))] = True
+        return np.flatnonzero(used)
+
+    def _fits(self, used: Array, widths: Array, grid: Grid) -> bool:
+        """Return whether a grid is neither too wide nor too fine for its density."""
+        sizes = np.array(grid.sizes)
+        needed = np.maximum((used[:, 1] - used[:, 0] + 4) * np.minimum(self.bounds.spacings / widths, 1.0), LEAST[grid.n])
+        return bool(np.prod(np.minimum(needed / sizes, 1.0)) > 0.55)
+
+    def _apply(
+        self, field: Field, t0: float, t1: float, move: _Move, potential: Potential | None, target: Grid | None = None
+    ) -> Field:
+        goal = move.target if target is None else target
+        sizes = padded_sizes(field.grid, move.linear.before.real, self.bounds)
+        field = Field(*padded(field.values, field.grid, sizes), field.log_scale)
+        moved = self._characteristics(field.grid, goal, t0, t1, move.steps)
+        before = potential(field.grid, t0, t1, False) if potential else None
+        after = potential(goal, t0, t1, True) if potential else None
+        values, top = transported(field.values, field.grid, goal, moved, move.linear, before, after)
+        return Field(values, goal, field.log_scale + top)
+
+    def limit(self, field: Field, t0: float, tau: float) -> float:
+        """Return the longest substep, at most tau, whose noise a density can be spread by on a few times its own grid."""
+        grid = field.grid
+        mean = grid.centre + moments(field.values.real, grid).mean
+        for _ in range(80):
+            with np.errstate(all="ignore"):
+                jacobian = self.dynamics.jacobian(mean, t0).real
+            jacobian = jacobian if np.all(np.isfinite(jacobian)) else np.zeros_like(jacobian)
+            G, falling = self.dynamics.noise(t0, t0 + tau)
+            linear = linearised(jacobian, G.real, falling.real, tau, grid.basis)
+            if enlargement(grid, linear.before, self.bounds) <= MOST_ENLARGED:
+                break
+            tau *= 0.5
+        return tau
+
+    def single(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, _Move, Report]:
+        """Return the density after one substep, on a grid that fits it."""
+        move = self._move(field, t0, t1, potential)
+        before = np.full(field.grid.n, np.inf)
+        for attempt in range(TRIES):
+            result = self._apply(field, t0, t1, move, potential)
+            real = result.values.real
+            found = checks(real, result.grid, self.bounds.edge)
+            wide = found.edges > 3 * self.bounds.edge
+            # What interpolation adds to the spectrum does not decrease with the spacing.
+            coarse = (found.tails > self.bounds.tail) & ((found.tails < 0.3 * before) | (found.tails > INTERPOLATED))
+            if attempt == TRIES - 1 or not (wide.any() or coarse.any()) or not np.isfinite(found.tails).all():
+                break
+            ends = 0.2 * np.where(wide, 1.0, 0.0)
+            finer = np.where(coarse, np.clip(self.bounds.spacings / deviations_in_spacings(found.tails), 1.1, 2.0), 1.0)
+            better = adjusted(result.grid, ends, ends, finer, self.bounds)
+            if better is None:
+                break
+            before = np.where(coarse, found.tails, before)
+            move = move._replace(target=better)
+        return result, move, self._report(field, found.edges, found.tails, real)
+
+    def _report(self, field: Field, edges: Array, tails: Array, real: Array) -> Report:
+        deviations = deviations_in_spacings(tails)
+        interpolation = float(np.sum(1e-4 / deviations**6))
+        negative = float(-np.minimum(real, 0.0).sum() / real.sum())
+        return Report(0.0, interpolation, float(edges.max()), float(tails.max()), negative)
+
+    def double(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report, float]:
+        """Return the extrapolated density after two halves of a substep, and the difference from the whole substep."""
+        middle = 0.5 * (t0 + t1)
+        first, _, one = self.single(field, t0, middle, potential)
+        fine, _, two = self.single(positive(first), middle, t1, potential)
+        move = self._move(field, t0, t1, potential)
+        coarse = self._apply(field, t0, t1, move, potential, fine.grid)
+        values, difference = extrapolated(fine.values, coarse.values, coarse.log_scale - fine.log_scale)
+        return Field(values, fine.grid, fine.log_scale), one.worst(two), difference
+
+
+def positive(field: Field) -> Field:
+    """Return the density without its negative values, and without values so small that arithmetic with them is slow."""
+    real = field.values.real
+    return field._replace(values=np.where(real > NEGLIGIBLE * real.max(), field.values, 0.0))
+
+
+def extrapolated(fine: Array, coarse: Array, log_ratio: Any) -> tuple[Array, float]:
+    """Return fine (fine / coarse)^(1/3), the extrapolation of an error of order two, and the relative difference."""
+    coarse = coarse * np.exp(log_ratio)
+    difference = float(np.abs(fine.real - coarse.real).sum() / np.abs(fine.real).sum())
+    good = (fine.real > 0) & (coarse.real > 0.2 * fine.real) & (coarse.real < 5.0 * fine.real)
+    ratio = np.where(good, fine, 1.0) / np.where(good, coarse, 1.0)
+    return np.where(fine.real > 0, fine * np.exp(np.log(ratio) / 3), 0.0), difference
+
+
+def advance(
+    stepper: Stepper,
+    field: Field,
+    t0: float,
+    tau: float,
+    potential: Potential | None,
+    control: Control,
+    allowed: float,
+    least: int = 1,
+) -> tuple[Field, Report, Control]:
+    """Return the density after the interval from t0 of length tau, with an error of the splitting of about `allowed`.
+
+    `least` is the number of substeps that resolve the coefficients' variation in time.
+    """
+    if tau <= 0:
+        return field, NOTHING, control
+    known = np.isfinite(control.rate) and control.age < CHECKED and tau <= 2 * control.measured
+    error = control.rate * tau**3 if known else np.inf
+    singles = np.ceil(np.sqrt(error / allowed)) if np.isfinite(error) else np.inf
+    doubles = max(1.0, np.ceil((_EXTRAPOLATED * (0.75 * min(error, 1.0)) ** (5 / 3) / allowed) ** 0.25)) if known else 1.0
+    singles, doubles = max(singles, 2.0 * least if least > 1 else 1.0), max(doubles, least)
+    if singles <= 3 * doubles and stepper.limit(field, t0, tau / singles) >= tau / singles:
+        parts, report = int(singles), NOTHING
+        for i in range(parts):
+            field, _, more = stepper.single(field, t0 + tau * i / parts, t0 + tau * (i + 1) / parts, potential)
+            field, report = positive(field), report.worst(more)
+        return field, report._replace(splitting=error / parts**2), control._replace(age=control.age + 1)
+    if control.measured > 0 and tau > 2 * control.measured:
+        doubles = max(doubles, np.ceil(min(tau / (1.5 * control.measured), MOST_PARTS)))
+    return _adaptively(stepper, field, t0, tau, potential, int(doubles), allowed, 1.0 / least)
+
+
+def _adaptively(
+    stepper: Stepper, field: Field, t0: float, tau: float, potential: Potential | None, parts: int, allowed: float, longest: float
+) -> tuple[Field, Report, Control]:
+    """Return the density after an interval in extrapolated substeps whose lengths follow from the error of each."""
+    done, length, report, rate, count = 0.0, 1.0 / parts, NOTHING, 0.0, 0
+    while done < 1 - 1e-12:
+        length = min(length, longest, 1 - done)
+        length = min(length, stepper.limit(field, t0 + tau * done, tau * length) / tau)
+        if 1 - done - length < 0.3 * length:
+            length = 1 - done if 1 - done <= 1.3 * length else 0.5 * (1 - done)
+        begin, end = t0 + tau * done, t0 + tau * (done + length)
+        result, more, difference = stepper.double(field, begin, end, potential)
+        if not np.isfinite(difference):
+            difference = 10.0
+        error = _EXTRAPOLATED * difference ** (5 / 3)
+        wanted = allowed * length
+        change = float(np.clip(0.9 * (wanted / max(error, 1e-30)) ** 0.25, 0.2, 3.0))
+        if error > 3 * wanted and count < MOST_PARTS and length > 1e-6:
+            length *= min(change, 0.7)
+            count += 1
+            continue
+        field, report = positive(result), report.worst(more._replace(splitting=error))
+        rate = max(rate, difference * (4 / 3) / (tau * length) ** 3)
+        done, count = done + length, count + 1
+        last, length = length, length * change
+    return field, report, Control(rate, tau * last, 0)

@@ -1,0 +1,239 @@
+"""One substep of the Kolmogorov forward equation on grids, with a potential: a symmetric splitting.
+
+    u_t = -div(f u) + G : Hess u / 2 + V u
+
+    exp(b/6) D' exp(b/3 - tau g/144) T exp(b/3 - tau g/144) D exp(b/6),     b = integral of V,  g = grad b . G grad b
+
+T moves along the characteristics of f, exactly but for the interpolation.  D' and D spread by the two halves of the noise of the
+system that is linearised at the mean, so that the splitting is exact for linear f and V = 0, singular G included; the factors
+are Chin's (1997), of fourth order where diffusion and V alone do not commute.  The splitting is symmetric, of order two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai.numerics.space_grid import (
+    Grid,
+    Places,
+    filtered,
+    gather,
+    gaussian_response,
+    places,
+    relative_index,
+    spread,
+    transformed,
+)
+
+Array = NDArray[Any]
+_TERMS = 12
+_LARGEST = 4.0  # of tau L
+_MOST_STEPS = 256
+
+
+class Dynamics(NamedTuple):
+    """`drift(x, t)` gives f and its divergence (J, n + 1) at points (J, n), `jacobian(x, t)` (n, n) at one point, `noise(t0, t1)`
+    the averages of G and of (1 - s) G over an interval; `varying` tells whether f depends on t."""
+
+    drift: Callable[[Array, Any], Array]
+    jacobian: Callable[[Array, Any], Array]
+    noise: Callable[[float, float], tuple[Array, Array]]
+    varying: bool
+
+
+def runge_kutta(
+    drift: Callable[[Array, Any], Array],
+    x: Array,
+    t0: float,
+    t1: float,
+    steps: int,
+    beyond: Callable[[Array], Array] | None = None,
+) -> Array:
+    """Return the displacement and the integral of the divergence (J, n + 1) along characteristics from t0 to t1, by steps of
+    the classical formula of order four.
+
+    Points for which `beyond` is true after a step are given up: their displacement is not a number.
+    """
+    count, n = x.shape
+    h = (t1 - t0) / steps
+    x = np.asfortranarray(x)
+    alive: Array | None = None
+    moved = np.zeros((), float)
+    for i in range(steps):
+        t = t0 + i * h
+        start = x + moved[:, :n] if i else x
+        k1 = drift(start, t)
+        k2 = drift(start + (0.5 * h) * k1[:, :n], t + 0.5 * h)
+        k3 = drift(start + (0.5 * h) * k2[:, :n], t + 0.5 * h)
+        k4 = drift(start + h * k3[:, :n], t + h)
+        k2 = k2 + k3
+        k2 *= 2.0
+        k2 += k1
+        k2 += k4
+        k2 *= h / 6
+        moved = moved + k2
+        if beyond is not None and i < steps - 1 and (steps < 8 or i % 4 == 1):
+            keep = ~beyond(x + moved[:, :n])
+            if keep.sum() < 0.8 * len(keep):
+                alive = np.flatnonzero(keep) if alive is None else alive[keep]
+                x, moved = np.asfortranarray(x[keep]), np.asfortranarray(moved[keep])
+                if not len(x):
+                    break
+    if alive is None:
+        return moved
+    result = np.full((count, n + 1), np.nan, moved.dtype)
+    result[alive] = moved
+    return result
+
+
+def steps_needed(dynamics: Dynamics, x: Array, t0: float, t1: float, scale: Array, tolerance: Array) -> int:
+    """Return how many Runge-Kutta steps move the points x (J, n) to `tolerance` (J,) of `scale` (n, n)."""
+    n, steps = x.shape[1], 1
+    if dynamics.varying:
+        steps = _fastest(dynamics, x[:: max(1, len(x) // 8)], t0, t1)
+    inverse = np.linalg.inv(scale)
+    with np.errstate(all="ignore"):
+        last = runge_kutta(dynamics.drift, x, t0, t1, steps)[:, :n]
+        while steps < _MOST_STEPS:
+            finer = runge_kutta(dynamics.drift, x, t0, t1, 2 * steps)[:, :n]
+            error = np.abs((finer - last) @ inverse.T).max(axis=1) / tolerance
+            worst = float(np.max(np.where(np.isfinite(error), error, np.inf)))
+            if worst <= 1:
+                return steps
+            if worst <= 16:
+                return 2 * steps
+            steps, last = 2 * steps, finer
+    return steps
+
+
+def _fastest(dynamics: Dynamics, x: Array, t0: float, t1: float) -> int:
+    """Return steps that are short enough for the fastest variation of f in time that 256 irregular times show."""
+    count = 256
+    shares = (np.arange(count) + 0.5 + 0.4 * np.sin(7.0 * np.arange(count))) / count
+    with np.errstate(all="ignore"):
+        values = dynamics.drift(x[None], t0 + (t1 - t0) * shares[:, None]).real
+    low, high = values.min(axis=0), values.max(axis=0)
+    span = np.where(high - low > 1e-9 * np.maximum(np.abs(low), np.abs(high)), high - low, np.inf)
+    speed = np.abs(np.diff(values, axis=0)) / np.diff(shares)[:, None, None] / span
+    worst = float(np.nanmax(speed)) if np.isfinite(speed).any() else 1.0
+    return int(np.clip(np.ceil(worst / 4), 1, _MOST_STEPS // 2))
+
+
+class Linearisation(NamedTuple):
+    """Phi and the noise Q of a linear system over an interval."""
+
+    map: Array
+    noise: Array
+
+    @property
+    def before(self) -> Array:
+        """The half of the noise before the motion, Phi^-1 (Q / 2) Phi^-T."""
+        inverse = np.linalg.inv(self.map)
+        return np.asarray(0.5 * inverse @ self.noise @ inverse.T)
+
+
+def linearised(matrix: Array, mean: Array, falling: Array, tau: float, basis: Array) -> Linearisation:
+    """Return exp(tau L) and the integral of exp((tau - s) L) G exp((tau - s) L') for averages of G and of (1 - s) G.
+
+    Where the eigenvalues of tau L are large L is reduced: it is a means to a smaller error of the splitting only.
+    """
+    n = len(matrix)
+    rate = tau * np.abs(np.linalg.eigvals(matrix.real)).max()
+    L = matrix * (_LARGEST / rate) if rate > _LARGEST else matrix
+    size = tau * np.abs(np.linalg.inv(basis) @ L.real @ basis).sum(axis=1).max()
+    doublings = int(np.clip(np.ceil(np.log2(max(size, 1e-3))), 0, 30))
+    tau = tau / 2**doublings
+    result = term = np.eye(n) + 0.0 * matrix
+    for k in range(1, _TERMS + 4):
+        term = term @ L * (tau / k)
+        result = result + term
+    average = 2.0 * falling if doublings == 0 else mean
+    noise = tau * mean + 0.5 * tau**2 * (L @ average + average @ L.T)
+    part = (L @ mean + mean @ L.T) * (tau**2 / 2)
+    for k in range(3, _TERMS + 4):
+        part = (L @ part + part @ L.T) * (tau / k)
+        noise = noise + part
+    for _ in range(doublings):
+        noise = noise + result @ noise @ result.T
+        result = result @ result
+    return Linearisation(result, noise)
+
+
+class Characteristics(NamedTuple):
+    """Where the points of a target grid come from in the source grid, and the log of the volume's change (J,)."""
+
+    at: Places
+    log_volume: Array
+
+
+def characteristics(
+    dynamics: Dynamics, source: Grid, target: Grid, t0: float, t1: float, steps: int, periodic: tuple[bool, ...]
+) -> Characteristics:
+    """Return the characteristics that end in the points of the target grid."""
+    n, offsets = source.n, target.offsets
+    with np.errstate(all="ignore"):
+        inverse, half = np.linalg.inv(source.basis), np.array(source.sizes) / 2.0
+        closed = np.array(source.closed)
+
+        def beyond(x: Array) -> Array:
+            z = np.abs(transformed(x.real - source.centre, inverse))
+            return np.asarray(np.any(~(z < 2.0 * half) & ~closed, axis=1))
+
+        moved = runge_kutta(dynamics.drift, target.centre + offsets, t1, t0, steps, None if any(periodic) else beyond)
+        at = places(relative_index(offsets + moved[:, :n], target.centre, source, periodic), source)
+        outside = at.base < 0
+        return Characteristics(at, np.where(outside, 0.0, moved[:, n]))
+
+
+class Factor(NamedTuple):
+    """The logarithms b and -tau g / 144 of a potential's factor at the points of a grid (*sizes)."""
+
+    log: Array
+    correction: Array
+
+
+def weighed(values: Array, logs: Array) -> tuple[Array, Any]:
+    """Return the values times exp(logs - top), and top, the largest logarithm where there is mass."""
+    real = values.real
+    top = float(np.max(logs.real, where=real > 1e-14 * real.max(), initial=-np.inf))
+    if not np.isfinite(top):
+        top = 0.0
+    shifted = logs - top
+    return values * np.exp(np.where(shifted.real > 30.0, 30.0, shifted)), top
+
+
+def transported(
+    values: Array,
+    source: Grid,
+    target: Grid,
+    moved: Characteristics,
+    linear: Linearisation,
+    before: Factor | None = None,
+    after: Factor | None = None,
+) -> tuple[Array, Any]:
+    """Return the density after one substep on the target grid, and the logarithm of the factor that was taken out."""
+    top: Any = 0.0
+    inverse = np.linalg.inv(source.basis)
+    half = inverse @ linear.before @ inverse.T
+    if before is None:
+        coefficients = filtered(values, gaussian_response(half, source.sizes, spline=True))
+    else:
+        values, first = weighed(values, before.log / 6)
+        values = spread(values, source, linear.before)
+        values, second = weighed(values, before.log / 3 + before.correction)
+        coefficients = filtered(values, gaussian_response(0.0 * half, source.sizes, spline=True))
+        top = first + second
+    result = gather(coefficients, moved.at, source) * np.exp(moved.log_volume)
+    result = result.reshape(target.sizes)
+    if after is not None:
+        result, third = weighed(result, after.log / 3 + after.correction)
+        top = top + third
+    result = spread(result, target, 0.5 * linear.noise)
+    if after is not None:
+        result, fourth = weighed(result, after.log / 6)
+        top = top + fourth
+    return result, top

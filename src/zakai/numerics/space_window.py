@@ -1,0 +1,180 @@
+"""The choice of a grid that covers and resolves a density of which points and weights are known."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai.numerics.space_grid import Grid, rounded_size
+
+Array = NDArray[Any]
+LEAST = {1: 32, 2: 20, 3: 16, 4: 12}
+MOST = {1: 1024, 2: 512, 3: 128, 4: 40}
+_CORRELATED = 0.6  # correlation above which the axes follow the covariance
+_OPEN, _CLOSED = 0.6, 0.85  # shares of a circle below which an axis is cut open, and above which it is closed
+
+
+class Bounds(NamedTuple):
+    """What a grid must keep: `edge`, the share of the maximum that counts as zero; `tail`, the share of the mass allowed in the
+    spectrum at the highest frequencies; `most` points along an axis; which coordinates are `periodic`."""
+
+    edge: float
+    tail: float
+    most: int
+    periodic: tuple[bool, ...]
+
+    @property
+    def reach(self) -> float:
+        """Deviations at which a Gaussian has fallen to `edge`."""
+        return float(np.sqrt(-2 * np.log(self.edge)))
+
+    @property
+    def spacings(self) -> float:
+        """Spacings in a standard deviation that leave `tail` with a margin."""
+        return float(np.sqrt(-2 * np.log(self.tail / 30)) / np.pi)
+
+
+def fitted_grid(
+    offsets: Array, logs: Array, start: Array, noise: Array, narrowness: Array, bounds: Bounds, previous: Grid
+) -> Grid:
+    """Return a grid for points with a Gaussian N(0, noise) added.
+
+    Args:
+        offsets: the points relative to `start` (J, n).
+        logs: logarithms of their densities (J,), at most 0.
+        start: a point nearby (n,).
+        noise: covariance that is added (n, n).
+        narrowness: width of the narrowest feature along each axis, in conditional deviations of a Gaussian (n,), at most 1.
+        bounds: what the grid must keep.
+        previous: the grid of the points; its axes are kept where they still fit.
+    """
+    n = len(start)
+    weights = np.exp(logs)
+    weights = weights / weights.sum()
+    x = offsets
+    if any(previous.closed):
+        turn = np.exp(1j * np.where(previous.closed, x, 0.0))
+        middle = np.angle(weights @ turn)
+        around = middle + (x - middle) - 2 * np.pi * np.round((x - middle) / (2 * np.pi))
+        x = np.where(previous.closed, around, x)
+    mean = weights @ x
+    apart = x - mean
+    cov = (apart * weights[:, None]).T @ apart + noise
+    shape = _shape(cov, previous, bounds.periodic)
+    inverse = np.linalg.inv(shape)
+    z, spread, added = apart @ inverse.T, inverse @ cov @ inverse.T, inverse @ noise @ inverse.T
+    room = np.sqrt(np.maximum(bounds.reach**2 + 2 * np.minimum(logs, 0.0), 0.0))[:, None] * np.sqrt(np.diagonal(added))
+    low, high = (z - room).min(axis=0), (z + room).max(axis=0)
+    scale = np.sqrt(np.diagonal(spread))
+    scaled = spread / np.outer(scale, scale) + 1e-10 * np.eye(n)
+    conditional = scale / np.sqrt(np.diagonal(np.linalg.inv(scaled)))
+    spacing = conditional * np.clip(narrowness, 1e-3, 1.0) / bounds.spacings
+    return _sized(mean + start, shape, low, high, spacing, bounds, previous)
+
+
+def _shape(cov: Array, previous: Grid, periodic: tuple[bool, ...]) -> Array:
+    """Return axes (columns) of unit size in their own coordinate: aligned, the previous ones, or the Cholesky factor's."""
+    n = len(cov)
+    if any(periodic) or n == 1:
+        return np.eye(n)
+    old = previous.basis / np.diagonal(previous.basis)
+    for axes in (old, np.eye(n)):
+        inverse = np.linalg.inv(axes)
+        spread = inverse @ cov @ inverse.T
+        scale = np.sqrt(np.diagonal(spread))
+        if np.abs(spread / np.outer(scale, scale) - np.eye(n)).max() < _CORRELATED:
+            return np.asarray(axes)
+    scale = np.sqrt(np.diagonal(cov))
+    factor = np.linalg.cholesky(cov / np.outer(scale, scale) + 1e-8 * np.eye(n))
+    return np.asarray(scale[:, None] * (factor / np.diagonal(factor)) / scale)
+
+
+def _sized(centre: Array, shape: Array, low: Array, high: Array, spacing: Array, bounds: Bounds, previous: Grid | None) -> Grid:
+    n = len(centre)
+    sizes, closed, steps = [], [], np.ones(n)
+    middle = 0.5 * (low + high)
+    for d in range(n):
+        width = high[d] - low[d] + 4 * spacing[d]
+        share = width / (2 * np.pi)
+        was = previous is not None and previous.closed[d]
+        circle = bool(bounds.periodic[d]) and share > (_OPEN if was else _CLOSED)
+        if circle:
+            width, middle[d] = 2 * np.pi, 0.0
+        size = rounded_size(width / spacing[d], LEAST[n], bounds.most)
+        sizes.append(size)
+        closed.append(circle)
+        # Points to spare go to the width and to the spacing alike.
+        steps[d] = 2 * np.pi / size if circle else max(width / size, np.sqrt(width / size * min(spacing[d], 1.3 * width / size)))
+    return Grid(centre + shape @ middle, shape * steps, tuple(sizes), tuple(closed))
+
+
+def adjusted(grid: Grid, below: Array, above: Array, finer: Array, bounds: Bounds) -> Grid | None:
+    """Return the grid with its ends moved outwards by `below` and `above` (n,), shares of its width, and its spacings divided by
+    `finer` (n,); None where nothing can be changed."""
+    n = grid.n
+    sizes, basis, centre = [], grid.basis.copy(), grid.centre
+    changed = False
+    for d, size in enumerate(grid.sizes):
+        wider = 0.0 if grid.closed[d] else below[d] + above[d]
+        new = rounded_size(size * (1 + wider) * finer[d], LEAST[n], bounds.most)
+        factor = size * (1 + wider) / new
+        if grid.closed[d]:
+            factor = size / new
+        sizes.append(new)
+        changed |= new != size or wider > 0
+        centre = centre + grid.basis[:, d] * (0.5 * size * (0.0 if grid.closed[d] else above[d] - below[d]))
+        basis[:, d] *= factor
+    return Grid(centre, basis, tuple(sizes), grid.closed) if changed else None
+
+
+def padded_sizes(grid: Grid, noise: Array, bounds: Bounds) -> tuple[int, ...]:
+    """Return the sizes that a density needs to be spread by N(0, noise) without running over the ends of its grid."""
+    inverse = np.linalg.inv(grid.basis)
+    variances = np.diagonal(inverse @ noise @ inverse.T)
+    sizes = []
+    for d, size in enumerate(grid.sizes):
+        half = 0.5 * size
+        needed = bounds.reach * np.sqrt((half / bounds.reach) ** 2 + variances[d])
+        sizes.append(size if grid.closed[d] or needed < half + 1 else rounded_size(2 * needed, LEAST[grid.n], 4 * bounds.most))
+    return tuple(sizes)
+
+
+def enlargement(grid: Grid, noise: Array, bounds: Bounds) -> float:
+    """Return the largest ratio of the width that a density needs to be spread by N(0, noise) to the width of its grid."""
+    inverse = np.linalg.inv(grid.basis)
+    variances = np.diagonal(inverse @ noise @ inverse.T)
+    half = 0.5 * np.array(grid.sizes)
+    ratios = bounds.reach * np.sqrt((half / bounds.reach) ** 2 + variances) / half
+    return float(np.max(np.where(grid.closed, 1.0, ratios)))
+
+
+def whitened_grid(offsets: Array, logs: Array, noise: Array, narrowness: Array, bounds: Bounds, grid: Grid) -> Grid:
+    """Return a grid whose axes are those of `grid` times the Cholesky factor of the covariance of some of its points.
+
+    The old axes in terms of the new are a lower triangle, so that band-limited interpolation takes one axis after the other.
+
+    Args:
+        offsets: the points relative to the centre of the grid (J, n).
+        logs, noise, narrowness, bounds: as for `fitted_grid`.
+        grid: the grid of the points.
+    """
+    n = grid.n
+    inverse = np.linalg.inv(grid.basis)
+    z, added = offsets @ inverse.T, inverse @ noise @ inverse.T
+    weights = np.exp(logs)
+    weights = weights / weights.sum()
+    mean = weights @ z
+    cov = ((z - mean) * weights[:, None]).T @ (z - mean) + added
+    factor = np.linalg.cholesky(cov + 1e-12 * np.diag(np.diagonal(cov)) + 1e-20 * np.eye(n))
+    white = (z - mean) @ np.linalg.inv(factor).T
+    spread = np.linalg.inv(factor) @ added @ np.linalg.inv(factor).T
+    room = np.sqrt(np.maximum(bounds.reach**2 + 2 * np.minimum(logs, 0.0), 0.0))[:, None] * np.sqrt(np.diagonal(spread))
+    low, high = (white - room).min(axis=0), (white + room).max(axis=0)
+    spacing = np.full(n, max(float(np.min(narrowness)), 1e-3) / bounds.spacings)
+    sizes = tuple(rounded_size((high[d] - low[d]) / spacing[d] + 3, LEAST[n], bounds.most) for d in range(n))
+    width = high - low + 3 * spacing
+    steps = np.maximum(width / np.array(sizes), np.sqrt(width / np.array(sizes) * spacing))
+    centre = grid.centre + grid.basis @ (mean + factor @ (0.5 * (low + high)))
+    return Grid(centre, grid.basis @ factor * steps, sizes, grid.closed)

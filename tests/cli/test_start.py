@@ -1,0 +1,76 @@
+"""What a fresh process imports, and where the compiled kernels are kept."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from .conftest import MODEL, RECORD
+
+KERNEL = """
+from zakai.numerics.compiled import kernel
+
+@kernel("float64(float64[::1])")
+def total(values):
+    result = 0.0
+    for value in values:
+        result += value
+    return result
+"""
+USE = "import numpy, one; print(one.total(numpy.arange(4.0)))"
+HITS = "import one; print(sum(one.total.stats.cache_hits.values()))"
+
+
+def started(folder, code, **environment):
+    """A fresh process in a folder, with no cache of its own but those that are given."""
+    own = {name: value for name, value in os.environ.items() if not name.startswith(("NUMBA_CACHE", "XDG_", "PYTHONDONTWRITE"))}
+    own |= {"HOME": "/proc/nowhere", "PYTHONPATH": os.pathsep.join([str(folder), *sys.path])} | environment
+    return subprocess.Popen([sys.executable, "-c", code], cwd=folder, env=own, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def answered(process):
+    out, error = process.communicate(timeout=120)
+    assert process.returncode == 0, error
+    return out.decode(), error.decode()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "one.py").write_text(KERNEL)
+    return tmp_path
+
+
+def test_without_a_cache_folder_a_kernel_is_compiled_and_nothing_is_printed(folder):
+    (folder / "__pycache__").write_text("a file in the way")
+    assert answered(started(folder, USE)) == ("6.0\n", "")
+    assert answered(started(folder, HITS))[0] == "0\n"
+
+
+def test_two_processes_that_compile_at_once_leave_a_whole_cache(folder):
+    for process in [started(folder, USE) for _ in range(2)]:
+        assert answered(process) == ("6.0\n", "")
+    assert list(folder.glob("__pycache__/*.nbi"))
+    assert answered(started(folder, HITS))[0] == "1\n"
+
+
+def test_a_full_disk_behind_the_cache_costs_compilation_only(folder):
+    (folder / "full.py").write_text(
+        "import errno, numba.core.caching as caching\n"
+        "def save(*_): raise OSError(errno.ENOSPC, 'no space')\n"
+        "caching.IndexDataCacheFile.save = save\n"
+    )
+    assert answered(started(folder, f"import full; {USE}")) == ("6.0\n", "")
+
+
+def test_a_filter_imports_no_library_that_it_does_not_need(tmp_path):
+    (tmp_path / "model.toml").write_text(MODEL)
+    (tmp_path / "record.csv").write_text(RECORD)
+    filtered = ["filter", "model.toml", "record.csv", "-o", "result.nc", "--method", "kalman-bucy"]
+    code = (
+        f"import sys; from zakai.cli import main; assert main({filtered!r}) == 0\n"
+        "print([name for name in ('jax', 'xarray', 'pandas', 'rich', 'plotly', 'matplotlib') if name in sys.modules])"
+    )
+    assert answered(started(tmp_path, code))[0].splitlines()[-1] == "[]"

@@ -1,0 +1,180 @@
+"""Maximum likelihood finds the parameters that made a record, and says so when it cannot."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zakai
+from zakai.engine import fit as fitting
+
+LINE = dict(
+    state=["x"],
+    drift=["-a*x"],
+    observation=["c*x"],
+    observation_noise=[["s"]],
+    observation_kind="samples",
+    parameters={"a": 0.5, "c": 1.0, "s": 0.3},
+    prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
+)
+
+
+@pytest.fixture(scope="module")
+def line():
+    model = zakai.Model(**LINE)
+    return model, zakai.simulate(model, 0.1 * np.arange(1, 401), seed=0)[1]
+
+
+@pytest.fixture(scope="module")
+def fitted(line):
+    return zakai.fit(*line, parameters=["a", "s"], method="kalman-bucy", start={"a": 2.0, "s": 1.0})
+
+
+def test_a_fit_finds_what_made_the_record_within_three_standard_errors(fitted):
+    assert fitted.converged and fitted.warnings == []
+    for name, truth in (("a", 0.5), ("s", 0.3)):
+        assert abs(fitted.estimates[name] - truth) < 3 * fitted.standard_errors[name]
+    assert fitted.model.theta().tolist() == [fitted.estimates["a"], 1.0, fitted.estimates["s"]]
+
+
+def test_the_maximum_is_that_of_a_plain_scan(line, fitted):
+    model, record = line
+
+    def at(a, s):
+        return zakai.filter(model.with_parameters(a=a, s=s), record, "kalman-bucy", keep="moments").log_likelihood
+
+    a, s = fitted.estimates["a"], fitted.estimates["s"]
+    da, ds = (0.2 * fitted.standard_errors[name] for name in ("a", "s"))
+    values = np.array([[at(a + i * da, s + j * ds) for j in (-1, 0, 1)] for i in (-1, 0, 1)])
+    assert values.max() == values[1, 1]
+    assert np.isclose(values[1, 1], fitted.log_likelihood, rtol=0, atol=1e-9)
+    # The curvature of the scan is the information, to the order of the steps.
+    hessian = [(values[2, 1] - 2 * values[1, 1] + values[0, 1]) / da**2, (values[1, 2] - 2 * values[1, 1] + values[1, 0]) / ds**2]
+    assert np.allclose(np.linalg.inv(fitted.covariance).diagonal(), -np.array(hessian), rtol=0.01)
+
+
+def test_the_covariance_is_the_inverse_of_the_hessian(line, fitted):
+    likelihood = zakai.log_likelihood(*line, "kalman-bucy", ["a", "s"])
+    at = np.array([fitted.estimates["a"], fitted.estimates["s"]])
+
+    def slope(values):
+        return likelihood.value_and_gradient(values)[1]
+
+    hessian = np.array([(slope(at + e) - slope(at - e)) / 2e-5 for e in 1e-5 * np.eye(2)])
+    assert np.allclose(fitted.covariance, np.linalg.inv(-hessian), rtol=1e-4)
+
+
+def test_a_fit_prints_its_estimates(fitted):
+    page = str(fitted)
+    assert "kalman-bucy, 400 observations" in page and "a = " in page and "+-" in page and "converged" in page
+
+
+def test_a_likelihood_that_does_not_exist_turns_the_search_back(line):
+    fitted = zakai.fit(*line, parameters=["s"], method="kalman-bucy", start={"s": 40.0})
+    assert fitted.converged and abs(fitted.estimates["s"] - 0.3) < 3 * fitted.standard_errors["s"]
+
+
+def test_a_parameter_at_its_bound_is_said(line):
+    fitted = zakai.fit(*line, parameters=["a", "c"], method="kalman-bucy", start={"c": 1.6}, bounds={"c": (1.5, None)})
+    assert fitted.converged and fitted.estimates["c"] == 1.5
+    assert np.isnan(fitted.standard_errors["c"]) and fitted.standard_errors["a"] > 0
+    assert "at a bound (c = 1.5)" in fitted.warnings[0]
+
+
+def test_parameters_that_the_record_does_not_tell_apart_have_no_standard_errors(line):
+    model = zakai.Model(**{**LINE, "observation": ["c*d*x"], "parameters": {**LINE["parameters"], "d": 1.0}})
+    fitted = zakai.fit(model, line[1], parameters=["c", "d"], method="kalman-bucy")
+    assert np.isnan(list(fitted.standard_errors.values())).all()
+    assert "does not determine c, d" in fitted.warnings[0]
+
+
+def test_a_fit_that_does_not_converge_says_so(line, monkeypatch):
+    monkeypatch.setattr(fitting, "ITERATIONS", 1)
+    monkeypatch.setattr(fitting, "NEAR", 0.0)
+    fitted = zakai.fit(*line, parameters=["a"], method="kalman-bucy", start={"a": 2.0})
+    assert not fitted.converged and "did not converge" in fitted.warnings[0] and "not converged" in str(fitted)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"parameters": ["b"]}, 'there is no "b"'),
+        ({"parameters": "a"}, "not a list of names"),
+        ({"parameters": []}, "at least one"),
+        ({"parameters": ["a"], "start": {"s": 1.0}}, "not among the parameters"),
+        ({"parameters": ["a"], "start": {"a": "x"}}, "not a number"),
+        ({"parameters": ["a"], "bounds": {"a": (1, 0)}}, "not below"),
+        ({"parameters": ["a"], "bounds": {"a": 1}}, "not a pair"),
+        ({"parameters": ["a"], "bounds": {"a": (1, 2)}}, "outside its bounds"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_line(line, arguments, words):
+    with pytest.raises(zakai.InputError, match=words) as raised:
+        zakai.fit(*line, method="kalman-bucy", **arguments)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_model_without_parameters_has_nothing_to_fit():
+    model = zakai.load_model("gallery:spiral-sensor")
+    if not model.parameters:
+        record = zakai.simulate(model, [0.1, 0.2], seed=0)[1]
+        with pytest.raises(zakai.InputError, match="has none"):
+            zakai.fit(model, record)
+
+
+@pytest.mark.parametrize(
+    ("keys", "truth", "method"),
+    [
+        (dict(drift=["a*tanh(a*x)"], observation=["c*x"], parameters={"a": 0.8, "c": 1.0}), {"a": 0.8, "c": 1.0}, "benes"),
+        (dict(drift=["t/40*x"], observation=["c*x*sin(x)", "c*x*cos(x)"], parameters={"c": 1.0}), {"c": 1.0}, "limited-direct"),
+    ],
+)
+def test_nonlinear_systems_are_fitted(keys, truth, method):
+    prior = {"kind": "gaussian", "mean": [0.5], "cov": [[0.5]]}
+    model = zakai.Model(state=["x"], prior=prior, **keys)
+    _, record = zakai.simulate(model, 0.02 * np.arange(1, 301), seed=4)
+    fitted = zakai.fit(model, record, method=method, start={name: 1.3 * value for name, value in truth.items()})
+    assert fitted.converged and fitted.warnings == []
+    for name, value in truth.items():
+        assert abs(fitted.estimates[name] - value) < 3 * fitted.standard_errors[name]
+    scan = [
+        zakai.filter(fitted.model.with_parameters(c=fitted.estimates["c"] + shift), record, method).log_likelihood
+        for shift in (-1e-2, 0.0, 1e-2)
+    ]
+    assert scan[1] == max(scan) and np.isclose(scan[1], fitted.log_likelihood, rtol=0, atol=1e-9)
+
+
+def test_the_likelihood_of_a_double_well_and_its_gradient_are_right():
+    """Samples .1 to .5 apart: a plain sum over a fine grid with the matrix exponential is the reference."""
+    from scipy.linalg import expm
+
+    model = zakai.Model(
+        state=["x"], drift=["k*(x - x**3)"], process_noise=[["0.49"]], observation=["x"], observation_noise=[["0.2"]],
+        observation_kind="samples", parameters={"k": 1.0}, prior={"kind": "gaussian", "mean": [0.5], "cov": [[0.05]]},
+    )  # fmt: skip
+    times = np.cumsum(np.random.default_rng(2).uniform(0.1, 0.5, 25))
+    record = zakai.simulate(model, times, seed=3)[1]
+    x = np.linspace(-3.2, 3.2, 129)
+    d = x[1] - x[0]
+    offset = np.subtract.outer(np.arange(129), np.arange(129)) + 0.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        second = np.where(offset == 0, np.pi**2 / 3, 2 * (-1.0) ** offset / offset**2) / d**2
+
+    def reference(k):
+        f, slope = k * (x - x**3), k * (1 - 3 * x**2)
+        gauge = np.exp(k * (x**2 / 2 - x**4 / 4) / 0.49)
+        H = 0.245 * second + np.diag(0.5 * (f**2 / 0.49 + slope))
+        p, total, before = np.exp(-0.5 * (x - 0.5) ** 2 / 0.05), 0.0, 0.0
+        p /= p.sum() * d
+        for time, (z,) in zip(times, record.values, strict=True):
+            p = gauge * (expm(-(time - before) * H) @ (p / gauge)) * np.exp(-0.5 * (z - x) ** 2 / 0.2) / np.sqrt(0.4 * np.pi)
+            mass, before = p.sum() * d, time
+            p, total = p / mass, total + np.log(mass)
+        return total
+
+    likelihood = zakai.log_likelihood(model, record)
+    value, (slope,) = likelihood.value_and_gradient([1.0])
+    assert np.isclose(value, reference(1.0), rtol=0, atol=1e-6)
+    assert np.isclose(slope, (reference(1 + 1e-4) - reference(1 - 1e-4)) / 2e-4, rtol=1e-5)
+    fitted = zakai.fit(model, record)
+    assert fitted.converged and reference(fitted.estimates["k"]) >= value - 1e-6
