@@ -31,6 +31,7 @@ Array = NDArray[Any]
 _STAGES = 8
 _LONGEST = 0.5  # norm of the Hamiltonian times the length of a step
 _MOST = 1024  # steps of one interval that are computed together
+_MOST_POWER = 20  # of two: steps of one interval
 _PROBES = 65  # times of an interval at which coefficients are compared with their interpolants, at least
 _RESOLVED = 1e-11
 
@@ -143,6 +144,10 @@ def channels(
     c = coefficients(starts[:, None] + lengths[:, None] * np.linspace(0.0, 1.0, 9), waiting[:, None])
     rate = np.max(np.abs(c.matrix.real) + np.sqrt(2.0 * np.abs(c.covariance.real * c.quadratic.real)), axis=1)
     power = np.maximum(0, np.ceil(np.log2(np.maximum(rate * lengths, 1e-300) / _LONGEST))).astype(int)
+    # An interval of so many steps is given up: its error is infinite.
+    hopeless = ~(power <= _MOST_POWER) & (not steady)
+    power[hopeless] = int(np.log2(_MOST))
+    errors[hopeless] = np.inf
     while len(waiting):
         level = int(power[waiting].min())
         rows = waiting[power[waiting] == level]
@@ -158,7 +163,7 @@ def channels(
         else:
             found, rest = _divided(coefficients, starts[rows], lengths[rows], rows, 2**level)
             good = (rest < _RESOLVED) | (2**level >= _MOST)
-            errors[rows] = np.where(rest < _RESOLVED, 0.0, rest)
+            errors[rows] = np.where(hopeless[rows], np.inf, np.where(rest < _RESOLVED, 0.0, rest))
         for i, row in enumerate(rows):
             if good[i]:
                 parts[row] = tuple(part[i] for part in found)
