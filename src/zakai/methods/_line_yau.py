@@ -54,7 +54,7 @@ class YauLine:
         self.m, self.blocks = m, entries[:9]
         self._numbers = numpy_function(entries, model)
         self.gauged = yau.form.potential != 0
-        self.steady_gauge = not sp.sympify(yau.form.potential).has(model.t)
+        self.steady_gauge = not sp.sympify(yau.form.potential, strict=True).has(model.t)
         self._potential = numpy_function([yau.form.potential], model, (1,))
         self.gauge_slope = numpy_function([yau.form.gradient[0]], model, (1,))
 

@@ -43,7 +43,7 @@ class PowerSeries:
 
     def __init__(self, model: Model, blocks: Sequence[sp.Expr], order: int | None):
         self.n, self.order = model.n, order
-        self.steady = not any(sp.sympify(entry).has(model.t) for entry in blocks)
+        self.steady = not any(sp.sympify(entry, strict=True).has(model.t) for entry in blocks)
         own = 2 * model.n**2 + model.n
         size = (len(blocks) - own) // 2
         self._expansions = [
