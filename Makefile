@@ -37,7 +37,7 @@ demo: .venv/.plots
 test: .venv/.dev
 	@began=$$(date +%s); \
 	$(BIN)/ruff check . && $(BIN)/mypy src && $(BIN)/mypy --strict src/zakai/methods src/zakai/engine && \
-	$(BIN)/python -m pytest -q -n auto --dist worksteal && \
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --dist worksteal && \
 	echo "make test took $$(( $$(date +%s) - began )) s"
 
 clean:
