@@ -113,7 +113,7 @@ class GridDensity:
     ) -> np.ndarray:
         """The result in the far tails where it is near the parabola through the neighbours, else the parabola.
 
-        The sum is wrong there where the density ends at the edge of the lattice.
+        The sum is wrong there where the density ends at the edge of the grid.
         """
         shape = np.array(logs.shape)
         local, change = level.copy(), np.full(len(level), 0.02)
