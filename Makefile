@@ -7,11 +7,12 @@ EXAMPLE := examples/wind-vane
 # A half-made environment or stamp would look finished to the next run.
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help demo test clean
+.PHONY: help demo test docs clean
 
 help:
 	@echo "make demo    filter a year of real wind directions; draws $(EXAMPLE)/out/wind-vane.html"
 	@echo "make test    linter, type checker and all tests"
+	@echo "make docs    the documentation, with every example executed: docs/_build/html/index.html"
 	@echo "make clean   remove the environment and everything that was generated"
 
 # The stamps say which extras the environment holds; they are older than pyproject.toml when it must be brought up to date.
@@ -40,6 +41,11 @@ test: .venv/.dev
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --dist worksteal && \
 	echo "make test took $$(( $$(date +%s) - began )) s"
 
+docs: .venv/.dev
+	@began=$$(date +%s); rm -rf docs/_build docs/_generated docs/reference/generated; \
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m sphinx -q -W --keep-going -j 2 -b html docs docs/_build/html && \
+	echo "docs/_build/html/index.html; make docs took $$(( $$(date +%s) - began )) s"
+
 clean:
-	rm -rf .venv build dist $(EXAMPLE)/out .pytest_cache .mypy_cache .ruff_cache .jax_cache .hypothesis
+	rm -rf .venv build dist $(EXAMPLE)/out docs/_build docs/_generated docs/reference/generated .pytest_cache .mypy_cache .ruff_cache .jax_cache .hypothesis
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +

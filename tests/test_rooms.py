@@ -14,12 +14,13 @@ PACKAGES = ["models", "algebra", "numerics", "densities", "records", "methods", 
 EVERYWHERE = {"errors", "_registry"}
 SOURCE = Path(zakai.__file__).parent
 # Simulating makes a record, which belongs to a later package; imported inside functions, so that there is no circle.
-LAZILY = {("models/simulate.py", "records")}
+# A result writes its report, which belongs to a later package.
+LAZILY = {("models/simulate.py", "records"), ("engine/results.py", "report")}
 # The registry at the root imports every package by name; no import of a package stands in it.
 FILES = sorted(path.relative_to(SOURCE).as_posix() for path in SOURCE.rglob("*.py") if path.parent != SOURCE)
 JAX = {"jax", "jaxlib", "cuthbert", "cuthbertlib", "dynamax", "tensorflow_probability"}
 # Inside functions, for what a caller who uses JAX passes: a key, or the parameters under `jax.grad`.
-WHERE_JAX_IS_LOADED = {"densities/_density.py", "engine/likelihood.py"}
+WHERE_JAX_IS_LOADED = {"densities/_density.py", "engine/likelihood.py", "engine/bayes.py"}
 KNOWS_NO_MODEL = {"models", "algebra", "densities", "records", "methods", "engine"}  # what numerics/ may not import
 
 

@@ -35,13 +35,8 @@ def agrees_in_other_coordinates(seed: int) -> bool:
     return outcome(model) == (other.verdict, other.dimension, other.linear_rank)
 
 
-def test_twenty_random_systems_have_proofs_that_stand():
-    assert [seed for seed in range(20) if not has_a_proof_that_stands(seed)] == []
-
-
-@pytest.mark.parametrize("hundred", range(10))
-def test_a_thousand_random_systems_have_proofs_that_stand(hundred):
-    assert [seed for seed in range(100 * hundred, 100 * hundred + 100) if not has_a_proof_that_stands(seed)] == []
+def test_random_systems_have_proofs_that_stand():
+    assert [seed for seed in range(200) if not has_a_proof_that_stands(seed)] == []
 
 
 @pytest.mark.parametrize("name", CONJUGATED)
@@ -50,10 +45,5 @@ def test_the_algebra_of_a_known_system_is_the_same_in_other_coordinates(name):
     assert all(outcome(conjugated(model, seed)) == outcome(model) for seed in range(2))
 
 
-def test_the_algebras_of_some_random_systems_are_the_same_in_other_coordinates():
-    assert [seed for seed in range(2000, 2015) if not agrees_in_other_coordinates(seed)] == []
-
-
-@pytest.mark.parametrize("part", range(4))
-def test_the_algebras_of_two_hundred_random_systems_are_the_same_in_other_coordinates(part):
-    assert [seed for seed in range(2000 + 50 * part, 2050 + 50 * part) if not agrees_in_other_coordinates(seed)] == []
+def test_the_algebras_of_random_systems_are_the_same_in_other_coordinates():
+    assert [seed for seed in range(2000, 2050) if not agrees_in_other_coordinates(seed)] == []

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -126,3 +128,8 @@ def test_health_figures_of_version_0_1_are_read_by_their_new_names(zakai, tmp_pa
     health = package.load_result("old.nc").health
     assert {"tolerance_ratio", "tail_depth", "std_in_spacings"} <= set(health) and "missed" not in health
     assert health["tail_depth"].tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_the_package_is_a_command_too():
+    answer = subprocess.run([sys.executable, "-m", "zakai", "--version"], capture_output=True, text=True, timeout=60)
+    assert answer.returncode == 0 and answer.stdout == f"zakai {package.__version__}\n"

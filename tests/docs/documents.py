@@ -7,21 +7,27 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
-_BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$(?:\n+```text\n(.*?)^```$)?", re.DOTALL | re.MULTILINE)
+_BLOCK = re.compile(
+    r"^```(?:\{code-block\} )?(\w+)\n(?::caption: (\S+)\n)?(.*?)^```$(?:\n+```text\n(.*?)^```$)?", re.DOTALL | re.MULTILINE
+)
 
 
 class Block(NamedTuple):
-    """A fenced block: its language, its code, and the output that a `text` block after it shows, or None."""
+    """A fenced block: its language, its file or "", its code, and the output that a `text` block after it shows, or None."""
 
     language: str
+    file: str
     code: str
     output: str | None
 
 
-def blocks(name: str, language: str) -> list[Block]:
-    """The fenced blocks of one language in a document, in their order."""
-    found = [Block(*match.groups()) for match in _BLOCK.finditer((ROOT / name).read_text(encoding="utf-8"))]
-    return [block for block in found if block.language == language]
+def blocks(name: str, language: str = "") -> list[Block]:
+    """Return the fenced blocks of a document in their order, of one language or of all."""
+    found = [
+        Block(kind, file or "", code, output)
+        for kind, file, code, output in (match.groups() for match in _BLOCK.finditer((ROOT / name).read_text(encoding="utf-8")))
+    ]
+    return [block for block in found if language in ("", block.language)]
 
 
 def table(name: str, heading: str) -> list[tuple[str, ...]]:

@@ -8,28 +8,55 @@ import sys
 from types import ModuleType
 
 import pytest
+from executed_blocks import Session
 
 import zakai
+from docs import language
 from docs.documents import ROOT, blocks, table
 from zakai import _registry
 from zakai.algebra import theorems
 from zakai.cli import main
 from zakai.models.files import read_model
 
-DOCUMENTS = sorted(path.relative_to(ROOT).as_posix() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").glob("*/*.md"))
+DOCUMENTS = ["README.md", "docs/index.md", *PAGES]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [name for name in DOCUMENTS if blocks(name, "python")],
-)
-def test_the_python_of_a_document_runs_and_prints_what_is_shown(name, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    names: dict = {}
-    for block in blocks(name, "python"):
-        exec(compile(block.code, name, "exec"), names)
-        printed = capsys.readouterr().out
-        assert block.output is None or printed == block.output
+@pytest.mark.parametrize("name", [name for name in DOCUMENTS if blocks(name)])
+def test_the_blocks_of_a_document_run_and_print_what_is_shown(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    session = Session(tmp_path, name)
+    for block in blocks(name):
+        if block.language == "python" or name != "README.md":
+            output = session.run(block.language, block.code, block.file)
+            assert block.output is None or output.text == block.output
+
+
+def test_every_code_block_of_the_documentation_is_one_that_is_run():
+    shown = {block.language for name in PAGES for block in blocks(name)}
+    assert shown <= {"python", "sh", "toml", "text"}
+
+
+def test_every_public_name_is_in_the_reference():
+    page = (ROOT / "docs/reference/python.md").read_text()
+    listed = set(re.findall(r"^   (\w+)$", page, re.MULTILINE))
+    assert set(zakai.__all__) - {"__version__", "gallery"} <= listed
+
+
+def test_every_test_that_a_page_of_figures_names_exists():
+    page = (ROOT / "docs/reference/figures.md").read_text()
+    names = re.findall(r"`((?:tests|benchmarks)/[\w/]+\.py)`|python (benchmarks/\w+\.py)", page)
+    assert names and [name for pair in names for name in pair if name and not (ROOT / name).exists()] == []
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs"])
+def test_the_documentation_uses_the_standard_terms(name):
+    assert list(language.hits(ROOT / name)) == []
+
+
+def test_a_word_that_is_not_used_is_found(tmp_path):
+    (tmp_path / "page.md").write_text("A lattice is laid anew; bathrooms and displaying are words.")
+    assert [what for _, _, what, _ in language.hits(tmp_path)] == ["lattice", "laid", "anew"]
 
 
 def test_the_first_shell_session_runs_and_prints_what_is_shown(tmp_path, monkeypatch, capsys):
@@ -46,18 +73,18 @@ def test_the_first_shell_session_runs_and_prints_what_is_shown(tmp_path, monkeyp
 def test_every_command_and_exit_code_is_in_the_page_of_the_command(capsys):
     main(["--help"])
     commands = re.findall(r"^│ ([a-z]+) ", capsys.readouterr().out, re.MULTILINE)
-    page = (ROOT / "docs/command.md").read_text()
+    page = (ROOT / "docs/reference/command.md").read_text()
     assert len(commands) >= 6
     assert [command for command in commands if f"| `zakai {command} " not in page] == []
     for error in (zakai.InputError, zakai.ConditionError):
         assert f"| {error.exit_code} |" in page
 
 
-def test_the_methods_of_the_readme_are_those_that_exist():
-    assert [row[0] for row in table("README.md", "method")] == list(_registry.METHODS)
+def test_the_methods_of_the_reference_are_those_that_exist():
+    assert [row[0] for row in table("docs/reference/methods.md", "method")] == list(_registry.METHODS)
 
 
-MODEL = blocks("docs/model-files.md", "toml")[0].code
+MODEL = blocks("docs/reference/model-file.md", "toml")[0].code
 
 
 def test_the_model_file_that_is_shown_is_one():
@@ -65,7 +92,7 @@ def test_the_model_file_that_is_shown_is_one():
     assert read_model(model.to_toml(), "again").drift == model.drift
 
 
-@pytest.mark.parametrize(("line", "error"), table("docs/model-files.md", "the line"))
+@pytest.mark.parametrize(("line", "error"), table("docs/reference/model-file.md", "the line"))
 def test_a_wrong_line_of_a_model_file_gives_the_error_that_is_shown(line, error):
     key = line.partition("=")[0].strip()
     changed, count = re.subn(rf"^{key} *=.*$", lambda _: line, MODEL, count=1, flags=re.MULTILINE)
@@ -74,7 +101,7 @@ def test_a_wrong_line_of_a_model_file_gives_the_error_that_is_shown(line, error)
     assert str(raised.value) == f"model.toml: {error}"
 
 
-@pytest.mark.parametrize(("text", "error"), table("docs/records.md", "the file"))
+@pytest.mark.parametrize(("text", "error"), table("docs/reference/record-file.md", "the file"))
 def test_a_wrong_record_gives_the_error_that_is_shown(text, error, tmp_path):
     path = tmp_path / "record.csv"
     path.write_text(text.replace("\\n", "\n") + "\n")
@@ -86,7 +113,7 @@ def test_a_wrong_record_gives_the_error_that_is_shown(text, error, tmp_path):
 def test_every_key_of_a_model_file_is_in_its_page():
     from zakai.models.model import KEYS
 
-    rows = [row[0].strip("[]") for row in table("docs/model-files.md", "key")]
+    rows = [row[0].strip("[]") for row in table("docs/reference/model-file.md", "key")]
     assert sorted(rows) == sorted(KEYS)
 
 
@@ -123,10 +150,10 @@ def test_every_link_inside_the_repository_leads_somewhere(name):
 
 
 def test_every_misprint_of_the_errata_has_its_test():
-    tests = set(re.findall(r"^def (test_\w+)", (ROOT / "tests/errata/test_printed_formulas.py").read_text(), re.MULTILINE))
-    assert {row[3] for row in table("docs/limited-direct.md", "where")} == tests
-    later = set(re.findall(r"^def (test_\w+)", (ROOT / "tests/errata/test_hu_yau_printed.py").read_text(), re.MULTILINE))
-    assert {row[3] for row in table("docs/kalman-bucy-benes-hu-yau.md", "where")} <= later
-    text = (ROOT / "tests/errata/test_estimation_algebras_printed.py").read_text()
-    printed = set(re.findall(r"^def (test_\w+)", text, re.MULTILINE))
-    assert {row[3] for row in table("docs/estimation-algebras.md", "where")} <= printed
+    printed: set[str] = set()
+    for path in (ROOT / "tests/errata").glob("test_*printed*.py"):
+        printed |= set(re.findall(r"^def (test_\w+)", path.read_text(), re.MULTILINE))
+    rows = [row[3] for row in table("docs/explanation/errata.md", "where")]
+    assert [row for row in rows if row.startswith("test_") and row not in printed] == []
+    formulas = set(re.findall(r"^def (test_\w+)", (ROOT / "tests/errata/test_printed_formulas.py").read_text(), re.MULTILINE))
+    assert formulas <= set(rows)

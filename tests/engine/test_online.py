@@ -270,5 +270,3 @@ def test_an_outlier_of_fifty_deviations_neither_breaks_nor_freezes_the_filter(ke
     assert [k for k, _ in refused] in ([], [20]) and all("not used" in text for _, text in refused)
     # After two units of time the system has come back.
     assert np.all(abs(estimate.mean - usual.mean) < 3 * np.sqrt(np.diag(usual.cov)))
-
-

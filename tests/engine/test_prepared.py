@@ -76,7 +76,7 @@ def test_a_file_of_another_model_or_that_is_none_is_refused(tmp_path):
         with pytest.raises(zakai.InputError):
             zakai.Prepared.load(path)
     write_checkpoint(path, {**about, "versions": {}}, arrays, "prepared")
-    with pytest.raises(zakai.InputError, match="another versions"):
+    with pytest.raises(zakai.InputError, match="another version of"):
         zakai.Prepared.load(path)
     write_checkpoint(path, about, arrays)
     with pytest.raises(zakai.InputError, match="not a prepared file"):

@@ -1,12 +1,13 @@
 """What a result and a run report beside the posterior."""
 
 import logging
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import zakai
-from zakai.engine import loop
+from zakai.engine import batch
 
 PRIOR = {"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]}
 
@@ -27,14 +28,24 @@ def test_noise_that_varies_within_an_interval_is_reported_with_its_first_time(no
 def test_long_work_is_announced_with_what_would_shorten_it(monkeypatch, caplog):
     model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], prior=PRIOR)
     record = zakai.Record(0.01 * np.arange(1, 1001), np.zeros(1000), "increments")
-    monkeypatch.setattr(loop, "SURE", 0.0)
+    monkeypatch.setattr(batch, "SURE", 0.0)
     with caplog.at_level(logging.WARNING, "zakai"):
         zakai.filter(model, record)
         assert caplog.text == ""
-        monkeypatch.setattr(loop, "LONG", 0.0)
+        monkeypatch.setattr(batch, "LONG", 0.0)
         zakai.filter(model, record)
-    assert "kalman-bucy: 872 more observations take about" in caplog.text and "to shorten it," in caplog.text
+    assert "kalman-bucy: 991 more observations take about" in caplog.text and "to shorten it," in caplog.text
     assert len(caplog.records) == 1
+
+
+def test_the_first_interval_which_may_compile_does_not_count(monkeypatch, caplog):
+    model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], prior=PRIOR)
+    record = zakai.Record(0.01 * np.arange(1, 1001), np.zeros(1000), "increments")
+    clock = iter([100.0, 102.0] + [103.0] * 100)  # after the first interval, and after eight more
+    monkeypatch.setattr(batch, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    with caplog.at_level(logging.WARNING, "zakai"):
+        zakai.filter(model, record)
+    assert "991 more observations take about 248 s" in caplog.text
 
 
 def test_results_of_earlier_versions_are_read_with_their_old_names(tmp_path):

@@ -14,10 +14,10 @@ import sympy
 from sympy import Function, Matrix, Rational, Symbol, diff, exp, eye, symbols
 
 from references.flow import flow_kernel
+from references.power_series import data, single
 from references.systems import planar
 from zakai.methods import _power_series as power_series
-from zakai.methods._power_series import power_series_kernel, taylor_data
-from zakai.methods._taylor import apply, cauchy
+from zakai.numerics.series import apply, cauchy
 
 t = Symbol("t", real=True)
 x1, x2 = symbols("x1 x2", real=True)
@@ -184,15 +184,11 @@ def printed_shift_rate(B, offset):
     return cauchy(B, offset, apply)
 
 
-def data(terms=16):
-    texts = [Matrix(sympy.sympify(planar().yau[key])) for key in ("G", "L", "l", "Q", "p")]
-    return taylor_data(Symbol("t"), *texts, sympy.sympify(planar().yau["r"]), np.array(0.2), terms)
-
-
 def error(names):
     """The largest error of the named coefficients of the kernel over a tenth, against the flow."""
-    kernel, exact = power_series_kernel(data(), 0.1), dict(zip("ABCDEs", flow_kernel(planar(), 0.2, 0.3)))
-    return max(np.max(np.abs(getattr(kernel, name) - exact[name])) for name in names)
+    kernel = dict(zip("ABCDEs", single(data(planar(), 0.2, 16), 0.1)[0]))
+    exact = dict(zip("ABCDEs", flow_kernel(planar(), 0.2, 0.3)))
+    return max(np.max(np.abs(kernel[name] - exact[name])) for name in names)
 
 
 @pytest.mark.parametrize(
@@ -216,12 +212,12 @@ def test_the_kernel_is_right_as_corrected_and_wrong_as_printed(
 
 def residuals():
     """The largest coefficient of t^v, v < 12, that the series leave of the equations (48) and (49)."""
-    z = power_series.schroedinger(data())
+    z = power_series.schroedinger(data(planar(), 0.2, 16))
     A, B, _, D, E, _ = power_series._recursion(z)
     left_D, left_E = [], []
     for v in range(12):
-        rate_D = sum(2.0 * A[i] @ D[v - i] for i in range(-1, v + 2)) + z.FQFb[v] - 0.5 * z.Fp[v]
-        rate_E = sum(B[i].T @ D[v - i] for i in range(-1, v + 2))
+        rate_D = sum(2.0 * apply(A[i], D[v - i]) for i in range(-1, v + 2)) + z.FQFb[v] - 0.5 * z.Fp[v]
+        rate_E = sum(apply(np.swapaxes(B[i], -1, -2), D[v - i]) for i in range(-1, v + 2))
         left_D.append(np.max(np.abs((v + 1) * D[v + 1] - rate_D)))
         left_E.append(np.max(np.abs((v + 1) * E[v + 1] - rate_E)))
     return max(left_D), max(left_E)

@@ -52,7 +52,7 @@ def exponents(constant, printed=False):
 
 def difference(constant, printed=False):
     (m, P), A, b, c = exponents(constant, printed)
-    moved = move(gaussians(np.zeros(1), m[None], P[None]), transition(constant), np.ones(1), True)
+    moved = move(gaussians(np.zeros(1), m[None], P[None]), transition(constant), np.ones(1))
     mean, cov, log_mass = moved.mean[0], moved.cov[0], moved.log_mass[0]
     inverse = np.linalg.inv(cov)
     level = log_mass - 0.5 * mean @ inverse @ mean - 0.5 * np.linalg.slogdet(2 * np.pi * cov)[1]

@@ -370,3 +370,14 @@ def test_the_log_likelihood_has_the_gradient_of_differences(form, theorem):
     for i in range(3):
         above, below = (float(likelihood(theta + shift * np.eye(3)[i])) for shift in (1e-5, -1e-5))
         assert gradient[i] == pytest.approx((above - below) / 2e-5, rel=1e-6, abs=1e-8)
+
+
+@pytest.mark.parametrize("theorem", ["theorem-5", "theorem-6"])
+def test_a_drift_without_potential_has_the_same_filter_by_every_theorem(theorem):
+    prior = {"kind": "gaussian", "mean": [1.0], "cov": [[0.3]]}
+    model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], prior=prior)
+    record = zakai.Record([0.1, 0.3], [[0.2], [0.1]], "increments")
+    own, other = zakai.filter(model, record, "hu-yau", theorem=theorem), zakai.filter(model, record, "kalman-bucy")
+    np.testing.assert_allclose(own.mean, other.mean, atol=1e-12)
+    np.testing.assert_allclose(own.variance, other.variance, atol=1e-12)
+    assert own.log_likelihood == pytest.approx(other.log_likelihood, abs=1e-12)

@@ -3,6 +3,8 @@ sine and cosine samples of a linear system in any dimension, against importance 
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -26,19 +28,34 @@ def sensor(name, **changes):
     return zakai.Model(**(keys | changes))
 
 
-def on_a_line(name, record, nodes=2401, reach=9.0):
-    """Means, variances and evidences (K,) of dx = -x/5 dt + dv, by matrices of exact transition densities."""
+LINE = np.linspace(-9.0, 9.0, 2401)
+
+
+@cache
+def transition(step):
+    """The matrix of transition densities of dx = -x/5 dt + dv, times the distance of two points."""
+    decay = np.exp(-step / 5)
+    variance = 2.5 * (1 - decay**2)
+    move = np.exp(-0.5 * (LINE[:, None] - decay * LINE) ** 2 / variance)
+    return move * (LINE[1] - LINE[0]) / np.sqrt(2 * np.pi * variance)
+
+
+@cache
+def record_of(name, seed):
+    return zakai.simulate(sensor(name), np.arange(1, 41) * 0.1, seed=seed)[1]
+
+
+@cache
+def on_a_line(name, seed):
+    """Means, variances and evidences (K,) of a record, by matrices of exact transition densities."""
     observation, noise, mean = SENSORS[name]
     h = {"x**2": np.square, "x**3": lambda x: x**3, "x**4 - x": lambda x: x**4 - x, "sin(x)": np.sin}[observation]
-    x = np.linspace(-reach, reach, nodes)
+    x, record = LINE, record_of(name, seed)
     density = np.exp(-0.5 * (x - mean[0]) ** 2)
     density /= density.sum()
     told, before = [], 0.0
     for time, value in zip(record.times, record.values[:, 0]):
-        decay = np.exp(-(time - before) / 5)
-        variance = 2.5 * (1 - decay**2)
-        move = np.exp(-0.5 * (x[:, None] - decay * x) ** 2 / variance)
-        density = move @ density * (x[1] - x[0]) / np.sqrt(2 * np.pi * variance)
+        density = transition(round(time - before, 12)) @ density
         density *= np.exp(-0.5 * (value - h(x)) ** 2 / noise) / np.sqrt(2 * np.pi * noise)
         mass = density.sum()
         density /= mass
@@ -66,10 +83,8 @@ def said(result):
 )
 def test_a_sum_is_near_the_density_or_says_that_it_is_not(name, seed):
     model = sensor(name)
-    _, record = zakai.simulate(model, np.arange(1, 41) * 0.1, seed=seed)
-    exact = on_a_line(name, record)
-    result = zakai.filter(model, record, "general-direct")
-    mean, evidence = distance(result, *exact)
+    result = zakai.filter(model, record_of(name, seed), "general-direct")
+    mean, evidence = distance(result, *on_a_line(name, seed))
     assert (mean <= 0.05 and evidence <= 0.1) or said(result)
     # With a warning too it is not far: twenty Gaussians hold these densities to a tenth of a deviation.
     assert mean <= 0.1 and evidence <= (0.3 if name == "sine" else 0.2)
@@ -79,9 +94,8 @@ def test_a_sum_is_near_the_density_or_says_that_it_is_not(name, seed):
 @pytest.mark.parametrize("components", [*(few for few in (2, 4, 6)), 10])
 def test_a_sum_of_too_few_components_says_so(name, components):
     model = sensor(name)
-    _, record = zakai.simulate(model, np.arange(1, 41) * 0.1, seed=3)
-    result = zakai.filter(model, record, "general-direct", components=components)
-    mean, evidence = distance(result, *on_a_line(name, record))
+    result = zakai.filter(model, record_of(name, 3), "general-direct", components=components)
+    mean, evidence = distance(result, *on_a_line(name, 3))
     assert (mean <= 0.05 and evidence <= 0.1) or said(result)
 
 
@@ -109,7 +123,8 @@ def paths(record, count=20000, turns=(-1, 0, 1)):
     prior = np.triu(across[:, :, 0]) + np.triu(across[:, :, 0], 1).T
     centre = np.array([m[0] for m in means])
     angle, radius = np.arctan2(z[:, 0], z[:, 1]), np.hypot(z[:, 0], z[:, 1])
-    rng, told = np.random.default_rng(0), []
+    normals, told = np.random.default_rng(0).standard_normal((count, K)), []
+    normals = np.concatenate([normals, -normals])
     for k in range(1, K + 1):
         inverse = np.linalg.inv(prior[:k, :k])
         parts = []
@@ -120,16 +135,16 @@ def paths(record, count=20000, turns=(-1, 0, 1)):
                 slope = -radius[:k] * np.sin(u - angle[:k]) / noise - inverse @ (u - centre[:k])
                 u = u + np.linalg.solve(np.diag(bend) + inverse, slope)
             root = 1.03 * np.linalg.cholesky(np.linalg.inv(np.diag(bend) + inverse))
-            e = rng.standard_normal((count, k))
-            e = np.concatenate([e, -e])
+            e = normals[:, :k]
             path = u + e @ root.T
-            logs = -0.5 * np.einsum("qi,ij,qj->q", path - centre[:k], inverse, path - centre[:k])
+            apart = path - centre[:k]
+            logs = -0.5 * (apart @ inverse * apart).sum(axis=1)
             logs += 0.5 * np.linalg.slogdet(inverse)[1] + 0.5 * (e**2).sum(axis=1) + np.log(np.diag(root)).sum()
-            logs -= 0.5 * ((z[:k, 0] - np.sin(path)) ** 2 + (z[:k, 1] - np.cos(path)) ** 2).sum(axis=1) / noise
+            logs -= 0.5 * (radius[:k] ** 2 + 1 - 2 * radius[:k] * np.cos(path - angle[:k])).sum(axis=1) / noise
             logs -= k * np.log(2 * np.pi * noise)
             weight = np.exp(logs - logs.max())
             gain = across[:k, k - 1].T @ inverse
-            state = means[k - 1] + (path - centre[:k]) @ gain.T
+            state = means[k - 1] + apart @ gain.T
             rest = np.diag(covs[k - 1] - gain @ across[:k, k - 1])
             mass, share = logs.max() + np.log(weight.mean()), weight / weight.sum()
             parts.append((mass, share @ state, share @ state**2 + rest))

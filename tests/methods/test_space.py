@@ -285,3 +285,41 @@ def test_a_prior_with_two_peaks_in_two_states():
 def test_a_prior_that_is_no_density_is_refused(log_density, words):
     with pytest.raises(InputError, match=words):
         prior_grid(log_density, 1)
+
+
+def test_a_free_angle_with_a_rate_that_is_not_observed_has_its_wrapped_gaussian():
+    """The mass spreads over many turns, so that the density is folded again and again."""
+    keys = {
+        "state": ["w", "a"], "drift": ["-0.5*w", "w + 0.3"], "process_noise": [["1", "0"], ["0", "0.5"]],
+        "observation": ["cos(a)", "sin(a)"], "observation_noise": [["1e3", "0"], ["0", "1e3"]], "observation_kind": "samples",
+        "prior": {"kind": "gaussian", "mean": [0.2, 3.0], "cov": [0.5, 0.4]},
+    }  # fmt: skip
+    model = zakai.Model(periodic=["a"], **keys)
+    times = np.array([0.5, 2.0, 6.0, 6.3, 11.0])
+    record = zakai.Record(times, np.full((5, 2), np.nan), "samples")
+    prepared, states, infos = steps(model, record, method="limited-direct")
+    exact = zakai.filter(zakai.Model(**{**keys, "observation": ["a", "w"]}), record, "kalman-bucy")
+    angles = np.linspace(-np.pi, np.pi, 41)[:-1]
+    for k, (state, info) in enumerate(zip(states, infos, strict=True), start=1):
+        law = multivariate_normal(exact.mean[k], exact.cov[k])
+        points = np.stack([np.full(40, exact.mean[k, 0] + 0.3), angles], axis=1)
+        expected = sum(law.pdf(points + [0.0, 2 * np.pi * turn]) for turn in range(-30, 31))
+        got = np.exp(_space.density(prepared, state).log_density(points))
+        assert np.abs(got - expected).max() < 1e-8 * expected.max()
+        assert abs(info.mean[0] - exact.mean[k, 0]) < 1e-9 and abs(info.cov[0, 0] / exact.cov[k, 0, 0] - 1) < 1e-9
+        resultant = np.exp(1j * exact.mean[k, 1])
+        assert exact.cov[k, 1, 1] > 30 or abs(np.angle(np.exp(1j * info.mean[1]) / resultant)) < 1e-6
+
+
+def test_an_angle_whose_prior_is_a_density_agrees_with_the_same_angle_on_a_circle():
+    model = zakai.Model(
+        state=["a", "w"], periodic=["a"], drift=["w", "-w"], process_noise=[["0.3", "0"], ["0", "0.5"]], observation=["cos(a)"],
+        observation_noise=[["0.3"]], observation_kind="samples",
+        prior={"kind": "density", "log_density": "0.5*cos(a) - w**2"},
+    )  # fmt: skip
+    record = zakai.Record([0.0, 0.5, 1.0], [[0.4], [-0.2], [0.3]], "samples")
+    _, _, first = steps(model, record, method="limited-direct")
+    _, _, second = steps(model, record, tolerance=1e-5)
+    for one, two in zip(first, second, strict=True):
+        assert np.abs(one.mean[1] - two.mean[1]) < 1e-4
+        assert abs(one.log_likelihood_increment - two.log_likelihood_increment) < 1e-4

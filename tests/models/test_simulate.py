@@ -2,6 +2,7 @@
 import numpy as np
 import pytest
 
+import zakai
 from zakai.errors import InputError
 from zakai.models import Model, gallery, load_model
 from zakai.models.prior import GaussianPrior, MixturePrior
@@ -18,11 +19,13 @@ def linear(kind, **keys):
 @pytest.mark.parametrize("name", [name for name in gallery.names() if gallery.load(name).prior is not None])
 def test_every_gallery_model_with_a_prior_can_be_simulated_and_repeated(name):
     model = load_model(f"gallery:{name}")
-    truth, record = simulate(model, np.arange(1, 31) * 0.05, seed=3)
-    again = simulate(model, np.arange(1, 31) * 0.05, seed=3)
+    inputs = zakai.Inputs([0.0, 0.4], [[1.0, 5.0], [0.0, 4.0]]) if model.inputs else None
+    truth, record = simulate(model, np.arange(1, 31) * 0.05, seed=3, inputs=inputs)
+    again = simulate(model, np.arange(1, 31) * 0.05, seed=3, inputs=inputs)
     assert truth.values.shape == (31, model.n) and record.values.shape == (30, model.m)
     assert np.array_equal(truth.values, again[0].values) and np.array_equal(record.values, again[1].values)
-    assert not np.array_equal(record.values, simulate(model, np.arange(1, 31) * 0.05, seed=4)[1].values)
+    other = simulate(model, np.arange(1, 31) * 0.05, seed=4, inputs=inputs)[1]
+    assert not np.array_equal(record.values, other.values)
     assert truth.times[0] == model.start and record.kind == model.observation_kind
 
 

@@ -48,7 +48,7 @@ def test_a_family_is_moved_and_observed_as_its_gaussians_are_one_by_one():
     slope, residual, noise = RNG.standard_normal((2, N)), RNG.standard_normal(2), np.eye(2)
     alone = [(mean + response @ s, cov, 0.0) for s in nodes]
     for _ in range(3):
-        family = move(family, own, inputs, True)
+        family = move(family, own, inputs)
         for row, value in zip(slope, residual, strict=True):
             family = observe(family, row, value)
         moved = []

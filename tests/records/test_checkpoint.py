@@ -180,7 +180,7 @@ def test_the_checkpoint_of_another_filter_is_refused_and_changes_nothing(tmp_pat
     about, arrays = read_checkpoint(path)
     about["versions"]["version_numba"] = "0.0.1"
     write_checkpoint(path, about, arrays)
-    with pytest.raises(zakai.InputError, match="another versions"):
+    with pytest.raises(zakai.InputError, match="another version of"):
         online.restore(path)
 
 

@@ -12,7 +12,7 @@ from zakai.records import Record, read_record
 
 
 def model(m=2, kind="samples", start=0.0):
-    return SimpleNamespace(m=m, observation_kind=kind, start=start)
+    return SimpleNamespace(m=m, observation_kind=kind, start=start, inputs=())
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def test_the_careful_road_gives_the_same_numbers_as_the_fast_one(read):
         (
             "time,a,b\n1,2,3\n\n2,2,3\n1.5,2,3\n",
             5,
-            "comes after the time 2.0; times must be strictly increasing",
+            "comes after the time 2.0; times must be strictly increasing: sort the rows",
         ),
         ("time,a,b\n1,2,3\n2,two,3\n3,x,y\n", 3, "'two' in column 'a' is not a number"),
         ("time,a,b\n2,2,3\n1,2,3\n3,x,y\n", 3, "strictly increasing"),

@@ -53,14 +53,14 @@ def test_the_largest_value_can_be_squared_and_is_accepted():
 
 def test_a_record_is_checked_against_its_model():
     record = Record([1.0], [[1.0, 2.0]], "path")
-    record.check(SimpleNamespace(m=2, observation_kind="path", start=0.5))
+    record.check(SimpleNamespace(m=2, observation_kind="path", start=0.5, inputs=()))
     for m, kind, start, says in [
         (1, "path", 0.5, r"shape \(1, 2\); expected \(1, 1\)"),
         (2, "rates", 0.5, "holds path; the model observes rates"),
         (2, "path", 1.0, "must be after the model's start 1.0"),
     ]:
         with pytest.raises(InputError, match=says):
-            record.check(SimpleNamespace(m=m, observation_kind=kind, start=start))
+            record.check(SimpleNamespace(m=m, observation_kind=kind, start=start, inputs=()))
 
 
 def test_a_data_frame_gives_its_time_column_or_its_index():

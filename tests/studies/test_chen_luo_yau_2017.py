@@ -11,7 +11,6 @@ from zakai.studies import chen_luo_yau_2017 as study_module
 from zakai.studies._grid_optimal import grid_optimal
 
 NAME = "chen-luo-yau-2017"
-# Whole runs have all six columns; each costs some compilations.
 SETTINGS = (study_module.Setting("standard deviation", 3.0),)
 
 
@@ -88,12 +87,11 @@ def test_the_table_and_the_pictures_are_in_the_folder(small, capsys):
     assert seen[-1][0] == seen[-1][1] and [done for done, _ in seen] == list(range(1, len(seen) + 1))
 
 
-
-
 def test_the_direct_method_is_optimal_and_the_ekf_far_from_it_on_whole_paths():
-    study = study_module.run(paths=12)
+    # Of the six columns the narrowest and the widest: euler loses no path of the first and 76 of 100 of the second.
+    narrow, wide = study_module.Setting("variance", 0.1), study_module.Setting("standard deviation", 10.0)
+    study = study_module.run(paths=8, settings=(narrow, wide))
     assert_bands(study)
-    for setting in study.figures["settings"][:1]:
-        assert setting["mse"]["ekf-stable"] > 2 * setting["mse"]["direct"]
-    narrow, _, wide = (setting["lost"] for setting in study.figures["settings"][3:])
-    assert narrow == 0 and wide >= 6
+    first, last = study.figures["settings"]
+    assert first["mse"]["ekf-stable"] > 2 * first["mse"]["direct"]
+    assert first["lost"] == 0 and last["lost"] >= 4

@@ -470,7 +470,7 @@ def test_a_scheduler_that_is_not_there_is_said(done, tmp_path, monkeypatch):
 def test_the_example_of_the_documents_is_a_study():
     root = Path(__file__).parents[2]
     example = root / "examples" / "studies" / "spiral-sensor.toml"
-    assert example.read_text().partition("name =")[2] in (root / "docs" / "studies.md").read_text()
+    assert example.read_text().partition("name =")[2] in (root / "docs" / "how-to" / "compare-filters.md").read_text()
     study = read_study(example)
     assert len(study.batches) == 40 and len(study.methods) == 3
 

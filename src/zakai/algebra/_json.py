@@ -58,6 +58,8 @@ def _equations(model: Model) -> dict[str, Any]:
         "observation": _list(model.observation),
         "observation_noise": _rows(model.observation_noise),
         "observation_kind": model.observation_kind,
+        "features": dict(model.features),
+        **{key: value for key, value in model.keys_of_features.items() if model.features},
         "parameters": {name: str(value) for name, value in model.parameters.items()},
         "functions": list(model.functions),
     }

@@ -33,11 +33,12 @@ def text(analysis: Analysis) -> str:
     """The page that `print(analysis)` shows."""
     model = analysis.model
     title = "".join(character if character.isprintable() else " " for character in model.name)
+    energy = analysis.eta
     blocks = [
         [title, "=" * len(title), *_equations(model)],
         *([["Explosion", *_wrapped("  ", str(analysis.explosion), 4)]] if analysis.explosion is not None else []),
         ["Omega_ij = d_i g_j - d_j g_i  with g = G^-1 f", *_omega(analysis)],
-        ["eta = f'G^-1 f + div f + h'S^-1 h", f"  {_SINGULAR}" if analysis.eta is None else f"  eta = {readable(analysis.eta)}"],
+        ["eta = f'G^-1 f + div f + h'S^-1 h", f"  {_undefined(model)}" if energy is None else f"  eta = {readable(energy)}"],
         ["Yau form  f = L x + l + G grad phi", *_yau_form(analysis)],
         ["Estimation algebra", *_algebra(analysis)],
     ]
@@ -66,22 +67,42 @@ def _equations(model: Model) -> Iterator[str]:
     path, _ = path_symbols(model.m, {*model.state, *model.parameters, *model.functions})
     for j in range(model.m):
         number = f"{j + 1}" if model.m > 1 else ""
-        if samples:
+        if model.log_density is not None:
+            continue
+        if samples and model.observation_family[j] != "gaussian":
+            yield f"  z{number} ~ {model.observation_family[j]}({model.observation[j]})"
+        elif samples:
             yield f"  z{number} = {model.observation[j]} + r{number}"
         else:
             yield f"  d{path[j]} = {times(model.observation[j], 'dt') or '0'} + dw{number}"
-    law = "r ~ N(0, S)" if samples else "E dw dw' = S dt"
-    yield f"  {law},  S = {_flat(model.observation_noise)};  {_MEANING[model.observation_kind]}"
+    laws = ["r ~ N(0, S)" if samples else "E dw dw' = S dt", f"S = {_flat(model.observation_noise)}"]
+    if not {"gaussian", "student-t"} & set(model.observation_family):
+        laws = []
+    if not model.cross_noise.is_zero_matrix:
+        laws += [f"E dv dw' = C dt,  C = {_flat(model.cross_noise)}"]
+    for key, j in model.family_parameters:
+        laws += [f"{key}{f' {j + 1}' if model.m > 1 else ''} = {model.family_parameters[key, j]}"]
+    if model.log_density is not None:
+        laws = [f"log p({', '.join(model.observed)} | x) = {model.log_density}"]
+    yield f"  {',  '.join(laws)}{';  ' if laws else ''}{_MEANING[model.observation_kind]}"
+    if model.inputs:
+        yield f"  known inputs ({model.input_hold} hold): {', '.join(model.inputs)}"
+    for name, interval in model.domain.items():
+        yield f"  {name} {interval} ends"
     if model.parameters:
         yield "  with " + ", ".join(f"{name} = {float(value):.10g}" for name, value in model.parameters.items())
     if model.functions:
         yield f"  undetermined: {', '.join(model.functions)}"
 
 
+def _undefined(model: Model) -> str:
+    return f"not defined: {'; '.join(model.features.values())}" if model.features else _SINGULAR
+
+
 def _omega(analysis: Analysis) -> Iterator[str]:
     omega, n = analysis.omega, analysis.model.n
     if omega is None:
-        yield f"  {_SINGULAR}"
+        yield f"  {_undefined(analysis.model)}"
     elif omega.is_zero_matrix:
         yield "  Omega = 0" + ("" if n > 1 else "  (as for every system with one state)")
     else:

@@ -18,7 +18,7 @@ from zakai.algebra.conditions import Condition
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
 from zakai.algebra.explosion import Explosion, explosion
 from zakai.algebra.observed_block import ObservedBlock, observed_block
-from zakai.algebra.theorems import THEOREMS, cached_yau_form
+from zakai.algebra.theorems import THEOREMS, cached_yau_form, conditions_of
 from zakai.algebra.yau import (
     NoYauForm,
     YauForm,
@@ -104,7 +104,7 @@ class Analysis:
 def analyze(model: Model) -> Analysis:
     """Decide, from the equations alone, which methods hold for a system and why.
 
-    `model` needs no prior, and may have undetermined functions.  Nothing numerical is loaded or run.  What can be neither
+    `model` needs no prior, and may have undetermined functions.  Nothing numerical is run.  What can be neither
     proved nor refuted is undecided, and said so.
 
     Source: Wong (1987) for Omega and eta; the source of every assumption stands beside it.
@@ -114,7 +114,7 @@ def analyze(model: Model) -> Analysis:
     """
     form = cached_yau_form(model)
     omega, energy = wong_omega(model), wong_eta(model)
-    methods = {name: theorem(model) for name, theorem in THEOREMS.items()}
+    methods = {name: conditions_of(name, model) for name in THEOREMS}
     return Analysis(
         model=model,
         omega=None if omega is None else sp.ImmutableMatrix(omega),

@@ -72,6 +72,8 @@ class Groups:
 
 def connected(model: Model, more: Callable[[Groups], None] | None = None) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
     """The places of the states and of the observations of each connected part; `more` may join some."""
+    if model.features:
+        return [(tuple(range(model.n)), tuple(range(model.m)))]
     groups, place = Groups(model), {symbol: i for i, symbol in enumerate(model.x)}
     for i, formula in enumerate([*model.drift, *model.observation]):
         used = [place[symbol] for symbol in formula.free_symbols if symbol in place]

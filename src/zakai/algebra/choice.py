@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from zakai._registry import AUTO
-from zakai.algebra import theorems
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.independent import IndependentBlock, independent_blocks
+from zakai.algebra.theorems import conditions_of
 from zakai.errors import ConditionError
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior
@@ -55,20 +55,22 @@ def chosen(model: Model, method: str) -> tuple[str, str, Mapping[str, Conditions
     Raises ConditionError, with what fails, if it does not hold, or none does.
     """
     if method != "auto":
-        conditions = theorems.theorem_of(method)(model)
+        conditions = conditions_of(method, model)
         if all_hold(conditions) is not True:
             raise ConditionError(f"{model.source}: {method} does not hold: {failure(conditions)}")
         return method, "asked for by name, and every assumption of its theorem holds", {method: conditions}
     considered: dict[str, Conditions] = {}
     for name in AUTO:
-        considered[name] = theorems.THEOREMS[name](model)
+        considered[name] = conditions_of(name, model)
         if all_hold(considered[name]) is True:
             return name, "the first method whose every assumption holds for this system", considered
-    reasons = "; ".join(f"{name}: {failure(conditions)}" for name, conditions in considered.items())
-    raise ConditionError(
-        f"{model.source}: no method holds for this system ({reasons}); "
-        "if it is named, `extended-kalman-bucy` approximates any smooth system"
-    )
+    by_reason: dict[str, list[str]] = {}
+    for name, conditions in considered.items():
+        by_reason.setdefault(failure(conditions), []).append(name)
+    reasons = "; ".join(f"{', '.join(names)}: {reason}" for reason, names in by_reason.items())
+    named = all_hold(conditions_of("extended-kalman-bucy", model)) is True
+    hint = "; if it is named, `extended-kalman-bucy` approximates any smooth system" if named else ""
+    raise ConditionError(f"{model.source}: no method holds for this system ({reasons}){hint}")
 
 
 def divided(model: Model, prior: Any, method: str = "auto", by_value: bool = True) -> Division | None:
@@ -84,9 +86,9 @@ def divided(model: Model, prior: Any, method: str = "auto", by_value: bool = Tru
         return None
     if method == "auto":
         plain = model.n <= FEW and isinstance(prior, GaussianPrior | None)
-        if plain and all_hold(theorems.THEOREMS["kalman-bucy"](model)) is True:
+        if plain and all_hold(conditions_of("kalman-bucy", model)) is True:
             return None
-    elif model.n <= MANY and all_hold(theorems.theorem_of(method)(model)) is True:
+    elif model.n <= MANY and all_hold(conditions_of(method, model)) is True:
         return None
     methods, conditions = {}, {}
     for part in dict.fromkeys(block.model for block in blocks):
@@ -95,7 +97,7 @@ def divided(model: Model, prior: Any, method: str = "auto", by_value: bool = Tru
         except ConditionError as error:
             if method == "auto" or model.n > MANY:
                 raise
-            whole = failure(theorems.theorem_of(method)(model))
+            whole = failure(conditions_of(method, model))
             raise ConditionError(f"{model.source}: {method} does not hold: {whole}; nor block by block: {error}") from None
     return Division(blocks, methods, conditions, method != "auto")
 

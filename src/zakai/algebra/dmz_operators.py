@@ -29,6 +29,8 @@ class DmzOperators:
 
     def __init__(self, model: Model, values: Mapping[sp.Symbol, sp.Expr], jets: int = 6):
         self.model = model
+        if model.features:
+            raise Unreadable(f"{'; '.join(model.features.values())}: the Zakai equation is that of another kind of model")
         given = (model.drift, model.observation, model.covariance, model.observation_noise)
         drift, h, G, S = (matrix.xreplace(dict(values)) for matrix in given)
         symbols = drift.free_symbols | h.free_symbols | G.free_symbols | S.free_symbols

@@ -213,7 +213,7 @@ def _at_other_values(model: Model, explored: _Exploration) -> tuple[Basis | None
 
 
 def _rank_of_observations(model: Model) -> int | None:
-    affine = affine_observation(model)
+    affine = None if model.features else affine_observation(model)
     return None if affine is None else int(affine[0].applyfunc(tidy).rank())
 
 

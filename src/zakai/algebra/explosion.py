@@ -9,6 +9,7 @@ import numpy as np
 
 from zakai.algebra.systems import affine_parts
 from zakai.errors import InputError
+from zakai.models.features import STATE_DEPENDENT_DIFFUSION, of_dynamics
 from zakai.models.model import Model
 from zakai.models.numeric import NumericFunction, numpy_function
 
@@ -49,7 +50,7 @@ def explosion(model: Model) -> Explosion | None:
         >>> print(explosion(zakai.load_model("gallery:lorenz")))
         None
     """
-    if affine_parts(model.drift, model.x) is not None:
+    if of_dynamics(model).keys() - {STATE_DEPENDENT_DIFFUSION} or affine_parts(model.drift, model.x) is not None:
         return None
     try:
         drift = numpy_function(model.drift, model)

@@ -18,9 +18,12 @@ import mpmath
 import sympy as sp
 from sympy.core.function import AppliedUndef
 
+from zakai.models.functions import Floor, Maximum, Minimum, TableFunction
+
 DIGITS = 60
 POINTS = 12
 SHORT = 160  # operations up to which the algebraic proof is tried
+UNDERFLOW = 80  # argument of an exponential and its like from which a sum loses it in so many digits
 LARGEST_ARGUMENT = 10**6  # of an exponential and its like
 MANY_TERMS = 5000  # of an expansion: more of them tell nobody anything
 
@@ -37,6 +40,8 @@ _FUNCTIONS = {
     sp.Abs: abs,
     sp.sign: mpmath.sign,
 }
+_EXPONENTIAL = (sp.exp, sp.erf, *_HYPERBOLIC)
+_RELATIVE = (sp.exp, sp.cosh, sp.sech, sp.csch)  # whose derivative is not much larger than they are
 _SLOW_GROWING = (sp.log, sp.Abs, sp.sign)
 _ENTIRE = (sp.sin, sp.cos, sp.sinh, sp.cosh, sp.tanh, sp.sech, sp.exp, sp.erf, sp.atan)
 
@@ -95,13 +100,14 @@ def is_quadratic(q: sp.Expr, x: Sequence[sp.Symbol]) -> bool | None:
         rng = random.Random(repr(sorted((s.name, str(v)) for s, v in point.items())))
         step = {s: mpmath.mpf(rng.randint(500, 2000)) / 1511 for s in x}
         with mpmath.workdps(DIGITS):
-            values = [evaluate(q, {s: v + k * step.get(s, 0) for s, v in point.items()}) for k in range(4)]
+            known: list[dict] = [{} for _ in range(4)]
+            values = [evaluate(q, {s: v + k * step.get(s, 0) for s, v in point.items()}, known[k]) for k in range(4)]
             if any(v is None for v in values):
                 continue
             difference = abs(values[3] - 3 * values[2] + 3 * values[1] - values[0])
             if difference > sum(abs(v) for v in values) * _margin() + _margin():
                 return False
-        vanished += 1
+            vanished += not any(_underflows(one) for one in known)
     if q.count_ops() <= SHORT:
         thirds = (sp.diff(q, a, b, c) for i, a in enumerate(x) for j, b in enumerate(x[i:], i) for c in x[j:])
         if is_in_one_piece(q, x) and all(_provably_zero(third) for third in thirds):
@@ -166,9 +172,40 @@ def _vanishes(expression: sp.Expr, point: Mapping[sp.Symbol, mpmath.mpf]) -> boo
         value = evaluate(expression, point, known)
         if value is None:
             return None
-        # What was added up anywhere inside tells how many digits a true zero could have lost.
-        scale = 1 + max((abs(v) for v in known.values() if v is not None), default=0)
-        return bool(abs(value) <= scale * _margin())
+        if abs(value) > (1 + max((abs(v) for v in known.values()), default=0)) * _margin():
+            return False
+        if abs(value) > _scale(expression, known, {}) * _margin():
+            return False
+        return None if _underflows(known) else True
+
+
+def _scale(expression: sp.Expr, known: Mapping[sp.Expr, mpmath.mpf], scales: dict[sp.Expr, mpmath.mpf]) -> mpmath.mpf:
+    """The size of what was added up inside of an expression, which tells how many digits a true zero could have lost.
+
+    It is relative where rounding is relative: a product or an exponential may be as small as it likes, and is not zero.
+    """
+    if expression not in scales:
+        size = abs(known[expression])
+        parts = [_scale(a, known, scales) for a in expression.args if a in known]
+        if isinstance(expression, sp.Add):
+            size = mpmath.fsum(parts)
+        elif isinstance(expression, sp.Mul):
+            size = mpmath.fprod(parts)
+        elif isinstance(expression, sp.Pow):
+            if expression.exp.is_Integer and expression.exp > 0:
+                size = parts[0] ** int(expression.exp)
+            elif known[expression.base]:
+                size *= (1 + mpmath.fsum(parts[1:])) * parts[0] / abs(known[expression.base])
+        elif parts:
+            inner = mpmath.fsum(parts)
+            size = size * (1 + inner) if isinstance(expression, _RELATIVE) else size + (1 + size) * inner
+        scales[expression] = size
+    return scales[expression]
+
+
+def _underflows(known: Mapping[sp.Expr, mpmath.mpf]) -> bool:
+    """Whether an exponential is so small, or its like so near to its limit, that a sum may have lost it."""
+    return any(isinstance(e, _EXPONENTIAL) and abs(known.get(e.args[0], 0)) > UNDERFLOW for e in known)
 
 
 def _is_analytic(expression: sp.Expr) -> bool:
@@ -192,7 +229,7 @@ def is_in_one_piece(expression: sp.Expr, x: Sequence[sp.Symbol]) -> bool:
     for e in sp.preorder_traversal(expression):
         if not e.has(*x):
             continue
-        if isinstance(e, sp.Abs | sp.sign | sp.asin | sp.acos):
+        if isinstance(e, sp.Abs | sp.sign | sp.asin | sp.acos | sp.atan2 | Floor | Minimum | Maximum | TableFunction):
             return False
         if isinstance(e, sp.atan) and _has_poles(e.args[0]):
             return False

@@ -10,6 +10,7 @@ from functools import lru_cache
 
 import sympy as sp
 
+from zakai import _registry
 from zakai.algebra.conditions import Condition
 from zakai.algebra.exact_theorems import benes, hu_yau, kalman_bucy
 from zakai.algebra.exponentials import wei_norman_filter
@@ -25,6 +26,8 @@ from zakai.algebra.systems import (
     yau_system,
 )
 from zakai.algebra.yau import YauForm, inverse, short
+from zakai.models import features
+from zakai.models.features import ASSUMPTIONS
 from zakai.models.model import Model
 
 _SURVEY = "Chen and Dong, survey of direct methods"
@@ -162,6 +165,31 @@ def any_smooth_system(model: Model) -> tuple[Condition, ...]:
             f"n = {model.n}",
             "the grid of this method",
         ),
+        *_in_many_states(model),
+        *_natural_ends(model),
+    )
+
+
+def _in_many_states(model: Model) -> tuple[Condition, ...]:
+    """Return what fails in two or more states, where the density moves along the characteristics of the drift."""
+    parts = [] if model.n == 1 else [*model.drift, *model.covariance]
+    jumps = [call for part in parts for call in part.atoms(*features.JUMP_FUNCTIONS) if call.has(*model.x)]
+    source, found = "the grid of this method in two or more states", []
+    if jumps:
+        words = f"a formula contains {short(str(jumps[0]))}"
+        found.append(Condition("f and g do not jump where the state changes", False, words, source))
+    if model.n > 3 and features.STATE_DEPENDENT_DIFFUSION in model.features:
+        words = f"n = {model.n}, and {model.features[features.STATE_DEPENDENT_DIFFUSION]}"
+        found.append(Condition("the state has at most three coordinates where g depends on it", False, words, source))
+    return tuple(found)
+
+
+def _natural_ends(model: Model) -> tuple[Condition, ...]:
+    """Return a condition that fails for every state with reflecting ends."""
+    return tuple(
+        Condition("the ends of the domain are natural", False, f"domain: {name} {interval}", "the grid of this method")
+        for name, interval in model.domain.items()
+        if interval.reflecting
     )
 
 
@@ -218,6 +246,22 @@ def theorem_of(name: str) -> Callable[[Model], tuple[Condition, ...]]:
     return THEOREMS[name] if name in THEOREMS else PEERS[name]
 
 
+def conditions_of(name: str, model: Model) -> tuple[Condition, ...]:
+    """Return the conditions under which a method or a peer holds for a model: the one place where that is decided.
+
+    Features of the model that the method does not handle fail first, and its theorem, which does not know them, is not asked.
+    """
+    if model.features:
+        handled = _registry.load(name).handles if name in _registry.METHODS else frozenset()
+        refused = tuple(
+            Condition(ASSUMPTIONS[feature], False, words, "what this method handles")
+            for feature, words in model.features.items()
+            if feature not in handled
+        )
+        if refused:
+            return refused
+    return theorem_of(name)(model)
+
 
 __all__ = [
     "PEERS",
@@ -227,6 +271,7 @@ __all__ = [
     "any_smooth_system",
     "benes",
     "cached_yau_form",
+    "conditions_of",
     "hu_yau",
     "gaussian_sum",
     "general_direct",

@@ -15,6 +15,7 @@ from functools import lru_cache
 from typing import Any
 
 import sympy as sp
+from sympy.polys.rings import PolyRing
 
 from zakai.algebra._evaluation import TINY, differences_vanish, values_at_random_points
 from zakai.algebra.certificates import CLOSED, GROWTH, OCONE, OMEGA, QUADRATIC, RANK, SYMBOL, Certificate
@@ -87,16 +88,29 @@ class _Plain:
     def compose(self, a: Operator, b: Operator) -> dict[tuple[int, ...], Any]:
         """sum_alpha sum_beta a_alpha (alpha over gamma) (d^gamma b_beta) d^(alpha - gamma + beta)."""
         result: dict[tuple[int, ...], Any] = {}
+        zero = (0,) * self.n
+        slopes = {zero: b}
         for alpha, left in a.items():
             for gamma in itertools.product(*(range(k + 1) for k in alpha)):
+                if gamma not in slopes:  # gamma without its last index was before it
+                    i = max(j for j, k in enumerate(gamma) if k)
+                    lower = (*gamma[:i], gamma[i] - 1, *gamma[i + 1 :])
+                    slopes[gamma] = {beta: self.slope(right, i) for beta, right in slopes[lower].items()}
                 times = math.prod(map(math.comb, alpha, gamma))
-                for beta, right in b.items():
-                    for symbol, k in zip(self.x, gamma):
-                        for _ in range(k):
-                            right = sp.diff(right, symbol) if self.ring is None else right.diff(self.ring.from_expr(symbol))
+                for beta, right in slopes[gamma].items():
                     if right != 0:
                         _accumulate(result, tuple(i - j + k for i, j, k in zip(alpha, gamma, beta)), times * left * right)
         return result
+
+    def slope(self, coefficient: Any, i: int) -> Any:
+        """The derivative of a coefficient in the i-th coordinate."""
+        return sp.diff(coefficient, self.x[i]) if self.ring is None else coefficient.diff(self.ring.gens[i])
+
+    def monomials(self, words: Mapping[tuple[int, ...], sp.Expr]) -> list[tuple[int, ...]]:
+        """The exponents of x and of the derivatives in a combination of words."""
+        if isinstance(self.ring, PolyRing):
+            return [(*m, *alpha) for alpha, c in self.total(words).items() for m in c.monoms()]
+        return [(*m, *alpha) for alpha, c in self.combination(words).items() for m in sp.Poly(c, *self.x).monoms()]
 
     def bracket(self, a: Operator, b: Operator) -> Operator:
         result = self.compose(a, b)
@@ -104,16 +118,20 @@ class _Plain:
             _accumulate(result, alpha, -c)
         return self.prepared(result)
 
-    def combination(self, words: Mapping[tuple[int, ...], sp.Expr]) -> Operator:
-        """A combination of words, with SymPy expressions for coefficients."""
+    def total(self, words: Mapping[tuple[int, ...], sp.Expr]) -> Operator:
+        """A combination of words; no coefficient is zero."""
         total: dict[tuple[int, ...], Any] = {}
         for word, number in words.items():
             factor = number if self.ring is None else sp.QQ.from_sympy(number)
             for alpha, c in self.word(word).items():
                 _accumulate(total, alpha, c * factor)
         if self.ring is not None:
-            return self.expressions({alpha: c for alpha, c in total.items() if c})
+            return {alpha: c for alpha, c in total.items() if c}
         return {alpha: e for alpha, c in total.items() if not self.is_zero(e := sp.expand(c))}
+
+    def combination(self, words: Mapping[tuple[int, ...], sp.Expr]) -> Operator:
+        """A combination of words, with SymPy expressions for coefficients."""
+        return self.expressions(self.total(words))
 
     def expressions(self, operator: Operator) -> dict[tuple[int, ...], Any]:
         return {alpha: c if self.ring is None else c.as_expr() for alpha, c in operator.items()}
@@ -228,7 +246,7 @@ def _grows(plain: _Plain, certificate: Certificate) -> bool:
         return False
     monomials = []
     for words in certificate.elements:
-        support = [(*m, *alpha) for alpha, c in plain.combination(words).items() for m in sp.Poly(c, *plain.x).monoms()]
+        support = plain.monomials(words)
         heaviest = max(sum(w * k for w, k in zip(weights, m)) for m in support)
         leading = [m for m in support if sum(w * k for w, k in zip(weights, m)) == heaviest]
         if len(leading) > 1:

@@ -17,6 +17,7 @@ import sympy as sp
 
 from zakai.algebra._readable import readable
 from zakai.algebra.identities import MANY_TERMS, grouped, is_quadratic, is_zero, normal_form, terms_of, tidy
+from zakai.models.features import of_dynamics
 from zakai.models.model import Model
 
 DEEPEST = 4  # functions inside of each other that are integrated
@@ -60,7 +61,7 @@ def inverse(matrix: sp.MatrixBase) -> sp.MatrixBase:
 
 def wong_omega(model: Model) -> sp.Matrix | None:
     """Wong's matrix omega_ij = d_i g_j - d_j g_i with g = G^-1 f, or None where G is singular."""
-    if is_zero(model.covariance.det()) is not False:
+    if of_dynamics(model) or is_zero(model.covariance.det()) is not False:
         return None
     g = inverse(model.covariance) * model.drift
     return curl(g, model.x)
@@ -86,6 +87,9 @@ def tidy_state(expression: sp.Expr, x: tuple[sp.Symbol, ...]) -> sp.Expr:
 def yau_form(model: Model) -> YauForm | NoYauForm:
     """The Yau form of the drift; affine parts, and quadratic parts of the potential, are kept in L and l."""
     x, n = model.x, model.n
+    features = of_dynamics(model)
+    if features:
+        return NoYauForm(False, f"{'; '.join(features.values())}: the Yau form is for f(x, t) with g(t)")
     matrix, offset, rest = _affine_and_rest(model.drift, x)
     if all(term == 0 for term in rest):
         zero = sp.ImmutableMatrix.zeros(n, 1)
@@ -187,12 +191,25 @@ def _known_antiderivative(function: sp.Expr, symbol: sp.Symbol) -> sp.Expr | Non
     }
     rule = rules.get(function.func)
     if rule is None:
-        return None
+        return _logarithm(function, symbol)
     argument = function.args[0]
     slope = sp.diff(argument, symbol)
     if slope.has(symbol) or slope == 0:
         return None
     return rule(argument) / slope
+
+
+def _logarithm(function: sp.Expr, symbol: sp.Symbol) -> sp.Expr | None:
+    """Return c log D where the function is c D' / D."""
+    denominator = sp.denom(sp.together(function))
+    if not denominator.has(symbol) or terms_of(denominator) > 8:
+        return None
+    for inner in sp.Mul.make_args(sp.factor(denominator)):
+        if inner.is_Add and inner.has(symbol):
+            ratio = sp.powsimp(sp.cancel(function / sp.diff(sp.log(inner), symbol)))
+            if not ratio.has(symbol):
+                return ratio * sp.log(inner)
+    return None
 
 
 def q_without_observation(model: Model, form: YauForm) -> sp.Expr:
@@ -215,8 +232,8 @@ def observation_energy(model: Model) -> sp.Expr:
 
 
 def eta(model: Model) -> sp.Expr | None:
-    """Wong's eta = f'G^-1 f + div f + h'S^-1 h, or None where G is singular."""
-    if is_zero(model.covariance.det()) is not False:
+    """Wong's eta = f'G^-1 f + div f + h'S^-1 h, or None where G is singular or the model has other features."""
+    if model.features or is_zero(model.covariance.det()) is not False:
         return None
     kinetic = (model.drift.T * inverse(model.covariance) * model.drift)[0, 0]
     divergence = sum(sp.diff(model.drift[i], symbol) for i, symbol in enumerate(model.x))
@@ -230,6 +247,8 @@ def as_quadratic(q: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Quadratic | None
     if terms_of(q) > MANY_TERMS // 10 and is_quadratic(q, x) is False:
         return None, False, f"q contains {not_quadratic_part(q, x)}"
     quadratic = _read_off(q, x)
+    if quadratic is None and terms_of(q) <= 12:
+        quadratic = _read_off(sp.cancel(q), x)  # quotients of one function, such as D''/D of phi = log D
     if quadratic is not None:
         return quadratic, True, f"q = {short(str(quadratic_expression(quadratic, x)))}"
     answer = is_quadratic(q, x)

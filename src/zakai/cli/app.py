@@ -18,6 +18,9 @@ app = typer.Typer(
 )
 
 _Model = Annotated[str, typer.Argument(metavar="MODEL", help="A model file (TOML), or gallery:NAME.")]
+_Inputs = Annotated[Path | None, typer.Option("--inputs", metavar="FILE.csv", help="The known inputs: time, a column for each.")]
+
+_Output = Annotated[Path, typer.Option("-o", "--output", metavar="RESULT.nc", help="Where the result goes (NetCDF).")]
 
 
 def _show_version(asked: bool) -> None:
@@ -56,27 +59,81 @@ def simulate(
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="The same seed gives the same record.")] = 0,
     truth: Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="Where the true states go.")] = None,
     initial: Annotated[str, typer.Option(metavar="NUMBERS", help='The state at the start, as "0.1" or "0.1, 2".')] = "",
+    inputs: _Inputs = None,
 ) -> None:
     """Simulate a path of the state and a record of its observations."""
     from zakai.cli import simulating
 
-    simulating.simulate(model, until, step, seed, output, truth, initial)
+    simulating.simulate(model, until, step, seed, output, truth, initial, inputs)
 
 
 @app.command()
 def filter(
     model: _Model,
     record: Annotated[Path, typer.Argument(metavar="RECORD", help="The observations (CSV).")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="RESULT.nc", help="Where the result goes (NetCDF).")],
+    output: _Output,
     method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
     option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
     truth: Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="The true states, for the report.")] = None,
     report: Annotated[Path | None, typer.Option(metavar="REPORT.html", help="Write a report with pictures.")] = None,
+    inputs: _Inputs = None,
 ) -> None:
     """Compute the conditional density of the state at every time of a record."""
     from zakai.cli import filtering
 
-    filtering.filter(model, record, output, method, option or [], truth, report)
+    filtering.filter(model, record, output, method, option or [], truth, report, inputs)
+
+
+@app.command()
+def smooth(
+    model: _Model,
+    record: Annotated[Path, typer.Argument(metavar="RECORD", help="The observations (CSV).")],
+    output: _Output,
+    method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
+    option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
+    truth: Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="The true states, for the report.")] = None,
+    report: Annotated[Path | None, typer.Option(metavar="REPORT.html", help="Write a report with pictures.")] = None,
+    inputs: _Inputs = None,
+) -> None:
+    """Compute the conditional density of the state given all observations, at every time of the record."""
+    from zakai.cli import filtering
+
+    filtering.filter(model, record, output, method, option or [], truth, report, inputs, smoothed=True)
+
+
+@app.command()
+def forecast(
+    model: _Model,
+    record: Annotated[Path, typer.Argument(metavar="RECORD", help="The observations (CSV).")],
+    until: Annotated[float, typer.Option(metavar="T", help="Forecast up to this time.")],
+    step: Annotated[float, typer.Option(metavar="DT", help="One forecast every DT after the end of the record.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FORECAST.nc", help="Where the result goes (NetCDF).")],
+    method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
+    option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
+    inputs: _Inputs = None,
+) -> None:
+    """Compute the density of the state at times after a record."""
+    from zakai.cli import filtering
+
+    filtering.forecast(model, record, until, step, output, method, option or [], inputs)
+
+
+@app.command()
+def fit(
+    model: _Model,
+    record: Annotated[Path, typer.Argument(metavar="RECORD", help="The observations (CSV).")],
+    parameters: Annotated[str, typer.Option(metavar="a,b", help="The parameters to estimate; by default all.")] = "",
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FITTED.toml", help="Where the model with the estimates goes.")
+    ] = None,
+    method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
+    option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
+    inputs: _Inputs = None,
+) -> None:
+    """Estimate parameters of a model by maximum likelihood, with their standard errors."""
+    from zakai.cli import filtering
+
+    filtering.fit(model, record, parameters, output, method, option or [], inputs)
 
 
 @app.command()
@@ -122,11 +179,12 @@ def study(
     folder: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="The results, or a study to continue.")],
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run it on the workers of a Dask scheduler.")] = None,
     processes: Annotated[int | None, typer.Option(metavar="N", help="Run it in N processes.")] = None,
+    inputs: _Inputs = None,
 ) -> None:
     """Filter many records by many methods; an interrupted study continues where it stopped."""
     from zakai.cli import studying
 
-    studying.study(file, folder, scheduler, processes)
+    studying.study(file, folder, scheduler, processes, inputs)
 
 
 @app.command()

@@ -1,10 +1,11 @@
-"""zakai filter"""
+"""zakai filter, smooth, forecast and fit"""
 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +14,10 @@ from zakai.cli._progress import progress
 from zakai.errors import InputError
 from zakai.models.files import load_model
 from zakai.models.simulate import Truth
-from zakai.records import Record, read_record, read_truth
+from zakai.records import Record, read_inputs, read_record, read_truth
+
+if TYPE_CHECKING:
+    from zakai.engine.results import FilterResult
 
 _SHOWN = 20  # states whose last estimates are printed
 
@@ -26,9 +30,14 @@ def filter(
     settings: list[str],
     truth_path: Path | None,
     report: Path | None,
+    inputs_path: Path | None = None,
+    smoothed: bool = False,
 ) -> None:
-    """Filter a record, and write the result and the report; wrong input is refused before the work begins."""
-    check_outputs([output, report], [source, record_path, truth_path])
+    """Filter or smooth a record, print a summary, and write the result and the report.
+
+    Wrong input is refused before the work begins.
+    """
+    check_outputs([output, report], [source, record_path, truth_path, inputs_path])
     options = options_of(settings)
     if report is not None:
         from zakai.report import write_report
@@ -36,14 +45,20 @@ def filter(
 
         plotting("plotly")
     model = load_model(source)
-    record = read_record(record_path, model)
+    record = record_with_inputs(record_path, model, inputs_path)
     truth = None if truth_path is None else _truth(truth_path, model, record)
 
-    from zakai.engine.driver import filter as run
+    if smoothed:
+        from zakai.engine.smoother import smooth
 
-    with progress("filtering") as advance:
-        # Only the report uses the densities.
-        result = run(model, record, method, keep=None if report else "moments", progress=advance, **options)
+        with progress("smoothing") as advance:
+            result: FilterResult = smooth(model, record, method, progress=advance, **options)
+    else:
+        from zakai.engine.driver import filter as run
+
+        with progress("filtering") as advance:
+            # Only the report uses the densities.
+            result = run(model, record, method, keep=None if report else "moments", progress=advance, **options)
     for warning in result.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     result.save(output)
@@ -54,14 +69,89 @@ def filter(
         ("observations", f"{len(record):,}, times {record.times[0]:g} to {record.times[-1]:g}"),
         ("log-likelihood", f"{result.log_likelihood:.6f}"),
     ]
-    last = list(zip(result.state, result.mean[-1], np.sqrt(result.variance[-1]), strict=True))
-    lines += [(f"{name} at the end", f"{mean:.6g} +- {deviation:.3g}") for name, mean, deviation in last[:_SHOWN]]
+    row, when = (0, "start") if smoothed else (-1, "end")
+    last = list(zip(result.state, result.mean[row], np.sqrt(result.variance[row]), strict=True))
+    lines += [(f"{name} at the {when}", f"{mean:.6g} +- {deviation:.3g}") for name, mean, deviation in last[:_SHOWN]]
     if len(last) > _SHOWN:
         lines.append(("and", f"{len(last) - _SHOWN} more states, in the result"))
     lines += [("written", str(path)) for path in (output, report) if path is not None]
     width = max(len(what) for what, _ in lines)
     for what, said in lines:
         print(f"{what:<{width}}  {said}")
+
+
+def forecast(
+    source: str,
+    record_path: Path,
+    until: float,
+    step: float,
+    output: Path,
+    method: str,
+    settings: list[str],
+    inputs_path: Path | None = None,
+) -> None:
+    """Filter a record, and write the density of the state at times after it."""
+    from zakai.engine.driver import filter as run
+    from zakai.models.clock import clock
+
+    check_outputs([output], [source, record_path, inputs_path])
+    options = options_of(settings)
+    model = load_model(source)
+    record = record_with_inputs(record_path, model, inputs_path)
+    last = float(record.times[-1])
+    if not until > last:
+        raise InputError(f"--until {until:g}: must be after the end of the record, {last:g}")
+    times = clock(last, until, step)
+    with progress("filtering") as advance:
+        result = run(model, record, method, keep="moments", progress=advance, **options)
+    found = result.forecast(times)
+    for warning in dict.fromkeys([*result.warnings, *found.warnings]):
+        print(f"warning: {warning}", file=sys.stderr)
+    found.save(output)
+    print(f"method          {found.method}: {found.why}")
+    print(f"forecast times  {len(times):,}, {times[0]:g} to {times[-1]:g}")
+    for name, mean, deviation in list(zip(found.state, found.mean[-1], np.sqrt(found.variance[-1]), strict=True))[:_SHOWN]:
+        print(f"{name} at the end  {mean:.6g} +- {deviation:.3g}")
+    print(f"written         {output}")
+
+
+def fit(
+    source: str,
+    record_path: Path,
+    parameters: str,
+    output: Path | None,
+    method: str,
+    settings: list[str],
+    inputs_path: Path | None = None,
+) -> None:
+    """Print the parameters of largest likelihood, and write the model with them."""
+    from zakai.engine.fit import fit as run
+    from zakai.records.writing import atomic_write
+
+    check_outputs([output], [source, record_path, inputs_path])
+    options = options_of(settings)
+    model = load_model(source)
+    record = record_with_inputs(record_path, model, inputs_path)
+    names = [name.strip() for name in parameters.split(",") if name.strip()] or None
+    found = run(model, record, names, method, **options)
+    for warning in found.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    if output is not None:
+        with atomic_write(output) as temporary:
+            temporary.write_text(found.model.text, encoding="utf-8")
+    print("\n".join(line for line in str(found).splitlines() if not line.startswith("  warning: ")))
+    if output is not None:
+        print(f"written  {output}")
+
+
+def record_with_inputs(path: Path, model: Any, inputs_path: Path | None) -> Record:
+    """Read a record, and its inputs from a file of their own where there is one."""
+    record = read_record(path, model)
+    if inputs_path is None:
+        return record
+    if record.inputs is not None:
+        raise InputError(f"--inputs {inputs_path}: {path} has columns for the inputs too; give them once")
+    return replace(record, inputs=read_inputs(inputs_path, model))
 
 
 def _truth(path: Path, model: Any, record: Record) -> Truth:

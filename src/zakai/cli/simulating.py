@@ -11,17 +11,26 @@ from zakai.models.clock import clock
 
 
 def simulate(
-    source: str, until: float, step: float, seed: int, output: Path, truth_path: Path | None, initial: str
+    source: str,
+    until: float,
+    step: float,
+    seed: int,
+    output: Path,
+    truth_path: Path | None,
+    initial: str,
+    inputs_path: Path | None = None,
 ) -> None:
     """Simulate a record, and write it and the truth."""
     from zakai.models.files import load_model
     from zakai.models.simulate import simulate
-    from zakai.records import write_record, write_truth
+    from zakai.records import read_inputs, write_record, write_truth
 
-    check_outputs([output, truth_path], [source])
+    check_outputs([output, truth_path], [source, inputs_path])
     model = load_model(source)
+    inputs = None if inputs_path is None else read_inputs(inputs_path, model)
     times = clock(model.start, until, step)
-    truth, record = simulate(model, times, seed=seed, initial=_numbers(initial, model.state) if initial else None)
+    start = _numbers(initial, model.state) if initial else None
+    truth, record = simulate(model, times, seed=seed, initial=start, inputs=inputs)
     if truth_path is not None:
         write_truth(truth_path, truth, model.state)
     write_record(output, record)

@@ -69,7 +69,7 @@ class _Stream:
                 self.skip_until = self.online.time
                 self.show(self.online.last)
         _interrupt.insist()
-        for line in lines_of(sys.stdin.buffer, self.online.model.m):
+        for line in lines_of(sys.stdin.buffer, self.online.model.m, self.online.model.inputs):
             _interrupt.check()
             try:
                 estimate = self.used(line)
@@ -95,7 +95,7 @@ class _Stream:
             raise InputError(line.fault)
         if self.skip_until is not None and line.time <= self.skip_until:
             return None
-        estimate = self.online.update(line.time, line.values)
+        estimate = self.online.update(line.time, line.values, line.inputs)
         self.skip_until = None
         self.accepted += 1
         return estimate

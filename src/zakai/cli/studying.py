@@ -25,12 +25,12 @@ def reproduce(name: str, folder: Path | None, settings: list[str]) -> None:
         studies.reproduce(name, folder, advance, **options)
 
 
-def study(file: Path, folder: Path, scheduler: str | None, processes: int | None) -> None:
+def study(file: Path, folder: Path, scheduler: str | None, processes: int | None, inputs: Path | None = None) -> None:
     """Run a study, or continue it, and print its table."""
     from zakai.studies.specification import read_study
     from zakai.studies.study import run_study
 
-    read = read_study(file)
+    read = read_study(file, inputs)
     with progress(read.name) as advance:
         outcome = run_study(read, folder, scheduler, processes, advance)
     for point, seconds in zip(outcome.summary["points"], outcome.timing["points"], strict=True):

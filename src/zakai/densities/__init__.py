@@ -3,7 +3,8 @@
 from zakai.densities._density import Density
 from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
+from zakai.densities.mapped import MappedDensity
 from zakai.densities.points import PointMasses
 from zakai.densities.product import ProductDensity
 
-__all__ = ["Density", "GaussianMixture", "GridDensity", "PointMasses", "ProductDensity"]
+__all__ = ["Density", "GaussianMixture", "GridDensity", "MappedDensity", "PointMasses", "ProductDensity"]

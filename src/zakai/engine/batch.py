@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from threading import Lock
 
-from zakai.engine.loop import Progress, Run
+from zakai.engine.loop import Run
+
+LONG = 10.0  # seconds of work that are announced
+SURE = 1.0  # seconds after which the rest can be estimated
+
+_LOG = logging.getLogger("zakai")
+Progress = Callable[[int, int], None]
 
 
 def filter_all(runs: Sequence[Run], progress: Progress | None, blocks: float = 1.0) -> None:
@@ -18,23 +26,42 @@ def filter_all(runs: Sequence[Run], progress: Progress | None, blocks: float = 1
         progress: called with the number of observations done and their total.
         blocks: how many runs share an observation.
     """
-    total, done, lock = sum(len(run.schedule) for run in runs), 0, Lock()
-
-    def one(run: Run) -> None:
-        last = 0
-
-        def advance(now: int, _: int) -> None:
-            nonlocal done, last
-            with lock:
-                done += now - last
-                last = now
-                if progress is not None:
-                    progress(min(round(done / blocks), round(total / blocks)), round(total / blocks))
-
-        run.all(advance)
-
-    if len(runs) == 1:
-        return one(runs[0])
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        for finished in [pool.submit(one, run) for run in runs]:
+    threads = min(os.cpu_count() or 1, len(runs))
+    watch = _Watch(sum(len(run.schedule) for run in runs), threads, progress, blocks)
+    if threads == 1:
+        for run in runs:
+            run.all(watch.report)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for finished in [pool.submit(run.all, watch.report) for run in runs]:
             finished.result()
+
+
+class _Watch:
+    """How much of all runs is done, and whether the rest takes long."""
+
+    def __init__(self, total: int, threads: int, progress: Progress | None, blocks: float):
+        self.total, self.progress, self.blocks = total, progress, blocks
+        self.lock = Lock()
+        self.done = self.counted = 0
+        self.began, self.waiting = 0.0, threads
+        self.announced = False
+
+    def report(self, run: Run, count: int) -> None:
+        """Add intervals that a run has done; say once that the rest takes long, and what would shorten it."""
+        with self.lock:
+            self.done += count
+            done, total = round(self.done / self.blocks), round(self.total / self.blocks)
+            if self.progress is not None:
+                self.progress(min(done, total), total)
+            now = time.monotonic()
+            if self.waiting:  # the first interval of a thread waits for what it compiles: it says nothing of the others
+                self.began, self.counted, self.waiting = now, self.done, self.waiting - 1
+            spent = now - self.began
+            if self.announced or spent <= SURE:
+                return
+            self.announced = True
+            left = spent / (self.done - self.counted) * (self.total - self.done)
+            if left > LONG:
+                name, shorter = run.setting.method.name, run.setting.method.shorter
+                _LOG.warning("%s: %d more observations take about %.0f s; to shorten it, %s", name, total - done, left, shorter)

@@ -25,7 +25,7 @@ _NUMBER = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 def record_of_block(record: Record, block: IndependentBlock) -> Record:
     """What was observed of one block; of one that is not observed at all, nothing of a sensor that shows nothing."""
     values = record.values[:, list(block.observations)] if block.observations else np.full((len(record), 1), np.nan)
-    return Record(record.times, values, record.kind)
+    return Record(record.times, values, record.kind, record.inputs)
 
 
 def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> FilterResult:

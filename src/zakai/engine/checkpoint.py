@@ -14,6 +14,8 @@ import numpy as np
 
 from zakai.engine.feed import Feed, Moment
 from zakai.methods._protocol import Info
+from zakai.models.model import Model
+from zakai.records.inputs import Inputs
 
 ROUNDING = 1e-9  # of a covariance
 AGREES = 0.1  # share by which the reported moments and those of the density may differ: they are computed in two ways
@@ -34,6 +36,7 @@ def stored(moment: Moment) -> tuple[dict[str, Any], list[np.ndarray]]:
         "values": list(moment.values),
         "times": list(moment.times),
         "notes": list(moment.notes),
+        "inputs": None if moment.inputs is None else _encoded((moment.inputs.times, moment.inputs.values), arrays),
     }
     return said, arrays
 
@@ -52,7 +55,7 @@ def restored(feed: Feed, said: Mapping[str, Any], arrays: list[np.ndarray]) -> M
 
 
 def _restored(feed: Feed, said: Mapping[str, Any], arrays: list[np.ndarray]) -> Moment:
-    keys = ("time", "length", "state", "info", "health", "values", "times", "notes")
+    keys = ("time", "length", "state", "info", "health", "values", "times", "notes", "inputs")
     _check(isinstance(said, dict) and set(said) == set(keys))
     start, time, length = float(feed.setting.model.start), _number(said["time"]), _number(said["length"])
     _check(0.0 <= length <= time - start)
@@ -66,7 +69,7 @@ def _restored(feed: Feed, said: Mapping[str, Any], arrays: list[np.ndarray]) -> 
     else:
         _check(values == (0.0,) * feed.m and times == (start,) * feed.m)
     if said["info"] is None:
-        _check(said["health"] is None and time == start)
+        _check(said["health"] is None and said["inputs"] is None and time == start)
         moment = Moment(time, length, state, None, values, times, tuple(notes))
         fresh, own = stored(feed.now), stored(moment)
         _check(fresh[0] == own[0] and all(a.tobytes() == b.tobytes() for a, b in zip(fresh[1], own[1], strict=True)))
@@ -75,9 +78,10 @@ def _restored(feed: Feed, said: Mapping[str, Any], arrays: list[np.ndarray]) -> 
     template = (0.0, np.zeros(n), np.zeros((n, n)))
     increment, mean, cov = _decoded(template, said["info"], numbered)
     health = said["health"]
+    inputs = _inputs(feed.setting.model, time, said["inputs"], numbered)
     _check(next(numbered, None) is None and type(health) is dict and all(type(one) is float for one in health.values()))
     _check(time > start or (time == start and feed.kind == "samples"))
-    moment = Moment(time, length, state, Info(increment, mean, cov, health), values, times, tuple(notes))
+    moment = Moment(time, length, state, Info(increment, mean, cov, health), values, times, tuple(notes), inputs)
     _check(np.shape(mean) == (n,) and np.shape(cov) == (n, n))
     valid = feed.setting.method.valid
     _check(valid is None or valid(feed.empty, state))
@@ -105,7 +109,17 @@ def _check_believable(feed: Feed, moment: Moment) -> None:
     if moment.length > 0:
         follower = Feed(feed.setting)
         follower.now = moment
-        follower.moved(moment.time + moment.length, [math.nan] * feed.m)
+        follower.moved(moment.time + moment.length, [math.nan] * feed.m, moment.inputs)
+
+
+def _inputs(model: Model, time: float, said: Any, arrays: Iterator[tuple[int, np.ndarray]]) -> Inputs | None:
+    """Return the known inputs from the time of a moment on."""
+    if said is None:
+        _check(not model.inputs)
+        return None
+    inputs = Inputs(*_decoded((np.zeros(0), np.zeros((0, 0))), said, arrays))
+    inputs.check(model, time, time)
+    return inputs
 
 
 def _encoded(part: Any, arrays: list[np.ndarray]) -> Any:

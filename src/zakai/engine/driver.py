@@ -8,8 +8,8 @@ from typing import Any, overload
 
 import numpy as np
 
-from zakai.engine.batch import filter_all
-from zakai.engine.loop import KEPT_BYTES, Progress
+from zakai.engine.batch import Progress, filter_all
+from zakai.engine.loop import KEPT_BYTES
 from zakai.engine.plan import Plan, plan_of
 from zakai.engine.results import FilterResult
 from zakai.errors import InputError
@@ -176,3 +176,4 @@ def _check(model: Model, record: Record) -> None:
     first = record.times[0]
     if first < model.start or (first == model.start and record.kind != "samples"):
         raise InputError(f"record: row 1: time {first:g} is not after the start {model.start:g} of {model.source}")
+    record.check_law(model)

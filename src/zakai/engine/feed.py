@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from functools import lru_cache, partial
+from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,8 @@ from zakai.densities import Density
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
 from zakai.methods._protocol import Info
-from zakai.records.noise import notes_on_noise
+from zakai.records.inputs import Inputs
+from zakai.records.noise import noise_varies, notes_on_noise
 from zakai.records.schedule import ROUNDING, Schedule, length_of
 
 AFTER_GAP = (
@@ -25,7 +27,7 @@ class Moment(NamedTuple):
     """Everything that decides what a filter reports next; it never changes, the next observation makes another.
 
     `length` is that of the last interval.  `info` is what the last step reported, None at the start.  `values` and `times` (m,)
-    are the last values of a path and when they were observed.
+    are the last values of a path and when they were observed.  `inputs` are the known inputs from `time` on.
     """
 
     time: float
@@ -35,6 +37,7 @@ class Moment(NamedTuple):
     values: tuple[float, ...]
     times: tuple[float, ...]
     notes: tuple[str, ...]
+    inputs: Inputs | None = None
 
 
 class Feed:
@@ -45,71 +48,69 @@ class Feed:
         model = setting.model
         self.m, self.kind = model.m, model.observation_kind
         self.empty, state = setting.begin()
-        self._prepared: OrderedDict[Any, Any] = OrderedDict()
+        self._noise_varies = noise_varies(model)
+        # What is prepared depends on the length alone: the last lengths are kept.
+        self._kept = lru_cache(KEPT)(partial(self._prepared, 0.0)) if setting.autonomous else None
         start = float(model.start)
         self.now = Moment(start, 0.0, state, None, (0.0,) * self.m, (start,) * self.m, self.empty.notes)
 
-    def moved(self, time: float, values: list[float]) -> Moment:
+    @np.errstate(all="ignore")  # what is not finite is refused below
+    def moved(self, time: float, values: list[float], inputs: Inputs | None = None) -> Moment:
         """Return the moment after an observation (m,), NaN where there is none; `now` stays as it is.
+
+        `inputs` are known from the time of `now` to `time` or beyond.
 
         Raises:
             InputError: the observation leaves nothing of the density.
         """
-        now, start = self.now, self.now.time
-        seen = [value == value for value in values]
-        last_values, last_times = now.values, now.times
-        late = False
-        if self.kind == "samples":
-            elapsed = [0.0] * self.m
+        start, _, state, _, last_values, last_times, _, _ = self.now
+        span, length, late = time - start, length_of(start, time), False
+        seen = tuple([value == value for value in values])
+        if self.kind == "path":
+            spans = [time - last for last in last_times]
+            late = any([there and one > (1 + ROUNDING) * span for one, there in zip(spans, seen)])
+            elapsed = tuple([_rounded(one, length) if there else 0.0 for one, there in zip(spans, seen)])
+            increments = [value - last for value, last in zip(values, last_values)]
+            last_values = tuple([value if there else last for value, last, there in zip(values, last_values, seen)])
+            last_times = tuple([time if there else last for last, there in zip(last_times, seen)])
+            values = increments
         else:
-            elapsed = [time - start] * self.m
+            elapsed = (0.0 if self.kind == "samples" else _rounded(span, length),) * self.m
             if self.kind == "rates":
-                values = [value * (time - start) for value in values]
-            elif self.kind == "path":
-                elapsed = [time - last for last in last_times]
-                increments = [value - last for value, last in zip(values, last_values)]
-                last_values = tuple([value if there else last for value, last, there in zip(values, last_values, seen)])
-                last_times = tuple([time if there else last for last, there in zip(last_times, seen)])
-                values = increments
-                late = any(there and one > (1 + ROUNDING) * (time - start) for one, there in zip(elapsed, seen))
-        elapsed = [span if there else 0.0 for span, there in zip(elapsed, seen)]
-        prepared, notes = self._interval(start, time, seen, elapsed)
-        given = np.array([value if there else 0.0 for value, there in zip(values, seen)])
-        with np.errstate(all="ignore"):  # what is not finite is refused below
-            state, info = self.setting.method.step(prepared, 0, now.state, given)
-        increment = float(info.log_likelihood_increment)
-        if increment - increment != 0.0:  # NaN or infinite
+                values = [value * span for value in values]
+        if False in seen:
+            values = [value if there else 0.0 for value, there in zip(values, seen)]
+        if self._kept is None:
+            prepared, notes = self._prepared(start, time, seen, elapsed, inputs)
+        else:
+            prepared, notes = self._kept(length, seen, elapsed)
+        state, info = self.setting.method.step(prepared, 0, state, np.array(values))
+        if not isfinite(info.log_likelihood_increment):
             raise InputError(
                 f"{self.setting.model.source}: at t = {time:g} the observation leaves nothing of the density, or takes it "
                 "beyond double precision; it is not used. Where it ends a gap of many times the system's own time, report "
                 "that time as unobserved, and go on from there"
             )
-        return Moment(time, time - start, state, info, last_values, last_times, ((AFTER_GAP,) if late else ()) + notes)
+        notes = (AFTER_GAP, *notes) if late else notes
+        return Moment(time, span, state, info, last_values, last_times, notes, None if inputs is None else inputs.part(time))
 
     def density(self, moment: Moment) -> Density:
         """Return the density at a moment."""
         return self.setting.method.density(self.empty, moment.state)
 
-    def _interval(self, start: float, stop: float, seen: list[bool], elapsed: list[float]) -> tuple[Any, tuple[str, ...]]:
+    def _prepared(
+        self, start: float, stop: float, seen: tuple[bool, ...], elapsed: tuple[float, ...], inputs: Inputs | None = None
+    ) -> tuple[Any, tuple[str, ...]]:
         """Return what is prepared for one interval, and what is to be reported of it."""
-        length = length_of(start, stop)
-        inside = [length if abs(span - length) <= ROUNDING * length else span for span in elapsed]
-        if not self.setting.autonomous:
-            schedule = _single(start, stop, seen, inside)
-            prepared = self.setting.prepared(schedule)
-            return prepared, (*notes_on_noise(self.setting.model, schedule), *prepared.notes)
-        key = (length, *seen, *inside)
-        found = self._prepared.get(key)
-        if found is None:
-            prepared = self.setting.method.prepare(
-                self.setting.model, _single(0.0, length, seen, inside), self.setting.theta, **self.setting.options
-            )
-            self._prepared[key] = found = prepared, prepared.notes
-            if len(self._prepared) > KEPT:
-                self._prepared.popitem(last=False)
-        return found
+        setting = self.setting
+        observed = np.array([seen])
+        inputs = None if inputs is None else inputs.part(start, stop)
+        schedule = Schedule(np.array([start]), np.array([stop]), observed, np.where(observed, [elapsed], 0.0), inputs)
+        prepared = setting.method.prepare(setting.model, schedule, setting.theta, **setting.options)
+        noise = notes_on_noise(setting.model, schedule) if self._noise_varies else ()
+        return prepared, (*noise, *prepared.notes)
 
 
-def _single(start: float, stop: float, seen: list[bool], elapsed: list[float]) -> Schedule:
-    return Schedule(np.array([start]), np.array([stop]), np.array([seen]), np.array([elapsed]))
-
+def _rounded(span: float, length: float) -> float:
+    """Return the length of the interval for a span that is equal to it up to rounding."""
+    return length if abs(span - length) <= ROUNDING * length else span

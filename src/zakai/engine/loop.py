@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -21,13 +19,9 @@ from zakai.records.noise import notes_on_noise
 from zakai.records.schedule import ROUNDING, Schedule, schedule_of
 
 CHUNK = 1024  # intervals that are prepared together, at most
-PIECE = 128  # intervals between two reports of progress
+PIECE = 128  # intervals between two reports of progress, at most
+GROWTH = 8  # the first report comes after one interval
 KEPT_BYTES = 512 * 2**20  # of densities that are kept by default
-LONG = 10.0  # seconds of work that are announced
-SURE = 1.0  # seconds after which the rest can be estimated
-
-_LOG = logging.getLogger("zakai")
-Progress = Callable[[int, int], None]
 
 
 def advance(setting: Setting, prepared: Any, rows: slice, state: Any, values: np.ndarray) -> tuple[list[Any], Infos]:
@@ -65,7 +59,7 @@ def joined(parts: Sequence[Infos]) -> Infos:
 
 def size_of(state: Any) -> int:
     """Return the bytes of the arrays of a state."""
-    return sum(np.asarray(part).nbytes for part in state)
+    return sum(size_of(part) if isinstance(part, tuple) else np.asarray(part).nbytes for part in state)
 
 
 class Run:
@@ -85,38 +79,28 @@ class Run:
         self.bytes = 0
         self.done = 0
 
-    def all(self, progress: Progress | None = None) -> None:
-        """Filter the rest of the record."""
-        count, began, announced = len(self.schedule), time.monotonic(), False
+    def all(self, report: Callable[[Run, int], None] | None = None) -> None:
+        """Filter the rest of the record; `report` receives the run and how many intervals have been added."""
+        count, size = len(self.schedule), 1
         while self.done < count:
             chunk = slice(self.done, min(self.done + CHUNK, count))
             prepared = self.setting.prepared(self.schedule.part(chunk))
             self.notes.update(dict.fromkeys(prepared.notes))
-            for first in range(chunk.start, chunk.stop, PIECE):
-                last = min(first + PIECE, chunk.stop)
+            while self.done < chunk.stop:
+                first, last = self.done, min(self.done + size, chunk.stop)
                 rows = slice(first - chunk.start, last - chunk.start)
                 with np.errstate(all="ignore"):  # what is not finite is reported below
                     states, infos = advance(self.setting, prepared, rows, self.state, self.values[first:last])
                 self._explain(infos)
                 self._take(states, infos)
-                if progress is not None:
-                    progress(self.done, count)
-                spent = time.monotonic() - began
-                if not announced and spent > SURE:
-                    announced = self._announce(spent, count)
+                size = min(GROWTH * size, PIECE)
+                if report is not None:
+                    report(self, last - first)
 
     def prepare(self) -> None:
         """Prepare the chunks of the record that are remembered."""
         for first in range(0, min(len(self.schedule), KEPT * CHUNK), CHUNK):
             self.setting.prepared(self.schedule.part(slice(first, min(first + CHUNK, len(self.schedule)))))
-
-    def _announce(self, spent: float, count: int) -> bool:
-        """Say once that the rest takes long, and what would shorten it."""
-        left = spent / self.done * (count - self.done)
-        if left > LONG:
-            name, shorter = self.setting.method.name, self.setting.method.shorter
-            _LOG.warning("%s: %d more observations take about %.0f s; to shorten it, %s", name, count - self.done, left, shorter)
-        return True
 
     def _take(self, states: list[Any], infos: Infos) -> None:
         self.state = states[-1]
@@ -138,16 +122,19 @@ class Run:
         model, k = self.setting.model, int(np.argmax(bad))
         stop = float(self.schedule.stops[self.done + k])
         density = self.setting.method.density(self.empty, self.state)
-        centre, width = density.mean(), np.sqrt(np.maximum(np.diagonal(density.cov()), 0.0))
+        with np.errstate(all="ignore"):
+            centre, width = density.mean(), np.sqrt(np.maximum(np.diagonal(density.cov()), 0.0))
         if not np.isfinite(centre).all() or not np.isfinite(width).all():
             return
         points = centre + np.linspace(-8.0, 8.0, 257)[:, None, None] * np.diag(width)
         points = points.reshape(-1, model.n)
+        inputs = self.schedule.inputs
+        u = None if inputs is None else inputs.at(stop, model.input_hold)
         for key in ("drift", "observation"):
-            values = numpy_function(getattr(model, key), model)(points, stop, self.setting.theta.real)
+            values = numpy_function(getattr(model, key), model)(points, stop, self.setting.theta.real, u)
             wrong = ~np.isfinite(values).all(axis=-1)
             if wrong.any():
-                reason = explain_nonfinite(model, key, getattr(model, key), points[wrong][0], stop)
+                reason = explain_nonfinite(model, key, getattr(model, key), points[wrong][0], stop, u)
                 raise InputError(f"{model.source}: {reason}, which the density reaches")
 
     def prior_moments(self) -> tuple[np.ndarray, np.ndarray]:

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from functools import lru_cache
-from statistics import NormalDist
 from threading import RLock
 from typing import Any
 
 import numpy as np
 
-from zakai.densities import Density, ProductDensity
-from zakai.densities.product import renamed
-from zakai.engine.blocks import SMALLEST_IS_WORST
 from zakai.engine.checkpoint import restored, stored
 from zakai.engine.driver import check_model, planned
-from zakai.engine.feed import Feed, Moment
+from zakai.engine.estimate import Estimate
+from zakai.engine.feed import Feed
 from zakai.engine.plan import ByBlocks
-from zakai.engine.results import versions, warnings_of_step
+from zakai.engine.results import other_versions, versions
 from zakai.errors import InputError
+from zakai.models._errors import named
 from zakai.models.checks import check_noise_at
 from zakai.models.model import Model
-from zakai.models.prior import GaussianPrior
 from zakai.records.checkpoint import read_checkpoint, write_checkpoint
+from zakai.records.inputs import Inputs, known_inputs
 from zakai.records.record import LARGEST
 from zakai.records.writing import shown
 
@@ -79,13 +76,16 @@ class Online:
         """The time of the last observation, or the model's start."""
         return self.feeds[0].now.time
 
-    def update(self, time: float, value: Any) -> Estimate:
+    def update(self, time: float, value: Any, inputs: Any = None) -> Estimate:
         """Return the estimate after an observation.
 
         Args:
             time: later than that of the last observation, or for samples the model's start itself.
             value: (m,), of the model's `observation_kind`; NaN or None where a coordinate was not observed. A number is accepted
                 where m is one.
+            inputs: of a model with inputs, their values from this time on, as {"u": 1.0} or in the order of the model; the first
+                hold from the model's start. Or `zakai.Inputs`, for times of their own: they replace what is known from their
+                first time on. Without them the last ones hold; with `input_hold = "linear"` they are needed.
 
         Raises:
             InputError: a value or a time that cannot be used; the filter then stays as it was.
@@ -93,8 +93,10 @@ class Online:
         values = self._values(value)
         with self.lock:
             time = self._time(time)
+            known = self._known("update", time, inputs) if self.model.inputs or inputs is not None else None
+            parts = zip(self.feeds, self._divided(values), strict=True)
             try:
-                moments = tuple(feed.moved(time, part) for feed, part in zip(self.feeds, self._divided(values), strict=True))
+                moments = tuple([feed.moved(time, part, known) for feed, part in parts])
             except (MemoryError, OverflowError):
                 fault = f"the time from {self.time:g} to {time:g} is too long for this filter; check its unit"
                 raise InputError(f"update: {fault}") from None
@@ -102,8 +104,11 @@ class Online:
                 feed.now = moment
         return Estimate(self, moments)
 
-    def predict(self, time: float) -> Estimate:
-        """Return the estimate at a later time, or now, if nothing is observed until then; the filter stays as it was."""
+    def predict(self, time: float, inputs: Any = None) -> Estimate:
+        """Return the estimate at a later time, or now, if nothing is observed until then; the filter stays as it was.
+
+        `inputs` as for `update`.
+        """
         with self.lock:
             time = _number(time)
             if time == self.time:
@@ -111,7 +116,8 @@ class Online:
             if not time > self.time:
                 raise InputError(f"predict: the time {time!r} is before {self.time!r}, the time of the filter")
             nothing = self._divided([np.nan] * self.model.m)
-            return Estimate(self, tuple(feed.moved(time, part) for feed, part in zip(self.feeds, nothing, strict=True)))
+            known = self._known("predict", time, inputs)
+            return Estimate(self, tuple(feed.moved(time, part, known) for feed, part in zip(self.feeds, nothing, strict=True)))
 
     @property
     def last(self) -> Estimate:
@@ -139,6 +145,8 @@ class Online:
             InputError: the checkpoint is damaged, or that of another filter; this one then stays as it was.
         """
         about, arrays = read_checkpoint(path)
+        if wrong := other_versions(about.get("versions")):
+            raise InputError(f"{shown(path)}: was written with another version of {wrong}; name another file, or remove it")
         for what, own in self._bound.items():
             if about.get(what) != own:
                 said = "" if what == "model" else f" ({_short(about.get(what))}, not {_short(own)})"
@@ -170,6 +178,12 @@ class Online:
         if self._columns is None:
             return [values]
         return [[values[i] for i in columns] or [np.nan] for columns in self._columns]
+
+    def _known(self, call: str, time: float, inputs: Any) -> Inputs | None:
+        """Return the known inputs from the time of the filter on, None for a model without inputs."""
+        now = self.feeds[0].now
+        with named(call):
+            return known_inputs(self.model, now.inputs, inputs, now.time, time)
 
     def _time(self, time: Any) -> float:
         now = self.feeds[0].now.time
@@ -208,118 +222,6 @@ class Online:
                     f"update: observation {index + 1} is {_short(one)}; values must be finite and at most {LARGEST:g} in size"
                 )
         return [float(one) for one in values]
-
-
-class Estimate:
-    """The posterior at a time: its moments, the health of the step, and the whole density."""
-
-    __slots__ = ("_online", "_moments", "_density")
-
-    def __init__(self, online: Online, moments: tuple[Moment, ...]):
-        self._online, self._moments = online, moments
-        self._density: Density | None = None
-
-    def __repr__(self) -> str:
-        names = self._online.model.state
-        deviations = np.sqrt(np.maximum(np.diag(self.cov), 0.0))
-        parts = (f"{name} = {mean:.6g} +- {deviation:.3g}" for name, mean, deviation in zip(names, self.mean, deviations))
-        return f"Estimate(t = {self.time:g}: {', '.join(parts)})"
-
-    @property
-    def time(self) -> float:
-        """The time of the estimate."""
-        return self._moments[0].time
-
-    @property
-    def mean(self) -> np.ndarray:
-        """The mean of the state (n,)."""
-        means = [self._part(i).mean() if one.info is None else one.info.mean for i, one in enumerate(self._moments)]
-        if self._online.blocks is None:
-            return means[0]
-        mean = np.empty(self._online.model.n)
-        for block, part in zip(self._online.blocks, means, strict=True):
-            mean[list(block.states)] = part
-        return mean
-
-    @property
-    def cov(self) -> np.ndarray:
-        """The covariance of the state (n, n)."""
-        covs = [self._part(i).cov() if one.info is None else one.info.cov for i, one in enumerate(self._moments)]
-        if self._online.blocks is None:
-            return covs[0]
-        cov = np.zeros((self._online.model.n,) * 2)
-        for block, part in zip(self._online.blocks, covs, strict=True):
-            cov[np.ix_(block.states, block.states)] = part
-        return cov
-
-    @property
-    def log_likelihood_increment(self) -> float:
-        """What the observation adds to the log-likelihood; zero where there was none."""
-        return sum(float(one.info.log_likelihood_increment) for one in self._moments if one.info is not None)
-
-    @property
-    def health(self) -> dict[str, float]:
-        """The health figures of the step, of blocks the worst."""
-        worst: dict[str, float] = {}
-        for moment in self._moments:
-            for name, figure in ({} if moment.info is None else moment.info.health).items():
-                choose = min if name in SMALLEST_IS_WORST else max
-                worst[name] = choose(float(figure), worst[name]) if name in worst else float(figure)
-        return worst
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """A sentence for every bound that this step exceeded, and for what else is to be known of it."""
-        said: dict[str, None] = {}
-        for feed, moment in zip(self._online.feeds, self._moments, strict=True):
-            said.update(dict.fromkeys(moment.notes))
-            if moment.info is not None:
-                said.update(dict.fromkeys(warnings_of_step(moment.info.health, feed.setting.method.bounds)))
-        return tuple(said)
-
-    @property
-    def density(self) -> Density:
-        """The conditional density of the state."""
-        if self._density is None:
-            online, parts = self._online, [self._part(i) for i in range(len(self._moments))]
-            if online.blocks is None:
-                self._density = parts[0]
-            else:
-                model, blocks = online.model, online.blocks
-                named = [renamed(part, block.names) for part, block in zip(parts, blocks, strict=True)]
-                angles = tuple(name in model.periodic for name in model.state)
-                self._density = ProductDensity(named, tuple(block.states for block in blocks), model.state, angles)
-        return self._density
-
-    def interval(self, probability: float = 0.95) -> np.ndarray:
-        """Return the credible interval of each coordinate (n, 2): half of the rest lies outside on each side."""
-        if not 0 < probability < 1:
-            raise InputError(f"interval: the probability {probability!r} must be between 0 and 1")
-        tail = 0.5 * (1 - probability)
-        online, found = self._online, np.empty((self._online.model.n, 2))
-        for i, (feed, moment) in enumerate(zip(online.feeds, self._moments, strict=True)):
-            info = moment.info
-            if info is not None and _is_gaussian(feed):
-                half = _deviations(1 - tail) * np.sqrt(np.maximum(info.cov.diagonal(), 0.0))
-                part = np.array([info.mean - half, info.mean + half]).T
-            else:
-                part = self._part(i).quantile([tail, 1 - tail]).T
-            found[slice(None) if online.blocks is None else list(online.blocks[i].states)] = part
-        return found
-
-    def _part(self, index: int) -> Density:
-        return self._online.feeds[index].density(self._moments[index])
-
-
-@lru_cache(maxsize=8)
-def _deviations(probability: float) -> float:
-    return NormalDist().inv_cdf(probability)
-
-
-def _is_gaussian(feed: Feed) -> bool:
-    """Return whether the density is a Gaussian at all times."""
-    name, prior = feed.setting.method.name, feed.setting.prior
-    return name == "extended-kalman-bucy" or (name == "kalman-bucy" and isinstance(prior, GaussianPrior))
 
 
 def _count(arrays: Mapping[str, Any], index: int) -> int:

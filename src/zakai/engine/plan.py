@@ -35,7 +35,7 @@ class Whole(NamedTuple):
 
     def result(self, runs: Sequence[Run]) -> FilterResult:
         """Return the result of the runs."""
-        return runs[0].result(self.why, self.considered)
+        return _with_origin(runs[0].result(self.why, self.considered), self, runs)
 
 
 class ByBlocks(NamedTuple):
@@ -54,10 +54,16 @@ class ByBlocks(NamedTuple):
 
     def result(self, runs: Sequence[Run]) -> FilterResult:
         """Return the result of the runs, assembled."""
-        return joined_blocks(self.model, self.division, runs)
+        return _with_origin(joined_blocks(self.model, self.division, runs), self, runs)
 
 
 Plan = Whole | ByBlocks
+
+
+def _with_origin(result: FilterResult, plan: Plan, runs: Sequence[Run]) -> FilterResult:
+    """Return a result that holds what continues it: the plan, and the last state of each run."""
+    result.origin = plan, tuple(run.state for run in runs)
+    return result
 
 
 def plan_of(model: Model, prior: Any, method: str, options: Mapping[str, Any], by_value: bool = True) -> Plan:

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from zakai.engine.batch import Progress
 from zakai.engine.driver import check_model, check_noise, check_records, filter_planned
-from zakai.engine.loop import Progress
 from zakai.engine.plan import plan_of
-from zakai.engine.results import FilterResult, versions
+from zakai.engine.results import FilterResult, other_versions, versions
 from zakai.errors import InputError
 from zakai.models.files import read_model
 from zakai.models.model import Model
-from zakai.records import Record
+from zakai.records import Inputs, Record
 from zakai.records.checkpoint import read_checkpoint, write_checkpoint
 from zakai.records.writing import shown
 
@@ -27,7 +27,7 @@ def prepare(model: Model, times: Any, method: str = "auto", **options: Any) -> P
 
     Args:
         model: the system, with a prior.
-        times: (K,), when all coordinates will be observed, or a Record with those times and gaps.
+        times: (K,), when all coordinates will be observed, or a Record with those times and gaps, and the known inputs.
         method: as for `filter`.
         **options: as for `filter`.
 
@@ -89,8 +89,10 @@ class Prepared:
         Raises:
             InputError: the file cannot be written.
         """
-        about = {**self._bound, "source": self.model.source}
-        write_checkpoint(path, about, {"times": self.record.times, "seen": ~np.isnan(self.record.values)}, KIND)
+        about, inputs = {**self._bound, "source": self.model.source}, self.record.inputs
+        arrays = {"times": self.record.times, "seen": ~np.isnan(self.record.values)}
+        arrays |= {} if inputs is None else {"input_times": inputs.times, "inputs": inputs.values}
+        write_checkpoint(path, about, arrays, KIND)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], model: Model | None = None) -> Prepared:
@@ -105,13 +107,15 @@ class Prepared:
             text, source, method, options = (about[key] for key in ("model", "source", "method", "options"))
             model = read_model(text, source) if model is None else model
             check_model(model)
-            for what, own in {"model": model.text, "versions": versions()}.items():
-                if about[what] != own:
-                    raise InputError(f"{name}: was prepared for another {what}; prepare anew")
+            if about["model"] != model.text:
+                raise InputError(f"{name}: was prepared for another model; prepare anew")
+            if wrong := other_versions(about["versions"]):
+                raise InputError(f"{name}: was prepared with another version of {wrong}; prepare anew")
             if arrays["seen"].dtype != bool or arrays["seen"].shape != (len(arrays["times"]), model.m):
                 raise ValueError
             values = np.where(arrays["seen"], 0.0, np.nan)
-            record = Record(arrays["times"], values, model.observation_kind)
+            inputs = Inputs(arrays["input_times"], arrays["inputs"]) if model.inputs else None
+            record = Record(arrays["times"], values, model.observation_kind, inputs)
             check_records(model, record)
             return cls(model, method, options, record)
         except (KeyError, IndexError, TypeError, ValueError, AttributeError):

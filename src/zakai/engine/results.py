@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +22,9 @@ from zakai.records.writing import shown
 
 if TYPE_CHECKING:
     import xarray
+
+    from zakai.engine.plan import Plan
+    from zakai.records import Inputs
 
 _LARGEST_COV = 32
 _LONGEST_NAME = 64  # of a state, or a method
@@ -69,6 +73,7 @@ class FilterResult:
     state: tuple[str, ...] = ()
     attributes: dict[str, str] = field(default_factory=dict)
     blocks: tuple[FilterResult, ...] = ()
+    origin: tuple[Plan, tuple[Any, ...]] | None = None
     _cov: np.ndarray | None = None
     _density: Callable[[int], Density] | None = None
     _no_density: str = "the densities were not kept"
@@ -128,6 +133,69 @@ class FilterResult:
         if not isinstance(k, int | np.integer) or not -count <= k < count:
             raise InputError(f"density: there is no time number {k!r}; numbers run from 0 to {count - 1}")
         return self._density(k % count)
+
+    def forecast(self, times: Any, inputs: Inputs | None = None) -> FilterResult:
+        """Return the density of the state at times after the record, when nothing more is observed.
+
+        Index 0 of the forecast is the end of the record, index k the time k.  It equals, to the bit, the result of a record that
+        goes on with unobserved rows.
+
+        Args:
+            times: (K,), increasing, after the last time of the record.
+            inputs: for a model with known inputs; they replace those of the record from their first time on.
+
+        Raises:
+            InputError: a time before the end of the record, missing inputs, or a result that was read from a file.
+
+        Example:
+
+            ahead = result.forecast([11.0, 12.0])
+            ahead.mean, ahead.density(-1).quantile([0.05, 0.95])
+        """
+        from zakai.engine.forecast import forecast
+
+        return forecast(self, times, inputs)
+
+    def residuals(self, seed: int = 0) -> np.ndarray:
+        """Return the probability integral transforms (K, m) of the observations.
+
+            u_kj = P(Z_kj <= z_kj | z_k1, ..., z_k(j-1), all rows before k)
+
+        They are independent and uniform on (0, 1) if the model is true.  Of counts u is drawn uniformly between P(Z < z) and
+        P(Z <= z).  NaN where nothing is observed.
+
+        Args:
+            seed: of the draws for counts.
+
+        Raises:
+            InputError: a result that was read from a file, or a law without conditional laws of its coordinates.
+
+        References:
+            Diebold, Gunther and Tay 1998, Evaluating density forecasts.
+            Czado, Gneiting and Held 2009, Predictive model assessment for count data.
+
+        Example:
+
+            u = result.residuals()
+            scipy.stats.kstest(u[~np.isnan(u)], "uniform").pvalue
+        """
+        from zakai.engine.residuals import residuals
+
+        return residuals(self, seed)
+
+    def report(self, path: str | os.PathLike[str], truth: Any = None) -> None:
+        """Write an HTML report of the result: one file that needs no network.
+
+        Args:
+            path: the file.
+            truth: the true states (K+1, n) or what `zakai.simulate` returns, where they are known.
+
+        Raises:
+            InputError: a truth of the wrong shape, or the extra `plots` is not installed.
+        """
+        from zakai.report import write_report
+
+        write_report(self, Path(path), truth)
 
     def _variables(self) -> dict[str, tuple[list[str], np.ndarray, dict[str, Any]]]:
         names = np.array(self.state, dtype=object)
@@ -213,7 +281,7 @@ def warnings_of_step(health: Mapping[str, Any], bounds: Mapping[str, tuple[float
     return [
         f"{name} is {float(health[name]):.2g} and exceeds {bound:g}: {what}"
         for name, (bound, what) in bounds.items()
-        if float(health[name]) > bound
+        if name in health and float(health[name]) > bound
     ]
 
 
@@ -240,7 +308,7 @@ def warnings_of_run(result: FilterResult) -> list[str]:
         time = result.times[np.argmax(bad)]
         said.append(f"the density was lost at t = {time:g}; nothing after that time is to be trusted")
     for name, (bound, what) in result.bounds.items():
-        over = result.health[name] > bound
+        over = result.health[name] > bound if name in result.health else np.zeros(0, bool)
         if over.any():
             worst = int(np.nanargmax(np.where(over, result.health[name], -np.inf)))
             said.append(
@@ -254,3 +322,9 @@ def warnings_of_run(result: FilterResult) -> list[str]:
 def versions() -> dict[str, str]:
     """Return the versions of what computed a result."""
     return {f"version_{name}": version(name) for name in ("zakai", "numba", "numpy", "scipy", "sympy")}
+
+
+def other_versions(stored: Any) -> str:
+    """Return the names of the packages of which a file has not the versions in use, joined by commas."""
+    stored = stored if isinstance(stored, dict) else {}
+    return ", ".join(name.removeprefix("version_") for name, own in versions().items() if stored.get(name) != own)

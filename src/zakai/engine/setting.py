@@ -38,7 +38,7 @@ class Setting(NamedTuple):
         """Return the setting with the model's own parameters."""
         parts = (model.drift, model.diffusion, model.process_noise, model.observation, model.observation_noise)
         depends = any(part.has(model.t) for part in parts) or (method.absolute is not None and method.absolute(options))
-        return cls(model, prior, method, options, model.theta(), not depends)
+        return cls(model, prior, method, options, model.theta(), not (depends or model.inputs))
 
     def at(self, theta: np.ndarray | None) -> Setting:
         """Return the setting with other values of the parameters; None stands for these."""
@@ -54,7 +54,7 @@ class Setting(NamedTuple):
             self.method.name,
             tuple(sorted(self.options.items())),
             self.theta.tobytes(),
-            *(np.ascontiguousarray(part).tobytes() for part in schedule),
+            *schedule.key(),
         )
         with _LOCK:
             kept = _PREPARED.setdefault(self.model, OrderedDict())

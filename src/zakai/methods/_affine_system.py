@@ -27,7 +27,7 @@ from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.complex_step import cholesky
 from zakai.numerics.flow import Coefficients, FlowResult, Transition, integrate
-from zakai.numerics.transition import Array, transposed
+from zakai.numerics.transition import Array, at, transposed
 from zakai.records.schedule import Schedule
 
 RESOLVED = 1e-9  # relative error of a transition above which a result warns
@@ -137,11 +137,11 @@ def precision_of(noise: Array, seen: Array) -> Array:
 class Ends(NamedTuple):
     """What is observed at the ends of K intervals, with noise of variance one: `whiten` (K, m, m) values = H x + c + noise.
 
-    `rows` (K,) tells which rows count, `slope` is H (K, m, n), `intercept` c (K, m) and `constant` (K,) what the logarithm of the
-    factor exp(-|whiten values - H x - c|^2 / 2) lacks.  The evidence of increments is relative to noise alone.
+    `observed` (K, m) marks the rows that count, `slope` is H (K, m, n), `intercept` c (K, m) and `constant` (K,) what the
+    logarithm of the factor exp(-|whiten values - H x - c|^2 / 2) lacks.  The evidence of increments is relative to noise alone.
     """
 
-    rows: list[Array]
+    observed: Array
     slope: Array
     intercept: Array
     whiten: Array
@@ -168,7 +168,7 @@ def ends_of(kind: str, schedule: Schedule, slope: Array, intercept: Array, noise
     logs = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1) + 0.5 * np.log(2 * np.pi) * at_end.sum(axis=1)
     constant = -logs if sampled else np.zeros(len(logs))
     return Ends(
-        [np.flatnonzero(row) for row in at_end],
+        np.ascontiguousarray(at_end),
         whiten @ (spans[:, :, None] * slope),
         (whiten @ (spans * intercept)[:, :, None])[:, :, 0],
         whiten,
@@ -208,48 +208,48 @@ class Setup:
         slope, intercept, noise = (np.broadcast_to(array, (len(stops), *array.shape[1:])) for array in self.still[0])
         return slope, intercept, noise
 
-    def transitions(self, schedule: Schedule) -> tuple[list[Transition], tuple[str, ...]]:
-        """Return the transition of every interval and what is to be said of them.
+    def transitions(self, schedule: Schedule) -> tuple[Transition, tuple[str, ...]]:
+        """Return the transitions of all intervals and what is to be said of them.
 
         Raises:
             InputError: a coefficient is not finite.
         """
         if self.system.varying or len(schedule) == 0:
             found = self.integrated(schedule.starts, schedule.stops, schedule.inside)
-            self._check_finite(found, schedule)
+            self._check_finite(found, schedule.starts, schedule.stops)
             worst = float(found.error.max(initial=0.0))
-            separate = [Transition(*parts) for parts in zip(*found.transition, strict=True)]
             if worst <= RESOLVED:
-                return separate, ()
-            at = schedule.stops[np.argmax(found.error)]
-            return separate, (
+                return found.transition, ()
+            time = schedule.stops[np.argmax(found.error)]
+            return found.transition, (
                 f"the coefficients vary so fast within an interval that its transition is known to {worst:.1g} only (first at "
-                f"t = {at:g}); give shorter intervals",
+                f"t = {time:g}); give shorter intervals",
             )
         names = [row.tobytes() for row in np.concatenate([schedule.lengths[:, None], schedule.inside], axis=1)]
         first = {name: row for row, name in reversed(list(enumerate(names)))}
         with self.lock:
             known = {name: self.kept[name] for name in first if name in self.kept}
         missing = [name for name in first if name not in known]
+        tables = [Transition(*(array[None] for array in one)) for one in known.values()]
         if missing:
             rows = np.array([first[name] for name in missing])
             found = self.integrated(np.zeros(len(rows)), schedule.lengths[rows], schedule.inside[rows])
-            self._check_finite(found, Schedule(*(part[rows] for part in schedule)))
-            fresh = {name: Transition(*(array[i] for array in found.transition)) for i, name in enumerate(missing)}
-            known.update(fresh)
+            self._check_finite(found, schedule.starts[rows], schedule.stops[rows])
+            tables.append(found.transition)
             with self.lock:
                 if len(self.kept) > _KEPT:
                     self.kept.clear()
-                self.kept.update(dict(list(fresh.items())[:_KEPT]))
-        return [known[name] for name in names], ()
+                self.kept.update({name: at(found.transition, i) for i, name in enumerate(missing[:_KEPT])})
+        place = {name: i for i, name in enumerate([*known, *missing])}
+        places = np.array([place[name] for name in names])
+        return Transition(*(np.concatenate(fields)[places] for fields in zip(*tables, strict=True))), ()
 
-    def _check_finite(self, found: FlowResult, schedule: Schedule) -> None:
+    def _check_finite(self, found: FlowResult, starts: Array, stops: Array) -> None:
         wrong = np.isinf(found.error)
         if wrong.any():
             row = int(np.argmax(wrong))
             raise InputError(
-                f"{self.system.source}: a coefficient is not finite between t = {schedule.starts[row]:g} and "
-                f"{schedule.stops[row]:g}"
+                f"{self.system.source}: a coefficient is not finite between t = {starts[row]:g} and {stops[row]:g}"
             )
 
 

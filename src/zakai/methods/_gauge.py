@@ -65,12 +65,13 @@ class Gauge:
         self._formulas = _FORMULAS[model]
         self.trivial, self.exact, self.count = self._formulas.trivial, self._formulas.exact, self._formulas.count
         self.theta, self.origin = theta, origin
+        self._constant: list[Array] | None = None  # the matrices, where they do not depend on time
 
     def real(self) -> Gauge:
         """Return the same without derivatives."""
         other = object.__new__(Gauge)
         other.__dict__.update(self.__dict__)
-        other.theta = self.theta.real
+        other.theta, other._constant = self.theta.real, None
         return other
 
     def potential(self, x: Array, t: Any) -> Array:
@@ -79,7 +80,13 @@ class Gauge:
 
     def at(self, times: Array) -> Tilts:
         """Return the directions, slopes and logarithms of the coefficients at times (J,)."""
-        blocks = self._formulas.matrices(times, self.theta)
+        matrices = self._formulas.matrices
+        if matrices.varying:
+            blocks = matrices(times, self.theta)
+        else:
+            if self._constant is None:
+                self._constant = matrices(np.zeros(1), self.theta)
+            blocks = [np.broadcast_to(block, (len(times), *block.shape[1:])) for block in self._constant]
         if not self.exact:
             return Tilts(blocks[0], None, None)
         return Tilts(blocks[0], blocks[1], (blocks[2] + blocks[1] @ self.origin[:, None])[:, :, 0])
@@ -115,8 +122,9 @@ class Posterior(NamedTuple):
 
 
 def posterior(gauge: Gauge, tilts: Tilts, t: Any, families: Family) -> Posterior:
-    """Return e^phi times the families, with its first two moments."""
-    centres, covs, extra = _exponential(tilts, families) if gauge.exact else _summed(gauge, tilts, t, families)
+    """Return e^phi times the families, with its first two moments; phi is that of `tilts` where they have slopes."""
+    exact = tilts.slopes is not None
+    centres, covs, extra = _exponential(tilts, families) if exact else _summed(gauge, tilts, t, families)
     logs = log_terms(families)[:, :, None] + extra
     signs = families.signs[:, :, None]
     top = np.max(logs.real)
@@ -124,7 +132,7 @@ def posterior(gauge: Gauge, tilts: Tilts, t: Any, families: Family) -> Posterior
     total = np.sum(weights)
     share = weights / total
     doubt = 0.0
-    if not gauge.exact:
+    if not exact:
         # Twice the spacing squares the error of such a sum, or more.
         doubt = float(np.real(np.sum(weights * _checkerboard(gauge.count)) / total) ** 2)
     # Sums over the nodes are relative to a node near the mass, so that nothing large is subtracted.

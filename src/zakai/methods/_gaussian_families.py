@@ -23,9 +23,10 @@ from zakai.methods._gauged_density import GaugedDensity
 from zakai.methods._protocol import Info
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior, MixturePrior
+from zakai.numerics.complex_step import is_complex
 from zakai.numerics.families import Family, exponents, log_terms, move, observe, weigh
-from zakai.numerics.flow import Transition
-from zakai.numerics.transition import Array, transposed
+from zakai.numerics.gaussian_step import advance
+from zakai.numerics.transition import Array, Transition, at, transposed
 from zakai.records.schedule import Schedule
 
 _KEPT = 8  # values of the parameters for which a model's setup is kept
@@ -64,7 +65,10 @@ class State(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What is known without data: for every interval the transition, whether it `weighs`, its `ends`, and the gauge there."""
+    """What is known without data: for every interval the transition, its `ends`, and the gauge there.
+
+    `compiled`: the compiled step serves a single Gaussian.
+    """
 
     model: Model
     setup: Setup
@@ -72,8 +76,8 @@ class Prepared:
     lengths: Array
     stops: Array
     frequencies: Array
-    transitions: list[Transition]
-    weighs: list[bool]
+    transitions: Transition
+    compiled: bool
     ends: Ends
     tilts: Tilts
     notes: tuple[str, ...]
@@ -110,9 +114,9 @@ def prepare(model: Model, schedule: Schedule, theta: Array, kind: type[AffineSys
     inside = schedule.inside & (not sampled)
     frequencies = np.where(inside, 1.0, 0.0) / np.where(inside, lengths[:, None], 1.0)
     ends = ends_of(model.observation_kind, schedule, slope, intercept, noise)
-    weighs = [bool(one.information.any() or one.vector.any()) for one in transitions]
+    compiled = gauge.trivial and kind is AffineSystem and not is_complex(*transitions, *ends[1:4])
     tilts = gauge.at(schedule.stops)
-    return Prepared(model, setup, gauge, lengths, schedule.stops, frequencies, transitions, weighs, ends, tilts, notes)
+    return Prepared(model, setup, gauge, lengths, schedule.stops, frequencies, transitions, compiled, ends, tilts, notes)
 
 
 @np.errstate(all="ignore")
@@ -150,7 +154,7 @@ def move_families(prepared: Prepared, k: int, families: Family, inputs: Array) -
     """Return the families after the transition of interval k."""
     if prepared.lengths[k] == 0:
         return families
-    return move(families, prepared.transitions[k], inputs, prepared.weighs[k])
+    return move(families, at(prepared.transitions, k), inputs)
 
 
 def inputs_of(prepared: Prepared, k: int, values: Array) -> Array:
@@ -163,12 +167,13 @@ def inputs_of(prepared: Prepared, k: int, values: Array) -> Array:
 
 def observe_end(ends: Ends, k: int, families: Family, values: Array) -> Family:
     """Return the families times the factor of what is observed at the end of interval k."""
-    if not len(ends.rows[k]):
+    rows = ends.observed[k].nonzero()[0]
+    if not len(rows):
         return families
     white = ends.whiten[k].dot(values)
     residual, slope = white - ends.intercept[k], ends.slope[k]
     constant = ends.constant[k]
-    for row in ends.rows[k]:
+    for row in rows:
         families = observe(families, slope[row], residual[row])
         if ends.relative:
             constant = constant + 0.5 * white[row] ** 2
@@ -178,25 +183,26 @@ def observe_end(ends: Ends, k: int, families: Family, values: Array) -> Family:
 @np.errstate(all="ignore")
 def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
     """Advance one interval: the transition, with the rates of y inside; what is observed at its end; normalise."""
-    families = move_families(prepared, k, state.families, inputs_of(prepared, k, values))
-    families = observe_end(prepared.ends, k, families, values)
+    gauge, setup, inputs = prepared.gauge, prepared.setup, inputs_of(prepared, k, values)
+    if prepared.compiled and len(state.log_mass) == 1 and not state.nodes.shape[2]:
+        mean, cov, ends = state.mean.copy(), state.cov.copy(), prepared.ends
+        log_mass = state.log_mass[0] + advance(
+            k, mean[0], cov[0], prepared.lengths[k] > 0, *prepared.transitions, inputs, np.ascontiguousarray(values),
+            ends.whiten, ends.slope, ends.intercept, ends.observed, ends.constant, ends.relative,
+        )  # fmt: skip
+        moved = State(*state[:3], mean, cov, *state[5:8], np.zeros(1), *state[9:11], float(prepared.stops[k]))
+        return moved, Info(log_mass, mean[0] + setup.origin, cov[0], health_of_gaussian(cov[0]))
+    families = observe_end(prepared.ends, k, move_families(prepared, k, state.families, inputs), values)
     moved = State(*families, state.log_error, state.edge, float(prepared.stops[k]))
-    gauge, setup = prepared.gauge, prepared.setup
-    if gauge.trivial and len(families.log_mass) == 1 and not families.nodes.shape[2]:
-        log_mass, mean, cov = families.log_mass[0], families.mean[0], families.cov[0]
-        health = _no_nodes(cov)
-        unit = np.zeros(1)
-    else:
-        quadratic = setup.system.quadratic(setup.theta, setup.origin)
-        own = families if quadratic is None else times_gauge(families, quadratic, -1.0)
-        found = posterior(gauge, tilts_at(prepared.tilts, k), prepared.stops[k], own)
-        log_mass, mean, cov = found.log_mass, found.mean, found.cov
-        health = health_of(moved, own, found)
-        unit = families.log_mass - log_mass
-    return moved._replace(log_mass=unit), Info(log_mass, mean + setup.origin, cov, health)
+    quadratic = setup.system.quadratic(setup.theta, setup.origin)
+    own = families if quadratic is None else times_gauge(families, quadratic, -1.0)
+    found = posterior(gauge, tilts_at(prepared.tilts, k), prepared.stops[k], own)
+    info = Info(found.log_mass, found.mean + setup.origin, found.cov, health_of(moved, own, found))
+    return moved._replace(log_mass=families.log_mass - found.log_mass), info
 
 
-def _no_nodes(cov: Array) -> dict[str, float]:
+def health_of_gaussian(cov: Array) -> dict[str, float]:
+    """Return the health of a posterior without nodes."""
     variances = cov.diagonal().real.tolist()
     negative = max(0.0, -min(variances)) / max(max(map(abs, variances)), 1e-300)
     return {"negative_variance": negative, "representation_error": 0.0, "edge_weight": 0.0, "gauge_error": 0.0}
@@ -204,7 +210,7 @@ def _no_nodes(cov: Array) -> dict[str, float]:
 
 def health_of(state: State, families: Family, found: Posterior) -> dict[str, float]:
     """Return the health of the posterior of `families`, which are not yet normalised; `state` has the errors of the nodes."""
-    health = _no_nodes(found.cov)
+    health = health_of_gaussian(found.cov)
     if families.nodes.shape[2] == 0:
         return health
     # The effect of an error of the prior's representation on the posterior, wherever it was made.
@@ -232,21 +238,30 @@ def density(prepared: Prepared, state: State) -> Density:
 def density_of(model: Model, gauge: Gauge, time: float, families: Family) -> Density:
     """Return e^phi times the families, normalised."""
     found = posterior(gauge, gauge.at_one(time), time, families)
-    weights = found.signs * np.exp(found.logs - found.log_mass)
-    moved = families.nodes @ transposed(families.response)
-    means = found.centres[:, None] + moved[:, :, None] + gauge.origin
     # A density without width in some direction, as of a known start, is on no grid.
     if not gauge.exact and np.all(np.linalg.eigvalsh(families.cov)[:, 0] > 1e-14 * np.trace(families.cov, axis1=1, axis2=2)):
-        return _gauged(model, gauge, time, families, found, np.abs(weights), means)
+        return _gauged(model, gauge, time, families, found)
+    return mixture_of(model, gauge.origin, families, found)
+
+
+def _weighted(origin: Array, families: Family, found: Posterior) -> tuple[Array, Array]:
+    """Return the weights (J, N, E) of the Gaussians of a posterior and their means (J, N, E, n)."""
+    moved = families.nodes @ transposed(families.response)
+    return found.signs * np.exp(found.logs - found.log_mass), found.centres[:, None] + moved[:, :, None] + origin
+
+
+def mixture_of(model: Model, origin: Array, families: Family, found: Posterior) -> GaussianMixture:
+    """Return the Gaussians of a posterior as a density."""
+    weights, means = _weighted(origin, families, found)
     covs = np.broadcast_to(found.covs[:, None, None], (*weights.shape, model.n, model.n))
     used = weights != 0.0
     return GaussianMixture(weights[used], means[used], covs[used], model.state, (False,) * model.n)
 
 
-def _gauged(
-    model: Model, gauge: Gauge, time: float, families: Family, found: Posterior, shares: Array, points: Array
-) -> GaugedDensity:
-    """Return e^phi v by its formula; `shares` (J, N, E) at `points` (J, N, E, n) are where its mass is."""
+def _gauged(model: Model, gauge: Gauge, time: float, families: Family, found: Posterior) -> GaugedDensity:
+    """Return e^phi v by its formula."""
+    shares, points = _weighted(gauge.origin, families, found)
+    shares = np.abs(shares)
     logs = log_terms(families)
     weights = families.signs * np.exp(logs - logs.max())
     means = families.mean[:, None] + families.nodes @ transposed(families.response) + gauge.origin

@@ -16,11 +16,21 @@ from typing import Any
 
 import numpy as np
 
-from zakai.densities import GridDensity
+from zakai.densities import Density, GridDensity, MappedDensity
 from zakai.errors import InputError
-from zakai.methods import _line_fast as fast
+from zakai.methods import _line_loop as loop
+from zakai.methods._line_domain import on_the_line, variable_of
+from zakai.methods._line_model import System
 from zakai.methods._line_moves import Report, propagated
-from zakai.methods._line_system import NOISE, Prepared, State, system_of
+from zakai.methods._line_system import (
+    NOISE,
+    Prepared,
+    State,
+    covariance_at,
+    edge_of_moments,
+    outside_tables,
+    state_moments,
+)
 from zakai.methods._line_update import exponential_factor, factor_at_end
 from zakai.methods._protocol import Info, Infos
 from zakai.models.model import Model
@@ -28,7 +38,9 @@ from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior, GaussianPrior
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel, around, chosen
-from zakai.numerics.line_posterior import multiplied
+from zakai.numerics.line_loop import RELIABLE
+from zakai.numerics.line_posterior import General, Likelihood, multiplied
+from zakai.numerics.line_transition import separated
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 from zakai.records.schedule import Schedule
 
@@ -43,7 +55,7 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
     """
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 1e-12 <= tolerance <= 0.1:
         raise InputError(f"option tolerance: {tolerance!r} must be a number from 1e-12 to 0.1")
-    system = system_of(model)
+    system = System(on_the_line(model), schedule.inputs)
     # A sample may lead deep into the tails, where a small error counts; increments do not.
     negligible = 1e-13 if system.samples else float(np.clip(1e-6 * tolerance, 1e-13, 1e-10))
     generous = lw.LARGEST if system.samples and not system.moving else 96
@@ -53,16 +65,13 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
 
 def init(prepared: Prepared, prior: Any) -> State:
     """Return the prior on a grid that fits it."""
-    model, closed = prepared.model, bool(prepared.model.periodic)
+    model, closed, variable = prepared.model, bool(prepared.model.periodic), variable_of(prepared.model)
     if isinstance(prior, DensityPrior):
         function, log_density = numpy_function([prior.log_density], model, (1,)), None
 
         def evaluate(points: Array) -> Array:
-            return function(points, model.start, prepared.theta)[..., 0]
+            return function(points if variable is None else variable.x(points), model.start, prepared.theta)[..., 0]
 
-        grid = prior_grid(lambda points: evaluate(points).real, 1, [closed])
-        low, high = (float(grid.points[i, 0]) for i in (0, -1))
-        logs, spacing = grid.log_values, float(grid.basis[0, 0])
     else:
         if isinstance(prior, GaussianPrior):
             weights, means, covs = np.ones(1), prior.mean[None], prior.cov[None]
@@ -72,7 +81,26 @@ def init(prepared: Prepared, prior: Any) -> State:
         if np.any(deviations <= 1e-14 * np.abs(means[:, 0])):
             raise InputError("prior: a variance is zero; a grid needs a density, so give it a small variance")
         log_density = mixture_log_density(weights, means, covs, [closed])
-        low, high = float(np.min(means[:, 0] - 7.8 * deviations)), float(np.max(means[:, 0] + 7.8 * deviations))
+        if variable is not None:
+            mixture, log_density = log_density, None
+
+            def evaluate(points: Array) -> Array:
+                return mixture(np.array([variable.end]), variable.offset(points))
+
+    if variable is not None:
+        of_state = evaluate
+
+        def evaluate(points: Array) -> Array:
+            with np.errstate(all="ignore"):
+                return of_state(points) + variable.log_slope(points)[..., 0]
+
+    if log_density is None:
+        grid = prior_grid(lambda points: evaluate(points).real, 1, [closed])
+        low, high = (float(grid.points[i, 0]) for i in (0, -1))
+        spacing = float(grid.basis[0, 0])
+    else:
+        depth = float(np.sqrt(-2.0 * np.log(prepared.cut))) + 0.1
+        low, high = float(np.min(means[:, 0] - depth * deviations)), float(np.max(means[:, 0] + depth * deviations))
         spacing = float(deviations.min()) / 3.0
     if closed:
         size = lw.size_for(2 * np.pi / min(spacing * 0.95, 2 * np.pi / 64))
@@ -90,24 +118,24 @@ def init(prepared: Prepared, prior: Any) -> State:
             logs = log_density(np.array([window.origin]), window.offsets[:, None])
         values = np.exp(logs - np.max(logs.real))
         values = values / np.sum(values)
-        look = lw.figures(values, closed)
+        look = lw.figures(values, closed, cut=prepared.cut)
         new = lw.fitted(look, window, lw.SIZES[-1])
         if new == window:
             break
         window = new
-    return _state(values, window, max(0.0, look.aliasing - 1e-12))
+    return _state(values, window, max(0.0, look.aliasing - 1e-12), -700.0)
 
 
-def _state(values: Array, window: lw.Window, error: float) -> State:
-    return State(values, window.origin, window.centre, window.spacing, window.unit, window.closed, float(error))
+def _state(values: Array, window: lw.Window, error: float, log_floor: float) -> State:
+    return State(values, window.origin, window.centre, window.spacing, window.unit, window.closed, error, log_floor)
 
 
 def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
     """Return the state after interval k and the observation at its stop, and the report."""
     if prepared.fast[k]:
-        found = fast.run(prepared, slice(k, k + 1), state, observed[None])
+        found = loop.run(prepared, slice(k, k + 1), state, observed[None])
         if found is not None:
-            return found[0][0], fast.one_of(found[1], 0)
+            return found[0][0], loop.one_of(found[1], 0)
     # Attempts that overflow are taken again in shorter substeps.
     with np.errstate(all="ignore"):
         return _step(prepared, k, state, observed)
@@ -124,7 +152,7 @@ def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray)
             last += 1
         found = None
         if last > k:
-            found = fast.run(prepared, slice(k, last), state, observed[k - rows.start : last - rows.start])
+            found = loop.run(prepared, slice(k, last), state, observed[k - rows.start : last - rows.start])
         if found is not None:
             states += found[0]
             parts.append(found[1])
@@ -134,9 +162,7 @@ def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray)
             states.append(state)
             parts.append(_alone(info))
         k, state = rows.start + len(states), states[-1]
-    health = {name: np.concatenate([part.health[name] for part in parts]) for name in parts[0].health}
-    increments, means, covs = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    return states, Infos(increments, means, covs, health)
+    return states, loop.joined(parts)
 
 
 def _alone(info: Info) -> Infos:
@@ -156,25 +182,40 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
         start = float(schedule.starts[k])
         kernel = _kernel(prepared, k, window, rates, report)
         values, window, gained, look = propagated(prepared, values, window, start, length, inside, rates, kernel, report)
-    predicted, floor = lw.moments(values, window), NOISE + report.aliasing + report.edge
+    predicted, log_floor = lw.moments(values, window), float(state.log_floor)
+    if report.positive:
+        floor = float(np.exp(log_floor)) + report.edge
+    else:
+        log_floor = float(np.log(NOISE))
+        floor = NOISE + report.aliasing + report.edge
     at_end = schedule.seen[k] & ~inside
     if at_end.any() or (prepared.lie and inside.any()):
         if at_end.any():
-            likelihood = factor_at_end(prepared, k, at_end, observed, window)
+            likelihood: Likelihood = factor_at_end(prepared, k, at_end, observed, window)
         else:
             likelihood = exponential_factor(prepared, k, observed)
+        if isinstance(likelihood, General):
+            report.lawless = float(np.sum(values.real[np.isnan(likelihood.log_density(window.points).real)]))
         result = multiplied(values, window, likelihood, max(1e-10, 1e-3 * prepared.tolerance))
         values, window, gained = result.values, result.window, gained + result.log_mass
         report.depth, report.growth = result.depth, result.growth
-        look = lw.figures(values, window.closed, prepared.negligible)
+        look = lw.figures(values, window.closed, prepared.negligible, prepared.cut)
         report.density(look)
+    look = lw.figures(values, window.closed, prepared.negligible, prepared.cut) if look is None else look
+    new = lw.fitted(look, window, prepared.largest, prepared.generous)
+    moved = lw.resampled(values, window, new)
+    if new != window:  # the largest grid may be too coarse for all that the density has
+        moved = moved / np.sum(moved)
+        coarse = lw.figures(moved, new.closed, prepared.negligible, prepared.cut).aliasing
+        report.aliasing = max(report.aliasing, coarse)
     mean, variance = lw.moments(values, window)
+    report.edge = max(report.edge, edge_of_moments(prepared, values, window))
     made = 2.0 * report.aliasing + 10.0 * report.edge + report.time + 10.0 * report.negative
     made += min(floor * report.growth, 1.0)
-    error = made + state.error * forgetting(before[1], predicted[1], variance, spread(prepared, k, length))
+    kept = forgetting(before[1], predicted[1], variance, spread(prepared, k, length, window.origin + mean.real))
+    error = made + state.error * (1.0 if separated(np.ascontiguousarray(values.real)) else kept)
+    error = max(error, RELIABLE * prepared.promised)
     spacings = float(np.sqrt(max(variance.real, 0.0))) / window.spacing
-    look = lw.figures(values, window.closed, prepared.negligible) if look is None else look
-    new = lw.fitted(look, window, prepared.largest, prepared.generous)
     health = {
         "error_estimate": error,
         "tolerance_ratio": made / prepared.promised,
@@ -182,16 +223,18 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
         "negative_mass": report.negative,
         "aliasing": report.aliasing,
         "time_error": report.time,
-        "tail_depth": report.depth / prepared.deepest,
+        "tail_depth": report.depth / prepared.deepest(floor),
         "std_in_spacings": spacings,
     }
-    moved = lw.resampled(values, window, new)
-    if new is not window and new != window:
-        moved = moved / np.sum(moved)
-    mean = window.origin + mean
+    if prepared.system.general:
+        health["without_law"] = report.lawless
+    if prepared.system.tabulated:
+        health["outside_tables"] = outside_tables(prepared, values, window, float(schedule.stops[k]))
+    mean, variance = state_moments(prepared, values, window, mean, variance)
     if window.closed:
         mean = mean - 2 * np.pi * np.ceil((mean.real - np.pi) / (2 * np.pi))
-    return _state(moved, new, error), Info(gained, np.array([mean]), np.array([[variance]]), health)
+    log_floor = min(log_floor + max(report.depth - 1.0, 0.0), 0.0)
+    return _state(moved, new, float(error), log_floor), Info(gained, np.array([mean]), np.array([[variance]]), health)
 
 
 def _kernel(prepared: Prepared, k: int, window: lw.Window, rates: np.ndarray, report: Report) -> Channel | None:
@@ -213,18 +256,18 @@ def forgetting(before: Any, predicted: Any, after: Any, spread: float) -> float:
     return float(np.clip(ratio * np.exp(-min(0.5 * spread / max(before.real, 1e-300), 5.0)), 0.3, 1.0))
 
 
-def spread(prepared: Prepared, k: int, length: float) -> float:
+def spread(prepared: Prepared, k: int, length: float, mean: float) -> float:
     """Return about the integral of G over interval k where increments act inside."""
     if not prepared.inside[k].any():
         return 0.0
     middle = float(prepared.schedule.starts[k]) + 0.5 * length
-    return length * float(prepared.system.covariance(np.zeros(1), middle, prepared.theta)[0, 0].real)
+    return length * float(np.max(covariance_at(prepared.system, np.array([mean]), middle, prepared.theta).real))
 
 
 def valid(prepared: Prepared, state: State) -> bool:
     """Return whether the parts of a state fit together."""
     values = np.asarray(state.values)
-    numbers = np.array([state.origin, state.centre, state.spacing, state.unit, state.error], float)
+    numbers = np.array([state.origin, state.centre, state.spacing, state.unit, state.error, state.log_floor], float)
     if values.ndim != 1 or not 8 <= len(values) <= lw.SIZES[-1] or not np.isfinite(numbers).all():
         return False
     if bool(state.closed) != bool(prepared.model.periodic) or not (state.spacing > 0 and state.unit > 0):
@@ -232,10 +275,11 @@ def valid(prepared: Prepared, state: State) -> bool:
     return bool(np.isfinite(values).all() and values.real.sum() > 0)
 
 
-def density(prepared: Prepared, state: State) -> GridDensity:
+def density(prepared: Prepared, state: State) -> Density:
     """Return the density of a state."""
     with np.errstate(divide="ignore"):
         logs = np.log(np.maximum(np.asarray(state.values).real, 0.0))
     window = state.window
-    names = prepared.model.state
-    return GridDensity(logs, np.array([window.origin + window.centre]), np.array([[window.spacing]]), names, (window.closed,))
+    names, variable = prepared.model.state, variable_of(prepared.model)
+    found = GridDensity(logs, np.array([window.origin + window.centre]), np.array([[window.spacing]]), names, (window.closed,))
+    return found if variable is None else MappedDensity(found, variable)

@@ -1,6 +1,6 @@
 """The density of one state after an interval: attempts on a grid, in substeps, until one is accurate.
 
-    u_t = G u'' / 2 - (f u)' + (h'S^-1 dy/dt - h'S^-1 h / 2) u
+    u_t = (G u)'' / 2 - (f u)' + (h'S^-1 dy/dt - h'S^-1 h / 2) u
 """
 
 from __future__ import annotations
@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods._line_system import Prepared, finite, spectral, tables
+from zakai.methods._line_model import within
+from zakai.methods._line_system import Prepared, covariance_at, drift_at, finite, spectral, tables
 from zakai.methods._line_yau import moved
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel
@@ -29,8 +30,8 @@ class Report:
     """The worst health figures within one step."""
 
     def __init__(self) -> None:
-        self.aliasing = self.edge = self.time = self.depth = self.growth = self.negative = 0.0
-        self.spacings = np.inf
+        self.aliasing = self.edge = self.time = self.depth = self.growth = self.negative = self.lawless = 0.0
+        self.positive = True  # small values are accurate
 
     def density(self, look: lw.Figures) -> None:
         """Note the figures of a density."""
@@ -55,11 +56,13 @@ def propagated(
     gained: Any = 0.0
     rough, resolved = max(1e-10, 1e-3 * prepared.tolerance), 30.0 * negligible
     if kernel is not None and prepared.yau is not None:
-        direct = moved(prepared.yau, kernel, values, window, start, start + length, prepared.theta, negligible, rough)
+        ends = start, start + length
+        direct = moved(prepared.yau, kernel, values, window, *ends, prepared.theta, negligible, rough, prepared.cut)
         if direct is not None:
             report.density(direct.look)
             mass = np.sum(direct.values)
             return direct.values / mass, direct.window, np.log(mass) + direct.offset, direct.look
+    report.positive = False
     bounds = [(0.0, length)]
     if system.varying:
         bounds = _panels(prepared, values, window, start, length, inside, report)
@@ -70,6 +73,8 @@ def propagated(
         substeps += 1
         if not np.isfinite(values.real).all():
             return values, window, np.float64(np.nan), look
+        begin = window
+        known = lw.figures(values, window.closed, negligible).aliasing
         while True:
             attempt = _attempt(prepared, values, window, start, first, last, inside, rates)
             total = float(np.sum(attempt.values.real))
@@ -103,8 +108,8 @@ def propagated(
         if split:
             if attempt.split and attempt.error > 0:  # the error of Magnus' series falls as the fifth power of the length
                 count = int(np.clip(np.ceil(1.1 * (attempt.error / (MAGNUS * prepared.tolerance)) ** 0.2), 2, 16))
-                ends = first + (last - first) * np.arange(1, count) / count
-                stack += list(zip([first, *ends], [*ends, last], strict=True))[::-1]
+                cuts = first + (last - first) * np.arange(1, count) / count
+                stack += list(zip([first, *cuts], [*cuts, last], strict=True))[::-1]
             else:
                 middle = first + (last - first) * (0.25 if last - first > 1e-3 * length else 0.0625)
                 stack += [(middle, last), (first, middle)]
@@ -113,6 +118,9 @@ def propagated(
             continue
         assert look is not None
         report.density(look)
+        if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
+            brought = lw.figures(values, window.closed, negligible).aliasing
+            report.aliasing = max(report.aliasing, brought - known)
         report.time += attempt.error
         values = np.where(attempt.values.real > 0, attempt.values, 0.0)
         mass = np.sum(values)
@@ -196,7 +204,7 @@ def _magnus(
     zeroth, moment = length * GAUSS_WEIGHTS, 2.0 * length * GAUSS_WEIGHTS * (GAUSS_NODES - 0.5)
     early, late = 0.5 * zeroth - moment, 0.5 * zeroth + moment
     offset, split = _offset(zeroth @ potential, values)
-    if split or (early @ covariance).real < 0 or (late @ covariance).real < 0:
+    if split or np.any((early @ covariance).real < 0) or np.any((late @ covariance).real < 0):
         return _Attempt(values, 0.0, 0.0, True)
     closed, spacing = window.closed, window.spacing
     shift = np.full(window.size, offset / 2)
@@ -218,16 +226,16 @@ def _magnus(
 def _coefficients(
     prepared: Prepared, window: lw.Window, times: np.ndarray, inside: np.ndarray, rates: np.ndarray, values: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return f (T, N), G (T,), V less a constant (T, N) and the constant (T,)."""
+    """Return f (T, N), G (T,) or (T, N), V less a constant (T, N) and the constant (T,)."""
     system, theta = prepared.system, prepared.theta
     points = window.points[:, None]
     if system.moving:
-        drift = finite(system.drift(points, times[:, None], theta)[..., 0])
-        covariance = system.covariance(np.zeros((len(times), 1)), times, theta)[:, 0, 0]
+        drift = drift_at(system, window, times, theta)
+        covariance = covariance_at(system, window.points, times, theta)
     else:
         known = tables(prepared, window)
         drift = np.broadcast_to(known.drift, (len(times), window.size))
-        covariance = np.broadcast_to(known.covariance, len(times))
+        covariance = np.broadcast_to(known.covariance, (len(times), *np.shape(known.covariance)))
     if not inside.any():
         return drift, covariance, np.zeros((len(times), window.size)), np.zeros(len(times))
     if system.steady_observation and system.steady_noise:
@@ -288,19 +296,23 @@ def _panels(
     first, last = look.first, look.last
     x = window.points[np.unique(np.linspace(first, last, 7).astype(int))]
 
-    def coefficients(times: Array) -> Array:
-        t = start + times
-        columns = []
-        if system.moving:
-            columns.append(system.drift(x[:, None], t[:, None], theta)[..., 0])
-            columns.append(system.covariance(np.zeros((len(t), 1)), t, theta)[:, 0])
-        if inside.any() and not system.steady_observation:
-            columns.append(system.observation(x[:, None], t[:, None], theta)[..., inside].reshape(len(t), -1))
-        if inside.any() and not system.steady_noise:
-            noise = system.noise(np.zeros((len(t), 1)), t, theta)[:, inside][..., inside]
-            columns.append(np.linalg.inv(noise).reshape(len(t), -1))
-        return finite(np.concatenate(columns, axis=1)) if columns else np.zeros((len(t), 1))
+    bounds = []
+    for low, high in system.pieces(start, start + length):
 
-    found = panels(coefficients, 0.0, length)
-    report.time += found.error
-    return found.bounds
+        def coefficients(times: Array, low: float = low, high: float = high) -> Array:
+            t = within(start + times, low, high)
+            columns = []
+            if system.moving:
+                columns.append(system.drift(x[:, None], t[:, None], theta)[..., 0])
+                columns.append(covariance_at(system, x, t, theta).reshape(len(t), -1))
+            if inside.any() and not system.steady_observation:
+                columns.append(system.observation(x[:, None], t[:, None], theta)[..., inside].reshape(len(t), -1))
+            if inside.any() and not system.steady_noise:
+                noise = system.noise(np.zeros((len(t), 1)), t, theta)[:, inside][..., inside]
+                columns.append(np.linalg.inv(noise).reshape(len(t), -1))
+            return finite(np.concatenate(columns, axis=1)) if columns else np.zeros((len(t), 1))
+
+        found = panels(coefficients, low - start, length if high == start + length else high - start)
+        report.time += found.error
+        bounds += found.bounds
+    return bounds

@@ -8,16 +8,16 @@ from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import sympy as sp
 
+from zakai.methods._line_domain import variable_of
+from zakai.methods._line_model import System
 from zakai.methods._line_yau import Kernels, YauLine
 from zakai.methods._series_kernel import PowerSeries
 from zakai.models.model import Model
-from zakai.models.numeric import numpy_function
 from zakai.numerics import line_window as lw
+from zakai.numerics.line_loop import FACTOR, KERNEL, SPLIT
 from zakai.numerics.line_operator import Spectral
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
-from zakai.numerics.line_splitting import FACTOR, KERNEL, SPLIT
 from zakai.records.schedule import Schedule
 
 Array = Any
@@ -26,41 +26,16 @@ NOISE = 3e-15  # error of a density relative to its maximum, which matters in it
 KEPT = 60  # tables and decompositions of grids that are kept for a model
 
 
-class System:
-    """The formulas of a model with one state as functions of points and times."""
-
-    def __init__(self, model: Model):
-        x, t = model.x[0], model.t
-        self.m = model.m
-        self.samples = model.observation_kind == "samples"
-        self.drift = numpy_function(model.drift, model, (1,))
-        self.slope = numpy_function([sp.diff(model.drift[0], x)], model, (1,))
-        self.covariance = numpy_function(model.covariance, model, (1, 1))
-        self.observation = numpy_function(model.observation, model, (model.m,))
-        self.noise = numpy_function(model.observation_noise, model, (model.m, model.m))
-        self.observation_slope = numpy_function([sp.diff(h, x) for h in model.observation], model, (model.m,))
-        second = [sp.diff(h, x, 2) for h in model.observation]
-        smooth = not any(h.has(sp.DiracDelta, sp.Derivative, sp.sign) for h in second)
-        self.curvature = numpy_function(second, model, (model.m,)) if smooth else None
-        self.moving = model.drift.has(t) or model.covariance.has(t)
-        self.steady_observation = not model.observation.has(t)
-        self.steady_noise = not model.observation_noise.has(t)
-        self.varying = self.moving or not (self.samples or (self.steady_observation and self.steady_noise))
-
-
-@lru_cache(maxsize=32)
-def system_of(model: Model) -> System:
-    """Return the functions of a model, made once."""
-    return System(model)
-
-
 @lru_cache(maxsize=8)
 def _kept(model: Model, theta: bytes, kind: str) -> dict[Any, Any]:
     return {}
 
 
 class State(NamedTuple):
-    """The probabilities (N,) of the points of a grid, and an estimate of their relative error so far."""
+    """The probabilities (N,) of the points of a grid, and an estimate of their relative error so far.
+
+    `log_floor` is the logarithm of the error of small values, relative to the largest.
+    """
 
     values: np.ndarray
     origin: float
@@ -69,6 +44,7 @@ class State(NamedTuple):
     unit: float
     closed: bool
     error: float
+    log_floor: float
 
     @property
     def window(self) -> lw.Window:
@@ -113,8 +89,38 @@ class Prepared:
     @cached_property
     def gaussian(self) -> bool:
         """Whether the compiled loop takes Gaussian kernels, else the decomposition of the operator."""
+        if self.model.periodic:
+            return self.yau is not None and self.yau.flat and self.system.samples
         steady = not self.system.varying
         return self.yau is not None and not (steady and not self.yau.affine)
+
+    @cached_property
+    def cut(self) -> float:
+        """The density relative to its maximum that a grid must hold."""
+        if not self.gaussian or (self.kinds < 0).all():
+            return lw.CUT
+        if self.model.periodic:
+            return 1e-280  # a grid around the circle holds every value
+        return 1e-32 if self.system.samples else lw.DEEP
+
+    @property
+    def finest(self) -> float:
+        """The points of the largest grid that is taken so that kernels are filters of positive numbers."""
+        return 512.0 if self.system.samples else 256.0
+
+    @cached_property
+    def precisions(self) -> tuple[np.ndarray, np.ndarray]:
+        """The inverses of the observed blocks of S (K, m, m), and the constants of the log-likelihoods (K,)."""
+        from zakai.methods._line_loop import precisions_of
+
+        return precisions_of(self)
+
+    @cached_property
+    def channels(self) -> np.ndarray:
+        """The kernels (K, P, 6) of intervals and of their halves."""
+        from zakai.methods._line_loop import channels_of
+
+        return channels_of(self)
 
     @property
     def largest(self) -> int:
@@ -135,18 +141,28 @@ class Prepared:
     def parts(self, count: int) -> Kernels | None:
         """Return the kernels of `count` equal parts of the intervals that are split, for those without observations inside."""
         if count not in self.divided:
-            schedule, split = self.schedule, self.kinds == SPLIT
-            lengths, nothing = np.where(split, self.lengths, 0.0), np.zeros_like(self.inside)
             assert self.yau is not None
+            first = self.divided.get(2)
+            lengths, nodes = np.where(self.kinds == SPLIT, self.lengths, 0.0), None if first is None else first.nodes
+            starts, nothing = self.schedule.starts, np.zeros_like(self.inside)
             self.divided[count] = self.yau.kernels(
-                schedule.starts, lengths, nothing, self.theta, False, self.origin, self.series, count
+                starts, lengths, nothing, self.theta, False, self.origin, self.series, count, nodes
             )
         return self.divided[count]
 
-    @property
-    def deepest(self) -> float:
-        """The depth of the tails, as a logarithm below the maximum, down to which a density is accurate."""
-        return float(np.log(max(self.promised / NOISE, 10.0)))
+    def parts_of(self, k: int, count: int) -> Kernels | None:
+        """Return the same of interval k alone."""
+        together, row = self.parts(2), slice(k, k + 1)
+        if self.yau is None or together is None or together.place[k] < 0:
+            return None
+        place = int(together.place[k])
+        nodes = None if together.nodes is None else together.nodes.part(slice(place, place + 1))
+        starts, nothing = self.schedule.starts[row], np.zeros_like(self.inside[row])
+        return self.yau.kernels(starts, self.lengths[row], nothing, self.theta, False, self.origin, self.series, count, nodes)
+
+    def deepest(self, floor: float) -> float:
+        """Return the depth of the tails, as a logarithm below the maximum, to which a density with this floor is accurate."""
+        return max(float(np.log(self.promised) - np.log(max(floor, 1e-300))), 2.3)
 
     def once(self, key: Any, make: Callable[[], Any]) -> Any:
         """Return what `make` returns for a key, from the last ones that were kept; a value depends on its key alone."""
@@ -163,19 +179,20 @@ class Prepared:
 
 
 def kinds_of(prepared: Prepared) -> np.ndarray:
-    """Return how the compiled loop of `_line_fast` takes each interval (K,), -1 where it does not."""
+    """Return how the compiled loop of `_line_loop` takes each interval (K,), -1 where it does not."""
     system, schedule, yau, kernels = prepared.system, prepared.schedule, prepared.yau, prepared.kernels
     positive = prepared.lengths > 0
     none = np.full(len(schedule), -1)
-    if np.iscomplexobj(prepared.theta) or prepared.model.periodic or prepared.lie:
+    if np.iscomplexobj(prepared.theta) or prepared.lie or (prepared.model.periodic and not system.samples):
         return none
-    splits = system.steady_observation and system.steady_noise and system.curvature is not None
+    splits = system.steady_observation and system.steady_noise and system.curvature is not None and not system.state_dependent
+    silent = ~schedule.seen.any(axis=1)
     regular = positive & np.all(schedule.seen == prepared.inside, axis=1)
     if not prepared.gaussian or yau is None:
         if system.moving or not system.steady_observation:
             return none
         if system.samples:
-            return np.where(positive, FACTOR, -1)
+            return np.where(positive & (silent | (not system.general)), FACTOR, -1)
         return np.where(regular, SPLIT, -1) if splits else none
     if not yau.bare or not yau.steady_gauge:
         return none
@@ -184,19 +201,44 @@ def kinds_of(prepared: Prepared) -> np.ndarray:
     else:
         whole = positive & (kernels.place >= 0) & (kernels.errors[kernels.place] == 0)
     if system.samples:
-        return np.where(whole, FACTOR, -1) if system.steady_observation else none
-    observed = schedule.seen.any(axis=1)
+        return np.where(whole & (silent | (not system.general)), FACTOR, -1) if system.steady_observation else none
     split = SPLIT if splits else -1
     inside = np.where(whole, KERNEL, -1) if yau.affine else np.full(len(schedule), split)
-    return np.where(observed, np.where(regular, inside, -1), np.where(whole, FACTOR, -1))
+    return np.where(silent, np.where(whole, FACTOR, -1), np.where(regular, inside, -1))
 
 
 class Tables(NamedTuple):
-    """f and h at the points of a grid where they do not depend on t: (N,), (m, N); and G."""
+    """f and h at the points of a grid where they do not depend on t: (N,), (m, N); and G, (N,) where it depends on x."""
 
     drift: Array
     observation: Array
     covariance: Any
+
+
+def outside_tables(prepared: Prepared, values: Array, window: lw.Window, t: float) -> float:
+    """Return the share of the mass where a table is constant beyond its range."""
+    return float(values.real @ prepared.system.outside(window.points, t, prepared.theta) / np.sum(values.real))
+
+
+def state_moments(prepared: Prepared, values: Array, window: lw.Window, mean: Any, variance: Any) -> tuple[Any, Any]:
+    """Return the mean and variance of the state from those of the variable of the grid, relative to its origin."""
+    variable = variable_of(prepared.model)
+    if variable is None:
+        return window.origin + mean, variance
+    offsets = variable.offset(window.points)
+    mean = offsets @ values
+    apart = offsets - mean
+    return variable.end + mean, (apart * apart) @ values
+
+
+def edge_of_moments(prepared: Prepared, values: Array, window: lw.Window) -> float:
+    """Return the share of the second moment of the state at the ends of the grid, where the state has a domain."""
+    variable = variable_of(prepared.model)
+    if variable is None:
+        return 0.0
+    offsets = variable.offset(window.points)
+    parts = (offsets - offsets[int(np.argmax(values.real))]) ** 2 * values.real
+    return float(max(parts[0], parts[-1]) / np.sum(parts))
 
 
 def finite(values: Array) -> Array:
@@ -210,10 +252,9 @@ def tables(prepared: Prepared, window: lw.Window) -> Tables:
 
     def make() -> Tables:
         points = window.points[:, None]
-        drift = finite(system.drift(points, start, theta)[:, 0])
+        drift = drift_at(system, window, start, theta)
         observation = system.observation(points, start, theta).T
-        covariance = system.covariance(np.zeros(1), start, theta)[0, 0]
-        return Tables(drift, observation, covariance)
+        return Tables(drift, observation, covariance_at(system, window.points, start, theta))
 
     found: Tables = prepared.once(window, make)
     return found
@@ -225,19 +266,50 @@ def spectral(prepared: Prepared, window: lw.Window) -> Spectral | None:
     return found[0]
 
 
+_MIDPOINTS = (np.arange(32) + 0.5) / 32.0 - 0.5
+
+
+def drift_at(system: System, window: lw.Window, t: Array, theta: Array) -> Array:
+    """Return f at the points of a grid and times (...), (..., N).
+
+    Of an f with jumps it is the mean over the spacing around a point, less the second difference that a smooth f adds to it.
+    """
+    times = np.asarray(t)[..., None]
+    if system.slope is not None:
+        return finite(system.drift(window.points[:, None], times, theta)[..., 0])
+    around = window.origin + window.centre + window.spacing * (np.arange(-1, window.size + 1) - window.size // 2)
+    nodes = (around[:, None] + window.spacing * _MIDPOINTS).reshape(-1, 1)
+    means = finite(system.drift(nodes, times, theta)[..., 0]).reshape(*times.shape[:-1], window.size + 2, -1).mean(axis=-1)
+    return means[..., 1:-1] - (means[..., 2:] - 2.0 * means[..., 1:-1] + means[..., :-2]) / 24.0
+
+
+def covariance_at(system: System, points: Array, t: Array, theta: Array) -> Array:
+    """Return G at points (N,) and times (...): (..., N) where it depends on the state, else (...)."""
+    if system.state_dependent:
+        return finite(system.covariance(points[:, None], np.asarray(t)[..., None], theta)[..., 0, 0])
+    return system.covariance(np.zeros((*np.shape(t), 1)), t, theta)[..., 0, 0]
+
+
 def _decomposed(prepared: Prepared, window: lw.Window) -> Spectral | None:
     known = tables(prepared, window)
     drift, covariance = known.drift, known.covariance
     system, theta, start = prepared.system, prepared.theta, prepared.model.start
-    if system.moving or covariance.real <= 0 or window.size > lw.LARGEST:
+    if system.moving or system.slope is None or system.spread is None or window.size > lw.LARGEST:
         return None
-    slope = system.slope(window.points[:, None], start, theta)[:, 0]
-    nodes = (window.points[:, None] + window.spacing * GAUSS_NODES).reshape(-1, 1)
-    inner = system.drift(nodes, start, theta).reshape(window.size, -1)
-    if not np.isfinite(slope.real).all() or not np.isfinite(inner.real).all():
+    if not (covariance.real > 0).all():
         return None
-    steps = window.spacing * (inner @ GAUSS_WEIGHTS) / covariance
+    points = window.points[:, None]
+    nodes = (points + window.spacing * GAUSS_NODES).reshape(-1, 1)
+    slope, spread = system.slope(points, start, theta)[:, 0], 0.0
+    inner = system.drift(nodes, start, theta)[:, 0] / covariance_at(system, nodes[:, 0], start, theta)
+    scale = 1.0
+    if system.state_dependent:
+        spread, scale = system.spread(points, start, theta)[:, 0], 1.0 / np.sqrt(covariance)
+    steps = window.spacing * (inner.reshape(window.size, -1) @ GAUSS_WEIGHTS)
+    potential = 0.5 * ((drift - 0.5 * spread) ** 2 / covariance + slope)
+    if not np.isfinite(potential.real).all() or not np.isfinite(steps.real).all():
+        return None
     if window.closed and abs(np.sum(steps).real) > 1e-12 * max(1.0, float(np.sum(np.abs(steps.real)))):
         return None
     gauge = np.concatenate([np.zeros(1), np.cumsum(steps[:-1])])
-    return Spectral(window.closed, window.spacing, covariance, 0.5 * (drift**2 / covariance + slope), gauge)
+    return Spectral(window.closed, window.spacing, covariance, potential, gauge, scale)

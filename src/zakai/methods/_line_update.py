@@ -6,19 +6,28 @@ from typing import Any
 
 import numpy as np
 
-from zakai.methods._line_system import Prepared, System, tables
+from zakai.methods._line_model import System
+from zakai.methods._line_system import Prepared, tables
+from zakai.methods._observation import log_likelihood
 from zakai.numerics import line_window as lw
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS, panels
-from zakai.numerics.line_posterior import Gaussian
+from zakai.numerics.line_posterior import Gaussian, General, Likelihood
 
 Array = Any
 
 
-def factor_at_end(prepared: Prepared, k: int, at_end: np.ndarray, observed: np.ndarray, window: lw.Window) -> Gaussian:
+def factor_at_end(prepared: Prepared, k: int, at_end: np.ndarray, observed: np.ndarray, window: lw.Window) -> Likelihood:
     """Return the likelihood of the samples, or of the increments that were gathered over more than the interval."""
     system, theta, stop = prepared.system, prepared.theta, float(prepared.schedule.stops[k])
     rows = np.flatnonzero(at_end)
+    if system.general:
+        inputs = system.inputs_at(stop)
+
+        def log_density(points: Array) -> Array:
+            return log_likelihood(system.model, observed, at_end, points[:, None], stop, theta, inputs)
+
+        return General(log_density)
     if system.samples:
         spans = np.ones(len(rows))
         precision, constant = _sample_noise(prepared, stop, at_end)

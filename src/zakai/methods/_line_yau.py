@@ -19,7 +19,7 @@ from zakai.methods._series_kernel import PowerSeries
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics import line_window as lw
-from zakai.numerics.line_channel import Channel, Channels, Coefficients, applied, parts
+from zakai.numerics.line_channel import Channel, Channels, Coefficients, Nodes, applied, nodes_of, parts
 
 Array = Any
 
@@ -53,6 +53,8 @@ class YauLine:
         entries = [*own, *numbers(yau.full), *slope, *intercept, *model.observation_noise]
         self.m, self.blocks = m, entries[:9]
         self._numbers = numpy_function(entries, model)
+        # Whether the kernel of an interval depends on x - y alone.
+        self.flat = self.bare and all(entry == 0 for entry in (own[0], own[3], own[4], yau.form.potential))
         self.gauged = yau.form.potential != 0
         self.steady_gauge = not sp.sympify(yau.form.potential, strict=True).has(model.t)
         self._potential = numpy_function([yau.form.potential], model, (1,))
@@ -111,6 +113,7 @@ class YauLine:
         origin: float,
         series: PowerSeries | None = None,
         count: int = 1,
+        nodes: Nodes | None = None,
     ) -> Kernels | None:
         """Return the kernels of `count` equal parts of intervals whose equation is linear-quadratic, None if there are none.
 
@@ -125,7 +128,8 @@ class YauLine:
             return self.coefficients(times, theta, inside[rows[which[:, 0]]], lie, origin)
 
         if series is None:
-            found, errors = parts(at, starts[rows], lengths[rows], count)
+            nodes = nodes_of(at, starts[rows], lengths[rows]) if nodes is None else nodes
+            found, errors = parts(at, starts[rows], lengths[rows], count, nodes)
         else:
             full = np.repeat(inside[rows].all(axis=1) & lie, count)
             length = lengths[rows] / count
@@ -134,16 +138,20 @@ class YauLine:
             errors = errors.reshape(-1, count).sum(axis=1)
         place = np.full(len(starts), -1)
         place[rows] = np.arange(len(rows))
-        return Kernels(found, errors, place, origin)
+        return Kernels(found, errors, place, origin, nodes)
 
 
 class Kernels(NamedTuple):
-    """The kernels for x relative to `origin`, the errors of their coefficients, and where that of an interval is, or -1."""
+    """The kernels for x relative to `origin`, the errors of their coefficients, and where that of an interval is, or -1.
+
+    `nodes` are the coefficients that they were computed from, None for a series.
+    """
 
     channels: Channels
     errors: Array
     place: Array
     origin: float
+    nodes: Nodes | None
 
 
 def _unexpanded(model: Model, yau: Any) -> list[sp.Expr] | None:
@@ -194,6 +202,7 @@ def moved(
     theta: Array,
     negligible: float,
     rough: float,
+    cut: float,
 ) -> Moved | None:
     """Return the density after an interval, or None where its kernel is too narrow for the grid or no grid fits.
 
@@ -204,6 +213,7 @@ def moved(
         start, stop: the ends of the interval.
         theta: parameters (p,).
         negligible, rough: the spectrum that need not be resolved, and that of a density with kinks that is accepted.
+        cut: the density relative to its maximum that a grid must hold.
     """
     width = np.sqrt(np.abs(kernel.variance.real))
     if not width > NARROWEST * window.spacing * abs(kernel.scale.real):
@@ -230,21 +240,22 @@ def moved(
         return (np.exp(total - best), best) if np.isfinite(best) else (np.zeros_like(found), best)
 
     def good(found: Array) -> tuple[lw.Figures, bool, bool, bool]:
-        look = lw.figures(found, False, negligible)
+        look = lw.figures(found, False, negligible, cut)
         if not found.any():
             return look, True, True, False
         coarse = look.aliasing > 30.0 * negligible and (look.aliasing > rough or not look.rough)
-        return look, look.left > 1e-12, look.right > 1e-12, coarse
+        return look, look.left > 10 * cut, look.right > 10 * cut, coarse
 
     new = window
     found, best = after(new)
     look, *bad = good(found)
     if any(bad):
-        own = lw.figures(values, False, negligible)
+        own = lw.figures(values, False, negligible, cut)
         first, last = own.first, own.last
         ends = kernel.scale.real * sources[[first, last]] + kernel.shift.real
         spacing = float(np.sqrt((kernel.scale.real * window.spacing) ** 2 + kernel.variance.real / 6.0))
-        low, high = float(ends.min() - 7.5 * width), float(ends.max() + 7.5 * width)
+        reach = float(np.sqrt(-2.0 * np.log(cut)))
+        low, high = float(ends.min() - reach * width), float(ends.max() + reach * width)
         if (high - low) / window.spacing < KEPT_SPACING:
             spacing = min(spacing, window.spacing)
         new = lw.quantized(window, low, high, max(spacing, (high - low) / 400), most=lw.SIZES[-1])

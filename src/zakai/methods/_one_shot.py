@@ -35,32 +35,18 @@ _NODES, _WEIGHTS = 0.5 * (_LINE + 1.0), 0.5 * _MASSES
 
 
 class State(NamedTuple):
-    """The families of u~ (`zakai.methods._gaussian_families.State`); the statistics b, a~ (n,), y (m,) and c; the `log_scale` of
-    sigma, and the number of `steps`; the latter stay zero in the stepwise form."""
+    """The state `own` of u~; the statistics b, a~ (n,), y (m,) and c; the `log_scale` of sigma, and the number of `steps`.
 
-    nodes: Array
-    log_weights: Array
-    signs: Array
-    mean: Array
-    cov: Array
-    response: Array
-    tilt: Array
-    curvature: Array
-    log_mass: Array
-    log_error: Array
-    edge: Array
-    time: float
+    All but `own` stay zero in the stepwise form.
+    """
+
+    own: families.State
     b: Array
     a: Array
     y: Array
     c: Array
     log_scale: Array
     steps: float
-
-    @property
-    def families(self) -> Family:
-        """The families of u~."""
-        return Family(*self[:9])
 
 
 class Constants(NamedTuple):
@@ -156,7 +142,7 @@ def init(prepared: Prepared | families.Prepared, prior: Any) -> State:
     base = prepared.base if isinstance(prepared, Prepared) else prepared
     zero, kind = np.zeros(base.model.n), (complex if is_complex(base.setup.theta) else float)
     none = zero.astype(kind)
-    return State(*families.init(base, prior), none, none, np.zeros(base.model.m, kind), none[0], none[0], 0.0)
+    return State(families.init(base, prior), none, none, np.zeros(base.model.m, kind), none[0], none[0], 0.0)
 
 
 def c_rate(k: Constants, b: Array, a: Array, b_rate: Array) -> Any:
@@ -173,7 +159,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     rates = families.inputs_of(base, k, values)
     silent = np.zeros_like(rates)
     silent[0] = 1.0
-    moved_families = families.move_families(base, k, state.families, silent)
+    moved_families = families.move_families(base, k, state.own.families, silent)
     rate = own.whiten @ rates[1:]
     inside = prepared.maps[k] @ np.concatenate([state.b, state.a, rate])
     growth = 0.0
@@ -183,13 +169,11 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
         growth = growth + weight * c_rate(own, b, a + own.slope.T @ (state.y + share * length * rate), b_rate)
     c = state.c + length * growth
     y = state.y + length * rate
-    new = State(
-        *moved_families, state.log_error, state.edge, float(base.stops[k]), inside[-1, :n], inside[-1, n:], y, c, state.log_scale,
-        state.steps + 1.0,
-    )  # fmt: skip
+    moved = families.State(*moved_families, state.own.log_error, state.own.edge, float(base.stops[k]))
+    new = State(moved, inside[-1, :n], inside[-1, n:], y, c, state.log_scale, state.steps + 1.0)
     sigma = _sigma(prepared, new)
     found = posterior(base.gauge, tilts_at(base.tilts, k), base.stops[k], sigma)
-    health = families.health_of(families.State(*new[:12]), sigma, found)
+    health = families.health_of(moved, sigma, found)
     health = {"lost_digits": _rounding(own, new), **health}
     increment = found.log_mass - state.log_scale
     return new._replace(log_scale=np.asarray(found.log_mass)), Info(increment, found.mean + base.setup.origin, found.cov, health)
@@ -204,7 +188,7 @@ def _rounding(k: Constants, state: State) -> float:
 def _sigma(prepared: Prepared, state: State) -> Family:
     """Return e^-F sigma as families."""
     setup, k = prepared.base.setup, prepared.constants
-    found = state.families
+    found = state.own.families
     quadratic = setup.system.quadratic(setup.theta, setup.origin)
     found = found if quadratic is None else families.times_gauge(found, quadratic, -1.0)
     constant = k.intercept @ state.y - state.c + (state.a + k.slope.T @ state.y) @ state.b
@@ -215,4 +199,4 @@ def density(prepared: Prepared, state: State) -> Density:
     """Return the posterior."""
     base = prepared.base
     sigma = Family(*(array.real for array in _sigma(prepared, state)))
-    return families.density_of(base.model, base.gauge.real(), state.time, sigma)
+    return families.density_of(base.model, base.gauge.real(), state.own.time, sigma)

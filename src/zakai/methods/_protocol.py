@@ -63,6 +63,27 @@ class Prepared(Protocol):
 
 P = TypeVar("P", bound=Prepared)
 S = TypeVar("S")
+M = TypeVar("M")
+
+
+@dataclass(frozen=True)
+class Backward(Generic[P, S, M]):
+    """The backward pass of a smoother.  A message is p(observations after t | x at t), up to a constant factor.
+
+    `message(prepared, state)` returns the message at the last time, constant one; it raises InputError where this model has no
+    smoother, and is asked for that before the record is filtered.  `step(prepared, k, message, values)` returns the message at
+    the start of interval k from that at its end.  `smoothed(prepared, state, message)` returns the message normalised, so that
+    its product with the filtered state at the same time has mass one, and the Info of that product, whose
+    `log_likelihood_increment` is the logarithm of the mass before: what the step over interval k has gained must be the
+    increment of the filter over interval k.  `density(prepared, state, message)` returns the smoothed density.
+
+    `message`, `smoothed` and `density` use of `prepared` only what does not depend on the schedule.
+    """
+
+    message: Callable[[P, S], M]
+    step: Callable[[P, int, M, np.ndarray], M]
+    smoothed: Callable[[P, S, M], tuple[M, Info]]
+    density: Callable[[P, S, M], Density]
 
 
 @dataclass(frozen=True)
@@ -73,6 +94,9 @@ class Method(Generic[P, S]):
     which a result warns, and the words of the warning.  `state` is the class of the states.  `shorter` says what shortens a long
     run, as in "this takes about 40 s; to shorten it, raise the tolerance".
 
+    `handles` names the features of a model (`models/features.py`) that the method handles; a model with another one is refused
+    before `theorem` is asked.
+
     Optional: `absolute(options)` says whether what is prepared for an interval depends on where it begins, although the model
     does not depend on t.
 
@@ -81,6 +105,8 @@ class Method(Generic[P, S]):
 
     Optional: `segment(prepared, rows, state, values)` advances the intervals of a slice in one compiled loop that calls the same
     kernel as `step`, and returns the states after each step and their Infos.
+
+    Optional: `backward` is the backward pass of `zakai.smooth`.
     """
 
     name: str
@@ -95,7 +121,9 @@ class Method(Generic[P, S]):
     state: type[S]
     bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)
     differentiable: bool = True
+    handles: frozenset[str] = frozenset()
     shorter: str = "give fewer observations"
     absolute: Callable[[Mapping[str, Any]], bool] | None = None
     valid: Callable[[P, S], bool] | None = None
     segment: Callable[[P, slice, S, np.ndarray], tuple[list[S], Infos]] | None = None
+    backward: Backward[P, S, Any] | None = None

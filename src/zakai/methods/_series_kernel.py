@@ -16,19 +16,20 @@ import numpy as np
 import sympy as sp
 
 from zakai.errors import ConditionError
-from zakai.methods._power_series import TOLERANCE, Schroedinger, Series, TaylorData, power_series, schroedinger
-from zakai.methods._taylor import Expansion, apply, dot, symmetric, transpose, value
+from zakai.methods._jets import Expansion
+from zakai.methods._power_series import Schroedinger, Series, power_series, schroedinger, taylor_data
 from zakai.models.model import Model
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.flow import FlowResult
 from zakai.numerics.line_channel import Channels
-from zakai.numerics.transition import Array, Transition, at, compose, identity
+from zakai.numerics.series import apply, dot, value
+from zakai.numerics.transition import Array, Transition, at, compose, identity, symmetric, transposed
 
+TOLERANCE = 1e-13  # remainder above which an interval is divided
 TERMS = 20  # of a series whose order is not given
 MOST_PARTS = 1024  # of one interval
 PROBES = 128  # times of an interval at which the Taylor polynomials are compared with the coefficients
 RESOLVED = 1e-10  # difference at these times above which an interval is divided
-_BOTH = (False, True)
 BLOCK = 2048  # parts of intervals that are computed together, for memory
 
 
@@ -38,7 +39,7 @@ class PowerSeries:
     Args:
         model: the Yau system.
         blocks: the entries of L, l, G and of Q, p, r of the potential x'Q x + p.x + r without and with -h'S^-1 h / 2.
-        order: the power after which a series is cut; None for the first that leaves a remainder below 1e-13.
+        order: the power after which a series is cut; None for 20 terms and as many parts of an interval as they need.
     """
 
     def __init__(self, model: Model, blocks: Sequence[sp.Expr], order: int | None):
@@ -65,14 +66,12 @@ class PowerSeries:
                 not converge on the shortest parts.
         """
         starts, lengths = np.asarray(starts, float), np.asarray(lengths, float)
+        inverse = np.arange(len(lengths))
         if self.steady:
             lengths, inverse = np.unique(lengths, return_inverse=True)
             starts = np.zeros(len(lengths))
-        else:
-            inverse = np.arange(len(lengths))
-        count = len(lengths)
-        whole = Transition(*(field.astype(theta.dtype) for field in identity(self.n, 1, count)))
-        error = np.zeros(count)
+        whole = Transition(*(field.astype(theta.dtype) for field in identity(self.n, 1, len(lengths))))
+        error = np.zeros(len(lengths))
         pending, parts = np.flatnonzero(lengths > 0), 1
         while len(pending):
             again = []
@@ -96,11 +95,10 @@ class PowerSeries:
     def channels(
         self, starts: Array, lengths: Array, theta: Array, origin: float, full: Array, inputs: int
     ) -> tuple[Channels, Array]:
-        """Return the kernels of one state with room for `inputs`, which have no effect, and their errors; `full` is (K,)."""
-        both = [
-            self.integrate(starts[full == which], lengths[full == which], theta, np.array([origin]), which) for which in _BOTH
-        ]
-        back = np.argsort(np.concatenate([np.flatnonzero(full == which) for which in _BOTH]))
+        """Return the kernels of one state for `inputs`, which have no effect, and their errors; `full` is (K,)."""
+        groups = [(which, np.flatnonzero(full == which)) for which in (False, True)]
+        both = [self.integrate(starts[rows], lengths[rows], theta, np.array([origin]), which) for which, rows in groups]
+        back = np.argsort(np.concatenate([rows for _, rows in groups]))
         found = Transition(*(np.concatenate(fields)[back] for fields in zip(*(one.transition for one in both), strict=True)))
         wider = ((0, 0), (0, inputs - 1))
         return Channels(
@@ -122,12 +120,12 @@ class PowerSeries:
         expansion = self._expansions[full]
         taylor = expansion.taylor(begins, TERMS if self.order is None else self.order + 4, theta)
         with np.errstate(all="ignore"):
-            z = schroedinger(self._data(taylor, origin))
+            z = schroedinger(taylor_data(taylor, origin))
             series = power_series(z, widths, self.order, parts=len(shares))
-            found = _transition(z, series, widths)
+            found = transition_of(z, series, widths)
             mismatch = 0.0 * widths
             if not self.steady:
-                mismatch = self._mismatch(expansion, taylor, z.B[0].real, begins, widths, theta.real, origin, parts)
+                mismatch = _mismatch(expansion, taylor, z.B[0].real, begins, widths, theta.real, origin, parts)
         errors = np.where(np.isfinite(series.remainder), series.remainder, np.inf)
         errors = np.where(mismatch > RESOLVED, np.maximum(errors, mismatch), errors).reshape(len(starts), -1)
         # The most that any part leaves, in each of them.
@@ -137,60 +135,46 @@ class PowerSeries:
             found = compose(first, second)
         return found, error
 
-    def _data(self, taylor: Array, origin: Array) -> TaylorData:
-        """Return the Taylor data for x relative to the origin."""
-        n = self.n
-        sizes = [n * n, n, n * n, n * n, n, 1]
-        L, l, G, Q, p, r = np.split(taylor, np.cumsum(sizes)[:-1], axis=-1)
-        L, G, Q = (matrix.reshape(*taylor.shape[:-1], n, n) for matrix in (L, G, Q))
-        place = np.broadcast_to(origin, p.shape)
-        pushed = apply(Q, place)
-        r = r[..., 0] + dot(p + pushed, place)
-        l, p = l + apply(L, place), p + 2.0 * pushed
-        # The series is written for the potential -(x'Q x + p.x + r) / 2.
-        return TaylorData(G, L, l, -2.0 * symmetric(Q), -2.0 * p, -2.0 * r)
 
-    def _mismatch(
-        self, expansion: Expansion, taylor: Array, B: Array, begins: Array, widths: Array, theta: Array, origin: Array, parts: int
-    ) -> Array:
-        """Return how far the Taylor polynomials of parts are from the coefficients, in units of the interval and of G = (B'B)^-1.
+def _mismatch(
+    expansion: Expansion, taylor: Array, B: Array, begins: Array, widths: Array, theta: Array, origin: Array, parts: int
+) -> Array:
+    """Return how far the Taylor polynomials of parts are from the coefficients, in units of the interval and of G = (B'B)^-1.
 
-        A pulse that is flat at the start of a part does not appear in the series there.
-        """
-        count = max(PROBES // parts, 8)
-        shares = (np.arange(count) + 0.7 + 0.25 * np.sin(7.0 * np.arange(count))) / count
-        times = begins[:, None] + widths[:, None] * shares
-        values = expansion.values(times, theta)
-        difference = value(taylor.real[:, :, None], widths[:, None] * shares) - values
-        # Neither the time nor a value is known better than to its rounding.
-        steps = np.abs(np.diff(values, axis=1)).max(axis=1, keepdims=True) * (count / widths[:, None, None])
-        noise = 8.0 * np.finfo(float).eps * (np.abs(times[:, :, None]) * steps + np.abs(values))
-        difference = np.sign(difference) * np.maximum(np.abs(difference) - noise, 0.0)
-        F, B = np.linalg.inv(B)[:, None], B[:, None]
-        length = parts * widths[:, None]
+    A pulse that is flat at the start of a part does not appear in the series there.
+    """
+    count = max(PROBES // parts, 8)
+    shares = (np.arange(count) + 0.7 + 0.25 * np.sin(7.0 * np.arange(count))) / count
+    times = begins[:, None] + widths[:, None] * shares
+    values = expansion.values(times, theta)
+    difference = value(taylor.real[:, :, None], widths[:, None] * shares) - values
+    # Neither the time nor a value is known better than to its rounding.
+    steps = np.abs(np.diff(values, axis=1)).max(axis=1, keepdims=True) * (count / widths[:, None, None])
+    noise = 8.0 * np.finfo(float).eps * (np.abs(times[:, :, None]) * steps + np.abs(values))
+    difference = np.sign(difference) * np.maximum(np.abs(difference) - noise, 0.0)
+    F, B, T = np.linalg.inv(B)[:, None], B[:, None], parts * widths[:, None]
 
-        def sizes(entries: Array) -> Array:
-            """Return the size of the terms in x'.x, in x and in 1, (3, J)."""
-            G, L, l, Q, p, r = self._data(entries, origin)
-            square, T = length[..., None, None], length[..., None]
-            squares = [B @ G @ transpose(B), square * (B @ L @ F), square**2 * (transpose(F) @ Q @ F)]
-            vectors = [np.sqrt(T) * apply(B, l), T**1.5 * apply(transpose(F), p)]
-            groups = [squares, vectors, [length * r]]
-            return np.stack([np.max([np.abs(one).reshape(len(B), -1).max(axis=1) for one in group], axis=0) for group in groups])
+    def sizes(entries: Array) -> Array:
+        """Return the size of the terms in x'.x, in x and in 1, (3, J)."""
+        G, L, l, Q, p, r = taylor_data(entries, origin)
+        square, vector = T[..., None, None], T[..., None]
+        squares = [B @ G @ transposed(B), square * (B @ L @ F), square**2 * (transposed(F) @ Q @ F)]
+        groups = [squares, [np.sqrt(vector) * apply(B, l), vector**1.5 * apply(transposed(F), p)], [T * r]]
+        return np.stack([np.max([np.abs(one).reshape(len(B), -1).max(axis=1) for one in group], axis=0) for group in groups])
 
-        scales = np.maximum(sizes(values).reshape(3, -1, parts).max(axis=2), 1.0).repeat(parts, axis=1)
-        found = (sizes(difference) / scales).max(axis=0)
-        return np.where(np.isfinite(found), found, np.inf)
+    scales = np.maximum(sizes(values).reshape(3, -1, parts).max(axis=2), 1.0).repeat(parts, axis=1)
+    found = (sizes(difference) / scales).max(axis=0)
+    return np.where(np.isfinite(found), found, np.inf)
 
 
-def _transition(z: Schroedinger, series: Series, delta: Array) -> Transition:
-    """Return the transition in x of a kernel in z."""
-    A, B, C, D, E, s = series[:6]
+def transition_of(z: Schroedinger, series: Series, delta: Array) -> Transition:
+    """Return the transition in x of a kernel in z, for intervals of the lengths `delta` (K,)."""
+    A, B, C, D, E, s, _ = series
     one, t = np.eye(A.shape[-1]), delta[:, None, None]
     M = symmetric(np.linalg.inv(one - 2.0 * t * A))
     N = one + t * B
     map_, noise = M @ N, t * M
-    information = -2.0 * C - B - transpose(B) - t * (transpose(B) @ B) - 2.0 * (transpose(N) @ (A @ map_))
+    information = -2.0 * C - B - transposed(B) - t * (transposed(B) @ B) - 2.0 * (transposed(N) @ (A @ map_))
     shift = apply(noise, D)
     constant = s + 0.5 * dot(D, shift) + 0.5 * log_determinant(M)
     start, end, b = z.B[0], value(z.B, delta), value(z.b, delta)
@@ -198,9 +182,9 @@ def _transition(z: Schroedinger, series: Series, delta: Array) -> Transition:
     in_x = Transition(
         F @ map_ @ start,
         apply(F, shift - b)[..., None],
-        symmetric(F @ noise @ transpose(F)),
-        symmetric(transpose(start) @ information @ start + z.Omega[0]),
-        apply(transpose(start), E + apply(transpose(map_), D))[..., None],
+        symmetric(F @ noise @ transposed(F)),
+        symmetric(transposed(start) @ information @ start + z.Omega[0]),
+        apply(transposed(start), E + apply(transposed(map_), D))[..., None],
         (constant + log_determinant(start) - log_determinant(end))[..., None, None],
     )
     gauge = identity(len(one), 1, len(delta))

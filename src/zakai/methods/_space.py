@@ -18,8 +18,7 @@ from zakai.records.schedule import Schedule
 BOUNDS: dict[str, tuple[float, str]] = {
     "tolerance_ratio": (
         1.0,
-        "by what factor the tolerance was missed: by the error estimate, or by mass at the edges of the grid, at its highest "
-        "frequencies, or in tails that rounding does not hold",
+        "the error of a step exceeds the tolerance by this factor. Give more frequent observations, or a larger tolerance",
     ),
     "tail_depth": (1.0, "depth in the tails of the prediction to which an observation leads, divided by the accurate depth"),
 }
@@ -28,8 +27,8 @@ BOUNDS: dict[str, tuple[float, str]] = {
 class State(NamedTuple):
     """The density `values` (*sizes), of integral one, at `centre` + `basis` (i - size // 2), and what is known of the errors.
 
-    `rate`, `measured` and `age` control the substeps, `error` is the estimate of the relative error of the density, `kept` the
-    share of it that an interval leaves.
+    `rate`, `measured` and `age` control the substeps, `deviations` (n,) are those of the density for which `rate` was measured,
+    `error` is the estimate of the relative error of the density, `kept` the share of it that an interval leaves.
     """
 
     values: np.ndarray
@@ -38,6 +37,7 @@ class State(NamedTuple):
     rate: float
     measured: float
     age: int
+    deviations: np.ndarray
     error: float
     kept: float
 
@@ -89,17 +89,18 @@ def step(prepared: Any, k: int, state: State, values: np.ndarray) -> tuple[State
 def density(prepared: Any, state: State) -> GridDensity:
     """Return the posterior on its grid."""
     model: Model = prepared.model
+    field = prepared.density(state)
     with np.errstate(divide="ignore"):
-        logs = np.log(np.maximum(state.values.real, 0.0))
-    periodic = tuple(name in model.periodic for name in model.state)
-    return GridDensity(logs, state.centre, state.basis, model.state, periodic)
+        logs = np.log(np.maximum(field.values.real, 0.0))
+    return GridDensity(logs, field.grid.centre, field.grid.basis, model.state, prepared.angles)
 
 
 def valid(prepared: Any, state: State) -> bool:
     """Return whether the arrays of a state fit together and to the model."""
     n = prepared.model.n
     values = np.asarray(state.values)
-    shapes = values.ndim == n and np.shape(state.centre) == (n,) and np.shape(state.basis) == (n, n)
+    shapes = values.ndim == n and np.shape(state.centre) == np.shape(state.deviations) == (n,)
+    shapes = shapes and np.shape(state.basis) == (n, n)
     if not shapes or min(values.shape) < 1 or not np.all(np.isfinite(values)):
         return False
     return bool(np.isfinite(state.centre).all() and np.isfinite(state.basis).all() and abs(np.linalg.det(state.basis)) > 0)

@@ -22,16 +22,16 @@ from zakai.methods._options import tolerance_of
 from zakai.methods._protocol import Info
 from zakai.methods._series_kernel import PowerSeries
 from zakai.methods._space import State
+from zakai.methods._space_observed import Observations
+from zakai.methods._space_system import grid_of, moments_of, prior_on_grid, system_of
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
+from zakai.models.prior import DensityPrior
+from zakai.numerics.complex_step import is_complex
 from zakai.numerics.flow import Coefficients, Flow, at, integrate, motion, spread_first
 from zakai.numerics.space_grid import (
     Grid,
-    checks,
-    deviations_in_spacings,
     gradient,
-    moments,
-    narrowest,
     padded,
     refined,
     rounded_size,
@@ -39,7 +39,10 @@ from zakai.numerics.space_grid import (
     spread,
     triangular_resampled,
 )
-from zakai.numerics.space_step import MOST_ENLARGED, Control, Field, Report, advance, extrapolated
+from zakai.numerics.space_step import MOST_ENLARGED, Control, Field, Report, advance, extrapolated, positive
+from zakai.numerics.space_survey import deviations_in_spacings, narrowest, survey
+from zakai.numerics.space_unrolled import MOST as MOST_WIDE
+from zakai.numerics.space_unrolled import folded, opened, widths, wrapped
 from zakai.numerics.space_update import Update, updated
 from zakai.numerics.space_window import LEAST, MOST, Bounds, enlargement, padded_sizes, whitened_grid
 from zakai.records.schedule import Schedule
@@ -197,7 +200,7 @@ class Stepper:
 
     def _adapted(self, source: Field, result: Field) -> Field | None:
         """Return the source on a wider or finer grid, or None where the result is within bounds or nothing can be changed."""
-        found = checks(result.values.real, result.grid, self.bounds.edge)
+        found = survey(result.values.real, result.grid, self.bounds.edge)
         wide, coarse = found.edges > 10 * self.bounds.edge, found.tails > 10 * self.bounds.tail
         if not (wide.any() or coarse.any()):
             return None
@@ -266,7 +269,7 @@ class Stepper:
 
     def report(self, result: Field) -> Report:
         """Return the errors that the grid shows."""
-        found = checks(result.values.real, result.grid, self.bounds.edge)
+        found = survey(result.values.real, result.grid, self.bounds.edge)
         real = result.values.real
         negative = float(-np.minimum(real, 0.0).sum() / real.sum())
         return Report(0.0, 0.0, float(found.edges.max()), float(found.tails.max()), negative)
@@ -308,7 +311,7 @@ def regridded(field: Field, bounds: Bounds) -> Field:
     """Return the density on a grid with as many points as it needs, where its own has many more or its axes are skew."""
     grid = field.grid
     real = np.where(field.values.real > 0, field.values.real, 0.0)
-    narrow, _ = narrowest(real, grid, moments(real, grid).cov, bounds.tail)
+    narrow, _ = narrowest(survey(real, grid, bounds.edge, bounds.tail), grid, bounds.tail)
     used = np.flatnonzero(real > bounds.edge * real.max())
     with np.errstate(divide="ignore"):
         logs = np.log(real.reshape(-1)[used] / real.max())
@@ -316,7 +319,7 @@ def regridded(field: Field, bounds: Bounds) -> Field:
     if np.prod(new.sizes) > 0.7 * np.prod(grid.sizes):
         return field
     values = triangular_resampled(field.values, grid, new)
-    if np.any(checks(values.real, new, bounds.edge).tails > 10 * bounds.tail):
+    if np.any(survey(values.real, new, bounds.edge).tails > 10 * bounds.tail):
         return field
     return Field(values, new, field.log_scale)
 
@@ -329,13 +332,44 @@ class Prepared(base.Prepared):
     yau: YauSystem = field(default=None)  # type: ignore[assignment]
     series: PowerSeries | None = None
 
+    def init(self, prior: Any) -> State:
+        """Return the prior on a grid; an angle with a Gaussian or a mixture is not wrapped."""
+        tolerance = min(self.bounds.edge, self.bounds.tail)
+        periodic = self.angles if isinstance(prior, DensityPrior) else self.bounds.periodic
+        found = prior_on_grid(self.model, prior, self.theta, tolerance, periodic)
+        values = np.exp(found.log_values - np.max(found.log_values.real))
+        values, grid = opened(values, Grid(found.centre, found.basis, values.shape, found.closed))
+        error = found.error if found.error > 1e-6 else 0.0
+        begin = positive(self._folded(Field(values, grid, 0.0)))
+        return self._state(begin, Control(np.inf, 0.0, 0), np.zeros(self.model.n), error, 0.9)
+
+    def density(self, state: State) -> Field:
+        """Return the posterior on a grid, folded onto the circle where it is wide."""
+        field = super().density(state)
+        if not any(self.angles) or not np.any(widths(field.grid)[np.array(self.angles)] > 2 * np.pi):
+            return field
+        return Field(*wrapped(field.values, field.grid, self.angles), field.log_scale)
+
+    def _folded(self, source: Field) -> Field:
+        """Return a density on the line that spreads over at most three turns in an angle, and one peak only once."""
+        if not any(self.angles):
+            return source
+        angle = np.array(self.angles)
+        width = widths(source.grid)[angle]
+        mean, cov = moments_of(source.values.real, source.grid, self.angles)
+        deviation = np.sqrt(np.diagonal(cov)[angle])
+        narrow = bool(np.all(self.bounds.reach * deviation < 0.8 * np.pi))
+        if not np.any(width > (2 * np.pi if narrow else MOST_WIDE)):
+            return source
+        values, grid = folded(source.values, source.grid, self.angles, mean, narrow)
+        return Field(values, grid, source.log_scale)
+
     def step(self, k: int, state: State, values: np.ndarray) -> tuple[State, Info]:
         """Return the state after interval k and its observation, and what the step reports."""
         schedule, yau, bounds = self.schedule, self.yau, self.bounds
-        begin = Field(state.values, base.grid_of(state, bounds.periodic), 0.0)
-        start, length = float(schedule.starts[k]), float(schedule.lengths[k])
-        samples = self.model.observation_kind == "samples"
-        inside = np.zeros(self.model.m, bool) if samples else schedule.inside[k]
+        begin, observations = Field(state.values, grid_of(state, bounds.periodic), 0.0), self.observations
+        start, length = float(schedule.starts[k]), float(observations.lengths[k])
+        inside = observations.inside[k]
         linear = yau.affine and not self.lie and self.series is None  # the series has no inputs
         full = (bool(inside.all()) and not linear and yau.full) or not yau.bare
         inputs = np.ones(1)
@@ -349,30 +383,31 @@ class Prepared(base.Prepared):
         acting = inside if linear else np.zeros(self.model.m, bool)
         stepper = Stepper(yau, self.theta, bounds, begin.grid.centre, acting, inputs, full, self.series)
         control = Control(state.rate, state.measured, state.age) if potential is not None else Control(0.0, np.inf, 0)
-        allowed = 0.3 * self.tolerance * float(np.sqrt(1 - min(state.kept, 0.98) ** 2))
+        allowed = self.allowed(state)
         predicted, report, after = advance(stepper, begin, start, length, potential, control, allowed)  # type: ignore[arg-type]
-        factor, constant = self._factor(k, inside, values)
+        factor, constant = observations.factor(k, inside, values)
         factors = [one for one in (factor, extra) if one is not None]
         update = Update(predicted, report.edges, report.tails, 0.0, False)
         if factors:
             update = updated(predicted, lambda grid: sum(one(grid) for one in factors), bounds, band_limited=True)
-        update = update._replace(field=regridded(update.field, bounds))
+        update = update._replace(field=regridded(self._folded(update.field), bounds))
         if potential is None:
             after = Control(state.rate, state.measured, state.age)
         noise = 1e-15 * float(np.exp(min(stepper.exponent, 50.0))) + max(stepper.error, 0.0)
         report = report._replace(interpolation=noise)
-        new, info = self._reported(state, begin, predicted, update, report, after, constant)
+        kept = self._kept(begin, predicted, update.field)
+        new, info = self._reported(state, update, report, after, constant, kept, None)
         health = {**info.health, "gauge_exponent": stepper.exponent}
         return new, info._replace(health=health)
 
     def _whole(self, k: int, inside: Array, values: Array, full: bool) -> Any:
         """Return the factor exp(h'S^-1 dy) at the end; with -h'S^-1 h dt / 2 where the transition does not hold it."""
-        stop, length = float(self.schedule.stops[k]), float(self.schedule.lengths[k])
+        stop, length = float(self.schedule.stops[k]), float(self.observations.lengths[k])
         S = self.system.noise(np.zeros(self.model.n), stop, self.theta)
         precision = precision_of(S[None], inside[None])[0]
 
         def log_factor(grid: Grid) -> Array:
-            h, _ = self._observed(grid, stop)
+            h = self.observations.observed(grid, stop)
             energy = 0.0 if full and inside.all() else 0.5 * length
             return (h * ((values - energy * h) @ precision)).sum(axis=1)
 
@@ -381,8 +416,8 @@ class Prepared(base.Prepared):
     def _remaining(self, inside: Array, values: Array, start: float, length: float, full: bool) -> Any:
         """Return the factor of what the transition does not hold: rates, and the energy where it is not that of `inside`."""
         whole = np.ones(self.model.m, bool)
-        acting = self._potential(inside, values, start, length) if inside.any() else None
-        energy = self._potential(whole, np.zeros(self.model.m), start, length) if full else None
+        acting = self.observations.potential(inside, values, start, length) if inside.any() else None
+        energy = self.observations.potential(whole, np.zeros(self.model.m), start, length) if full else None
 
         def potential(grid: Grid, a: float, b: float, end: bool) -> Any:
             first = None if acting is None else acting(grid, a, b, end)
@@ -406,13 +441,13 @@ def prepare(
     order: int | None = None,
     **_: Any,
 ) -> base.Prepared:
-    """Return what is known without data; angles are filtered by the machinery for any system."""
+    """Return what is known without data."""
     tolerance = tolerance_of(tolerance, DEFAULT_TOLERANCE)
-    if model.periodic:
-        return base.prepare(model, schedule, theta, tolerance=max(tolerance, 1e-5))
-    bounds = Bounds(EDGE, TAIL, MOST[model.n], (False,) * model.n)
+    bounds = Bounds(EDGE, TAIL, TAIL, MOST[model.n], (False,) * model.n)
     theta = np.asarray(theta)
     yau = yau_of(model)
     series = power_series_of(model, order) if kernel == "power-series" else None
     lie = splitting == "lie"
-    return Prepared(model, schedule, theta, base.system_of(model), tolerance, bounds, lie=lie, yau=yau, series=series)
+    system = system_of(model)
+    observations = Observations(model, schedule, system, theta, {} if is_complex(theta) else system.caches(theta)[0])
+    return Prepared(model, schedule, theta, system, tolerance, bounds, observations, lie=lie, yau=yau, series=series)

@@ -16,16 +16,17 @@ Array = NDArray[Any]
 
 
 def point_function(expressions: Sequence[sympy.Expr], model: Model, shape: tuple[int, ...]) -> Callable[..., Array]:
-    """Return f(x, t, theta) of points x (J, n), one time (or times that broadcast with the points) and theta (p,).
+    """Return f(x, t, theta, u) of points x (J, n), one time (or times that broadcast with the points), theta (p,) and the inputs
+    u (..., number of inputs) at these times.
 
     The result is (J, *shape), with the values of one expression contiguous; what does not exist is not a number.
     """
     program = program_of(list(expressions), model)
     outputs = program.outputs
 
-    def function(x: Array, t: Any, theta: Array) -> Array:
+    def function(x: Array, t: Any, theta: Array, u: Array | None = None) -> Array:
         derivative = np.iscomplexobj(x) or np.iscomplexobj(theta)
-        values = program.run(x, t, theta, COMPLEX if derivative else REAL)
+        values = program.run(x, t, theta, COMPLEX if derivative else REAL, u)
         batch = np.broadcast_shapes(x.shape[:-1], np.shape(t))
         result = np.empty((len(outputs), *batch), complex if derivative else float)
         for row, slot in enumerate(outputs):

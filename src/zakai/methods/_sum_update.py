@@ -26,12 +26,11 @@ from zakai.numerics.gaussian_sum import (
     symmetric,
     wrapped,
 )
+from zakai.numerics.sum_curvature import Curvature, curvature
 from zakai.numerics.sum_fits import fit_dictionary, fit_peaks
 from zakai.numerics.sum_quadrature import (
     SEARCH,
-    Curvature,
     Refitted,
-    curvature,
     refit,
     refit_affine,
     rows_of,

@@ -9,21 +9,15 @@ With u = cosh(q.x + delta) v and v Gaussian, N(m, P), the density u is a sum of 
 
 from __future__ import annotations
 
-from zakai.algebra.exact_theorems import benes as theorem
-from zakai.methods import _gaussian_families as families
-from zakai.methods._protocol import Method
+from dataclasses import replace
 
-METHOD: Method[families.Prepared, families.State] = Method(
+from zakai.algebra.exact_theorems import benes as theorem
+from zakai.methods import kalman_bucy
+
+METHOD = replace(
+    kalman_bucy.METHOD,
     name="benes",
     source="Benes 1981; any prior: Makowski 1986",
     exactness="exact for y that is linear between observations, and for samples; the prior to 1e-12",
     theorem=theorem,
-    options={},
-    prepare=families.prepare,
-    init=families.init,
-    step=families.step,
-    density=families.density,
-    state=families.State,
-    bounds=families.BOUNDS,
-    valid=families.valid,
 )

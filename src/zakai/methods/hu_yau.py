@@ -13,7 +13,7 @@ stable over any time; Theorems 4 and 5 then are one method, for e^F cancels.  `f
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import sympy as sp
@@ -26,7 +26,8 @@ from zakai.errors import InputError
 from zakai.methods import _gaussian_families as families
 from zakai.methods import _one_shot as one_shot
 from zakai.methods._affine_system import AffineSystem
-from zakai.methods._protocol import Info, Method
+from zakai.methods._gaussian_backward import BACKWARD, Message
+from zakai.methods._protocol import Backward, Info, Method
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.flow import Coefficients
@@ -132,22 +133,42 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     """Advance one interval; nothing cancels in the stepwise form."""
     if isinstance(prepared, one_shot.Prepared):
         return one_shot.step(prepared, k, state, values)
-    moved, info = families.step(prepared, k, families.State(*state[:12]), values)
-    return State(*moved, *state[12:]), info._replace(health={"lost_digits": 0.0, **info.health})
+    moved, info = families.step(prepared, k, state.own, values)
+    return state._replace(own=moved), info._replace(health={"lost_digits": 0.0, **info.health})
 
 
 def density(prepared: Prepared, state: State) -> Density:
     """Return the posterior."""
     if isinstance(prepared, one_shot.Prepared):
         return one_shot.density(prepared, state)
-    return families.density(prepared, families.State(*state[:12]))
+    return families.density(prepared, state.own)
+
+
+def message(prepared: Prepared, state: State) -> Message:
+    """Return the message of the backward pass at the last time."""
+    if isinstance(prepared, one_shot.Prepared):
+        raise InputError(
+            f'{prepared.base.model.source}: option form: "one-shot" has no smoother; take form="stepwise"'
+        )
+    return BACKWARD.message(prepared, state.own)
+
+
+def smoothed(prepared: Any, state: State, later: Message) -> tuple[Message, Info]:
+    """Return the message normalised, and the smoothed moments."""
+    own, info = BACKWARD.smoothed(prepared, state.own, later)
+    return own, info._replace(health={"lost_digits": 0.0, **info.health})
+
+
+def smoothed_density(prepared: Any, state: State, later: Message) -> Density:
+    """Return the smoothed density."""
+    return BACKWARD.density(prepared, state.own, later)
 
 
 def valid(prepared: Prepared, state: State) -> bool:
     """Return whether the arrays of a state fit together."""
     base = prepared.base if isinstance(prepared, one_shot.Prepared) else prepared
     n, m = base.model.n, base.model.m
-    return families.valid(base, families.State(*state[:12])) and [np.shape(part) for part in state[12:15]] == [(n,), (n,), (m,)]
+    return families.valid(base, state.own) and [np.shape(part) for part in state[1:4]] == [(n,), (n,), (m,)]
 
 
 BOUNDS: Mapping[str, tuple[float, str]] = {
@@ -169,4 +190,5 @@ METHOD: Method[Prepared, State] = Method(
     bounds=BOUNDS,
     absolute=lambda options: bool(options["form"] == "one-shot"),
     valid=valid,
+    backward=Backward(message, cast(Any, BACKWARD.step), smoothed, smoothed_density),
 )

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from zakai.algebra.exact_theorems import kalman_bucy as theorem
 from zakai.methods import _gaussian_families as families
+from zakai.methods._gaussian_backward import BACKWARD
 from zakai.methods._protocol import Method
 
 METHOD: Method[families.Prepared, families.State] = Method(
@@ -27,4 +28,5 @@ METHOD: Method[families.Prepared, families.State] = Method(
     state=families.State,
     bounds=families.BOUNDS,
     valid=families.valid,
+    backward=BACKWARD,
 )

@@ -78,7 +78,7 @@ class System:
         kernels = self._kernels.get(grid)
         if kernels is None:
             with np.errstate(all="ignore"):
-                heat = heat_series(self.model, grid.points[:, None], self.order, theta=self.theta, potential=False)
+                heat = heat_series(self.model, grid.points, self.order, theta=self.theta, potential=False)
             kernels = self._kernels[grid] = Kernels(heat, grid, self.form)
             while len(self._kernels) > KEPT:
                 self._kernels.popitem(last=False)

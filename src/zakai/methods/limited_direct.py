@@ -73,7 +73,7 @@ def prepare(
     inside = prepared.inside & (prepared.inside.all(axis=1, keepdims=True) if lie else True)
     power_series = power_series_of(model, order) if series else None
     prepared.kernels = yau.kernels(schedule.starts, prepared.lengths, inside, theta, lie, origin, power_series)
-    prepared.yau, prepared.lie, prepared.generous = yau, lie, 128
+    prepared.yau, prepared.lie, prepared.generous = yau, lie, 256 if model.periodic else 128
     prepared.origin, prepared.series = origin, power_series
     return prepared
 
@@ -91,7 +91,7 @@ METHOD: Method[Any, Any] = Method(
     density=density,
     state=State,
     bounds=BOUNDS,
-    shorter="raise the option tolerance",
+    shorter="raise the option tolerance (command: --option tolerance=...)",
     valid=valid,
     segment=segment,
 )

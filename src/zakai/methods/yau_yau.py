@@ -14,16 +14,27 @@ from zakai.algebra.theorems import any_smooth_system
 from zakai.methods import _line
 from zakai.methods._line_system import State
 from zakai.methods._protocol import Info, Infos, Method
+from zakai.models import features
 from zakai.models.model import Model
 from zakai.records.schedule import Schedule
 
 BOUNDS = {
     "tolerance_ratio": (
         1.0,
-        "by what factor the tolerance was missed: by the spectrum at the highest frequencies of the grid, mass at its edges or "
-        "below zero, the integration over time, or errors that an observation enlarges in the tails",
+        "the error of a step exceeds the tolerance by this factor. Give more frequent observations, or a larger tolerance",
     ),
     "tail_depth": (1.0, "depth in the tails of the prediction to which an observation leads, divided by the accurate depth"),
+    "outside_tables": (1e-4, "share of the mass where a table is constant beyond its range"),
+    "without_law": (1e-6, "share of the mass where the law of the observation has no value, as for counts with a negative mean"),
+}
+HANDLES = features.OF_OBSERVATION | {
+    features.DOMAIN,
+    features.INPUTS,
+    features.JUMPS,
+    features.KINKS,
+    features.SINC,
+    features.STATE_DEPENDENT_DIFFUSION,
+    features.TABLES,
 }
 
 
@@ -103,7 +114,8 @@ METHOD: Method[Any, Any] = Method(
     density=density,
     state=State,
     bounds=BOUNDS,
-    shorter="raise the option tolerance",
+    shorter="raise the option tolerance (command: --option tolerance=...)",
     valid=valid,
+    handles=HANDLES,
     segment=segment,
 )

@@ -28,6 +28,23 @@ class _GrammarPrinter(StrPrinter):
     def _print_Abs(self, expr: sympy.Abs) -> str:
         return f"abs({self._print(expr.args[0])})"
 
+    def _print_Minimum(self, expr: sympy.Expr) -> str:
+        return f"min({self.stringify(expr.args, ', ')})"
+
+    def _print_Maximum(self, expr: sympy.Expr) -> str:
+        return f"max({self.stringify(expr.args, ', ')})"
+
+    _print_Min, _print_Max = _print_Minimum, _print_Maximum
+
+    def _print_Floor(self, expr: sympy.Expr) -> str:
+        return f"floor({self._print(expr.args[0])})"
+
+    def _print_Heaviside(self, expr: sympy.Expr) -> str:
+        return f"heaviside({self._print(expr.args[0])})"
+
+    def _print_Sinc(self, expr: sympy.Expr) -> str:
+        return f"sinc({self._print(expr.args[0])})"
+
     def _print_Exp1(self, expr: sympy.Expr) -> str:
         return "exp(1)"
 

@@ -36,7 +36,7 @@ def did_you_mean(word: str, options: Iterable[str]) -> str:
 
 
 def listing(options: Iterable[str]) -> str:
-    """The options as a list in words, those beyond the first 20 as their number, or 'none'."""
+    """The options as a list in words, those beyond the first 12 as their number, or 'none'."""
     words = list(options)
-    rest = [f"and {len(words) - 20} more"] if len(words) > 20 else []
-    return ", ".join([*words[:20], *rest]) or "none"
+    rest = [f"and {len(words) - 12} more"] if len(words) > 12 else []
+    return ", ".join([*words[:12], *rest]) or "none"

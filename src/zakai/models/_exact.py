@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import sympy
@@ -12,6 +12,7 @@ import sympy
 from zakai.models._cost import MAX_EXPONENT, MAX_ROOT, Cost, cost_of_call, cost_of_product, cost_of_sum
 from zakai.models._errors import did_you_mean, echo, listing
 from zakai.models.expressions import (
+    ARGUMENTS,
     FUNCTIONS,
     Call,
     ExpressionError,
@@ -23,15 +24,43 @@ from zakai.models.expressions import (
     Product,
     Sum,
 )
+from zakai.models.functions import Floor, Maximum, Minimum, Sinc, pairwise, table_function
+from zakai.models.tables import Table
 
 MAX_CONSTANT_BITS = 2_200  # of a numerator or denominator: twice what a double's exponent can hold
 
-_SYMPY: dict[str, Callable[..., sympy.Expr]] = {
-    name: getattr(sympy, name) for name in FUNCTIONS if name not in ("abs", "sqrt")
-} | {"abs": sympy.Abs}
-_FLOAT: dict[str, Callable[[float], float]] = {name: getattr(math, name) for name in FUNCTIONS if name != "abs"} | {"abs": abs}
+_ELEMENTARY = FUNCTIONS[: FUNCTIONS.index("abs")]
+_SYMPY: dict[str, Callable[..., sympy.Expr]] = {name: getattr(sympy, name) for name in _ELEMENTARY if name != "sqrt"} | {
+    "abs": sympy.Abs,
+    "sign": sympy.sign,
+}
+# Functions that SymPy may not simplify, from their arguments.
+_PLAIN: dict[str, Callable[..., sympy.Expr]] = {
+    "atan2": lambda y, x: sympy.atan2(y, x, evaluate=False),
+    "min": lambda *parts: pairwise(Minimum, list(parts)),
+    "max": lambda *parts: pairwise(Maximum, list(parts)),
+    "floor": Floor,
+    "heaviside": lambda u: (1 + sympy.sign(u, evaluate=False)) / 2,
+    "log1p": lambda u: sympy.log(1 + u, evaluate=False),
+    "expm1": lambda u: sympy.exp(u, evaluate=False) - 1,
+    "sinc": lambda u: Sinc(u, 0),
+}
+_LEVELS = {"heaviside": 2, "log1p": 1, "expm1": 1}  # of the expression that stands for the function, beyond one
+_FLOAT: dict[str, Callable[..., float]] = {name: getattr(math, name) for name in _ELEMENTARY} | {
+    "abs": abs,
+    "atan2": math.atan2,
+    "min": min,
+    "max": max,
+    "sign": lambda u: float((u > 0) - (u < 0)),
+    "floor": lambda u: float(math.floor(u)),
+    "heaviside": lambda u: 0.5 * (1 + (u > 0) - (u < 0)),
+    "log1p": math.log1p,
+    "expm1": math.expm1,
+    "sinc": lambda u: math.sin(u) / u if u else 1.0,
+}
 _DOMAINS = {
     "log": "log of a number that is not positive",
+    "log1p": "log1p of a number that is not above -1",
     "sqrt": "square root of a negative number",
     "asin": "asin outside [-1, 1]",
     "acos": "acos outside [-1, 1]",
@@ -48,14 +77,17 @@ class _Part:
     cost: Cost
 
 
-def to_sympy(tree: Node, symbols: Mapping[str, sympy.Expr], functions: Collection[str] = ()) -> sympy.Expr:
-    """The SymPy expression of a tree; `symbols` and `functions` as in `parse_expression`."""
-    return _Converter(symbols, functions).convert(tree).expr
+def to_sympy(
+    tree: Node, symbols: Mapping[str, sympy.Expr], functions: Collection[str] = (), tables: Mapping[str, Table] | None = None
+) -> sympy.Expr:
+    """The SymPy expression of a tree; `symbols`, `functions` and `tables` as in `parse_expression`."""
+    return _Converter(symbols, functions, tables or {}).convert(tree).expr
 
 
 class _Converter:
-    def __init__(self, symbols: Mapping[str, sympy.Expr], functions: Collection[str]):
+    def __init__(self, symbols: Mapping[str, sympy.Expr], functions: Collection[str], tables: Mapping[str, Table]):
         self._symbols = symbols
+        self._tables = tables
         self._functions = functions
 
     def convert(self, node: Node) -> _Part:
@@ -83,9 +115,9 @@ class _Converter:
             return _Part(sympy.pi, math.pi, Cost())
         if node.name in self._symbols:
             return _Part(self._symbols[node.name], None, Cost(degree=Fraction(1)))
-        if node.name in FUNCTIONS or node.name in self._functions:
+        if node.name in (*FUNCTIONS, *self._functions, *self._tables):
             raise ExpressionError(f"the function {node.name} needs an argument in parentheses", node.position)
-        known = [*self._symbols, "pi", *FUNCTIONS, *self._functions]
+        known = [*self._symbols, "pi", *FUNCTIONS, *self._functions, *self._tables]
         hint = did_you_mean(node.name, known) or f"; the names are {listing([*self._symbols, 'pi'])[:200]}"
         raise ExpressionError(f"unknown name {echo(node.name)}{hint}", node.position)
 
@@ -143,22 +175,32 @@ class _Converter:
 
     def _call(self, node: Call) -> _Part:
         undetermined = node.name in self._functions
-        if not undetermined and node.name not in FUNCTIONS:
+        table = self._tables.get(node.name)
+        if not undetermined and table is None and node.name not in FUNCTIONS:
             if node.name in self._symbols or node.name == "pi":
                 raise ExpressionError(f"{node.name!r} is not a function; write * to multiply", node.position)
-            hint = did_you_mean(node.name, [*FUNCTIONS, *self._functions])
-            hint = hint or f"; the functions are {listing([*FUNCTIONS, *self._functions])[:200]}"
+            known = [*FUNCTIONS, *self._functions, *self._tables]
+            hint = did_you_mean(node.name, known) or f"; the functions are {listing(known[::-1])[:200]}"
             raise ExpressionError(f"unknown function {echo(node.name)}{hint}", node.position)
-        if not undetermined and len(node.arguments) != 1:
-            raise ExpressionError(f"{node.name} takes 1 argument, got {len(node.arguments)}", node.position)
+        least, largest = ARGUMENTS.get(node.name, (1, 1)) if table is None else (len(table.axes),) * 2
+        if not undetermined and not least <= len(node.arguments) <= largest:
+            count = f"{least} argument{'s' * (least > 1)}" if least == largest else f"{least} to {largest} arguments"
+            raise ExpressionError(f"{node.name} takes {count}, got {len(node.arguments)}", node.position)
         parts = [self.convert(argument) for argument in node.arguments]
-        cost = cost_of_call([part.cost for part in parts]).checked(node.position)
+        cost = cost_of_call([part.cost for part in parts])
+        levels = _LEVELS.get(node.name, len(parts) - 2 if node.name in ("min", "max") else 0)
+        cost = replace(cost, height=cost.height + levels).checked(node.position)
         if undetermined:
             function = sympy.Function(node.name, real=True)
             return _Part(function(*(part.expr for part in parts), evaluate=cost.small), None, cost)
-        (part,) = parts
-        value = None if part.value is None else _float_call(node, part.value)
-        if node.name == "sqrt":
+        if table is not None:
+            return _Part(table_function(table)(*(part.expr for part in parts), evaluate=False), None, cost)
+        constants = [part.value for part in parts if part.value is not None]
+        value = _float_call(node, *constants) if len(constants) == len(parts) else None
+        (part, *_) = parts
+        if node.name in _PLAIN:
+            expr = _PLAIN[node.name](*(part.expr for part in parts))
+        elif node.name == "sqrt":
             expr = _raised(part, sympy.S.Half)
         else:
             # SymPy may only simplify the absolute value of what is real: it would make |sqrt(x)| of sqrt(|x|).
@@ -169,9 +211,9 @@ class _Converter:
         return _Part(expr, value, cost)
 
 
-def _float_call(node: Call, argument: float) -> float:
+def _float_call(node: Call, *arguments: float) -> float:
     try:
-        return float(_FLOAT[node.name](argument))
+        return float(_FLOAT[node.name](*arguments))
     except ValueError:
         words = _DOMAINS.get(node.name, f"{node.name} has no value here")
     except OverflowError:

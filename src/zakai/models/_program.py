@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,6 +17,7 @@ import sympy
 from sympy.core.function import AppliedUndef
 
 from zakai.errors import InputError
+from zakai.models.functions import Floor, Maximum, Minimum, Sinc, TableFunction, sinc
 
 _UNARY: dict[type, str] = {
     sympy.sin: "sin",
@@ -32,7 +34,9 @@ _UNARY: dict[type, str] = {
     sympy.erf: "erf",
     sympy.Abs: "abs",
     sympy.sign: "sign",
+    Floor: "floor",
 }
+_BINARY: dict[type, str] = {sympy.atan2: "atan2", Minimum: "min", Maximum: "max"}
 # SymPy makes these of the grammar's functions: tan(x + pi/2) becomes -cot(x), and derivatives hold others.
 _QUOTIENTS: dict[type, tuple[Callable, Callable]] = {
     sympy.cot: (sympy.cos, sympy.sin),
@@ -57,14 +61,17 @@ class Instruction:
 class Program:
     """A list of instructions that computes `expressions` from x (..., n), t and theta (..., p).
 
-    `symbols` are the coordinates of x, then t, then the parameters. Raises InputError for what has no
-    numerical value.
+    `symbols` are the coordinates of x, then t, then the parameters; after these, where there are any, those of known inputs
+    u (..., p) and of observations z (..., m). With `stable`, exp(u) - 1 and log(1 + u) keep their digits for small u. Raises
+    InputError for what has no numerical value.
     """
 
-    def __init__(self, expressions: Sequence[sympy.Expr], symbols: tuple[Sequence, sympy.Symbol, Sequence]):
-        state, time, parameters = symbols
+    def __init__(self, expressions: Sequence[sympy.Expr], symbols: tuple[Any, ...], stable: bool = False):
+        state, time, parameters, *others = symbols
+        self._stable = stable
         self._inputs: dict[sympy.Symbol, tuple[str, int]] = {s: ("x", i) for i, s in enumerate(state)}
         self._inputs |= {time: ("t", 0)} | {s: ("theta", i) for i, s in enumerate(parameters)}
+        self._inputs |= {s: (kind, i) for kind, group in zip("uz", others) for i, s in enumerate(group)}
         self._slots: dict[sympy.Expr, int] = {}
         self.instructions: list[Instruction] = []
         self.outputs = [self._slot(sympy.sympify(e, strict=True)) for e in expressions]
@@ -84,7 +91,7 @@ class Program:
         if expr.is_Number or expr.is_NumberSymbol:
             return "constant", (), _number(expr)
         if isinstance(expr, sympy.Add):
-            return "add", expr.args, None
+            return self._sum(expr)
         if isinstance(expr, sympy.Mul):
             above: list[sympy.Expr] = []
             below: list[sympy.Expr] = []
@@ -98,16 +105,33 @@ class Program:
             return self._power(expr)
         if isinstance(expr, sympy.log) and isinstance(expr.args[0], sympy.cosh):
             return "logcosh", expr.args[0].args, None  # cosh overflows at 710; its logarithm does not
+        if self._stable and isinstance(expr, sympy.log) and sympy.S.One in expr.args[0].args and expr.args[0].is_Add:
+            return "log1p", (expr.args[0] - 1,), None
         if type(expr) in _UNARY:
             return _UNARY[type(expr)], expr.args, None
+        if type(expr) in _BINARY:
+            return _BINARY[type(expr)], expr.args, None
+        if isinstance(expr, Sinc):
+            return "sinc", expr.args[:1], int(expr.args[1])
+        if isinstance(expr, TableFunction):
+            return "table", expr.args, partial(expr.table, orders=expr.orders)
         if type(expr) in _QUOTIENTS:
             above_function, below_function = _QUOTIENTS[type(expr)]
             return "divide", (above_function(expr.args[0]), below_function(expr.args[0])), None
         if isinstance(expr, AppliedUndef | sympy.Derivative):
             raise InputError(f"{str(expr)[:60]} is an undetermined function: the model can be analysed, not computed with")
         if expr.is_Symbol:
-            raise InputError(f"{expr} is neither a state, nor t, nor a parameter")
+            raise InputError(f"{expr} is neither a state, nor t, nor a parameter, nor an input")
         raise InputError(f"{str(expr)[:60]} has no real numerical value")
+
+    def _sum(self, expr: sympy.Add) -> tuple[str, Sequence[sympy.Expr], Any]:
+        if self._stable and len(expr.args) == 2 and expr.args[0].is_Rational:
+            coefficient, factors = expr.args[1].as_coeff_mul()
+            if coefficient == -expr.args[0] and len(factors) == 1 and isinstance(factors[0], sympy.exp):
+                if coefficient == 1:
+                    return "expm1", factors[0].args, None
+                return "multiply", (coefficient, sympy.Add(-1, factors[0], evaluate=False)), None
+        return "add", expr.args, None
 
     @staticmethod
     def _power(expr: sympy.Pow) -> tuple[str, Sequence[sympy.Expr], Any]:
@@ -127,7 +151,14 @@ class Program:
         """Whether every output is a plain number."""
         return all(self.instructions[slot].operation == "constant" for slot in self.outputs)
 
-    def run(self, x: Any, t: Any, theta: Any, functions: Mapping[str, Callable]) -> list[Any]:
+    @property
+    def needs_inputs(self) -> bool:
+        """Whether a value depends on the inputs u."""
+        return any(instruction.operation == "u" for instruction in self.instructions)
+
+    def run(
+        self, x: Any, t: Any, theta: Any, functions: Mapping[str, Callable], u: Any = None, z: Any = None
+    ) -> list[Any]:
         """The value of every instruction; `functions` holds the operations of the array library."""
         values: list[Any] = []
         for instruction in self.instructions:
@@ -138,17 +169,23 @@ class Program:
                     value = t
                 case "theta":
                     value = theta[..., instruction.constant]
+                case "u":
+                    value = u[..., instruction.constant]
+                case "z":
+                    value = z[..., instruction.constant]
                 case "constant":
                     value = instruction.constant
-                case "power":
-                    value = functions["power"](values[instruction.operands[0]], instruction.constant)
+                case "power" | "sinc" as operation:
+                    value = functions[operation](values[instruction.operands[0]], instruction.constant)
+                case "table":
+                    value = instruction.constant(*(values[slot] for slot in instruction.operands))
                 case operation:
                     value = functions[operation](*(values[slot] for slot in instruction.operands))
             values.append(value)
         return values
 
-    def scalar(self, theta: Sequence[float]) -> Callable[[Sequence[float], float], list[float]]:
-        """The program as a function of plain floats (x, t), for loops over time.
+    def scalar(self, theta: Sequence[float]) -> Callable[..., list[float]]:
+        """The program as a function of plain floats (x, t) or (x, t, u), for loops over time.
 
         What does not exist raises ValueError or ArithmeticError.
         """
@@ -158,15 +195,18 @@ class Program:
                 fixed[slot] = instruction.constant
             elif instruction.operation == "theta":
                 fixed[slot] = float(theta[instruction.constant])
-            elif instruction.operation in ("x", "t"):
-                moving.append((slot, instruction.operation == "x", instruction.constant))
+            elif instruction.operation in ("x", "t", "u"):
+                moving.append((slot, "xtu".index(instruction.operation), instruction.constant))
+            elif instruction.operation == "table":
+                steps.append((slot, _float_table(instruction.constant), instruction.operands, None))
             else:
                 steps.append((slot, SCALAR[instruction.operation], instruction.operands, instruction.constant))
 
-        def call(x: Sequence[float], t: float) -> list[float]:
+        def call(x: Sequence[float], t: float, u: Sequence[float] = ()) -> list[float]:
             values = fixed.copy()
-            for slot, is_state, index in moving:
-                values[slot] = x[index] if is_state else t
+            sources = (x, (t,), u)
+            for slot, source, index in moving:
+                values[slot] = sources[source][index]
             for slot, function, operands, constant in steps:
                 if constant is not None:
                     values[slot] = function(values[operands[0]], constant)
@@ -199,9 +239,13 @@ def _number(expr: sympy.Expr) -> float:
         return math.inf if expr > 0 else -math.inf
 
 
+def _float_table(table: Callable[..., Any]) -> Callable[..., float]:
+    return lambda *arguments: float(table(*arguments))
+
+
 def operations(xp: Any, erf: Callable, **special: Callable) -> dict[str, Callable]:
     """The operations of an array library with NumPy's names."""
-    names = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}
+    names = {"asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2", "min": "minimum", "max": "maximum"}
     plain = (
         "sin",
         "cos",
@@ -217,11 +261,18 @@ def operations(xp: Any, erf: Callable, **special: Callable) -> dict[str, Callabl
         "abs",
         "sign",
         "sqrt",
+        "atan2",
+        "min",
+        "max",
+        "floor",
+        "log1p",
+        "expm1",
     )
     return (
         {name: getattr(xp, names.get(name, name)) for name in plain}
         | {
             "erf": erf,
+            "sinc": sinc,
             "add": _add,
             "multiply": _multiply,
             "divide": lambda a, b: a / b,
@@ -273,12 +324,19 @@ _MATH = SimpleNamespace(
     arcsin=math.asin,
     arccos=math.acos,
     arctan=math.atan,
+    arctan2=math.atan2,
+    minimum=lambda a, b: b if b < a or b != b else a,
+    maximum=lambda a, b: b if b > a or b != b else a,
+    floor=math.floor,
+    log1p=math.log1p,
+    expm1=math.expm1,
     abs=abs,
-    sign=lambda u: (u > 0) - (u < 0),
+    sign=lambda u: float(u > 0) - float(u < 0),
 )
 SCALAR = operations(
     _MATH,
     math.erf,
+    sinc=lambda u, order: float(sinc(u, order)),
     power=_float_power,
     general_power=_float_power,
     logcosh=lambda u: abs(u) + math.log1p(math.exp(-2 * abs(u))) - math.log(2),

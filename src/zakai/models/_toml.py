@@ -12,7 +12,15 @@ import sympy
 
 from zakai.models.expressions import MAX_DIGITS
 
-_OPTIONAL: dict[str, Any] = {"observation_kind": "increments", "start": 0.0, "periodic": (), "functions": ()}
+_OPTIONAL: dict[str, Any] = {
+    "observation_kind": "increments",
+    "start": 0.0,
+    "periodic": (),
+    "functions": (),
+    "inputs": (),
+    "input_hold": "zero",
+    "observation_family": "gaussian",
+}
 _MATRICES = ("diffusion", "process_noise", "observation_noise")
 _ORDER = (
     "name",
@@ -26,12 +34,23 @@ _ORDER = (
     "start",
     "periodic",
     "functions",
+    "inputs",
+    "input_hold",
+    "cross_noise",
+    "observation_family",
+    "degrees_of_freedom",
+    "concentration",
+    "observation_log_density",
+    "observed",
 )
 
 
 def to_toml(keys: Mapping[str, Any]) -> str:
     """The TOML of a model's keys, all formulas as text; keys that hold their default are left out."""
-    lines = [f"{key} = {_value(keys[key])}" for key in _ORDER if not _is_default(key, keys[key])]
+    kept = [key for key in _ORDER if key in keys and not _is_default(key, keys[key])]
+    if "observation_log_density" in keys:
+        kept = [key for key in kept if key not in ("observation", "observation_family")]
+    lines = [f"{key} = {_value(keys[key])}" for key in kept]
     if keys["parameters"]:
         lines += [
             "",
@@ -40,10 +59,15 @@ def to_toml(keys: Mapping[str, Any]) -> str:
         ]
     if keys["prior"]:
         lines += ["", "[prior]", *(f"{name} = {_value(value)}" for name, value in keys["prior"].items())]
+    for table in ("domain", "tables"):
+        if keys[table]:
+            lines += ["", f"[{table}]", *(f"{name} = {_value(value)}" for name, value in keys[table].items())]
     return "\n".join(lines) + "\n"
 
 
 def _is_default(key: str, value: Any) -> bool:
+    if key == "cross_noise":
+        return all(entry == "0" for row in value for entry in row)
     if key in _MATRICES:
         size = len(value)
         row = ["0"] * size
@@ -56,8 +80,12 @@ def _value(value: Any) -> str:
         return _text(value)
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_value(entry) for entry in value) + "]"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{name} = {_value(entry)}" for name, entry in value.items()) + "}"
     if isinstance(value, sympy.Rational):
         return _rational(value)
+    if isinstance(value, bool):
+        return "true" if value else "false"
     return repr(float(value))
 
 

@@ -12,13 +12,13 @@ from sympy.core.function import AppliedUndef
 
 from zakai.errors import InputError
 from zakai.models._definite import ROUNDING, is_symmetric, smallest_eigenvalue
-from zakai.models.numeric import numpy_function
+from zakai.models.numeric import NumericFunction, numpy_function
 from zakai.models.prior import DensityPrior
 
 if TYPE_CHECKING:
     from zakai.models.model import Model
 
-COEFFICIENTS = ("diffusion", "process_noise", "observation_noise")
+COEFFICIENTS = ("diffusion", "process_noise", "observation_noise", "cross_noise")
 WITHIN = 1024  # times inside of intervals at which noise is looked at
 
 _GOOD: WeakKeyDictionary[Model, set[str]] = WeakKeyDictionary()  # the noises of a model that are noise at all times
@@ -27,7 +27,8 @@ _GOOD: WeakKeyDictionary[Model, set[str]] = WeakKeyDictionary()  # the noises of
 def check_noise_at(model: Model, times: Any, keys: Sequence[str] = COEFFICIENTS) -> None:
     """Check that the noise of a model (or that of some `keys`) is noise at every given time.
 
-    S(t) must be positive definite, Q(t) positive semidefinite, and g(t), Q(t), S(t) finite.
+    S(t) must be positive definite, Q(t) and the joint covariance of both noises positive semidefinite, and all finite.
+    What depends on the state or on inputs is checked where it is evaluated.
 
     `times` has shape (K,), in the model's unit of time. Raises InputError naming the model, the key and the
     first time.
@@ -36,7 +37,7 @@ def check_noise_at(model: Model, times: Any, keys: Sequence[str] = COEFFICIENTS)
         >>> check_noise_at(load_model("gallery:spiral-sensor"), [0.0, 10.0])
     """
     for key in keys:
-        if key in _GOOD.get(model, ()):
+        if key in _GOOD.get(model, ()) or depends_on_state(getattr(model, key), model):
             continue
         problem, varies = _problem(model, key, np.atleast_1d(np.asarray(times, dtype=float))), getattr(model, key).has(model.t)
         if problem:
@@ -53,7 +54,7 @@ def check_noise_within(model: Model, times: np.ndarray) -> None:
     The noise of samples need only be one when they are taken.
     """
     edges = np.unique(np.concatenate([[model.start], times]))
-    keys = COEFFICIENTS[:-1] if model.observation_kind == "samples" else COEFFICIENTS
+    keys = COEFFICIENTS[:2] if model.observation_kind == "samples" else COEFFICIENTS
     if len(edges) > 1 and any(getattr(model, key).has(model.t) for key in keys):
         count = max(1, WITHIN // (len(edges) - 1))
         check_noise_at(model, (edges[:-1, None] + np.diff(edges)[:, None] * irregular(count)).ravel(), keys)
@@ -69,7 +70,7 @@ def check_constant_noise(model: Model) -> None:
     """The checks of `check_noise_at` for the matrices that do not depend on time; errors name the key."""
     for key in COEFFICIENTS:
         matrix = getattr(model, key)
-        if not matrix.has(model.t) and not matrix.atoms(AppliedUndef):
+        if not matrix.has(model.t) and not matrix.atoms(AppliedUndef) and not depends_on_state(matrix, model):
             problem = _problem(model, key, np.array([model.start]))
             if problem:
                 raise InputError(f"{key}: {problem[1][0]}{problem[1][1]}")
@@ -80,7 +81,9 @@ def _problem(model: Model, key: str, times: np.ndarray) -> tuple[int, tuple[str,
     matrix, theta = getattr(model, key), model.theta()
     times = times if matrix.has(model.t) else times[:1]
     entries = matrix.todok()
-    if key == "diffusion" or all(row == column for row, column in entries):
+    if key == "cross_noise" and not entries:
+        return None
+    if key == "diffusion" or key != "cross_noise" and all(row == column for row, column in entries):
         # Each entry is a matrix of its own: independent noises of a hundred states at a thousand times need no eigenvalues.
         each = list(entries.values() if key == "diffusion" else matrix.diagonal())
         matrices = numpy_function(each, model)(np.zeros(model.n), times, theta)[..., None, None]
@@ -91,6 +94,11 @@ def _problem(model: Model, key: str, times: np.ndarray) -> tuple[int, tuple[str,
         return int(np.argmin(finite)), ("is not finite", "")
     if key == "diffusion":
         return None
+    if key == "cross_noise":
+        joint = joint_covariance(model)(np.zeros(model.n), times, theta)
+        good = smallest_eigenvalue(joint) >= -ROUNDING * joint.shape[-1]
+        words = ("is larger than process_noise and observation_noise allow", "; a correlation is at most 1 in size")
+        return None if good.all() else (int(np.argmin(good)), words)
     symmetric = is_symmetric(matrices).all(axis=-1)
     if not symmetric.all():
         return int(np.argmin(symmetric)), ("is not symmetric", "")
@@ -104,13 +112,32 @@ def _problem(model: Model, key: str, times: np.ndarray) -> tuple[int, tuple[str,
     return None if good.all() else (int(np.argmin(good)), words)
 
 
+def joint_covariance(model: Model) -> NumericFunction:
+    """Return the covariance [[Q, C], [C', S]] of dv and dw per unit time, as a function of x, t and theta."""
+    upper = model.process_noise.row_join(model.cross_noise)
+    matrix = upper.col_join(model.cross_noise.T.row_join(model.observation_noise))
+    return numpy_function(matrix, model, matrix.shape)
+
+
+def depends_on_state(matrix: sympy.MatrixBase, model: Model) -> bool:
+    """Return whether a matrix depends on the state or on inputs."""
+    return bool(matrix.free_symbols & {*model.x, *model.u})
+
+
 def check_periodic(model: Model) -> None:
-    """Check that drift, observation and a prior density are 2 pi-periodic in every angle, at random points.
+    """Check that drift, noise, observation and a prior density are 2 pi-periodic in every angle, at random points.
 
     Raises InputError naming the entry. Undetermined functions are taken as periodic.
     """
     rng = np.random.default_rng(0)
-    entries = [(f"{key}[{i}]", expr) for key in ("drift", "observation") for i, expr in enumerate(getattr(model, key))]
+    entries = [(f"drift[{i}]", expr) for i, expr in enumerate(model.drift)]
+    for i, (expr, family) in enumerate(zip(model.observation, model.observation_family, strict=True)):
+        # The mean direction of an angle is an angle.
+        parts = (sympy.sin(expr), sympy.cos(expr)) if family == "von-mises" else (expr,)
+        entries += [(f"observation[{i}]", part) for part in parts]
+    for key in ("diffusion", "observation_noise"):
+        entries += [(f"{key}[{i}][{j}]", expr) for (i, j), expr in sorted(getattr(model, key).todok().items())]
+    entries += [("observation_log_density", model.log_density)] if model.log_density is not None else []
     if isinstance(model.prior, DensityPrior):
         entries.append(("prior: log_density", model.prior.log_density))
     for angle in model.periodic:
@@ -120,11 +147,12 @@ def check_periodic(model: Model) -> None:
         turned = x.copy()
         turned[:, column] += 2 * np.pi * rng.choice([-2, -1, 1, 3], size=24)
         t = model.start + rng.uniform(0, 10, size=24)
+        u, z = rng.normal(size=(24, len(model.u))), rng.integers(0, 2, size=(24, len(model.z)))
         for place, expr in entries:
             if not expr.has(model.x[column]) or expr.atoms(AppliedUndef):
                 continue
             value = numpy_function([expr], model, ())
-            here, there = value(x, t, model.theta()), value(turned, t, model.theta())
+            here, there = value(x, t, model.theta(), u, z), value(turned, t, model.theta(), u, z)
             with np.errstate(invalid="ignore"):
                 same = (np.abs(here - there) <= 1e-8 * (1 + np.abs(here))) | (~np.isfinite(here) & ~np.isfinite(there))
             if not same.all():
@@ -132,11 +160,12 @@ def check_periodic(model: Model) -> None:
                 raise InputError(f"{place}: {text} is not 2*pi-periodic in {angle!r}, which is listed in periodic")
 
 
-def check_independent_of_state(matrix: sympy.MatrixBase, x: tuple[sympy.Symbol, ...]) -> None:
-    """Raise InputError at the first entry that depends on the state."""
-    state = set(x)
+def check_independent_of_state(matrix: sympy.MatrixBase, model: Model) -> None:
+    """Raise InputError at the first entry that depends on the state or on an input."""
+    others = {*model.x, *model.u}
     for (row, column), expr in sorted(matrix.todok().items()):
-        found = expr.free_symbols & state
+        found = expr.free_symbols & others
         if found:
             name = min(str(symbol) for symbol in found)
-            raise InputError(f"[{row}][{column}]: depends on the state {name!r}; it may depend on t and on parameters only")
+            what = "state" if name in model.state else "input"
+            raise InputError(f"[{row}][{column}]: depends on the {what} {name!r}; it may depend on t and on parameters only")

@@ -15,12 +15,15 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import sympy
 
 from zakai.errors import InputError
 from zakai.models._errors import echo
+
+if TYPE_CHECKING:
+    from zakai.models.tables import Table
 
 MAX_LENGTH = 10_000
 MAX_DEPTH = 100
@@ -42,7 +45,17 @@ FUNCTIONS = (
     "sqrt",
     "erf",
     "abs",
+    "atan2",
+    "min",
+    "max",
+    "sign",
+    "floor",
+    "heaviside",
+    "log1p",
+    "expm1",
+    "sinc",
 )
+ARGUMENTS = {"atan2": (2, 2), "min": (2, 64), "max": (2, 64)}  # the least and the largest number; one for all others
 RESERVED = ("t", "pi", *FUNCTIONS)
 
 
@@ -258,12 +271,14 @@ def _number(token: _Token) -> Fraction:
     return Fraction(int(digits)) * Fraction(10) ** (int(exponent or "0") + leading - len(digits))
 
 
-def parse_expression(text: str, symbols: Mapping[str, sympy.Expr], functions: Collection[str] = ()) -> sympy.Expr:
+def parse_expression(
+    text: str, symbols: Mapping[str, sympy.Expr], functions: Collection[str] = (), tables: Mapping[str, Table] | None = None
+) -> sympy.Expr:
     """Read a formula into SymPy, with decimals as exact rationals.
 
     `text` is one formula; `symbols` maps each name it may use to the symbol that stands for it; `functions`
-    names the undetermined functions. Raises `ExpressionError` with the column for anything else, for a
-    constant that does not exist (1/0, log(-1)) and for powers and numbers that grow beyond the bounds.
+    names the undetermined functions, `tables` holds the tables by name. Raises `ExpressionError` with the column for anything
+    else, for a constant that does not exist (1/0, log(-1)) and for powers and numbers that grow beyond the bounds.
 
         >>> x = sympy.Symbol("x", real=True)
         >>> parse_expression("0.5*x**2", {"x": x})
@@ -271,4 +286,4 @@ def parse_expression(text: str, symbols: Mapping[str, sympy.Expr], functions: Co
     """
     from zakai.models._exact import to_sympy
 
-    return to_sympy(parse(text), symbols, functions)
+    return to_sympy(parse(text), symbols, functions, tables or {})

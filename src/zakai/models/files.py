@@ -40,15 +40,15 @@ def load_model(source: str | os.PathLike[str]) -> Model:
     except TypeError:
         raise InputError(f"a model is a path or gallery:NAME, got a {type(source).__name__}") from None
     shown = str(source) if str(source).isprintable() else ascii(str(source))
-    return read_model(read_text(path, shown), shown)
+    return read_model(read_text(path, shown), shown, path.parent)
 
 
-def read_model(text: str, source: str) -> Model:
-    """The model in the text of a model file; `source` is what errors call it."""
+def read_model(text: str, source: str, folder: Path | None = None) -> Model:
+    """The model in the text of a model file; `source` is what errors call it, `folder` where the files of tables are."""
     with named(source):
         if len(text) > MAX_BYTES:
             raise InputError("larger than 1 MiB, which no model file is")
-        return Model._from_file(read_keys(text), source, text)
+        return Model._from_file(read_keys(text), source, text, folder)
 
 
 def read_text(path: Path, shown: str, what: str = "model") -> str:

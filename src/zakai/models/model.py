@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,14 @@ import sympy
 from zakai.errors import InputError
 from zakai.models import _entries, checks
 from zakai.models._errors import did_you_mean, listing, named
+from zakai.models._law_keys import read_law, read_observed
 from zakai.models._toml import to_toml
+from zakai.models.domain import Interval, check_prior, read_domain
 from zakai.models.expressions import MAX_LENGTH, parse_expression
+from zakai.models.features import features_of
+from zakai.models.observation_law import ObservationLaw
 from zakai.models.prior import Prior, read_prior
+from zakai.models.tables import Table, read_tables
 
 KEYS = (
     "name",
@@ -31,7 +37,18 @@ KEYS = (
     "functions",
     "parameters",
     "prior",
+    "inputs",
+    "input_hold",
+    "cross_noise",
+    "observation_family",
+    "degrees_of_freedom",
+    "concentration",
+    "observation_log_density",
+    "observed",
+    "domain",
+    "tables",
 )
+HOLDS = ("zero", "linear")
 MOST_STATES = 1024  # of states, sensors and noises: a default identity matrix has this many squared entries
 MOST_CHARACTERS = 250_000  # of all different formulas together: what a computer reads in seconds
 MOST_PARENTHESES = 8_192
@@ -41,17 +58,24 @@ OBSERVATION_KINDS = ("increments", "path", "rates", "samples")
 class Model:
     """A continuous-time stochastic system and what is observed of it.
 
-        dx = f(x,t) dt + g(t) dv      E dv dv' = Q(t) dt      x in R^n
-        dy = h(x,t) dt + dw           E dw dw' = S(t) dt      y in R^m       ("increments", "path", "rates")
-        z_k = h(x(t_k), t_k) + r_k    r_k ~ N(0, S(t_k))                     ("samples")
+        dx = f(x,u,t) dt + g(x,u,t) dv    E dv dv' = Q(t) dt                        x in R^n, u known
+        dy = h(x,u,t) dt + dw             E dw dw' = S(t) dt, E dv dw' = C(t) dt    ("increments", "path", "rates")
+        z_k ~ p(z | x(t_k), u(t_k), t_k)  N(h, S) by default                        ("samples")
 
     Keywords, each as in a model file; a formula is a text, a number or a SymPy expression whose symbols are
     meant by name:
 
     * `state`: n names; `drift`: f, n formulas; `observation`: h, m formulas (these three are required);
     * `observation_kind`: increments (the default), path, rates or samples;
-    * `diffusion`: g, n rows of r formulas; `process_noise`: Q, r x r; `observation_noise`: S, m x m; in t
-      and parameters only, by default identities; covariances are per unit time, or per reading for samples;
+    * `diffusion`: g, n rows of r formulas (Ito); `process_noise`: Q, r x r; `observation_noise`: S, m x m; `cross_noise`:
+      C, r x m; Q, C and S in t and parameters only, S of samples in the state and inputs too; by default identities, and
+      zero for C; covariances are per unit time, or per observation for samples;
+    * `inputs`: names of known signals u(t); `input_hold`: "zero" (the default) or "linear";
+    * `observation_family`, for samples: "gaussian", "student-t" (`degrees_of_freedom`), "poisson", "bernoulli" or "von-mises"
+      (`concentration`), for all coordinates or a list; or `observation_log_density` instead of `observation`: log p(z | x) in
+      the state and the names in `observed`, normalised over z if the evidence is to mean something;
+    * `domain`: state -> {"lower": a, "upper": b, "boundary": "natural" or "reflecting"};
+    * `tables`: name -> (x, values), (x, y, values) or a table as in a model file;
     * `start`: the time at which the prior holds; `periodic`: states that are angles (period 2 pi);
     * `parameters`: name -> number; `functions`: names of undetermined functions, for analysis only;
     * `prior`: a table as in a model file, or a `GaussianPrior`, `MixturePrior` or `DensityPrior`; `name`: a
@@ -82,30 +106,52 @@ class Model:
     functions: tuple[str, ...]
     prior: Prior | None
     source: str
+    inputs: tuple[str, ...]
+    u: tuple[sympy.Symbol, ...]
+    input_hold: str
+    cross_noise: sympy.ImmutableMatrix
+    observation_family: tuple[str, ...]
+    family_parameters: dict[tuple[str, int], sympy.Expr]
+    log_density: sympy.Expr | None
+    observed: tuple[str, ...]
+    z: tuple[sympy.Symbol, ...]
+    domain: dict[str, Interval]
+    tables: dict[str, Table]
 
     def __init__(self, /, **keys: Any):
-        self._read(keys, source="<python>", text=None)
+        self._read(keys, source="<python>", text=None, folder=Path())
 
     @classmethod
-    def _from_file(cls, keys: Mapping[str, Any], source: str, text: str | None) -> Model:
+    def _from_file(cls, keys: Mapping[str, Any], source: str, text: str | None, folder: Path | None = None) -> Model:
         model = object.__new__(cls)
-        model._read(keys, source, text)
+        model._read(keys, source, text, folder)
         return model
 
-    def _read(self, keys: Mapping[str, Any], source: str, text: str | None) -> None:
+    def _read(self, keys: Mapping[str, Any], source: str, text: str | None, folder: Path | None) -> None:
         _entries.known_keys(keys, KEYS)
         for key in ("state", "drift", "observation"):
-            if keys.get(key) is None:
+            if keys.get(key) is None and not (key == "observation" and keys.get("observation_log_density") is not None):
                 raise InputError(f"{key}: missing; a model needs state, drift and observation")
         canonical: dict[str, Any] = {}
-        vars(self).update(source=source, _keys=canonical)
+        vars(self).update(source=source, _keys=canonical, log_density=None, z=(), observed=())
+        with named("tables"):
+            vars(self)["tables"] = read_tables(keys.get("tables") or {}, folder)
+            canonical["tables"] = {name: table.keys() for name, table in self.tables.items()}
+            for name in self.tables:
+                _entries.allowed_name(name)
+        if any(isinstance(table, Mapping) and "file" in table for table in (keys.get("tables") or {}).values()):
+            text = None  # the text of a model stands for itself, and this one needs a file
         self._read_names(keys)
         self._read_formulas(keys)
+        with named("domain"):
+            vars(self)["domain"] = read_domain(keys.get("domain") or {}, self.state, self.periodic)
+            canonical["domain"] = {name: interval.keys() for name, interval in self.domain.items()}
         with named("start"):
             vars(self)["start"] = canonical["start"] = _entries.number(keys.get("start", 0.0))
         with named("prior"):
             prior, table = read_prior(keys.get("prior"), self.n, self._reader(in_time=False))
             vars(self)["prior"], canonical["prior"] = prior, table
+        check_prior(self)
         checks.check_constant_noise(self)
         checks.check_periodic(self)
         if text is not None:
@@ -136,10 +182,24 @@ class Model:
             if len(functions) > MOST_STATES:
                 raise InputError(f"expected a list of at most {MOST_STATES} names, got {len(functions)}")
             _refuse_clash(functions, state, "a state")
+            _refuse_clash(functions, tuple(self.tables), "a table")
         with named("parameters"):
             parameters = _read_parameters(keys.get("parameters") or {})
             _refuse_clash(parameters, state, "a state")
             _refuse_clash(parameters, functions, "an undetermined function")
+        with named("inputs"):
+            inputs = _entries.names(keys.get("inputs", ()), "a list of names of known signals")
+            if len(inputs) > MOST_STATES:
+                raise InputError(f"expected a list of at most {MOST_STATES} names, got {len(inputs)}")
+            for others, what in ((state, "a state"), (functions, "an undetermined function"), (parameters, "a parameter")):
+                _refuse_clash(inputs, tuple(others), what)
+        with named("tables"):
+            for others, what in ((state, "a state"), (parameters, "a parameter"), (inputs, "an input")):
+                _refuse_clash(self.tables, tuple(others), what)
+        with named("input_hold"):
+            hold = _one_of(keys.get("input_hold", "zero"), HOLDS)
+            if "input_hold" in keys and not inputs:
+                raise InputError("there are no inputs to hold; give inputs, or leave it out")
         with named("periodic"):
             periodic = _entries.names(keys.get("periodic", ()), "a list of states that are angles")
             for angle in periodic:
@@ -147,29 +207,35 @@ class Model:
                     hint = did_you_mean(angle, state)
                     raise InputError(f"{angle!r} is not a state{hint} (the states are {listing(state)})")
         with named("observation_kind"):
-            kind = keys.get("observation_kind", "increments")
-            if not isinstance(kind, str) or kind not in OBSERVATION_KINDS:
-                hint = did_you_mean(kind, OBSERVATION_KINDS) if isinstance(kind, str) else ""
-                raise InputError(f"expected one of {listing(OBSERVATION_KINDS)}, got {_entries.kind_of(kind)}{hint}")
+            kind = _one_of(keys.get("observation_kind", "increments"), OBSERVATION_KINDS)
         attributes.update(
             state=state,
             functions=functions,
             parameters=parameters,
             periodic=periodic,
             observation_kind=kind,
+            inputs=inputs,
+            input_hold=hold,
+            u=tuple(sympy.Symbol(name, real=True) for name in inputs),
             n=len(state),
             x=tuple(sympy.Symbol(name, real=True) for name in state),
             t=sympy.Symbol("t", real=True),
             parameter_symbols=tuple(sympy.Symbol(name, real=True) for name in parameters),
         )
         canonical.update(state=state, functions=functions, parameters=parameters, periodic=periodic, observation_kind=kind)
+        canonical.update(inputs=inputs, input_hold=hold)
 
     def _read_formulas(self, keys: Mapping[str, Any]) -> None:
         canonical, n = self._keys, self.n
         with named("drift"):
             canonical["drift"] = _entries.vector_of_formulas(keys["drift"], n, f"a list of {n} formulas (one a state)")
-        with named("observation"):
-            canonical["observation"] = _entries.vector_of_formulas(keys["observation"], None, "a list of formulas (one a sensor)")
+        custom = keys.get("observation_log_density") is not None
+        if custom:
+            canonical["observation"] = ["0"] * read_observed(self, keys)
+        with nullcontext() if custom else named("observation"):
+            if not custom:
+                formulas = "a list of formulas (one a sensor)"
+                canonical["observation"] = _entries.vector_of_formulas(keys["observation"], None, formulas)
             if not 1 <= len(canonical["observation"]) <= MOST_STATES:
                 raise InputError(f"expected a list of 1 to {MOST_STATES} formulas (one a sensor)")
         m = vars(self)["m"] = len(canonical["observation"])
@@ -183,6 +249,14 @@ class Model:
         r = len(canonical["diffusion"][0])
         if r > MOST_STATES:
             raise InputError(f"diffusion: at most {MOST_STATES} noises are read, got rows of {r}")
+        with named("cross_noise"):
+            if given["cross_noise"] is None:
+                canonical["cross_noise"] = [["0"] * m for _ in range(r)]
+            else:
+                if self.observation_kind == "samples":
+                    raise InputError("samples have no noise between their times; it is for increments, path and rates")
+                rows = f"{r} rows (one a noise) of {m} formulas (one a sensor)"
+                canonical["cross_noise"] = _entries.matrix_of_formulas(given["cross_noise"], r, m, rows)
         for key, size, what in (("process_noise", r, "noise"), ("observation_noise", m, "sensor")):
             if given[key] is None:
                 canonical[key] = _identity(size)
@@ -205,19 +279,21 @@ class Model:
                     if text != "0"
                 }
                 vars(self)[key] = _matrix(len(canonical[key]), len(canonical[key][0]), entries)
-                checks.check_independent_of_state(vars(self)[key], self.x)
+                if key != "diffusion" and not (key == "observation_noise" and self.observation_kind == "samples"):
+                    checks.check_independent_of_state(vars(self)[key], self)
+        read_law(self, keys, read)
 
     def _reader(self, in_time: bool = True) -> Callable[..., sympy.Expr]:
         """A function that reads a formula at a place; it remembers, for large matrices repeat few formulas."""
         symbols = dict(zip((*self.state, *self.parameters), (*self.x, *self.parameter_symbols), strict=True))
         if in_time:
-            symbols["t"] = self.t
+            symbols |= {"t": self.t, **dict(zip(self.inputs, self.u, strict=True))}
         known: dict[str, sympy.Expr] = {}
 
         def read(text: str, place: str = "") -> sympy.Expr:
             if text not in known:
                 with named(place) if place else nullcontext():
-                    known[text] = parse_expression(text, symbols, self.functions)
+                    known[text] = parse_expression(text, symbols, self.functions, self.tables)
             return known[text]
 
         return read
@@ -226,6 +302,16 @@ class Model:
     def covariance(self) -> sympy.ImmutableMatrix:
         """G = g Q g', the covariance of the state's noise per unit time, of shape (n, n)."""
         return sympy.ImmutableMatrix(self.diffusion * self.process_noise * self.diffusion.T)
+
+    @cached_property
+    def features(self) -> dict[str, str]:
+        """What the model has beyond f(x, t), g(t), h(x, t) and Gaussian noise, each feature with the words that show it."""
+        return features_of(self)
+
+    @cached_property
+    def observation_law(self) -> ObservationLaw:
+        """The law of an observation given the state, as NumPy functions."""
+        return ObservationLaw(self)
 
     @cached_property
     def text(self) -> str:
@@ -254,7 +340,7 @@ class Model:
                     raise InputError(f"unknown parameter {name!r}{did_you_mean(name, self.parameters)} {known}")
             parameters = {**self.parameters, **_read_parameters(values)}
         other = object.__new__(Model)
-        kept = {key: value for key, value in vars(self).items() if key != "text"}
+        kept = {key: value for key, value in vars(self).items() if key not in ("text", "observation_law")}
         vars(other).update({**kept, "parameters": parameters, "_keys": {**self._keys, "parameters": parameters}})
         with named(self.source):
             checks.check_constant_noise(other)
@@ -263,6 +349,13 @@ class Model:
     def to_toml(self) -> str:
         """The model as the text of a model file that gives this model again."""
         return to_toml(self._keys)
+
+    @property
+    def keys_of_features(self) -> dict[str, Any]:
+        """The keys of inputs, families, domains and tables, as in a model file, without those that hold their default."""
+        kept = {key: self._keys[key] for key in KEYS[KEYS.index("inputs") :] if self._keys.get(key)}
+        needless = {"input_hold": not self.inputs, "cross_noise": self.cross_noise.is_zero_matrix}
+        return {key: value for key, value in kept.items() if not needless.get(key)}
 
     @property
     def _keys(self) -> dict[str, Any]:
@@ -276,7 +369,7 @@ def _matrix(rows: int, columns: int, entries: Mapping[tuple[int, int], sympy.Exp
 
 def _refuse_long(canonical: Mapping[str, Any]) -> None:
     """Raise InputError if all formulas together are more than can be read in a moment, before any of them is."""
-    rows = (row for key in checks.COEFFICIENTS for row in canonical[key])
+    rows = [row for key in checks.COEFFICIENTS for row in canonical[key]]
     texts = set(canonical["drift"]).union(canonical["observation"], *rows)
     characters, parentheses = sum(map(len, texts)), sum(text.count("(") for text in texts)
     if characters > MOST_CHARACTERS and max(map(len, texts)) <= MAX_LENGTH:
@@ -300,6 +393,13 @@ def _read_parameters(table: Any) -> dict[str, sympy.Rational]:
         with named(name):
             parameters[name] = _entries.exact_number(value)
     return parameters
+
+
+def _one_of(value: Any, options: tuple[str, ...]) -> str:
+    if not isinstance(value, str) or value not in options:
+        hint = did_you_mean(value, options) if isinstance(value, str) else ""
+        raise InputError(f"expected one of {listing(options)}, got {_entries.kind_of(value)}{hint}")
+    return value
 
 
 def _refuse_clash(names: Any, others: tuple[str, ...], what: str) -> None:

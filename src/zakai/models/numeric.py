@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sympy
 
+from zakai.errors import InputError
 from zakai.models._program import Program, operations
 
 if TYPE_CHECKING:
@@ -49,8 +50,33 @@ def _complex_log_cosh(values: Any) -> Any:
     return size + np.log1p(np.exp(-2.0 * size)) - np.log(2.0)
 
 
+def _chosen(first: Any, second: Any, choose_first: Any) -> Any:
+    return np.where(choose_first | np.isnan(np.real(first)), first, second)
+
+
+def _complex_log1p(values: Any) -> Any:
+    return np.log1p(np.real(values)) + 1j * np.imag(values) / (1.0 + np.real(values))
+
+
+def _complex_atan2(y: Any, x: Any) -> Any:
+    size = np.real(x) ** 2 + np.real(y) ** 2
+    return np.arctan2(np.real(y), np.real(x)) + 1j * (np.imag(y) * np.real(x) - np.imag(x) * np.real(y)) / size
+
+
 # Functions that keep a derivative by the complex step, to first order in the imaginary part.
-COMPLEX = operations(np, _complex_erf, abs=_absolute, sign=_sign, logcosh=_complex_log_cosh)
+COMPLEX = operations(
+    np,
+    _complex_erf,
+    abs=_absolute,
+    sign=_sign,
+    logcosh=_complex_log_cosh,
+    atan2=_complex_atan2,
+    min=lambda a, b: _chosen(a, b, np.real(a) <= np.real(b)),
+    max=lambda a, b: _chosen(a, b, np.real(a) >= np.real(b)),
+    floor=lambda u: np.floor(np.real(u)),
+    log1p=_complex_log1p,
+    expm1=lambda u: np.expm1(np.real(u)) + 1j * np.exp(np.real(u)) * np.imag(u),
+)
 
 
 def flattened(expressions: Any, shape: Sequence[int] | None = None) -> tuple[list[sympy.Expr], tuple[int, ...]]:
@@ -69,18 +95,19 @@ def flattened(expressions: Any, shape: Sequence[int] | None = None) -> tuple[lis
     return flat, shape
 
 
-def program_of(expressions: Sequence[sympy.Expr], model: Model) -> Program:
-    """The program that computes the expressions from the model's x, t and parameters."""
-    return Program(expressions, (model.x, model.t, model.parameter_symbols))
+def program_of(expressions: Sequence[sympy.Expr], model: Model, stable: bool = False) -> Program:
+    """The program that computes the expressions from the model's x, t, parameters and inputs, and from its observations z."""
+    return Program(expressions, (model.x, model.t, model.parameter_symbols, model.u, model.z), stable)
 
 
 def numpy_function(expressions: Any, model: Model, shape: Sequence[int] | None = None) -> NumericFunction:
-    """The expressions as one function f(x, t, theta) of NumPy arrays.
+    """The expressions as one function f(x, t, theta, u=None, z=None) of NumPy arrays.
 
-    `expressions` is a list or Matrix in the model's state, t and parameters; `shape` is the shape of one
-    value (the Matrix' own by default). f takes x (..., n), t (...) and theta (p,) and broadcasts them; what
-    does not exist is nan. Complex arguments give complex values, for derivatives by the complex step. Raises InputError for an
-    undetermined function.
+    `expressions` is a list or Matrix in the model's state, t, parameters and inputs; `shape` is the shape of one
+    value (the Matrix' own by default). f takes x (..., n), t (...), theta (p,), the inputs u (..., number of inputs) at t and,
+    for `observation_log_density`, the observations z (..., m), and broadcasts them; what does not exist is nan. Complex
+    arguments give complex values, for derivatives by the complex step. Raises InputError for an undetermined function, and f if
+    u is needed and None.
 
         >>> from zakai.models import load_model
         >>> model = load_model("gallery:benes")
@@ -89,14 +116,20 @@ def numpy_function(expressions: Any, model: Model, shape: Sequence[int] | None =
         (5, 1)
     """
     flat, shape = flattened(expressions, shape)
-    program = program_of(flat, model)
+    program = program_of(flat, model, stable=True)
+    needs_inputs = program.needs_inputs
 
-    def function(x: Any, t: Any, theta: Any) -> np.ndarray:
+    def function(x: Any, t: Any, theta: Any, u: Any = None, z: Any = None) -> np.ndarray:
+        if needs_inputs and u is None:
+            raise InputError(f"{model.source}: inputs: the values of {', '.join(model.inputs)} are missing")
         x, t, theta = (_inexact(a) for a in (x, t, theta))
-        batch = np.broadcast_shapes(x.shape[:-1], t.shape, theta.shape[:-1])
+        u, z = (None if a is None else np.asarray(a, dtype=float) for a in (u, z))
+        batch = np.broadcast_shapes(
+            x.shape[:-1], t.shape, theta.shape[:-1], *(a.shape[:-1] for a in (u, z) if a is not None)
+        )
         derivative = np.iscomplexobj(x) or np.iscomplexobj(t) or np.iscomplexobj(theta)
         with np.errstate(all="ignore"):
-            values = program.run(x, t, theta, COMPLEX if derivative else REAL)
+            values = program.run(x, t, theta, COMPLEX if derivative else REAL, u, z)
         result = np.empty((*batch, len(flat)), complex if derivative else float)
         for column, slot in enumerate(program.outputs):
             result[..., column] = values[slot]
@@ -115,7 +148,7 @@ _DOMAINS = {
 }
 
 
-def explain_nonfinite(model: Model, key: str, expressions: Any, x: Any, t: float) -> str:
+def explain_nonfinite(model: Model, key: str, expressions: Any, x: Any, t: float, u: Any = None) -> str:
     """Say which innermost part of the expressions is not finite at a point, and why, in one line.
 
     `key` is the name of the expressions in the model file; `x` has shape (n,). The empty string if all are
@@ -132,12 +165,13 @@ def explain_nonfinite(model: Model, key: str, expressions: Any, x: Any, t: float
         [
             *(f"{name} = {value:.6g}" for name, value in zip(model.state, x, strict=True)),
             f"t = {float(t):.6g}",
+            *(f"{name} = {value:.6g}" for name, value in zip(model.inputs, [] if u is None else u)),
         ]
     )
     for index, expr in enumerate(flat):
         program = program_of([expr], model)
         with np.errstate(all="ignore"):
-            values = program.run(x, np.float64(t), model.theta(), REAL)
+            values = program.run(x, np.float64(t), model.theta(), REAL, u)
         if np.isfinite(values[program.outputs[0]]):
             continue
         place = key + "".join(f"[{i}]" for i in np.unravel_index(index, shape))
@@ -151,7 +185,7 @@ def explain_nonfinite(model: Model, key: str, expressions: Any, x: Any, t: float
 
 
 def _reason(operation: str, arguments: list[float], value: float) -> str:
-    if operation in ("x", "t", "theta"):
+    if operation in ("x", "t", "theta", "u"):
         return "the point itself is not finite"
     if operation == "divide" and arguments[1] == 0:
         return "division by zero"

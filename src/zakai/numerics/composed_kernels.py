@@ -48,11 +48,11 @@ def repeated_band(bands: Any, values: Any, count: int) -> Any:
 
 
 class Series(Protocol):
-    """What is known of a short kernel: its covariance G per unit of time, (1, 1), and its values on a grid."""
+    """What is known of a short kernel: its variance G per unit of time, and its values on a grid."""
 
     @property
-    def covariance(self) -> Array:
-        """G."""
+    def G(self) -> Any:
+        """The variance."""
 
     def banded(self, spacing: float, t: float, form: str = "log") -> Array:
         """Return the kernel of a time t times the spacing, (2 b + 1, N), for the differences -b, ..., b of grid points."""
@@ -70,7 +70,7 @@ class Kernels:
 
     def __init__(self, heat: Series, grid: Grid, form: str):
         self.heat, self.grid, self.form = heat, grid, form
-        self.base = 2 * (SHORTEST * grid.spacing) ** 2 / float(heat.covariance[0, 0].real)
+        self.base = 2 * (SHORTEST * grid.spacing) ** 2 / float(heat.G.real)
         self._short: dict[float, Kernel] = {}
         self._powers: dict[tuple[float, int], Array] = {}
 

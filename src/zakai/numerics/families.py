@@ -126,10 +126,10 @@ def propagate(family: Family, matrix: Array, offset: Array, noise: Array) -> Fam
     return Family(nodes, log_weights, signs, mean.dot(backward) + offset, cov, response, tilt, curvature, log_mass)
 
 
-def move(family: Family, transition: Transition, inputs: Array, weighs: bool) -> Family:
-    """Return the families after one transition with inputs e (k,); not `weighs`: its Omega and eta are zero."""
+def move(family: Family, transition: Transition, inputs: Array) -> Family:
+    """Return the families after one transition with inputs e (k,)."""
     constant = inputs.dot(transition.constant.dot(inputs))
-    if weighs:
+    if transition.information.any() or transition.vector.any():
         family = weigh(family, transition.information, transition.vector.dot(inputs), constant)
     else:
         family = family._replace(log_mass=family.log_mass + constant)

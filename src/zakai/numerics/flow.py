@@ -112,8 +112,9 @@ class _Problem(NamedTuple):
 def _unresolved(problem: _Problem, panels: _Panels, probes: int, scales: Array | None) -> tuple[Array, Array]:
     """Return how far the features of panels are from polynomials, (J,), relative to `scales` (K, F), and the scales."""
     places, interpolation = _CHECKS[probes]
-    times = problem.times(panels, places)
-    at_nodes, at_probes = problem.values(panels, problem.times(panels, NODES)), problem.values(panels, times)
+    times = problem.times(panels, np.concatenate([NODES, places]))
+    values = problem.values(panels, times)
+    times, at_nodes, at_probes = times[:, STAGES:], values[:, :STAGES], values[:, STAGES:]
     with np.errstate(all="ignore"):
         if scales is None:
             scales = np.maximum(np.abs(at_nodes).max(axis=1), np.abs(at_probes).max(axis=1))

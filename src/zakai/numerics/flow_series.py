@@ -22,6 +22,11 @@ STAGES = 8  # Gauss nodes of a panel: the coefficients are polynomials of degree
 MOST_TERMS = 32  # of the power series of a panel
 _LEAST_RATE = 0.05  # so that the variation of the coefficients counts however short a panel is
 _NEGLIGIBLE = 2e-14  # share of a power of tau in the coefficients
+_LOG_NEGLIGIBLE_TERM = np.log(1e-16)
+_RADII = 2.0 ** np.arange(-2.0, 11.0)  # of the circles on which the terms of a series are bounded
+_ORDERS = np.arange(MOST_TERMS + 1)
+_EXPONENTS = _ORDERS[:, None] * np.log(_RADII)
+_CIRCLES = np.stack([_RADII ** (j + 1) / (j + 1) for j in range(STAGES)])
 
 
 class Coefficients(NamedTuple):
@@ -112,22 +117,16 @@ def _terms(sizes: Array) -> tuple[Array, Array]:
                 power = power @ power
         rate = np.exp(log_rate + np.log(np.maximum(np.trace(power, axis1=1, axis2=2), 1e-300)) / 32)
         rate = np.where(np.isfinite(rate), np.maximum(rate, _LEAST_RATE), np.inf)
-        bounds = np.zeros((count, MOST_TERMS + 1 + degrees))
-        bounds[:, 0] = 1.0
-        for order in range(MOST_TERMS + degrees):
-            used = min(order + 1, degrees)
-            recent = bounds[:, order - used + 1 : order + 1][:, ::-1]
-            bounds[:, order + 1] = rate * (shares[:, :used] * recent).sum(axis=1) / (order + 1)
-            # Once that many in a row are negligible, so are all others.
-            if order % 4 == 3 and order > degrees and bounds[:, order + 1 - degrees : order + 2].max(initial=0.0) <= 1e-16:
-                break
-        small = np.maximum.accumulate(bounds[:, ::-1], axis=1)[:, ::-1] <= 1e-16
+        # Cauchy's bound of the coefficients of exp(rate sum_j shares_j R^(j + 1) / (j + 1)), with Hayman's factor.
+        growth = rate[:, None] * (shares @ _CIRCLES[:degrees])
+        logs = (growth[:, None, :] - _EXPONENTS).min(axis=2) - 0.5 * np.log(2 * np.pi * np.maximum(_ORDERS, 1))
+        needed = np.count_nonzero(~(logs <= _LOG_NEGLIGIBLE_TERM), axis=1)
     patterns, which = square > 0, np.zeros(count, int)
     if count:
         keys = [pattern.tobytes() for pattern in patterns]
         depths = {key: _depth(key, patterns.shape[1]) for key in set(keys)}
         which = np.array([depths[key] for key in keys])
-    needed = np.where(small.any(axis=1), np.argmax(small, axis=1) + which, MOST_TERMS + 1)
+    needed = needed + which
     terms = np.where(needed > MOST_TERMS, MOST_TERMS + 1, 2 * np.ceil(needed / 2)).astype(int)
     degree = degrees - np.argmax((shares > _NEGLIGIBLE)[:, ::-1], axis=1)
     return terms, degree

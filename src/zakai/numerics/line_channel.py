@@ -172,22 +172,39 @@ def channels(
     return Channels(*(np.array(part) for part in zip(*parts, strict=True))), errors
 
 
+class Nodes(NamedTuple):
+    """Coefficients at eight nodes of K intervals, a bound of their rates (K,), and whether the nodes resolve them (K,)."""
+
+    values: Coefficients
+    rate: Array
+    resolved: Array
+
+    def part(self, rows: slice) -> Nodes:
+        """Return the nodes of some of the intervals."""
+        return Nodes(Coefficients(*(value[rows] for value in self.values)), self.rate[rows], self.resolved[rows])
+
+
+def nodes_of(coefficients: Callable[[Array, Array], Coefficients], starts: Array, lengths: Array) -> Nodes:
+    """Return the coefficients of intervals at their nodes."""
+    rows = np.arange(len(starts))
+    times = starts[:, None] + lengths[:, None] * _CHECKED
+    c = coefficients(times, rows[:, None])
+    rate = (np.abs(c.matrix.real) + np.sqrt(2.0 * np.abs(c.covariance.real * c.quadratic.real))).max(axis=1)
+    resolved = np.ones(len(rows), bool)
+    for part in c:
+        resolved &= _missed(np.ascontiguousarray(part.real, float).reshape(*times.shape, -1), _TO_PROBES) < _RESOLVED
+    return Nodes(Coefficients(*(part[:, :_STAGES] for part in c)), rate, resolved)
+
+
 def parts(
-    coefficients: Callable[[Array, Array], Coefficients], starts: Array, lengths: Array, count: int
+    coefficients: Callable[[Array, Array], Coefficients], starts: Array, lengths: Array, count: int, known: Nodes | None = None
 ) -> tuple[Channels, Array]:
     """Return the kernels of `count` equal parts of K intervals, (K * count), and the relative errors (K,) of coefficients.
 
     Where eight nodes resolve the coefficients in the interval these are evaluated once for all parts.
     """
-    rows = np.arange(len(starts))
-    times = starts[:, None] + lengths[:, None] * _CHECKED
-    c = coefficients(times, rows[:, None])
-    rate = np.abs(c.matrix.real) + np.sqrt(2.0 * np.abs(c.covariance.real * c.quadratic.real))
-    good = rate.max(axis=1) * lengths <= _LONGEST * count
-    nodes = Coefficients(*(part[:, :_STAGES] for part in c))
-    missed = [_missed(np.ascontiguousarray(part.real, float).reshape(*times.shape, -1), _TO_PROBES) for part in c]
-    for one in missed:
-        good &= one < _RESOLVED
+    known = nodes_of(coefficients, starts, lengths) if known is None else known
+    nodes, good = known.values, known.resolved & (known.rate * lengths <= _LONGEST * count)
     if count > 1:
         ends = (np.arange(count)[:, None] + _NODES).reshape(-1) / count
         matrix = np.polynomial.legendre.legvander(2 * ends - 1, _STAGES - 1) @ _FROM_NODES

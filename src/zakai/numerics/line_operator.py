@@ -1,6 +1,6 @@
 """The Kolmogorov operator of one state on a uniform grid, and its exponential.
 
-    L u = G u'' / 2 - (f u)' + V u
+    L u = (G u)'' / 2 - (f u)' + V u
 
 with the derivatives of the sinc interpolant on the line and of the trigonometric interpolant on the circle: spectrally
 accurate, exact in time for every interval.
@@ -45,7 +45,7 @@ def derivatives(size: int, closed: bool) -> tuple[Array, Array]:
 
 
 def generator(closed: bool, spacing: float, covariance: Any, drift: Array, potential: Array | None = None) -> Array:
-    """Return L (N, N) for G, f (N,) and V (N,), or integrals over time of these."""
+    """Return L (N, N) for G, one number or (N,), f (N,) and V (N,), or integrals over time of these."""
     size = len(drift)
     first, second = derivatives(size, closed)
     scale = 1.0 if closed else spacing
@@ -138,25 +138,29 @@ _INVERSE_FACTORIALS = 1.0 / np.cumprod(np.concatenate([[1.0], np.arange(1.0, 16.
 
 
 class Spectral:
-    """exp(tau L) for every tau where L is similar to a symmetric operator: u = exp(phi) v with G phi' = f,
+    """exp(tau L) for every tau where L is similar to a symmetric operator: u = s v with s'/s = (f - G'/2) / G,
 
-        v_t = G v'' / 2 - (f^2 / G + f') / 2 v = -H v,      exp(tau L) = e^phi U exp(-tau lambda) U' e^-phi.
+        v_t = (G v')' / 2 - ((f - G'/2)^2 / G + f') / 2 v = -H v,      exp(tau L) = s U exp(-tau lambda) U' / s.
     """
 
-    def __init__(self, closed: bool, spacing: float, covariance: Any, potential: Array, gauge: Array):
+    def __init__(self, closed: bool, spacing: float, covariance: Any, potential: Array, gauge: Array, scale: Any = 1.0):
         """Decompose H.
 
+        With the second derivative D, (G v')' is (G D + D G) v / 2 - G'' v / 2, and the two terms of G'' cancel.
+
         Args:
-            covariance: G.
-            potential: (f^2 / G + f') / 2 at the points (N,).
-            gauge: phi (N,).
+            covariance: G, one number or (N,).
+            potential: ((f - G'/2)^2 / G + f') / 2 at the points (N,).
+            gauge: int f / G (N,).
+            scale: G^(-1/2) where G depends on the state.
         """
         size = len(potential)
-        second = derivatives(size, closed)[1]
-        operator = -(0.5 * covariance / (1.0 if closed else spacing) ** 2) * second + np.diag(potential)
+        second = derivatives(size, closed)[1] / (1.0 if closed else spacing) ** 2
+        columns = second * covariance
+        operator = -0.25 * (columns + columns.T) + np.diag(potential)
         self.rates, self.modes = np.linalg.eigh(operator.real)
         self.change = self.modes.T @ operator.imag @ self.modes if np.iscomplexobj(operator) else None
-        self.scale = np.exp(gauge - gauge.real.max())
+        self.scale = np.exp(gauge - gauge.real.max()) * scale
         self.largest = 1.0
 
     def __call__(self, values: Array, length: float) -> tuple[Array, float]:

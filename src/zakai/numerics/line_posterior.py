@@ -18,6 +18,7 @@ Array = NDArray[Any]
 _DEPTH = 36.0  # logarithm below the best bound from which parts of the line are left out
 _LEVELS = 80
 _MOST_CELLS = 4096
+_NOTHING = 1e-290
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,63 @@ class Gaussian:
             logs = self.constant - 0.5 * np.sum(rest * (self.precision @ rest), axis=0)
         return np.where(np.isnan(logs.real), -np.inf, logs)
 
+    def cells(self, ends: Array, prior: Callable[[Array], Array], origin: float) -> tuple[Array, Array, Array]:
+        """Return for cells between offsets `ends` (J, 2) from the origin what the placing of a grid needs.
+
+        The likelihood of a cell is bounded by the range of h over its ends, widened by half of it.
+
+        Args:
+            ends: (J, 2).
+            prior: logarithm of the density at offsets.
+            origin: the point from which offsets count.
+
+        Returns:
+            The logarithm of the product at the ends (J, 2), a bound of it (J,) and by how much it changes, in deviations (J,).
+        """
+        factor = np.linalg.cholesky(self.precision.real).T
+        target = factor @ self.value.real
+        h = self.observation(origin + ends.reshape(-1)).real
+        own = prior(ends)
+        scaled = (factor @ np.where(np.isfinite(h), h, np.inf)).reshape(len(target), -1, 2)
+        with np.errstate(all="ignore"):
+            rest = target[:, None, None] - scaled
+            product = own - 0.5 * np.sum(np.where(np.isfinite(rest), rest, 1e150) ** 2, axis=0)
+            low, high = scaled.min(axis=2), scaled.max(axis=2)
+            more = 0.5 * (high - low)
+            apart = np.maximum(np.maximum(low - more - target[:, None], target[:, None] - high - more), 0.0)
+            bound = own.max(axis=1) + 1.0 - 0.5 * np.sum(np.where(np.isfinite(apart), apart, 0.0) ** 2, axis=0)
+            change = np.max(np.where(np.isfinite(high - low), high - low, np.inf), axis=0)
+        return product, bound, change
+
+
+@dataclass(frozen=True)
+class General:
+    """Any likelihood, by its values: `log_density` maps points (J,) to log l (J,), NaN where there is none."""
+
+    log_density: Callable[[Array], Array]
+    linear = False
+
+    def logs(self, points: Array) -> Array:
+        """Return log l (J,), minus infinity where it has no value."""
+        found = self.log_density(points)
+        return np.where(np.isnan(found.real), -np.inf, found)
+
+    def cells(self, ends: Array, prior: Callable[[Array], Array], origin: float) -> tuple[Array, Array, Array]:
+        """Return what `Gaussian.cells` returns, from values at five points of each cell.
+
+        A change d of the logarithm counts as the distance from the maximum of a Gaussian between depths D and D + d.
+        """
+        points = ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * np.linspace(0.0, 1.0, 5)
+        logs = np.maximum(self.logs(origin + points.reshape(-1)).real.reshape(points.shape), -1e150)
+        product = prior(points) + logs
+        highest, range_ = product.max(axis=1), logs.max(axis=1) - logs.min(axis=1)
+        depth = np.maximum(product.max() - highest, 0.0)
+        change = np.sqrt(2.0 * (depth + range_)) - np.sqrt(2.0 * depth)
+        return product[:, [0, -1]], highest + 0.5 * range_ + 1.0, change
+
+
+Likelihood = Gaussian | General
+
 
 class Product(NamedTuple):
     """The normalised product on its grid, the logarithm of its mass, and how deep in the tails of the density it stands.
@@ -62,7 +120,7 @@ class Product(NamedTuple):
     window: lw.Window
 
 
-def multiplied(values: Array, window: lw.Window, likelihood: Gaussian, rough: float) -> Product:
+def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: float) -> Product:
     """Return the product of probabilities and a likelihood, on a grid that resolves it.
 
     Args:
@@ -78,20 +136,42 @@ def multiplied(values: Array, window: lw.Window, likelihood: Gaussian, rough: fl
         return product
     new = lw.fitted(look, window) if likelihood.linear else _placed(values, window, likelihood)
     for _ in range(12):
-        product = _product(values, window, lw.resampled(values, window, new), new, likelihood)
+        moved = lw.resampled(values, window, new)
+        if not moved.any():  # the observation contradicts all that is known, which the depth reports
+            moved = np.full_like(moved, _NOTHING)
+        product = _product(values, window, moved, new, likelihood)
         if not np.isfinite(product.log_mass.real):
             return product
         look = lw.figures(product.values, new.closed)
         if look.aliasing <= 1e-11 or new.size >= lw.LARGEST_POSTERIOR:
             break
-        finer = lw.fitted(look, new, lw.LARGEST_POSTERIOR)
-        new = finer if finer.spacing < new.spacing else lw.refined(new)
+        finer = _finer(product.values, look, new)
+        if finer == new:
+            break
+        new = finer
     return product
 
 
-def _product(values: Array, window: lw.Window, moved: Array, new: lw.Window, likelihood: Gaussian) -> Product:
-    known = likelihood.known
-    logs = likelihood.of(known[1]) if known is not None and known[0] == new else likelihood.logs(new.points)
+def _finer(values: Array, look: lw.Figures, window: lw.Window) -> lw.Window:
+    """Return a finer grid that holds all of a density, of which modes may be far apart; the same grid where there is none."""
+    used = window.offsets[np.flatnonzero(values.real > lw.CUT * values.real.max())]
+    factor = float(np.clip(1.0 / look.resolving, 2**0.5, 8.0))
+    while factor > 1.1:
+        if window.closed:
+            finer = lw.refined(window, factor)
+        else:
+            finer = lw.quantized(window, used[0], used[-1], 1.001 * window.spacing / factor, most=lw.LARGEST_POSTERIOR)
+        if finer.spacing < 0.95 * window.spacing and finer.size * finer.spacing > 1.04 * (used[-1] - used[0]):
+            return finer
+        factor /= 2**0.25
+    return window
+
+
+def _product(values: Array, window: lw.Window, moved: Array, new: lw.Window, likelihood: Likelihood) -> Product:
+    if isinstance(likelihood, Gaussian) and likelihood.known is not None and likelihood.known[0] == new:
+        logs = likelihood.of(likelihood.known[1])
+    else:
+        logs = likelihood.logs(new.points)
     if np.iscomplexobj(logs) or np.iscomplexobj(moved):
         logs, moved = logs.astype(complex), moved.astype(complex)
     top_of_density = float(values.real.max()) * new.spacing / window.spacing
@@ -133,37 +213,21 @@ def _normalized(values: Array, logs: Array, largest: float) -> tuple[Array, Any,
     return found, np.log(mass) + top, depth, growth
 
 
-def _placed(values: Array, window: lw.Window, likelihood: Gaussian) -> lw.Window:
+def _placed(values: Array, window: lw.Window, likelihood: Likelihood) -> lw.Window:
     """Return a grid for the product.
 
-    The likelihood of a cell is bounded by the range of h over its ends, widened by half of it; cells whose bound is far below the
-    best value are left out, and the others divided until h hardly changes in any of them.
+    Cells whose bound is far below the best value are left out, and the others divided until the likelihood hardly changes in any.
     """
     offsets = window.offsets
     top = values.real.max()
     logs = np.log(np.maximum(values.real, 1e-30 * top))
-    factor = np.linalg.cholesky(likelihood.precision.real).T
-    target = factor @ likelihood.value.real
 
-    def bounds(ends: Array) -> tuple[Array, Array, Array]:
-        """At the ends (J, 2) of cells: the product (J, 2), its bound (J,) and how much the likelihood changes (J,)."""
-        flat = ends.reshape(-1)
-        h = likelihood.observation(window.origin + flat).real
-        own = np.interp(flat, offsets, logs, left=-200.0, right=-200.0).reshape(ends.shape)
-        scaled = (factor @ np.where(np.isfinite(h), h, np.inf)).reshape(len(target), -1, 2)
-        with np.errstate(all="ignore"):
-            rest = target[:, None, None] - scaled
-            product = own - 0.5 * np.sum(np.where(np.isfinite(rest), rest, 1e150) ** 2, axis=0)
-            low, high = scaled.min(axis=2), scaled.max(axis=2)
-            more = 0.5 * (high - low)
-            apart = np.maximum(np.maximum(low - more - target[:, None], target[:, None] - high - more), 0.0)
-            bound = own.max(axis=1) + 1.0 - 0.5 * np.sum(np.where(np.isfinite(apart), apart, 0.0) ** 2, axis=0)
-            change = np.max(np.where(np.isfinite(high - low), high - low, np.inf), axis=0)
-        return product, bound, change
+    def prior(points: Array) -> Array:
+        return np.asarray(np.interp(points.reshape(-1), offsets, logs, left=-200.0, right=-200.0)).reshape(points.shape)
 
     cells = np.stack([offsets[:-1], offsets[1:]], axis=1)
     for _ in range(_LEVELS):
-        product, bound, change = bounds(cells)
+        product, bound, change = likelihood.cells(cells, prior, window.origin)
         best = float(product.max())
         keep = bound > best - _DEPTH
         cells, change, product = cells[keep], change[keep], product[keep]
@@ -174,10 +238,10 @@ def _placed(values: Array, window: lw.Window, likelihood: Gaussian) -> lw.Window
         quarters = cells[divide, :1] + widths[divide, None] * np.linspace(0.0, 1.0, 5)
         parts = np.stack([quarters[:, :-1], quarters[:, 1:]], axis=2).reshape(-1, 2)
         cells = np.concatenate([cells[~divide], parts])
-    product, _, _ = bounds(cells)
+    product, _, _ = likelihood.cells(cells, prior, window.origin)
     good = (product > product.max() - 32.0).any(axis=1)
     low, high = float(cells[good, 0].min()), float(cells[good, 1].max())
-    spacing = min(window.spacing, max(float((cells[good, 1] - cells[good, 0]).min()), (high - low) / 400.0))
+    spacing = min(window.spacing, max(float((cells[good, 1] - cells[good, 0]).min()), (high - low) / 370.0))
     if window.closed:
         size = lw.size_for(min(2 * np.pi / spacing, lw.LARGEST_POSTERIOR))
         return window._replace(size=size, spacing=2 * np.pi / size)

@@ -19,10 +19,11 @@ from zakai.numerics.compiled import kernel
 
 Array = NDArray[Any]
 
-SIZES = (32, 48, 64, 80, 96, 112, 128, 160, 192, 256, 384, 512)
-LARGEST = 256  # points of a grid on which densities are moved
-LARGEST_POSTERIOR = 512  # points of a grid for the product with a likelihood
+SIZES = (32, 48, 64, 80, 96, 112, 128, 160, 192, 256, 384, 512, 768, 1024)
+LARGEST = 384  # points of a grid on which densities are moved
+LARGEST_POSTERIOR = 1024  # points of a grid for the product with a likelihood
 CUT = 1e-13  # density relative to its maximum that a new grid must hold
+DEEP = 1e-20  # the same of densities whose small values are accurate
 NEGLIGIBLE = 1e-13  # spectrum relative to the mass that need not be resolved
 ALIGNMENT = 8  # centres stand at multiples of so many spacings
 
@@ -122,28 +123,32 @@ def figures_of(values: Array, cut: float, negligible: float, cosines: Array, sin
     nyquist = size // 2
     scale = 1.0 / abs(mass) if mass != 0.0 else 0.0
     aliasing, middle, highest = 0.0, 0.0, -1
-    k = nyquist
+    stride = max(1, nyquist // 32)  # a few frequencies of a large grid
+    k, top_known = nyquist, False
     while k > 0:
         in_top = k >= nyquist * 7 // 8
         in_middle = nyquist * 5 // 8 <= k < nyquist * 3 // 4
         if in_top or in_middle or highest < 0:
+            if not in_top and not top_known:
+                top_known = True
+                if aliasing > negligible:
+                    # Above, nothing can be resolved: what counts is noise or too much for this grid.
+                    negligible = 4.0 * aliasing
             real, imag = np.dot(cosines[k], values) * scale, np.dot(sines[k], values) * scale
             size_here = np.sqrt(real * real + imag * imag)
             if in_top:
                 aliasing = max(aliasing, size_here)
-                if k == nyquist * 7 // 8 and aliasing > negligible:
-                    # Above, nothing can be resolved: what counts is noise or too much for this grid.
-                    negligible = 4.0 * aliasing
             elif in_middle:
                 middle = max(middle, size_here)
             if highest < 0 and size_here > negligible and not in_top:
-                highest = k
+                highest = k + stride - 1
         elif k < nyquist * 5 // 8:
             break
-        k -= 1
+        k -= stride
     if highest < 0 and aliasing > negligible:
         highest = nyquist
-    cut = max(cut, min(aliasing, 1e-4))
+    if cut >= 1e-14:  # smaller values are accurate
+        cut = max(cut, min(aliasing, 1e-4))
     first, last = 0, size - 1
     while first < size - 1 and not values[first] > cut * top:
         first += 1
@@ -158,10 +163,17 @@ def figures_of(values: Array, cut: float, negligible: float, cosines: Array, sin
     return left, right, float(first), float(last), negative, aliasing, middle, float(highest), float(nyquist)
 
 
-def figures(values: Array, closed: bool, negligible: float = NEGLIGIBLE) -> Figures:
-    """Return the figures of a density; `negligible` is the spectrum that need not be resolved."""
+def figures(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: float = CUT) -> Figures:
+    """Return the figures of a density.
+
+    Args:
+        values: probabilities (N,).
+        closed: whether the grid goes around the circle.
+        negligible: the spectrum that need not be resolved.
+        cut: the smallest value that counts, relative to the largest.
+    """
     real = np.ascontiguousarray(values.real)
-    left, right, first, last, negative, aliasing, middle, highest, nyquist = figures_of(real, CUT, negligible, *waves(len(real)))
+    left, right, first, last, negative, aliasing, middle, highest, nyquist = figures_of(real, cut, negligible, *waves(len(real)))
     rough = middle < 6.0 * aliasing
     if aliasing <= negligible or (rough and aliasing < 1e-9):
         resolving = 0.92 * nyquist / (max(highest, 0.0) + 1.0)
@@ -254,8 +266,36 @@ def resampled(values: Array, window: Window, new: Window) -> Array:
         shift = (new.centre - window.centre) / window.spacing + window.size // 2 - new.size // 2
         if abs(shift - round(shift)) < 1e-6:
             return _shifted(values, round(shift), new.size)
-    found = interpolated(values, window, new.offsets) * (new.spacing / window.spacing)
-    return np.where(found.real > 0, found, 0.0)
+    found = interpolated(values, window, new.offsets)
+    found = np.where(found.real > 0, found, 0.0)
+    small = np.flatnonzero(found.real < _SMALL * values.real.max())
+    if len(small):
+        # There the interpolant is the rounding of large values; small values are interpolated by their logarithms.
+        found[small] = _interpolated_logs(values, window, new.offsets[small])
+    return found * (new.spacing / window.spacing)
+
+
+_SMALL = 1e-8
+_STENCIL = np.arange(-3, 5)
+_WEIGHTS = np.array([1.0 / np.prod([float(i - j) for j in _STENCIL if j != i]) for i in _STENCIL])
+
+
+def _interpolated_logs(values: Array, window: Window, offsets: Array) -> Array:
+    """Return the exponential of the polynomial through eight logarithms, zero where a value is zero or beyond the grid."""
+    at = (offsets - window.centre) / window.spacing + window.size // 2
+    near = np.floor(at)
+    if not window.closed:
+        near = np.clip(near, -_STENCIL[0], window.size - 1 - _STENCIL[-1])
+    own = values[(near[:, None].astype(int) + _STENCIL) % window.size]
+    distance = (at - near)[:, None] - _STENCIL
+    exact = np.abs(distance) < 1e-12
+    weights = np.where(exact.any(axis=1, keepdims=True), exact, _WEIGHTS / np.where(exact, 1.0, distance))
+    with np.errstate(all="ignore"):
+        found = np.exp(np.sum(weights * np.log(own), axis=1) / np.sum(weights, axis=1))
+    inside = (own.real > 0).all(axis=1) & (found.real < 2.0 * _SMALL * values.real.max())
+    if not window.closed:
+        inside &= (at > -0.5) & (at < window.size - 0.5)
+    return np.where(inside, found, 0.0)
 
 
 def _shifted(values: Array, shift: int, size: int) -> Array:

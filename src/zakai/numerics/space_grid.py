@@ -1,4 +1,4 @@
-"""Functions on uniform affine grids in one to four dimensions: Gaussian spreading, interpolation by splines, moments and checks.
+"""Functions on uniform affine grids in one to four dimensions: Gaussian spreading and interpolation by splines and in frequency.
 
 A grid is x = centre + basis (i - size // 2).  A density that the grid resolves is band-limited: its sums are integrals, and
 spreading by a Gaussian is exact in frequency.  Values between the points are those of the quintic spline, whose error for a
@@ -7,6 +7,7 @@ Gaussian of s spacings is about 5e-4 / s^6.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
+from zakai.numerics.complex_step import is_complex
 
 Array = NDArray[Any]
 _MOST_SHEARED = 3.0  # times the points of an axis that a shear may need
@@ -133,21 +135,28 @@ def spread(values: Array, grid: Grid, cov: Array, spline: bool = False) -> Array
     return filtered(values, gaussian_response(inverse @ cov @ inverse.T, grid.sizes, spline))
 
 
-def _gather(c: Any, strides: Any, base: Any, shares: Any, out: Any) -> None:
-    """out_j = sum over the taps of c[base_j + taps] times quintic B-splines at shares (J, n); a negative base means zero."""
-    count, n = shares.shape
+def _gather(c: Any, strides: Any, sizes: Any, closed: Any, z: Any, out: Any) -> None:
+    """out_j = sum over the taps of padded coefficients times quintic B-splines at indices z (J, n); outside it is zero."""
+    count, n = z.shape
     outer = 1
     for _ in range(n - 1):
         outer *= 6
     offsets = np.zeros(outer, np.int64)
-    weights = np.zeros(outer, shares.dtype)
-    w = np.zeros((n, 6), shares.dtype)
+    weights = np.zeros(outer, z.dtype)
+    w = np.zeros((n, 6), z.dtype)
     for j in range(count):
-        if base[j] < 0:
-            out[j] = 0.0
-            continue
+        base = 0
+        inside = True
         for d in range(n):
-            t = shares[j, d]
+            floor = math.floor(z[j, d].real) if math.isfinite(z[j, d].real) else -1e9
+            if not closed[d] and (floor < -1 or floor >= sizes[d]) or abs(floor) > 1e8:
+                inside = False
+                break
+            t = z[j, d] - floor
+            cell = int(floor)
+            if closed[d]:
+                cell = cell % sizes[d]
+            base += (cell + PAD - 2) * strides[d]
             s = 1.0 - t
             t2 = t * t
             s2 = s * s
@@ -157,8 +166,11 @@ def _gather(c: Any, strides: Any, base: Any, shares: Any, out: Any) -> None:
             w[d, 2] = (66.0 + t2 * (-60.0 + t2 * (30.0 - 10.0 * t))) / 120.0
             w[d, 3] = (66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s))) / 120.0
             w[d, 4] = (26.0 + s * (-50.0 + s * (20.0 + s * (20.0 + s * (-20.0 + 5.0 * s))))) / 120.0
+        if not inside:
+            out[j] = 0.0
+            continue
         size = 1
-        offsets[0] = base[j]
+        offsets[0] = base
         weights[0] = 1.0
         for d in range(n - 1):
             for tap in range(5, -1, -1):
@@ -181,53 +193,31 @@ def _gather(c: Any, strides: Any, base: Any, shares: Any, out: Any) -> None:
         out[j] = total
 
 
-_gather_real = kernel("void(float64[::1], int64[::1], int64[::1], float64[:, ::1], float64[::1])")(_gather)
-_gather_complex = kernel("void(complex128[::1], int64[::1], int64[::1], complex128[:, ::1], complex128[::1])")(_gather)
+_gather_real = kernel("void(float64[::1], int64[::1], int64[::1], boolean[::1], float64[:, ::1], float64[::1])")(_gather)
 
 
-class Places(NamedTuple):
-    """Where a spline is evaluated: the first tap `base` (J,) in the padded coefficients (-1: outside), and `shares` (J, n)."""
-
-    base: Array
-    shares: Array
-
-
-def places(z: Array, grid: Grid) -> Places:
-    """Return the places of the indices z (J, n), counted from the first point of the grid; not a number means outside."""
-    n = grid.n
-    base = np.zeros(len(z), np.int64)
-    shares = np.empty_like(z)
-    inside = np.ones(len(z), bool)
-    stride = 1
-    with np.errstate(invalid="ignore"):
-        for d in reversed(range(n)):
-            size, column = grid.sizes[d], z[:, d]
-            floor = np.floor(column.real)
-            inside &= np.isfinite(floor)
-            if grid.closed[d]:
-                index = np.mod(floor, size)
-            else:
-                inside &= (floor >= -1) & (floor < size)
-                index = floor
-            shares[:, d] = column - floor
-            base += np.where(inside, index + (PAD - 2), 0).astype(np.int64) * stride
-            stride *= size + 2 * PAD
-    return Places(np.where(inside, base, -1), np.ascontiguousarray(np.where(inside[:, None], shares, 0.0)))
+@lru_cache(maxsize=1)
+def _gather_complex() -> Any:
+    """Return the kernel for derivatives, compiled when it is needed first."""
+    return kernel("void(complex128[::1], int64[::1], int64[::1], boolean[::1], complex128[:, ::1], complex128[::1])")(_gather)
 
 
-def gather(coefficients: Array, at: Places, grid: Grid) -> Array:
-    """Return the spline with the coefficients (*sizes) at places (J,)."""
-    c = coefficients
+def gather(coefficients: Array, z: Array, grid: Grid) -> Array:
+    """Return the spline with the coefficients (*sizes) at the indices z (J, n), counted from the first point of the grid."""
+    c = np.zeros([size + 2 * PAD for size in grid.sizes], coefficients.dtype)
+    c[tuple(slice(PAD, -PAD) for _ in grid.sizes)] = coefficients
     for d, closed in enumerate(grid.closed):
-        width = [(PAD, PAD) if a == d else (0, 0) for a in range(c.ndim)]
-        c = np.pad(c, width, mode="wrap" if closed else "constant")
-    strides = np.array([int(np.prod(c.shape[d + 1 :])) for d in range(c.ndim)], np.int64)
-    if np.iscomplexobj(c) or np.iscomplexobj(at.shares):
-        out = np.empty(len(at.base), complex)
-        _gather_complex(c.astype(complex).ravel(), strides, at.base, at.shares.astype(complex), out)
+        if closed:
+            line = np.moveaxis(c, d, 0)
+            line[:PAD], line[-PAD:] = line[-2 * PAD : -PAD].copy(), line[PAD : 2 * PAD].copy()
+    strides = np.array(c.strides, np.int64) // c.itemsize
+    shape = np.array(grid.sizes, np.int64), np.array(grid.closed)
+    if is_complex(c, z):
+        out = np.empty(len(z), complex)
+        _gather_complex()(c.astype(complex).ravel(), strides, *shape, np.ascontiguousarray(z, complex), out)
     else:
-        out = np.empty(len(at.base))
-        _gather_real(np.ascontiguousarray(c).ravel(), strides, at.base, at.shares, out)
+        out = np.empty(len(z))
+        _gather_real(c.ravel(), strides, *shape, np.ascontiguousarray(z), out)
     return out
 
 
@@ -242,8 +232,7 @@ def relative_index(offsets: Array, start: Array, grid: Grid, periodic: Sequence[
 def resampled(values: Array, grid: Grid, new: Grid, periodic: Sequence[bool] | None = None) -> Array:
     """Return the spline interpolant of a density at the points of another grid (*sizes)."""
     coefficients = filtered(values, gaussian_response(np.zeros((grid.n, grid.n)), grid.sizes, spline=True))
-    at = places(relative_index(new.offsets, new.centre, grid, periodic), grid)
-    return gather(coefficients, at, grid).reshape(new.sizes)
+    return gather(coefficients, relative_index(new.offsets, new.centre, grid, periodic), grid).reshape(new.sizes)
 
 
 def padded(values: Array, grid: Grid, sizes: tuple[int, ...]) -> tuple[Array, Grid]:
@@ -340,101 +329,12 @@ def gradient(values: Array, grid: Grid) -> Array:
     return np.stack([np.fft.irfftn(1j * k[d] * spectrum, values.shape, axes) for d in axes])
 
 
-class Moments(NamedTuple):
-    """The sum of the values, and the mean (n,) and covariance (n, n) of the offsets from the centre, in x."""
-
-    total: Any
-    mean: Array
-    cov: Array
-
-
-def moments(values: Array, grid: Grid) -> Moments:
-    """Return the moments of a density; those of an axis around a circle are linear about the centre."""
-    index = indices(grid.sizes)
-    flat = values.reshape(-1)
-    total = flat.sum()
-    mean = np.array([flat @ index[:, d] for d in range(grid.n)]) / total
-    second = weighted_products(flat, index - mean) / total
-    return Moments(total, grid.basis @ mean, grid.basis @ second @ grid.basis.T)
-
-
-class Checks(NamedTuple):
-    """How well a grid holds a density: for each axis (n,) the largest `edges` relative to the maximum of the marginal, and the
-    `tails` of the spectrum at its highest frequencies relative to the mass; `used` (n, 2) the first and last index above the
-    bound on edges."""
-
-    edges: Array
-    tails: Array
-    used: Array
-
-
-@lru_cache(maxsize=64)
-def _highest(size: int) -> Array:
-    """Return rows whose products are the spectrum at the two highest frequencies."""
-    i = np.arange(size)
-    k = 2 * np.pi * (size // 2 - 1) / size * i
-    return np.stack([1.0 - 2.0 * (i % 2), np.cos(k), np.sin(k)])
-
-
-def checks(values: Array, grid: Grid, edge: float) -> Checks:
-    """Return how well the grid holds a real density; `edge` is the share of the maximum that counts as zero."""
-    n, total = grid.n, float(values.sum())
-    edges, tails, used = np.zeros(n), np.zeros(n), np.zeros((n, 2), int)
-    for d, size in enumerate(grid.sizes):
-        lines = np.moveaxis(values, d, 0).reshape(size, -1)
-        marginal = lines.sum(axis=1)
-        top = marginal.max()
-        waves = np.abs(_highest(size) @ lines).sum(axis=1)
-        tails[d] = max(waves[0], np.hypot(waves[1], waves[2])) / total if size > 2 else 0.0
-        if not grid.closed[d]:
-            edges[d] = max(abs(marginal[0]), abs(marginal[1]), abs(marginal[-1]), abs(marginal[-2])) / top
-        above = np.flatnonzero(marginal > edge * top)
-        used[d] = (above[0], above[-1]) if len(above) else (0, size - 1)
-    if not np.isfinite(total) or total <= 0:
-        edges[:], tails[:] = 1.0, 1.0
-    return Checks(edges, tails, used)
-
-
 _SIZES = np.array([8, 12, 16, 20, 24, 28, 32, 36, 40, 48, 54, 60, 64, 72, 80, 90, 96, 108, 120, 128, 144, 160, 180, 192, 216, 240,
-                   256, 288, 320, 360, 384, 432, 480, 512, 576, 640, 720, 768, 864, 960, 1024])  # fmt: skip
+                   256, 288, 320, 360, 384, 432, 480, 512, 576, 640, 720, 768, 864, 960, 1024,
+                   1152, 1280, 1440, 1536, 1728, 1920, 2048])  # fmt: skip
 
 
 def rounded_size(points: float, least: int, most: int) -> int:
     """Return the smallest size, fast for the Fourier transform, of at least so many points, between two bounds."""
     wanted = min(max(points, least), most)
     return int(_SIZES[min(int(np.searchsorted(_SIZES, wanted - 1e-9)), len(_SIZES) - 1)])
-
-
-def narrowest(values: Array, grid: Grid, cov: Array, tail: float) -> tuple[Array, Array]:
-    """Return the width of the narrowest feature along each axis, in conditional deviations of a Gaussian (n,), at most 1, and
-    in spacings (n,).
-
-    It follows from the highest frequency at which the spectrum of a real density is above `tail` of its mass.
-
-    Args:
-        values: real density (*sizes).
-        grid: its grid.
-        cov: its covariance in x (n, n).
-        tail: share of the mass that counts as zero.
-    """
-    n, total = grid.n, float(values.sum())
-    inverse = np.linalg.inv(grid.basis)
-    spread_ = inverse @ cov @ inverse.T
-    scale = np.sqrt(np.maximum(np.diagonal(spread_), 1e-12))
-    scaled = spread_ / np.outer(scale, scale) + 1e-9 * np.eye(n)
-    conditional = scale / np.sqrt(np.diagonal(np.linalg.inv(scaled)))
-    out, widths = np.ones(n), np.ones(n)
-    for d, size in enumerate(grid.sizes):
-        spectrum = np.abs(np.fft.rfft(values, axis=d)).sum(axis=tuple(a for a in range(n) if a != d)) / total
-        above = np.flatnonzero(spectrum > tail)
-        share = (above[-1] + 1.0) / (size // 2) if len(above) else 1.0
-        width = np.sqrt(-2 * np.log(tail)) / (np.pi * min(share, 1.0))
-        if share >= 1.0:
-            width = float(deviations_in_spacings(spectrum[-1]))
-        out[d], widths[d] = min(width / conditional[d], 1.0), min(width, conditional[d])
-    return out, widths
-
-
-def deviations_in_spacings(tails: Array) -> Array:
-    """Return the standard deviation in spacings of a Gaussian with such a spectrum at the highest frequency."""
-    return np.asarray(np.sqrt(-2 * np.log(np.clip(tails, 1e-15, 0.9))) / np.pi)

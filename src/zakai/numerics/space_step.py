@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.numerics.space_grid import Grid, checks, deviations_in_spacings, moments, narrowest, padded
+from zakai.numerics.space_grid import Grid, padded
+from zakai.numerics.space_survey import Survey, deviations_in_spacings, narrowest, survey
 from zakai.numerics.space_transport import (
     Characteristics,
     Dynamics,
@@ -21,7 +22,6 @@ from zakai.numerics.space_transport import (
     Linearisation,
     characteristics,
     linearised,
-    runge_kutta,
     steps_needed,
     transported,
 )
@@ -37,7 +37,7 @@ MOST_PARTS = 512
 MOST_ENLARGED = 4.0  # times its own width that a grid may need for the noise of a substep
 NEGLIGIBLE = 1e-40  # of the maximum
 CHECKED = 64  # intervals after which the error of single substeps is measured again
-_EXTRAPOLATED = 0.5  # the error that extrapolation leaves, as a multiple of difference^(5/3)
+_EXTRAPOLATED = 1.0  # the error that extrapolation leaves, as a multiple of difference^(5/3)
 
 
 class Field(NamedTuple):
@@ -61,6 +61,12 @@ class Control(NamedTuple):
     measured: float
     age: int
 
+    def known(self, tau: float, allowed: float) -> bool:
+        """Return whether the error of a substep of length tau is known well enough: the larger it is, the sooner it expires."""
+        error = self.rate * tau**3
+        fresh = np.isfinite(error) and self.age * (1 + 4 * error / allowed) < CHECKED
+        return bool(fresh and tau <= 2 * self.measured)
+
 
 class Report(NamedTuple):
     """The errors of an interval, relative to the density: of the splitting in time, of interpolation, at the edges, in the tails
@@ -82,6 +88,13 @@ class Report(NamedTuple):
             max(self.tails, other.tails),
             max(self.negative, other.negative),
         )
+
+
+def grid_report(found: Survey, real: Array) -> Report:
+    """Return the errors that a grid shows."""
+    interpolation = float(np.sum(1e-4 / deviations_in_spacings(found.tails) ** 6))
+    negative = float(-np.minimum(real, 0.0).sum() / found.total)
+    return Report(0.0, interpolation, float(found.edges.max()), float(found.tails.max()), negative)
 
 
 NOTHING = Report(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -119,43 +132,61 @@ class Stepper:
             self.cache[key] = found
         return found
 
-    def _move(self, field: Field, t0: float, t1: float, potential: Potential | None) -> _Move:
-        """Choose the target grid of a substep by moving points of the density."""
-        grid, tau = field.grid, t1 - t0
-        m = moments(field.values, grid)
-        mean = grid.centre + m.mean
-        drift = self.dynamics.drift
+    def _linear(self, found: Survey, grid: Grid, t0: float, t1: float) -> Linearisation:
+        """Return the system that is linearised in the middle of the path of the mean."""
+        mean, drift = grid.centre + found.mean, self.dynamics.drift
         with np.errstate(all="ignore"):
-            end = mean + runge_kutta(drift, mean[None], t0, t1, 1)[0, :-1]
-            jacobian = 0.5 * (self.dynamics.jacobian(mean, t0) + self.dynamics.jacobian(end, t1))
-        if not np.all(np.isfinite(jacobian)):
-            jacobian = np.zeros_like(jacobian)
-        linear = linearised(jacobian, *self.dynamics.noise(t0, t1), tau, grid.basis)
-        real = field.values.real
-        found = checks(real, grid, self.bounds.edge)
-        narrow, widths = narrowest(real, grid, m.cov.real, self.bounds.tail)
+            middle = mean + 0.5 * (t1 - t0) * drift(mean[None], t0)[0, :-1].real
+            jacobian = self.dynamics.jacobian(middle, 0.5 * (t0 + t1))
+        jacobian = jacobian if np.all(np.isfinite(jacobian)) else np.zeros_like(jacobian)
+        if self.dynamics.diffusion is None:
+            return linearised(jacobian, *self.dynamics.noise(t0, t1), t1 - t0, grid.basis)
+        noise = self._largest_noise(mean, found.cov, 0.5 * (t0 + t1))
+        return linearised(jacobian, noise, 0.5 * noise, t1 - t0, grid.basis)
+
+    def _largest_noise(self, mean: Array, cov: Array, t: float) -> Array:
+        """Return G (n, n) at the mean, enlarged along each axis to the largest within four deviations, to choose a grid."""
+        assert self.dynamics.diffusion is not None
+        offsets = np.concatenate([np.zeros((1, len(mean))), *(s * np.diag(np.sqrt(np.diagonal(cov))) for s in (-4, -2, 2, 4))])
+        noise = self.dynamics.diffusion(mean + offsets, t).real
+        variances = np.diagonal(noise, axis1=1, axis2=2).max(axis=0)
+        own = np.diagonal(noise[0])
+        scale = np.sqrt(variances / np.where(own > 0, own, 1.0))
+        return np.asarray(np.where(np.eye(len(mean)) > 0, variances, noise[0] * np.outer(scale, scale)))
+
+    def _noises(self, source: Grid, target: Grid, t0: float, t1: float) -> tuple[Array, Array, float] | None:
+        """Return G at the points of both grids and half of the substep, where the noise depends on the state."""
+        diffusion, t = self.dynamics.diffusion, 0.5 * (t0 + t1)
+        if diffusion is None:
+            return None
+        return diffusion(source.points, t), diffusion(target.points, t), 0.5 * (t1 - t0)
+
+    def _move(self, field: Field, t0: float, t1: float) -> _Move:
+        """Choose the target grid of a substep by moving points of the density."""
+        grid, real, bounds = field.grid, field.values.real, self.bounds
+        found = survey(real, grid, bounds.edge, bounds.accepted)
+        linear = self._linear(found, grid, t0, t1)
+        narrow, widths = narrowest(found, grid, bounds.accepted)
         support = self._support(real)
         offsets = grid.offsets[support]
         logs = np.log(real.reshape(-1)[support] / real.max())
-        x = grid.centre + offsets
-        steps = steps_needed(self._real(), x, t0, t1, grid.basis, 0.05 * self.tolerance * np.exp(-0.5 * logs))
-        moved = runge_kutta(self._real().drift, x, t0, t1, steps)
+        tolerance = 0.05 * self.tolerance * np.exp(-0.5 * logs)
+        steps, moved = steps_needed(self._real(), grid.centre + offsets, t0, t1, grid.basis, tolerance)
         good = np.isfinite(moved).all(axis=1)
         if not good.any():
             return _Move(linear, steps, grid)
         offsets, logs, moved = offsets[good], logs[good], moved[good]
         noise = linear.noise.real
-        shift = np.abs(moved[:, :-1] @ np.linalg.inv(grid.basis).T).max()
-        spreads = np.diagonal(noise) / np.maximum(np.diagonal(m.cov.real), 1e-300)
-        holds = bool(np.all(found.edges <= 0.5 * self.bounds.edge) and np.all(found.tails <= 0.5 * self.bounds.tail))
+        shift = np.abs(moved @ np.linalg.inv(grid.basis).T).max()
+        spreads = np.diagonal(noise) / np.maximum(np.diagonal(found.cov), 1e-300)
+        holds = bool(np.all(found.edges <= 0.5 * bounds.edge) and np.all(found.tails <= 0.5 * bounds.accepted))
         short = shift < 1.5 and spreads.max() < 0.2
         if short and holds and self._fits(found.used, widths, grid):
             return _Move(linear, steps, grid)
         # A grid that can stay for many short steps is worth more points.
         spare = MARGIN if short and spreads.max() < 0.05 else 1.0
-        bounds = self.bounds._replace(edge=spare * self.bounds.edge, tail=spare * self.bounds.tail)
-        target = fitted_grid(offsets + moved[:, :-1], logs, grid.centre, noise, narrow, bounds, grid)
-        return _Move(linear, steps, target)
+        bounds = bounds._replace(edge=spare * bounds.edge)
+        return _Move(linear, steps, fitted_grid(offsets + moved, logs, grid.centre, noise, narrow, bounds, grid))
 
     def _real(self) -> Dynamics:
         """The dynamics without derivatives, for decisions."""
@@ -180,44 +211,37 @@ class Stepper:
         needed = np.maximum((used[:, 1] - used[:, 0] + 4) * np.minimum(self.bounds.spacings / widths, 1.0), LEAST[grid.n])
         return bool(np.prod(np.minimum(needed / sizes, 1.0)) > 0.55)
 
-    def _apply(
-        self, field: Field, t0: float, t1: float, move: _Move, potential: Potential | None, target: Grid | None = None
-    ) -> Field:
-        goal = move.target if target is None else target
+    def _apply(self, field: Field, t0: float, t1: float, move: _Move, potential: Potential | None) -> Field:
+        goal = move.target
         sizes = padded_sizes(field.grid, move.linear.before.real, self.bounds)
         field = Field(*padded(field.values, field.grid, sizes), field.log_scale)
         moved = self._characteristics(field.grid, goal, t0, t1, move.steps)
         before = potential(field.grid, t0, t1, False) if potential else None
         after = potential(goal, t0, t1, True) if potential else None
-        values, top = transported(field.values, field.grid, goal, moved, move.linear, before, after)
+        noises = self._noises(field.grid, goal, t0, t1)
+        values, top = transported(field.values, field.grid, goal, moved, move.linear, before, after, noises)
         return Field(values, goal, field.log_scale + top)
 
     def limit(self, field: Field, t0: float, tau: float) -> float:
         """Return the longest substep, at most tau, whose noise a density can be spread by on a few times its own grid."""
-        grid = field.grid
-        mean = grid.centre + moments(field.values.real, grid).mean
+        found = survey(field.values, field.grid)
         for _ in range(80):
-            with np.errstate(all="ignore"):
-                jacobian = self.dynamics.jacobian(mean, t0).real
-            jacobian = jacobian if np.all(np.isfinite(jacobian)) else np.zeros_like(jacobian)
-            G, falling = self.dynamics.noise(t0, t0 + tau)
-            linear = linearised(jacobian, G.real, falling.real, tau, grid.basis)
-            if enlargement(grid, linear.before, self.bounds) <= MOST_ENLARGED:
+            noise = self._linear(found, field.grid, t0, t0 + tau).before.real
+            if enlargement(field.grid, noise, self.bounds) <= MOST_ENLARGED:
                 break
             tau *= 0.5
         return tau
 
     def single(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, _Move, Report]:
         """Return the density after one substep, on a grid that fits it."""
-        move = self._move(field, t0, t1, potential)
+        move = self._move(field, t0, t1)
         before = np.full(field.grid.n, np.inf)
         for attempt in range(TRIES):
             result = self._apply(field, t0, t1, move, potential)
             real = result.values.real
-            found = checks(real, result.grid, self.bounds.edge)
+            found = survey(real, result.grid, self.bounds.edge)
             wide = found.edges > 3 * self.bounds.edge
-            # What interpolation adds to the spectrum does not decrease with the spacing.
-            coarse = (found.tails > self.bounds.tail) & ((found.tails < 0.3 * before) | (found.tails > INTERPOLATED))
+            coarse = refinable(found.tails, before, self.bounds)
             if attempt == TRIES - 1 or not (wide.any() or coarse.any()) or not np.isfinite(found.tails).all():
                 break
             ends = 0.2 * np.where(wide, 1.0, 0.0)
@@ -227,23 +251,28 @@ class Stepper:
                 break
             before = np.where(coarse, found.tails, before)
             move = move._replace(target=better)
-        return result, move, self._report(field, found.edges, found.tails, real)
-
-    def _report(self, field: Field, edges: Array, tails: Array, real: Array) -> Report:
-        deviations = deviations_in_spacings(tails)
-        interpolation = float(np.sum(1e-4 / deviations**6))
-        negative = float(-np.minimum(real, 0.0).sum() / real.sum())
-        return Report(0.0, interpolation, float(edges.max()), float(tails.max()), negative)
+        return result, move, grid_report(found, real)
 
     def double(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report, float]:
         """Return the extrapolated density after two halves of a substep, and the difference from the whole substep."""
         middle = 0.5 * (t0 + t1)
-        first, _, one = self.single(field, t0, middle, potential)
+        first, move, one = self.single(field, t0, middle, potential)
         fine, _, two = self.single(positive(first), middle, t1, potential)
-        move = self._move(field, t0, t1, potential)
-        coarse = self._apply(field, t0, t1, move, potential, fine.grid)
+        whole = self._linear(survey(field.values, field.grid), field.grid, t0, t1)
+        coarse = self._apply(field, t0, t1, _Move(whole, 2 * move.steps, fine.grid), potential)
         values, difference = extrapolated(fine.values, coarse.values, coarse.log_scale - fine.log_scale)
+        # Moments differ by a few times as much as densities; by more only where rounding far away counts.
+        difference = max(difference, min(moments_difference(fine.values, coarse.values, fine.grid), 5 * difference))
         return Field(values, fine.grid, fine.log_scale), one.worst(two), difference
+
+
+def refinable(tails: Array, before: Array, bounds: Bounds) -> Array:
+    """Return along which axes (n,) a finer grid leaves smaller tails of the spectrum; `before` are those of the last grid.
+
+    What interpolation adds to the spectrum does not decrease with the spacing, and what a kink adds decreases slowly.
+    """
+    enough = max(INTERPOLATED, 100 * bounds.accepted)
+    return np.asarray((tails > bounds.accepted) & ((tails < 0.1 * before) | (tails > enough)))
 
 
 def positive(field: Field) -> Field:
@@ -259,6 +288,15 @@ def extrapolated(fine: Array, coarse: Array, log_ratio: Any) -> tuple[Array, flo
     good = (fine.real > 0) & (coarse.real > 0.2 * fine.real) & (coarse.real < 5.0 * fine.real)
     ratio = np.where(good, fine, 1.0) / np.where(good, coarse, 1.0)
     return np.where(fine.real > 0, fine * np.exp(np.log(ratio) / 3), 0.0), difference
+
+
+def moments_difference(fine: Array, coarse: Array, grid: Grid) -> float:
+    """Return the largest difference of two densities on a grid: of means in deviations, and of variances, relative to them."""
+    # Rounding far from the mean has a large variance.
+    one, two = (survey(np.where(u.real > 1e-12 * u.real.max(), u.real, 0.0), grid) for u in (fine, coarse))
+    variances = np.maximum(np.diagonal(one.cov), 1e-6 * np.diagonal(grid.basis @ grid.basis.T))
+    means = np.abs(one.mean - two.mean) / np.sqrt(variances)
+    return float(max(means.max(), (np.abs(np.diagonal(one.cov - two.cov)) / variances).max()))
 
 
 def advance(
@@ -277,12 +315,12 @@ def advance(
     """
     if tau <= 0:
         return field, NOTHING, control
-    known = np.isfinite(control.rate) and control.age < CHECKED and tau <= 2 * control.measured
+    known = control.known(tau, allowed)
     error = control.rate * tau**3 if known else np.inf
     singles = np.ceil(np.sqrt(error / allowed)) if np.isfinite(error) else np.inf
     doubles = max(1.0, np.ceil((_EXTRAPOLATED * (0.75 * min(error, 1.0)) ** (5 / 3) / allowed) ** 0.25)) if known else 1.0
     singles, doubles = max(singles, 2.0 * least if least > 1 else 1.0), max(doubles, least)
-    if singles <= 3 * doubles and stepper.limit(field, t0, tau / singles) >= tau / singles:
+    if singles < 2 * doubles and stepper.limit(field, t0, tau / singles) >= tau / singles:
         parts, report = int(singles), NOTHING
         for i in range(parts):
             field, _, more = stepper.single(field, t0 + tau * i / parts, t0 + tau * (i + 1) / parts, potential)
@@ -305,8 +343,7 @@ def _adaptively(
             length = 1 - done if 1 - done <= 1.3 * length else 0.5 * (1 - done)
         begin, end = t0 + tau * done, t0 + tau * (done + length)
         result, more, difference = stepper.double(field, begin, end, potential)
-        if not np.isfinite(difference):
-            difference = 10.0
+        difference = min(difference, 10.0) if np.isfinite(difference) else 10.0
         error = _EXTRAPOLATED * difference ** (5 / 3)
         wanted = allowed * length
         change = float(np.clip(0.9 * (wanted / max(error, 1e-30)) ** 0.25, 0.2, 3.0))
@@ -315,7 +352,7 @@ def _adaptively(
             count += 1
             continue
         field, report = positive(result), report.worst(more._replace(splitting=error))
-        rate = max(rate, difference * (4 / 3) / (tau * length) ** 3)
+        rate = max(rate, difference * (4 / 3) / max((tau * length) ** 3, 1e-300))
         done, count = done + length, count + 1
         last, length = length, length * change
     return field, report, Control(rate, tau * last, 0)

@@ -17,13 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zakai.numerics.space_diffusion import diffused
 from zakai.numerics.space_grid import (
     Grid,
-    Places,
     filtered,
     gather,
     gaussian_response,
-    places,
     relative_index,
     spread,
     transformed,
@@ -33,16 +32,19 @@ Array = NDArray[Any]
 _TERMS = 12
 _LARGEST = 4.0  # of tau L
 _MOST_STEPS = 256
+_LARGEST_VOLUME = 300.0  # nats; points beyond come from outside of the grid
 
 
 class Dynamics(NamedTuple):
     """`drift(x, t)` gives f and its divergence (J, n + 1) at points (J, n), `jacobian(x, t)` (n, n) at one point, `noise(t0, t1)`
-    the averages of G and of (1 - s) G over an interval; `varying` tells whether f depends on t."""
+    the averages of G and of (1 - s) G over an interval; `varying` tells whether f depends on t; `diffusion(x, t)` gives G
+    (J, n, n) at points where it depends on the state, for which `noise` is not used."""
 
     drift: Callable[[Array, Any], Array]
     jacobian: Callable[[Array, Any], Array]
     noise: Callable[[float, float], tuple[Array, Array]]
     varying: bool
+    diffusion: Callable[[Array, float], Array] | None = None
 
 
 def runge_kutta(
@@ -90,8 +92,8 @@ def runge_kutta(
     return result
 
 
-def steps_needed(dynamics: Dynamics, x: Array, t0: float, t1: float, scale: Array, tolerance: Array) -> int:
-    """Return how many Runge-Kutta steps move the points x (J, n) to `tolerance` (J,) of `scale` (n, n)."""
+def steps_needed(dynamics: Dynamics, x: Array, t0: float, t1: float, scale: Array, tolerance: Array) -> tuple[int, Array]:
+    """Return how many Runge-Kutta steps move points x (J, n) to `tolerance` (J,) of `scale` (n, n), and their displacement."""
     n, steps = x.shape[1], 1
     if dynamics.varying:
         steps = _fastest(dynamics, x[:: max(1, len(x) // 8)], t0, t1)
@@ -103,11 +105,11 @@ def steps_needed(dynamics: Dynamics, x: Array, t0: float, t1: float, scale: Arra
             error = np.abs((finer - last) @ inverse.T).max(axis=1) / tolerance
             worst = float(np.max(np.where(np.isfinite(error), error, np.inf)))
             if worst <= 1:
-                return steps
-            if worst <= 16:
-                return 2 * steps
+                return steps, finer
             steps, last = 2 * steps, finer
-    return steps
+            if worst <= 16:
+                break
+    return steps, last
 
 
 def _fastest(dynamics: Dynamics, x: Array, t0: float, t1: float) -> int:
@@ -141,32 +143,34 @@ def linearised(matrix: Array, mean: Array, falling: Array, tau: float, basis: Ar
 
     Where the eigenvalues of tau L are large L is reduced: it is a means to a smaller error of the splitting only.
     """
-    n = len(matrix)
     rate = tau * np.abs(np.linalg.eigvals(matrix.real)).max()
     L = matrix * (_LARGEST / rate) if rate > _LARGEST else matrix
     size = tau * np.abs(np.linalg.inv(basis) @ L.real @ basis).sum(axis=1).max()
     doublings = int(np.clip(np.ceil(np.log2(max(size, 1e-3))), 0, 30))
-    tau = tau / 2**doublings
-    result = term = np.eye(n) + 0.0 * matrix
-    for k in range(1, _TERMS + 4):
-        term = term @ L * (tau / k)
+    n, step = len(L), tau / 2**doublings
+    # The exponential of [[L, G], [0, -L']] holds exp(L) and the noise times exp(-L') (Van Loan 1978).
+    block = np.zeros((2 * n, 2 * n), np.result_type(L, mean))
+    block[:n, :n], block[:n, n:], block[n:, n:] = step * L, step * mean, -step * L.T
+    result = term = np.eye(2 * n) + 0.0 * block
+    for k in range(1, _TERMS + 6):
+        term = term @ block / k
         result = result + term
-    average = 2.0 * falling if doublings == 0 else mean
-    noise = tau * mean + 0.5 * tau**2 * (L @ average + average @ L.T)
-    part = (L @ mean + mean @ L.T) * (tau**2 / 2)
-    for k in range(3, _TERMS + 4):
-        part = (L @ part + part @ L.T) * (tau / k)
-        noise = noise + part
+    transition = result[:n, :n]
+    noise = result[:n, n:] @ transition.T
+    if doublings == 0:
+        uneven = 2.0 * falling - mean
+        noise = noise + 0.5 * tau**2 * (L @ uneven + uneven @ L.T)
     for _ in range(doublings):
-        noise = noise + result @ noise @ result.T
-        result = result @ result
-    return Linearisation(result, noise)
+        noise = noise + transition @ noise @ transition.T
+        transition = transition @ transition
+    return Linearisation(transition, 0.5 * (noise + noise.T))
 
 
 class Characteristics(NamedTuple):
-    """Where the points of a target grid come from in the source grid, and the log of the volume's change (J,)."""
+    """The indices `at` (J, n) in the source grid from which the points of a target grid come, and the log of the change of
+    volume (J,)."""
 
-    at: Places
+    at: Array
     log_volume: Array
 
 
@@ -184,9 +188,8 @@ def characteristics(
             return np.asarray(np.any(~(z < 2.0 * half) & ~closed, axis=1))
 
         moved = runge_kutta(dynamics.drift, target.centre + offsets, t1, t0, steps, None if any(periodic) else beyond)
-        at = places(relative_index(offsets + moved[:, :n], target.centre, source, periodic), source)
-        outside = at.base < 0
-        return Characteristics(at, np.where(outside, 0.0, moved[:, n]))
+        at = relative_index(offsets + moved[:, :n], target.centre, source, periodic)
+        return Characteristics(at, np.where(np.abs(moved[:, n].real) < _LARGEST_VOLUME, moved[:, n], 0.0))
 
 
 class Factor(NamedTuple):
@@ -214,16 +217,23 @@ def transported(
     linear: Linearisation,
     before: Factor | None = None,
     after: Factor | None = None,
+    noises: tuple[Array, Array, float] | None = None,
 ) -> tuple[Array, Any]:
-    """Return the density after one substep on the target grid, and the logarithm of the factor that was taken out."""
+    """Return the density after one substep on the target grid, and the logarithm of the factor that was taken out.
+
+    `noises` are G (J, n, n) at the points of both grids, and half of the substep, where the noise depends on the state.
+    """
     top: Any = 0.0
     inverse = np.linalg.inv(source.basis)
     half = inverse @ linear.before @ inverse.T
-    if before is None:
+    if before is None and noises is None:
         coefficients = filtered(values, gaussian_response(half, source.sizes, spline=True))
-    else:
+    elif before is None and noises is not None:
+        values = diffused(values, source, noises[0], noises[2])
+        coefficients = filtered(values, gaussian_response(0.0 * half, source.sizes, spline=True))
+    elif before is not None:
         values, first = weighed(values, before.log / 6)
-        values = spread(values, source, linear.before)
+        values = spread(values, source, linear.before) if noises is None else diffused(values, source, noises[0], noises[2])
         values, second = weighed(values, before.log / 3 + before.correction)
         coefficients = filtered(values, gaussian_response(0.0 * half, source.sizes, spline=True))
         top = first + second
@@ -232,7 +242,7 @@ def transported(
     if after is not None:
         result, third = weighed(result, after.log / 3 + after.correction)
         top = top + third
-    result = spread(result, target, 0.5 * linear.noise)
+    result = spread(result, target, 0.5 * linear.noise) if noises is None else diffused(result, target, noises[1], noises[2])
     if after is not None:
         result, fourth = weighed(result, after.log / 6)
         top = top + fourth

@@ -10,18 +10,14 @@ from numpy.typing import NDArray
 
 from zakai.numerics.space_grid import (
     Grid,
-    checks,
-    deviations_in_spacings,
     filtered,
     gather,
     gaussian_response,
-    moments,
-    narrowest,
-    places,
     relative_index,
     triangular_resampled,
 )
-from zakai.numerics.space_step import INTERPOLATED, Field, positive
+from zakai.numerics.space_step import Field, positive, refinable
+from zakai.numerics.space_survey import deviations_in_spacings, narrowest, survey
 from zakai.numerics.space_window import Bounds, adjusted, fitted_grid, whitened_grid
 
 Array = NDArray[Any]
@@ -51,6 +47,7 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, b
     inverse_previous = grid
     logs = log_factor(grid).reshape(grid.sizes)
     found, before = None, np.full(grid.n, np.inf)
+    best: Any = None  # the grid with the smallest edges and tails so far: a later one may be worse
     for attempt in range(_TRIES):
         real = np.where(values.real > 0, values.real, 0.0)
         with np.errstate(divide="ignore"):
@@ -60,11 +57,13 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, b
             return Update(field, 1.0, 1.0, np.inf, True)
         power = _power(logs.real, product, grid)
         if power == 1.0:
-            found = checks(_exp(product - top), grid, bounds.edge)
+            found = survey(_exp(product - top), grid, bounds.edge)
+            worst = float(max(found.tails.max(), found.edges.max()))
+            if best is None or worst < best[0]:
+                best = worst, grid, values, logs, product, top, found
             span = (found.used[:, 1] - found.used[:, 0] + 4) / np.array(grid.sizes)
             wide = found.edges > 3 * bounds.edge
-            # What interpolation adds to the spectrum does not decrease with the spacing.
-            coarse = (found.tails > bounds.tail) & ((found.tails < 0.3 * before) | (found.tails > INTERPOLATED))
+            coarse = refinable(found.tails, before, bounds)
             before = np.where(coarse & (attempt > 0), found.tails, before)
             sparse = np.array([attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1])
             if not (wide.any() or coarse.any() or sparse.any()):
@@ -82,11 +81,13 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, b
             inverse_previous = field.grid
             zero = np.zeros((grid.n, grid.n))
             coefficients = filtered(field.values, gaussian_response(zero, field.grid.sizes, spline=True))
-        at = places(relative_index(new.offsets, new.centre, inverse_previous, bounds.periodic), inverse_previous)
+        at = relative_index(new.offsets, new.centre, inverse_previous, bounds.periodic)
         grid, values = new, gather(coefficients, at, inverse_previous).reshape(new.sizes)
         logs, found = log_factor(grid).reshape(grid.sizes), None
     if found is None:
-        found = checks(_exp(product - top), grid, bounds.edge)
+        found = survey(_exp(product - top), grid, bounds.edge)
+    if best is not None and best[0] < 0.1 * max(found.tails.max(), found.edges.max()):
+        _, grid, values, logs, product, top, found = best
     peak = int(np.argmax(product))
     ratio = float(values.real.flat[peak] / max(field.values.real.max(), values.real.max()))
     shift = float(logs.real.flat[peak])
@@ -134,11 +135,10 @@ def _next(
         narrow = np.ones(grid.n)
     else:
         tempered, noise = product, np.zeros((grid.n, grid.n))
-        values = _exp(product - product.max())
-        narrow, _ = narrowest(values, grid, moments(values, grid).cov, bounds.tail)
-        if late and (found.tails > bounds.tail).any() and not (found.edges > 3 * bounds.edge).any():
+        narrow, _ = narrowest(survey(_exp(product - product.max()), grid, bounds.edge, bounds.accepted), grid, bounds.accepted)
+        if late and (found.tails > bounds.accepted).any() and not (found.edges > 3 * bounds.edge).any():
             ratio = np.clip(bounds.spacings / deviations_in_spacings(found.tails), 1.1, 2)
-            finer = np.where(found.tails > bounds.tail, ratio, 1.0)
+            finer = np.where(found.tails > bounds.accepted, ratio, 1.0)
             return adjusted(grid, np.zeros(grid.n), np.zeros(grid.n), finer, bounds)
     used = tempered > tempered.max() + np.log(bounds.edge)
     flat = np.flatnonzero(used)

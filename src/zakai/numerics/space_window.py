@@ -17,11 +17,13 @@ _OPEN, _CLOSED = 0.6, 0.85  # shares of a circle below which an axis is cut open
 
 
 class Bounds(NamedTuple):
-    """What a grid must keep: `edge`, the share of the maximum that counts as zero; `tail`, the share of the mass allowed in the
-    spectrum at the highest frequencies; `most` points along an axis; which coordinates are `periodic`."""
+    """What a grid must keep: `edge`, the share of the maximum that counts as zero; `tail`, the share of the mass in the spectrum
+    at the highest frequencies for which a grid is chosen, and `accepted`, with which it is used (interpolation adds to the
+    spectrum); `most` points along an axis; which coordinates are `periodic`."""
 
     edge: float
     tail: float
+    accepted: float
     most: int
     periodic: tuple[bool, ...]
 
@@ -137,7 +139,8 @@ def padded_sizes(grid: Grid, noise: Array, bounds: Bounds) -> tuple[int, ...]:
     for d, size in enumerate(grid.sizes):
         half = 0.5 * size
         needed = bounds.reach * np.sqrt((half / bounds.reach) ** 2 + variances[d])
-        sizes.append(size if grid.closed[d] or needed < half + 1 else rounded_size(2 * needed, LEAST[grid.n], 4 * bounds.most))
+        larger = max(rounded_size(2 * needed, LEAST[grid.n], 4 * bounds.most), size)
+        sizes.append(size if grid.closed[d] or needed < half + 1 else larger)
     return tuple(sizes)
 
 

@@ -7,6 +7,7 @@ import os
 import re
 from array import array
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
@@ -14,6 +15,8 @@ from typing import Any, NamedTuple, TextIO
 import numpy as np
 
 from zakai.errors import InputError
+from zakai.models._errors import named
+from zakai.records.inputs import Inputs
 from zakai.records.record import Record, early, first_fault
 from zakai.records.writing import default_names, shown
 
@@ -32,6 +35,9 @@ def read_record(path: str | os.PathLike[str], model: Any) -> Record:
     model's `start` (samples: at or after). An empty cell or `nan` is "not observed". The text is UTF-8; a
     byte-order mark, Windows line ends and blank lines are accepted.
 
+    Columns with the names of the model's inputs, in addition to the m observations, are the inputs at these times; the first
+    row with inputs holds from the model's start, and a row with empty inputs changes nothing.
+
     Arguments:
         path: the file.
         model: a `zakai.Model`; its `m`, `start` and `observation_kind` say what the file must hold.
@@ -47,12 +53,44 @@ def read_record(path: str | os.PathLike[str], model: Any) -> Record:
         Record(3 rows x 1 increments, times 0.1 to 0.4)
     """
     path = Path(path)
-    table, row = read_table(path, model.m, "observations")
-    record = Record(table[:, 0], table[:, 1:], model.observation_kind)
+    names = header_of(path) if model.inputs else []
+    if set(model.inputs) & set(names[1:]):
+        record, row = _with_inputs(path, model, names)
+    else:
+        table, row = read_table(path, model.m, "observations")
+        record = Record(table[:, 0], table[:, 1:], model.observation_kind)
     fault = early(record.times[0], record.kind, model.start)
     if fault is not None:
         raise InputError(f"{shown(path)}: row {row}: {fault}")
     return record
+
+
+def _with_inputs(path: Path, model: Any, names: list[str]) -> tuple[Record, int]:
+    """The record in a file that has columns for the inputs too, and the line of its first row."""
+    with named(f"{shown(path)}: row 1"):
+        observed, placed = columns_with_inputs(names, model.m, model.inputs)
+    table, row = read_table(path, len(names) - 1, "observations and inputs")
+    values = table[:, placed]
+    given = ~np.isnan(values)
+    partial = given.any(axis=1) & ~given.all(axis=1)
+    if partial.any():
+        raise InputError(f"{shown(path)}: row {row + int(np.argmax(partial))}: only some inputs are given; give all or none")
+    rows = given.all(axis=1)
+    if not rows.any():
+        raise InputError(f"{shown(path)}: no row has the inputs {', '.join(model.inputs)}; fill their columns")
+    times, values = table[rows, 0], values[rows]
+    if times[0] > model.start:
+        times, values = np.concatenate([[model.start], times]), np.concatenate([values[:1], values])
+    return Record(table[:, 0], table[:, observed], model.observation_kind, Inputs(times, values)), row
+
+
+def header_of(path: Path) -> list[str]:
+    """The names of the columns of a CSV file, or nothing where it cannot be read, which `read_table` reports."""
+    try:
+        with path.open(encoding="utf-8-sig", errors="surrogateescape") if path.is_file() else nullcontext() as file:
+            return [] if file is None else header_names(file.readline(LONGEST_LINE).rstrip("\r\n"))
+    except (OSError, ValueError):
+        return []
 
 
 def read_table(path: Path, columns: int, what: str, names: Sequence[str] | None = None) -> tuple[np.ndarray, int]:
@@ -144,6 +182,24 @@ def _header(source: str, line: str, m: int, what: str, expected: Sequence[str] |
 def header_names(line: str) -> list[str]:
     """The names of the columns that a header gives."""
     return [name.strip() for name in _cells(line)]
+
+
+def columns_with_inputs(names: Sequence[str], m: int, inputs: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Return the places of the m observations and of the inputs in a header, the first column of which is the time.
+
+    Raises:
+        InputError: an input has no column or two, or the other columns are not the observations.
+    """
+    missing = [name for name in inputs if name not in names[1:]]
+    if missing:
+        raise InputError(f"no column for the input {', '.join(missing)}; give a column for each input")
+    observed = [i for i, name in enumerate(names) if i > 0 and name not in inputs]
+    fault = columns_fault([names[0], *(names[i] for i in observed)], m, "observations")
+    if fault is None and len(names) != 1 + m + len(inputs):
+        fault = "an input has two columns; give one for each"
+    if fault is not None:
+        raise InputError(fault)
+    return observed, [names.index(name) for name in inputs]
 
 
 def columns_fault(names: Sequence[str], m: int, what: str, expected: Sequence[str] | None = None) -> str | None:

@@ -17,6 +17,11 @@ DIFFERS = 0.05  # relative difference of the two precisions that a result report
 AT_ONCE = 4096  # intervals that are checked together
 
 
+def noise_varies(model: Model) -> bool:
+    """Return whether the noise may vary within an interval over which an increment is gathered."""
+    return model.observation_kind != "samples" and bool(model.observation_noise.has(model.t))
+
+
 def notes_on_noise(model: Model, schedule: Schedule) -> list[str]:
     """Return a sentence where y linear between observations is far from the exact law of the increments.
 
@@ -27,7 +32,7 @@ def notes_on_noise(model: Model, schedule: Schedule) -> list[str]:
 
     the first is the larger.  Where their ratio exceeds 1 + 0.05 in some coordinate, the sentence names the first such time.
     """
-    if model.observation_kind == "samples" or not model.observation_noise.has(model.t):
+    if not noise_varies(model):
         return []
     noise = numpy_function(list(model.observation_noise.diagonal()), model)
     origin, theta = np.zeros(model.n), model.theta()

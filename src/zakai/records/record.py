@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from zakai.errors import InputError
+
+if TYPE_CHECKING:
+    from zakai.records.inputs import Inputs
 
 KINDS = ("increments", "path", "rates", "samples")
 
@@ -28,7 +31,8 @@ class Record:
         times: (K,), in the model's unit of time, strictly increasing, at least one.
         values: (K, m), in the model's units; nan, or a masked cell, is "this coordinate was not observed here". (K,) is taken
             as (K, 1).
-        kind: "increments", "path", "rates" or "samples".
+        kind: "increments" (the default), "path", "rates" or "samples".
+        inputs: a `zakai.Inputs` for a model with known inputs.
 
     Both arrays are copied to float64 and cannot be written to.
 
@@ -45,7 +49,8 @@ class Record:
 
     times: np.ndarray
     values: np.ndarray
-    kind: str
+    kind: str = "increments"
+    inputs: Inputs | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -81,6 +86,16 @@ class Record:
         fault = early(self.times[0], self.kind, model.start)
         if fault is not None:
             raise InputError(f"record: row 0: {fault}")
+        self.check_law(model)
+
+    def check_law(self, model: Any) -> None:
+        """Refuse a record without the model's inputs, or with values that its observation family cannot have."""
+        if self.inputs is not None or model.inputs:
+            from zakai.records.inputs import check_inputs
+
+            check_inputs(model, self.inputs, float(self.times[-1]))
+        if self.kind == "samples" and not model.observation_law.is_gaussian:
+            model.observation_law.check(self.values)
 
     @classmethod
     def from_pandas(cls, frame: Any, kind: str) -> Record:
@@ -167,8 +182,9 @@ def first_fault(times: np.ndarray, values: np.ndarray) -> tuple[int, str] | None
         return row, f"the time is {time!r}; times must be finite and at most {LARGEST:g} in size"
     if not rising[row]:
         before = float(times[row - 1])
-        what = "repeats the time before it" if time == before else f"comes after the time {before!r}"
-        return row, f"the time {time!r} {what}; times must be strictly increasing"
+        if time == before:
+            return row, f"the time {time!r} repeats the time before it; times must be strictly increasing: leave one row out"
+        return row, f"the time {time!r} comes after the time {before!r}; times must be strictly increasing: sort the rows"
     column = int(np.argmax(np.abs(values[row]) > LARGEST))
     return row, (
         f"observation {column + 1} is {float(values[row, column])!r}; values must be finite and at most "
@@ -184,7 +200,7 @@ def early(first: float, kind: str, start: float) -> str | None:
     return f"the time {float(first)!r} must be {need} the model's start {float(start)!r}"
 
 
-def _numbers(array: Any, name: str) -> np.ndarray:
+def _numbers(array: Any, name: str, what: str = "record") -> np.ndarray:
     """A fresh float64 copy, nan where it is masked; text, dates, durations and complex numbers are refused."""
     try:
         if isinstance(array, np.ma.MaskedArray) and array.dtype.kind in "biuf":
@@ -196,7 +212,7 @@ def _numbers(array: Any, name: str) -> np.ndarray:
         return np.array(array, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         kind = f" of {array.dtype}" if isinstance(array, np.ndarray) else ""
-        raise InputError(f"record: {name} must be real numbers, not an array{kind}") from None
+        raise InputError(f"{what}: {name} must be real numbers, not an array{kind}") from None
 
 
 def _column(series: Any, name: str) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from zakai.records.inputs import Inputs
 from zakai.records.record import Record
 
 if TYPE_CHECKING:
@@ -20,20 +21,30 @@ class Schedule(NamedTuple):
 
     `starts` and `stops` (K,) in the model's unit of time; an interval of length zero is a sample at the model's start.
     `seen` (K, m) marks the coordinates that are observed at the stop.  `elapsed` (K, m) is the time over which an increment was
-    gathered, zero for samples and where nothing is observed.
+    gathered, zero for samples and where nothing is observed.  `inputs` are the known inputs u(t), for models that have some:
+    `inputs.at(t, model.input_hold)`.
     """
 
     starts: np.ndarray
     stops: np.ndarray
     seen: np.ndarray
     elapsed: np.ndarray
+    inputs: Inputs | None = None
 
     def __len__(self) -> int:  # type: ignore[override]
         return len(self.starts)
 
     def part(self, rows: slice) -> Schedule:
         """Return the schedule of some of the intervals."""
-        return Schedule(self.starts[rows], self.stops[rows], self.seen[rows], self.elapsed[rows])
+        found = Schedule(self.starts[rows], self.stops[rows], self.seen[rows], self.elapsed[rows], self.inputs)
+        if self.inputs is None or len(found) == 0:
+            return found
+        return Schedule(*found[:4], self.inputs.part(float(found.starts[0]), float(found.stops[-1])))
+
+    def key(self) -> tuple[bytes, ...]:
+        """Return what equal schedules have in common."""
+        inputs = () if self.inputs is None else (self.inputs.times, self.inputs.values)
+        return tuple(np.ascontiguousarray(part).tobytes() for part in (*self[:4], *inputs))
 
     @property
     def lengths(self) -> np.ndarray:
@@ -70,7 +81,7 @@ def lengths_of(starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
 def length_of(start: float, stop: float) -> float:
     """Return `lengths_of` one interval, without arrays."""
     length = stop - start
-    unit = math.ldexp(1.0, max(math.frexp(max(abs(start), abs(stop)))[1] - 50, -1000))
+    unit = max(8.0 * math.ulp(max(abs(start), abs(stop))), 2.0**-1000)
     return round(length / unit) * unit if length > 64 * unit else length
 
 
@@ -90,7 +101,7 @@ def schedule_of(model: Model, record: Record) -> tuple[Schedule, np.ndarray]:
         values, elapsed = _path_increments(model.start, stops, values)
     rounded = lengths_of(starts, stops)[:, None]
     elapsed = np.where(np.abs(elapsed - rounded) <= ROUNDING * rounded, rounded, elapsed)
-    return Schedule(starts, stops, seen, np.where(seen, elapsed, 0.0)), np.where(seen, values, 0.0)
+    return Schedule(starts, stops, seen, np.where(seen, elapsed, 0.0), record.inputs), np.where(seen, values, 0.0)
 
 
 def _path_increments(start: float, times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

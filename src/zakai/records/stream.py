@@ -6,11 +6,13 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, BinaryIO, NamedTuple
 
 from zakai.errors import InputError
-from zakai.records.csv import columns_fault, header_names
+from zakai.models._errors import named
+from zakai.records.csv import columns_with_inputs, header_names
 
 LONGEST = 2**20  # bytes of a line
 MOST_DIGITS = 640  # of an integer: what Python always reads, however it is set
@@ -20,24 +22,29 @@ _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", r
 
 
 class Line(NamedTuple):
-    """One line: its number, from 1, its time and its values, None where nothing was observed; or what is wrong with it."""
+    """One line: its number, from 1, its time and its values, None where nothing was observed; or what is wrong with it.
+
+    `inputs` are the values of known inputs by their names, None where the line gives none.
+    """
 
     number: int
     time: Any
     values: list[Any]
+    inputs: dict[str, Any] | None = None
     fault: str | None = None
 
 
-def lines_of(file: BinaryIO, m: int) -> Iterator[Line]:
-    """The lines of a stream of observations, each as soon as it is there.
+def lines_of(file: BinaryIO, m: int, inputs: Sequence[str] = ()) -> Iterator[Line]:
+    """Yield the lines of a stream of observations, each as soon as it is there.
 
-    JSON lines are {"time": 0.1, "y": [0.5, null]}, of which other keys are left alone, but none may stand twice; a stream
-    whose first line begins with `time` is CSV, with m columns after that. Empty lines are passed over. No line is held in
-    memory beyond a mebibyte.
+    JSON lines are {"time": 0.1, "y": [0.5, null], "inputs": {"u": 1.0}}; other keys are ignored, and no key may stand twice. A
+    stream whose first line begins with `time` is CSV, with m columns after that and, in any place, one for each input. Empty
+    lines are skipped. No line is held in memory beyond a mebibyte.
 
-    Arguments:
+    Args:
         file: bytes, as `sys.stdin.buffer`.
         m: how many values an observation has.
+        inputs: the names of the known inputs.
 
     Raises:
         InputError: the header of a CSV does not fit, or what looks like CSV has none.
@@ -48,29 +55,30 @@ def lines_of(file: BinaryIO, m: int) -> Iterator[Line]:
         >>> [line.values for line in lines_of(io.BytesIO(b'{"time": 1, "y": [0.5]}\\n{"time": 2, "y": [null]}\\n'), 1)]
         [[0.5], [None]]
     """
-    parse: Callable[[str], tuple[Any, list[Any]]] | None = None
+    parse: Callable[[str], tuple[Any, list[Any], dict[str, Any] | None]] | None = None
     number = 0
     while content := file.readline(LONGEST + 1):
         number += 1
         if len(content) > LONGEST:
             _skip_rest(file, content)
-            yield Line(number, None, [], f"is longer than {LONGEST} bytes")
+            yield Line(number, None, [], fault=f"is longer than {LONGEST} bytes")
             continue
         try:
             text = content.decode("utf-8-sig" if number == 1 else "utf-8")
         except UnicodeDecodeError:
-            yield Line(number, None, [], "holds bytes that are not UTF-8 text")
+            yield Line(number, None, [], fault="holds bytes that are not UTF-8 text")
             continue
         if not text.strip():
             continue
         if parse is None:
-            parse = _csv if _is_header(text, number, m) else _json
-            if parse is _csv:
+            columns = _columns(text, number, m, inputs)
+            parse = _json if columns is None else partial(_csv, inputs, columns)
+            if columns is not None:
                 continue
         try:
             yield Line(number, *parse(text))
         except ValueError as error:
-            yield Line(number, None, [], str(error))
+            yield Line(number, None, [], fault=str(error))
 
 
 def _skip_rest(file: BinaryIO, content: bytes) -> None:
@@ -78,22 +86,27 @@ def _skip_rest(file: BinaryIO, content: bytes) -> None:
         content = file.readline(LONGEST)
 
 
-def _json(text: str) -> tuple[Any, list[Any]]:
+def _json(text: str) -> tuple[Any, list[Any], dict[str, Any] | None]:
     try:
-        told = _DECODER.decode(text)
+        found = _DECODER.decode(text)
     except json.JSONDecodeError:
         raise ValueError(f'{_quoted(text.strip())} is not JSON; expected {{"time": ..., "y": [...]}}') from None
     except RecursionError:
         raise ValueError(f"{_quoted(text.strip())} is nested too deep to be read as JSON") from None
-    if not isinstance(told, dict) or "time" not in told or "y" not in told:
+    if not isinstance(found, dict) or "time" not in found or "y" not in found:
         raise ValueError(f'{_quoted(text.strip())} is not an object with "time" and "y"')
-    time, values = told["time"], told["y"] if isinstance(told["y"], list) else [told["y"]]
+    time, values, inputs = found["time"], found["y"] if isinstance(found["y"], list) else [found["y"]], found.get("inputs")
     if not _is_number(time):
         raise ValueError(f"the time is {_said(time)}; give a number")
     for index, value in enumerate(values):
         if value is not None and not _is_number(value):
             raise ValueError(f"observation {index + 1} is {_said(value)}; give a number, or null where there is none")
-    return time, values
+    if inputs is not None and not isinstance(inputs, dict):
+        raise ValueError(f'"inputs" is {_said(inputs)}; give an object, as {{"u": 1.0}}')
+    for name, value in (inputs or {}).items():
+        if not _is_number(value):
+            raise ValueError(f"the input {_said(name)} is {_said(value)}; give a number")
+    return time, values, inputs
 
 
 def _is_number(value: Any) -> bool:
@@ -111,11 +124,11 @@ def _said(value: Any) -> str:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    told = dict(pairs)
-    if len(told) < len(pairs):
+    found = dict(pairs)
+    if len(found) < len(pairs):
         ((twice, _),) = Counter(name for name, _ in pairs).most_common(1)
         raise ValueError(f"the key {_said(twice)} stands twice; which of the two is meant is not known")
-    return told
+    return found
 
 
 def _integer(digits: str) -> int:
@@ -131,28 +144,41 @@ def _no_number(name: str) -> None:
 _DECODER = json.JSONDecoder(object_pairs_hook=_object, parse_int=_integer, parse_constant=_no_number)
 
 
-def _csv(text: str) -> tuple[Any, list[Any]]:
+def _csv(inputs: Sequence[str], columns: tuple[list[int], list[int]], text: str) -> tuple[Any, list[Any], dict[str, Any] | None]:
+    """Return the time, the observations and the inputs of a row; `columns` are the places of both, see `_columns`."""
     cells = [cell.strip() for cell in text.split(",")]
     for cell in cells:
         if cell and not _NUMBER.fullmatch(cell):
             raise ValueError(f"{_quoted(cell)} is not a number; leave the cell empty if nothing was observed")
     if not cells[0]:
         raise ValueError("the time is missing")
-    return float(cells[0]), [float(cell) if cell else None for cell in cells[1:]]
+    numbers = [float(cell) if cell else None for cell in cells]
+    observed, placed = columns
+    if not placed:
+        return numbers[0], numbers[1:], None
+    if len(cells) != 1 + len(observed) + len(placed):
+        raise ValueError(f"{len(cells)} columns; the header has {1 + len(observed) + len(placed)}")
+    given = {name: numbers[place] for name, place in zip(inputs, placed, strict=True) if cells[place]}
+    return numbers[0], [numbers[place] for place in observed], given or None
 
 
-def _is_header(text: str, number: int, m: int) -> bool:
-    """Whether the first line of a stream is the header of a CSV, else it is JSON; InputError where the header is wrong."""
+def _columns(text: str, number: int, m: int, inputs: Sequence[str]) -> tuple[list[int], list[int]] | None:
+    """Return the places of the observations and of the inputs if the first line is the header of a CSV, None if it is JSON.
+
+    Raises:
+        InputError: a header that does not fit, or a line that looks like CSV and is no header.
+    """
     names = header_names(text.strip())
-    fault = None
-    if names[0] == "time":
-        fault = columns_fault(names, m, "observations")
-    elif _looks_like_csv(text):
-        header = f"whose first line must be a header: first the column time, then {m} for the observations, with commas between"
-        fault = f"{_quoted(text.strip())} looks like CSV, {header}"
-    if fault is not None:
-        raise InputError(f"standard input: line {number}: {fault}")
-    return names[0] == "time"
+    with named(f"standard input: line {number}"):
+        if names[0] == "time":
+            given = inputs if set(inputs) & set(names[1:]) else ()
+            return columns_with_inputs(names, m, given)
+        if _looks_like_csv(text):
+            header = (
+                f"whose first line must be a header: first the column time, then {m} for the observations, with commas between"
+            )
+            raise InputError(f"{_quoted(text.strip())} looks like CSV, {header}")
+    return None
 
 
 def _looks_like_csv(text: str) -> bool:

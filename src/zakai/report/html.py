@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from zakai.report import _style, plots, sections, words
+from zakai.report import _style, calibration, plots, sections, words
 from zakai.report.heatmap import is_periodic, state_names, true_states, wrapped
 from zakai.report.words import signed
 
@@ -41,6 +41,7 @@ def page(result: Any, truth: Any = None) -> str:
         ("posterior", "The posterior over time", sections.posterior(result, states)),
         ("snapshots", "The density at moments of note", sections.snapshots(result, states)),
         ("log-likelihood", "Log-likelihood", sections.likelihood(result)),
+        ("calibration", "Calibration", calibration.section(result)),
         ("health", "Health of the computation", sections.health(result)),
         ("method", "Which method, and why", sections.method(result)),
         ("model", "The model", sections.model(result)),

@@ -68,7 +68,7 @@ def posterior(picture: DensityOverTime, height: int = 430, label: str | None = N
             "truth",
             {"color": style.TRUTH_COLOUR, "width": 1.4, "dash": "4px,2px"},
         )
-    _layout(figure, height)
+    layout(figure, height)
     figure.update_layout(hovermode="x unified")
     figure.update_xaxes(title_text="time", hoverformat=".6g")
     if not picture.joined:  # plotly leaves a margin around dots
@@ -107,7 +107,7 @@ def snapshots(shots: list[tuple[str, float, Profile, float | None]], name: str, 
             if periodic:
                 truth = shot.centre + float(np.angle(np.exp(1j * (truth - shot.centre))))
             figure.add_vline(x=truth, line={"color": style.TRUTH_COLOUR, "width": 1.6, "dash": "4px,2px"}, **where)
-    _layout(figure, 235 * rows + 50)
+    layout(figure, 235 * rows + 50)
     figure.update_annotations(font={"size": 13, "color": style.INK})
     figure.update_yaxes(rangemode="tozero", nticks=4)
     figure.update_xaxes(nticks=5)
@@ -149,7 +149,7 @@ def log_likelihood(times: np.ndarray, increments: np.ndarray, surprise: int | No
         row=2,
         col=1,
     )
-    _layout(figure, 480)
+    layout(figure, 480)
     figure.update_yaxes(title_text="per observation", row=1, col=1)
     figure.update_yaxes(title_text="cumulative", row=2, col=1)
     figure.update_xaxes(title_text="time", row=2, col=1)
@@ -180,7 +180,7 @@ def health(times: np.ndarray, series: dict[str, np.ndarray], bounds: dict[str, f
         if bound is not None and np.nanmax(drawn) > 1e-3 * bound:
             line = {"color": style.TRUTH_COLOUR, "width": 1.2, "dash": "dot"}
             figure.add_hline(y=bound, line=line, row=row, col=1)
-    _layout(figure, 150 * rows + 70)
+    layout(figure, 150 * rows + 70)
     figure.update_annotations(font={"size": 13, "color": style.INK}, x=0, xanchor="left")
     figure.update_layout(margin={"t": 62})
     figure.update_xaxes(title_text="time", row=rows, col=1)
@@ -227,7 +227,7 @@ def _line(figure: Any, picture: DensityOverTime, values: np.ndarray, name: str, 
     )  # fmt: skip
 
 
-def _layout(figure: Any, height: int) -> None:
+def layout(figure: Any, height: int) -> None:
     axis = {
         "showline": True, "linecolor": style.RULE, "ticks": "outside", "tickcolor": style.RULE, "ticklen": 4,
         "zeroline": False, "showgrid": False, "automargin": True, "title_font": {"size": 13},

@@ -10,7 +10,7 @@ import numpy as np
 from zakai.report import _style as style
 from zakai.report._extra import plotting
 from zakai.report.comparisons import MOST, Curve, error_curves, log_range, nees_curves, spans_decades, works
-from zakai.report.plots import _layout
+from zakai.report.plots import layout
 from zakai.report.study_pictures import COLOURS, FEW
 
 DASHES = ("solid", "7px,3px", "2px,2px", "8px,2px,2px,2px", "12px,3px")
@@ -61,7 +61,7 @@ def work(outcome: Any, point: int) -> Any:
     for one in found if both else ():
         if not np.isfinite(one.distance):  # a line in an empty panel would not be drawn, so it comes last
             figure.add_vline(x=1e6 * one.seconds, line={"color": style.FAINT, "width": 1.2, "dash": "dot"}, row=1, col=2)
-    _layout(figure, 400)
+    layout(figure, 400)
     figure.update_xaxes(title_text="time per observation (µs)", **_log(*log_range([1e6 * one.seconds for one in found])))
     panels = [("root mean squared error", [one.error for one in found])]
     if both:
@@ -100,7 +100,7 @@ def _lines(figure: Any, curves: list[Curve]) -> None:
 
 
 def _finished(figure: Any, curves: list[Curve], what: str) -> Any:
-    _layout(figure, 380)
+    layout(figure, 380)
     figure.update_layout(hovermode="x unified")
     figure.update_xaxes(title_text="time (unit of the model)", hoverformat=".6g")
     figure.update_yaxes(title_text=what, rangemode="tozero")

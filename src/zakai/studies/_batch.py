@@ -86,11 +86,11 @@ def _observed(job: Job, model: Model, times: np.ndarray) -> tuple[list[np.ndarra
     study = job.study
     if study.records:
         truths: list[np.ndarray | None] = [None if one.truth is None else np.array(one.truth) for one in study.records]
-        return truths, [Record(times, np.array(r.values), model.observation_kind) for r in study.records], [""] * len(truths)
+        return truths, [study.record(model, one) for one in study.records], [""] * len(truths)
     truths, records, faults = [], list[Record | None](), list[str]()
     for seed in job.seeds:
         try:
-            truth, record = simulate(model, times, seed=seed, substeps=study.substeps)
+            truth, record = simulate(model, times, seed=seed, substeps=study.substeps, inputs=study.known_inputs)
         except InputError as error:
             truths.append(None)
             records.append(None)

@@ -6,7 +6,8 @@ the integral of the observation,
     dm = f dt,   da = h dt,   d Sigma = (A Sigma + Sigma A' + diag(G, S)) dt,   A = (F 0; H 0),   F = df/dx, H = dh/dx at m,
 
 from Sigma = diag(P, 0).  An increment y(t_k) - y(t_{k-1}) is then expected to be a with the covariance Sigma_yy; a sample to be
-h(m) with H P H' + S.  For a linear system this is exact (Jazwinski 1970, chapter 7).
+h(m) with H P H' + S.  For a linear system this is exact (Jazwinski 1970, chapter 7).  Observations of another law than a
+Gaussian have no innovations.
 """
 
 from __future__ import annotations
@@ -49,17 +50,19 @@ class Innovations:
         """
         schedule, values = schedule_of(self.model, record)
         n, m = self.model.n, self.model.m
+        u, undefined = self._inputs(schedule, schedule.stops, schedule.stops), not self.model.observation_law.is_gaussian
         with np.errstate(invalid="ignore", over="ignore"):
             x, sigma = self._moved(schedule, np.asarray(mean, float)[:-1], np.asarray(cov, float)[:-1])
             if record.kind == "samples":
-                slope = self.slope(x[:, :n], schedule.stops, self.theta)
-                expected = self.observation(x[:, :n], schedule.stops, self.theta)
-                spread = slope @ sigma[:, :n, :n] @ np.swapaxes(slope, 1, 2) + self.noise(x[:, :n], schedule.stops, self.theta)
+                slope = self.slope(x[:, :n], schedule.stops, self.theta, u)
+                expected = self.observation(x[:, :n], schedule.stops, self.theta, u)
+                noise = self.noise(x[:, :n], schedule.stops, self.theta, u)
+                spread = slope @ sigma[:, :n, :n] @ np.swapaxes(slope, 1, 2) + noise
                 late = np.zeros((len(x), m), bool)
             else:
                 expected, spread = x[:, n:], sigma[:, n:, n:]
                 late = schedule.elapsed > _LATE * (schedule.stops - schedule.starts)[:, None]
-        return np.where(late | ~schedule.seen, np.nan, values - expected), spread
+        return np.where(late | ~schedule.seen | undefined, np.nan, values - expected), spread
 
     def nis(self, record: Record, mean: np.ndarray, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return nu' S^-1 nu (K,), and the number of observed coordinates (K,), the degrees of freedom of its chi-square law.
@@ -80,34 +83,61 @@ class Innovations:
         z = np.concatenate([mean, np.zeros((K, m))], axis=1)
         sigma = np.zeros((K, n + m, n + m))
         sigma[:, :n, :n] = cov
-        lengths = schedule.stops - schedule.starts
-        size = np.abs(self._matrix(mean, schedule.starts)).sum(axis=2).max(axis=1) * lengths
+        for starts, stops in _pieces(schedule):
+            z, sigma = self._over(schedule, starts, stops, z, sigma)
+        return z, sigma
+
+    def _over(
+        self, schedule: Schedule, starts: np.ndarray, stops: np.ndarray, z: np.ndarray, sigma: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return (x, y) and their covariance after a piece of each interval in which the inputs are smooth."""
+        lengths = stops - starts
+        u = self._inputs(schedule, starts, starts)
+        size = np.abs(self._matrix(z[:, : self.model.n], starts, u)).sum(axis=2).max(axis=1) * lengths
         finite = size[np.isfinite(size)]
         steps = int(np.clip(np.ceil(finite.max(initial=0.0) / _STEP), 1, _MOST_STEPS))
         z[np.nan_to_num(size, nan=np.inf) > 10 * _STEP * _MOST_STEPS] = np.nan  # stiffer than this method can follow
         d = lengths / steps
         for j in range(steps):
-            t = schedule.starts + j * d
-            z1, s1 = self._rates(z, sigma, t)
-            z2, s2 = self._rates(z + 0.5 * d[:, None] * z1, sigma + 0.5 * d[:, None, None] * s1, t + 0.5 * d)
-            z3, s3 = self._rates(z + 0.5 * d[:, None] * z2, sigma + 0.5 * d[:, None, None] * s2, t + 0.5 * d)
-            z4, s4 = self._rates(z + d[:, None] * z3, sigma + d[:, None, None] * s3, t + d)
+            t = starts + j * d
+            u0, u1, u2 = (self._inputs(schedule, starts, at) for at in (t, t + 0.5 * d, t + d))
+            z1, s1 = self._rates(z, sigma, t, u0)
+            z2, s2 = self._rates(z + 0.5 * d[:, None] * z1, sigma + 0.5 * d[:, None, None] * s1, t + 0.5 * d, u1)
+            z3, s3 = self._rates(z + 0.5 * d[:, None] * z2, sigma + 0.5 * d[:, None, None] * s2, t + 0.5 * d, u1)
+            z4, s4 = self._rates(z + d[:, None] * z3, sigma + d[:, None, None] * s3, t + d, u2)
             z = z + d[:, None] / 6 * (z1 + 2 * z2 + 2 * z3 + z4)
             sigma = sigma + d[:, None, None] / 6 * (s1 + 2 * s2 + 2 * s3 + s4)
         return z, sigma
 
-    def _matrix(self, x: np.ndarray, t: np.ndarray) -> np.ndarray:
+    def _inputs(self, schedule: Schedule, starts: np.ndarray, t: np.ndarray) -> np.ndarray | None:
+        """Return the inputs (K, number of inputs) at times t of pieces that begin at `starts`."""
+        if schedule.inputs is None:
+            return None
+        return schedule.inputs.at(starts if self.model.input_hold == "zero" else t, self.model.input_hold)
+
+    def _matrix(self, x: np.ndarray, t: np.ndarray, u: np.ndarray | None) -> np.ndarray:
         n, m = self.model.n, self.model.m
         matrix = np.zeros((len(x), n + m, n + m))
-        matrix[:, :n, :n] = self.drift_slope(x, t, self.theta)
-        matrix[:, n:, :n] = self.slope(x, t, self.theta)
+        matrix[:, :n, :n] = self.drift_slope(x, t, self.theta, u)
+        matrix[:, n:, :n] = self.slope(x, t, self.theta, u)
         return matrix
 
-    def _rates(self, z: np.ndarray, sigma: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _rates(self, z: np.ndarray, sigma: np.ndarray, t: np.ndarray, u: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         n = self.model.n
         x = z[:, :n]
-        moved = self._matrix(x, t) @ sigma
+        moved = self._matrix(x, t, u) @ sigma
         moved = moved + np.swapaxes(moved, 1, 2)
-        moved[:, :n, :n] += self.covariance(x, t, self.theta)
-        moved[:, n:, n:] += self.noise(x, t, self.theta)
-        return np.concatenate([self.drift(x, t, self.theta), self.observation(x, t, self.theta)], axis=1), moved
+        moved[:, :n, :n] += self.covariance(x, t, self.theta, u)
+        moved[:, n:, n:] += self.noise(x, t, self.theta, u)
+        return np.concatenate([self.drift(x, t, self.theta, u), self.observation(x, t, self.theta, u)], axis=1), moved
+
+
+def _pieces(schedule: Schedule) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return starts and stops (K,) of the pieces of all intervals between their input times; missing ones have length zero."""
+    if schedule.inputs is None:
+        return [(schedule.starts, schedule.stops)]
+    cuts = [schedule.inputs.within(start, stop) for start, stop in zip(schedule.starts, schedule.stops)]
+    ends = np.repeat(schedule.stops[:, None], 1 + max(map(len, cuts)), axis=1)
+    for row, own in zip(ends, cuts):
+        row[: len(own)] = own
+    return list(zip(np.column_stack([schedule.starts, ends]).T, ends.T))

@@ -25,7 +25,7 @@ from zakai.models._errors import did_you_mean, echo, listing, named
 from zakai.models.clock import clock
 from zakai.models.files import load_model, read_keys, read_text
 from zakai.models.model import Model
-from zakai.records import Record, read_record, read_truth
+from zakai.records import Inputs, Record, read_inputs, read_record, read_truth
 from zakai.records.writing import shown
 
 KEYS = (
@@ -63,12 +63,16 @@ class Entry:
 
 @dataclass(frozen=True)
 class Given:
-    """A record from a file, with the true states (K+1, n) where they are known; nan at the start if it is not."""
+    """A record from a file, with the true states (K+1, n) where they are known; nan at the start if it is not.
+
+    `inputs` are rows of a time and the values of the known inputs, where the record has columns for them.
+    """
 
     label: str
     times: tuple[float, ...]
     values: tuple[tuple[float, ...], ...]
     truth: tuple[tuple[float, ...], ...] | None
+    inputs: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,8 @@ class Study:
     """All that decides the numbers of a study, and nothing else: two with the same `key` have the same numbers.
 
     `first` and `count` are the seeds, `until`, `step` and `substeps` the times, where records are simulated; else `records`.
-    Runs are the seeds or the records; a batch is up to `batch` runs of one point, by every method.
+    `inputs` are rows of a time and the values of the known inputs then. Runs are the seeds or the records; a batch is up to
+    `batch` runs of one point, by every method.
     """
 
     name: str
@@ -93,6 +98,17 @@ class Study:
     densities: int = 0
     lost_above: float | None = None
     batch: int = BATCH
+    inputs: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def known_inputs(self) -> Inputs | None:
+        """The inputs of every run, or None where there are none or each record has its own."""
+        return _inputs_of(self.inputs)
+
+    def record(self, model: Model, given: Given) -> Record:
+        """Return a given record, with its own inputs or those of the study."""
+        inputs = _inputs_of(given.inputs) if given.inputs else self.known_inputs
+        return Record(np.array(given.times), np.array(given.values), model.observation_kind, inputs)
 
     @cached_property
     def runs(self) -> tuple[str, ...]:
@@ -108,7 +124,11 @@ class Study:
 
     def key(self) -> str:
         """A hash of all that decides the numbers: not of the name, nor of the versions of the libraries."""
-        return hashlib.sha256(json.dumps(asdict(replace(self, name="")), sort_keys=True).encode()).hexdigest()
+        values = asdict(replace(self, name=""))
+        for part in (values, *values["records"]):
+            if not part["inputs"]:
+                del part["inputs"]
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
     def job(self, index: int) -> Job:
         """One batch, by itself."""
@@ -134,8 +154,19 @@ class Job:
     versions: Mapping[str, str] = field(default_factory=lambda: dict(versions()))
 
 
-def read_study(path: str | os.PathLike[str]) -> Study:
-    """Read and check a study file (docs/studies.md); models and records are looked for beside it.
+def _inputs_of(rows: tuple[tuple[float, ...], ...]) -> Inputs | None:
+    table = np.array(rows)
+    return Inputs(table[:, 0], table[:, 1:]) if rows else None
+
+
+def _rows_of(inputs: Inputs | None) -> tuple[tuple[float, ...], ...]:
+    return () if inputs is None else tuple(map(tuple, np.column_stack([inputs.times, inputs.values]).tolist()))
+
+
+def read_study(path: str | os.PathLike[str], inputs: str | os.PathLike[str] | None = None) -> Study:
+    """Read and check a study file (docs/how-to/compare-filters.md); models and records are looked for beside it.
+
+    `inputs` is a CSV file with the known inputs of its models, for records without columns for them.
 
     Every method is asked whether it holds for every model, before anything runs.  Raises InputError, in one line that names the
     file and the key, for what cannot be used; ConditionError where a method does not hold.
@@ -143,16 +174,18 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     where, source = Path(path), shown(path)
     text = read_text(where, source, "study")
     with named(source):
-        study, models = study_of(read_keys(text, "study"), where.stem, where.parent)
+        study, models = study_of(read_keys(text, "study"), where.stem, where.parent, inputs)
         for model in models:
             _check(study, model, first=model is models[0])
     return study
 
 
-def study_of(keys: Mapping[str, Any], name: str, folder: Path) -> tuple[Study, list[Model]]:
-    """The study of these keys, and the model of each of its points, before any method is asked whether it holds.
+def study_of(
+    keys: Mapping[str, Any], name: str, folder: Path, inputs: str | os.PathLike[str] | None = None
+) -> tuple[Study, list[Model]]:
+    """Return the study of these keys, and the model of each of its points, before any method is asked whether it holds.
 
-    name: what it is called where it does not say so. folder: where models and records are looked for.
+    name: what it is called where it does not say so. folder: where models and records are. inputs: as for `read_study`.
     """
     _entries.known_keys(keys, KEYS)
     for key in ("models", "methods"):
@@ -160,11 +193,15 @@ def study_of(keys: Mapping[str, Any], name: str, folder: Path) -> tuple[Study, l
             raise InputError(f"{key}: missing; a study needs models and methods, and seeds with times, or records")
     methods = _methods(keys["methods"])
     models = _models(keys, folder)
+    known = None if inputs is None else read_inputs(inputs, models[0][1])
+    if any(model.inputs != models[0][1].inputs for _, model in models):
+        raise InputError("models: their inputs differ; give models with other inputs a study of their own")
     given = {
         "name": _text("name", keys.get("name", name)),
         "methods": methods,
         "points": tuple(point for point, _ in models),
-        **_runs(keys, [model for _, model in models], folder),
+        "inputs": _rows_of(known),
+        **_runs(keys, [model for _, model in models], folder, known),
         **_numbers(keys),
     }
     reference = keys.get("reference")
@@ -311,12 +348,12 @@ def _plain(key: str, value: Any) -> Any:
     raise InputError(f"options.{_shown(key)}: expected a number, a text, true, false or a list of them, got {kind}")
 
 
-def _runs(keys: Mapping[str, Any], models: list[Model], folder: Path) -> dict[str, Any]:
+def _runs(keys: Mapping[str, Any], models: list[Model], folder: Path, known: Inputs | None) -> dict[str, Any]:
     if "records" in keys:
         for key in ("seeds", "times"):
             if key in keys:
                 raise InputError(f"{key}: the records are given, so nothing is simulated; take {key} or records out")
-        return {"records": _records(keys["records"], models, folder)}
+        return {"records": _records(keys["records"], models, folder, known)}
     for key in ("seeds", "times"):
         if key not in keys:
             raise InputError(f"{key}: missing; give seeds and times for simulated records, or records")
@@ -339,7 +376,7 @@ def _runs(keys: Mapping[str, Any], models: list[Model], folder: Path) -> dict[st
     }
 
 
-def _records(value: Any, models: list[Model], folder: Path) -> tuple[Given, ...]:
+def _records(value: Any, models: list[Model], folder: Path, known: Inputs | None) -> tuple[Given, ...]:
     if not isinstance(value, list) or not value:
         raise InputError('records: expected a list of tables, as in [[records]] with file = "a.csv"')
     if len(value) > MOST_RECORDS:
@@ -356,6 +393,10 @@ def _records(value: Any, models: list[Model], folder: Path) -> tuple[Given, ...]
             record, truth = read_record(folder / file, models[0]), None
             if "truth" in table:
                 truth = _truth(folder / _text("truth", table["truth"]), models[0], record)
+            own = record.inputs
+            if own is not None and known is not None:
+                raise InputError(f"{file[:80]} has columns for the inputs, and --inputs gives them too; give them once")
+            record = record if own is not None else replace(record, inputs=known)
             for model in models:
                 check_records(model, record)
                 if truth is not None and len(truth[0]) != model.n:
@@ -363,7 +404,7 @@ def _records(value: Any, models: list[Model], folder: Path) -> tuple[Given, ...]
             times = tuple(record.times.tolist())
             if found and times != found[0].times:
                 raise InputError(f"file: its times are not those of {found[0].label}; give it a study of its own")
-            found.append(Given(file, times, tuple(map(tuple, record.values.tolist())), truth))
+            found.append(Given(file, times, tuple(map(tuple, record.values.tolist())), truth, _rows_of(own)))
     return tuple(found)
 
 
@@ -418,7 +459,8 @@ def _numbers(keys: Mapping[str, Any]) -> dict[str, Any]:
 def _check(study: Study, model: Model, first: bool) -> None:
     """Check that every method holds for the model, and, once, that it accepts its options, before anything runs."""
     times = times_of(study, model)
-    record = Record(times, np.zeros((len(times), model.m)), model.observation_kind)
+    record = Record(times, np.zeros((len(times), model.m)), model.observation_kind, study.known_inputs)
+    record = study.record(model, study.records[0]) if study.records else record
     check_records(model, record)
     for entry in study.methods:
         with named(f"methods.{_shown(entry.label)}"):

@@ -94,7 +94,7 @@ def run(
     work.add()
     spectrum, model = Spectrum.of(), Model(state=["x"], drift=["x - x**3"], observation=["0"])
     y = np.linspace(-1, 1, 9)
-    near = heat_series(model, y[:, None], order, degree=16)
+    near = heat_series(model, y, order, degree=16)
     errors = {N: [series_error(spectrum, near, y, t, N) for t in TIMES] for N in range(order + 1)}
     comparisons += orders(errors) + [equation_14(spectrum)]
     work.add()
@@ -193,7 +193,7 @@ def statistics_mean(times: np.ndarray, increments: np.ndarray, mean: float, vari
 def series_error(spectrum: Spectrum, near: HeatSeries, y: np.ndarray, t: float, N: int) -> float:
     """The largest relative error of the sum up to t^N for |x - y| <= 2 sqrt(t)."""
     z = 2 * np.sqrt(t) * np.linspace(-1, 1, 17)
-    points = np.broadcast_to(z[:, None, None], (len(z), len(y), 1))
+    points = np.broadcast_to(z[:, None], (len(z), len(y)))
     exact = spectrum.kernel(y + z[:, None], y, t)
     return float(np.max(np.abs(np.asarray(near.offset(points, t, "sum", N)) / exact - 1)))
 
@@ -224,7 +224,7 @@ def compositions(spectrum: Spectrum, model: Model) -> dict[str, list[float]]:
     """The error in L1 after a unit of time of a density that starts as N(1/2, 1/10), by joining kernels (Theorem 12)."""
     x = np.linspace(-4, 4, 321)
     cell = x[1] - x[0]
-    heat = heat_series(model, x[:, None], 2)
+    heat = heat_series(model, x, 2)
     start = np.exp(-((x - 0.5) ** 2) / 0.2) / np.sqrt(0.2 * np.pi)
     lattice = spectrum.x
     inner = np.exp(-((lattice - 0.5) ** 2) / 0.2 - primitive(lattice)) / np.sqrt(0.2 * np.pi)

@@ -1,0 +1,279 @@
+"""The posterior of parameters given a record, by the no-U-turn sampler on the evidence of the filter."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from zakai.engine.batch import Progress
+from zakai.engine.likelihood import LogLikelihood, chosen_parameters
+from zakai.engine.priors import Prior
+from zakai.errors import InputError
+from zakai.models.model import Model
+from zakai.records import Record
+
+if TYPE_CHECKING:
+    import xarray
+
+Array = NDArray[Any]
+STEP = 1e-4  # of the differences that give the force, in posterior standard deviations
+LARGEST_R_HAT = 1.01
+
+
+def sample(
+    model: Model,
+    record: Record,
+    priors: Mapping[str, str],
+    draws: int = 1000,
+    chains: int = 2,
+    seed: int = 0,
+    *,
+    warmup: int = 300,
+    method: str = "auto",
+    progress: Progress | None = None,
+    **options: Any,
+) -> xarray.Dataset:
+    """Draw from the posterior of parameters given a record.
+
+        p(theta | observations) is proportional to p(observations | theta) p(theta)
+
+    The evidence is that of `zakai.log_likelihood`, so that the states are integrated out.  The sampler is NUTS with window
+    adaptation (blackjax, the extra `bayes`), after a linear transform by the Hessian at the posterior's mode.
+
+    Args:
+        model: the system, with a prior of the state and with parameters.
+        record: K observations.
+        priors: for each parameter to sample its prior: "normal(mean, standard deviation)", "lognormal(mean, standard deviation)"
+            (of the logarithm), "half-normal(scale)", "gamma(shape, rate)", "uniform(low, high)" or "beta(a, b)".  The other
+            parameters keep their values.
+        draws: number of draws of each chain that are kept.
+        chains: number of chains.
+        seed: the same seed gives the same draws.
+        warmup: number of draws of each chain for adaptation, which are not kept.
+        method: as for `zakai.filter`.
+        progress: called with the number of draws done and their total; by default a line on a terminal.
+        **options: options of the method.
+
+    Returns:
+        One variable for each parameter over `chain` and `draw`, each with attributes `r_hat` (split R-hat) and `ess` (effective
+        sample size).  The attributes of the whole are `divergences`, the largest `r_hat`, the smallest `ess`, and `method`.
+
+    Raises:
+        InputError: a wrong prior, an unknown parameter, blackjax is not installed, and as `zakai.filter`.
+        ConditionError: the method's theorem does not hold.
+
+    References:
+        Hoffman and Gelman 2014, The No-U-Turn Sampler.
+        Vehtari, Gelman, Simpson, Carpenter and Buerkner 2021, Rank-normalization, folding, and localization: An improved R-hat.
+
+    Example:
+
+        posterior = zakai.sample(model, record, {"a": "lognormal(0, 1)", "s": "half-normal(1)"})
+        posterior["a"].mean(), posterior.attrs["r_hat"]
+    """
+    if not isinstance(priors, Mapping) or not priors:
+        raise InputError('priors: expected a dictionary by parameter name, such as {"a": "normal(0, 1)"}')
+    for name, number, least in (("draws", draws, 4), ("chains", chains, 1), ("warmup", warmup, 20)):
+        if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < least:
+            raise InputError(f"sample: {name} is {number!r}; expected a whole number of at least {least}")
+    names = chosen_parameters(model, tuple(priors))
+    posterior = _Posterior(LogLikelihood(model, record, method, names, dict(options)), names, priors)
+    try:
+        import blackjax
+    except ImportError:
+        raise InputError("sample: blackjax is not installed; install the extra bayes: pip install 'zakai[bayes]'") from None
+    report = _line if progress is None and sys.stderr.isatty() else progress
+    posterior.whiten(np.array([posterior.priors[i].place(model.parameters[name]) for i, name in enumerate(names)]))
+    rng = np.random.default_rng(seed)
+    found, divergences = np.empty((chains, draws, len(names))), 0
+    with _double_precision():
+        for chain in range(chains):
+            start = posterior.start(rng)
+            key = int(rng.integers(2**31))
+
+            def done(count: int, chain: int = chain) -> None:
+                if report is not None:
+                    report(chain * draws + count, chains * draws)
+
+            found[chain], diverged = _chain(blackjax, posterior, start, key, warmup, draws, done)
+            divergences += diverged
+    values = np.array([[posterior.values(w) for w in one] for one in found])
+    return _dataset(blackjax, values, names, divergences, posterior.method)
+
+
+class _Posterior:
+    """The log posterior as a function of whitened coordinates w: u = mode + factor w, theta_i = prior_i.value(u_i)."""
+
+    def __init__(self, likelihood: LogLikelihood, names: tuple[str, ...], priors: Mapping[str, str]):
+        self.likelihood = likelihood
+        self.priors = [Prior(name, priors[name]) for name in names]
+        self.mode: Array = np.zeros(len(names))
+        self.factor: Array = np.eye(len(names))
+        settings = likelihood._plan.settings
+        self.method = ", ".join(dict.fromkeys(setting.method.name for setting in settings))
+
+    def values(self, w: Array) -> Array:
+        """Return the parameters at w."""
+        return np.array([prior.value(u) for prior, u in zip(self.priors, self.mode + self.factor @ w, strict=True)])
+
+    def __call__(self, w: Array) -> float:
+        """Return the log posterior density of w, up to a constant; -inf where the model does not exist."""
+        with np.errstate(all="ignore"):
+            u = self.mode + self.factor @ w
+            values = self.values(w)
+            if not np.isfinite(values).all():
+                return -np.inf
+            prior = sum(one.log_density(place) for one, place in zip(self.priors, u, strict=True))
+            total = self.likelihood(values) + prior
+        return float(total) if np.isfinite(total) else -np.inf
+
+    def value_and_force(self, w: Array) -> tuple[float, Array]:
+        """Return the value and its gradient by differences.
+
+        Leapfrog steps are reversible and keep volume for any force that is a function of w, and the value decides on acceptance:
+        the error of the differences does not change what is sampled.
+        """
+        value = self(w)
+        if not np.isfinite(value):
+            return value, np.zeros(len(w))
+        slopes = np.array([(self(w + STEP * row) - value) / STEP for row in np.eye(len(w))])
+        return value, np.where(np.isfinite(slopes), slopes, 0.0)
+
+    def whiten(self, start: Array) -> None:
+        """Set the coordinates by the mode and the Hessian there, where it is negative definite."""
+        self.mode = start
+        if not np.isfinite(self(np.zeros(len(start)))):
+            raise InputError(
+                f"sample: the log-likelihood is not finite at {self._shown(self.values(np.zeros(len(start))))}; give the model "
+                "parameters at which the record is possible"
+            )
+
+        def objective(w: Array) -> tuple[float, Array]:
+            value, force = self.value_and_force(w)
+            return -max(value, -1e300), -force
+
+        found = minimize(objective, np.zeros(len(start)), jac=True, method="L-BFGS-B", options={"maxiter": 100, "ftol": 1e-7})
+        mode = found.x
+        size = np.full(len(mode), 1e-2)
+        for _ in range(2):  # the second time with steps of half a standard deviation
+            hessian = self._hessian(mode, size)
+            curvature = -np.diag(hessian)
+            size = np.where(curvature > 0, 0.5 / np.sqrt(np.abs(curvature) + 1e-300), size)
+            size = np.clip(size, 1e-6, 1.0)
+        self.mode = mode + start
+        try:
+            self.factor = np.linalg.cholesky(np.linalg.inv(-hessian))
+        except np.linalg.LinAlgError:
+            self.factor = np.diag(size)
+        if not np.isfinite(self.factor).all():
+            self.factor = np.eye(len(mode))
+
+    def _hessian(self, w: Array, size: Array) -> Array:
+        rows = np.diag(size)
+        middle = self(w)
+        second = np.empty((len(w), len(w)))
+        ends = [(self(w + row), self(w - row)) for row in rows]
+        for i, (above, below) in enumerate(ends):
+            second[i, i] = (above - 2 * middle + below) / size[i] ** 2
+        for i in range(len(w)):
+            for j in range(i):
+                both = self(w + rows[i] + rows[j]) + self(w - rows[i] - rows[j]) - 2 * middle
+                mixed = both - size[i] ** 2 * second[i, i] - size[j] ** 2 * second[j, j]
+                second[i, j] = second[j, i] = mixed / (2 * size[i] * size[j])
+        return np.nan_to_num(second, nan=0.0, posinf=0.0, neginf=0.0)
+
+    def start(self, rng: np.random.Generator) -> Array:
+        """Return a start of a chain, wider than the posterior."""
+        for _ in range(100):
+            w = 1.5 * rng.standard_normal(len(self.mode))
+            if np.isfinite(self(w)):
+                return w
+        return np.zeros(len(self.mode))
+
+    def _shown(self, values: Array) -> str:
+        return ", ".join(f"{name} = {value:g}" for name, value in zip(self.likelihood.names, values, strict=True))
+
+
+@contextmanager
+def _double_precision() -> Iterator[None]:
+    """Use double precision in JAX, in all threads: its callbacks run in others."""
+    import jax
+
+    before = jax.config.jax_enable_x64  # type: ignore[attr-defined]
+    jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_x64", before)  # type: ignore[no-untyped-call]
+
+
+def _chain(
+    blackjax: Any, posterior: _Posterior, start: Array, key: int, warmup: int, draws: int, done: Callable[[int], None]
+) -> tuple[Array, int]:
+    """Return the draws (draws, p) of one chain in whitened coordinates, and the number of divergences."""
+    import jax
+
+    p = len(start)
+    shapes = tuple(jax.ShapeDtypeStruct(shape, "float64") for shape in ((), (p,)))  # type: ignore[no-untyped-call]
+
+    def host(w: Any) -> tuple[Array, Array]:
+        value, force = posterior.value_and_force(np.asarray(w))
+        return np.asarray(value), force
+
+    def both(w: Any) -> Any:
+        return jax.pure_callback(host, shapes, w, vmap_method="sequential")
+
+    @jax.custom_vjp
+    def log_density(w: Any) -> Any:
+        return both(w)[0]
+
+    log_density.defvjp(both, lambda force, cotangent: (cotangent * force,))
+    adapt_key, draw_key = jax.random.split(jax.random.key(key))
+    adaptation = blackjax.window_adaptation(blackjax.nuts, log_density, is_mass_matrix_diagonal=False)
+    (state, parameters), _ = adaptation.run(adapt_key, jax.numpy.asarray(start), num_steps=warmup)
+    step = jax.jit(blackjax.nuts(log_density, **parameters).step)
+    found, diverged = np.empty((draws, p)), 0
+    for i, one in enumerate(jax.random.split(draw_key, draws)):
+        state, info = step(one, state)
+        found[i] = state.position
+        diverged += int(info.is_divergent)
+        done(i + 1)
+    return found, diverged
+
+
+def _dataset(blackjax: Any, values: Array, names: tuple[str, ...], divergences: int, method: str) -> xarray.Dataset:
+    """Return the draws (chains, draws, p) with their diagnostics."""
+    import xarray
+
+    chains, draws, _ = values.shape
+    half = draws // 2
+    split = np.concatenate([values[:, :half], values[:, draws - half :]])
+    variables, worst, least = {}, 0.0, np.inf
+    for i, name in enumerate(names):
+        r_hat = float(blackjax.diagnostics.potential_scale_reduction(split[:, :, i]))
+        ess = float(blackjax.diagnostics.effective_sample_size(split[:, :, i]))
+        worst, least = max(worst, r_hat), min(least, ess)
+        variables[name] = (("chain", "draw"), values[:, :, i], {"r_hat": r_hat, "ess": ess})
+    if worst > LARGEST_R_HAT or divergences > 0.01 * chains * draws:
+        warnings.warn(
+            f"sample: R-hat is {worst:.3f}, with {divergences} divergences: the chains do not represent the posterior; draw "
+            "more, or give narrower priors",
+            stacklevel=3,
+        )
+    coordinates = {"chain": np.arange(chains), "draw": np.arange(draws)}
+    about = {"divergences": divergences, "r_hat": worst, "ess": least, "method": method}
+    return xarray.Dataset(variables, coords=coordinates, attrs=about)
+
+
+def _line(done: int, total: int) -> None:
+    """Write the progress on a terminal, in place."""
+    if done % 20 == 0 or done == total:
+        sys.stderr.write(f"\rsampling: {done} of {total} draws" + ("\n" if done == total else ""))
+        sys.stderr.flush()

@@ -1,0 +1,132 @@
+"""What an online filter knows after an observation."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from statistics import NormalDist
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from zakai.densities import Density, ProductDensity
+from zakai.densities.product import renamed
+from zakai.engine.blocks import SMALLEST_IS_WORST
+from zakai.engine.feed import Feed, Moment
+from zakai.engine.results import warnings_of_step
+from zakai.errors import InputError
+from zakai.models.prior import GaussianPrior
+
+if TYPE_CHECKING:
+    from zakai.engine.online import Online
+
+
+class Estimate:
+    """The posterior at a time: its moments, the health of the step, and the whole density."""
+
+    __slots__ = ("_online", "_moments", "_density")
+
+    def __init__(self, online: Online, moments: tuple[Moment, ...]):
+        self._online, self._moments = online, moments
+        self._density: Density | None = None
+
+    def __repr__(self) -> str:
+        names = self._online.model.state
+        deviations = np.sqrt(np.maximum(np.diag(self.cov), 0.0))
+        parts = (f"{name} = {mean:.6g} +- {deviation:.3g}" for name, mean, deviation in zip(names, self.mean, deviations))
+        return f"Estimate(t = {self.time:g}: {', '.join(parts)})"
+
+    @property
+    def time(self) -> float:
+        """The time of the estimate."""
+        return self._moments[0].time
+
+    @property
+    def mean(self) -> np.ndarray:
+        """The mean of the state (n,)."""
+        means = [self._part(i).mean() if one.info is None else one.info.mean for i, one in enumerate(self._moments)]
+        if self._online.blocks is None:
+            return means[0]
+        mean = np.empty(self._online.model.n)
+        for block, part in zip(self._online.blocks, means, strict=True):
+            mean[list(block.states)] = part
+        return mean
+
+    @property
+    def cov(self) -> np.ndarray:
+        """The covariance of the state (n, n)."""
+        covs = [self._part(i).cov() if one.info is None else one.info.cov for i, one in enumerate(self._moments)]
+        if self._online.blocks is None:
+            return covs[0]
+        cov = np.zeros((self._online.model.n,) * 2)
+        for block, part in zip(self._online.blocks, covs, strict=True):
+            cov[np.ix_(block.states, block.states)] = part
+        return cov
+
+    @property
+    def log_likelihood_increment(self) -> float:
+        """What the observation adds to the log-likelihood; zero where there was none."""
+        return sum(float(one.info.log_likelihood_increment) for one in self._moments if one.info is not None)
+
+    @property
+    def health(self) -> dict[str, float]:
+        """The health figures of the step, of blocks the worst."""
+        worst: dict[str, float] = {}
+        for moment in self._moments:
+            for name, figure in ({} if moment.info is None else moment.info.health).items():
+                choose = min if name in SMALLEST_IS_WORST else max
+                worst[name] = choose(float(figure), worst[name]) if name in worst else float(figure)
+        return worst
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for every bound that this step exceeded, and for what else is to be known of it."""
+        said: dict[str, None] = {}
+        for feed, moment in zip(self._online.feeds, self._moments, strict=True):
+            said.update(dict.fromkeys(moment.notes))
+            if moment.info is not None:
+                said.update(dict.fromkeys(warnings_of_step(moment.info.health, feed.setting.method.bounds)))
+        return tuple(said)
+
+    @property
+    def density(self) -> Density:
+        """The conditional density of the state."""
+        if self._density is None:
+            online, parts = self._online, [self._part(i) for i in range(len(self._moments))]
+            if online.blocks is None:
+                self._density = parts[0]
+            else:
+                model, blocks = online.model, online.blocks
+                named = [renamed(part, block.names) for part, block in zip(parts, blocks, strict=True)]
+                angles = tuple(name in model.periodic for name in model.state)
+                self._density = ProductDensity(named, tuple(block.states for block in blocks), model.state, angles)
+        return self._density
+
+    def interval(self, probability: float = 0.95) -> np.ndarray:
+        """Return the credible interval of each coordinate (n, 2): half of the rest lies outside on each side."""
+        if not 0 < probability < 1:
+            raise InputError(f"interval: the probability {probability!r} must be between 0 and 1")
+        tail = 0.5 * (1 - probability)
+        online, found = self._online, np.empty((self._online.model.n, 2))
+        for i, (feed, moment) in enumerate(zip(online.feeds, self._moments, strict=True)):
+            info = moment.info
+            if info is not None and _is_gaussian(feed):
+                half = _deviations(1 - tail) * np.sqrt(np.maximum(info.cov.diagonal(), 0.0))
+                part = np.array([info.mean - half, info.mean + half]).T
+            else:
+                part = self._part(i).quantile([tail, 1 - tail]).T
+            found[slice(None) if online.blocks is None else list(online.blocks[i].states)] = part
+        return found
+
+    def _part(self, index: int) -> Density:
+        return self._online.feeds[index].density(self._moments[index])
+
+
+@lru_cache(maxsize=8)
+def _deviations(probability: float) -> float:
+    return NormalDist().inv_cdf(probability)
+
+
+def _is_gaussian(feed: Feed) -> bool:
+    """Return whether the density is a Gaussian at all times."""
+    name, prior = feed.setting.method.name, feed.setting.prior
+    return name == "extended-kalman-bucy" or (name == "kalman-bucy" and isinstance(prior, GaussianPrior))

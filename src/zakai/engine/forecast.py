@@ -1,0 +1,69 @@
+"""Forecasts: the density of the state after the end of a record, by the steps of the filter with nothing observed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zakai.algebra.conditions import Condition
+from zakai.engine.batch import filter_all
+from zakai.engine.loop import Run
+from zakai.errors import InputError
+from zakai.records import Inputs, Record
+from zakai.records.inputs import check_inputs
+
+if TYPE_CHECKING:
+    from zakai.engine.plan import Plan
+    from zakai.engine.results import FilterResult
+
+
+def origin_of(result: FilterResult, what: str) -> tuple[Plan, tuple[Any, ...], Record]:
+    """Return how a result was computed, the last states of its runs, and its record.
+
+    Raises:
+        InputError: the result was read from a file.
+    """
+    if result.origin is None or result.record is None:
+        raise InputError(f"{what}: a result that was read from a file does not hold its filter; filter the record again")
+    return result.origin[0], result.origin[1], result.record
+
+
+def forecast(result: FilterResult, times: Any, inputs: Inputs | None = None) -> FilterResult:
+    """Return the density of the state at times after a record; see `FilterResult.forecast`."""
+    plan, states, record = origin_of(result, "forecast")
+    values = np.full((np.size(times), record.values.shape[1]), np.nan)
+    known = record.inputs if inputs is None or record.inputs is None else record.inputs.followed_by(inputs)
+    future = Record(times, values, record.kind, known)
+    last = float(record.times[-1])
+    if future.times[0] <= last:
+        raise InputError(f"forecast: the time {future.times[0]:g} is not after the end of the record, {last:g}; give later times")
+    if result.model is not None:
+        check_inputs(result.model, future.inputs, float(future.times[-1]))
+    runs = [ForecastRun(run, state, last) for run, state in zip(plan.runs(future, None), states, strict=True)]
+    filter_all(runs, None, len(runs))
+    found = plan.result(runs)
+    found.record = future
+    found.times[0], found.mean[0] = last, result.mean[-1]
+    found.attributes["kind"] = "forecast"
+    return found
+
+
+class ForecastRun(Run):
+    """A run that continues another one from its last state."""
+
+    def __init__(self, run: Run, state: Any, last: float):
+        super().__init__(run.setting, run.record, None, run.most)
+        self.state = self.first = state
+        self.states = [state]
+        self.schedule.starts[0] = last
+
+    def result(
+        self,
+        why: str,
+        considered: Mapping[str, tuple[Condition, ...]],
+        prior_moments: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> FilterResult:
+        """Return the result; blocks that share a prior differ at the end of the record."""
+        return super().result(why, considered, self.prior_moments())

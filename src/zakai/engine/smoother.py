@@ -1,0 +1,159 @@
+"""Smoothing: p(x(t_k) | all observations), by the filter forward and a message backward.
+
+The forward pass keeps the state at the start of every segment only.  The backward pass filters a segment again, and takes the
+message p(later observations | x) through it, so that a record needs the memory of its checkpoints and of one segment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from zakai.algebra.conditions import Condition
+from zakai.densities import Density
+from zakai.engine.batch import Progress, filter_all
+from zakai.engine.driver import check_noise, check_records, planned
+from zakai.engine.loop import CHUNK, Run, advance, joined, stacked
+from zakai.engine.results import FilterResult, warnings_of_run
+from zakai.engine.setting import Setting
+from zakai.errors import InputError
+from zakai.methods._protocol import Infos
+from zakai.models.model import Model
+from zakai.records import Record
+
+_BOUND = 1e-6, "the evidence of the backward pass differs from the filter's, in nats"
+
+
+@dataclass(eq=False, repr=False)
+class SmoothingResult(FilterResult):
+    """The density of the state at every time of a record given all of its observations.
+
+    Index 0 is the model's start, index k the time of observation k.  `filtered` is the result of the filter; the
+    log-likelihood is the filter's.  All else is as for a `FilterResult`.
+    """
+
+    filtered: FilterResult | None = None
+
+    def __repr__(self) -> str:
+        return super().__repr__().replace("FilterResult", "SmoothingResult", 1)
+
+
+def smooth(
+    model: Model, record: Record, method: str = "auto", *, progress: Progress | None = None, **options: Any
+) -> SmoothingResult:
+    """Return the conditional density of the state given all observations, at every time of the record.
+
+    Args:
+        model: the system, with a prior.
+        record: K observations of the model's kind.
+        method: a method's name, or "auto", as for `zakai.filter`.
+        progress: called with the number of observations filtered and K.
+        **options: options of the method.
+
+    Raises:
+        InputError: a wrong record or option, or a method without a backward pass.
+        ConditionError: the method's theorem does not hold.
+
+    Example:
+
+        model = zakai.load_model("gallery:benes")
+        truth, record = zakai.simulate(model, np.arange(0.01, 1.0, 0.01))
+        smoothed = zakai.smooth(model, record)
+        smoothed.mean[0], smoothed.density(0).quantile([0.025, 0.975])
+    """
+    check_records(model, record)
+    plan = planned(model, None, method, options)
+    check_noise([plan], [record])
+    runs = [SmoothingRun(run.setting, run.record) for run in plan.runs(record, "moments")]
+    filter_all(runs, progress, len(runs))
+    filtered = plan.result(runs)
+    filtered.record = record
+    for run in runs:
+        run.smooth()
+    result = plan.result(runs)
+    result.record = record
+    result.attributes["kind"] = "smoothed"
+    return SmoothingResult(**{field.name: getattr(result, field.name) for field in fields(result)}, filtered=filtered)
+
+
+class SmoothingRun(Run):
+    """One record on its way through one method, and back."""
+
+    def __init__(self, setting: Setting, record: Record):
+        super().__init__(setting, record, "moments")
+        backward = setting.method.backward
+        if backward is None:
+            raise InputError(
+                f"smooth: the method {setting.method.name} has no backward pass; take kalman-bucy, benes or hu-yau, where one "
+                "holds"
+            )
+        self.backward = backward
+        backward.message(self.empty, self.state)  # a model without a smoother is refused before it is filtered
+        self.segments: list[tuple[int, Any]] = []  # the first interval of each, and the state at its start
+        self.messages: list[Any] = []  # at the end of each segment
+        self.start: tuple[np.ndarray, np.ndarray] | None = None
+
+    def _take(self, states: list[Any], infos: Infos) -> None:
+        self.segments.append((self.done, self.state))
+        super()._take(states, infos)
+
+    def _segment(self, number: int) -> tuple[range, Any, int, list[Any]]:
+        """Return the intervals of a segment, what is prepared for them and from which interval on, and the states around them."""
+        first, state = self.segments[number]
+        last = self.segments[number + 1][0] if number + 1 < len(self.segments) else len(self.schedule)
+        begin = first // CHUNK * CHUNK
+        prepared = self.setting.prepared(self.schedule.part(slice(begin, min(begin + CHUNK, len(self.schedule)))))
+        with np.errstate(all="ignore"):
+            states, _ = advance(self.setting, prepared, slice(first - begin, last - begin), state, self.values[first:last])
+        return range(first, last), prepared, begin, [state, *states]
+
+    def smooth(self) -> None:
+        """Replace the filter's moments by the smoothed ones."""
+        forward = joined(self.parts).log_likelihood_increment
+        message = self.backward.message(self.empty, self.state)
+        expected, self.parts, self.messages = 0.0, [], [None] * len(self.segments)
+        for number in reversed(range(len(self.segments))):
+            rows, prepared, begin, states = self._segment(number)
+            self.messages[number] = message
+            infos = []
+            for k in reversed(rows):
+                message, info = self.backward.smoothed(self.empty, states[k + 1 - rows.start], message)
+                error = abs(float(info.log_likelihood_increment) - expected)
+                health = {**info.health, "evidence_error": error}
+                infos.append(info._replace(log_likelihood_increment=forward[k], health=health))
+                expected = float(forward[k])
+                message = self.backward.step(prepared, k - begin, message, self.values[k])
+            self.parts.append(stacked(infos[::-1]))
+        self.parts.reverse()
+        _, info = self.backward.smoothed(self.empty, self.first, message)
+        figure = self.parts[0].health["evidence_error"]
+        figure[0] = max(figure[0], abs(float(info.log_likelihood_increment) - expected))
+        self.start = info.mean, info.cov
+
+    def density(self, index: int) -> Density:
+        """Return the smoothed density at an index of the result, made from the nearest checkpoints."""
+        number = max(i for i, (first, _) in enumerate(self.segments) if first < max(index, 1))
+        rows, prepared, begin, states = self._segment(number)
+        message = self.messages[number]
+        for k in reversed(range(max(index, rows.start), rows.stop)):
+            message, _ = self.backward.smoothed(self.empty, states[k + 1 - rows.start], message)
+            message = self.backward.step(prepared, k - begin, message, self.values[k])
+        return self.backward.density(self.empty, states[index - rows.start], message)
+
+    def result(
+        self,
+        why: str,
+        considered: Mapping[str, tuple[Condition, ...]],
+        prior_moments: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> FilterResult:
+        """Return the result, of the filter until the record is smoothed; blocks that share a prior differ at the start then."""
+        if self.start is None:
+            return super().result(why, considered, prior_moments)
+        result = super().result(why, considered, self.start)
+        result._density = self.density
+        result.bounds = {**result.bounds, "evidence_error": _BOUND}
+        result.warnings = [*self.notes, *warnings_of_run(result)]
+        return result

@@ -1,0 +1,134 @@
+"""The backward pass of the Gaussian families: what the observations after t say of the state at t.
+
+With u = e^phi v, the density of the later observations given x, times e^phi, obeys the adjoint of the equation of v, and stays
+
+    e^{-(x - a)'Lambda (x - a) / 2} sum_e e^{c_e + q_e.(x - a)}.
+
+It begins as e^phi at the last time.  The smoothed density is v times this message: a mixture of Gaussians.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from zakai.densities import GaussianMixture
+from zakai.errors import InputError
+from zakai.methods._gauge import Tilts, posterior
+from zakai.methods._gaussian_families import Prepared, State, health_of, health_of_gaussian, inputs_of, mixture_of
+from zakai.methods._protocol import Backward, Info
+from zakai.numerics.families import Family, solve, weigh
+from zakai.numerics.transition import Array, at, symmetric
+
+
+class Message(NamedTuple):
+    """The message above: `centre` a (n,), `information` Lambda (n, n), `slopes` q (E, n) and `logs` c (E,)."""
+
+    centre: Array
+    information: Array
+    slopes: Array
+    logs: Array
+
+    def around(self, centre: Array) -> Message:
+        """Return the same message with another centre."""
+        away = centre - self.centre
+        push = self.information @ away
+        return Message(
+            centre, self.information, self.slopes - push, self.logs + self.slopes @ away - 0.5 * away @ push
+        )
+
+
+def message(prepared: Prepared, state: State) -> Message:
+    """Return the message at the last time.
+
+    Raises:
+        InputError: e^phi is no sum of exponentials.
+    """
+    gauge, setup, n = prepared.gauge, prepared.setup, prepared.model.n
+    if not gauge.exact and not gauge.trivial:
+        raise InputError(
+            f"{prepared.model.source}: smooth: e^phi of this system is not a sum of exponentials, and its smoother needs that; "
+            "take another method"
+        )
+    slopes, logs = np.zeros((1, n)), np.zeros(1)
+    if not gauge.trivial:
+        tilts = gauge.at_one(state.time)
+        assert tilts.slopes is not None and tilts.logs is not None
+        slopes, logs = tilts.slopes, tilts.logs
+    quadratic = setup.system.quadratic(setup.theta, setup.origin)
+    matrix, slope = (np.zeros((n, n)), np.zeros(n)) if quadratic is None else quadratic
+    return Message(np.zeros(n), -matrix, slopes + slope, logs)
+
+
+@np.errstate(all="ignore")
+def backward(prepared: Prepared, k: int, later: Message, values: Array) -> Message:
+    """Return the message at the start of interval k from that at its end; `values` (m,) are what is observed."""
+    ends, rows = prepared.ends, prepared.ends.observed[k]
+    centre, information, slopes, logs = later
+    if rows.any():
+        white, H = (ends.whiten[k] @ values)[rows], ends.slope[k][rows]
+        residual = white - ends.intercept[k][rows] - H @ centre
+        information, slopes = information + H.T @ H, slopes + residual @ H
+        constant = ends.constant[k] - 0.5 * residual @ residual + (0.5 * white @ white if ends.relative else 0.0)
+        logs = logs + constant
+    if prepared.lengths[k] == 0:
+        return Message(centre, information, slopes, logs)
+    own, inputs = at(prepared.transitions, k), inputs_of(prepared, k, values)
+    # The average over x -> Psi x + b + N(0, Gamma): with W = (I + Gamma Lambda)^-1,
+    # Psi'Lambda W Psi, Psi'(W'q - Lambda W b), q'W b - b'Lambda W b / 2 + q'W Gamma q / 2 - log |I + Gamma Lambda| / 2.
+    system = np.eye(len(centre)) + own.noise @ information
+    start, n = own.map @ centre + own.offset @ inputs - centre, len(centre)
+    both, log_volume = solve(system[None], np.column_stack([own.map, start, own.noise])[None])
+    solved = both[0]
+    moved, offset, noise = solved[:, :n], solved[:, n], symmetric(solved[:, n + 1 :])
+    push = own.information @ centre
+    pull = own.vector @ inputs - push
+    constant = (
+        inputs @ own.constant @ inputs + pull @ centre + 0.5 * push @ centre
+        - 0.5 * start @ information @ offset - 0.5 * log_volume[0]
+    )  # fmt: skip
+    return Message(
+        centre,
+        symmetric(own.map.T @ information @ moved) + own.information,
+        slopes @ moved - offset @ information @ own.map + pull,
+        logs + slopes @ offset + 0.5 * np.sum((slopes @ noise) * slopes, axis=1) + constant,
+    )
+
+
+def _product(state: State, later: Message) -> tuple[Message, Family, Tilts]:
+    """Return the message about the state's mean, the families weighed by its largest exponential, and the others' excess."""
+    families = state.families
+    own = later.around(families.mean[np.argmax(families.log_mass)])
+    first = np.argmax(own.logs)
+    shifted = families._replace(mean=families.mean - own.centre)
+    weighed = weigh(shifted, own.information, own.slopes[first], own.logs[first])
+    return own, weighed, Tilts(own.slopes[:0], own.slopes - own.slopes[first], own.logs - own.logs[first])
+
+
+@np.errstate(all="ignore")
+def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message, Info]:
+    """Return the message, normalised so that its product with the state has mass one, and the moments of the product.
+
+    The `log_likelihood_increment` is the logarithm of the mass before: the evidence of the observations that the message has
+    gained since it was normalised.
+    """
+    own, families, tilts = _product(state, later)
+    origin = own.centre + prepared.setup.origin
+    if len(own.logs) == len(families.log_mass) == 1 and not families.nodes.shape[2]:
+        log_mass, mean, cov = families.log_mass[0], families.mean[0], families.cov[0]
+        health = health_of_gaussian(cov)
+    else:
+        found = posterior(prepared.gauge, tilts, state.time, families)
+        log_mass, mean, cov, health = found.log_mass, found.mean, found.cov, health_of(state, families, found)
+    return own._replace(logs=own.logs - log_mass), Info(log_mass, mean + origin, cov, health)
+
+
+def density(prepared: Prepared, state: State, later: Message) -> GaussianMixture:
+    """Return the smoothed density."""
+    own, families, tilts = _product(state, later)
+    found = posterior(prepared.gauge, tilts, state.time, families)
+    return mixture_of(prepared.model, prepared.setup.origin + own.centre, families, found)
+
+
+BACKWARD: Backward[Prepared, State, Message] = Backward(message, backward, smoothed, density)

@@ -1,0 +1,113 @@
+"""One state between natural ends, in a variable w on the whole line.
+
+    x = lower + e^w,    x = upper - e^-w,    x = lower + (upper - lower) / (1 + e^-w)
+
+By Ito's formula w has the drift f / x' - G x'' / (2 x'^3) and the diffusion g / x'.  A natural end is not reached, so that the
+density of w is negligible far out.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import sympy as sp
+
+from zakai.models.model import Model
+
+Array = Any
+_DERIVED = ("text", "observation_law", "covariance", "features")  # attributes that a model computes from its formulas
+
+
+class Variable(NamedTuple):
+    """The map between x in an interval and w."""
+
+    lower: float
+    upper: float
+
+    @property
+    def end(self) -> float:
+        """The end from which `offset` counts."""
+        return self.upper if np.isinf(self.lower) else self.lower
+
+    def offset(self, w: Array) -> Array:
+        """Return x less one of the ends, without cancellation."""
+        with np.errstate(over="ignore"):
+            if np.isinf(self.upper):
+                return np.exp(w)
+            if np.isinf(self.lower):
+                return -np.exp(-w)
+            return (self.upper - self.lower) / (1.0 + np.exp(-w))
+
+    def x(self, w: Array) -> Array:
+        """Return x."""
+        return self.end + self.offset(w)
+
+    def w(self, x: Array) -> Array:
+        """Return w, infinite at an end, NaN outside."""
+        with np.errstate(all="ignore"):
+            if np.isinf(self.upper):
+                return np.log(x - self.lower)
+            if np.isinf(self.lower):
+                return -np.log(self.upper - x)
+            return np.log(x - self.lower) - np.log(self.upper - x)
+
+    def log_slope(self, w: Array) -> Array:
+        """Return log dx/dw."""
+        if np.isinf(self.upper):
+            return w
+        if np.isinf(self.lower):
+            return -w
+        return np.log(self.upper - self.lower) - np.logaddexp(0.0, w) - np.logaddexp(0.0, -w)
+
+    def formula(self, w: sp.Symbol) -> sp.Expr:
+        """Return x as a formula."""
+        lower, upper = (sp.nsimplify(end, rational=True) if np.isfinite(end) else None for end in self)
+        if upper is None:
+            return lower + sp.exp(w)
+        if lower is None:
+            return upper - sp.exp(-w)
+        return lower + (upper - lower) / (1 + sp.exp(-w))
+
+
+def variable_of(model: Model) -> Variable | None:
+    """Return the variable of a model whose state has a domain."""
+    if not model.domain:
+        return None
+    interval = model.domain[model.state[0]]
+    return Variable(interval.lower, interval.upper)
+
+
+@lru_cache(maxsize=32)
+def on_the_line(model: Model) -> Model:
+    """Return the model for w, whose state has the same symbol; a model without a domain is returned as it is."""
+    variable = variable_of(model)
+    if variable is None:
+        return model
+    w = model.x[0]
+    x = variable.formula(w)
+    first, second = sp.diff(x, w), sp.diff(x, w, 2)
+
+    arranged = sp.expand if np.isinf(variable.upper - variable.lower) else sp.together
+
+    def moved(formula: sp.Expr, factor: Any = 1, more: Any = 0) -> sp.Expr:
+        return sp.powsimp(arranged(formula.subs(w, x) * factor + more))
+
+    def matrix(formulas: sp.MatrixBase, factor: Any = 1) -> sp.ImmutableMatrix:
+        return sp.ImmutableMatrix(formulas.applyfunc(lambda entry: moved(entry, factor)))
+
+    ito = -model.covariance[0, 0].subs(w, x) * second / (2 * first**3)
+    other = object.__new__(Model)
+    vars(other).update({key: value for key, value in vars(model).items() if key not in _DERIVED})
+    vars(other).update(
+        domain={},
+        prior=None,
+        drift=sp.ImmutableMatrix([[moved(model.drift[0], 1 / first, ito)]]),
+        diffusion=matrix(model.diffusion, 1 / first),
+        observation=matrix(model.observation),
+        observation_noise=matrix(model.observation_noise),
+        family_parameters={key: moved(value) for key, value in model.family_parameters.items()},
+        log_density=None if model.log_density is None else moved(model.log_density),
+    )
+    return other

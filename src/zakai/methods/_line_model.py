@@ -1,0 +1,145 @@
+"""The formulas of a model with one state as functions of points and times, with its inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import sympy as sp
+
+from zakai.models.features import OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
+from zakai.models.functions import Floor, Maximum, Minimum, TableFunction
+from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
+from zakai.models.tables import Table
+from zakai.records.inputs import Inputs
+
+Array = Any
+Function = Callable[..., Array]
+
+_JUMPS = (sp.sign, sp.Heaviside, Floor, sp.atan2)
+_KINKS = (sp.Abs, Minimum, Maximum)
+
+
+class Formulas(NamedTuple):
+    """Functions of x (..., 1), t (...), theta (p,) and the inputs; None where a derivative is not that of a smooth function.
+
+    `slope` is f', `spread` G', `observation_slope` h' and `curvature` h''.
+    """
+
+    drift: Function
+    slope: Function | None
+    covariance: Function
+    spread: Function | None
+    observation: Function
+    noise: Function
+    observation_slope: Function | None
+    curvature: Function | None
+    arguments: tuple[Function, ...]
+
+
+@lru_cache(maxsize=32)
+def _formulas(model: Model) -> Formulas:
+    """Return the functions of a model, made once."""
+    x, m = model.x[0], model.m
+    f, G, h = model.drift[0], model.covariance[0], list(model.observation)
+    smooth = all(_continuous(entry, x) and not _rough(entry, x) for entry in h)
+    first, second = [sp.diff(entry, x) for entry in h], [sp.diff(entry, x, 2) for entry in h]
+    return Formulas(
+        numpy_function(model.drift, model, (1,)),
+        numpy_function([sp.diff(f, x)], model, (1,)) if _continuous(f, x) else None,
+        numpy_function(model.covariance, model, (1, 1)),
+        numpy_function([sp.diff(G, x)], model, (1,)) if _continuous(G, x) and not _rough(G, x) else None,
+        numpy_function(model.observation, model, (m,)),
+        numpy_function(model.observation_noise, model, (m, m)),
+        numpy_function(first, model, (m,)) if smooth else None,
+        numpy_function(second, model, (m,)) if smooth else None,
+        tuple(numpy_function(list(call.args), model, (len(call.args),)) for call in _tables(model)),
+    )
+
+
+def _continuous(formula: sp.Expr, x: sp.Symbol) -> bool:
+    return not any(part.has(x) for part in formula.atoms(*_JUMPS))
+
+
+def _rough(formula: sp.Expr, x: sp.Symbol) -> bool:
+    """Return whether the derivative of a formula may jump."""
+    linear = any(part.table.degree == 1 and part.has(x) for part in formula.atoms(TableFunction))
+    return linear or any(part.has(x) for part in formula.atoms(*_KINKS))
+
+
+def _tables(model: Model) -> list[Any]:
+    """Return the calls of tables in the formulas of a model that depend on the state."""
+    parts = [*model.drift, *model.diffusion, *model.observation, *model.observation_noise, *model.family_parameters.values()]
+    parts += [] if model.log_density is None else [model.log_density]
+    calls = {call for part in parts for call in part.atoms(TableFunction) if call.has(model.x[0])}
+    return sorted(calls, key=str)
+
+
+class System:
+    """The formulas of a model with one state as functions of points, times and parameters; `inputs` are those of a record."""
+
+    def __init__(self, model: Model, inputs: Inputs | None = None):
+        x, given = model.x[0], {model.t, *model.u}
+        self.model, self.inputs, self.m = model, inputs, model.m
+        self.samples = model.observation_kind == "samples"
+        formulas = _formulas(model)
+        self.drift, self.covariance = self._bound(formulas.drift), self._bound(formulas.covariance)
+        self.observation, self.noise = self._bound(formulas.observation), self._bound(formulas.noise)
+        self.slope, self.spread = self._optional(formulas.slope), self._optional(formulas.spread)
+        self.observation_slope, self.curvature = self._optional(formulas.observation_slope), self._optional(formulas.curvature)
+        self._tables: list[tuple[Table, Function]] = [
+            (call.table, self._bound(arguments)) for call, arguments in zip(_tables(model), formulas.arguments, strict=True)
+        ]
+        # Whether G depends on the state, and whether samples have a law that is not N(h, S(t)).
+        self.state_dependent = STATE_DEPENDENT_DIFFUSION in model.features
+        self.general = bool(OF_OBSERVATION & model.features.keys())
+        self.rough = any(not _continuous(part, x) or _rough(part, x) for part in (model.drift[0], model.covariance[0]))
+        self.moving = bool((model.drift.free_symbols | model.covariance.free_symbols) & given)
+        self.steady_observation = not model.observation.free_symbols & given
+        self.steady_noise = not model.observation_noise.free_symbols & given
+        self.varying = self.moving or not (self.samples or (self.steady_observation and self.steady_noise))
+
+    @property
+    def tabulated(self) -> bool:
+        """Whether a formula contains a table of the state."""
+        return bool(self._tables)
+
+    def _bound(self, function: Function) -> Function:
+        """Return a function of points, times and parameters alone."""
+        inputs, hold = self.inputs, self.model.input_hold
+        if inputs is None:
+            return function
+
+        def bound(x: Array, t: Array, theta: Array) -> Array:
+            return function(x, t, theta, inputs.at(t, hold))
+
+        return bound
+
+    def _optional(self, function: Function | None) -> Function | None:
+        return None if function is None else self._bound(function)
+
+    def inputs_at(self, t: float) -> Array | None:
+        """Return the inputs at a time."""
+        return None if self.inputs is None else self.inputs.at(t, self.model.input_hold)
+
+    def pieces(self, start: float, stop: float) -> list[tuple[float, float]]:
+        """Return the parts of an interval in which the inputs have no jump and no kink."""
+        if self.inputs is None:
+            return [(start, stop)]
+        times = [start, *self.inputs.within(start, stop).tolist(), stop]
+        return list(zip(times[:-1], times[1:], strict=True))
+
+    def outside(self, points: Array, t: float, theta: Array) -> Array:
+        """Return which points (N,) lead beyond the range of a table."""
+        found = np.zeros(len(points), bool)
+        for table, arguments in self._tables:
+            found |= table.outside(*np.moveaxis(arguments(points[:, None], t, theta).real, -1, 0))
+        return found
+
+
+def within(times: Array, start: float, stop: float) -> Array:
+    """Return times of a piece, in which the end counts as the limit from inside."""
+    return np.clip(times, start, np.nextafter(stop, start))

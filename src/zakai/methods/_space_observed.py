@@ -1,0 +1,211 @@
+"""Observations on density grids: increments inside an interval as a potential, all others as a factor at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.methods._observation import log_likelihood
+from zakai.methods._space_system import System
+from zakai.models.model import Model
+from zakai.numerics.complex_step import is_complex, log_determinant
+from zakai.numerics.space_average import average, panel_rule
+from zakai.numerics.space_grid import Grid
+from zakai.numerics.space_transport import Dynamics, Factor
+from zakai.records.schedule import Schedule
+
+Array = Any
+CACHED = 2_000_000  # numbers of tables that are kept
+MOST_PANELS = 1024  # substeps for the variation of coefficients within an interval
+
+
+class Energy(NamedTuple):
+    """S^-1 h (J, m) and h'S^-1 h / 2 (J,) at the points of a grid, and their derivatives (n, J, m) and (n, J)."""
+
+    gain: Array
+    half: Array
+    gain_slopes: Array
+    half_slopes: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """What a schedule observes; `tables` keeps h, and its energy, at the points of grids."""
+
+    model: Model
+    schedule: Schedule
+    system: System
+    theta: Array
+    tables: dict[Any, Any]
+
+    @cached_property
+    def inside(self) -> Array:
+        """Whether a coordinate (K, m) is an increment over just its interval."""
+        samples = self.model.observation_kind == "samples"
+        return np.zeros(self.schedule.seen.shape, bool) if samples else self.schedule.inside
+
+    @cached_property
+    def lengths(self) -> Array:
+        """The lengths (K,) of the intervals."""
+        return self.schedule.lengths
+
+    @cached_property
+    def dynamics(self) -> Dynamics:
+        """The drift and the noise."""
+        return self.system.dynamics(self.theta)
+
+    def start(self, k: int) -> float:
+        """Return when interval k begins; zero where nothing depends on time, so that equal intervals are the same."""
+        return float(self.schedule.starts[k]) if self.system.varies else 0.0
+
+    def parts(self, k: int) -> list[tuple[float, float]]:
+        """Return the starts and lengths of the parts of interval k in which no input has a jump or a kink."""
+        inputs, start, stop = self.schedule.inputs, float(self.schedule.starts[k]), float(self.schedule.stops[k])
+        if inputs is None:
+            return [(self.start(k), float(self.lengths[k]))]
+        times = [start, *inputs.within(start, stop).tolist(), stop]
+        return [(a, b - a) for a, b in pairwise(times)]
+
+    def over(self, start: float, length: float) -> Observations:
+        """Return the observations with the inputs of a part of an interval."""
+        inputs = self.schedule.inputs
+        return self if inputs is None else replace(self, system=self.system.over(inputs, start, start + length))
+
+    def inputs_at(self, t: float) -> Array | None:
+        """Return the inputs at a time."""
+        return None if self.schedule.inputs is None else self.schedule.inputs.at(t, self.system.hold)
+
+    def _kept(self, grid: Grid, what: Any, make: Callable[[], tuple[Array, ...]]) -> Any:
+        """Return what is made for a grid, from the tables where nothing depends on time."""
+        system = self.system
+        if system.observation_varies or system.noise_varies or is_complex(self.theta):
+            return make()
+        key = (grid.centre.tobytes(), grid.basis.tobytes(), grid.sizes, what)
+        found = self.tables.get(key)
+        if found is None:
+            found = make()
+            if sum(sum(a.size for a in kept) for kept in list(self.tables.values())) > CACHED:
+                self.tables.clear()
+            self.tables[key] = found
+        return found
+
+    def observed(self, grid: Grid, t: float) -> Array:
+        """Return h (J, m) at the points of a grid."""
+        return self._kept(grid, None, lambda: (self.system.observe(grid.points, t, self.theta),))[0]
+
+    def energy(self, grid: Grid, t: float, inside: Array, precision: Array) -> Energy:
+        """Return the energy of the coordinates `inside`, whose precision is given."""
+
+        def make() -> Energy:
+            points = grid.points
+            h = self.system.observe(points, t, self.theta)[:, inside]
+            slopes = np.moveaxis(self.system.slopes(points, t, self.theta)[:, inside], 2, 0)
+            gain, gain_slopes = h @ precision, slopes @ precision
+            return Energy(gain, 0.5 * (h * gain).sum(axis=1), gain_slopes, (slopes * gain).sum(axis=2))
+
+        return Energy(*self._kept(grid, inside.tobytes(), make))
+
+    def potential(self, inside: Array, values: Array, start: float, length: float) -> Any:
+        """Return the factor of the increments `inside` over a substep, as a function of a grid."""
+        system, theta, n, m = self.system, self.theta, self.model.n, self.model.m
+        rate, rows = values[inside] / length, np.ix_(inside, inside)
+        origin, stop = np.zeros(n), start + length
+        dynamics = self.dynamics
+
+        def precision(times: Array) -> Array:
+            noise = np.broadcast_to(system.noise(origin, times, theta), (len(times), m, m))
+            return np.linalg.inv(noise[:, rows[0], rows[1]])
+
+        fixed = None if system.noise_varies else precision(np.zeros(1))[0]
+
+        def parts(grid: Grid, a: float, b: float) -> list[tuple[float, float, Array]]:
+            if not system.observation_varies:
+                return [(b - a, 0.5 * (a + b), average(precision, a, b - a).whole if fixed is None else fixed)]
+            shares, weight = panel_rule(self._panels(grid, a, b, precision))
+            times = a + (b - a) * shares
+            return list(zip((b - a) * weight, times, precision(times), strict=True))
+
+        def potential(grid: Grid, a: float, b: float, end: bool) -> Factor:
+            a, b = max(a, start), min(b, stop)
+            log: Array = 0.0
+            slope: Array = 0.0
+            for weight, t, P in parts(grid, a, b):
+                e = self.energy(grid, t, inside, P)
+                log = log + weight * (e.gain @ rate - e.half)
+                slope = slope + weight * (e.gain_slopes @ rate - e.half_slopes)
+            if dynamics.diffusion is None:
+                steep = ((dynamics.noise(a, b)[0] @ slope) * slope).sum(axis=0)
+            else:
+                steep = np.einsum("jde,dj,ej->j", dynamics.diffusion(grid.points, 0.5 * (a + b)), slope, slope)
+            log, steep = np.where(np.isfinite(log), log, -1e6), np.where(np.isfinite(steep), steep, 0.0)
+            return Factor(log.reshape(grid.sizes), (-(b - a) / 144 * steep).reshape(grid.sizes))
+
+        return potential
+
+    def _panels(self, grid: Grid, a: float, b: float, precision: Any) -> int:
+        """Return the panels that resolve S^-1 and h at some points of the grid over an interval."""
+        x = grid.points[:: max(1, len(grid.points) // 16)]
+
+        def function(times: Array) -> Array:
+            h = self.system.observe(x[None], times[:, None], self.theta).real
+            parts = precision(times).real if self.system.noise_varies else np.ones((len(times), 1))
+            rows = [np.where(np.isfinite(h), h, 0.0), parts]
+            return np.concatenate([part.reshape(len(times), -1) for part in rows], axis=1)
+
+        return average(function, a, b - a, 1e-7).panels
+
+    def least(self, points: Array, start: float, length: float, inside: Array) -> int:
+        """Return how many substeps resolve the variation of the coefficients in time at some points (J, n)."""
+        system, theta, origin = self.system, self.theta.real, np.zeros(self.model.n)
+
+        def function(times: Array) -> Array:
+            parts = []
+            if system.covariance_varies:
+                parts.append(system.covariance(points[None] if system.state_dependent else origin, times[:, None], theta))
+            if system.drift_varies:
+                parts.append(system.drift(points[None], times[:, None], theta))
+            if inside.any() and system.observation_varies:
+                parts.append(system.observe(points[None], times[:, None], theta))
+            if inside.any() and system.noise_varies:
+                parts.append(np.linalg.inv(system.noise(origin, times, theta)))
+            rows = [np.where(np.isfinite(part), part, 0.0).reshape(len(times), -1) for part in parts]
+            # Each coefficient counts relative to its own size.
+            rows = [row / max(float(np.abs(row).max()), 1e-300) for row in rows]
+            return np.concatenate([*rows, np.ones((len(times), 1))], axis=1)
+
+        return min(average(function, start, length, 1e-2).panels, MOST_PANELS)
+
+    def factor(self, k: int, inside: Array, values: Array) -> tuple[Any, Any]:
+        """Return the log-likelihood of what is observed at the end of interval k, without a constant, and the constant."""
+        schedule, system, theta, m = self.schedule, self.system, self.theta, self.model.m
+        seen = schedule.seen[k] & ~inside
+        if not seen.any():
+            return None, 0.0
+        if system.general:
+            stop, u = float(schedule.stops[k]), self.inputs_at(float(schedule.stops[k]))
+            return lambda grid: log_likelihood(self.model, values, seen, grid.points, stop, theta, u), 0.0
+        stop, rows, origin = self.start(k) + float(self.lengths[k]), np.ix_(seen, seen), np.zeros(self.model.n)
+        samples = self.model.observation_kind == "samples"
+        elapsed = np.ones(m) if samples else schedule.elapsed[k]
+        spans = np.minimum(elapsed[:, None], elapsed)
+        if samples or not system.noise_varies:
+            cov = system.noise(origin, stop, theta) * spans
+        else:
+            distinct, which = np.unique(spans, return_inverse=True)
+            noise = np.stack([s * average(lambda t: system.noise(origin, t, theta), stop - s, s).whole for s in distinct])
+            cov = np.take_along_axis(noise, which.reshape(1, m, m), axis=0)[0]
+        precision = np.linalg.inv(cov[rows])
+        z, count = values[seen], int(seen.sum())
+        # A sample by its density; an increment relative to noise alone.
+        constant = -0.5 * (log_determinant(cov[rows]) + count * np.log(2 * np.pi)) if samples else 0.5 * z @ precision @ z
+
+        def log_factor(grid: Grid) -> Array:
+            residual = z - self.observed(grid, stop)[:, seen] * elapsed[seen]
+            return -0.5 * (residual * (residual @ precision)).sum(axis=1)
+
+        return log_factor, constant

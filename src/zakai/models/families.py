@@ -1,0 +1,203 @@
+"""Families of laws of one coordinate of a sample.
+
+A family is a class of functions of z, the location h, the variance or squared scale s and the shape of the family (degrees of
+freedom or concentration), all of which broadcast.  What is no law (a negative mean of counts) is NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+class Family(Protocol):
+    """One family of laws of one coordinate."""
+
+    @property
+    def parameter(self) -> str | None:
+        """The key of the shape."""
+
+    @property
+    def noise(self) -> bool:
+        """Whether observation_noise enters."""
+
+    @property
+    def support(self) -> str:
+        """The values that it has, in words."""
+
+    @staticmethod
+    def inside(z: Array) -> Array:
+        """Return where z is a possible value."""
+
+    @staticmethod
+    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+        """Return the log density, or the log mass of a count."""
+
+    @staticmethod
+    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+        """Return one draw for each h."""
+
+    @staticmethod
+    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+        """Return P(Z < z) and P(Z <= z)."""
+
+
+class _Continuous:
+    """A law of any number."""
+
+    @staticmethod
+    def inside(z: Array) -> Array:
+        return np.isfinite(z)
+
+
+class Gaussian(_Continuous):
+    """N(h, s)."""
+
+    parameter, noise, support = None, True, "numbers"
+
+    @staticmethod
+    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+        return np.asarray(-0.5 * ((z - h) ** 2 / s + np.log(2 * np.pi * s)))
+
+    @staticmethod
+    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+        return h + np.sqrt(s) * rng.standard_normal(h.shape)
+
+    @staticmethod
+    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+        from scipy.special import ndtr
+
+        value = ndtr((z - h) / np.sqrt(s))
+        return value, value
+
+
+class StudentT(_Continuous):
+    """Location h, squared scale s, `degrees_of_freedom`."""
+
+    parameter, noise, support = "degrees_of_freedom", True, "numbers"
+
+    @staticmethod
+    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+        from scipy.special import loggamma
+
+        constant = _loggamma(loggamma, (shape + 1) / 2) - _loggamma(loggamma, shape / 2) - 0.5 * np.log(shape * np.pi * s)
+        return np.asarray(constant - (shape + 1) / 2 * np.log(1 + (z - h) ** 2 / (shape * s)))
+
+    @staticmethod
+    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+        return h + np.sqrt(s) * rng.standard_t(shape, h.shape)
+
+    @staticmethod
+    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+        from scipy.special import stdtr
+
+        value = stdtr(shape, (z - h) / np.sqrt(s))
+        return value, value
+
+
+class Poisson:
+    """Counts with mean h >= 0."""
+
+    parameter, noise, support = None, False, "whole numbers of at least 0"
+
+    @staticmethod
+    def inside(z: Array) -> Array:
+        return (z >= 0) & (z == np.floor(z)) & (z <= 2.0**53)
+
+    @staticmethod
+    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+        from scipy.special import gammaln
+
+        rate = _where_law(h, np.real(h) >= 0)
+        term = z * np.log(np.where(np.real(rate) == 0, 1.0, rate)) if np.any(z) else 0.0
+        impossible = (np.real(rate) == 0) & (z > 0)
+        return np.asarray(np.where(impossible, -np.inf, term - rate - gammaln(np.asarray(z) + 1.0)))
+
+    @staticmethod
+    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+        return rng.poisson(h).astype(float)
+
+    @staticmethod
+    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+        from scipy.special import pdtr
+
+        return np.where(np.asarray(z) > 0, pdtr(np.maximum(z - 1.0, 0.0), h), 0.0), pdtr(z, h)
+
+
+class Bernoulli:
+    """0 or 1; h is the probability of 1."""
+
+    parameter, noise, support = None, False, "0 or 1"
+
+    @staticmethod
+    def inside(z: Array) -> Array:
+        return (z == 0) | (z == 1)
+
+    @staticmethod
+    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+        chance = _where_law(h, (np.real(h) >= 0) & (np.real(h) <= 1))
+        return np.log(np.where(np.asarray(z) == 1, chance, 1.0 - chance))
+
+    @staticmethod
+    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+        return (rng.uniform(size=h.shape) < h).astype(float)
+
+    @staticmethod
+    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+        one = np.asarray(z) == 1
+        return np.where(one, 1.0 - h, 0.0), np.where(one, 1.0, 1.0 - h)
+
+
+class VonMises(_Continuous):
+    """An angle with mean direction h and `concentration`; distribution functions count from -pi."""
+
+    parameter, noise, support = "concentration", False, "angles in radians"
+
+    @staticmethod
+    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+        from scipy.special import ive
+
+        size = np.real(shape)
+        log_bessel = np.log(ive(0, size)) + size
+        if np.iscomplexobj(shape):
+            log_bessel = log_bessel + 1j * np.imag(shape) * ive(1, size) / ive(0, size)
+        return np.asarray(shape * np.cos(z - h) - log_bessel - np.log(2 * np.pi))
+
+    @staticmethod
+    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+        return rng.vonmises(np.mod(h + np.pi, 2 * np.pi) - np.pi, shape)
+
+    @staticmethod
+    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+        from scipy.stats import vonmises
+
+        angle = np.pi - np.mod(np.pi - np.asarray(z), 2 * np.pi)
+        mean = np.pi - np.mod(np.pi - h, 2 * np.pi)
+        value = vonmises.cdf(angle - mean, shape) - vonmises.cdf(-np.pi - mean, shape)
+        return value, value
+
+
+FAMILIES: dict[str, Family] = {
+    "gaussian": Gaussian(),
+    "student-t": StudentT(),
+    "poisson": Poisson(),
+    "bernoulli": Bernoulli(),
+    "von-mises": VonMises(),
+}
+
+
+def _where_law(values: Any, good: Any) -> Array:
+    return np.where(good, values, np.nan)
+
+
+def _loggamma(loggamma: Callable[[Any], Any], values: Any) -> Any:
+    """Return log Gamma; complex values keep a derivative."""
+    from scipy.special import digamma
+
+    real = np.real(loggamma(np.real(values)))
+    return real + 1j * np.imag(values) * digamma(np.real(values)) if np.iscomplexobj(values) else real

@@ -1,0 +1,108 @@
+"""What a model has beyond f(x, t), g(t), h(x, t) and Gaussian noise: a method must say that it handles it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import sympy
+
+from zakai.models.functions import Floor, Maximum, Minimum, Sinc, TableFunction
+
+if TYPE_CHECKING:
+    from zakai.models.model import Model
+
+STATE_DEPENDENT_DIFFUSION = "state-dependent diffusion"
+INPUTS = "inputs"
+CROSS_NOISE = "cross noise"
+STATE_DEPENDENT_OBSERVATION_NOISE = "state-dependent observation noise"
+OBSERVATION_FAMILY = "observation family"
+OBSERVATION_LOG_DENSITY = "observation log density"
+DOMAIN = "domain"
+TABLES = "tables"
+KINKS = "kinks"
+JUMPS = "jumps"
+SINC = "sinc"
+
+# The features that belong to the observation alone: the law of the state is that of an ordinary model.
+OF_OBSERVATION = frozenset({STATE_DEPENDENT_OBSERVATION_NOISE, OBSERVATION_FAMILY, OBSERVATION_LOG_DENSITY})
+JUMP_FUNCTIONS: tuple[type, ...] = (sympy.sign, Floor, sympy.atan2)
+_OF_FORMULAS: dict[str, tuple[type, ...]] = {
+    TABLES: (TableFunction,),
+    KINKS: (Minimum, Maximum),
+    JUMPS: JUMP_FUNCTIONS,
+    SINC: (Sinc,),
+}
+
+
+# What the theorem of a method assumes that does not handle the feature.
+ASSUMPTIONS = {
+    STATE_DEPENDENT_DIFFUSION: "g does not depend on the state",
+    INPUTS: "there are no inputs",
+    CROSS_NOISE: "dv and dw are independent",
+    STATE_DEPENDENT_OBSERVATION_NOISE: "S does not depend on the state",
+    OBSERVATION_FAMILY: "the noise of observations is Gaussian",
+    OBSERVATION_LOG_DENSITY: "the noise of observations is Gaussian",
+    DOMAIN: "every state is free to take any value",
+    TABLES: "formulas are without tables",
+    KINKS: "formulas are without min and max",
+    JUMPS: "formulas are without sign, floor, heaviside and atan2",
+    SINC: "formulas are without sinc",
+}
+
+
+def of_dynamics(model: Model) -> dict[str, str]:
+    """Return the features that the law of the state has, apart from what is observed."""
+    matrices = (model.diffusion, model.process_noise)
+    found = {feature: words for feature, words in model.features.items() if feature not in (*OF_OBSERVATION, *_OF_FORMULAS)}
+    found |= _of_formulas([*model.drift, *(entry for matrix in matrices for entry in matrix.todok().values())])
+    if not any(part.free_symbols & set(model.u) for part in (model.drift, model.diffusion)):
+        found.pop(INPUTS, None)
+    return found
+
+
+def features_of(model: Model) -> dict[str, str]:
+    """Return the features of a model, each with the words that show it: {"inputs": "inputs: u, wind"}."""
+    found: dict[str, str] = {}
+    state, inputs = set(model.x), set(model.u)
+
+    def first(matrix: sympy.MatrixBase, symbols: set[sympy.Symbol]) -> sympy.Expr | None:
+        return next((entry for entry in matrix.todok().values() if entry.free_symbols & symbols), None)
+
+    if (entry := first(model.diffusion, state)) is not None:
+        found[STATE_DEPENDENT_DIFFUSION] = f"diffusion contains {_short(entry)}"
+    if inputs:
+        found[INPUTS] = f"inputs: {', '.join(model.inputs)}"
+    if not model.cross_noise.is_zero_matrix:
+        found[CROSS_NOISE] = "cross_noise is not zero"
+    if (entry := first(model.observation_noise, state)) is not None:
+        found[STATE_DEPENDENT_OBSERVATION_NOISE] = f"observation_noise contains {_short(entry)}"
+    if set(model.observation_family) != {"gaussian"}:
+        found[OBSERVATION_FAMILY] = f"observation_family: {', '.join(dict.fromkeys(model.observation_family))}"
+    if model.log_density is not None:
+        found[OBSERVATION_LOG_DENSITY] = f"observation_log_density: {_short(model.log_density)}"
+    if model.domain:
+        found[DOMAIN] = f"domain: {', '.join(f'{name} {interval}' for name, interval in model.domain.items())}"
+    formulas = [*model.drift, *model.observation, *model.family_parameters.values()]
+    formulas += [entry for matrix in _matrices(model) for entry in matrix.todok().values()]
+    formulas += [] if model.log_density is None else [model.log_density]
+    return found | _of_formulas(formulas)
+
+
+def _of_formulas(formulas: list[sympy.Expr]) -> dict[str, str]:
+    found = {}
+    for feature, functions in _OF_FORMULAS.items():
+        entry = next((formula for formula in formulas if formula.has(*functions)), None)
+        if entry is not None:
+            found[feature] = f"a formula contains {_short(next(iter(entry.atoms(*functions))))}"
+    return found
+
+
+def _matrices(model: Model) -> tuple[sympy.MatrixBase, ...]:
+    return model.diffusion, model.process_noise, model.observation_noise, model.cross_noise
+
+
+def _short(expression: sympy.Expr) -> str:
+    from zakai.models._entries import formula
+
+    text = formula(expression)
+    return text if len(text) <= 60 else text[:57] + "..."

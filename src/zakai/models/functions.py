@@ -1,0 +1,107 @@
+"""Functions of formulas that SymPy lacks, or evaluates in ways that a filter cannot use: min, max, floor, sinc and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import sympy
+from numpy.typing import NDArray
+
+from zakai.models.tables import Table
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
+_NEAR = 8.0  # |x| up to which the integral of sinc is taken; the recursion loses digits for small |x|
+
+
+class _Real(sympy.Function):  # type: ignore[misc]
+    """A function with real values that SymPy neither simplifies nor rewrites."""
+
+    def _eval_is_extended_real(self) -> bool:
+        return True
+
+
+class Minimum(_Real):
+    """min(a, b); its derivative at a = b is the mean of the two."""
+
+    nargs = 2
+
+    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+        own, other = self.args if argindex == 1 else reversed(self.args)
+        return (1 + sympy.sign(other - own)) / 2
+
+
+class Maximum(_Real):
+    """max(a, b); its derivative at a = b is the mean of the two."""
+
+    nargs = 2
+
+    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+        own, other = self.args if argindex == 1 else reversed(self.args)
+        return (1 + sympy.sign(own - other)) / 2
+
+
+class Floor(_Real):
+    """The largest whole number that is at most a; its derivative is zero between the jumps."""
+
+    nargs = 1
+
+    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+        return sympy.Integer(0)
+
+
+class Sinc(_Real):
+    """The derivative of order k of sin(x) / x, as Sinc(x, k)."""
+
+    nargs = 2
+
+    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+        return Sinc(self.args[0], self.args[1] + 1)
+
+
+class TableFunction(_Real):
+    """A table as a function; `table` and the orders of the derivatives belong to the class, one for each table and orders."""
+
+    table: Table
+    orders: tuple[int, ...]
+
+    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+        orders = tuple(order + (place == argindex - 1) for place, order in enumerate(self.orders))
+        if orders[argindex - 1] > self.table.degree:
+            return sympy.Integer(0)
+        return table_function(self.table, orders)(*self.args)
+
+
+def table_function(table: Table, orders: tuple[int, ...] | None = None) -> Any:
+    """Return the class of functions that evaluate a table or its derivative of these orders."""
+    orders = orders or (0,) * len(table.axes)
+    if orders not in table.functions:
+        name = table.name + "".join(f"_d{place + 1}" * order for place, order in enumerate(orders))
+        table.functions[orders] = type(name, (TableFunction,), {"table": table, "orders": orders, "nargs": len(orders)})
+    return table.functions[orders]
+
+
+def sinc(x: Any, order: int) -> NDArray[Any]:
+    """Return the derivative of some order of sin(x) / x; complex x keeps a derivative.
+
+    S_k(x) = int_0^1 s^k cos(x s + k pi/2) ds, and x S_k = sin(x + k pi/2) - k S_(k-1) where |x| is large.
+    """
+    x = np.asarray(x)
+    near = np.abs(x.real) <= _NEAR + 2 * order
+    nodes, weights = (_NODES + 1) / 2, _WEIGHTS / 2
+    small = np.where(near, x, 0.0)[..., None]
+    integral = (np.cos(small * nodes + order * np.pi / 2) * (weights * nodes**order)).sum(axis=-1)
+    large = np.where(near, 1.0, x)
+    recursion = np.sin(large) / large
+    for k in range(1, order + 1):
+        recursion = (np.sin(large + k * np.pi / 2) - k * recursion) / large
+    return np.asarray(np.where(near, integral, recursion))
+
+
+def pairwise(function: Callable[[Any, Any], Any], arguments: list[Any]) -> Any:
+    """Return f(f(a, b), c) and so on: a function of two arguments, of several."""
+    result = arguments[0]
+    for argument in arguments[1:]:
+        result = function(result, argument)
+    return result

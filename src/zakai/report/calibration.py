@@ -1,0 +1,133 @@
+"""The section on calibration: residuals of a result as pictures, with bounds that hold if the model is true."""
+
+from __future__ import annotations
+
+import warnings
+from html import escape
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.errors import InputError
+from zakai.report import _style as style
+from zakai.report import plots
+from zakai.report._extra import plotting
+
+_ROWS = 200  # of the end of a record, of which the residuals are computed
+_BINS, _LAGS, _MOST_COORDINATES = 10, 20, 4
+_CLIP = 1e-9  # a residual nearer to 0 or 1 is drawn as this
+
+
+class Calibration(NamedTuple):
+    """Residuals u of one observed coordinate, with their times, normal scores and autocorrelations.
+
+    `p_value` is that of the Kolmogorov-Smirnov test of uniformity.
+    """
+
+    times: np.ndarray
+    u: np.ndarray
+    scores: np.ndarray
+    autocorrelation: np.ndarray
+    p_value: float
+
+
+def calibration_of(times: np.ndarray, u: np.ndarray) -> Calibration:
+    """Return the figures of the residuals (K,) of one coordinate; NaN where nothing was observed."""
+    from scipy.special import ndtri
+    from scipy.stats import kstest
+
+    rows = np.flatnonzero(np.isfinite(u))
+    scores = ndtri(np.clip(u, _CLIP, 1 - _CLIP))
+    centred = np.where(np.isfinite(scores), scores - np.nanmean(scores), 0.0)
+    variance = float(centred @ centred)
+    lags = range(1, min(_LAGS, len(rows) - 1) + 1)
+    found = np.array([float(centred[lag:] @ centred[:-lag]) / variance if variance > 0 else 0.0 for lag in lags])
+    return Calibration(times[rows], u[rows], scores[rows], found, float(kstest(u[rows], "uniform").pvalue))
+
+
+def section(result: Any) -> str:
+    """Return the section: PIT histogram, normal scores over time, and autocorrelation of each observed coordinate."""
+    from zakai.engine.residuals import residuals
+
+    count = len(result.times) - 1
+    if getattr(result, "origin", None) is None or result.record is None or count == 0:
+        return "<p>The result does not hold its filter and its record. Filter the record again to have residuals.</p>"
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            u = residuals(result, first=max(0, count - _ROWS))
+    except InputError as error:
+        return f"<p>There are no residuals: {escape(str(error))}.</p>"
+    parts = [
+        "<p>A residual is the probability, given all earlier observations, of an observation at most as large as the one that "
+        "came. If the model is true, residuals are uniform on 0 to 1 and independent: the histogram is flat, the normal scores "
+        "look like standard normal numbers, and their autocorrelations are zero. The bands hold 95% of the values of a true "
+        "model. A U-shaped histogram shows that the noise of the model is too small, a hump that it is too large, a slope a "
+        "bias; autocorrelation shows that the dynamics are wrong.</p>"
+    ]
+    if count > _ROWS:
+        parts.append(f"<p>The last {_ROWS:,} of {count:,} observations are used.</p>")
+    parts += [f"<p><strong>{escape(str(one.message))}.</strong></p>" for one in caught]
+    columns = [j for j in range(u.shape[1]) if np.isfinite(u[:, j]).sum() >= 3]
+    if not columns:
+        return "".join(parts) + "<p>Fewer than three observations have a residual.</p>"
+    if len(columns) > _MOST_COORDINATES:
+        parts.append(f"<p>The first {_MOST_COORDINATES} of {len(columns)} observed coordinates are drawn.</p>")
+    times = np.asarray(result.times, dtype=float)[1:]
+    for j in columns[:_MOST_COORDINATES]:
+        found = calibration_of(times, u[:, j])
+        title = f"<h3>Observation {j + 1}</h3>" if u.shape[1] > 1 else ""
+        said = "" if found.p_value >= 0.01 else " The residuals are not uniform: model and data disagree."
+        note = f"{len(found.u):,} residuals; Kolmogorov-Smirnov test of uniformity: p = {found.p_value:.3g}.{said}"
+        figure = plots.html(calibration_figure(found), f"calibration-{j}")
+        parts.append(f"{title}<figure>{figure}<figcaption>{escape(note)}</figcaption></figure>")
+    return "".join(parts)
+
+
+def calibration_figure(found: Calibration) -> Any:
+    """Return the three panels for one observed coordinate."""
+    from scipy.stats import binom
+
+    go, make_subplots = plotting("plotly.graph_objects"), plotting("plotly.subplots").make_subplots
+    titles = ["residuals", "autocorrelation of the normal scores", "normal scores over time"]
+    figure = make_subplots(
+        rows=2, cols=2, specs=[[{}, {}], [{"colspan": 2}, None]], subplot_titles=titles, vertical_spacing=0.2,
+        horizontal_spacing=0.1,
+    )  # fmt: skip
+    count = len(found.u)
+    heights = np.histogram(found.u, _BINS, (0.0, 1.0))[0] * _BINS / count
+    bars = {"color": style.SERIES_COLOUR, "opacity": 0.75}
+    middles = (np.arange(_BINS) + 0.5) / _BINS
+    figure.add_trace(
+        go.Bar(x=middles, y=heights, width=0.92 / _BINS, marker=bars, showlegend=False, name="density"), row=1, col=1
+    )
+    low, high = binom.ppf([0.025, 0.975], count, 1.0 / _BINS) * _BINS / count
+    band = {"fillcolor": style.BAND_COLOUR, "opacity": 0.16, "line_width": 0, "layer": "below"}
+    figure.add_hrect(y0=float(low), y1=float(high), row=1, col=1, **band)
+    figure.add_hline(y=1.0, line={"color": style.INK, "width": 1}, row=1, col=1)
+    lags = np.arange(1, len(found.autocorrelation) + 1)
+    figure.add_trace(
+        go.Bar(x=lags, y=found.autocorrelation, width=0.3, marker=bars, showlegend=False, name="autocorrelation"), row=1, col=2
+    )
+    bound = 1.96 / np.sqrt(count)
+    figure.add_hrect(y0=-bound, y1=bound, row=1, col=2, **band)
+    figure.add_hline(y=0.0, line={"color": style.INK, "width": 1}, row=1, col=2)
+    dots = {"color": style.SERIES_COLOUR, "size": 4, "opacity": 0.75}
+    figure.add_trace(
+        go.Scatter(
+            x=found.times, y=found.scores, mode="markers", marker=dots, showlegend=False, name="normal score",
+            hovertemplate="t = %{x:.6g}<br>%{y:.3g}<extra></extra>",
+        ), row=2, col=1,
+    )  # fmt: skip
+    figure.add_hrect(y0=-1.96, y1=1.96, row=2, col=1, **band)
+    plots.layout(figure, 560)
+    figure.update_annotations(font={"size": 13, "color": style.INK})
+    figure.update_layout(margin={"t": 62}, bargap=0.05)
+    size = max(0.3, 1.2 * bound, 1.1 * float(np.abs(found.autocorrelation).max(initial=0.0)))
+    figure.update_xaxes(title_text="probability", range=[0, 1], row=1, col=1)
+    figure.update_yaxes(title_text="density", rangemode="tozero", row=1, col=1)
+    figure.update_xaxes(title_text="lag (observations)", row=1, col=2)
+    figure.update_yaxes(range=[-size, size], row=1, col=2)
+    figure.update_xaxes(title_text="time", row=2, col=1)
+    figure.update_yaxes(title_text="standard deviations", row=2, col=1)
+    return figure

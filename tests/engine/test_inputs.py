@@ -1,0 +1,415 @@
+"""Known inputs online, in checkpoints, in streams and in studies: what a record with the same inputs gives, to the bit."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import zakai
+from zakai import _registry
+from zakai.algebra import theorems
+from zakai.cli import main
+from zakai.densities.gaussian import GaussianMixture
+from zakai.errors import InputError
+from zakai.methods._protocol import Info, Method
+from zakai.models.files import read_model
+
+TEXT = """
+name = "driven"
+state = ["x"]
+drift = ["-x + u"]
+observation = ["x + u"]
+observation_kind = "samples"
+observation_noise = [["0.25"]]
+inputs = ["u"]
+input_hold = "{hold}"
+[prior]
+kind = "gaussian"
+mean = [0.5]
+cov = [[1.0]]
+"""
+
+
+class State(NamedTuple):
+    """A Gaussian."""
+
+    mean: np.ndarray
+    cov: np.ndarray
+
+
+class Prepared(NamedTuple):
+    """The model and the schedule."""
+
+    model: zakai.Model
+    schedule: object
+    notes: tuple[str, ...] = ()
+
+
+def step(prepared, k, state, values):
+    """Move the mean over the pieces on which u is linear, and use a sample of x + u."""
+    schedule, hold = prepared.schedule, prepared.model.input_hold
+    start, stop = float(schedule.starts[k]), float(schedule.stops[k])
+    mean, variance = state.mean[0], state.cov[0, 0]
+    cuts = [start, *schedule.inputs.within(start, stop), stop]
+    for a, b in zip(cuts, cuts[1:]):
+        decay = np.exp(-(b - a))
+        u, end = schedule.inputs.at(a, hold)[0], schedule.inputs.at(b, hold, before=True)[0]
+        slope = (end - u) / (b - a) if b > a else 0.0
+        mean = decay * mean + (u - slope) * (1 - decay) + slope * (b - a)
+        variance = decay**2 * variance + (1 - decay**2) / 2
+    increment = 0.0
+    if schedule.seen[k, 0]:
+        rest, spread = values[0] - mean - schedule.inputs.at(stop, hold)[0], variance + 0.25
+        mean, variance = mean + variance / spread * rest, 0.25 * variance / spread
+        increment = -0.5 * (rest**2 / spread + np.log(2 * np.pi * spread))
+    state = State(np.array([mean]), np.array([[variance]]))
+    return state, Info(increment, state.mean, state.cov, {})
+
+
+METHOD = Method(
+    name="linear",
+    source="",
+    exactness="",
+    theorem=lambda model: (),
+    options={},
+    prepare=lambda model, schedule, theta: Prepared(model, schedule),
+    init=lambda prepared, prior: State(np.array(prior.mean), np.array(prior.cov)),
+    step=step,
+    density=lambda prepared, state: GaussianMixture(np.ones(1), state.mean[None], state.cov[None], ("x",), (False,)),
+    state=State,
+    handles=frozenset({"inputs"}),
+)
+
+
+@pytest.fixture(autouse=True)
+def linear(monkeypatch):
+    """A method that handles inputs in a few lines, beside those of the package."""
+    monkeypatch.setitem(_registry.METHODS, "linear", _registry.Entry(__name__, "exact for the system of this file"))
+    monkeypatch.setitem(theorems.THEOREMS, "linear", METHOD.theorem)
+
+
+def driven(hold):
+    """Return dx = (-x + u) dt + dv with samples of x + u."""
+    return read_model(TEXT.format(hold=hold), "driven.toml")
+
+
+@pytest.fixture(params=["zero", "linear"])
+def model(request):
+    """The system with each of the two holds."""
+    return driven(request.param)
+
+
+def times_and_values(count=40):
+    """Irregular times, and observations of which some are missing."""
+    draw = np.random.default_rng(1)
+    times = np.cumsum(10.0 ** draw.uniform(-3, 0.3, count))
+    return times, np.where(draw.uniform(size=count) < 0.2, np.nan, draw.normal(size=count))
+
+
+def inputs_until(last):
+    """Inputs at times of their own."""
+    draw = np.random.default_rng(2)
+    times = np.concatenate([[0.0], np.cumsum(draw.uniform(0.05, 1.5, 60))])
+    assert times[-1] > last
+    return zakai.Inputs(times, draw.normal(size=len(times)))
+
+
+def rows_of(estimates):
+    """What estimates report, as arrays."""
+    return np.array([[one.mean[0], one.cov[0, 0], one.log_likelihood_increment] for one in estimates])
+
+
+def rows_of_result(result):
+    """The same of a result."""
+    return np.column_stack([result.mean[1:, 0], result.variance[1:, 0], result.log_likelihood_increments[1:]])
+
+
+def test_a_record_with_inputs_follows_the_moment_equations(model):
+    times, values = times_and_values()
+    inputs = inputs_until(times[-1])
+    result = zakai.filter(model, zakai.Record(times, values, "samples", inputs), method="linear")
+    mean, variance, start = 0.5, 1.0, 0.0
+    for k, (time, value) in enumerate(zip(times, values)):
+        for a, b in zip([start, *inputs.within(start, time)], [*inputs.within(start, time), time]):
+
+            def u(t, a=a):
+                if model.input_hold == "linear":
+                    return np.interp(t, inputs.times, inputs.values[:, 0])
+                return inputs.values[inputs.times <= a][-1, 0]
+
+            own = solve_ivp(lambda t, y: [-y[0] + u(t), 1 - 2 * y[1]], (a, b), [mean, variance], rtol=1e-12, atol=1e-13)
+            mean, variance = own.y[:, -1]
+        if not np.isnan(value):
+            now = np.interp(time, inputs.times, inputs.values[:, 0])
+            now = now if model.input_hold == "linear" else inputs.values[inputs.times <= time][-1, 0]
+            gain = variance / (variance + 0.25)
+            mean, variance = mean + gain * (value - mean - now), (1 - gain) * variance
+        assert abs(result.mean[k + 1, 0] - mean) < 1e-9 and abs(result.variance[k + 1, 0] - variance) < 1e-9
+        start = time
+
+
+@pytest.mark.parametrize("chunk", [1, 3, 1024])
+def test_online_and_in_chunks_the_numbers_are_those_of_a_record(model, chunk, monkeypatch):
+    times, values = times_and_values()
+    inputs = inputs_until(times[-1])
+    record = zakai.Record(times, values, "samples", inputs)
+    expected = rows_of_result(zakai.filter(model, record, method="linear"))
+    monkeypatch.setattr("zakai.engine.loop.CHUNK", chunk)
+    assert rows_of_result(zakai.filter(driven(model.input_hold), record, method="linear")).tobytes() == expected.tobytes()
+    assert rows_of_result(zakai.filter(model, [record, record], method="linear")[1]).tobytes() == expected.tobytes()
+    first, always, late = (zakai.online(model, method="linear") for _ in range(3))
+    rows = []
+    for k, (time, value) in enumerate(zip(times, values)):
+        # The rows that have come since the last observation, and the next one, between which u is linear.
+        last = np.searchsorted(inputs.times, time, "right") + 1
+        since = 0 if k == 0 else int(np.searchsorted(inputs.times, times[k - 1], "right"))
+        rows.append(
+            (
+                first.update(time, value, inputs if k == 0 else None),
+                always.update(time, value, inputs),
+                late.update(time, value, zakai.Inputs(inputs.times[since:last], inputs.values[since:last])),
+            )
+        )
+    for one in zip(*rows):
+        assert rows_of(one).tobytes() == expected.tobytes()
+
+
+def test_values_hold_from_the_time_of_their_observation_and_the_first_from_the_start(model):
+    times, values = times_and_values()
+    u = np.sin(np.arange(len(times)))
+    inputs = zakai.Inputs(np.concatenate([[0.0], times]), np.concatenate([u[:1], u]))
+    expected = rows_of_result(zakai.filter(model, zakai.Record(times, values, "samples", inputs), method="linear"))
+    for given in (lambda one: {"u": one}, lambda one: [one], lambda one: float(one), np.atleast_1d):
+        online = zakai.online(model, method="linear")
+        assert rows_of([online.update(t, z, given(one)) for t, z, one in zip(times, values, u)]).tobytes() == expected.tobytes()
+
+
+def test_the_last_value_holds_and_a_linear_input_is_needed_at_each_time():
+    zero, linear = (zakai.online(driven(hold), method="linear") for hold in ("zero", "linear"))
+    zero.update(1.0, 0.3, {"u": 2.0})
+    zero.update(2.0, None)
+    inputs = zakai.Inputs([0.0, 5.0], [2.0, 2.0])
+    record = zakai.Record([1.0, 2.0], [0.3, np.nan], "samples", inputs)
+    assert (
+        rows_of([zero.last])[0].tobytes() == rows_of_result(zakai.filter(driven("zero"), record, method="linear"))[-1].tobytes()
+    )
+    linear.update(1.0, 0.3, {"u": 2.0})
+    for call in (lambda: linear.update(2.0, 0.1), lambda: linear.predict(2.0)):
+        with pytest.raises(InputError, match='(update|predict): inputs: the last time 1 is before 2; with input_hold = "linear"'):
+            call()
+    before = linear.last
+    ahead = linear.predict(2.0, {"u": 3.0})
+    assert linear.last.time == before.time
+    assert rows_of([ahead]).tobytes() == rows_of([linear.update(2.0, None, {"u": 3.0})]).tobytes()
+
+
+def test_a_checkpoint_holds_the_inputs_that_are_needed(model, tmp_path):
+    times, values = times_and_values()
+    inputs = inputs_until(times[-1])
+    record = zakai.Record(times, values, "samples", inputs)
+    expected = rows_of_result(zakai.filter(model, record, method="linear"))
+    for count in (0, 1, 7, 39):
+        online = zakai.online(model, method="linear")
+        for k in range(count):
+            online.update(times[k], values[k], inputs if k == 0 else None)
+        online.save(tmp_path / "state")
+        follower = zakai.online(model, method="linear")
+        follower.restore(tmp_path / "state")
+        known = inputs if count == 0 else None
+        rest = rows_of([follower.update(times[k], values[k], known) for k in range(count, len(times))])
+        assert rest.tobytes() == expected[count:].tobytes()
+    assert len(online.feeds[0].now.inputs) < len(inputs)
+
+
+def test_a_checkpoint_with_other_inputs_is_refused(tmp_path):
+    from zakai.records.checkpoint import read_checkpoint, write_checkpoint
+
+    online = zakai.online(driven("zero"), method="linear")
+    online.update(1.0, 0.3, {"u": 2.0})
+    online.save(tmp_path / "state")
+    about, arrays = read_checkpoint(tmp_path / "state")
+    last = sorted(arrays)[-1]
+    for change in (lambda a: a[:, :0], lambda a: np.full_like(a, np.nan), lambda a: np.hstack([a, a]), lambda a: a[:1]):
+        write_checkpoint(tmp_path / "forged", about, {**arrays, last: change(arrays[last])})
+        with pytest.raises(InputError, match="the checkpoint does not fit"):
+            zakai.online(driven("zero"), method="linear").restore(tmp_path / "forged")
+    about["filters"][0]["inputs"] = None
+    write_checkpoint(tmp_path / "forged", about, arrays)
+    with pytest.raises(InputError, match="the checkpoint does not fit"):
+        zakai.online(driven("zero"), method="linear").restore(tmp_path / "forged")
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (None, "update: inputs: u of .* are missing; give them with the first observation"),
+        ({"v": 1.0}, "update: inputs: 'v' is not an input of .*; its inputs: u"),
+        ({}, "update: inputs: u of .* are missing; give all inputs, or none"),
+        ([1.0, 2.0], "update: inputs: 2 values; .* has 1: u"),
+        ("1.0", "update: inputs: values must be real numbers"),
+        ({"u": None}, "update: inputs: row 0, counted from 0: values must be finite"),
+        (np.nan, "update: inputs: .* must be finite"),
+        (zakai.Inputs([0.5], [1.0]), "update: inputs: the first time 0.5 is after the start 0 of"),
+        (zakai.Inputs([0.0], [[1.0, 2.0]]), "update: inputs: 2 columns; .* has 1: u"),
+    ],
+)
+def test_wrong_inputs_are_refused_and_the_filter_stays_as_it_was(given, words):
+    online = zakai.online(driven("zero"), method="linear")
+    with pytest.raises(InputError, match=words):
+        online.update(1.0, 0.3, given)
+    assert online.time == 0.0
+    online.update(1.0, 0.3, {"u": 2.0})
+    if given is not None and not (isinstance(given, zakai.Inputs) and len(given.values[0]) == 1):
+        with pytest.raises(InputError, match="update: inputs:"):
+            online.update(2.0, 0.3, given)
+
+
+def test_a_model_without_inputs_refuses_them():
+    online = zakai.online(zakai.load_model("gallery:kalman-bucy-1d"))
+    for call in (online.update, lambda time, value, inputs: online.predict(time, inputs)):
+        with pytest.raises(InputError, match="inputs: .* has no inputs; leave them out"):
+            call(0.1, 0.0, {"u": 1.0})
+
+
+def test_offline_work_and_forecasts_keep_the_inputs(model, tmp_path):
+    times, values = times_and_values()
+    inputs = inputs_until(times[-1])
+    record = zakai.Record(times, values, "samples", inputs)
+    expected = zakai.filter(model, record, method="linear")
+    zakai.prepare(model, record, method="linear").save(tmp_path / "prepared")
+    again = zakai.Prepared.load(tmp_path / "prepared").filter(record)
+    assert rows_of_result(again).tobytes() == rows_of_result(expected).tobytes()
+    part = zakai.filter(model, zakai.Record(times[:30], values[:30], "samples", inputs), method="linear")
+    rest = zakai.Record(times, np.where(np.arange(40) < 30, values, np.nan), "samples", inputs)
+    ahead = rows_of_result(zakai.filter(model, rest, method="linear"))[30:]
+    assert rows_of_result(part.forecast(times[30:])).tobytes() == ahead.tobytes()
+    first = int(np.searchsorted(inputs.times, times[29]))
+    later = zakai.Inputs(inputs.times[first:], inputs.values[first:])
+    assert rows_of_result(part.forecast(times[30:], later)).tobytes() == ahead.tobytes()
+
+
+def command(*arguments, given=""):
+    """Run the command with this text on standard input."""
+    sys.stdin = io.TextIOWrapper(io.BytesIO(given.encode()))
+    return main([str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with the model, and a record with its input in a column."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "stdin", sys.stdin)
+    (tmp_path / "model.toml").write_text(TEXT.format(hold="zero"))
+    times, values = times_and_values(12)
+    rows = [
+        [f"{t!r}", "" if np.isnan(z) else f"{z!r}", "" if k % 3 else f"{float(np.cos(k))!r}"]
+        for k, (t, z) in enumerate(zip(times.tolist(), values.tolist()))
+    ]
+    (tmp_path / "record.csv").write_text("\n".join(["time,z,u", *(",".join(row) for row in rows)]) + "\n")
+    return tmp_path
+
+
+def test_a_stream_takes_inputs_in_its_lines_and_in_columns(folder, capsys):
+    record = zakai.read_record("record.csv", zakai.load_model("model.toml"))
+    result = zakai.filter(zakai.load_model("model.toml"), record, method="linear")
+    table = (folder / "record.csv").read_text()
+    assert command("stream", "model.toml", "--method", "linear", given=table) == 0
+    out, err = capsys.readouterr()
+    assert err == "" and [json.loads(line)["mean"][0] for line in out.splitlines()] == result.mean[1:, 0].tolist()
+    cells = [line.split(",") for line in table.splitlines()[1:]]
+    lines = [f'{{"time": {t}, "y": [{z or "null"}]' + (f', "inputs": {{"u": {u}}}' if u else "") + "}\n" for t, z, u in cells]
+    assert command("stream", "model.toml", "--method", "linear", given="".join(lines)) == 0
+    assert capsys.readouterr() == (out, "")
+    # A stream that goes on from a checkpoint has the last value.
+    arguments = ("stream", "model.toml", "--method", "linear", "--checkpoint", "state")
+    assert command(*arguments, given="".join(lines[:5])) == 0 and command(*arguments, given="".join(lines)) == 0
+    assert capsys.readouterr().out.splitlines()[5:] == out.splitlines()[4:]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('{"time": 1, "y": [1]}', "line 1: update: inputs: u of model.toml are missing"),
+        ('{"time": 1, "y": [1], "inputs": [1]}', 'line 1: "inputs" is a list; give an object'),
+        ('{"time": 1, "y": [1], "inputs": {"u": "1"}}', 'line 1: the input "u" is "1"; give a number'),
+        ('{"time": 1, "y": [1], "inputs": {"u": 1, "u": 2}}', 'line 1: the key "u" stands twice'),
+        ('{"time": 1, "y": [1], "inputs": {"v": 1}}', "line 1: update: inputs: 'v' is not an input"),
+        ("time,u\n1,2", "line 1: 1 columns; the model needs time and 1 observations"),
+        ("time,u,z\n1,2", "line 2: 2 columns; the header has 3"),
+        ("time,u,z\n1,,2", "line 2: update: inputs: u of model.toml are missing"),
+    ],
+)
+def test_a_wrong_line_is_named(folder, capsys, line, words):
+    assert command("stream", "model.toml", "--method", "linear", "--strict", given=line + "\n") == 2
+    err = capsys.readouterr().err
+    assert words in err and err.count("\n") == 1
+
+
+STUDY = """
+models = ["model.toml"]
+[methods]
+linear = {}
+[[records]]
+file = "%s"
+"""
+
+
+def test_a_study_of_given_records_takes_inputs_from_a_file_or_from_their_columns(folder, capsys):
+    record = zakai.read_record("record.csv", zakai.load_model("model.toml"))
+    expected = zakai.filter(zakai.load_model("model.toml"), record, method="linear").log_likelihood
+    rows = [f"{t!r},{u!r}" for t, u in zip(record.inputs.times.tolist(), record.inputs.values[:, 0].tolist())]
+    (folder / "u.csv").write_text("\n".join(["time,u", *rows]) + "\n")
+    lines = [line.rpartition(",")[0] for line in (folder / "record.csv").read_text().splitlines()]
+    (folder / "alone.csv").write_text("\n".join(lines) + "\n")
+    for name, more in (("record.csv", ()), ("alone.csv", ("--inputs", "u.csv"))):
+        (folder / "study.toml").write_text(STUDY % name)
+        assert command("study", "study.toml", "-o", name[:-4], *more) == 0, capsys.readouterr().err
+        import xarray
+
+        with xarray.open_dataset(folder / name[:-4] / "study.nc", group=None) as data:
+            assert float(data["log_likelihood"].values.ravel()[0]) == expected
+    for name, more, words in (
+        (
+            "record.csv",
+            ("--inputs", "u.csv"),
+            "record.csv has columns for the inputs, and --inputs gives them too; give them once",
+        ),
+        ("alone.csv", (), "inputs: u of model.toml are missing"),
+    ):
+        (folder / "study.toml").write_text(STUDY % name)
+        capsys.readouterr()
+        assert command("study", "study.toml", "-o", "other", *more) == 2
+        assert words in capsys.readouterr().err
+
+
+def test_the_innovations_of_a_study_are_those_of_the_evidence(model):
+    from zakai.studies.innovations import Innovations
+
+    times, values = times_and_values()
+    record = zakai.Record(times, values, "samples", inputs_until(times[-1]))
+    result = zakai.filter(model, record, method="linear")
+    found, spread = Innovations(model)(record, result.mean, result.cov)
+    seen = ~np.isnan(values)
+    evidence = -0.5 * (found[:, 0] ** 2 / spread[:, 0, 0] + np.log(2 * np.pi * spread[:, 0, 0]))
+    np.testing.assert_allclose(evidence[seen], result.log_likelihood_increments[1:][seen], atol=1e-4)
+
+
+def test_a_method_of_the_package_agrees_online_and_after_a_checkpoint(model, tmp_path):
+    times, values = times_and_values(10)
+    inputs = inputs_until(times[-1])
+    record = zakai.Record(times, values, "samples", inputs)
+    result = zakai.filter(model, record, method="yau-yau")
+    expected = rows_of_result(result)
+    np.testing.assert_allclose(expected, rows_of_result(zakai.filter(model, record, method="linear")), atol=1e-4)
+    online, follower = (zakai.online(model, method="yau-yau") for _ in range(2))
+    rows = [online.update(times[k], values[k], inputs if k == 0 else None) for k in range(5)]
+    online.save(tmp_path / "state")
+    follower.restore(tmp_path / "state")
+    rows += [follower.update(times[k], values[k]) for k in range(5, 10)]
+    assert rows_of(rows).tobytes() == expected.tobytes()
