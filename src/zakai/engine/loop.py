@@ -170,7 +170,7 @@ class Run:
             model=model,
             record=self.record,
             conditions=considered,
-            bounds=method.bounds,
+            bounds={name: bound for name, bound in method.bounds.items() if name in infos.health},
             state=model.state,
             attributes={"source": method.source, "exactness": method.exactness, **versions()},
             _cov=cov,
