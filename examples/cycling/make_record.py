@@ -66,14 +66,14 @@ def main() -> None:
     # The second lap: an observation every half minute, with the error of a barometer.
     rows = np.searchsorted(time, np.arange(time[last], time[-1], EVERY))
     seconds = time[rows] - time[last]
-    readings = altitude[rows] + np.random.default_rng(0).normal(0, ERROR, len(rows))
+    observations = altitude[rows] + np.random.default_rng(0).normal(0, ERROR, len(rows))
 
     def write(name: str, header: str, *columns: np.ndarray) -> None:
         lines = [",".join(f"{value:.6g}" for value in row) for row in zip(*columns, strict=True)]
         (HERE / name).write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")
 
     (HERE / "map.csv").write_text("phi,altitude\n" + "".join(f"{a!r},{h:.3f}\n" for a, h in zip(knots.tolist(), heights)))
-    write("observations.csv", "time,altitude", seconds, np.round(readings, 2))
+    write("observations.csv", "time,altitude", seconds, np.round(observations, 2))
     write("truth.csv", "time,phi,v", seconds, phi[rows - first], 2 * np.pi * speed[rows] / length)
     print(f"lap of {length:.0f} m; {last - first} rows of the first, {len(rows)} observations on the second")
 

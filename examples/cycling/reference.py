@@ -26,7 +26,7 @@ def transition(tau: float, speeds: np.ndarray, bins: int, p: dict) -> np.ndarray
     return weights * np.exp(-1j * f * mean - 0.5 * f**2 * (of_distance - common**2 / of_speed))
 
 
-def histogram_filter(times: np.ndarray, readings: np.ndarray, table: np.ndarray, p: dict, bins: int = 768, rows: int = 40):
+def histogram_filter(times: np.ndarray, observations: np.ndarray, table: np.ndarray, p: dict, bins: int = 768, rows: int = 40):
     """Filter with a histogram of `bins` positions and `rows` speeds, from any position and a stationary speed at the time 0.
 
     Gives the positions (bins,), the posterior of the position after each observation (K, bins), the mean speed (K,), the log
@@ -39,13 +39,13 @@ def histogram_filter(times: np.ndarray, readings: np.ndarray, table: np.ndarray,
     density /= density.sum()
     kernels: dict[float, np.ndarray] = {}
     posterior, (speed, increments, below) = np.empty((len(times), bins)), np.empty((3, len(times)))
-    for k, (tau, reading) in enumerate(zip(np.diff(times, prepend=0.0).tolist(), readings, strict=True)):
+    for k, (tau, observation) in enumerate(zip(np.diff(times, prepend=0.0).tolist(), observations, strict=True)):
         if tau > 0:
             if tau not in kernels:
                 kernels[tau] = transition(tau, speeds, bins, p)
             moved = kernels[tau] @ np.fft.rfft(density).T[:, :, None]
             density = np.maximum(np.fft.irfft(moved[:, :, 0].T, bins), 0)
-        residual = (reading - altitude) / p["r"]
+        residual = (observation - altitude) / p["r"]
         below[k] = density.sum(axis=0) @ ndtr(residual)
         density = density * np.exp(-0.5 * residual**2) / np.sqrt(2 * np.pi * p["r"] ** 2)
         increments[k] = np.log(density.sum())

@@ -176,14 +176,18 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
     inside = prepared.inside[k]
     if prepared.lie and not inside.all():
         inside = np.zeros_like(inside)
-    before, gained = lw.moments(values, window), 0.0
+    before, gained, contraction = lw.moments(values, window), 0.0, 1.0
     if length > 0:
         rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
         start = float(schedule.starts[k])
         kernel = _kernel(prepared, k, window, rates, report)
+        contraction = 1.0 if kernel is None else float(kernel.scale.real)
         values, window, gained, look = propagated(prepared, values, window, start, length, inside, rates, kernel, report)
     predicted, log_floor = lw.moments(values, window), float(state.log_floor)
     if report.positive:
+        # A positive kernel fills the tails anew.
+        wider = predicted[1].real / max(contraction**2 * before[1].real, 1e-300)
+        log_floor = max(log_floor * float(np.clip(wider, 1.0, 20.0)), float(np.log(prepared.cut)))
         floor = float(np.exp(log_floor)) + report.edge
     else:
         log_floor = float(np.log(NOISE))
@@ -240,7 +244,7 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
 def _kernel(prepared: Prepared, k: int, window: lw.Window, rates: np.ndarray, report: Report) -> Channel | None:
     """Return the Gaussian kernel of interval k, for x relative to the origin of the window, if there is one."""
     kernels = prepared.kernels
-    if kernels is None or window.closed or kernels.place[k] < 0:
+    if kernels is None or kernels.place[k] < 0:
         return None
     place = int(kernels.place[k])
     report.time += float(kernels.errors[place])

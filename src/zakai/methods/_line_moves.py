@@ -16,6 +16,7 @@ from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel
 from zakai.numerics.line_operator import exponential_action, generator
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS, panels
+from zakai.numerics.line_transition import WIDE, wrapped
 
 Array = Any
 
@@ -55,7 +56,13 @@ def propagated(
     system, negligible, look = prepared.system, prepared.negligible, None
     gained: Any = 0.0
     rough, resolved = max(1e-10, 1e-3 * prepared.tolerance), 30.0 * negligible
-    if kernel is not None and prepared.yau is not None:
+    if kernel is not None and window.closed:
+        around = _around(prepared, values, window, kernel)
+        if around is not None:
+            look, mass = lw.figures(around, True, negligible), np.sum(around)
+            report.density(look)
+            return around / mass, window, np.log(mass) + kernel.constant, look
+    elif kernel is not None and prepared.yau is not None:
         ends = start, start + length
         direct = moved(prepared.yau, kernel, values, window, *ends, prepared.theta, negligible, rough, prepared.cut)
         if direct is not None:
@@ -132,6 +139,18 @@ def propagated(
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
     return values, window, gained, look
+
+
+def _around(prepared: Prepared, values: Array, window: lw.Window, kernel: Channel) -> Array | None:
+    """Return a density on the circle convolved with a wrapped Gaussian, None where the kernel is none or too narrow."""
+    if np.iscomplexobj(values) or np.iscomplexobj(kernel.variance) or np.iscomplexobj(kernel.shift):
+        return None
+    variance = kernel.variance / window.spacing**2
+    if kernel.scale != 1.0 or kernel.slope != 0.0 or kernel.curvature != 0.0 or not variance >= WIDE:
+        return None
+    moved = np.array(values, float)
+    wrapped(moved, np.empty_like(moved), kernel.shift / window.spacing, variance, 8.0 - np.log(prepared.cut))
+    return moved
 
 
 class _Attempt(NamedTuple):
