@@ -4,13 +4,7 @@ A sample multiplies the density after the transition (`numerics/line_transition.
 
     exp(b / 6) exp(tau A / 2) exp(2 b / 3 - tau G b'^2 / 72) exp(tau A / 2) exp(b / 6),     b = h'S^-1 dy - tau h'S^-1 h / 2,
 
-which is of fourth order in tau (Chin 1997, scheme A).  The residual of the splitting is, with the third and fifth commutators
-for a Gaussian density of the variance P,
-
-    tau^2 std(G^2 b'^2 b'') / 2160 + 7 tau^3 sqrt(8) (G / P) rms(G^2 b''^2) / 8640
-    + tau^4 max(rate^2 rms([A, [b, A]]), std(L^4 b)) / 2880 + tau^3 rms((dL/dt) b) / 2880,
-
-L the backward operator.  With s substeps of an increment, s^-4 of that.
+in as many substeps as its error asks for (`numerics/line_splitting.py`).
 
 For Gaussian kernels the grid is a window of a long table, and the loop moves it by whole spacings.  It stops before the first
 step that is not accurate enough, or needs another grid or kernels of more substeps, and says so.
@@ -25,6 +19,7 @@ from numba import boolean, float64, int64, types
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
+from zakai.numerics.line_splitting import exponent_of, residual
 from zakai.numerics.line_transition import (
     BAND,
     WIDE,
@@ -124,90 +119,6 @@ class Taken(NamedTuple):
 _V, _M, _T = float64[::1], float64[:, ::1], float64[:, :, ::1]
 
 
-@kernel(float64(_V, _V, _V, _V, _V, _V, float64, float64, float64, float64))
-def _residual(
-    values: Array, b: Array, first: Array, second: Array, drift: Array, change: Array, covariance: float, acceleration: float,
-    spacing: float, tau: float,
-) -> float:  # fmt: skip
-    """The residual of the splitting of an increment, relative to the density; `change` and `acceleration` are df/dt and dG/dt."""
-    size, G = values.size, covariance
-    mass, mean, variance = moments(values)
-    mean, variance = mean + size // 2, variance * spacing * spacing
-    third = third_square = bent = upward = flow = seen = moving = 0.0
-    twice_mean = twice_square = four_mean = four_square = 0.0
-    # b, L b, ..., L^4 b, L the backward operator by differences.
-    powers = np.zeros((5, size))
-    powers[0], powers[1, 1 : size - 1] = b, drift[1 : size - 1] * first[1 : size - 1] + 0.5 * G * second[1 : size - 1]
-    for i in range(1, 4):
-        for j in range(i + 1, size - i - 1):
-            rise = (powers[i, j + 1] - powers[i, j - 1]) / (2.0 * spacing)
-            bend = (powers[i, j + 1] - 2.0 * powers[i, j] + powers[i, j - 1]) / (spacing * spacing)
-            powers[i + 1, j] = drift[j] * rise + 0.5 * G * bend
-    for j in range(4, size - 4):
-        p = values[j] / mass
-        if p < 1e-12:
-            continue
-        seen += p
-        part = G * G * first[j] * first[j] * second[j]
-        third += p * part
-        third_square += p * part * part
-        bent += p * (G * second[j]) ** 4
-        moving += p * (change[j] * first[j] + 0.5 * acceleration * second[j]) ** 2
-        upward += p * G * ((powers[1, j + 1] - powers[1, j - 1]) / (2.0 * spacing)) ** 2
-        twice_mean += p * powers[2, j]
-        twice_square += p * powers[2, j] ** 2
-        four_mean += p * powers[4, j]
-        four_square += p * powers[4, j] ** 2
-        flow += p * drift[j] * (j - mean) * spacing
-    if not (seen > 0.5 and variance > 0):
-        return np.inf
-    growth, turning = G / variance, abs(flow) / variance
-    spread = np.sqrt(max(third_square - third * third, 0.0))
-    curved = np.sqrt(bent)
-    twice = np.sqrt(max(twice_square - twice_mean * twice_mean, 0.0))
-    four = np.sqrt(max(four_square - four_mean * four_mean, 0.0))
-    commutator = twice + 2.0 * np.sqrt(upward * growth) + growth * np.sqrt(2.0 * curved)
-    residual = tau**2 / 2160.0 * spread + 7.0 / 8640.0 * tau**3 * np.sqrt(8.0) * growth * curved
-    residual += tau**3 / 2880.0 * np.sqrt(moving)
-    total: float = residual + tau**4 / 2880.0 * max((growth + turning) ** 2 * commutator, four)
-    return total
-
-
-@kernel(float64(_M, _M, _M, _M, _V, int64, float64, _V, _V, _V))
-def _exponent(
-    h: Array, slope: Array, curvature: Array, precision: Array, observed: Array, at: int, share: float, b: Array, first: Array,
-    second: Array,
-) -> float:  # fmt: skip
-    """Write h'S^-1 (y - share h / 2) less its value at a point, and its derivatives; return the largest difference.
-
-    Large numbers cancel in this way before they are squared.
-    """
-    m, size, largest = h.shape[0], h.shape[1], 0.0
-    b[:], first[:], second[:] = 0.0, 0.0, 0.0
-    for i in range(m):
-        weighted, centre = 0.0, h[i, at]
-        for l in range(m):
-            weighted += precision[i, l] * (observed[l] - share * h[l, at])
-        for j in range(size):
-            b[j] += weighted * (h[i, j] - centre)
-            first[j] += weighted * slope[i, j]
-            second[j] += weighted * curvature[i, j]
-        for l in range(m):
-            other, pull = h[l, at], share * precision[i, l]
-            if pull == 0.0:
-                continue
-            for j in range(size):
-                apart = pull * (h[l, j] - other)
-                b[j] -= 0.5 * apart * (h[i, j] - centre)
-                first[j] -= apart * slope[i, j]
-                second[j] -= apart * curvature[i, j] + pull * slope[i, j] * slope[l, j]
-    for j in range(size):
-        if not (b[j] > -1e8):
-            b[j], first[j], second[j] = -1e8, 0.0, 0.0
-        largest = max(largest, abs(b[j]))
-    return largest
-
-
 @kernel(
     int64(
         _V, _M, _M, _V, _M, _M, int64, float64, _V, _M, float64, _M, float64, float64, float64, boolean, _V, float64, _V, _V
@@ -236,7 +147,7 @@ def _attempt(
     low, high = support(now, cut)
     width_before = moments(now)[2]
     share = 0.0 if kind == KERNEL else (tau if kind == SPLIT else 1.0)
-    seen = _exponent(h, slope, curvature, precision, observed, at, share, b, first, second) > 0.0
+    seen = exponent_of(h, slope, curvature, precision, observed, at, share, b, first, second) > 0.0
     for i in range(m):
         for l in range(m):
             if kind == FACTOR:
@@ -318,7 +229,7 @@ def _attempt(
                 x = (j - half) * spacing + offset
                 flow[j] = ((one[0] + two[0] - 2.0) * x + one[1] + two[1]) / tau + drift[j] * spread / tau
                 change[j] = ((two[0] - one[0]) * x + two[1] - one[1]) * 4.0 / tau**2 + drift[j] * acceleration
-        splitting = _residual(now, b, first, second, flow, change, spread / tau, acceleration, spacing, tau)
+        splitting = residual(now, b, first, second, flow, change, spread / tau, acceleration, spacing, tau)
         if splitting <= most_splitting:
             break
         needed = np.ceil((splitting / most_splitting) ** 0.25)
