@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class ZakaiError(Exception):
-    """An error that is not a bug of ours; its text is one line that says what is wrong and what to do."""
+    """An error that is no bug in zakai; its text is one line that says what is wrong and what to do."""
 
     exit_code = 2
 

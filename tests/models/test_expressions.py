@@ -6,7 +6,8 @@ import sympy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zakai.models.expressions import ExpressionError, parse_expression
+from zakai.models.expressions import ExpressionError
+from zakai.models.formulas import parse_expression
 
 x, y, t = sympy.symbols("x y t", real=True)
 NAMES = {"x": x, "y": y, "t": t}

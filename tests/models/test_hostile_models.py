@@ -1,4 +1,4 @@
-"""Model files from a stranger: refused in one line before anything large is computed, whatever they hold."""
+"""Untrusted model files: refused in one line before anything large is computed, whatever they hold."""
 
 from __future__ import annotations
 

@@ -21,8 +21,11 @@ _MANY = 10**6  # expansions larger than this need not be told apart
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Of one formula: its degree as a polynomial in names and functions, the bits of all its exact numbers together,
-    the height and the size of its tree, and the number of terms that it has when it is expanded."""
+    """The cost of one formula.
+
+    Its degree as a polynomial in names and functions, the bits of all its exact numbers together, the height and the size of
+    its tree, and the number of terms of its expansion.
+    """
 
     degree: Fraction = Fraction(0)
     bits: int = 0
@@ -32,7 +35,7 @@ class Cost:
 
     @property
     def small(self) -> bool:
-        """Whether SymPy may look for simpler forms: its searches expand, and a stranger's formula can be large."""
+        """Whether SymPy may look for simpler forms: its searches expand, and an untrusted formula can be large."""
         return self.size <= SMALL_SIZE and self.terms <= SMALL_EXPANSION
 
     @property

@@ -60,7 +60,7 @@ def _refuse_nonfinite(model: Model, values: np.ndarray, grid: np.ndarray) -> Non
         point = grid[np.unravel_index(np.argmax(bad), bad.shape)]
         raise InputError(explain_nonfinite(model, "log_density", model.prior.log_density, point, model.start))
     if not np.isfinite(values).any():
-        raise InputError("log_density: the density is zero everywhere that was looked at")
+        raise InputError("log_density: the density is zero at all points that were tried")
 
 
 def on_edge(grid: np.ndarray, ends: np.ndarray) -> np.ndarray:

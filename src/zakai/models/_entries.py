@@ -17,7 +17,8 @@ from sympy.printing.str import StrPrinter
 
 from zakai.errors import InputError
 from zakai.models._errors import did_you_mean, echo, listing, named
-from zakai.models.expressions import RESERVED, parse_expression
+from zakai.models.expressions import RESERVED
+from zakai.models.formulas import parse_expression
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}\Z")
 
@@ -88,7 +89,7 @@ def formula(value: Any) -> str:
 
 
 def exact_number(value: Any) -> sympy.Rational:
-    """A rational number, given as a number or as a text like \"1/3\"."""
+    """Return a rational number that is given as a number or as a text like "1/3"."""
     text = formula(value)
     result = parse_expression(text, {})
     if not result.is_Rational:

@@ -1,4 +1,4 @@
-"""Words shared by the errors of this room: where something is wrong, and what the user may have meant."""
+"""Words shared by the errors of this package: where something is wrong, and what the user may have meant."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from zakai.models.expressions import (
     Sum,
 )
 from zakai.models.functions import Floor, Maximum, Minimum, Sinc, pairwise, table_function
-from zakai.models.tables import Table
+from zakai.models.table import Table
 
 MAX_CONSTANT_BITS = 2_200  # of a numerator or denominator: twice what a double's exponent can hold
 
@@ -251,7 +251,7 @@ def _finite(part: _Part, position: int) -> _Part:
     """The part, with its value exact where SymPy found one, if it is not a number or double precision holds it."""
     expr, value = part.expr, part.value
     if expr in _NOT_NUMBERS:
-        raise ExpressionError("division by zero, or a number that does not exist", position)
+        raise ExpressionError("division by zero, or a value that is not finite", position)
     if expr.is_Rational:
         if max(int(expr.p).bit_length(), int(expr.q).bit_length()) > MAX_CONSTANT_BITS:
             raise ExpressionError("its exact numbers grow too large", position)

@@ -11,8 +11,8 @@ import sympy
 from zakai.errors import InputError
 from zakai.models import _entries
 from zakai.models._errors import did_you_mean, listing, named
-from zakai.models.expressions import parse_expression
 from zakai.models.families import FAMILIES
+from zakai.models.formulas import parse_expression
 
 if TYPE_CHECKING:
     from zakai.models.model import Model

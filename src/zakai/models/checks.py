@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from zakai.models.model import Model
 
 COEFFICIENTS = ("diffusion", "process_noise", "observation_noise", "cross_noise")
-WITHIN = 1024  # times inside of intervals at which noise is looked at
+NoiseCheck = Callable[[np.ndarray, np.ndarray], tuple[int, tuple[str, str]] | None]
+WITHIN = 1024  # times inside of intervals at which noise is checked
 
 _GOOD: WeakKeyDictionary[Model, set[str]] = WeakKeyDictionary()  # the noises of a model that are noise at all times
 
@@ -77,39 +78,51 @@ def check_constant_noise(model: Model) -> None:
 
 
 def _problem(model: Model, key: str, times: np.ndarray) -> tuple[int, tuple[str, str]] | None:
-    """The first time at which the matrix is not what it must be, and the words before and after that time."""
-    matrix, theta = getattr(model, key), model.theta()
-    times = times if matrix.has(model.t) else times[:1]
+    """Return the first time at which the matrix is not what it must be, and the words before and after that time."""
+    check = noise_check(model, key)
+    return None if check is None else check(times, model.theta())
+
+
+def noise_check(model: Model, key: str) -> NoiseCheck | None:
+    """Return what `_problem` does as a function of the times and the parameters; None where there is nothing to check."""
+    matrix, m, rows = getattr(model, key), model.m, getattr(model, key).shape[0]
+    varies, state = matrix.has(model.t), np.zeros(model.n)
     entries = matrix.todok()
     if key == "cross_noise" and not entries:
         return None
-    if key == "diffusion" or key != "cross_noise" and all(row == column for row, column in entries):
-        # Each entry is a matrix of its own: independent noises of a hundred states at a thousand times need no eigenvalues.
-        each = list(entries.values() if key == "diffusion" else matrix.diagonal())
-        matrices = numpy_function(each, model)(np.zeros(model.n), times, theta)[..., None, None]
-    else:
-        matrices = numpy_function(matrix, model, matrix.shape)(np.zeros(model.n), times, theta)[:, None]
-    finite = np.isfinite(matrices).all(axis=(-3, -2, -1))
-    if not finite.all():
-        return int(np.argmin(finite)), ("is not finite", "")
-    if key == "diffusion":
-        return None
-    if key == "cross_noise":
-        joint = joint_covariance(model)(np.zeros(model.n), times, theta)
-        good = smallest_eigenvalue(joint) >= -ROUNDING * joint.shape[-1]
-        words = ("is larger than process_noise and observation_noise allow", "; a correlation is at most 1 in size")
+    alone = key == "diffusion" or key != "cross_noise" and all(row == column for row, column in entries)
+    # Each entry is a matrix of its own: independent noises of a hundred states at a thousand times need no eigenvalues.
+    each = list(entries.values() if key == "diffusion" else matrix.diagonal()) if alone else matrix
+    function = numpy_function(each, model) if alone else numpy_function(matrix, model, matrix.shape)
+    joint = joint_covariance(model) if key == "cross_noise" else None
+
+    def check(times: np.ndarray, theta: np.ndarray) -> tuple[int, tuple[str, str]] | None:
+        times = times if varies else times[:1]
+        values = function(state, times, theta)
+        matrices = values[..., None, None] if alone else values[:, None]
+        finite = np.isfinite(matrices).all(axis=(-3, -2, -1))
+        if not finite.all():
+            return int(np.argmin(finite)), ("is not finite", "")
+        if key == "diffusion":
+            return None
+        if joint is not None:
+            both = joint(state, times, theta)
+            good = smallest_eigenvalue(both) >= -ROUNDING * both.shape[-1]
+            words = ("is larger than process_noise and observation_noise allow", "; a correlation is at most 1 in size")
+            return None if good.all() else (int(np.argmin(good)), words)
+        symmetric = is_symmetric(matrices).all(axis=-1)
+        if not symmetric.all():
+            return int(np.argmin(symmetric)), ("is not symmetric", "")
+        smallest = smallest_eigenvalue(matrices).min(axis=-1)
+        if key == "observation_noise":
+            good = smallest > ROUNDING * m
+            words = ("is not positive definite", "; every direction of the observation needs noise of its own")
+        else:
+            good = smallest >= -ROUNDING * rows
+            words = ("is not positive semidefinite", "; a covariance has no negative direction")
         return None if good.all() else (int(np.argmin(good)), words)
-    symmetric = is_symmetric(matrices).all(axis=-1)
-    if not symmetric.all():
-        return int(np.argmin(symmetric)), ("is not symmetric", "")
-    smallest = smallest_eigenvalue(matrices).min(axis=-1)
-    if key == "observation_noise":
-        good = smallest > ROUNDING * model.m
-        words = ("is not positive definite", "; every direction of the observation needs noise of its own")
-    else:
-        good = smallest >= -ROUNDING * matrix.shape[0]
-        words = ("is not positive semidefinite", "; a covariance has no negative direction")
-    return None if good.all() else (int(np.argmin(good)), words)
+
+    return check
 
 
 def joint_covariance(model: Model) -> NumericFunction:
@@ -156,8 +169,15 @@ def check_periodic(model: Model) -> None:
             with np.errstate(invalid="ignore"):
                 same = (np.abs(here - there) <= 1e-8 * (1 + np.abs(here))) | (~np.isfinite(here) & ~np.isfinite(there))
             if not same.all():
-                text = str(expr)[:60]
-                raise InputError(f"{place}: {text} is not 2*pi-periodic in {angle!r}, which is listed in periodic")
+                said = f"{str(expr)[:60]} is not 2*pi-periodic in {angle!r}, which is listed in periodic"
+                raise InputError(f"{place}: {said}; {_instead(model, place, expr, angle)}")
+
+
+def _instead(model: Model, place: str, expr: sympy.Expr, angle: str) -> str:
+    """Return what to write instead of a formula that is not periodic."""
+    if place.startswith("observation[") and expr == model.x[model.state.index(angle)] and model.observation_kind == "samples":
+        return f'observe cos({angle}) and sin({angle}), or set observation_family = "von-mises"'
+    return f"write it in cos({angle}) and sin({angle}), or leave {angle} out of periodic"
 
 
 def check_independent_of_state(matrix: sympy.MatrixBase, model: Model) -> None:

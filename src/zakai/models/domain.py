@@ -102,9 +102,8 @@ def _interval(given: Any) -> Interval:
     return interval
 
 
-def check_prior(model: Model) -> None:
+def check_prior(model: Model, prior: Any) -> None:
     """Raise InputError where a Gaussian or mixture prior has more than 1e-6 of its mass outside of the domain."""
-    prior = model.prior
     if prior is None or isinstance(prior, DensityPrior):
         return
     for name, interval in model.domain.items():

@@ -6,24 +6,22 @@
     power    = atom ["**" unary]                    as in Python: -x**2 = -(x**2), 2**-1 = 1/2, 2**3**2 = 2**9
     atom     = number | "pi" | name | name "(" sum ("," sum)* ")" | "(" sum ")"
 
-Nothing is ever evaluated as Python; a formula from a stranger can do nothing but be a formula.
+Nothing is ever evaluated as Python; an untrusted formula can be nothing but a formula.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, NamedTuple
-
-import sympy
 
 from zakai.errors import InputError
 from zakai.models._errors import echo
 
 if TYPE_CHECKING:
-    from zakai.models.tables import Table
+    pass
 
 MAX_LENGTH = 10_000
 MAX_DEPTH = 100
@@ -72,18 +70,24 @@ class ExpressionError(InputError):
 
 @dataclass(frozen=True, slots=True)
 class Number:
+    """An exact number."""
+
     value: Fraction
     position: int
 
 
 @dataclass(frozen=True, slots=True)
 class Name:
+    """A state, a parameter, t or a constant."""
+
     name: str
     position: int
 
 
 @dataclass(frozen=True, slots=True)
 class Call:
+    """A function of its arguments."""
+
     name: str
     arguments: tuple[Node, ...]
     position: int
@@ -91,12 +95,16 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Negative:
+    """The negative of its operand."""
+
     operand: Node
     position: int
 
 
 @dataclass(frozen=True, slots=True)
 class Power:
+    """A base to an exponent."""
+
     base: Node
     exponent: Node
     position: int
@@ -269,21 +277,3 @@ def _number(token: _Token) -> Fraction:
     if len(magnitude) > 3 or abs(int(exponent or "0") + leading - 1) > MAX_DECIMAL_EXPONENT:
         raise ExpressionError(f"the number {echo(token.text)} is outside 1e-308 to 1e308", token.position)
     return Fraction(int(digits)) * Fraction(10) ** (int(exponent or "0") + leading - len(digits))
-
-
-def parse_expression(
-    text: str, symbols: Mapping[str, sympy.Expr], functions: Collection[str] = (), tables: Mapping[str, Table] | None = None
-) -> sympy.Expr:
-    """Read a formula into SymPy, with decimals as exact rationals.
-
-    `text` is one formula; `symbols` maps each name it may use to the symbol that stands for it; `functions`
-    names the undetermined functions, `tables` holds the tables by name. Raises `ExpressionError` with the column for anything
-    else, for a constant that does not exist (1/0, log(-1)) and for powers and numbers that grow beyond the bounds.
-
-        >>> x = sympy.Symbol("x", real=True)
-        >>> parse_expression("0.5*x**2", {"x": x})
-        x**2/2
-    """
-    from zakai.models._exact import to_sympy
-
-    return to_sympy(parse(text), symbols, functions, tables or {})

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import sympy
 
+from zakai.models._entries import formula
 from zakai.models.functions import Floor, Maximum, Minimum, Sinc, TableFunction
 
 if TYPE_CHECKING:
@@ -82,10 +83,15 @@ def features_of(model: Model) -> dict[str, str]:
         found[OBSERVATION_LOG_DENSITY] = f"observation_log_density: {_short(model.log_density)}"
     if model.domain:
         found[DOMAIN] = f"domain: {', '.join(f'{name} {interval}' for name, interval in model.domain.items())}"
+    return found | _of_formulas(formulas_of(model))
+
+
+def formulas_of(model: Model) -> list[sympy.Expr]:
+    """Return the formulas of a model that are not zero, those of the prior apart."""
+    matrices = (model.diffusion, model.process_noise, model.observation_noise, model.cross_noise)
     formulas = [*model.drift, *model.observation, *model.family_parameters.values()]
-    formulas += [entry for matrix in _matrices(model) for entry in matrix.todok().values()]
-    formulas += [] if model.log_density is None else [model.log_density]
-    return found | _of_formulas(formulas)
+    formulas += [entry for matrix in matrices for entry in matrix.todok().values()]
+    return formulas + ([] if model.log_density is None else [model.log_density])
 
 
 def _of_formulas(formulas: list[sympy.Expr]) -> dict[str, str]:
@@ -97,12 +103,6 @@ def _of_formulas(formulas: list[sympy.Expr]) -> dict[str, str]:
     return found
 
 
-def _matrices(model: Model) -> tuple[sympy.MatrixBase, ...]:
-    return model.diffusion, model.process_noise, model.observation_noise, model.cross_noise
-
-
 def _short(expression: sympy.Expr) -> str:
-    from zakai.models._entries import formula
-
     text = formula(expression)
     return text if len(text) <= 60 else text[:57] + "..."

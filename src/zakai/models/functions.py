@@ -9,7 +9,7 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from zakai.models.tables import Table
+from zakai.models.table import Table
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _NEAR = 8.0  # |x| up to which the integral of sinc is taken; the recursion loses digits for small |x|

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property
 from pathlib import Path
@@ -11,14 +11,17 @@ from typing import Any
 import numpy as np
 import sympy
 
+from zakai import _display
+from zakai.densities import Density
 from zakai.errors import InputError
 from zakai.models import _entries, checks
 from zakai.models._errors import did_you_mean, listing, named
 from zakai.models._law_keys import read_law, read_observed
 from zakai.models._toml import to_toml
 from zakai.models.domain import Interval, check_prior, read_domain
-from zakai.models.expressions import MAX_LENGTH, parse_expression
-from zakai.models.features import features_of
+from zakai.models.expressions import MAX_LENGTH
+from zakai.models.features import features_of, formulas_of
+from zakai.models.formulas import parse_expression
 from zakai.models.observation_law import ObservationLaw
 from zakai.models.prior import Prior, read_prior
 from zakai.models.tables import Table, read_tables
@@ -49,6 +52,8 @@ KEYS = (
     "tables",
 )
 HOLDS = ("zero", "linear")
+Formulas = Sequence[str | float | sympy.Expr]
+FormulaRows = Sequence[Formulas]
 MOST_STATES = 1024  # of states, sensors and noises: a default identity matrix has this many squared entries
 MOST_CHARACTERS = 250_000  # of all different formulas together: what a computer reads in seconds
 MOST_PARENTHESES = 8_192
@@ -118,8 +123,36 @@ class Model:
     domain: dict[str, Interval]
     tables: dict[str, Table]
 
-    def __init__(self, /, **keys: Any):
-        self._read(keys, source="<python>", text=None, folder=Path())
+    def __init__(
+        self,
+        *,
+        state: Sequence[str] | None = None,
+        drift: Formulas | None = None,
+        observation: Formulas | None = None,
+        observation_kind: str | None = None,
+        prior: Prior | Density | Mapping[str, Any] | None = None,
+        diffusion: FormulaRows | None = None,
+        process_noise: FormulaRows | None = None,
+        observation_noise: FormulaRows | None = None,
+        cross_noise: FormulaRows | None = None,
+        parameters: Mapping[str, Any] | None = None,
+        start: float | None = None,
+        periodic: Sequence[str] | None = None,
+        name: str | None = None,
+        inputs: Sequence[str] | None = None,
+        input_hold: str | None = None,
+        observation_family: str | Sequence[str] | None = None,
+        degrees_of_freedom: Any = None,
+        concentration: Any = None,
+        observation_log_density: str | sympy.Expr | None = None,
+        observed: Sequence[str] | None = None,
+        domain: Mapping[str, Mapping[str, Any]] | None = None,
+        tables: Mapping[str, Any] | None = None,
+        functions: Sequence[str] | None = None,
+        **unknown: Any,
+    ):
+        given = {key: value for key, value in locals().items() if key in KEYS and value is not None}
+        self._read({**given, **unknown}, source="<python>", text=None, folder=Path())
 
     @classmethod
     def _from_file(cls, keys: Mapping[str, Any], source: str, text: str | None, folder: Path | None = None) -> Model:
@@ -149,9 +182,8 @@ class Model:
         with named("start"):
             vars(self)["start"] = canonical["start"] = _entries.number(keys.get("start", 0.0))
         with named("prior"):
-            prior, table = read_prior(keys.get("prior"), self.n, self._reader(in_time=False))
-            vars(self)["prior"], canonical["prior"] = prior, table
-        check_prior(self)
+            vars(self)["prior"], canonical["prior"] = self._prior(keys.get("prior"))
+        check_prior(self, self.prior)
         checks.check_constant_noise(self)
         checks.check_periodic(self)
         if text is not None:
@@ -163,8 +195,20 @@ class Model:
     __delattr__ = __setattr__  # type: ignore[assignment]
 
     def __repr__(self) -> str:
-        state = ", ".join(self.state)
-        return f"<Model {self.name!r}: state ({state}), {self.m} observations as {self.observation_kind}>"
+        observed = _display.counted(self.m, "observation")
+        return f"Model({self.name!r}: state {_display.short_names(self.state)}, {observed} as {self.observation_kind})"
+
+    def _repr_html_(self) -> str:
+        samples = self.observation_kind == "samples"
+        rows = [(f"d{name}", f"({_short(formula)}) dt + noise") for name, formula in zip(self.state, self.drift, strict=True)]
+        if self.log_density is not None:
+            rows.append(("log p(z | x)", _short(self.log_density)))
+        else:
+            place = [""] if self.m == 1 else [str(j + 1) for j in range(self.m)]
+            left, right = ("z", "{} with noise") if samples else ("dy", "({}) dt + noise")
+            rows += [(f"{left}{j}", right.format(_short(formula))) for j, formula in zip(place, self.observation, strict=True)]
+        rows += [(f"{name} =", _display.number(float(value))) for name, value in self.parameters.items()]
+        return _display.html_table(repr(self), ("", ""), rows)
 
     def _read_names(self, keys: Mapping[str, Any]) -> None:
         canonical, attributes = self._keys, vars(self)
@@ -309,6 +353,11 @@ class Model:
         return features_of(self)
 
     @cached_property
+    def depends_on_time(self) -> bool:
+        """Whether a formula depends on t or on an input."""
+        return bool(self.inputs) or any(self.t in formula.free_symbols for formula in formulas_of(self))
+
+    @cached_property
     def observation_law(self) -> ObservationLaw:
         """The law of an observation given the state, as NumPy functions."""
         return ObservationLaw(self)
@@ -346,6 +395,40 @@ class Model:
             checks.check_constant_noise(other)
         return other
 
+    def with_prior(self, prior: Prior | Density | Mapping[str, Any], start: float | None = None) -> Model:
+        """Return the same model with another prior, such as the density at the end of an earlier record.
+
+        Args:
+            prior: a density (`result.density(-1)`, `zakai.load_density`), a prior, or a table as in a model file.
+            start: the time at which the prior holds, by default the model's own.
+
+        Raises:
+            InputError: a density of other states, or one that a grid does not resolve.
+
+        Example:
+            >>> from zakai.models import load_model
+            >>> model = load_model("gallery:benes")
+            >>> later = model.with_prior({"kind": "gaussian", "mean": [0.3], "cov": [[0.1]]}, start=2.0)
+            >>> later.start, later.prior.mean.tolist()
+            (2.0, [0.3])
+        """
+        other = object.__new__(Model)
+        vars(other).update({key: value for key, value in vars(self).items() if key not in ("text", "observation_law")})
+        changed: dict[str, Any] = {}
+        with named(self.source):
+            if start is not None:
+                with named("start"):
+                    changed["start"] = vars(other)["start"] = _entries.number(start)
+            with named("prior"):
+                vars(other)["prior"], changed["prior"] = self._prior(prior)
+            vars(other)["_keys"] = {**self._keys, **changed}
+            check_prior(other, other.prior)
+            checks.check_periodic(other)
+        return other
+
+    def _prior(self, given: Any) -> tuple[Prior | None, dict[str, Any] | None]:
+        return read_prior(given, self.x, self._reader(in_time=False), tuple(name in self.periodic for name in self.state))
+
     def to_toml(self) -> str:
         """The model as the text of a model file that gives this model again."""
         return to_toml(self._keys)
@@ -360,6 +443,11 @@ class Model:
     @property
     def _keys(self) -> dict[str, Any]:
         return vars(self)["_keys"]
+
+
+def _short(formula: sympy.Expr) -> str:
+    text = str(formula)
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def _matrix(rows: int, columns: int, entries: Mapping[tuple[int, int], sympy.Expr]) -> sympy.ImmutableMatrix:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import sympy
 
+from zakai.densities import Density
+from zakai.densities.as_prior import prior_table
 from zakai.errors import InputError
 from zakai.models._definite import ROUNDING, is_symmetric, smallest_eigenvalue, square_root
 from zakai.models._entries import array, formula, items, kind_of, known_keys
 from zakai.models._errors import did_you_mean, listing, named
+from zakai.models.grid_prior import read_grid
 
 
 def _gaussian_log_density(x: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> np.ndarray:
@@ -96,17 +99,29 @@ MOST_COMPONENTS = 10_000
 LARGEST = 1e150
 Prior = GaussianPrior | MixturePrior | DensityPrior
 
-_KEYS = {"gaussian": ("mean", "cov"), "mixture": ("weights", "means", "covs"), "density": ("log_density",)}
+_KEYS = {
+    "gaussian": ("mean", "cov"),
+    "mixture": ("weights", "means", "covs"),
+    "density": ("log_density",),
+    "grid": ("log_values", "centre", "basis"),
+}
 
 
-def read_prior(keys: Any, n: int, read_formula: Callable[[str], sympy.Expr]) -> tuple[Prior | None, dict[str, Any] | None]:
+def read_prior(
+    keys: Any, states: Sequence[sympy.Symbol], read_formula: Callable[[str], sympy.Expr], periodic: tuple[bool, ...]
+) -> tuple[Prior | None, dict[str, Any] | None]:
     """The prior of the table `[prior]`, and the table in plain numbers and text.
 
-    `keys` is the table (or a prior, or None), `n` the number of states, `read_formula` reads the formula of
-    a density. Raises InputError, naming the key.
+    `keys` is the table (or a prior, a density of `zakai.densities`, or None), `states` the symbols of the states, `periodic`
+    which of them are angles, `read_formula` reads the formula of a density. Raises InputError, naming the key.
     """
     if keys is None:
         return None, None
+    n = len(states)
+    if isinstance(keys, Density):
+        if keys.names != tuple(map(str, states)):
+            raise InputError(f"the density is of {listing(keys.names)}, and the states are {listing(map(str, states))}")
+        keys = prior_table(keys)
     if isinstance(keys, GaussianPrior):
         keys = {"kind": "gaussian", "mean": keys.mean, "cov": keys.cov}
     elif isinstance(keys, MixturePrior):
@@ -128,6 +143,9 @@ def read_prior(keys: Any, n: int, read_formula: Callable[[str], sympy.Expr]) -> 
         prior: Prior = _read_gaussian(keys, n)
     elif kind == "mixture":
         prior = _read_mixture(keys, n)
+    elif kind == "grid":
+        log_density, grid = read_grid(keys, states, periodic)
+        return DensityPrior(log_density), grid
     else:
         with named("log_density"):
             text = formula(keys["log_density"])

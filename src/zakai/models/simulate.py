@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,20 +18,12 @@ from zakai.models.stepper import Stepper, outside_domain
 
 if TYPE_CHECKING:
     from zakai.models.model import Model
-    from zakai.records import Inputs, Record
+    from zakai.records import Inputs, Record, Truth
 
 SUBSTEPS = 10
 SUBSTEPS_OF_STATE_DEPENDENT_NOISE = 50
 MOST_SUBSTEPS = 1000
 CHUNK = 100_000  # substeps held in memory at once
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """A path of the state: `times` (K+1,), the start first, `values` (K+1, n); angles in (-pi, pi]."""
-
-    times: np.ndarray
-    values: np.ndarray
 
 
 def simulate(
@@ -48,25 +39,33 @@ def simulate(
         x_{j+1} = x_j + f(x_j, t_j) d + g(t_j) Q(t_j)^{1/2} sqrt(d) e_j        e_j ~ N(0, I)
         y_{j+1} = y_j + h(x_j, t_j) d + S(t_j)^{1/2} sqrt(d) e'_j
 
-    `times` (K,) are the times of the record, in the model's unit, strictly increasing and after the model's
-    start (samples may begin at it); `seed` is an integer (the same seed gives the same record) or a NumPy
-    generator; `initial` (n,) is the state at the start, drawn from the prior if not given; `substeps` is the
-    number of Euler steps in each interval. By default an interval of median length or less has 10, a longer
-    one proportionally more, at most 1,000; 50 where the diffusion depends on the state, with Milstein's correction where the
-    noises commute. `inputs` are those of the model; a step begins where they jump. Samples are drawn from the model's
-    observation family. A step that would leave a domain with natural ends is halved, with the Brownian bridge between; at
-    reflecting ends the state is mirrored.
+    Samples are drawn from the model's observation family. A step that would leave a domain with natural ends is halved, with
+    the Brownian bridge between; at reflecting ends the state is mirrored.
 
-    Returns the `Truth` at the start and at the K times, and the `Record`. Raises InputError for times, an
-    initial state or a noise that cannot be, and when the state is no longer finite, with the formula that
-    caused it.
+    Args:
+        model: the system.
+        times: times (K,) of the record, in the model's unit, strictly increasing and after the model's start (samples: at or
+            after it).
+        seed: an integer (the same seed gives the same record) or a NumPy generator.
+        initial: the state (n,) at the start; by default it is drawn from the prior.
+        substeps: Euler steps in each interval. By default 10 in an interval of at most the median length, and proportionally
+            more in a longer one, at most 1,000; 50 where the diffusion depends on the state, with Milstein's correction where
+            the noises commute.
+        inputs: the known inputs of the model; a step begins where they jump.
 
+    Returns:
+        The `Truth` at the start and at the K times, and the `Record`.
+
+    Raises:
+        InputError: wrong times, initial state or noise; or the state is no longer finite, with the formula that caused it.
+
+    Example:
         >>> from zakai.models import load_model
         >>> truth, record = simulate(load_model("gallery:benes"), [0.1, 0.2, 0.3], seed=1)
         >>> truth.values.shape, record.values.shape
         ((4, 1), (3, 1))
     """
-    from zakai.records import Record
+    from zakai.records import Record, Truth
     from zakai.records.inputs import check_inputs
 
     grid = _checked_times(model, times)
@@ -79,18 +78,18 @@ def simulate(
         raise InputError(f"seed: expected a whole number of at least 0, got {kind_of(seed)}") from None
     state = _initial_state(model, initial, rng)
     path = _Path(model, rng, inputs)
-    states, readings = [state], []
+    states, rows = [state], []
     for first, last in _chunks(counts):
         inner, observed = path.advance(state, grid[first : last + 1], counts[first:last])
         state = inner[-1]
         states.extend(inner)
-        readings.append(observed)
+        rows.append(observed)
     values = np.array(states)
     for column, name in enumerate(model.state):
         if name in model.periodic:
             values[:, column] = np.pi - np.mod(np.pi - values[:, column], 2 * np.pi)
-    observed = _reading(model, grid, np.concatenate(readings))
-    return Truth(grid, values), Record(grid[1:], observed, model.observation_kind, inputs)
+    observed = _reading(model, grid, np.concatenate(rows))
+    return Truth(grid, values, model.state), Record(grid[1:], observed, model.observation_kind, inputs)
 
 
 class _Path:
