@@ -1,4 +1,4 @@
-"""A lattice of three states that is slanted in every way: values between its points and marginals against SciPy's Gaussian."""
+"""A grid of three states that is slanted in every way: values between its points and marginals against SciPy's Gaussian."""
 
 from __future__ import annotations
 

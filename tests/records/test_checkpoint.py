@@ -101,7 +101,7 @@ SINE = dict(WALK, observation=["x*sin(x)", "x*cos(x)"])
 TIMES = np.concatenate([np.arange(1, 30) / 20, [1.5, 1.53, 1.6], 1.6 + np.arange(1, 9) / 20])
 
 
-def told(estimate):
+def values_of(estimate):
     """Everything that an estimate says, to the bit."""
     numbers = [estimate.time, *estimate.mean, *estimate.cov.ravel(), estimate.log_likelihood_increment]
     return np.array([*numbers, *estimate.health.values(), *estimate.interval().ravel()]).tobytes(), estimate.warnings
@@ -112,7 +112,7 @@ def check_continuation(tmp_path, model, method, times, every):
     values = 0.1 * rng.standard_normal((len(times), model.m))
     values[5, 0] = np.nan
     straight = zakai.online(model, method)
-    expected = [told(straight.update(time, value)) for time, value in zip(times, values, strict=True)]
+    expected = [values_of(straight.update(time, value)) for time, value in zip(times, values, strict=True)]
     path = tmp_path / "state"
     online = zakai.online(model, method)
     for k, (time, value) in enumerate(zip(times, values, strict=True)):
@@ -120,8 +120,8 @@ def check_continuation(tmp_path, model, method, times, every):
             online.save(path, {"k": k})
             online = zakai.online(model, method)
             assert online.restore(path) == {"k": k}
-            assert k == 0 or told(online.last) == expected[k - 1]
-        assert told(online.update(time, value)) == expected[k]
+            assert k == 0 or values_of(online.last) == expected[k - 1]
+        assert values_of(online.update(time, value)) == expected[k]
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_a_state_that_somebody_made_up_is_refused_and_nothing_of_it_is_run(tmp_p
     path = tmp_path / "state"
     online = zakai.online(zakai.Model(**WALK), "kalman-bucy")
     online.update(0.1, 0.2)
-    before = told(online.last)
+    before = values_of(online.last)
     online.save(path)
     good, arrays = read_checkpoint(path)
     wrong = [
@@ -206,7 +206,7 @@ def test_a_state_that_somebody_made_up_is_refused_and_nothing_of_it_is_run(tmp_p
         write_checkpoint(path, about, arrays)
         with pytest.raises(zakai.InputError, match="does not fit"):
             online.restore(path)
-        assert told(online.last) == before
+        assert values_of(online.last) == before
     (one,) = good["filters"]
     for filters in ([], None, [{}], [{**one, "info": None}], [{**one, "time": "x"}], [one, one]):
         write_checkpoint(path, {**good, "filters": filters}, arrays)

@@ -62,8 +62,8 @@ def saved_after_a_few(path, model, method="auto"):
 
 
 def numbers_of(estimate):
-    told = [estimate.mean.tolist(), estimate.cov.tolist(), estimate.interval().tolist(), estimate.log_likelihood_increment]
-    json.dumps([estimate.time, *told], allow_nan=False)
+    values = [estimate.mean.tolist(), estimate.cov.tolist(), estimate.interval().tolist(), estimate.log_likelihood_increment]
+    json.dumps([estimate.time, *values], allow_nan=False)
     assert (np.diag(estimate.cov) >= -1e-9 * np.abs(estimate.cov).max()).all() or estimate.warnings
 
 
@@ -146,11 +146,11 @@ def test_blocks_that_are_not_at_one_time_are_refused(tmp_path):
         online.restore(path)
 
 
-@pytest.mark.parametrize("readings", [0, 1])
-def test_before_the_first_interval_a_checkpoint_says_what_the_filter_knows_or_is_refused(tmp_path, readings):
+@pytest.mark.parametrize("count", [0, 1])
+def test_before_the_first_interval_a_checkpoint_says_what_the_filter_knows_or_is_refused(tmp_path, count):
     path = tmp_path / "state"
     online = zakai.online(zakai.Model(**BLOCKS, observation_kind="samples"), "extended-kalman-bucy")
-    if readings:
+    if count:
         online.update(0.0, [0.5, np.nan])
     expected = online.last.mean.tolist()
     online.save(path)

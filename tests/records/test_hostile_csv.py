@@ -1,4 +1,4 @@
-"""CSV files from a stranger: refused in one line, in little time and memory, whatever their size."""
+"""Untrusted CSV files: refused in one line, in little time and memory, whatever their size."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results from a stranger: nothing is loaded that the file does not hold, no other file is opened, no code runs."""
+"""Untrusted results: nothing is loaded that the file does not hold, no other file is opened, no code runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import xarray
 
-from zakai.engine.results import load_result
+from zakai.engine.stored import load_result
 from zakai.errors import InputError
 from zakai.records import load_dataset, save_dataset
 

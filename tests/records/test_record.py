@@ -34,7 +34,7 @@ def test_a_record_is_its_own_read_only_float64_copy():
         ([1.0, 2.0], [[0, 1], [np.nan, -np.inf]], "path", "row 1, counted from 0: observation 2 is -inf"),
         ([1.0], [1e308], "path", "at most 1e[+]150"),
         (["1"], [1.0], "path", "times must be real numbers"),
-        (np.array(["2013-01-01"], dtype="datetime64[ns]"), [1.0], "path", "times must be real numbers"),
+        (np.array(["2013-01-01"], dtype="datetime64[ns]"), [1.0], "path", "times are dates; give the unit"),
         ([1.0], [1j], "path", "values must be real numbers"),
         ([1.0], [[object()]], "path", "values must be real numbers"),
         ([1.0, 2.0], [[1.0], [1.0, 2.0]], "path", "values must be real numbers"),
@@ -76,12 +76,12 @@ def test_a_data_frame_gives_its_time_column_or_its_index():
 @pytest.mark.parametrize(
     ("frame", "says"),
     [
-        ({"time": pandas.to_datetime(["2013-01-01"]), "y": [1.0]}, "time must be real numbers"),
+        ({"time": pandas.to_datetime(["2013-01-01"]), "y": [1.0]}, "times are dates; give the unit"),
         ({"time": [1.0], "y": ["1.0"]}, "column 'y' must be real numbers"),
         ({"time": [1.0]}, r"values has shape \(1, 0\)"),
     ],
 )
-def test_a_data_frame_of_dates_or_text_is_refused(frame, says):
+def test_a_data_frame_of_text_or_of_dates_without_a_unit_is_refused(frame, says):
     with pytest.raises(InputError, match=says):
         Record.from_pandas(pandas.DataFrame(frame), "samples")
     with pytest.raises(InputError, match="takes a DataFrame, not dict"):

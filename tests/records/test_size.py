@@ -5,7 +5,7 @@ import numpy as np
 
 from zakai.records import Record, write_record
 
-# On Linux a child's ru_maxrss starts at what its parent held, here a whole pytest; VmHWM starts anew with each program.
+# On Linux a child's ru_maxrss starts at what its parent held, here a whole pytest; VmHWM starts again with each program.
 READ = """
 import re, sys
 from pathlib import Path

@@ -129,14 +129,14 @@ def test_a_dataset_comes_back_whole_with_its_attributes(tmp_path):
 
 
 def test_a_file_that_is_not_a_result_of_ours_is_refused(tmp_path):
-    stranger = xarray.Dataset({"mean": ("time", [1.0])})
-    stranger.to_netcdf(tmp_path / "stranger.nc", engine="h5netcdf")
-    save_dataset(stranger, tmp_path / "ours.nc")
+    foreign = xarray.Dataset({"mean": ("time", [1.0])})
+    foreign.to_netcdf(tmp_path / "foreign.nc", engine="h5netcdf")
+    save_dataset(foreign, tmp_path / "ours.nc")
     (tmp_path / "cut.nc").write_bytes((tmp_path / "ours.nc").read_bytes()[:1000])
     (tmp_path / "text.nc").write_text("time,y\n1,2\n")
     (tmp_path / "empty.nc").touch()
     for name, says in [
-        ("stranger.nc", "its attribute format is 'None', not 'zakai result 1'"),
+        ("foreign.nc", "its attribute format is 'None', not 'zakai result 1'"),
         ("cut.nc", "is damaged or no NetCDF"),
         ("text.nc", "is damaged or no NetCDF"),
         ("empty.nc", "is damaged or no NetCDF"),

@@ -3,8 +3,9 @@
 from zakai.densities._density import Density
 from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
+from zakai.densities.interval import IntervalDensity
 from zakai.densities.mapped import MappedDensity
 from zakai.densities.points import PointMasses
 from zakai.densities.product import ProductDensity
 
-__all__ = ["Density", "GaussianMixture", "GridDensity", "MappedDensity", "PointMasses", "ProductDensity"]
+__all__ = ["Density", "GaussianMixture", "GridDensity", "IntervalDensity", "MappedDensity", "PointMasses", "ProductDensity"]

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from zakai import _display
 from zakai.errors import InputError
+
+INTERVAL = (0.025, 0.975)  # what a density shows of itself
 
 
 @runtime_checkable
 class Density(Protocol):
     """A conditional density of the n state coordinates `names`; angles (`periodic`) live on (-pi, pi].
 
-    `log_density(x)` takes (..., n) and gives (...); `mean()` (n,), `cov()` (n, n), `mode()` (n,), `quantile(q)` (len(q), n) of
-    the marginals, `marginal(...)` the density of some of the coordinates, `sample(key, count)` (count, n).
+    `log_density(x)` takes (..., n) and gives (...), `pdf(x)` its exponential; `mean()` (n,), `cov()` (n, n), `mode()` (n,),
+    `quantile(q)` (len(q), n) of the marginals, `circular_deviation()` (n,) of the angles, `marginal(...)` the density of some of
+    the coordinates, `sample(key, count)` (count, n).  `plot()` draws one or two coordinates.  `save(path)` writes a file that
+    `zakai.load_density` reads.
     """
 
     @property
@@ -37,6 +43,84 @@ class Density(Protocol):
     def marginal(self, coordinates: int | str | Sequence[int | str]) -> Density: ...
 
     def sample(self, key: object, count: int) -> np.ndarray: ...
+
+    def pdf(self, x: np.ndarray) -> np.ndarray: ...
+
+    def resultant(self) -> np.ndarray: ...
+
+    def circular_deviation(self) -> np.ndarray: ...
+
+    def plot(self, coordinates: int | str | Sequence[int | str] | None = None, *, ax: Any = None) -> Any: ...
+
+    def save(self, path: str | os.PathLike[str]) -> None: ...
+
+
+class DensityMethods:
+    """What every density does by means of its other methods."""
+
+    def pdf(self: Density, x: np.ndarray) -> np.ndarray:
+        """Return the density at points x (..., n), of one coordinate (...) too."""
+        return np.exp(self.log_density(x))
+
+    def circular_deviation(self: Density) -> np.ndarray:
+        """Return the circular standard deviation sqrt(-2 log R), R = |E exp(i x)|, of each angle (n,); NaN for other states.
+
+        It is the standard deviation of an angle where that is small, and infinite for a uniform angle.
+
+        References:
+            Mardia and Jupp 2000, Directional Statistics, section 2.3.
+        """
+        with np.errstate(divide="ignore"):
+            deviation = np.sqrt(-2.0 * np.log(np.clip(np.abs(self.resultant()), 0.0, 1.0)))
+        return np.where(self.periodic, deviation, np.nan)
+
+    def plot(self: Density, coordinates: int | str | Sequence[int | str] | None = None, *, ax: Any = None) -> Any:
+        """Draw the density of one coordinate as a curve, or that of two as regions of highest density.
+
+        Args:
+            coordinates: one or two states, by name or number; needed where there are more than two.
+            ax: the Matplotlib Axes to draw in; a new figure without it.
+
+        Returns:
+            The Matplotlib Axes.
+
+        Raises:
+            InputError: more than two states, or Matplotlib is not installed (extra `plots`).
+        """
+        from zakai.report.axes import draw_density
+
+        return draw_density(self if coordinates is None else self.marginal(coordinates), ax)
+
+    def save(self: Density, path: str | os.PathLike[str]) -> None:
+        """Write the density to a file that `zakai.load_density` reads; it can be the prior of a next record.
+
+        Args:
+            path: the file to write.
+
+        Raises:
+            InputError: the file cannot be written, or a density that a grid of 40,000 points does not resolve.
+
+        Example:
+            result.density(-1).save("end.density")
+            later = model.with_prior(zakai.load_density("end.density"), start=result.times[-1])
+        """
+        from zakai.records.density_files import save_density
+
+        save_density(self, path)
+
+    def __repr__(self: Density) -> str:
+        if len(self.names) > _display.MOST_NAMES:
+            return f"{type(self).__name__}({len(self.names)} states: {_display.short_names(self.names)})"
+        mean = ", ".join(map(_display.number, self.mean()))
+        return f"{type(self).__name__}({', '.join(self.names)}: mean {mean})"
+
+    def _repr_html_(self: Density) -> str:
+        deviation = np.sqrt(np.maximum(np.diag(self.cov()), 0.0))
+        low, high = self.quantile(INTERVAL)
+        rows = [
+            (name, *map(_display.number, row)) for name, *row in zip(self.names, self.mean(), deviation, low, high, strict=True)
+        ]
+        return _display.html_table(type(self).__name__, ("", "mean", "deviation", "2.5 %", "97.5 %"), rows)
 
 
 def coordinate_numbers(names: tuple[str, ...], coordinates: int | str | Sequence[int | str]) -> list[int]:

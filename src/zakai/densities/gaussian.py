@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from zakai.densities._density import as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
+from zakai.densities._density import DensityMethods, as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 
 _AT_ONCE = 2**21  # points times components in one array
 
 
-@dataclass(frozen=True)
-class GaussianMixture:
+@dataclass(frozen=True, repr=False)
+class GaussianMixture(DensityMethods):
     """sum_k w_k N(m_k, P_k): `weights` (k,), `means` (k, n), `covs` (k, n, n); one component is a Gaussian.
 
     Weights sum to one and may be slightly negative, as those of nodes that represent a smooth density are; a density is then
@@ -80,10 +80,12 @@ class GaussianMixture:
         return np.asarray(np.stack(np.meshgrid(*turns, indexing="ij"), axis=-1).reshape(-1, len(turns)))
 
     def mean(self) -> np.ndarray:
-        plain = self.weights @ self.means
+        return np.asarray(np.where(self.periodic, np.angle(self.resultant()), self.weights @ self.means))
+
+    def resultant(self) -> np.ndarray:
+        """Return E exp(i x) of each coordinate (n,)."""
         damping = np.exp(-0.5 * np.diagonal(self.covs, axis1=1, axis2=2))
-        circular = np.angle(self.weights @ (damping * np.exp(1j * self.means)))
-        return np.asarray(np.where(self.periodic, circular, plain))
+        return np.asarray(self.weights @ (damping * np.exp(1j * self.means)))
 
     def cov(self) -> np.ndarray:
         deviation = self._difference(self.means, self.mean())
@@ -112,11 +114,13 @@ class GaussianMixture:
         return np.where(self.periodic, wrap(x), x)
 
     def quantile(self, q: Sequence[float]) -> np.ndarray:
-        from scipy.special import ndtr
+        from scipy.special import ndtr, ndtri
 
         wanted = probabilities(q)
         deviations = np.sqrt(np.diagonal(self.covs, axis1=1, axis2=2))
         centre = self.mean()
+        if len(self.weights) == 1:
+            return np.asarray(centre + ndtri(wanted)[:, None] * deviations[0])
         means = centre + self._difference(self.means, centre)
         out = np.empty((len(wanted), len(self.names)))
         for i in range(len(self.names)):

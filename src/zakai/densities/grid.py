@@ -1,4 +1,4 @@
-"""A density that is known by its logarithm on a lattice."""
+"""A density that is known by its logarithm on a grid."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from functools import cached_property
 
 import numpy as np
 
-from zakai.densities._density import as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
+from zakai.densities._density import DensityMethods, as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 
 _BLOCK = 4_000_000  # numbers held at once while a density is interpolated
 
 
 @dataclass(frozen=True, repr=False)
-class GridDensity:
-    """A density by its `log_values` on the lattice x = `centre` + `basis` (i - size // 2), i the index (n,).
+class GridDensity(DensityMethods):
+    """A density by its `log_values` on the grid x = `centre` + `basis` (i - size // 2), i the index (n,).
 
-    A smooth density that the lattice resolves is band-limited, so its sums over the lattice are integrals and its values
-    between the points are those of the sinc interpolant, both to nearly machine precision.  A lattice that covers the whole
-    circle in a coordinate of `periodic` closes on itself.  Outside of the lattice the density is zero.
+    A smooth density that the grid resolves is band-limited, so its sums over the grid are integrals and its values
+    between the points are those of the sinc interpolant, both to nearly machine precision.  A grid that covers the whole
+    circle in a coordinate of `periodic` closes on itself.  Outside of the grid the density is zero.
     """
 
     log_values: np.ndarray
@@ -29,19 +29,15 @@ class GridDensity:
     names: tuple[str, ...]
     periodic: tuple[bool, ...]
 
-    def __repr__(self) -> str:
-        size = " x ".join(map(str, self.log_values.shape))
-        return f"GridDensity({', '.join(self.names)}: {size} points, mean {self.mean().tolist()})"
-
     @cached_property
     def points(self) -> np.ndarray:
-        """The lattice (size_1, ..., size_n, n); angles are not wrapped."""
+        """The grid (size_1, ..., size_n, n); angles are not wrapped."""
         axes = [np.arange(size) - size // 2 for size in self.log_values.shape]
         return self.centre + np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) @ self.basis.T
 
     @cached_property
     def weights(self) -> np.ndarray:
-        """The probability of each lattice point."""
+        """The probability of each grid point."""
         values = np.exp(self.log_values - np.max(self.log_values))
         return values / values.sum()
 
@@ -54,7 +50,7 @@ class GridDensity:
 
     @cached_property
     def _closed(self) -> tuple[bool, ...]:
-        """Which axes of the lattice go once around the circle."""
+        """Which axes of the grid go once around the circle."""
         turn = self.basis @ np.diag(self.log_values.shape)
         return tuple(
             angle and np.allclose(turn[:, i], 2 * np.pi * np.eye(len(self.names))[i], atol=1e-9)
@@ -160,11 +156,15 @@ class GridDensity:
 
     def mean(self) -> np.ndarray:
         flat = self.points.reshape(-1, len(self.names))
-        weights = self.weights.ravel()
-        resultant = weights @ np.exp(1j * np.where(self.periodic, flat, 0.0))
-        # Of an angle that could be anything, rounding would make up a direction.
+        resultant = self.resultant()
+        # The direction of a uniform angle would be rounding.
         circular = np.where(np.abs(resultant) < 1e-9, 0.0, np.angle(resultant))
-        return np.where(self.periodic, circular, weights @ flat)
+        return np.where(self.periodic, circular, self.weights.ravel() @ flat)
+
+    def resultant(self) -> np.ndarray:
+        """Return E exp(i x) of each angle (n,); 1 for other states."""
+        flat = self.points.reshape(-1, len(self.names))
+        return np.asarray(self.weights.ravel() @ np.exp(1j * np.where(self.periodic, flat, 0.0)))
 
     def cov(self) -> np.ndarray:
         deviation = self.points.reshape(-1, len(self.names)) - self.mean()
@@ -212,7 +212,7 @@ class GridDensity:
             return self
         names, periodic = tuple(self.names[i] for i in keep), tuple(self.periodic[i] for i in keep)
         if len(keep) == count:
-            # The same coordinates in another order, on the same lattice; angles have the first axes.
+            # The same coordinates in another order, on the same grid; angles have the first axes.
             axes = keep if any(self.periodic) else list(range(count))
             basis = self.basis[np.ix_(keep, axes)]
             return GridDensity(np.transpose(self.log_values, axes), self.centre[keep], basis, names, periodic)
@@ -226,9 +226,9 @@ class GridDensity:
         return GridDensity(logs, centre, basis, names, periodic)
 
     def _projected(self, keep: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The weights, centre and basis of the marginal of some coordinates: the slanted lattice is summed along its other axes.
+        """The weights, centre and basis of the marginal of some coordinates: the slanted grid is summed along its other axes.
 
-        Lattice points with equal coordinates lie on slanted planes.  A sum over one of them of a band-limited function equals
+        Grid points with equal coordinates lie on slanted planes.  A sum over one of them of a band-limited function equals
         the sum after each row was shifted by a fraction of a cell, which a Fourier transform does exactly.
         """
         count = self.log_values.ndim
@@ -245,23 +245,23 @@ class GridDensity:
             np.meshgrid(*[np.arange(s) - s // 2 for s in values.shape[len(along) :]], indexing="ij"), axis=-1
         ).reshape(-1, len(across))
         shift = rows @ slant.T
-        # A circle shifts into itself; elsewhere there must be room.
-        room = np.where([self._closed[a] for a in along], 0, np.ceil(np.abs(shift).max(axis=0)) + 2).astype(int)
-        room = np.where(np.any(slant != 0, axis=1), room, 0)
+        # A circle shifts into itself; elsewhere there must be a margin.
+        margin = np.where([self._closed[a] for a in along], 0, np.ceil(np.abs(shift).max(axis=0)) + 2).astype(int)
+        margin = np.where(np.any(slant != 0, axis=1), margin, 0)
         values = values.reshape(*values.shape[: len(along)], -1)
-        values = np.pad(values, [*((r, r) for r in room), (0, 0)])
+        values = np.pad(values, [*((r, r) for r in margin), (0, 0)])
         spectrum = np.fft.fftn(values, axes=range(len(along)))
         for d, size in enumerate(values.shape[:-1]):
             phase = np.exp(-2j * np.pi * np.fft.fftfreq(size)[:, None] * shift[:, d])
             spectrum = spectrum * phase.reshape(*[size if a == d else 1 for a in range(len(along))], -1)
         values = np.real(np.fft.ifftn(spectrum.sum(axis=-1)))
         sizes = np.array(self.log_values.shape)[along]
-        centre = self.centre[keep] + basis @ (np.array(values.shape) // 2 - (sizes // 2 + room))
+        centre = self.centre[keep] + basis @ (np.array(values.shape) // 2 - (sizes // 2 + margin))
         return values, centre, basis
 
     @cached_property
     def _spread_along(self) -> np.ndarray:
-        """The standard deviation of the index along each axis of the lattice."""
+        """The standard deviation of the index along each axis of the grid."""
         out = []
         for axis, size in enumerate(self.log_values.shape):
             mass = self.weights.sum(axis=tuple(a for a in range(self.weights.ndim) if a != axis))

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from zakai.densities._density import as_states, coordinate_numbers
+from zakai.densities._density import DensityMethods, as_states, coordinate_numbers
 from zakai.densities.grid import GridDensity
 
 
@@ -22,8 +22,8 @@ class Map(Protocol):
     def log_slope(self, w: np.ndarray) -> np.ndarray: ...
 
 
-@dataclass(frozen=True)
-class MappedDensity:
+@dataclass(frozen=True, repr=False)
+class MappedDensity(DensityMethods):
     """The density of one state x in an interval: `grid` is that of w on the line, `map` gives x; outside it is zero."""
 
     grid: GridDensity
@@ -55,6 +55,10 @@ class MappedDensity:
 
     def mean(self) -> np.ndarray:
         return np.asarray(self.weights @ self.points)
+
+    def resultant(self) -> np.ndarray:
+        """Return E exp(i x) (1,)."""
+        return np.asarray(self.weights @ np.exp(1j * self.points))
 
     def cov(self) -> np.ndarray:
         apart = self.points - self.mean()

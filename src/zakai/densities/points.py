@@ -8,13 +8,13 @@ from functools import cached_property
 
 import numpy as np
 
-from zakai.densities._density import as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
+from zakai.densities._density import DensityMethods, as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 from zakai.densities.gaussian import GaussianMixture
 from zakai.errors import InputError
 
 
 @dataclass(frozen=True, repr=False)
-class PointMasses:
+class PointMasses(DensityMethods):
     """sum_i w_i delta(x - x_i): `weights` (N,), which sum to one, at `points` (N, n); angles (`periodic`) on (-pi, pi].
 
     Moments, quantiles, marginals and samples are those of the points.  Points have no density: `log_density` and `mode` are
@@ -30,12 +30,12 @@ class PointMasses:
     names: tuple[str, ...]
     periodic: tuple[bool, ...]
 
-    def __repr__(self) -> str:
-        return f"PointMasses({', '.join(self.names)}: {len(self.weights)} points, mean {self.mean().tolist()})"
-
     def mean(self) -> np.ndarray:
-        circular = np.angle(self.weights @ np.exp(1j * self.points))
-        return np.asarray(np.where(self.periodic, circular, self.weights @ self.points))
+        return np.asarray(np.where(self.periodic, np.angle(self.resultant()), self.weights @ self.points))
+
+    def resultant(self) -> np.ndarray:
+        """Return E exp(i x) of each coordinate (n,)."""
+        return np.asarray(self.weights @ np.exp(1j * self.points))
 
     def cov(self) -> np.ndarray:
         deviation = self._deviations

@@ -7,11 +7,11 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 
 import numpy as np
 
-from zakai.densities._density import Density, as_states, coordinate_numbers, generator, probabilities, sample_size
+from zakai.densities._density import Density, DensityMethods, as_states, coordinate_numbers, generator, probabilities, sample_size
 
 
 @dataclass(frozen=True, repr=False)
-class ProductDensity:
+class ProductDensity(DensityMethods):
     """p(x) = prod_b p_b(x_b): `parts` are the densities p_b, `places` the coordinates of each in the whole.
 
     The coordinates of a part may have other names; their order counts.
@@ -21,9 +21,6 @@ class ProductDensity:
     places: tuple[tuple[int, ...], ...]
     names: tuple[str, ...]
     periodic: tuple[bool, ...]
-
-    def __repr__(self) -> str:
-        return f"ProductDensity({len(self.names)} states in {len(self.places)} blocks)"
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
         x = as_states(x, len(self.names))
@@ -40,6 +37,10 @@ class ProductDensity:
         for part, place in zip(self.parts, self.places, strict=True):
             whole[np.ix_(place, place)] = part.cov()
         return whole
+
+    def resultant(self) -> np.ndarray:
+        """Return E exp(i x) of each coordinate (n,)."""
+        return self._vector([part.resultant() for part in self.parts])
 
     def mode(self) -> np.ndarray:
         return self._vector([part.mode() for part in self.parts])
@@ -67,7 +68,7 @@ class ProductDensity:
 
     def _vector(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         """Return arrays (..., n_b) of the blocks as one (..., n)."""
-        whole = np.empty((*np.shape(parts[0])[:-1], len(self.names)))
+        whole = np.empty((*np.shape(parts[0])[:-1], len(self.names)), np.asarray(parts[0]).dtype)
         for part, place in zip(parts, self.places, strict=True):
             whole[..., place] = part
         return whole

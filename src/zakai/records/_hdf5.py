@@ -1,7 +1,7 @@
-"""What a result file holds, looked at before it is loaded; as a program, whether it can be read at all.
+"""The contents of a result file, checked before it is loaded; as a program, whether it can be read at all.
 
-HDF5 is a large library that a file made for the purpose can send astray. So a stranger's file is first read by this file in
-a process of its own, with little time and memory; it imports nothing of zakai, that it starts at once.
+A file can be made so that the HDF5 library crashes or never ends. An untrusted file is therefore read first by this module in
+a process of its own, with limits of time and memory. The module imports nothing of zakai, so that the process starts fast.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-# The attribute by which a file of ours is known, and the number that changes when its layout does.
+# The attribute that marks a result file; its number changes with the layout.
 FORMAT = "zakai result 1"
 MOST_VARIABLES = 256
 MOST_ATTRIBUTES = 64  # of the file, or of one variable

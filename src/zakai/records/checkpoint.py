@@ -38,6 +38,7 @@ def write_checkpoint(
         path: the file; its folder must exist.
         about: what JSON can say.
         arrays: by their names, of numbers.
+        kind: the kind of the file, which a reader must ask for.
 
     Raises:
         InputError: the file cannot be written, or would be too large to be read.
@@ -97,7 +98,7 @@ def read_checkpoint(path: str | os.PathLike[str], kind: str = "checkpoint") -> t
 
 
 def _foreign(name: str, kind: str) -> InputError:
-    return InputError(f"{name}: is not a {kind} file; name another, or remove it to begin anew")
+    return InputError(f"{name}: is not a {kind} file; name another, or remove it to start again")
 
 
 def _unpacked(content: bytes, name: str, what: str = "checkpoint") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -108,9 +109,9 @@ def _unpacked(content: bytes, name: str, what: str = "checkpoint") -> tuple[dict
     if int(number) != VERSION:
         raise InputError(
             f"{name}: is a {what} file of format {int(number)}, and this version of zakai reads format {VERSION}; use the "
-            "version that wrote it, or remove it to begin anew"
+            "version that wrote it, or remove it to start again"
         )
-    damaged = InputError(f"{name}: the {what} file is damaged (its contents do not match its hash); remove it to begin anew")
+    damaged = InputError(f"{name}: the {what} file is damaged (its contents do not match its hash); remove it to start again")
     if hashlib.sha256(content[:-_DIGEST]).digest() != content[-_DIGEST:]:
         raise damaged
     # What follows was written by us, or by somebody who took the trouble to make it look so.

@@ -16,21 +16,22 @@ import numpy as np
 
 from zakai.errors import InputError
 from zakai.models._errors import named
+from zakai.records.dates import Clock, date_of, unit_name
 from zakai.records.inputs import Inputs
 from zakai.records.record import Record, early, first_fault
 from zakai.records.writing import default_names, shown
 
-LONGEST_LINE = 1 << 20  # characters: room for a thousand numbers with a thousand blanks each
+LONGEST_LINE = 1 << 20  # characters: a thousand numbers with a thousand blanks each
 _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 _AT_ONCE = 1 << 18  # characters
 _NO_TEXT = re.compile("[\ud800-\udfff]")
 
 
-def read_record(path: str | os.PathLike[str], model: Any) -> Record:
-    """Read the observations of `model` from a CSV file.
+def read_record(path: str | os.PathLike[str], model: Any, unit: str | None = None, origin: Any = None) -> Record:
+    r"""Read the observations of `model` from a CSV file.
 
     The first line is a header: `time`, then one column for each of the model's m observations in their order,
-    of any names, but not of y1 to ym in another order. Every other line is one time and its m readings, in
+    of any names, but not of y1 to ym in another order. Every other line is one time and its m observations, in
     what the model's `observation_kind` says. Times increase strictly, need not be regular, and begin after the
     model's `start` (samples: at or after). An empty cell or `nan` is "not observed". The text is UTF-8; a
     byte-order mark, Windows line ends and blank lines are accepted.
@@ -41,6 +42,8 @@ def read_record(path: str | os.PathLike[str], model: Any) -> Record:
     Arguments:
         path: the file.
         model: a `zakai.Model`; its `m`, `start` and `observation_kind` say what the file must hold.
+        unit: the model's unit of time, for a file whose first column has ISO dates; see `Record`.
+        origin: the date at which t = 0, by default the first date.
 
     Raises:
         InputError: the file, or its first bad row by its line number (the header is line 1), cannot be used.
@@ -48,28 +51,30 @@ def read_record(path: str | os.PathLike[str], model: Any) -> Record:
     Example:
         >>> import zakai, tempfile, pathlib
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "record.csv"
-        >>> _ = path.write_text("time,y\\n0.1,0.5\\n0.2,\\n0.4,-0.1\\n")
+        >>> _ = path.write_text("time,y\n0.1,0.5\n0.2,\n0.4,-0.1\n")
         >>> zakai.read_record(path, zakai.load_model("gallery:cubic-sensor"))
         Record(3 rows x 1 increments, times 0.1 to 0.4)
     """
     path = Path(path)
     names = header_of(path) if model.inputs else []
+    dates = None if unit is None else Dates(unit, origin)
     if set(model.inputs) & set(names[1:]):
-        record, row = _with_inputs(path, model, names)
+        record, row = _with_inputs(path, model, names, dates)
     else:
-        table, row = read_table(path, model.m, "observations")
-        record = Record(table[:, 0], table[:, 1:], model.observation_kind)
+        table, row = read_table(path, model.m, "observations", dates=dates)
+        record = Record(table[:, 0], table[:, 1:], model.observation_kind, **clock_of(dates))
     fault = early(record.times[0], record.kind, model.start)
     if fault is not None:
-        raise InputError(f"{shown(path)}: row {row}: {fault}")
+        hint = "" if dates is None else "; give the date at which t = 0 as origin"
+        raise InputError(f"{shown(path)}: row {row}: {fault}{hint}")
     return record
 
 
-def _with_inputs(path: Path, model: Any, names: list[str]) -> tuple[Record, int]:
+def _with_inputs(path: Path, model: Any, names: list[str], dates: Dates | None) -> tuple[Record, int]:
     """The record in a file that has columns for the inputs too, and the line of its first row."""
     with named(f"{shown(path)}: row 1"):
         observed, placed = columns_with_inputs(names, model.m, model.inputs)
-    table, row = read_table(path, len(names) - 1, "observations and inputs")
+    table, row = read_table(path, len(names) - 1, "observations and inputs", dates=dates)
     values = table[:, placed]
     given = ~np.isnan(values)
     partial = given.any(axis=1) & ~given.all(axis=1)
@@ -81,7 +86,7 @@ def _with_inputs(path: Path, model: Any, names: list[str]) -> tuple[Record, int]
     times, values = table[rows, 0], values[rows]
     if times[0] > model.start:
         times, values = np.concatenate([[model.start], times]), np.concatenate([values[:1], values])
-    return Record(table[:, 0], table[:, observed], model.observation_kind, Inputs(times, values)), row
+    return Record(table[:, 0], table[:, observed], model.observation_kind, Inputs(times, values), **clock_of(dates)), row
 
 
 def header_of(path: Path) -> list[str]:
@@ -93,7 +98,44 @@ def header_of(path: Path) -> list[str]:
         return []
 
 
-def read_table(path: Path, columns: int, what: str, names: Sequence[str] | None = None) -> tuple[np.ndarray, int]:
+class Dates:
+    """ISO dates of a file as times, in a unit from an origin, which is the first date unless it is given."""
+
+    def __init__(self, unit: str, origin: Any = None):
+        self.unit = unit_name(unit)
+        self.clock = None if origin is None else Clock.of(origin, unit)
+
+    def numbered(self, part: _Part) -> tuple[_Part, tuple[int, str] | None]:
+        """Return the lines with numbers for dates, up to the first without a date, and the row and fault of that one."""
+        cells = [line.partition(",") for line in part.lines]
+        found: list[Any] = []
+        wrong = None
+        for number, (cell, _, rest) in enumerate(cells, part.number):
+            found.append(date_of(cell.strip().strip('"')) if cell.strip() or rest else np.datetime64("NaT", "ns"))
+            if found[-1] is None:
+                wrong = number, f"{_quoted(cell)} in column 'time' is not a date; write dates as 2024-01-31T12:30"
+                found.pop()
+                break
+        dates = np.array(found, "datetime64[ns]")
+        known = dates[~np.isnat(dates)]
+        if self.clock is None and len(known):
+            self.clock = Clock(known[0], self.unit)
+        times = np.zeros(len(dates)) if self.clock is None else self.clock.times(dates)
+        lines = [
+            line if np.isnan(time) else f"{time!r}{comma}{rest}"
+            for line, time, (_, comma, rest) in zip(part.lines[: len(found)], times.tolist(), cells, strict=False)
+        ]
+        return part._replace(lines=lines), wrong
+
+
+def clock_of(dates: Dates | None) -> dict[str, Any]:
+    """Return the unit and the origin of dates as keywords of a `Record`."""
+    return {} if dates is None or dates.clock is None else dates.clock._asdict()
+
+
+def read_table(
+    path: Path, columns: int, what: str, names: Sequence[str] | None = None, dates: Dates | None = None
+) -> tuple[np.ndarray, int]:
     """The times and the `columns` numbers of every row of a CSV file, (K, 1 + columns), and the line of the first row.
 
     `what` is what a column holds, in the plural; with `names` the columns must have just these. Raises
@@ -106,14 +148,19 @@ def read_table(path: Path, columns: int, what: str, names: Sequence[str] | None 
             raise InputError(f"{shown(path)}: is {kind}; give a CSV file")
         # Bytes that are not UTF-8 become lone surrogates, which no number has; so their row is found.
         with path.open(encoding="utf-8-sig", errors="surrogateescape", newline=None) as file:
-            return table_of(file, shown(path), columns, what, names)
+            return table_of(file, shown(path), columns, what, names, dates)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{shown(path)}: cannot be read: {reason}; give a CSV file") from None
 
 
 def table_of(
-    file: TextIO, source: str, columns: int, what: str, names: Sequence[str] | None = None
+    file: TextIO,
+    source: str,
+    columns: int,
+    what: str,
+    names: Sequence[str] | None = None,
+    dates: Dates | None = None,
 ) -> tuple[np.ndarray, int]:
     """`read_table` of an open file, which is read once, a part at a time; `source` is what errors call it."""
     parts = _parts(file, source)
@@ -123,9 +170,11 @@ def table_of(
     header = _header(source, first.lines[0], columns, what, names)
     numbers, row, before = array("d"), 0, np.empty((0, len(header)))
     for part in chain([first._replace(number=2, lines=first.lines[1:])], parts):
-        rows, wrong = _fast(part.lines, len(header)), None
+        part, wrong = (part, None) if dates is None else dates.numbered(part)
+        rows = _fast(part.lines, len(header))
         if rows is None:
-            rows, wrong = _careful(part, header)
+            rows, other = _careful(part, header)
+            wrong = other or wrong
         # The first bad row is the one to name: an earlier one may break a rule about its numbers.
         both = np.vstack([before, rows])
         fault = first_fault(both[:, 0], both[:, 1:])
@@ -259,6 +308,8 @@ def _not_numbers(cells: list[str], names: list[str], whole: bool) -> str | None:
     for name, cell in zip(names, cells):
         if cell and not _NUMBER.fullmatch(cell):
             what = f"{_quoted(cell)} in column {_quoted(name)} is not a number"
+            if name == "time" and date_of(cell) is not None:
+                return f"{what}; for dates give the model's unit of time, as in unit='h' (command: --unit h)"
             return f"{what}; leave the cell empty if nothing was observed"
     return None
 

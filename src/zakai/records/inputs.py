@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zakai import _display
 from zakai.errors import InputError
 from zakai.models._errors import echo
-from zakai.records.record import LARGEST, _numbers
+from zakai.records.numbers import LARGEST, real_numbers
 
 if TYPE_CHECKING:
     from zakai.models.model import Model
@@ -43,7 +42,7 @@ class Inputs:
     values: NDArray[Any]
 
     def __post_init__(self) -> None:
-        times, values = _numbers(self.times, "times", "inputs"), _numbers(self.values, "values", "inputs")
+        times, values = real_numbers(self.times, "times", "inputs"), real_numbers(self.values, "values", "inputs")
         if values.ndim == 1:
             values = values[:, np.newaxis]
         if times.ndim != 1 or times.size == 0:
@@ -70,6 +69,12 @@ class Inputs:
 
     def __repr__(self) -> str:
         return f"Inputs({len(self)} rows x {self.values.shape[1]}, times {float(self.times[0])!r} to {float(self.times[-1])!r})"
+
+    def _repr_html_(self) -> str:
+        few = slice(_display.MOST_ROWS)
+        rows = [tuple(map(_display.number, (time, *row))) for time, row in zip(self.times[few], self.values[few], strict=True)]
+        header = ["time", *(f"u{i + 1}" for i in range(self.values.shape[1]))]
+        return _display.html_table(repr(self), header, rows, total=len(self))
 
     def at(self, t: Any, hold: str = "zero", before: bool = False) -> NDArray[Any]:
         """Return the inputs (..., number of inputs) at times t (...); `before` takes the limit from the left at a jump.
@@ -173,38 +178,7 @@ def _row(model: Model, given: Any) -> Any:
         if missing:
             raise InputError(f"inputs: {', '.join(missing)} of {model.source} are missing; give all inputs, or none")
         given = [given[name] for name in model.inputs]
-    row = np.atleast_1d(_numbers(given, "values", "inputs"))
+    row = np.atleast_1d(real_numbers(given, "values", "inputs"))
     if row.shape != (len(model.inputs),):
         raise InputError(f"inputs: {row.size} values; {model.source} has {len(model.inputs)}: {names}")
     return row
-
-
-def read_inputs(path: str | os.PathLike[str], model: Model) -> Inputs:
-    """Read the inputs of a model from a CSV file: `time`, then one column for each input, in any order.
-
-    Args:
-        path: the file.
-        model: says the names of the inputs.
-
-    Raises:
-        InputError: the file, or its first bad row by its line number, cannot be used, or an input is missing.
-    """
-    from zakai.records.csv import header_of, read_table
-    from zakai.records.writing import shown
-
-    path = Path(path)
-    if not model.inputs:
-        raise InputError(f"{shown(path)}: {model.source} has no inputs; leave --inputs out, or name them in the model")
-    names = header_of(path)
-    missing = [name for name in model.inputs if name not in names[1:]]
-    if missing:
-        raise InputError(
-            f"{shown(path)}: row 1: no column for the input {', '.join(missing)}; give time, {', '.join(model.inputs)}"
-        )
-    wanted = names[1:] if sorted(names[1:]) == sorted(model.inputs) else model.inputs
-    table, row = read_table(path, len(model.inputs), "inputs", wanted)
-    values = table[:, 1:][:, [wanted.index(name) for name in model.inputs]]
-    gaps = np.isnan(values).any(axis=1)
-    if gaps.any():
-        raise InputError(f"{shown(path)}: row {row + int(np.argmax(gaps))}: an input is missing; fill it or leave the row out")
-    return Inputs(table[:, 0], values)

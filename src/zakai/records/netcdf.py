@@ -1,4 +1,4 @@
-"""Results as NetCDF files (HDF5 inside), written whole or not at all; what is read is looked at before it is loaded."""
+"""Results as NetCDF files (HDF5 inside), written whole or not at all; a file is checked before it is loaded."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def load_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
         path: a NetCDF file made by `zakai filter` or `FilterResult.save`.
 
     Raises:
-        InputError: there is no such file, or it is not a result of ours, or it is damaged.
+        InputError: there is no such file, or it is not a result, or it is damaged.
 
     Example: see `save_dataset`.
     """
@@ -121,7 +121,7 @@ def load_variables(path: str | os.PathLike[str]) -> tuple[dict[str, Variable], d
             return _hdf5.read(file)
     except MemoryError:
         raise InputError(f"{shown(path)}: does not fit into the memory of this machine") from None
-    except Exception:  # it was changed since it was looked at
+    except Exception:  # it was changed since it was checked
         raise InputError(f"{shown(path)}: {DAMAGED}") from None
 
 

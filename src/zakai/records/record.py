@@ -1,61 +1,71 @@
-"""What was observed, when, and in which of the four readings."""
+"""Observations, their times, and of which of the four kinds they are."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
+from zakai import _display
 from zakai.errors import InputError
-
-if TYPE_CHECKING:
-    from zakai.records.inputs import Inputs
+from zakai.records.dates import Clock, read_times
+from zakai.records.inputs import Inputs, check_inputs
+from zakai.records.numbers import LARGEST, real_numbers
+from zakai.records.writing import default_names, write_table
 
 KINDS = ("increments", "path", "rates", "samples")
 
-# A filter squares what it reads and sums the squares; beyond this their sum is no longer a float64.
-LARGEST = 1e150
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """Observations at strictly increasing times, the second of the two things that a filter takes.
+    """Observations at strictly increasing times.
 
     What row k holds depends on `kind`: the increment y(t_k) - y(t_{k-1}) of dy = h dt + dw (`increments`),
     y(t_k) itself (`path`), the increment over the length of its interval (`rates`), or a sample
     z_k = h(x(t_k), t_k) + r_k (`samples`).
 
-    Arguments:
-        times: (K,), in the model's unit of time, strictly increasing, at least one.
+    Args:
+        times: (K,), in the model's unit of time, strictly increasing, at least one; or dates (pandas, NumPy, `datetime` or ISO
+            texts), with a `unit`.
         values: (K, m), in the model's units; nan, or a masked cell, is "this coordinate was not observed here". (K,) is taken
             as (K, 1).
         kind: "increments" (the default), "path", "rates" or "samples".
         inputs: a `zakai.Inputs` for a model with known inputs.
+        unit: the model's unit of time, for dates: "ns", "us", "ms", "s", "min", "h", "d", "week" or "year" (365.25 days).
+        origin: the date at which t = 0, by default the first date.  Dates with a time zone are taken in UTC.
 
     Both arrays are copied to float64 and cannot be written to.
 
     Raises:
-        InputError: a wrong shape or kind, times that do not increase, or a number that is infinite or beyond
-            1e150 in size.
+        InputError: a wrong shape or kind, times that do not increase, a number that is infinite or beyond 1e150 in size, or
+            dates without a unit.
 
     Example:
         >>> import numpy as np
         >>> from zakai.records import Record
         >>> Record([0.1, 0.2, 0.5], [[1.0], [np.nan], [0.7]], "samples").values.shape
         (3, 1)
+        >>> Record(np.array(["2024-01-31T00", "2024-01-31T06"], "M8[h]"), [0.5, 0.7], "samples", unit="d").times.tolist()
+        [0.0, 0.25]
     """
 
     times: np.ndarray
     values: np.ndarray
     kind: str = "increments"
     inputs: Inputs | None = None
+    unit: str | None = None
+    origin: Any = None
+    _dates: np.ndarray | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise InputError(f"record: kind is {self.kind!r}; it must be one of {', '.join(KINDS)}")
-        times, values = _numbers(self.times, "times"), _numbers(self.values, "values")
+        given, clock, dates = read_times(self.times, self.unit, self.origin)
+        times, values = real_numbers(given, "times"), real_numbers(self.values, "values")
         if values.ndim == 1:
             values = values[:, np.newaxis]
         if times.ndim != 1 or times.size == 0:
@@ -66,15 +76,37 @@ class Record:
         if fault is not None:
             raise InputError(f"record: row {fault[0]}, counted from 0: {fault[1]}")
         times.flags.writeable = values.flags.writeable = False
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "values", values)
+        found = {"times": times, "values": values, "_dates": dates}
+        found |= {"unit": None, "origin": None} if clock is None else clock._asdict()
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
 
     def __len__(self) -> int:
         return len(self.times)
 
     def __repr__(self) -> str:
-        span = f"{float(self.times[0])!r} to {float(self.times[-1])!r}"
-        return f"Record({len(self)} rows x {self.values.shape[1]} {self.kind}, times {span})"
+        first, last = self._when(0), self._when(-1)
+        return f"Record({len(self)} rows x {self.values.shape[1]} {self.kind}, times {first} to {last})"
+
+    def _repr_html_(self) -> str:
+        rows = [(self._when(k), *map(_display.number, self.values[k])) for k in range(min(len(self), _display.MOST_ROWS))]
+        header = ["time" if self.clock is None else "date", *(f"y{i + 1}" for i in range(self.values.shape[1]))]
+        return _display.html_table(repr(self), header, rows, total=len(self))
+
+    def _when(self, row: int) -> str:
+        return repr(float(self.times[row])) if self.dates is None else _date_text(self.dates[row])
+
+    @property
+    def clock(self) -> Clock | None:
+        """The unit and the date at which t = 0, of a record with dates."""
+        return None if self.unit is None else Clock(self.origin, self.unit)
+
+    @cached_property
+    def dates(self) -> np.ndarray | None:
+        """The dates (K,) of the observations as datetime64, of a record with dates."""
+        if self._dates is not None or self.clock is None:
+            return self._dates
+        return self.clock.dates(self.times)
 
     def check(self, model: Any) -> None:
         """Refuse a record that `model` cannot have made: another kind or m, or too early times."""
@@ -85,28 +117,29 @@ class Record:
             raise InputError(f"record: values has shape {self.values.shape}; {expected}")
         fault = early(self.times[0], self.kind, model.start)
         if fault is not None:
-            raise InputError(f"record: row 0: {fault}")
+            hint = "" if self.unit is None else "; give the date at which t = 0 as origin"
+            raise InputError(f"record: row 0: {fault}{hint}")
         self.check_law(model)
 
     def check_law(self, model: Any) -> None:
         """Refuse a record without the model's inputs, or with values that its observation family cannot have."""
         if self.inputs is not None or model.inputs:
-            from zakai.records.inputs import check_inputs
-
             check_inputs(model, self.inputs, float(self.times[-1]))
         if self.kind == "samples" and not model.observation_law.is_gaussian:
             model.observation_law.check(self.values)
 
     @classmethod
-    def from_pandas(cls, frame: Any, kind: str) -> Record:
-        """A record from a DataFrame: its column `time` or else its index, and the other columns as values.
+    def from_pandas(cls, frame: Any, kind: str, unit: str | None = None, origin: Any = None) -> Record:
+        """Return a record from a DataFrame: its column `time` or else its index, and the other columns as values.
 
-        Arguments:
+        Args:
             frame: a pandas DataFrame of K rows; missing values are not-observed.
             kind: as for `Record`.
+            unit: as for `Record`, for dates.
+            origin: as for `Record`, for dates.
 
         Raises:
-            InputError: as `Record` does; or times that are dates (give numbers), or a missing pandas.
+            InputError: as `Record` does, or pandas is not installed.
 
         Example:
             >>> import pandas
@@ -124,15 +157,17 @@ class Record:
         rest = frame.drop(columns="time", errors="ignore")
         columns = [_column(rest.iloc[:, i], f"column {rest.columns[i]!r}") for i in range(rest.shape[1])]
         values = np.column_stack(columns) if columns else np.empty((len(frame), 0))
-        return cls(_column(times, "time"), values, kind)
+        return cls(times if times.dtype.kind in "mM" else _column(times, "time"), values, kind, unit=unit, origin=origin)
 
     @classmethod
-    def from_xarray(cls, data: Any, kind: str) -> Record:
-        """A record from a DataArray over (time,) or (time, channel), or a Dataset of variables over `time`.
+    def from_xarray(cls, data: Any, kind: str, unit: str | None = None, origin: Any = None) -> Record:
+        """Return a record from a DataArray over (time,) or (time, channel), or a Dataset of variables over `time`.
 
-        Arguments:
-            data: an xarray DataArray or Dataset with a numeric coordinate `time` (K,); nan is not-observed.
+        Args:
+            data: an xarray DataArray or Dataset with a coordinate `time` (K,) of numbers or dates; nan is not-observed.
             kind: as for `Record`.
+            unit: as for `Record`, for dates.
+            origin: as for `Record`, for dates.
 
         Raises:
             InputError: as `Record` does; or no coordinate `time`, or another dimension too many.
@@ -155,16 +190,42 @@ class Record:
             if "time" not in part.dims or part.ndim > 2:
                 what = f"{part.name} has dimensions {part.dims}; expected (time,) or (time, channel)"
                 raise InputError(f"Record.from_xarray: {what}")
-            values = _numbers(part.transpose("time", ...).values, str(part.name))
+            values = real_numbers(part.transpose("time", ...).values, str(part.name))
             columns.append(values.reshape(data.sizes["time"], -1))
         values = np.concatenate(columns, axis=1) if columns else np.empty((data.sizes["time"], 0))
-        return cls(_numbers(data["time"].values, "time"), values, kind)
+        return cls(data["time"].values, values, kind, unit=unit, origin=origin)
 
     def to_csv(self, path: str | os.PathLike[str], names: list[str] | None = None) -> None:
         """Write the record as the CSV that `read_record` reads back bit for bit; see `write_record`."""
-        from zakai.records.writing import write_record
+        m = self.values.shape[1]
+        write_table(path, self.times, self.values, default_names(m) if names is None else list(names), self.dates)
 
-        write_record(path, self, names)
+
+def write_record(path: str | os.PathLike[str], record: Record, names: list[str] | None = None) -> None:
+    """Write a record as CSV, atomically; `read_record` gives the same float64 numbers back, bit for bit.
+
+    Arguments:
+        path: the file to write.
+        record: times (K,) and values (K, m); nan becomes an empty cell.
+        names: m column names, y1 to ym if not given.
+
+    Raises:
+        InputError: the file cannot be written, or there are not m names.
+
+    Example:
+        >>> import tempfile, pathlib
+        >>> from zakai.records import Record, write_record
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "record.csv"
+        >>> write_record(path, Record([0.1, 0.3], [[1.5], [float("nan")]], "samples"), ["range"])
+        >>> path.read_text().split()
+        ['time,range', '0.1,1.5', '0.3,']
+    """
+    record.to_csv(path, names)
+
+
+def _date_text(date: np.datetime64) -> str:
+    """Return a date to the second, without the time of day at midnight."""
+    return str(date.astype("datetime64[s]")).removesuffix("T00:00:00")
 
 
 def first_fault(times: np.ndarray, values: np.ndarray) -> tuple[int, str] | None:
@@ -200,22 +261,7 @@ def early(first: float, kind: str, start: float) -> str | None:
     return f"the time {float(first)!r} must be {need} the model's start {float(start)!r}"
 
 
-def _numbers(array: Any, name: str, what: str = "record") -> np.ndarray:
-    """A fresh float64 copy, nan where it is masked; text, dates, durations and complex numbers are refused."""
-    try:
-        if isinstance(array, np.ma.MaskedArray) and array.dtype.kind in "biuf":
-            array = np.ma.filled(array.astype(np.float64), np.nan)
-        array = np.asarray(array)
-        texts = array.dtype.kind == "O" and any(isinstance(item, str | bytes) for item in array.flat)
-        if texts or array.dtype.kind not in "biufO":
-            raise TypeError
-        return np.array(array, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        kind = f" of {array.dtype}" if isinstance(array, np.ndarray) else ""
-        raise InputError(f"{what}: {name} must be real numbers, not an array{kind}") from None
-
-
 def _column(series: Any, name: str) -> np.ndarray:
     """A pandas column as float64, its missing values (None and NA included) as nan."""
     plain = isinstance(series.dtype, np.dtype) and series.dtype.kind != "O"
-    return _numbers(series.to_numpy() if plain else series.to_numpy(dtype=object, na_value=np.nan), name)
+    return real_numbers(series.to_numpy() if plain else series.to_numpy(dtype=object, na_value=np.nan), name)

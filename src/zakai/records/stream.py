@@ -35,7 +35,7 @@ class Line(NamedTuple):
 
 
 def lines_of(file: BinaryIO, m: int, inputs: Sequence[str] = ()) -> Iterator[Line]:
-    """Yield the lines of a stream of observations, each as soon as it is there.
+    r"""Yield the lines of a stream of observations, each as soon as it is there.
 
     JSON lines are {"time": 0.1, "y": [0.5, null], "inputs": {"u": 1.0}}; other keys are ignored, and no key may stand twice. A
     stream whose first line begins with `time` is CSV, with m columns after that and, in any place, one for each input. Empty
@@ -52,7 +52,7 @@ def lines_of(file: BinaryIO, m: int, inputs: Sequence[str] = ()) -> Iterator[Lin
     Example:
         >>> import io
         >>> from zakai.records.stream import lines_of
-        >>> [line.values for line in lines_of(io.BytesIO(b'{"time": 1, "y": [0.5]}\\n{"time": 2, "y": [null]}\\n'), 1)]
+        >>> [line.values for line in lines_of(io.BytesIO(b'{"time": 1, "y": [0.5]}\n{"time": 2, "y": [null]}\n'), 1)]
         [[0.5], [None]]
     """
     parse: Callable[[str], tuple[Any, list[Any], dict[str, Any] | None]] | None = None
@@ -138,7 +138,7 @@ def _integer(digits: str) -> int:
 
 
 def _no_number(name: str) -> None:
-    raise ValueError(f"{name} is no number of JSON; null says that nothing was observed")
+    raise ValueError(f"{name} is not a JSON number; null says that nothing was observed")
 
 
 _DECODER = json.JSONDecoder(object_pairs_hook=_object, parse_int=_integer, parse_constant=_no_number)

@@ -4,16 +4,42 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from zakai.models.simulate import Truth
+import numpy as np
+
+from zakai import _display
 from zakai.records.csv import read_table
 from zakai.records.writing import write_table
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Truth:
+    """A path of the state: `times` (K+1,), the start first, `values` (K+1, n), the names of the states; angles in (-pi, pi]."""
+
+    times: np.ndarray
+    values: np.ndarray
+    names: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __repr__(self) -> str:
+        first, last = (_display.number(self.times[k]) for k in (0, -1))
+        what = _display.short_names(self.names) or _display.counted(self.values.shape[1], "state")
+        return f"Truth({what} at {_display.counted(len(self), 'time')}, {first} to {last})"
+
+    def _repr_html_(self) -> str:
+        names = self.names or tuple(f"x{i + 1}" for i in range(self.values.shape[1]))
+        few = slice(_display.MOST_ROWS)
+        rows = [tuple(map(_display.number, (time, *row))) for time, row in zip(self.times[few], self.values[few], strict=True)]
+        return _display.html_table(repr(self), ("time", *names), rows, total=len(self))
+
+
 def read_truth(path: str | os.PathLike[str], model: Any) -> Truth:
-    """Read the true states of `model` from a CSV file.
+    r"""Read the true states of `model` from a CSV file.
 
     The header is `time` and the names of the states in their order; the rules are those of `read_record`: an
     empty cell or `nan` is "not known", and times need not be those of the record.
@@ -22,12 +48,12 @@ def read_truth(path: str | os.PathLike[str], model: Any) -> Truth:
 
         >>> import zakai, tempfile, pathlib
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "truth.csv"
-        >>> _ = path.write_text("time,x\\n0,0.1\\n0.1,0.2\\n")
+        >>> _ = path.write_text("time,x\n0,0.1\n0.1,0.2\n")
         >>> read_truth(path, zakai.load_model("gallery:benes")).values.shape
         (2, 1)
     """
     table, _ = read_table(Path(path), model.n, "states", model.state)
-    return Truth(table[:, 0], table[:, 1:])
+    return Truth(table[:, 0], table[:, 1:], model.state)
 
 
 def write_truth(path: str | os.PathLike[str], truth: Truth, names: Sequence[str]) -> None:

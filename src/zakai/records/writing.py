@@ -16,8 +16,6 @@ from zakai.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from zakai.records.record import Record
-
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
@@ -63,47 +61,35 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         _sync(path.parent)
 
 
-def write_record(path: str | os.PathLike[str], record: Record, names: list[str] | None = None) -> None:
-    """Write a record as CSV, atomically; `read_record` gives the same float64 numbers back, bit for bit.
-
-    Arguments:
-        path: the file to write.
-        record: times (K,) and values (K, m); nan becomes an empty cell.
-        names: m column names, y1 to ym if not given.
-
-    Raises:
-        InputError: the file cannot be written, or there are not m names.
-
-    Example:
-        >>> import tempfile, pathlib
-        >>> from zakai.records import Record, write_record
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "record.csv"
-        >>> write_record(path, Record([0.1, 0.3], [[1.5], [float("nan")]], "samples"), ["range"])
-        >>> path.read_text().split()
-        ['time,range', '0.1,1.5', '0.3,']
-    """
-    m = record.values.shape[1]
-    write_table(path, record.times, record.values, default_names(m) if names is None else list(names))
-
-
 def default_names(m: int) -> list[str]:
     """The names of the columns of m observations where no others are given."""
     return [f"y{i + 1}" for i in range(m)]
 
 
-def write_table(path: str | os.PathLike[str], times: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
-    """Write times (K,) and values (K, c) as CSV with a header of `time` and c names; as `write_record` does."""
+def write_table(
+    path: str | os.PathLike[str],
+    times: np.ndarray,
+    values: np.ndarray,
+    names: Sequence[str],
+    dates: np.ndarray | None = None,
+) -> None:
+    """Write times (K,), or dates (K,), and values (K, c) as CSV with a header of `time` and c names; as `write_record` does."""
     if len(names) != values.shape[1] or any(set(name) & set("\r\n\0") for name in names):
         raise InputError(f"{shown(path)}: names must be {values.shape[1]} names of one line each, one a column")
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerow(["time", *names])
         rows = (
-            ",".join([repr(time), *("" if value != value else repr(value) for value in row)]) + "\n"
+            ",".join([time, *("" if value != value else repr(value) for value in row)]) + "\n"
             for part in (slice(start, start + 65536) for start in range(0, len(times), 65536))
-            for time, row in zip(times[part].tolist(), values[part].tolist())
+            for time, row in zip(_texts(times[part] if dates is None else dates[part]), values[part].tolist())
         )
         while block := "".join(islice(rows, 4096)):
             file.write(block)
+
+
+def _texts(times: np.ndarray) -> Iterator[str]:
+    """Yield times in all digits, or dates to the microsecond."""
+    return map(repr, times.tolist()) if times.dtype.kind == "f" else map(str, times.astype("datetime64[us]"))
 
 
 def shown(path: str | os.PathLike[str]) -> str:
@@ -120,7 +106,7 @@ def _one_line(path: str | os.PathLike[str]) -> Iterator[None]:
         if isinstance(error, ValueError) and "null" not in str(error):
             raise
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-        fault = f"{shown(path)}: cannot be written: {reason}; choose another place or make room"
+        fault = f"{shown(path)}: cannot be written: {reason}; choose another place or free some space"
         raise InputError(fault) from error
 
 

@@ -1,0 +1,74 @@
+"""Files of densities: a mixture, or the logarithm on a grid, in numbers that are equal to the last bit."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from zakai.densities import Density, GaussianMixture, GridDensity
+from zakai.densities.as_prior import plain
+from zakai.errors import InputError
+from zakai.records.checkpoint import read_checkpoint, write_checkpoint
+from zakai.records.writing import shown
+
+KIND = "density"
+_PARTS = {"mixture": ("weights", "means", "covs"), "grid": ("log_values", "centre", "basis")}
+
+
+def save_density(density: Density, path: str | os.PathLike[str]) -> None:
+    """Write a density to a file, atomically; see `Density.save`."""
+    found = plain(density)
+    kind = "mixture" if isinstance(found, GaussianMixture) else "grid"
+    about = {"kind": kind, "names": list(found.names), "periodic": [bool(angle) for angle in found.periodic]}
+    write_checkpoint(path, about, {name: getattr(found, name) for name in _PARTS[kind]}, KIND)
+
+
+def load_density(path: str | os.PathLike[str]) -> Density:
+    """Read a density that `Density.save` wrote.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The density: a Gaussian mixture, or one on a grid.
+
+    Raises:
+        InputError: the file is damaged, or holds something else.
+
+    Example:
+        >>> import tempfile, pathlib, zakai
+        >>> model = zakai.load_model("gallery:kalman-bucy-1d")
+        >>> result = zakai.filter(model, zakai.Record([0.1, 0.2], [0.3, 0.1]))
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "end.density"
+        >>> result.density(-1).save(path)
+        >>> later = model.with_prior(zakai.load_density(path), start=0.2)
+        >>> bool(later.prior.mean == result.mean[-1])
+        True
+    """
+    about, arrays = read_checkpoint(path, KIND)
+    damaged = InputError(f"{shown(path)}: does not hold a density; give a file that density.save wrote")
+    try:
+        names, periodic = tuple(about["names"]), tuple(about["periodic"])
+        parts = {name: arrays[name] for name in _PARTS[about["kind"]]}
+        n, whole = len(names), about["kind"] == "grid"
+        fits = all(array.dtype == float for array in parts.values())
+        fits &= all(isinstance(name, str) and name.isidentifier() for name in names)
+        fits &= len(periodic) == n > 0 and all(isinstance(angle, bool) for angle in periodic)
+        if not fits:
+            raise damaged
+        if whole:
+            fits = parts["log_values"].ndim == n and parts["centre"].shape == (n,) and parts["basis"].shape == (n, n)
+            fits &= bool(np.isfinite(parts["centre"]).all() and np.linalg.matrix_rank(parts["basis"]) == n)
+            fits &= not np.isnan(parts["log_values"]).any() and bool(np.isfinite(parts["log_values"].max()))
+        else:
+            k = len(parts["weights"])
+            fits = k > 0 and parts["weights"].shape == (k,)
+            fits &= parts["means"].shape == (k, n) and parts["covs"].shape == (k, n, n)
+            fits &= bool((parts["weights"] > 0).all()) and all(np.isfinite(array).all() for array in parts.values())
+            fits &= bool((np.linalg.eigvalsh(parts["covs"]) >= 0).all())
+    except (KeyError, TypeError, ValueError, np.linalg.LinAlgError):
+        raise damaged from None
+    if not fits:
+        raise damaged
+    return (GridDensity if whole else GaussianMixture)(**parts, names=names, periodic=periodic)
