@@ -34,7 +34,7 @@ def scalar_benes():
 
 
 def scalar_erf():
-    """F = x^2/2 + log(3/2 + erf x): its quadratic part becomes drift, and what is left is no sum of exponentials."""
+    """F = x^2/2 + log(3/2 + erf x): its quadratic part becomes drift, and the remainder is no sum of exponentials."""
 
     def slope(x):
         from scipy.special import erf
@@ -116,7 +116,7 @@ def test_the_density_solves_the_dmz_equation(case):
 
 
 def modes_far_apart(variance):
-    """e^F = e^(x^2/2) (2 + erf x), two modes at -10 and 10 where erf is flat, readings that say next to nothing."""
+    """e^F = e^(x^2/2) (2 + erf x), two modes at -10 and 10 where erf is flat, observations with next to no information."""
     return zakai.Model(
         state=["x"],
         drift=["x + exp(-x**2)*2/sqrt(pi)/(2 + erf(x))"],
@@ -128,7 +128,7 @@ def modes_far_apart(variance):
 
 
 def test_modes_that_are_narrow_and_far_apart_keep_their_shares():
-    """Each mode is a Kalman filter of dx = x dt + dw; both explain a reading of zero equally well."""
+    """Each mode is a Kalman filter of dx = x dt + dw; both explain an observation of zero equally well."""
     result = zakai.filter(modes_far_apart(0.0025), zakai.Record([0.0005, 0.001], [[0.0], [0.0]], "samples"), "hu-yau")
     assert not result.warnings
     at, variance, share = 10.0, 0.0025, np.array([0.3, 0.7])

@@ -1,4 +1,4 @@
-"""The filtering density of a system with increments, y running linearly between readings: the DMZ equation on a box.
+"""The filtering density of a system with increments, y running linearly between observations: the DMZ equation on a box.
 
     sigma_t = 1/2 G:Hess sigma - f.grad sigma - (div f + 1/2 h'S^-1 h - h'S^-1 dy/dt) sigma
 
@@ -13,7 +13,7 @@ from references.kolmogorov import Box, propagate
 
 
 def dmz(box: Box, sigma, times, increments, drift, divergence, covariance, h, S, start=0.0, tolerance=1e-13):
-    """sigma after each reading; `drift`, `divergence` and `h` are functions of x (..., n) and t."""
+    """sigma after each observation; `drift`, `divergence` and `h` are functions of x (..., n) and t."""
     out, precision = [], np.linalg.inv(S)
     for stop, dy in zip(times, increments, strict=True):
         rate = dy / (stop - start)

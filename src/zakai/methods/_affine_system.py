@@ -4,9 +4,17 @@ After the gauge u = e^phi v, with y linear between observations,
 
     v_t = 1/2 G:Hess v - (L x + l).grad v + (-q/2 - h'S^-1 h/2 + h'S^-1 dy/dt) v,     h = C x + c,
 
-is linear-quadratic.  The rates dy/dt of the coordinates that are observed over just an interval are its inputs, and the
+is linear-quadratic.  The rates dy/dt of the coordinates that are observed over just an interval drive it, and the
 transition of every interval is prepared without data.  Coordinates are relative to a fixed `origin`, so that a state far from
 zero costs no digits.
+
+With correlated noise E dv dw' = N dt and D = g N, the state is driven by dy and by noise that is independent of dw,
+
+    dx = (L x + l - D S^-1 h) dt + D S^-1 dy + dv~,     E dv~ dv~' = (G - D S^-1 D') dt,
+
+and y that is linear between observations adds -tr(S^-1 C D)/2 to the potential (Stratonovich).
+
+The transition of an interval is composed of those of its pieces, in which the known inputs u(t) are constant or linear.
 """
 
 from __future__ import annotations
@@ -14,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -23,19 +31,20 @@ import sympy as sp
 from zakai.algebra.gauges import affine_system
 from zakai.algebra.systems import affine_observation
 from zakai.errors import InputError
+from zakai.methods._input_pieces import Pieces, pieces_of
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-from zakai.numerics.complex_step import cholesky
-from zakai.numerics.flow import Coefficients, FlowResult, Transition, integrate
+from zakai.numerics.flow import Coefficients, FlowResult, Transition, composed, integrate
 from zakai.numerics.transition import Array, at, transposed
 from zakai.records.schedule import Schedule
 
 RESOLVED = 1e-9  # relative error of a transition above which a result warns
 _KEPT = 256  # transitions of a system without time that are kept
+_MOST_PIECES = 2**16  # that are prepared together, for memory
 
 
 class Matrices:
-    """Matrices of time and parameters as one function: few functions of t, times a table of numbers."""
+    """Matrices of time, inputs and parameters as one function: few functions of (t, u), times a table of numbers."""
 
     def __init__(self, blocks: Sequence[sp.MatrixBase], model: Model):
         self.shapes = [block.shape for block in blocks]
@@ -53,23 +62,26 @@ class Matrices:
         self.table = np.zeros((max(len(found), 1), len(entries)))
         np.add.at(self.table, (columns, places), numbers)
         functions = list(found) or [sp.Integer(0)]
-        self.varying = any(model.t in function.free_symbols for function in functions)
+        moving = [function for function in functions if function.free_symbols & {model.t, *model.u}]
+        self.timed = any(model.t in function.free_symbols for function in moving)
+        self.driven = any(function.free_symbols & set(model.u) for function in moving)
+        self.varying = self.timed or self.driven
         self._function = numpy_function(functions, model)
-        moving = [function for function in functions if model.t in function.free_symbols]
         self._moving = numpy_function(moving or [sp.Integer(0)], model)
         self._state = np.zeros(model.n)
+        ends = np.cumsum([0, *(rows * columns for rows, columns in self.shapes)]).tolist()
+        self._parts = [slice(first, last) for first, last in zip(ends[:-1], ends[1:], strict=True)]
 
-    def __call__(self, times: Array, theta: Array) -> list[Array]:
-        """Return the blocks (J, rows, columns) at times (J,)."""
-        values = self._function(self._state, times, theta)
+    def __call__(self, times: Array, theta: Array, u: Array | None = None) -> list[Array]:
+        """Return the blocks (J, rows, columns) at times (J,) and inputs (J, number of inputs)."""
+        values = self._function(self._state, times, theta, u)
         # One row after the other, so that a row does not depend on how many there are.
         flat = (values[:, None, :] @ self.table)[:, 0]
-        parts = np.split(flat, np.cumsum([rows * columns for rows, columns in self.shapes])[:-1], axis=1)
-        return [part.reshape(len(flat), *shape) for part, shape in zip(parts, self.shapes, strict=True)]
+        return [flat[:, part].reshape(len(flat), *shape) for part, shape in zip(self._parts, self.shapes, strict=True)]
 
-    def features(self, times: Array, theta: Array) -> Array:
-        """Return the functions (J, F) of time alone."""
-        return self._moving(self._state, times, theta)
+    def features(self, times: Array, theta: Array, u: Array | None = None) -> Array:
+        """Return the functions (J, F) of time and inputs alone."""
+        return self._moving(self._state, times, theta, u)
 
 
 class AffineSystem:
@@ -78,48 +90,69 @@ class AffineSystem:
     def __init__(self, model: Model):
         found, observed = affine_system(model), affine_observation(model)
         assert found is not None and observed is not None
-        (form, bare, _, _), (slope, intercept) = found, observed
-        assert bare is not None
-        constant = sp.Matrix([bare.constant])
-        own = [form.matrix, form.offset, model.covariance, bare.matrix, bare.linear, constant]
+        (form, unobserved, _, _), (slope, intercept) = found, observed
+        assert unobserved is not None
+        constant = sp.Matrix([unobserved.constant])
+        own = [form.matrix, form.offset, model.covariance, unobserved.matrix, unobserved.linear, constant]
         self.matrices = Matrices([*own, slope, intercept, model.observation_noise], model)
         self._observation = Matrices([slope, intercept, model.observation_noise], model)
         self._noise = Matrices([model.observation_noise], model)
-        self.varying = self.matrices.varying
-        self.source = model.source
+        self._cross = None if model.cross_noise.is_zero_matrix else Matrices([model.diffusion * model.cross_noise], model)
+        parts = [self.matrices] if self._cross is None else [self.matrices, self._cross]
+        self.varying = any(part.varying for part in parts)
+        # Whether a piece has one flow for each length: the inputs are constant in it.
+        self.autonomous = not any(part.timed for part in parts) and (model.input_hold == "zero" or not self.matrices.driven)
+        self.inputs = len(model.u)
+        self.kind, self.hold, self.source = model.observation_kind, model.input_hold, model.source
         self.kept_quadratics: dict[Any, tuple[Array, Array]] = {}
 
-    def letters(self, times: Array, theta: Array, origin: Array) -> list[Array]:
+    @property
+    def correlated(self) -> bool:
+        """Whether the noises of the state and of the observations are correlated."""
+        return self._cross is not None
+
+    def letters(self, times: Array, theta: Array, origin: Array, u: Array | None = None) -> list[Array]:
         """Return L, l, G, Q, p, r, C, c, S at times (J,), in coordinates relative to the origin."""
-        L, l, G, Q, p, r, C, c, S = self.matrices(times, theta)
+        L, l, G, Q, p, r, C, c, S = self.matrices(times, theta, u)
         if origin.any():
             pushed = Q @ origin[:, None]
             r = r + transposed(p + pushed) @ origin[:, None]
             l, p, c = l + L @ origin[:, None], p + 2.0 * pushed, c + C @ origin[:, None]
         return [L, l, G, Q, p, r, C, c, S]
 
-    def coefficients(self, times: Array, theta: Array, origin: Array, inside: Array) -> Coefficients:
-        """Return the coefficients at times (J,) with the potential of the coordinates `inside` (J, m)."""
-        L, l, G, Q, p, r, C, c, S = self.letters(times, theta, origin)
+    def coefficients(
+        self, times: Array, theta: Array, origin: Array, inside: Array, u: Array | None = None
+    ) -> Coefficients:
+        """Return the coefficients at times (J,) with the potential of the coordinates `inside` (J, m); samples have none."""
+        L, l, G, Q, p, r, C, c, S = self.letters(times, theta, origin, u)
+        if self.kind == "samples":
+            return Coefficients(L, l, G, Q, p, r[:, :, 0])
         precision = precision_of(S, inside)
         gain = transposed(C) @ precision
         driven = precision @ c
         linear = np.concatenate([p - gain @ c, gain], axis=2)
         constant = np.concatenate([r[:, :, 0] - 0.5 * (transposed(c) @ driven)[:, :, 0], driven[:, :, 0]], axis=1)
-        offset = np.concatenate([l, np.zeros((*l.shape[:2], inside.shape[1]))], axis=2)
-        return Coefficients(L, offset, G, Q - 0.5 * gain @ C, linear, constant)
+        pushed = np.zeros((*l.shape[:2], inside.shape[1]))
+        if self._cross is not None:
+            (cross,) = self._cross(times, theta, u)
+            pushed = cross @ precision
+            L, l, G = L - pushed @ C, l - pushed @ c, G - pushed @ transposed(cross)
+            # The transport of dx moves mass, tr(S^-1 C D), of which Stratonovich's term takes half.
+            constant[:, 0] += 0.5 * (gain * cross).sum(axis=(1, 2))
+        return Coefficients(L, np.concatenate([l, pushed], axis=2), G, Q - 0.5 * gain @ C, linear, constant)
 
-    def features(self, times: Array, theta: Array) -> Array:
+    def features(self, times: Array, theta: Array, u: Array | None = None) -> Array:
         """Return the functions of time that the coefficients are made of, (J, F)."""
-        own = self.matrices.features(times, theta)
-        if not self._noise.varying:
-            return own
-        precision = np.linalg.inv(self._noise(times, theta)[0])
-        return np.concatenate([own, precision.reshape(len(times), -1)], axis=1)
+        found = [self.matrices.features(times, theta, u)]
+        if self._noise.varying:
+            found.append(np.linalg.inv(self._noise(times, theta, u)[0]).reshape(len(times), -1))
+        if self._cross is not None:
+            found.append(self._cross.features(times, theta, u))
+        return np.concatenate(found, axis=1)
 
-    def observation(self, times: Array, theta: Array, origin: Array) -> tuple[Array, Array, Array]:
+    def observation(self, times: Array, theta: Array, origin: Array, u: Array | None) -> tuple[Array, Array, Array]:
         """Return C (J, m, n), c (J, m) and S (J, m, m) at times (J,)."""
-        slope, intercept, noise = self._observation(times, theta)
+        slope, intercept, noise = self._observation(times, theta, u)
         return slope, (intercept + slope @ origin[:, None])[:, :, 0], noise
 
     def quadratic(self, theta: Array, origin: Array) -> tuple[Array, Array] | None:
@@ -134,47 +167,14 @@ def precision_of(noise: Array, seen: Array) -> Array:
     return np.where(both, np.linalg.inv(np.where(both, noise, 0.0) + alone), 0.0)
 
 
-class Ends(NamedTuple):
-    """What is observed at the ends of K intervals, with noise of variance one: `whiten` (K, m, m) values = H x + c + noise.
-
-    `observed` (K, m) marks the rows that count, `slope` is H (K, m, n), `intercept` c (K, m) and `constant` (K,) what the
-    logarithm of the factor exp(-|whiten values - H x - c|^2 / 2) lacks.  The evidence of increments is relative to noise alone.
-    """
-
-    observed: Array
-    slope: Array
-    intercept: Array
-    whiten: Array
-    constant: Array
-    relative: bool
-
-
-def ends_of(kind: str, schedule: Schedule, slope: Array, intercept: Array, noise: Array) -> Ends:
-    """Return what is observed at the ends; `slope`, `intercept` and `noise` are C, c and S there.
-
-    Increments that end together share the noise of the time that they have in common, S min(elapsed_i, elapsed_j).
-    """
-    sampled = kind == "samples"
-    at_end = schedule.seen if sampled else schedule.seen & ~schedule.inside
-    both = at_end[:, :, None] & at_end[:, None, :]
-    spans = np.where(at_end, 1.0 if sampled else schedule.elapsed, 0.0)
-    shared = 1.0 if sampled else np.minimum(spans[:, :, None], spans[:, None, :])
-    try:
-        factor = cholesky(np.where(both, noise * shared, 0.0) + np.eye(at_end.shape[1]) * ~at_end[:, None, :])
-    except np.linalg.LinAlgError:
-        first, last = schedule.stops[0], schedule.stops[-1]
-        raise InputError(f"observation_noise: is not positive definite between t = {first:g} and {last:g}") from None
-    whiten = np.linalg.inv(factor)
-    logs = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1) + 0.5 * np.log(2 * np.pi) * at_end.sum(axis=1)
-    constant = -logs if sampled else np.zeros(len(logs))
-    return Ends(
-        np.ascontiguousarray(at_end),
-        whiten @ (spans[:, :, None] * slope),
-        (whiten @ (spans * intercept)[:, :, None])[:, :, 0],
-        whiten,
-        constant,
-        not sampled,
-    )
+def _padded(whole: Transition, m: int) -> Transition:
+    """Return transitions of an equation without rates of y as ones with m of them, which have no effect."""
+    wide = [np.zeros((*field.shape[:2], 1 + m), field.dtype) for field in (whole.offset, whole.vector)]
+    for padded, own in zip(wide, (whole.offset, whole.vector), strict=True):
+        padded[:, :, :1] = own
+    constant = np.zeros((len(whole.constant), 1 + m, 1 + m), whole.constant.dtype)
+    constant[:, :1, :1] = whole.constant
+    return whole._replace(offset=wide[0], vector=wide[1], constant=constant)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,44 +188,64 @@ class Setup:
     still: list[tuple[Array, Array, Array]] = field(default_factory=list)
     lock: Any = field(default_factory=Lock)
 
-    def integrated(self, starts: Array, stops: Array, inside: Array) -> FlowResult:
-        """Return the transitions of intervals in which the coordinates `inside` (K, m) act."""
-        system, theta = self.system, self.theta
-        return integrate(
-            lambda times, rows: system.coefficients(times, theta, self.origin, inside[rows]),
+    def integrated(self, pieces: Pieces, lengths: Array, inside: Array) -> FlowResult:
+        """Return the transitions of pieces in which the coordinates `inside` (J, m) act."""
+        system, theta, origin = self.system, self.theta, self.origin
+        # Equal lengths of what does not depend on time have equal flows.
+        starts, stops = (np.zeros(len(lengths)), lengths) if system.autonomous else (pieces.starts, pieces.stops)
+        found = integrate(
+            lambda times, rows: system.coefficients(times, theta, origin, inside[rows], pieces.inputs(times, rows)),
             starts,
             stops,
-            not system.varying,
-            lambda times, rows: system.features(times, theta.real),
+            system.autonomous,
+            lambda times, rows: system.features(times, theta.real, pieces.inputs(times, rows)),
         )
+        return found._replace(transition=_padded(found.transition, inside.shape[1])) if system.kind == "samples" else found
 
-    def observation(self, stops: Array) -> tuple[Array, Array, Array]:
-        """Return C (K, m, n), c (K, m) and S (K, m, m) at the ends of intervals."""
+    def observation(self, schedule: Schedule) -> tuple[Array, Array, Array]:
+        """Return C (K, m, n), c (K, m) and S (K, m, m) at the ends of intervals; increments end before an input jumps."""
+        stops, inputs = schedule.stops, schedule.inputs
         if self.system.varying:
-            return self.system.observation(stops, self.theta, self.origin)
+            u = np.zeros((len(stops), self.system.inputs))
+            if inputs is not None:
+                u = inputs.at(stops, self.system.hold, before=self.system.kind != "samples")
+            return self.system.observation(stops, self.theta, self.origin, u)
         if not self.still:
-            self.still.append(self.system.observation(np.zeros(1), self.theta, self.origin))
+            self.still.append(self.system.observation(np.zeros(1), self.theta, self.origin, None))
         slope, intercept, noise = (np.broadcast_to(array, (len(stops), *array.shape[1:])) for array in self.still[0])
         return slope, intercept, noise
 
-    def transitions(self, schedule: Schedule) -> tuple[Transition, tuple[str, ...]]:
-        """Return the transitions of all intervals and what is to be said of them.
+    def transitions(self, schedule: Schedule, inside: Array) -> tuple[Transition, tuple[str, ...]]:
+        """Return the transitions of all intervals, in which the coordinates `inside` (K, m) act, and notes.
 
         Raises:
             InputError: a coefficient is not finite.
         """
-        if self.system.varying or len(schedule) == 0:
-            found = self.integrated(schedule.starts, schedule.stops, schedule.inside)
-            self._check_finite(found, schedule.starts, schedule.stops)
-            worst = float(found.error.max(initial=0.0))
-            if worst <= RESOLVED:
-                return found.transition, ()
-            time = schedule.stops[np.argmax(found.error)]
-            return found.transition, (
-                f"the coefficients vary so fast within an interval that its transition is known to {worst:.1g} only (first at "
-                f"t = {time:g}); give shorter intervals",
-            )
-        names = [row.tobytes() for row in np.concatenate([schedule.lengths[:, None], schedule.inside], axis=1)]
+        pieces = pieces_of(schedule, self.system.hold, self.system.inputs)
+        if len(pieces.row) > _MOST_PIECES and len(schedule) > 1:
+            middle = len(schedule) // 2
+            both = [self.transitions(schedule.part(rows), inside[rows]) for rows in (slice(None, middle), slice(middle, None))]
+            parts = zip(*(found for found, _ in both), strict=True)
+            return Transition(*map(np.concatenate, parts)), tuple(dict.fromkeys(note for _, notes in both for note in notes))
+        inside = inside[pieces.row]
+        if self.system.autonomous and len(schedule):
+            return composed(self._repeated(pieces, inside), pieces.row, len(schedule)), ()
+        found = self.integrated(pieces, pieces.lengths, inside)
+        self._check_finite(found, pieces.starts, pieces.stops)
+        worst = float(found.error.max(initial=0.0))
+        whole = composed(found.transition, pieces.row, len(schedule))
+        if worst <= RESOLVED:
+            return whole, ()
+        time = pieces.stops[np.argmax(found.error)]
+        return whole, (
+            f"the coefficients vary so fast within an interval that its transition is known to {worst:.1g} only (first at "
+            f"t = {time:g}); give shorter intervals",
+        )
+
+    def _repeated(self, pieces: Pieces, inside: Array) -> Transition:
+        """Return the transitions of pieces that do not depend on time: one for each length, inputs and coordinates."""
+        lengths = pieces.lengths
+        names = [row.tobytes() for row in np.column_stack([lengths, inside, pieces.first])]
         first = {name: row for row, name in reversed(list(enumerate(names)))}
         with self.lock:
             known = {name: self.kept[name] for name in first if name in self.kept}
@@ -233,8 +253,8 @@ class Setup:
         tables = [Transition(*(array[None] for array in one)) for one in known.values()]
         if missing:
             rows = np.array([first[name] for name in missing])
-            found = self.integrated(np.zeros(len(rows)), schedule.lengths[rows], schedule.inside[rows])
-            self._check_finite(found, schedule.starts[rows], schedule.stops[rows])
+            found = self.integrated(pieces.part(rows), lengths[rows], inside[rows])
+            self._check_finite(found, pieces.starts[rows], pieces.stops[rows])
             tables.append(found.transition)
             with self.lock:
                 if len(self.kept) > _KEPT:
@@ -242,7 +262,7 @@ class Setup:
                 self.kept.update({name: at(found.transition, i) for i, name in enumerate(missing[:_KEPT])})
         place = {name: i for i, name in enumerate([*known, *missing])}
         places = np.array([place[name] for name in names])
-        return Transition(*(np.concatenate(fields)[places] for fields in zip(*tables, strict=True))), ()
+        return Transition(*(np.concatenate(fields)[places] for fields in zip(*tables, strict=True)))
 
     def _check_finite(self, found: FlowResult, starts: Array, stops: Array) -> None:
         wrong = np.isinf(found.error)

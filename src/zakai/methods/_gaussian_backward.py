@@ -9,6 +9,7 @@ It begins as e^phi at the last time.  The smoothed density is v times this messa
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +17,17 @@ import numpy as np
 from zakai.densities import GaussianMixture
 from zakai.errors import InputError
 from zakai.methods._gauge import Tilts, posterior
-from zakai.methods._gaussian_families import Prepared, State, health_of, health_of_gaussian, inputs_of, mixture_of
-from zakai.methods._protocol import Backward, Info
+from zakai.methods._gauged_density import mixture_of
+from zakai.methods._gaussian_families import (
+    Prepared,
+    State,
+    health_of,
+    health_of_gaussian,
+    health_of_gaussians,
+    inputs_of,
+    is_single,
+)
+from zakai.methods._protocol import Backward, Info, Infos
 from zakai.numerics.families import Family, solve, weigh
 from zakai.numerics.transition import Array, at, symmetric
 
@@ -62,7 +72,7 @@ def message(prepared: Prepared, state: State) -> Message:
 
 
 @np.errstate(all="ignore")
-def backward(prepared: Prepared, k: int, later: Message, values: Array) -> Message:
+def backward(prepared: Prepared, k: int, later: Message, values: Array, state: State) -> Message:
     """Return the message at the start of interval k from that at its end; `values` (m,) are what is observed."""
     ends, rows = prepared.ends, prepared.ends.observed[k]
     centre, information, slopes, logs = later
@@ -131,4 +141,24 @@ def density(prepared: Prepared, state: State, later: Message) -> GaussianMixture
     return mixture_of(prepared.model, prepared.setup.origin + own.centre, families, found)
 
 
-BACKWARD: Backward[Prepared, State, Message] = Backward(message, backward, smoothed, density)
+def segment(
+    prepared: Prepared, rows: slice, states: Sequence[State], later: Message, values: Array
+) -> tuple[Message, Infos] | None:
+    """Take a message from the end of a slice of intervals to its start by the compiled loop, where there is one Gaussian."""
+    if not is_single(prepared, states[0]) or len(later.logs) > 1:
+        return None
+    from zakai.numerics import gaussian_backward  # a filter does not wait for its compilation
+
+    assert prepared.loop is not None
+    compiled: Callable[..., None] = gaussian_backward.segment
+    _, arguments = prepared.loop
+    means, covs = np.array([state.mean[0] for state in states[1:]]), np.array([state.cov[0] for state in states[1:]])
+    moved, masses = Message(*(np.array(field, order="C") for field in later)), np.empty(len(values))
+    compiled(
+        rows.start, moved.centre, moved.information, moved.slopes[0], moved.logs, *arguments, np.ascontiguousarray(values),
+        means, covs, masses,
+    )  # fmt: skip
+    return moved, Infos(masses, means + prepared.setup.origin, covs, health_of_gaussians(covs))
+
+
+BACKWARD: Backward[Prepared, State, Message] = Backward(message, backward, smoothed, density, segment)

@@ -6,29 +6,32 @@ Kalman-Bucy, Benes and Hu-Yau are this filter for phi = 0, phi = log cosh and an
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from threading import Lock
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from zakai.densities import Density, GaussianMixture
+from zakai.densities import Density
 from zakai.errors import InputError
-from zakai.methods._affine_system import AffineSystem, Ends, Setup, affine_system_of, ends_of
+from zakai.methods._affine_system import AffineSystem, Setup, affine_system_of
 from zakai.methods._family_prior import prior_families
 from zakai.methods._gauge import Gauge, Posterior, Tilts, posterior, tilts_at
-from zakai.methods._gauged_density import GaugedDensity
-from zakai.methods._protocol import Info
+from zakai.methods._gauged_density import density_of
+from zakai.methods._gaussian_ends import Ends, ends_of
+from zakai.methods._protocol import Info, Infos, stacked
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior, MixturePrior
 from zakai.numerics.complex_step import is_complex
-from zakai.numerics.families import Family, exponents, log_terms, move, observe, weigh
-from zakai.numerics.gaussian_step import advance
-from zakai.numerics.transition import Array, Transition, at, transposed
+from zakai.numerics.families import Family, exponents, move, observe, weigh
+from zakai.numerics.gaussian_step import segment, segment_with_derivatives
+from zakai.numerics.transition import Array, Transition, at
 from zakai.records.schedule import Schedule
 
+_LATE = "cross_noise is omitted for increments that were gathered over more than their interval, as if dv and dw were independent"
 _KEPT = 8  # values of the parameters for which a model's setup is kept
 
 BOUNDS: Mapping[str, tuple[float, str]] = {
@@ -40,9 +43,11 @@ BOUNDS: Mapping[str, tuple[float, str]] = {
 
 
 class State(NamedTuple):
-    """The families of v, or of e^S v, relative to the origin (`zakai.numerics.families.Family`), normalised so that
-    u = e^phi v has mass one; the `time`; for each node the logarithm of the error of the prior's representation and whether it is
-    at the edge, (J, N)."""
+    """The families of v, or of e^S v, relative to the origin (`zakai.numerics.families.Family`).
+
+    They are normalised so that u = e^phi v has mass one. `time` is the time; for each node (J, N), `log_error` is the logarithm
+    of the error of the prior's representation, and `edge` marks the nodes at its edge.
+    """
 
     nodes: Array
     log_weights: Array
@@ -67,7 +72,7 @@ class State(NamedTuple):
 class Prepared:
     """What is known without data: for every interval the transition, its `ends`, and the gauge there.
 
-    `compiled`: the compiled step serves a single Gaussian.
+    `loop`: the compiled segment of a single Gaussian with what it receives of this; None where there is a gauge.
     """
 
     model: Model
@@ -77,10 +82,14 @@ class Prepared:
     stops: Array
     frequencies: Array
     transitions: Transition
-    compiled: bool
+    loop: tuple[Callable[..., None], tuple[Any, ...]] | None
     ends: Ends
-    tilts: Tilts
     notes: tuple[str, ...]
+
+    @cached_property
+    def tilts(self) -> Tilts:
+        """The gauge at the ends of the intervals."""
+        return self.gauge.at(self.stops)
 
 
 _SETUPS: WeakKeyDictionary[Model, OrderedDict[Any, tuple[Setup, Gauge]]] = WeakKeyDictionary()
@@ -106,17 +115,24 @@ def setup_of(model: Model, theta: Array, kind: type[AffineSystem]) -> tuple[Setu
 def prepare(model: Model, schedule: Schedule, theta: Array, kind: type[AffineSystem] = AffineSystem) -> Prepared:
     """Return the transition of every interval; `kind` is the equation, that of v by default."""
     setup, gauge = setup_of(model, np.asarray(theta), kind)
-    transitions, notes = setup.transitions(schedule)
+    sampled, inside = model.observation_kind == "samples", schedule.inside
+    transitions, notes = setup.transitions(schedule, inside)
     lengths = schedule.stops - schedule.starts
-    slope, intercept, noise = setup.observation(schedule.stops)
-    sampled = model.observation_kind == "samples"
     # A rate is an increment over its interval.
-    inside = schedule.inside & (not sampled)
-    frequencies = np.where(inside, 1.0, 0.0) / np.where(inside, lengths[:, None], 1.0)
-    ends = ends_of(model.observation_kind, schedule, slope, intercept, noise)
-    compiled = gauge.trivial and kind is AffineSystem and not is_complex(*transitions, *ends[1:4])
-    tilts = gauge.at(schedule.stops)
-    return Prepared(model, setup, gauge, lengths, schedule.stops, frequencies, transitions, compiled, ends, tilts, notes)
+    frequencies = inside / np.where(inside, lengths[:, None], 1.0)
+    at_end = np.ascontiguousarray(schedule.seen & ~inside)
+    if setup.system.correlated and at_end.any():
+        notes = (*notes, _LATE)
+    ends = ends_of(sampled, schedule, at_end, model.n, setup.observation)
+    loop = None
+    if gauge.trivial and kind is AffineSystem:
+        # The Gaussian itself may carry a derivative where nothing else does.
+        dtype = complex if is_complex(setup.theta) else float
+        parts = [np.ascontiguousarray(part, dtype) for part in (*transitions, ends.whiten, ends.slope, ends.intercept)]
+        level = np.ascontiguousarray(ends.constant, dtype)
+        compiled = segment if dtype is float else segment_with_derivatives()
+        loop = compiled, (lengths, frequencies, *parts, ends.observed, level, ends.relative)
+    return Prepared(model, setup, gauge, lengths, schedule.stops, frequencies, transitions, loop, ends, notes)
 
 
 @np.errstate(all="ignore")
@@ -183,15 +199,11 @@ def observe_end(ends: Ends, k: int, families: Family, values: Array) -> Family:
 @np.errstate(all="ignore")
 def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
     """Advance one interval: the transition, with the rates of y inside; what is observed at its end; normalise."""
+    if is_single(prepared, state):
+        (moved,), infos = segment_of_gaussian(prepared, slice(k, k + 1), state, values[None])
+        health = {name: float(figure[0]) for name, figure in infos.health.items()}
+        return moved, Info(infos.log_likelihood_increment[0], infos.mean[0], infos.cov[0], health)
     gauge, setup, inputs = prepared.gauge, prepared.setup, inputs_of(prepared, k, values)
-    if prepared.compiled and len(state.log_mass) == 1 and not state.nodes.shape[2]:
-        mean, cov, ends = state.mean.copy(), state.cov.copy(), prepared.ends
-        log_mass = state.log_mass[0] + advance(
-            k, mean[0], cov[0], prepared.lengths[k] > 0, *prepared.transitions, inputs, np.ascontiguousarray(values),
-            ends.whiten, ends.slope, ends.intercept, ends.observed, ends.constant, ends.relative,
-        )  # fmt: skip
-        moved = State(*state[:3], mean, cov, *state[5:8], np.zeros(1), *state[9:11], float(prepared.stops[k]))
-        return moved, Info(log_mass, mean[0] + setup.origin, cov[0], health_of_gaussian(cov[0]))
     families = observe_end(prepared.ends, k, move_families(prepared, k, state.families, inputs), values)
     moved = State(*families, state.log_error, state.edge, float(prepared.stops[k]))
     quadratic = setup.system.quadratic(setup.theta, setup.origin)
@@ -199,6 +211,46 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     found = posterior(gauge, tilts_at(prepared.tilts, k), prepared.stops[k], own)
     info = Info(found.log_mass, found.mean + setup.origin, found.cov, health_of(moved, own, found))
     return moved._replace(log_mass=families.log_mass - found.log_mass), info
+
+
+def is_single(prepared: Prepared, state: State) -> bool:
+    """Return whether a state is one Gaussian, which is advanced by the compiled loop."""
+    return prepared.loop is not None and state.nodes.shape == (1, 1, 0)
+
+
+def segment_of_gaussian(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[list[State], Infos]:
+    """Return the states after the intervals of a slice, and their reports, for one Gaussian."""
+    assert prepared.loop is not None
+    (loop, arguments), origin = prepared.loop, prepared.setup.origin
+    dtype = arguments[2].dtype
+    mean, cov = state.mean[0].astype(dtype), state.cov[0].astype(dtype)
+    (count, _), n = values.shape, len(mean)
+    means, covs, gains = np.empty((count, 1, n), dtype), np.empty((count, 1, n, n), dtype), np.empty(count, dtype)
+    loop(rows.start, mean, cov, *arguments, np.ascontiguousarray(values), means[:, 0], covs[:, 0], gains)
+    gains[0] += state.log_mass[0]
+    times, none = prepared.stops[rows].tolist(), np.zeros(1)
+    head, middle, errors = state[:3], state[5:8], state[9:11]
+    states = [State(*head, mean, cov, *middle, none, *errors, time) for mean, cov, time in zip(means, covs, times, strict=True)]
+    return states, Infos(gains, means[:, 0] + origin, covs[:, 0], health_of_gaussians(covs[:, 0]))
+
+
+def segment_of_families(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[list[State], Infos]:
+    """Return the states after the intervals of a slice, and their reports."""
+    if is_single(prepared, state):
+        return segment_of_gaussian(prepared, rows, state, values)
+    states, infos = [], []
+    for k, value in zip(range(rows.start, rows.stop), values, strict=True):
+        state, info = step(prepared, k, state, value)
+        states.append(state)
+        infos.append(info)
+    return states, stacked(infos)
+
+
+def health_of_gaussians(covs: Array) -> dict[str, Array]:
+    """Return the health of posteriors without nodes, with covariances (R, n, n)."""
+    variances, zero = np.diagonal(covs, axis1=1, axis2=2).real, np.zeros(len(covs))
+    negative = np.maximum(0.0, -variances.min(axis=1)) / np.maximum(np.abs(variances).max(axis=1), 1e-300)
+    return {"negative_variance": negative, "representation_error": zero, "edge_weight": zero, "gauge_error": zero}
 
 
 def health_of_gaussian(cov: Array) -> dict[str, float]:
@@ -233,54 +285,6 @@ def density(prepared: Prepared, state: State) -> Density:
     families = Family(*(array.real for array in state.families))
     families = families if quadratic is None else times_gauge(families, quadratic, -1.0)
     return density_of(prepared.model, prepared.gauge.real(), state.time, families)
-
-
-def density_of(model: Model, gauge: Gauge, time: float, families: Family) -> Density:
-    """Return e^phi times the families, normalised."""
-    found = posterior(gauge, gauge.at_one(time), time, families)
-    # A density without width in some direction, as of a known start, is on no grid.
-    if not gauge.exact and np.all(np.linalg.eigvalsh(families.cov)[:, 0] > 1e-14 * np.trace(families.cov, axis1=1, axis2=2)):
-        return _gauged(model, gauge, time, families, found)
-    return mixture_of(model, gauge.origin, families, found)
-
-
-def _weighted(origin: Array, families: Family, found: Posterior) -> tuple[Array, Array]:
-    """Return the weights (J, N, E) of the Gaussians of a posterior and their means (J, N, E, n)."""
-    moved = families.nodes @ transposed(families.response)
-    return found.signs * np.exp(found.logs - found.log_mass), found.centres[:, None] + moved[:, :, None] + origin
-
-
-def mixture_of(model: Model, origin: Array, families: Family, found: Posterior) -> GaussianMixture:
-    """Return the Gaussians of a posterior as a density."""
-    weights, means = _weighted(origin, families, found)
-    covs = np.broadcast_to(found.covs[:, None, None], (*weights.shape, model.n, model.n))
-    used = weights != 0.0
-    return GaussianMixture(weights[used], means[used], covs[used], model.state, (False,) * model.n)
-
-
-def _gauged(model: Model, gauge: Gauge, time: float, families: Family, found: Posterior) -> GaugedDensity:
-    """Return e^phi v by its formula."""
-    shares, points = _weighted(gauge.origin, families, found)
-    shares = np.abs(shares)
-    logs = log_terms(families)
-    weights = families.signs * np.exp(logs - logs.max())
-    means = families.mean[:, None] + families.nodes @ transposed(families.response) + gauge.origin
-    covs = np.broadcast_to(families.cov[:, None], (*weights.shape, model.n, model.n))
-    used, mass = weights != 0.0, weights.sum()
-    bare = GaussianMixture(weights[used] / mass, means[used], covs[used], model.state, (False,) * model.n)
-    scale = logs.max() + np.log(mass) - float(found.log_mass)
-    # A Gaussian is followed to ten deviations, where it is e^-50 of its maximum: its points end at nine.
-    rest, own = (np.sqrt(np.maximum(np.diagonal(c, axis1=1, axis2=2), 0.0)) for c in (found.covs, families.cov))
-    margins = np.broadcast_to((10.0 * rest + own)[:, None, None], points.shape)
-    near = shares >= np.exp(-50.0) * shares.max()
-    return GaugedDensity(
-        bare,
-        lambda x: gauge.potential(x - gauge.origin, time) + scale,
-        found.mean + gauge.origin,
-        found.cov,
-        points[near],
-        margins[near],
-    )
 
 
 def valid(prepared: Prepared, state: State) -> bool:

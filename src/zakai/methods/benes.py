@@ -13,6 +13,7 @@ from dataclasses import replace
 
 from zakai.algebra.exact_theorems import benes as theorem
 from zakai.methods import kalman_bucy
+from zakai.models.features import INPUTS
 
 METHOD = replace(
     kalman_bucy.METHOD,
@@ -20,4 +21,5 @@ METHOD = replace(
     source="Benes 1981; any prior: Makowski 1986",
     exactness="exact for y that is linear between observations, and for samples; the prior to 1e-12",
     theorem=theorem,
+    handles=frozenset({INPUTS}),
 )

@@ -5,7 +5,7 @@ With S, H and P as in Theorems 4 to 6, u~ = e^{S - F} sigma, taken along (b, a, 
     u~_t = 1/2 G:Hess u~ - H.grad u~ - P u~,     u~(0) = e^{S - F} sigma_0,
     Theorem 4: S = 0, H = l     Theorem 5: S = F, H = f     Theorem 6: G grad S = -l, H = 0, P = eta / 2,
 
-and the survey of Chen and Dong, Theorem 1, is Theorem 5 with G = I.  `form="stepwise"` starts anew at every observation and is
+and the survey of Chen and Dong, Theorem 1, is Theorem 5 with G = I.  `form="stepwise"` starts again at every observation and is
 stable over any time; Theorems 4 and 5 then are one method, for e^F cancels.  `form="one-shot"` is the papers' own: see
 `_one_shot`.
 """
@@ -28,6 +28,7 @@ from zakai.methods import _one_shot as one_shot
 from zakai.methods._affine_system import AffineSystem
 from zakai.methods._gaussian_backward import BACKWARD, Message
 from zakai.methods._protocol import Backward, Info, Method
+from zakai.models.features import INPUTS
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.flow import Coefficients
@@ -42,9 +43,11 @@ State = one_shot.State
 class WithoutDrift(AffineSystem):
     """The equation of e^S v with G grad S = -(L x + l): no drift, and the potential -(q + (L x + l)'G^-1 (L x + l) - tr L)/2."""
 
-    def coefficients(self, times: Array, theta: Array, origin: Array, inside: Array) -> Coefficients:
+    def coefficients(
+        self, times: Array, theta: Array, origin: Array, inside: Array, u: Array | None = None
+    ) -> Coefficients:
         """Return the coefficients at times (J,)."""
-        c = super().coefficients(times, theta, origin, inside)
+        c = super().coefficients(times, theta, origin, inside, u)
         n, first = c.matrix.shape[1], np.arange(c.constant.shape[1]) == 0
         slope = np.linalg.solve(c.covariance, np.concatenate([c.matrix, c.offset[:, :, :1]], axis=2))
         backward, end = transposed(c.matrix), slope[:, :, n:]
@@ -111,12 +114,12 @@ def _check_theorem(model: Model, theorem: str, theta: Array) -> None:
             f'{model.source}: option theorem: "survey-1" is stated for G = I, but G = {G.tolist()}; take "theorem-5"'
         )
     if theorem == "theorem-6":
-        entries = numpy_function(G, model, G.shape)(np.zeros(model.n), model.start, theta)
+        varying = any(entry.free_symbols & {model.t, *model.u} for entry in (*G, *form.matrix, *form.offset))
+        entries = np.eye(model.n) if varying else numpy_function(G, model, G.shape)(np.zeros(model.n), model.start, theta)
         if np.linalg.matrix_rank(entries) < model.n:
             raise InputError(f'{model.source}: option theorem: "theorem-6" needs a G that has an inverse; take "theorem-4"')
         # G^-1 D is symmetric if and only if D G is.
         product = form.matrix * G
-        varying = any(entry.has(model.t) for entry in (*G, *form.matrix, *form.offset))
         if all_zero(list(product - product.T)) is not True or varying:
             raise InputError(
                 f'{model.source}: option theorem: "theorem-6" needs constant coefficients and a symmetric G^-1 D; '
@@ -190,5 +193,6 @@ METHOD: Method[Prepared, State] = Method(
     bounds=BOUNDS,
     absolute=lambda options: bool(options["form"] == "one-shot"),
     valid=valid,
+    handles=frozenset({INPUTS}),
     backward=Backward(message, cast(Any, BACKWARD.step), smoothed, smoothed_density),
 )

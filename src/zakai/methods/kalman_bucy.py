@@ -1,9 +1,10 @@
 """The Kalman-Bucy filter, with time-varying coefficients, singular noise, and any prior.
 
-    dx = (L x + l) dt + g dv,   dy = (C x + c) dt + dw:   P' = L P + P L' + G - P C'S^-1 C P,
-    dm = (L m + l) dt + P C'S^-1 (dy - (C m + c) dt)
+    dx = (L x + l) dt + g dv,   dy = (C x + c) dt + dw,   E dv dw' = N dt,   K = (P C' + g N) S^-1:
+    P' = L P + P L' + G - K S K',   dm = (L m + l) dt + K (dy - (C m + c) dt)
 
-(Kalman and Bucy 1961), with y linear between observations and the evidence of the DMZ equation.  No Riccati equation is stepped:
+(Kalman and Bucy 1961), with y linear between observations and the evidence of the DMZ equation.  The coefficients may depend on
+time and on known inputs.  No Riccati equation is stepped:
 a step is the linear-fractional transition of an interval (`zakai.numerics.families`).  A mixture of Gaussians stays
 one, and a density becomes a family of them (Makowski 1986).
 """
@@ -14,6 +15,7 @@ from zakai.algebra.exact_theorems import kalman_bucy as theorem
 from zakai.methods import _gaussian_families as families
 from zakai.methods._gaussian_backward import BACKWARD
 from zakai.methods._protocol import Method
+from zakai.models.features import CROSS_NOISE, INPUTS, JUMPS, KINKS, SINC
 
 METHOD: Method[families.Prepared, families.State] = Method(
     name="kalman-bucy",
@@ -28,5 +30,7 @@ METHOD: Method[families.Prepared, families.State] = Method(
     state=families.State,
     bounds=families.BOUNDS,
     valid=families.valid,
+    handles=frozenset({CROSS_NOISE, INPUTS, JUMPS, KINKS, SINC}),
+    segment=families.segment_of_families,
     backward=BACKWARD,
 )

@@ -10,8 +10,8 @@
     moved = motion(at(flows, k), centre, inputs)
 
 An interval is cut by halves until its coefficients are polynomials of degree 7 on every panel, checked at irregular times
-between the nodes.  There the characteristics are a power series about the middle of the panel, whose number of terms is known
-beforehand; the panels are composed in pairs.
+between the nodes.  There the characteristics are a power series about the middle of the panel; a panel whose series needs too
+many terms is halved too.  The panels are composed in pairs.
 """
 
 from __future__ import annotations
@@ -21,22 +21,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.numerics.flow_series import MOST_TERMS, NODES, STAGES, WEIGHTS, Coefficients, Series, series_of, solve
+from zakai.numerics.flow_series import NODES, STAGES, WEIGHTS, Coefficients, solve
 from zakai.numerics.transition import Array, Flow, Motion, Transition, at, compose, motion, spread_first
 
 __all__ = [
-    "Coefficients", "Flow", "FlowResult", "Motion", "Transition", "at", "compose", "integrate", "motion", "spread_first",
+    "Coefficients", "Flow", "FlowResult", "Motion", "Transition", "at", "compose", "composed", "integrate", "motion",
+    "spread_first",
 ]  # fmt: skip
 
 RESOLVED = 1e-6  # pointwise error of these polynomials above which a panel is only accepted for its shortness
 TOLERANCE = 1e-13  # error of a panel, as a share of the interval
 PROBES = 128  # times at which an interval is checked: features wider than 1/128 of it are found
 FEWEST_PROBES = 16
+FEW = 16  # intervals that are solved at once, if they are resolved
 MOST_PANELS = 4096  # of one interval
 MOST_CUBES = 2**26  # the most panels times n^3, for time
 MOST_LEVELS = 52
 BLOCK = 1024  # intervals, or panels, that are integrated together, for memory
-MOST_NUMBERS = 2**21  # in the generators of the panels that are solved together
+MOST_NUMBERS = 2**18  # in the generators of the panels that are solved together
 
 
 class FlowResult(NamedTuple):
@@ -61,7 +63,10 @@ def _irregular(count: int) -> Array:
     return np.asarray(places)
 
 
-_CHECKS = {count: (_irregular(count), _interpolation(_irregular(count))) for count in (128, 64, 32, 16)}
+# The nodes with the places between them, and the interpolation to these.
+_CHECKS = {
+    count: (np.concatenate([NODES, _irregular(count)]), _interpolation(_irregular(count))) for count in (128, 64, 32, 16)
+}
 
 
 class _Panels(NamedTuple):
@@ -102,37 +107,42 @@ class _Problem(NamedTuple):
         found = np.asarray(self.features(times.ravel(), np.repeat(panels.row, times.shape[1]))).real
         return np.reshape(found, (*times.shape, -1))
 
-    def series(self, panels: _Panels, places: Array) -> Series:
-        """Return the power series of panels from the coefficients at places in [-1, 1]."""
-        times = self.times(panels, places)
-        c = self.coefficients(times.ravel(), np.repeat(panels.row, len(places)))
-        return series_of(c, self.lengths[panels.row] * panels.width)
+    def solve(self, panels: _Panels) -> tuple[Transition, Array]:
+        """Return the transitions of panels, and which of them are too long for their series."""
+        times = self.times(panels, NODES)
+        c = self.coefficients(times.ravel(), np.repeat(panels.row, STAGES))
+        return solve(c, self.lengths[panels.row] * panels.width)
 
 
 def _unresolved(problem: _Problem, panels: _Panels, probes: int, scales: Array | None) -> tuple[Array, Array]:
     """Return how far the features of panels are from polynomials, (J,), relative to `scales` (K, F), and the scales."""
     places, interpolation = _CHECKS[probes]
-    times = problem.times(panels, np.concatenate([NODES, places]))
+    times = problem.times(panels, places)
     values = problem.values(panels, times)
     times, at_nodes, at_probes = times[:, STAGES:], values[:, :STAGES], values[:, STAGES:]
     with np.errstate(all="ignore"):
         if scales is None:
-            scales = np.maximum(np.abs(at_nodes).max(axis=1), np.abs(at_probes).max(axis=1))
+            scales = np.abs(values).max(axis=1)
         own = np.maximum(scales[panels.row], 1e-290)[:, None]
         difference = np.abs(at_probes - interpolation @ at_nodes)
         # The time is known to its rounding only, and so are the values.
         span = (problem.lengths[panels.row] * panels.width)[:, None, None]
-        steps = np.abs(np.diff(at_probes, axis=1)).max(axis=1, keepdims=True) * (probes / span)
+        steps = np.abs(at_probes[:, 1:] - at_probes[:, :-1]).max(axis=1, keepdims=True) * (probes / span)
         noise = 8.0 * np.finfo(float).eps * np.abs(times[:, :, None]) * steps
         mismatch = (np.maximum(difference - noise, 0.0) / own).max(axis=(1, 2), initial=0.0)
     mismatch = np.where(np.isfinite(mismatch), mismatch, np.inf)
     return np.where(problem.lengths[panels.row] > 0, mismatch, 0.0), scales
 
 
-def _in_order(panels: _Panels, transitions: Transition, count: int) -> Transition:
-    """Return the transition of each of `count` intervals from those of its panels, composed in pairs."""
-    order = np.lexsort((panels.begin, panels.row))
-    rows, current = panels.row[order], at(transitions, order)
+def composed(transitions: Transition, rows: Array, count: int) -> Transition:
+    """Return the transition of each of `count` intervals from those of its parts in order of time, composed in pairs.
+
+    Args:
+        transitions: Of the parts (J,).
+        rows: The interval (J,) of each part, in increasing order; every interval has a part.
+        count: The number of intervals.
+    """
+    current = transitions
     while len(rows) > count:
         sizes = np.bincount(rows, minlength=count)
         place = np.arange(len(rows)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
@@ -148,18 +158,18 @@ def _in_order(panels: _Panels, transitions: Transition, count: int) -> Transitio
 def _integrate_autonomous(problem: _Problem) -> tuple[Transition, Array]:
     """Return the transitions of intervals whose coefficients do not vary: that of a part, doubled."""
     count = len(problem.starts)
-    whole = _Panels(np.arange(count), np.zeros(count), np.ones(count))
-    series = problem.series(whole, np.zeros(1))
+    c = problem.coefficients(problem.starts, np.arange(count))
+    finite = np.all([np.isfinite(field).all(axis=tuple(range(1, field.ndim))) for field in c], axis=0)
+    found, pending = solve(c, problem.lengths)
     doublings = np.zeros(count, int)
-    finite = np.isfinite(series.generators).all(axis=(1, 2, 3)) & np.isfinite(series.growth).all(axis=1)
     for level in range(1, 1100):
-        pending = (series.terms > MOST_TERMS) & finite
-        if not pending.any():
+        rows = np.flatnonzero(pending & finite)
+        if not len(rows):
             break
-        doublings[pending] = level
-        panels = whole._replace(width=np.ldexp(1.0, -doublings))
-        series = problem.series(panels, np.zeros(1))
-    found = solve(series)
+        doublings[rows] = level
+        part, pending[rows] = solve(Coefficients(*(field[rows] for field in c)), np.ldexp(problem.lengths[rows], -level))
+        for field, value in zip(found, part, strict=True):
+            field[rows] = value
     for level in range(int(doublings.max(initial=0))):
         rows = np.flatnonzero(doublings > level)
         part = at(found, rows)
@@ -174,7 +184,8 @@ def _integrate_varying(problem: _Problem) -> tuple[Transition, Array]:
     error = np.zeros(count)
     panels = _Panels(np.arange(count), np.zeros(count), np.ones(count))
     if count == 0:
-        return solve(problem.series(panels, NODES)), error
+        return problem.solve(panels)[0], error
+    latest = np.maximum(np.abs(problem.starts), np.abs(problem.starts + problem.lengths))
     checked = np.zeros(count, bool)
     number = np.ones(count, int)
     accepted: list[tuple[_Panels, Transition]] = []
@@ -185,38 +196,46 @@ def _integrate_varying(problem: _Problem) -> tuple[Transition, Array]:
         fresh = np.flatnonzero(~checked)
         if len(fresh):
             probes = max(FEWEST_PROBES, PROBES >> min(level, 8))
-            mismatch[fresh], scales = _unresolved(problem, panels.take(fresh), probes, scales)
+            some = panels if len(fresh) == len(checked) else panels.take(fresh)
+            mismatch[fresh], scales = _unresolved(problem, some, probes, scales)
         estimate = panels.width * mismatch * np.minimum(1.0, 1e3 * mismatch)
+        if level == 0 and count <= FEW and (estimate <= TOLERANCE).all():
+            whole, coarse = problem.solve(panels)
+            if not coarse.any():
+                return whole, estimate
         if level == 4:
             states = problem.coefficients(problem.starts[:1], np.zeros(1, int)).matrix.shape[1]
             most = min(MOST_PANELS, MOST_CUBES // states**3)
         last = (number[panels.row] >= most) | (level == MOST_LEVELS - 1) | np.isinf(mismatch)
         resolved = checked | (estimate <= TOLERANCE) | last
         np.add.at(error, panels.row[~checked & resolved], estimate[~checked & resolved])
-        # A panel that is not resolved but too short to matter needs no accurate series.
-        final = (mismatch > RESOLVED) | last
+        # A panel that is too short to matter, or for its times to be known, needs no accurate series.
+        short = problem.lengths[panels.row] * panels.width <= 256 * np.finfo(float).eps * latest[panels.row]
+        final = (mismatch > RESOLVED) | last | short
         split = ~resolved
         begin, ready = 0, np.flatnonzero(resolved)
         while begin < len(ready):
             chunk = ready[begin : begin + size]
             part = panels.take(chunk)
-            series = problem.series(part, NODES)
-            coarse = series.terms > MOST_TERMS
+            found, coarse = problem.solve(part)
             np.add.at(error, part.row[coarse & last[chunk] & checked[chunk]], 1.0)
             done = ~coarse | final[chunk]
-            if done.any():
-                accepted.append((part.take(done), solve(Series(*(field[done] for field in series)))))
+            accepted.append((part, found) if done.all() else (part.take(done), at(found, done)))
             split[chunk[~done]] = True
             begin += size
-            size = int(np.clip(MOST_NUMBERS // np.prod(series.generators.shape[1:]), 1, BLOCK))
+            n, k = found.offset.shape[1:]
+            size = int(np.clip(MOST_NUMBERS // (STAGES * (2 * n + k) ** 2), 1, BLOCK))
         again = np.flatnonzero(split)
         if not len(again):
             break
         panels, checked = panels.take(again).halves(), np.repeat(resolved[again], 2)
         np.add.at(number, panels.row[::2], 1)
+    if len(accepted) == 1 and len(accepted[0][0].row) == count:
+        return accepted[0][1], error
     every = _Panels(*(np.concatenate(fields) for fields in zip(*(part for part, _ in accepted), strict=True)))
     together = Transition(*(np.concatenate(fields) for fields in zip(*(found for _, found in accepted), strict=True)))
-    return _in_order(every, together, count), error
+    order = np.lexsort((every.begin, every.row))
+    return composed(at(together, order), every.row[order], count), error
 
 
 def integrate(
@@ -255,6 +274,8 @@ def integrate(
         problem = _Problem(shifted(coefficients), shifted(features or entries), starts[rows], lengths[rows])
         with np.errstate(all="ignore"):
             found, error = (_integrate_autonomous if autonomous else _integrate_varying)(problem)
+        if len(starts) <= BLOCK:
+            return FlowResult(found, error)
         transitions.append(found)
         errors.append(error)
     return FlowResult(Transition(*(np.concatenate(fields) for fields in zip(*transitions, strict=True))), np.concatenate(errors))

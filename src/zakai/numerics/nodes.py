@@ -1,4 +1,4 @@
-"""A function as a sum of narrow Gaussians of one covariance on a grid,
+"""A function as a sum of narrow Gaussians of one covariance on a grid.
 
     v(z) = sum_l w_l N(z; z_l, W),     z_l = origin + B l,  W = width^2 B B'.
 

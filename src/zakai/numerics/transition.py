@@ -29,8 +29,11 @@ Array = NDArray[Any]
 
 
 class Transition(NamedTuple):
-    """Equation (2): `map` Psi (..., n, n), `offset` b (..., n, k), `noise` Gamma (..., n, n), `information` Omega (..., n, n),
-    `vector` eta (..., n, k), `constant` C (..., k, k)."""
+    """The arrays of equation (2).
+
+    `map` Psi (..., n, n), `offset` b (..., n, k), `noise` Gamma (..., n, n), `information` Omega (..., n, n), `vector` eta
+    (..., n, k), `constant` C (..., k, k).
+    """
 
     map: Array
     offset: Array
@@ -41,8 +44,11 @@ class Transition(NamedTuple):
 
 
 class Flow(NamedTuple):
-    """Equation (3): `map` A, `spread` Sigma, `curvature` B, `lift` (..., n, n), `shift` and `push` (..., n, k), `log_volume`
-    log |det A| (...); `transition` is the same operator as equation (2), and `log_scale` log |det Psi| (...)."""
+    """The arrays of equation (3).
+
+    `map` A, `spread` Sigma, `curvature` B, `lift` (..., n, n), `shift` and `push` (..., n, k), `log_volume` log |det A| (...);
+    `transition` is the same operator as equation (2), and `log_scale` log |det Psi| (...).
+    """
 
     map: Array
     spread: Array
@@ -74,7 +80,7 @@ def at(whole: Part, index: Any) -> Part:
 
 def transposed(matrices: Array) -> Array:
     """Return the transposes of matrices (..., n, m)."""
-    return np.swapaxes(matrices, -1, -2)
+    return matrices.swapaxes(-1, -2)
 
 
 def symmetric(matrices: Array) -> Array:
