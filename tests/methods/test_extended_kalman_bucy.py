@@ -53,7 +53,7 @@ def numbers(system):
 
 
 def kalman_bucy(system, increments, step):
-    """The Kalman-Bucy equations with y linear between readings, by an adaptive integrator: mean, cov and log-evidence."""
+    """The Kalman-Bucy equations with y linear between observations, by an adaptive integrator: mean, cov and log-evidence."""
     A, G, H, S, mean, cov = numbers(system)
     n, evidence = len(mean), 0.0
     weigh, constant = H.T @ np.linalg.inv(S), np.array(system.drift.subs(at_zero(system)), float)[:, 0]
@@ -152,7 +152,7 @@ def test_increments_rates_and_path_tell_the_same(increments):
 
 
 def test_a_path_with_a_gap_uses_the_increment_since_the_last_reading():
-    # A state that stands still: the path's end tells the same whether the middle was read or not.
+    # A constant state: the end of the path gives the same whether the middle was observed or not.
     still = {"state": ["x"], "drift": ["0"], "process_noise": [["0"]], "observation": ["x"], "observation_kind": "path"}
     system = zakai.Model(**still, prior={"kind": "gaussian", "mean": [0.3], "cov": [[2.0]]})
     whole = run(system, zakai.Record([0.5, 1.5], [[0.4], [1.9]], "path"))
@@ -281,3 +281,57 @@ def test_the_log_likelihood_has_the_gradient_of_differences(kind, options):
     for i in range(3):
         above, below = (float(likelihood(theta + shift * np.eye(3)[i])) for shift in (1e-5, -1e-5))
         assert gradient[i] == pytest.approx((above - below) / 2e-5, rel=1e-6, abs=1e-8)
+
+
+@pytest.mark.parametrize("hold", ["zero", "linear"])
+def test_inputs_of_a_linear_system_are_exact_for_samples_and_converge_for_increments(hold):
+    keys = {"inputs": ["u"], "input_hold": hold, "drift": ["v", "-2*x - v/2 + u"], "observation": ["x + u", "x + 2*v"]}
+    inputs = zakai.Inputs([0.0, 0.13, 0.3, 0.61, 0.9], [1.0, -2.0, 0.5, 3.0, 1.0])
+    times, values = np.array([0.1, 0.45, 0.8]), np.array([[0.2, 0.1], [-0.3, np.nan], [0.4, 0.6]])
+    for kind in ("samples", "increments"):
+        system, record = model(**keys, observation_kind=kind), zakai.Record(times, values, kind, inputs)
+        exact = zakai.filter(system, record, method="kalman-bucy")
+        errors = []
+        for substeps in (1, 8, 16):
+            found = run(system, record, substeps=substeps)
+            parts = found.mean - exact.mean, found.cov - exact.cov, found.log_likelihood - exact.log_likelihood
+            errors.append(max(np.abs(part).max() for part in parts))
+        if kind == "samples":
+            assert max(errors) < 1e-11
+        else:
+            assert errors[2] < 5e-3 and errors[2] < 0.3 * errors[1] < 0.1 * errors[0]
+
+
+def test_noise_that_depends_on_the_state_is_that_at_the_mean():
+    system = zakai.Model(
+        state=["x"],
+        drift=["-x + u"],
+        diffusion=[["1/2 + 3/10*sin(x)"]],
+        observation=["x"],
+        observation_kind="samples",
+        inputs=["u"],
+        prior={"kind": "gaussian", "mean": [1.0], "cov": [[0.2]]},
+    )
+    inputs = zakai.Inputs([0.0, 0.25], [2.0, -1.0])
+    mean, variance = 1.0, 0.2
+    for a, b, u in ((0.0, 0.25, 2.0), (0.25, 0.6, -1.0)):
+        rates = lambda t, z, u=u: [-z[0] + u, -2 * z[1] + (0.5 + 0.3 * np.sin(z[0])) ** 2]  # noqa: E731
+        mean, variance = solve_ivp(rates, (a, b), [mean, variance], rtol=1e-11, atol=1e-12).y[:, -1]
+    record = zakai.Record([0.6], [[np.nan]], "samples", inputs)
+    errors = [abs(run(system, record, substeps=count).variance[-1, 0] - variance) for count in (5, 10)]
+    assert errors[1] < 1e-4 and errors[1] < 0.3 * errors[0]
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"observation_kind": "samples", "observation_family": "poisson", "observation_noise": None}, "is Gaussian"),
+        ({"cross_noise": [["1/10", "0"], ["0", "0"]]}, "dv and dw are independent"),
+        ({"drift": ["v", "-sign(x)"]}, "without sign"),
+        ({"domain": {"x": {"lower": -50.0}}}, "every state is free"),
+    ],
+)
+def test_what_a_linearisation_cannot_follow_is_refused(keys, words):
+    system = model(**keys)
+    with pytest.raises(zakai.ConditionError, match=words):
+        run(system, zakai.Record([0.1], [[1.0, 2.0]], system.observation_kind))
