@@ -27,8 +27,8 @@ BOUNDS: dict[str, tuple[float, str]] = {
 class State(NamedTuple):
     """The density `values` (*sizes), of integral one, at `centre` + `basis` (i - size // 2), and what is known of the errors.
 
-    `rate`, `measured` and `age` control the substeps, `deviations` (n,) are those of the density for which `rate` was measured,
-    `error` is the estimate of the relative error of the density, `kept` the share of it that an interval leaves.
+    `rate`, `measured`, `age` and `fixed` control the substeps, `deviations` (n,) are those of the density for which `rate` was
+    measured, `error` is the estimate of the relative error of the density, `kept` the share of it that an interval leaves.
     """
 
     values: np.ndarray
@@ -37,6 +37,7 @@ class State(NamedTuple):
     rate: float
     measured: float
     age: int
+    fixed: bool
     deviations: np.ndarray
     error: float
     kept: float

@@ -63,11 +63,11 @@ class YauSystem:
         assert yau is not None
         n, m = model.n, model.m
         self.affine = yau.slope is not None and model.observation_kind != "samples"
-        self.bare, self.full = yau.bare is not None, yau.full is not None
+        self.unobserved, self.full = yau.unobserved is not None, yau.full is not None
         slope = yau.slope if self.affine else sp.zeros(m, n)
         intercept = yau.intercept if self.affine else sp.zeros(m, 1)
         blocks = [yau.form.matrix, yau.form.offset, model.covariance]
-        for quadratic in (yau.bare or yau.full, yau.full or yau.bare):
+        for quadratic in (yau.unobserved or yau.full, yau.full or yau.unobserved):
             assert quadratic is not None
             blocks += [quadratic.matrix, quadratic.linear, sp.Matrix([quadratic.constant])]
         self.blocks = [entry for block in blocks for entry in block.flat()]
@@ -184,7 +184,7 @@ class Stepper:
             full = np.linalg.solve(flow.map, (new.centre - self.origin - moved.centre)[:, None]).T
             change = full + xi @ (np.linalg.inv(flow.map) @ flow.map.real).T - xi
             slopes = gradient(np.ascontiguousarray(wide.real), grid).reshape(grid.n, -1)
-            along = change.imag @ np.linalg.inv(grid.basis).T
+            along = change.imag @ grid.inverse.T
             wide = wide + 1j * (slopes.T * along).sum(axis=1).reshape(grid.sizes)
             xi = xi + 1j * change.imag
         exponent = xi @ moved.tilt + ((xi @ flow.curvature) * xi).sum(axis=1)
@@ -220,13 +220,13 @@ class Stepper:
         sizes = padded_sizes(source.grid, self.flow(t0, t1).spread.real, self.bounds)
         return Field(*padded(source.values, source.grid, sizes), source.log_scale)
 
-    def single(self, source: Field, t0: float, t1: float, potential: Any) -> tuple[Field, None, Report]:
+    def single(self, source: Field, t0: float, t1: float, potential: Any) -> tuple[Field, Report]:
         """Return the density after a substep, in parts where the flow grows."""
         parts, begin_time = self.parts(t0, t1), t0
         longest = (t1 - t0) / parts
         while True:
             length = min(longest, t1 - begin_time)
-            length = self.limit(source, begin_time, length)
+            length = self.limit(source, begin_time, begin_time + length) - begin_time
             last = begin_time + length >= t1 - 1e-12 * (t1 - t0)
             a, b = begin_time, t1 if last else begin_time + length
             begin = self._prepared(source, a, b)
@@ -237,18 +237,18 @@ class Stepper:
                     break
                 begin = better
             if last and a == t0:
-                return result, None, self.report(result)
+                return result, self.report(result)
             source, begin_time = regridded(result, self.bounds), b
             if last:
-                return source, None, self.report(source)
+                return source, self.report(source)
 
-    def limit(self, field: Field, t0: float, tau: float) -> float:
-        """Return the longest substep, at most tau, whose noise a density can be spread by on a few times its own grid."""
+    def limit(self, field: Field, t0: float, t1: float) -> float:
+        """Return the end, at most t1, of the longest substep by whose noise a density can be spread on a few times its grid."""
         for _ in range(80):
-            if enlargement(field.grid, self.flow(t0, t0 + tau).spread.real, self.bounds) <= MOST_ENLARGED:
+            if enlargement(field.grid, self.flow(t0, t1).spread.real, self.bounds) <= MOST_ENLARGED:
                 break
-            tau *= 0.5
-        return tau
+            t1 = t0 + 0.5 * (t1 - t0)
+        return t1
 
     def double(self, source: Field, t0: float, t1: float, potential: Any) -> tuple[Field, Report, float]:
         """Return the extrapolated density after two halves of a substep, and the difference from the whole substep."""
@@ -278,7 +278,7 @@ class Stepper:
 def _at(field: Field, new: Grid) -> Array:
     """Return the band-limited interpolant of a density on a grid whose basis is nearly its own."""
     grid, n = field.grid, field.grid.n
-    upper, lower = np.linalg.inv(grid.basis) @ new.basis, np.eye(n)
+    upper, lower = grid.inverse @ new.basis, np.eye(n)
     for i in range(n):
         if abs(upper[i, i]) < 0.3:
             return sinc_resampled(field.values, grid, new)
@@ -340,8 +340,7 @@ class Prepared(base.Prepared):
         values = np.exp(found.log_values - np.max(found.log_values.real))
         values, grid = opened(values, Grid(found.centre, found.basis, values.shape, found.closed))
         error = found.error if found.error > 1e-6 else 0.0
-        begin = positive(self._folded(Field(values, grid, 0.0)))
-        return self._state(begin, Control(np.inf, 0.0, 0), np.zeros(self.model.n), error, 0.9)
+        return self._started(positive(self._folded(Field(values, grid, 0.0))), error)
 
     def density(self, state: State) -> Field:
         """Return the posterior on a grid, folded onto the circle where it is wide."""
@@ -371,7 +370,7 @@ class Prepared(base.Prepared):
         start, length = float(schedule.starts[k]), float(observations.lengths[k])
         inside = observations.inside[k]
         linear = yau.affine and not self.lie and self.series is None  # the series has no inputs
-        full = (bool(inside.all()) and not linear and yau.full) or not yau.bare
+        full = (bool(inside.all()) and not linear and yau.full) or not yau.unobserved
         inputs = np.ones(1)
         potential, extra = None, None
         if linear and inside.any() and length > 0:
@@ -443,7 +442,7 @@ def prepare(
 ) -> base.Prepared:
     """Return what is known without data."""
     tolerance = tolerance_of(tolerance, DEFAULT_TOLERANCE)
-    bounds = Bounds(EDGE, TAIL, TAIL, MOST[model.n], (False,) * model.n)
+    bounds = Bounds(EDGE, TAIL, MOST[model.n], (False,) * model.n)
     theta = np.asarray(theta)
     yau = yau_of(model)
     series = power_series_of(model, order) if kernel == "power-series" else None

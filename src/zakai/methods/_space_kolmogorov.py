@@ -6,6 +6,7 @@ increments over more than the interval multiply it at the end.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,12 +18,25 @@ from zakai.methods._protocol import Info
 from zakai.methods._space import State
 from zakai.methods._space_observed import MOST_PANELS, Observations
 from zakai.methods._space_system import System, grid_of, moments_of, prior_on_grid, system_of, valid_noise
+from zakai.models.features import JUMPS
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex
+from zakai.numerics.space_fixed import LARGEST_RANGE, Motion, fits, fixed_step, motion, refitted
 from zakai.numerics.space_grid import Grid
-from zakai.numerics.space_short import PLAIN, motion, rate_of, short_step, splitting_error
-from zakai.numerics.space_step import CHECKED, NOTHING, Control, Field, Report, Stepper, advance, grid_report, positive
-from zakai.numerics.space_survey import Survey, deviations_in_spacings, survey
+from zakai.numerics.space_step import (
+    CHECKED,
+    NOTHING,
+    Control,
+    Field,
+    Report,
+    Stepper,
+    advance,
+    extrapolated,
+    grid_report,
+    moments_difference,
+    positive,
+)
+from zakai.numerics.space_survey import Survey, survey
 from zakai.numerics.space_update import Update, updated
 from zakai.numerics.space_window import MOST, Bounds
 from zakai.records.schedule import Schedule
@@ -36,6 +50,7 @@ SHARE = 0.2  # of the tolerance, for the error in time of one interval
 KEPT = 0.98  # largest share of an error that an interval is taken to leave
 WIDER = 1.1  # growth of the deviations after which the error of a substep is measured again
 MOST_TABLES = 64  # grids whose motion is kept
+MOST_FIXED = 8  # substeps of an interval on a grid that stays
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +65,6 @@ class Prepared:
     bounds: Bounds
     observations: Observations
     notes: tuple[str, ...] = ()
-    moves: dict[Any, Any] = field(default_factory=dict)
     motions: dict[Any, Any] = field(default_factory=dict)
 
     def init(self, prior: Any) -> State:
@@ -60,7 +74,12 @@ class Prepared:
         values = np.exp(found.log_values - np.max(found.log_values.real))
         error = found.error if found.error > 1e-6 else 0.0
         grid = Grid(found.centre, found.basis, values.shape, found.closed)
-        return self._state(positive(Field(values, grid, 0.0)), Control(np.inf, 0.0, 0), np.zeros(self.model.n), error, 0.9)
+        return self._started(positive(Field(values, grid, 0.0)), error)
+
+    def _started(self, field: Field, error: float) -> State:
+        """Return the state of a prior."""
+        mass, control = field.values.sum() * field.grid.cell, Control(np.inf, 0.0, 0)
+        return self._state(field, mass, control, np.zeros(self.model.n), error, 0.9)
 
     @property
     def angles(self) -> tuple[bool, ...]:
@@ -80,12 +99,12 @@ class Prepared:
         observations = self.observations
         begin = Field(state.values, grid_of(state, self.bounds.periodic), 0.0)
         length, inside = float(observations.lengths[k]), observations.inside[k]
-        control, allowed = Control(state.rate, state.measured, state.age), self.allowed(state)
+        control, allowed = Control(state.rate, state.measured, state.age, state.fixed), self.allowed(state)
         parts = observations.parts(k)
         last = observations.over(*parts[-1])
         potential = last.potential(inside, values, *parts[-1]) if inside.any() and length > 0 else None
         factor, constant = last.factor(k, inside, values)
-        quick, found = self._short(begin, control, allowed, length, potential), None
+        quick, found = self._fixed(begin, control, allowed, length, potential), None
         bounds, rates = self.bounds, values / max(length, 1e-300)
         for _ in range(3):
             if quick is not None:
@@ -103,8 +122,14 @@ class Prepared:
         new, info = self._reported(state, update, report, after, constant, kept, found)
         health = dict(info.health)
         if self.system.general:
-            lawless = False if factor is None else np.isnan(factor(predicted.grid).real).reshape(predicted.grid.sizes)
-            health["without_law"] = float(np.sum(predicted.values.real, where=lawless) / predicted.values.real.sum())
+            health["without_law"] = 0.0
+            if factor is not None:
+                lawless = np.isnan(factor(predicted.grid).real).reshape(predicted.grid.sizes)
+                near = lawless.copy()
+                for d in range(lawless.ndim):  # the border lies between two points
+                    near |= np.roll(lawless, 1, d) | np.roll(lawless, -1, d)
+                real = predicted.values.real
+                health["without_law"] = float(0.5 * (real.sum(where=lawless) + real.sum(where=near)) / real.sum())
         if self.system.tables:
             stop = float(self.schedule.stops[k])
             beyond = self.system.outside(update.field.grid.points, stop, self.theta, observations.inputs_at(stop))
@@ -112,11 +137,16 @@ class Prepared:
         return new, info._replace(health=health)
 
     def _predicted(
-        self, begin: Field, parts: list[tuple[float, float]], inside: Array, rates: Array, control: Control, allowed: float,
+        self,
+        begin: Field,
+        parts: list[tuple[float, float]],
+        inside: Array,
+        rates: Array,
+        control: Control,
+        allowed: float,
         bounds: Bounds,
     ) -> tuple[Field, Report, Control]:
         """Return the density at the end of an interval, advanced over its parts one after the other."""
-        cache = self.moves if not self.system.drift_varies and not is_complex(self.theta) else None
         result, report = begin, NOTHING
         for start, length in parts:
             observations = self.observations.over(start, length)
@@ -128,7 +158,7 @@ class Prepared:
                 mean, cov = moments_of(result.values.real, result.grid, bounds.periodic)
                 points = mean + np.concatenate([np.zeros((1, len(mean))), np.diag(np.sqrt(np.diagonal(cov)))])
                 least = observations.least(points, start, length, inside)
-            stepper = Stepper(observations.dynamics, bounds, self.tolerance, cache)
+            stepper = Stepper(observations.dynamics, bounds, self.tolerance)
             result, more, control = advance(stepper, result, start, length, potential, control, allowed / len(parts), least)
             unresolved = least >= MOST_PANELS
             if self.system.state_dependent:
@@ -140,7 +170,7 @@ class Prepared:
             report = report.worst(more)
         return result, report, control
 
-    def _short(
+    def _fixed(
         self, begin: Field, control: Control, allowed: float, length: float, potential: Any
     ) -> tuple[Field, Report, Control, Survey] | None:
         """Return the prediction of a short interval in which the grid can stay, and its survey, or None.
@@ -148,50 +178,72 @@ class Prepared:
         What is prepared depends on the grid and the length alone; whether an interval is short depends on the state and on the
         interval.
         """
-        made, grid = control.rate * length**3, begin.grid
-        if self.system.varies or self.system.state_dependent or length == 0 or control.age == 0:
+        grid = begin.grid
+        if self.system.varies or self.system.state_dependent or length == 0 or self.bounds.periodic != grid.closed:
             return None
-        if not (control.known(length, allowed) and made <= allowed):
+        moved = self._motion(grid, length)
+        if not length <= moved.longest:
             return None
+        factor = None if potential is None else potential(grid, 0.0, length, True)
+        if factor is not None and not np.ptp(factor.log.real) < LARGEST_RANGE:
+            return None
+
+        def substeps(parts: int) -> Field:
+            values, top, factors = begin.values, 0.0, None
+            if factor is not None:
+                top = float(factor.log.real.max())
+                outer = np.exp((factor.log - top) / (6 * parts))
+                factors = outer, outer * outer * np.exp(factor.correction / parts**3)
+            for _ in range(parts):
+                values = fixed_step(values, grid, moved, length / parts, factors)
+            return Field(values, grid, begin.log_scale + top)
+
+        known = control.fixed and control.known(length, allowed)
+        if known:
+            error = control.rate * length**3
+            parts = max(1, int(np.ceil(np.sqrt(error / allowed))))
+            if parts > MOST_FIXED:
+                return None
+            result, splitting = substeps(parts), error / parts**2
+            control = control._replace(age=control.age + 1)
+        else:
+            result, coarse = substeps(2), substeps(1)
+            values, difference = extrapolated(result.values, coarse.values, 0.0)
+            difference = max(difference, min(moments_difference(result.values, coarse.values, grid), 5 * difference))
+            splitting = difference ** (5 / 3)
+            if not splitting <= allowed:
+                return None
+            result = result._replace(values=values)
+            control = Control(difference * (4 / 3) / length**3, length, 0, True)
+        found = survey(result.values, grid, self.bounds.edge)
+        report = grid_report(found)
+        if not (report.edges <= 3 * self.bounds.edge and report.tails <= self.bounds.tail):
+            return None
+        return positive(result), report._replace(splitting=splitting), control, found
+
+    def _motion(self, grid: Grid, length: float) -> Motion:
+        """Return the motion of a grid, which is kept where it depends on the grid alone."""
         dynamics = self.observations.dynamics
-        unit = np.ceil(np.log2(length))
-        key = (grid.centre.tobytes(), grid.basis.tobytes(), grid.sizes, unit)
+        if is_complex(self.theta):
+            return motion(dynamics, grid, length)
+        key = (grid.centre.tobytes(), grid.basis.tobytes(), grid.sizes, np.ceil(np.log2(length)))
         kept = self.motions.get(key)
         if kept is None:
-            rate = rate_of(dynamics, grid)
-            kept = (motion(dynamics, grid, length) if rate * length <= PLAIN else None, rate)
             if len(self.motions) >= MOST_TABLES:
                 self.motions.clear()
-            if not is_complex(self.theta):
-                self.motions[key] = kept
-        moved, rate = kept
-        G = dynamics.noise(0.0, length)[0]
-        if moved is None or rate * length > PLAIN:
-            return None
-        made += splitting_error(grid, length, rate, G)
-        if made > allowed:
-            return None
-        top: Any = 0.0
-        factors = None
-        if potential is not None:
-            b = potential(grid, 0.0, length, True)
-            top = float(np.max(b.log.real, where=begin.values.real > 1e-14 * begin.values.real.max(), initial=-1e300))
-            outer = np.exp(np.where(b.log.real - top > 30.0, 30.0, b.log - top) / 6)
-            factors = outer, outer * outer * np.exp(b.correction)
-        values = short_step(begin.values, grid, moved, length, G, factors)
-        result = Field(values, grid, top)
-        found = survey(values, grid, self.bounds.edge)
-        report = grid_report(found, values.real)
-        if not (report.edges <= 3 * self.bounds.edge and report.tails <= self.bounds.accepted):
-            return None
-        return positive(result), report._replace(splitting=made), control._replace(age=control.age + 1), found
+            kept = self.motions[key] = motion(dynamics, grid, length)
+        return kept
 
     def _reported(
         self, state: State, update: Update, report: Report, control: Control, constant: Any, kept: float, found: Survey | None
     ) -> tuple[State, Info]:
         result = positive(update.field) if found is None else update.field
         mean, cov = moments_of(result.values.real, result.grid, self.angles, found)
-        gained = result.log_mass + constant
+        mass = result.values.sum() * result.grid.cell
+        gained = np.log(mass) + (result.log_scale + constant)
+        if found is not None and not fits(found, result.grid, self.bounds):
+            result = positive(refitted(result, self.bounds))
+            mass = result.values.sum() * result.grid.cell
         edge, tails = max(report.edges, update.edges), max(report.tails, update.tails)
         made = (report.splitting + report.interpolation) * (1 + update.depth) + 1e-15 * np.exp(min(update.depth, 40.0))
         made = made + self.bounds.reach**2 * edge * 0.1 + tails
@@ -206,20 +258,19 @@ class Prepared:
             "tail_depth": float(update.depth) / ACCURATE_DEPTH,
             "edge_mass": edge,
             "negative_mass": report.negative,
-            "std_in_spacings": float(deviations_in_spacings(np.array(tails))),
+            "std_in_spacings": math.sqrt(-2 * math.log(min(max(tails, 1e-15), 0.9))) / math.pi,
         }
         # The error of a substep grows steeply with the deviations.
-        deviations = np.sqrt(np.maximum(np.diagonal(cov).real, 0.0))
+        deviations = np.sqrt(np.maximum(cov.diagonal(), 0.0))
         measured = deviations if control.age == 0 else state.deviations
-        if np.any((deviations > WIDER * measured) | (deviations < measured / WIDER**3)):
+        if any(not new / WIDER <= old <= WIDER**3 * new for new, old in zip(deviations.tolist(), measured.tolist(), strict=True)):
             control = control._replace(age=CHECKED)
-        return self._state(result, control, measured, min(error, 1e3), kept), Info(gained, mean, cov, health)
+        return self._state(result, mass, control, measured, min(error, 1e3), kept), Info(gained, mean, cov, health)
 
-    def _state(self, found: Field, control: Control, deviations: Array, error: float, kept: float) -> State:
-        values = found.values / (found.values.sum() * abs(np.linalg.det(found.grid.basis)))
+    def _state(self, found: Field, mass: Any, control: Control, deviations: Array, error: float, kept: float) -> State:
         return State(
-            values, found.grid.centre, found.grid.basis, float(control.rate), float(control.measured), int(control.age),
-            deviations, float(error), float(kept),
+            found.values / mass, found.grid.centre, found.grid.basis, float(control.rate), float(control.measured),
+            int(control.age), control.fixed, deviations, float(error), float(kept),
         )  # fmt: skip
 
     def _kept(self, begin: Field, predicted: Field, result: Field) -> float:
@@ -245,8 +296,10 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: f
     if n > 4:
         raise InputError(f"{model.source}: a density grid is for at most four states, and there are {n}")
     periodic = tuple(name in model.periodic for name in model.state)
-    bounds = Bounds(1e-3 * tolerance, 1e-5 * tolerance, min(tolerance**2, 1e-3 * tolerance), MOST[n], periodic)
+    # Across a jump the spectrum decays slowly, and what is beyond the grid is not small.
+    tail = min(tolerance**2, (1e-5 if JUMPS in model.features else 1e-3) * tolerance)
+    bounds = Bounds(1e-3 * tolerance, tail, MOST[n], periodic)
     system, theta = system_of(model), np.asarray(theta)
-    tables, moves, motions = ({}, {}, {}) if is_complex(theta) else system.caches(theta)
+    tables, motions = ({}, {}) if is_complex(theta) else system.caches(theta)
     observations = Observations(model, schedule, system, theta, tables)
-    return Prepared(model, schedule, theta, system, tolerance, bounds, observations, (), moves, motions)
+    return Prepared(model, schedule, theta, system, tolerance, bounds, observations, (), motions)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,15 +22,6 @@ from zakai.records.schedule import Schedule
 Array = Any
 CACHED = 2_000_000  # numbers of tables that are kept
 MOST_PANELS = 1024  # substeps for the variation of coefficients within an interval
-
-
-class Energy(NamedTuple):
-    """S^-1 h (J, m) and h'S^-1 h / 2 (J,) at the points of a grid, and their derivatives (n, J, m) and (n, J)."""
-
-    gain: Array
-    half: Array
-    gain_slopes: Array
-    half_slopes: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +44,10 @@ class Observations:
     def lengths(self) -> Array:
         """The lengths (K,) of the intervals."""
         return self.schedule.lengths
+
+    @cached_property
+    def _precisions(self) -> dict[bytes, Array]:
+        return {}
 
     @cached_property
     def dynamics(self) -> Dynamics:
@@ -98,22 +93,29 @@ class Observations:
         """Return h (J, m) at the points of a grid."""
         return self._kept(grid, None, lambda: (self.system.observe(grid.points, t, self.theta),))[0]
 
-    def energy(self, grid: Grid, t: float, inside: Array, precision: Array) -> Energy:
-        """Return the energy of the coordinates `inside`, whose precision is given."""
+    def energy(self, grid: Grid, t: float, inside: Array, precision: Array) -> Array:
+        """Return S^-1 h and -h'S^-1 h / 2 of the coordinates `inside` (rows), and their derivatives, (m + 1, n + 1, J)."""
 
-        def make() -> Energy:
+        def make() -> tuple[Array]:
             points = grid.points
-            h = self.system.observe(points, t, self.theta)[:, inside]
-            slopes = np.moveaxis(self.system.slopes(points, t, self.theta)[:, inside], 2, 0)
-            gain, gain_slopes = h @ precision, slopes @ precision
-            return Energy(gain, 0.5 * (h * gain).sum(axis=1), gain_slopes, (slopes * gain).sum(axis=2))
+            h = self.system.observe(points, t, self.theta).T[inside]
+            slopes = np.moveaxis(self.system.slopes(points, t, self.theta), 0, -1)[inside]
+            fields = np.concatenate([h[:, None], slopes], axis=1)
+            gain = np.tensordot(precision, fields, axes=1)
+            half = (h[:, None] * gain).sum(axis=0)
+            half[0] *= 0.5
+            lost = ~np.isfinite(half.real).all(axis=0)  # the density ends where h is not finite
+            energy = np.concatenate([gain, -half[None]])
+            energy[:, :, lost] = 0.0
+            energy[-1, 0, lost] = -1e300
+            return (energy,)
 
-        return Energy(*self._kept(grid, inside.tobytes(), make))
+        return self._kept(grid, inside.tobytes(), make)[0]
 
     def potential(self, inside: Array, values: Array, start: float, length: float) -> Any:
         """Return the factor of the increments `inside` over a substep, as a function of a grid."""
         system, theta, n, m = self.system, self.theta, self.model.n, self.model.m
-        rate, rows = values[inside] / length, np.ix_(inside, inside)
+        coefficients, rows = np.append(values[inside] / length, 1.0), np.ix_(inside, inside)
         origin, stop = np.zeros(n), start + length
         dynamics = self.dynamics
 
@@ -121,7 +123,9 @@ class Observations:
             noise = np.broadcast_to(system.noise(origin, times, theta), (len(times), m, m))
             return np.linalg.inv(noise[:, rows[0], rows[1]])
 
-        fixed = None if system.noise_varies else precision(np.zeros(1))[0]
+        fixed = None if system.noise_varies else self._precisions.get(inside.tobytes())
+        if fixed is None and not system.noise_varies:
+            fixed = self._precisions[inside.tobytes()] = precision(np.zeros(1))[0]
 
         def parts(grid: Grid, a: float, b: float) -> list[tuple[float, float, Array]]:
             if not system.observation_varies:
@@ -132,18 +136,17 @@ class Observations:
 
         def potential(grid: Grid, a: float, b: float, end: bool) -> Factor:
             a, b = max(a, start), min(b, stop)
-            log: Array = 0.0
-            slope: Array = 0.0
+            fields: Array = 0.0
             for weight, t, P in parts(grid, a, b):
-                e = self.energy(grid, t, inside, P)
-                log = log + weight * (e.gain @ rate - e.half)
-                slope = slope + weight * (e.gain_slopes @ rate - e.half_slopes)
+                energy = self.energy(grid, t, inside, P)
+                fields = fields + (weight * coefficients) @ energy.reshape(len(energy), -1)
+            fields = fields.reshape(n + 1, -1)
+            log, slope = fields[0], fields[1:]
             if dynamics.diffusion is None:
                 steep = ((dynamics.noise(a, b)[0] @ slope) * slope).sum(axis=0)
             else:
                 steep = np.einsum("jde,dj,ej->j", dynamics.diffusion(grid.points, 0.5 * (a + b)), slope, slope)
-            log, steep = np.where(np.isfinite(log), log, -1e6), np.where(np.isfinite(steep), steep, 0.0)
-            return Factor(log.reshape(grid.sizes), (-(b - a) / 144 * steep).reshape(grid.sizes))
+            return Factor(log.reshape(grid.sizes), ((a - b) / 144 * steep).reshape(grid.sizes))
 
         return potential
 

@@ -25,7 +25,7 @@ from zakai.numerics.space_transport import Dynamics
 from zakai.records.inputs import Inputs
 
 Array = Any
-Caches = tuple[dict[Any, Any], dict[Any, Any], dict[Any, Any]]
+Caches = tuple[dict[Any, Any], dict[Any, Any]]
 
 
 class System:
@@ -83,8 +83,8 @@ class System:
         if key not in self._caches:
             if len(self._caches) >= 4:
                 self._caches.clear()
-            self._caches[key] = {}, {}, {}
-        return self._caches.get(key, ({}, {}, {}))
+            self._caches[key] = {}, {}
+        return self._caches.get(key, ({}, {}))
 
     def dynamics(self, theta: Array) -> Dynamics:
         """Return the drift and the noise for some parameters."""

@@ -15,8 +15,10 @@ _FIRST, _LAST = 16, 4096  # panels from which on two rules are compared, and at 
 
 
 class Average(NamedTuple):
-    """The averages of f and of (1 - s) f, s = (t - start) / length; the fewest `panels` of a rule that agrees with the last; and
-    the relative difference of the last two rules."""
+    """The averages of f and of (1 - s) f, s = (t - start) / length.
+
+    `panels` is the smallest number for which a rule agrees with the last; `error` is the relative difference of the last two.
+    """
 
     whole: Array
     falling: Array

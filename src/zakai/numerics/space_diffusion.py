@@ -43,7 +43,7 @@ def diffused(values: Array, grid: Grid, noise: Array, tau: float) -> Array:
         noise: G at the points of the grid (J, n, n).
         tau: the time.
     """
-    inverse = np.linalg.inv(grid.basis)
+    inverse = grid.inverse
     noise = inverse @ noise @ inverse.T
     axes, parts = tuple(range(grid.n)), []
     for (i, j), multiplier in _multipliers(grid.sizes).items():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,25 +23,37 @@ _MOST_SHEARED = 3.0  # times the points of an axis that a shear may need
 PAD = 3  # zeros, or the other end of a circle, around the coefficients of a spline
 
 
-class Grid(NamedTuple):
-    """x = `centre` (n,) + `basis` (n, n) (i - size // 2); `closed` tells which axes go once around a circle."""
-
+class _Fields(NamedTuple):
     centre: Array
     basis: Array
     sizes: tuple[int, ...]
     closed: tuple[bool, ...]
+
+
+class Grid(_Fields):
+    """x = `centre` (n,) + `basis` (n, n) (i - size // 2); `closed` tells which axes go once around a circle."""
 
     @property
     def n(self) -> int:
         """The number of coordinates."""
         return len(self.sizes)
 
-    @property
+    @cached_property
+    def inverse(self) -> Array:
+        """The inverse of the basis."""
+        return np.linalg.inv(self.basis)
+
+    @cached_property
+    def cell(self) -> float:
+        """The volume of one cell."""
+        return abs(float(np.linalg.det(self.basis)))
+
+    @cached_property
     def offsets(self) -> Array:
         """The points relative to the centre (J, n)."""
         return transformed(indices(self.sizes), self.basis)
 
-    @property
+    @cached_property
     def points(self) -> Array:
         """The points (J, n)."""
         return self.centre + self.offsets
@@ -131,13 +143,39 @@ def spread(values: Array, grid: Grid, cov: Array, spline: bool = False) -> Array
     """Return the values after spreading by N(0, cov) in x; with `spline`, the coefficients of their spline."""
     if not spline and not np.any(cov):
         return values
-    inverse = np.linalg.inv(grid.basis)
+    inverse = grid.inverse
     return filtered(values, gaussian_response(inverse @ cov @ inverse.T, grid.sizes, spline))
 
 
-def _gather(c: Any, strides: Any, sizes: Any, closed: Any, z: Any, out: Any) -> None:
-    """out_j = sum over the taps of padded coefficients times quintic B-splines at indices z (J, n); outside it is zero."""
-    count, n = z.shape
+def _gather(values: Any, sizes: Any, closed: Any, z: Any, out: Any) -> None:
+    """out_j = sum over the taps of coefficients times quintic B-splines at indices z (n, J); outside it is zero."""
+    n, count = z.shape
+    padded = sizes + 2 * PAD
+    strides = np.ones(n, np.int64)
+    for d in range(n - 2, -1, -1):
+        strides[d] = strides[d + 1] * padded[d + 1]
+    last = sizes[n - 1]
+    c = np.zeros(strides[0] * padded[0], z.dtype)
+    for line in range(c.size // padded[n - 1]):
+        # The source of a padded line: zeros, or the other end of a circle, surround the coefficients.
+        rest, source, scale, inside = line, 0, last, True
+        for d in range(n - 2, -1, -1):
+            i = rest % padded[d] - PAD
+            rest //= padded[d]
+            if closed[d]:
+                i = i % sizes[d]
+            inside = inside and 0 <= i < sizes[d]
+            source += i * scale
+            scale *= sizes[d]
+        first = line * padded[n - 1] + PAD
+        if inside:
+            for i in range(last):
+                c[first + i] = values[source + i]
+            if closed[n - 1]:
+                for i in range(PAD):
+                    c[first - 1 - i] = values[source + last - 1 - i]
+                    c[first + last + i] = values[source + i]
+    scaling = 120.0**-n
     outer = 1
     for _ in range(n - 1):
         outer *= 6
@@ -148,11 +186,11 @@ def _gather(c: Any, strides: Any, sizes: Any, closed: Any, z: Any, out: Any) -> 
         base = 0
         inside = True
         for d in range(n):
-            floor = math.floor(z[j, d].real) if math.isfinite(z[j, d].real) else -1e9
+            floor = math.floor(z[d, j].real) if math.isfinite(z[d, j].real) else -1e9
             if not closed[d] and (floor < -1 or floor >= sizes[d]) or abs(floor) > 1e8:
                 inside = False
                 break
-            t = z[j, d] - floor
+            t = z[d, j] - floor
             cell = int(floor)
             if closed[d]:
                 cell = cell % sizes[d]
@@ -160,12 +198,12 @@ def _gather(c: Any, strides: Any, sizes: Any, closed: Any, z: Any, out: Any) -> 
             s = 1.0 - t
             t2 = t * t
             s2 = s * s
-            w[d, 0] = s2 * s2 * s / 120.0
-            w[d, 5] = t2 * t2 * t / 120.0
-            w[d, 1] = (26.0 + t * (-50.0 + t * (20.0 + t * (20.0 + t * (-20.0 + 5.0 * t))))) / 120.0
-            w[d, 2] = (66.0 + t2 * (-60.0 + t2 * (30.0 - 10.0 * t))) / 120.0
-            w[d, 3] = (66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s))) / 120.0
-            w[d, 4] = (26.0 + s * (-50.0 + s * (20.0 + s * (20.0 + s * (-20.0 + 5.0 * s))))) / 120.0
+            w[d, 0] = s2 * s2 * s
+            w[d, 5] = t2 * t2 * t
+            w[d, 1] = 26.0 + t * (-50.0 + t * (20.0 + t * (20.0 + t * (-20.0 + 5.0 * t))))
+            w[d, 2] = 66.0 + t2 * (-60.0 + t2 * (30.0 - 10.0 * t))
+            w[d, 3] = 66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s))
+            w[d, 4] = 26.0 + s * (-50.0 + s * (20.0 + s * (20.0 + s * (-20.0 + 5.0 * s))))
         if not inside:
             out[j] = 0.0
             continue
@@ -181,7 +219,7 @@ def _gather(c: Any, strides: Any, sizes: Any, closed: Any, z: Any, out: Any) -> 
         total = 0.0 * w[0, 0]
         for i in range(size):
             o = offsets[i]
-            line = (
+            row = (
                 c[o] * w[n - 1, 0]
                 + c[o + 1] * w[n - 1, 1]
                 + c[o + 2] * w[n - 1, 2]
@@ -189,35 +227,26 @@ def _gather(c: Any, strides: Any, sizes: Any, closed: Any, z: Any, out: Any) -> 
                 + c[o + 4] * w[n - 1, 4]
                 + c[o + 5] * w[n - 1, 5]
             )
-            total += weights[i] * line
-        out[j] = total
+            total += weights[i] * row
+        out[j] = total * scaling
 
 
-_gather_real = kernel("void(float64[::1], int64[::1], int64[::1], boolean[::1], float64[:, ::1], float64[::1])")(_gather)
+_gather_real = kernel("void(float64[::1], int64[::1], boolean[::1], float64[:, ::1], float64[::1])")(_gather)
 
 
 @lru_cache(maxsize=1)
 def _gather_complex() -> Any:
     """Return the kernel for derivatives, compiled when it is needed first."""
-    return kernel("void(complex128[::1], int64[::1], int64[::1], boolean[::1], complex128[:, ::1], complex128[::1])")(_gather)
+    return kernel("void(complex128[::1], int64[::1], boolean[::1], complex128[:, ::1], complex128[::1])")(_gather)
 
 
 def gather(coefficients: Array, z: Array, grid: Grid) -> Array:
     """Return the spline with the coefficients (*sizes) at the indices z (J, n), counted from the first point of the grid."""
-    c = np.zeros([size + 2 * PAD for size in grid.sizes], coefficients.dtype)
-    c[tuple(slice(PAD, -PAD) for _ in grid.sizes)] = coefficients
-    for d, closed in enumerate(grid.closed):
-        if closed:
-            line = np.moveaxis(c, d, 0)
-            line[:PAD], line[-PAD:] = line[-2 * PAD : -PAD].copy(), line[PAD : 2 * PAD].copy()
-    strides = np.array(c.strides, np.int64) // c.itemsize
-    shape = np.array(grid.sizes, np.int64), np.array(grid.closed)
-    if is_complex(c, z):
-        out = np.empty(len(z), complex)
-        _gather_complex()(c.astype(complex).ravel(), strides, *shape, np.ascontiguousarray(z, complex), out)
-    else:
-        out = np.empty(len(z))
-        _gather_real(c.ravel(), strides, *shape, np.ascontiguousarray(z), out)
+    dtype = complex if is_complex(coefficients, z) else float
+    out = np.empty(len(z), dtype)
+    function = _gather_complex() if dtype is complex else _gather_real
+    c, at = np.ascontiguousarray(coefficients, dtype).reshape(-1), np.ascontiguousarray(z.T, dtype)
+    function(c, np.array(grid.sizes, np.int64), np.array(grid.closed), at, out)
     return out
 
 
@@ -226,7 +255,7 @@ def relative_index(offsets: Array, start: Array, grid: Grid, periodic: Sequence[
     x = offsets + (start - grid.centre)
     if periodic is not None and any(periodic):
         x = np.where(np.array(periodic), x - 2 * np.pi * np.round(x.real / (2 * np.pi)), x)
-    return np.asarray(transformed(x, np.linalg.inv(grid.basis)) + np.array(grid.sizes) // 2)
+    return np.asarray(transformed(x, grid.inverse) + np.array(grid.sizes) // 2)
 
 
 def resampled(values: Array, grid: Grid, new: Grid, periodic: Sequence[bool] | None = None) -> Array:
@@ -239,8 +268,10 @@ def padded(values: Array, grid: Grid, sizes: tuple[int, ...]) -> tuple[Array, Gr
     """Return a density with zeros around it, on a grid of larger sizes."""
     if sizes == grid.sizes:
         return values, grid
-    widths = [(new // 2 - old // 2, (new - new // 2) - (old - old // 2)) for old, new in zip(grid.sizes, sizes, strict=True)]
-    return np.pad(values, widths), grid._replace(sizes=sizes)
+    wide = np.zeros(sizes, values.dtype)
+    first = [new // 2 - old // 2 for old, new in zip(grid.sizes, sizes, strict=True)]
+    wide[tuple(slice(i, i + old) for i, old in zip(first, grid.sizes, strict=True))] = values
+    return wide, grid._replace(sizes=sizes)
 
 
 def triangular_resampled(values: Array, grid: Grid, new: Grid, sheared: bool = False) -> Array:
@@ -253,7 +284,7 @@ def triangular_resampled(values: Array, grid: Grid, new: Grid, sheared: bool = F
         real, imag = (triangular_resampled(np.ascontiguousarray(part), grid, new, sheared) for part in (values.real, values.imag))
         return np.asarray(real + 1j * imag)
     n = grid.n
-    inverse = np.linalg.inv(grid.basis)
+    inverse = grid.inverse
     matrix = inverse @ new.basis
     middle = inverse @ (new.centre - grid.centre)
     # A sheared density has higher frequencies along the axes before, for which these need more points.
@@ -303,15 +334,15 @@ def sinc_resampled(values: Array, grid: Grid, new: Grid) -> Array:
 
 
 def _shifted(values: Array, axis: int, shift: Array) -> Array:
-    """Return u(z + shift) along an axis; `shift` has length one along it.  Zeros around make room for the shift."""
+    """Return u(z + shift) along an axis; `shift` has length one along it.  Zeros around it leave space for the shift."""
     size = values.shape[axis]
-    room = int(min(np.ceil(np.abs(shift).max()), size)) + 2
-    padding = [(room, room) if a == axis else (0, 0) for a in range(values.ndim)]
+    padding_size = int(min(np.ceil(np.abs(shift).max()), size)) + 2
+    padding = [(padding_size, padding_size) if a == axis else (0, 0) for a in range(values.ndim)]
     wide = np.pad(values, padding)
-    k = 2 * np.pi * np.fft.rfftfreq(size + 2 * room)
+    k = 2 * np.pi * np.fft.rfftfreq(size + 2 * padding_size)
     view = k.reshape([-1 if a == axis else 1 for a in range(values.ndim)])
-    moved = np.fft.irfft(np.fft.rfft(wide, axis=axis) * np.exp(1j * view * shift), size + 2 * room, axis=axis)
-    return np.take(moved, np.arange(room, room + size), axis=axis)
+    moved = np.fft.irfft(np.fft.rfft(wide, axis=axis) * np.exp(1j * view * shift), size + 2 * padding_size, axis=axis)
+    return np.take(moved, np.arange(padding_size, padding_size + size), axis=axis)
 
 
 def refined(values: Array, grid: Grid, sizes: tuple[int, ...]) -> tuple[Array, Grid]:
@@ -329,8 +360,8 @@ def gradient(values: Array, grid: Grid) -> Array:
     return np.stack([np.fft.irfftn(1j * k[d] * spectrum, values.shape, axes) for d in axes])
 
 
-_SIZES = np.array([8, 12, 16, 20, 24, 28, 32, 36, 40, 48, 54, 60, 64, 72, 80, 90, 96, 108, 120, 128, 144, 160, 180, 192, 216, 240,
-                   256, 288, 320, 360, 384, 432, 480, 512, 576, 640, 720, 768, 864, 960, 1024,
+_SIZES = np.array([8, 12, 16, 20, 24, 28, 32, 36, 40, 44, 48, 52, 56, 60, 64, 70, 72, 80, 84, 90, 96, 100, 108, 112, 120, 128,
+                   140, 144, 160, 180, 192, 216, 240, 256, 288, 320, 360, 384, 432, 480, 512, 576, 640, 720, 768, 864, 960, 1024,
                    1152, 1280, 1440, 1536, 1728, 1920, 2048])  # fmt: skip
 
 

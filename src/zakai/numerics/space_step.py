@@ -7,7 +7,9 @@ earlier ones are taken in single substeps.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,12 +18,12 @@ from numpy.typing import NDArray
 from zakai.numerics.space_grid import Grid, padded
 from zakai.numerics.space_survey import Survey, deviations_in_spacings, narrowest, survey
 from zakai.numerics.space_transport import (
-    Characteristics,
     Dynamics,
     Factor,
     Linearisation,
     characteristics,
     linearised,
+    runge_kutta,
     steps_needed,
     transported,
 )
@@ -29,7 +31,7 @@ from zakai.numerics.space_window import LEAST, Bounds, adjusted, enlargement, fi
 
 Array = NDArray[Any]
 Potential = Callable[[Grid, float, float, bool], Factor]  # at the start (False) or the end (True) of a substep
-SUPPORT = 400  # points that are moved to see where a density goes
+SUPPORT = 200  # points that are moved to see where a density goes
 TRIES = 7
 MARGIN = 0.03  # of the bounds, for a grid of short steps
 INTERPOLATED = 3e-6  # tails of the spectrum below which they may be made by interpolation
@@ -50,16 +52,20 @@ class Field(NamedTuple):
     @property
     def log_mass(self) -> Any:
         """The logarithm of the integral."""
-        return np.log(self.values.sum() * abs(np.linalg.det(self.grid.basis))) + self.log_scale
+        return np.log(self.values.sum() * self.grid.cell) + self.log_scale
 
 
 class Control(NamedTuple):
-    """What is known of the error of a substep: `rate`, the error of a single one of length one (it grows as the cube), measured
-    for substeps of length `measured`, `age` intervals ago."""
+    """The error of a substep as it was measured last.
+
+    `rate` is the error of a substep of length one (it grows as the cube), from substeps of length `measured`, `age` intervals
+    ago, on a `fixed` grid or on grids that follow the mass.
+    """
 
     rate: float
     measured: float
     age: int
+    fixed: bool = False
 
     def known(self, tau: float, allowed: float) -> bool:
         """Return whether the error of a substep of length tau is known well enough: the larger it is, the sooner it expires."""
@@ -69,8 +75,10 @@ class Control(NamedTuple):
 
 
 class Report(NamedTuple):
-    """The errors of an interval, relative to the density: of the splitting in time, of interpolation, at the edges, in the tails
-    of the spectrum, and the negative mass."""
+    """The errors of an interval, relative to the density.
+
+    Those of the splitting in time, of interpolation, at the edges, in the tails of the spectrum, and the negative mass.
+    """
 
     splitting: float
     interpolation: float
@@ -90,11 +98,12 @@ class Report(NamedTuple):
         )
 
 
-def grid_report(found: Survey, real: Array) -> Report:
+def grid_report(found: Survey) -> Report:
     """Return the errors that a grid shows."""
-    interpolation = float(np.sum(1e-4 / deviations_in_spacings(found.tails) ** 6))
-    negative = float(-np.minimum(real, 0.0).sum() / found.total)
-    return Report(0.0, interpolation, float(found.edges.max()), float(found.tails.max()), negative)
+    edges, tails = found.edges.tolist(), found.tails.tolist()
+    # 1e-4 / s^6 for a standard deviation of s spacings that has such tails
+    interpolation = sum(1e-4 / (-2 * math.log(min(max(tail, 1e-15), 0.9)) / math.pi**2) ** 3 for tail in tails)
+    return Report(0.0, interpolation, max(edges), max(tails), found.negative)
 
 
 NOTHING = Report(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -109,40 +118,41 @@ class _Move(NamedTuple):
 
 
 class Stepper:
-    """Substeps of one interval; `cache` keeps characteristics of grids and lengths that come again (autonomous systems)."""
+    """Substeps of one interval."""
 
-    def __init__(self, dynamics: Dynamics, bounds: Bounds, tolerance: float, cache: dict[Any, Any] | None):
-        self.dynamics, self.bounds, self.tolerance, self.cache = dynamics, bounds, tolerance, cache
+    def __init__(self, dynamics: Dynamics, bounds: Bounds, tolerance: float):
+        self.dynamics, self.bounds, self.tolerance = dynamics, bounds, tolerance
+        self._surveyed: tuple[Array, Survey] | None = None
+        self._linearised: tuple[Array, tuple[float, ...], list[Linearisation]] | None = None
 
-    def _characteristics(self, source: Grid, target: Grid, t0: float, t1: float, steps: int) -> Characteristics:
-        def make() -> Characteristics:
-            return characteristics(self.dynamics, source, target, t0, t1, steps, self.bounds.periodic)
+    def _survey(self, field: Field) -> Survey:
+        """Return the survey of a density, which is kept for the last one."""
+        if self._surveyed is None or self._surveyed[0] is not field.values:
+            found = survey(field.values, field.grid, self.bounds.edge, self.bounds.tail)
+            self._surveyed = field.values, found
+        return self._surveyed[1]
 
-        if self.cache is None:
-            return make()
-        key = (
-            source.centre.tobytes(), source.basis.tobytes(), source.sizes,
-            target.centre.tobytes(), target.basis.tobytes(), target.sizes, t1 - t0, steps,
-        )  # fmt: skip
-        found = self.cache.get(key)
-        if found is None:
-            found = make()
-            if len(self.cache) > 32 or sum(len(v.log_volume) for v in list(self.cache.values())) > 400_000:
-                self.cache.clear()
-            self.cache[key] = found
-        return found
-
-    def _linear(self, found: Survey, grid: Grid, t0: float, t1: float) -> Linearisation:
-        """Return the system that is linearised in the middle of the path of the mean."""
+    def _linear(self, field: Field, times: tuple[float, ...]) -> list[Linearisation]:
+        """Return the system over intervals that follow each other, linearised in the middle of the path of the mean."""
+        last = self._linearised
+        if last is not None and last[0] is field.values and last[1] == times:
+            return last[2]
+        found, grid, (t0, t1) = self._survey(field), field.grid, (times[0], times[-1])
         mean, drift = grid.centre + found.mean, self.dynamics.drift
         with np.errstate(all="ignore"):
             middle = mean + 0.5 * (t1 - t0) * drift(mean[None], t0)[0, :-1].real
             jacobian = self.dynamics.jacobian(middle, 0.5 * (t0 + t1))
         jacobian = jacobian if np.all(np.isfinite(jacobian)) else np.zeros_like(jacobian)
-        if self.dynamics.diffusion is None:
-            return linearised(jacobian, *self.dynamics.noise(t0, t1), t1 - t0, grid.basis)
-        noise = self._largest_noise(mean, found.cov, 0.5 * (t0 + t1))
-        return linearised(jacobian, noise, 0.5 * noise, t1 - t0, grid.basis)
+        noises = [self.dynamics.noise(a, b) for a, b in pairwise(times)]
+        if self.dynamics.diffusion is not None:
+            largest = self._largest_noise(mean, found.cov, 0.5 * (t0 + t1))
+            noises = [(largest, 0.5 * largest) for _ in noises]
+        linears: list[Linearisation] = []
+        for i, ((a, b), noise) in enumerate(zip(pairwise(times), noises, strict=True)):
+            same = i > 0 and b - a == times[i] - times[i - 1] and all(map(np.array_equal, noise, noises[i - 1]))
+            linears.append(linears[-1] if same else linearised(jacobian, *noise, b - a, t1 - t0, grid.basis))
+        self._linearised = field.values, times, linears
+        return linears
 
     def _largest_noise(self, mean: Array, cov: Array, t: float) -> Array:
         """Return G (n, n) at the mean, enlarged along each axis to the largest within four deviations, to choose a grid."""
@@ -161,40 +171,37 @@ class Stepper:
             return None
         return diffusion(source.points, t), diffusion(target.points, t), 0.5 * (t1 - t0)
 
-    def _move(self, field: Field, t0: float, t1: float) -> _Move:
-        """Choose the target grid of a substep by moving points of the density."""
+    def _moves(self, field: Field, times: tuple[float, ...]) -> list[_Move]:
+        """Choose the target grids of substeps that follow each other by moving points of the density."""
         grid, real, bounds = field.grid, field.values.real, self.bounds
-        found = survey(real, grid, bounds.edge, bounds.accepted)
-        linear = self._linear(found, grid, t0, t1)
-        narrow, widths = narrowest(found, grid, bounds.accepted)
+        found, linears = self._survey(field), self._linear(field, times)
+        narrow, widths = narrowest(found, grid, bounds.tail)
+        holds = bool(np.all(found.edges <= 0.5 * bounds.edge) and np.all(found.tails <= 0.5 * bounds.tail))
+        holds = holds and self._fits(found.used, widths, grid)
         support = self._support(real)
-        offsets = grid.offsets[support]
-        logs = np.log(real.reshape(-1)[support] / real.max())
+        start, logs = grid.offsets[support], np.log(real.reshape(-1)[support] / real.max())
         tolerance = 0.05 * self.tolerance * np.exp(-0.5 * logs)
-        steps, moved = steps_needed(self._real(), grid.centre + offsets, t0, t1, grid.basis, tolerance)
-        good = np.isfinite(moved).all(axis=1)
-        if not good.any():
-            return _Move(linear, steps, grid)
-        offsets, logs, moved = offsets[good], logs[good], moved[good]
-        noise = linear.noise.real
-        shift = np.abs(moved @ np.linalg.inv(grid.basis).T).max()
-        spreads = np.diagonal(noise) / np.maximum(np.diagonal(found.cov), 1e-300)
-        holds = bool(np.all(found.edges <= 0.5 * bounds.edge) and np.all(found.tails <= 0.5 * bounds.accepted))
-        short = shift < 1.5 and spreads.max() < 0.2
-        if short and holds and self._fits(found.used, widths, grid):
-            return _Move(linear, steps, grid)
-        # A grid that can stay for many short steps is worth more points.
-        spare = MARGIN if short and spreads.max() < 0.05 else 1.0
-        bounds = bounds._replace(edge=spare * bounds.edge)
-        return _Move(linear, steps, fitted_grid(offsets + moved, logs, grid.centre, noise, narrow, bounds, grid))
+        inverse, variances = grid.inverse, np.maximum(np.diagonal(found.cov), 1e-300)
+        moves: list[_Move] = []
+        noise, moved, steps = np.zeros_like(found.cov), np.zeros_like(start), 0
+        for (a, b), linear in zip(pairwise(times), linears, strict=True):
+            if not steps:
+                steps, moved = steps_needed(self._drift, grid.centre + start, a, b, grid.basis, tolerance, self.dynamics.varying)
+            else:
+                with np.errstate(all="ignore"):
+                    moved = moved + runge_kutta(self._drift, grid.centre + start + moved, a, b, steps)[:, : grid.n]
+            noise = linear.map.real @ noise @ linear.map.real.T + linear.noise.real
+            good = np.isfinite(moved).all(axis=1)
+            short = np.abs(moved[good] @ inverse.T).max(initial=0.0) < 1.5 and (np.diagonal(noise) / variances).max() < 0.2
+            target = grid
+            if not (short and holds) and good.any():
+                target = fitted_grid((start + moved)[good], logs[good], grid.centre, noise, narrow, bounds, grid)
+            moves.append(_Move(linear, steps, target))
+        return moves
 
-    def _real(self) -> Dynamics:
-        """The dynamics without derivatives, for decisions."""
-
-        def drift(x: Array, t: Any) -> Array:
-            return np.asarray(self.dynamics.drift(x, t).real)
-
-        return self.dynamics._replace(drift=drift)
+    def _drift(self, x: Array, t: Any) -> Array:
+        """The drift without derivatives, for decisions."""
+        return np.asarray(self.dynamics.drift(x, t).real)
 
     def _support(self, real: Array) -> Array:
         """Return the numbers of some points that cover the support of a density."""
@@ -202,7 +209,8 @@ class Stepper:
         used = np.zeros(real.shape, bool)
         used[tuple(slice(s // 2 % stride, None, stride) for s in real.shape)] = True
         used &= real > MARGIN * self.bounds.edge * real.max()
-        used.flat[int(np.argmax(real))] = True
+        if not used.any():
+            used.flat[int(np.argmax(real))] = True
         return np.flatnonzero(used)
 
     def _fits(self, used: Array, widths: Array, grid: Grid) -> bool:
@@ -211,35 +219,44 @@ class Stepper:
         needed = np.maximum((used[:, 1] - used[:, 0] + 4) * np.minimum(self.bounds.spacings / widths, 1.0), LEAST[grid.n])
         return bool(np.prod(np.minimum(needed / sizes, 1.0)) > 0.55)
 
-    def _apply(self, field: Field, t0: float, t1: float, move: _Move, potential: Potential | None) -> Field:
+    def _apply(
+        self,
+        field: Field,
+        t0: float,
+        t1: float,
+        move: _Move,
+        potential: Potential | None,
+        begun: tuple[float, Array] | None = None,
+    ) -> tuple[Field, Array]:
+        """Return the density after a substep, and the displacement along the characteristics that end in the points of its grid.
+
+        `begun` is their displacement from the end to a time in between.
+        """
         goal = move.target
         sizes = padded_sizes(field.grid, move.linear.before.real, self.bounds)
         field = Field(*padded(field.values, field.grid, sizes), field.log_scale)
-        moved = self._characteristics(field.grid, goal, t0, t1, move.steps)
+        moved = characteristics(self.dynamics, field.grid, goal, t0, t1, move.steps, self.bounds.periodic, begun)
         before = potential(field.grid, t0, t1, False) if potential else None
         after = potential(goal, t0, t1, True) if potential else None
         noises = self._noises(field.grid, goal, t0, t1)
-        values, top = transported(field.values, field.grid, goal, moved, move.linear, before, after, noises)
-        return Field(values, goal, field.log_scale + top)
+        values, top = transported(field.values, field.grid, goal, moved, move.linear, self.bounds.periodic, before, after, noises)
+        return Field(values, goal, field.log_scale + top), moved
 
-    def limit(self, field: Field, t0: float, tau: float) -> float:
-        """Return the longest substep, at most tau, whose noise a density can be spread by on a few times its own grid."""
-        found = survey(field.values, field.grid)
+    def limit(self, field: Field, t0: float, t1: float) -> float:
+        """Return the end, at most t1, of the longest substep by whose noise a density can be spread on a few times its grid."""
         for _ in range(80):
-            noise = self._linear(found, field.grid, t0, t0 + tau).before.real
-            if enlargement(field.grid, noise, self.bounds) <= MOST_ENLARGED:
+            first, second = self._linear(field, (t0, 0.5 * (t0 + t1), t1))
+            if enlargement(field.grid, first.then(second).before.real, self.bounds) <= MOST_ENLARGED:
                 break
-            tau *= 0.5
-        return tau
+            t1 = t0 + 0.5 * (t1 - t0)
+        return t1
 
-    def single(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, _Move, Report]:
-        """Return the density after one substep, on a grid that fits it."""
-        move = self._move(field, t0, t1)
+    def _moved(self, field: Field, t0: float, t1: float, move: _Move, potential: Potential | None) -> tuple[Field, Array, Report]:
+        """Return the density after one substep on a grid that fits it, as `_apply`, and the errors of the grid."""
         before = np.full(field.grid.n, np.inf)
         for attempt in range(TRIES):
-            result = self._apply(field, t0, t1, move, potential)
-            real = result.values.real
-            found = survey(real, result.grid, self.bounds.edge)
+            result, moved = self._apply(field, t0, t1, move, potential)
+            found = survey(result.values, result.grid, self.bounds.edge)
             wide = found.edges > 3 * self.bounds.edge
             coarse = refinable(found.tails, before, self.bounds)
             if attempt == TRIES - 1 or not (wide.any() or coarse.any()) or not np.isfinite(found.tails).all():
@@ -251,19 +268,25 @@ class Stepper:
                 break
             before = np.where(coarse, found.tails, before)
             move = move._replace(target=better)
-        return result, move, grid_report(found, real)
+        return result, moved, grid_report(found)
+
+    def single(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report]:
+        """Return the density after one substep, on a grid that fits it."""
+        result, _, report = self._moved(field, t0, t1, self._moves(field, (t0, t1))[0], potential)
+        return result, report
 
     def double(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report, float]:
         """Return the extrapolated density after two halves of a substep, and the difference from the whole substep."""
         middle = 0.5 * (t0 + t1)
-        first, move, one = self.single(field, t0, middle, potential)
-        fine, _, two = self.single(positive(first), middle, t1, potential)
-        whole = self._linear(survey(field.values, field.grid), field.grid, t0, t1)
-        coarse = self._apply(field, t0, t1, _Move(whole, 2 * move.steps, fine.grid), potential)
+        one, two = self._moves(field, (t0, middle, t1))
+        half, _, first = self._moved(field, t0, middle, one, potential)
+        fine, moved, second = self._moved(positive(half), middle, t1, two, potential)
+        whole = _Move(one.linear.then(two.linear), one.steps, fine.grid)
+        coarse, _ = self._apply(field, t0, t1, whole, potential, (middle, moved))
         values, difference = extrapolated(fine.values, coarse.values, coarse.log_scale - fine.log_scale)
         # Moments differ by a few times as much as densities; by more only where rounding far away counts.
         difference = max(difference, min(moments_difference(fine.values, coarse.values, fine.grid), 5 * difference))
-        return Field(values, fine.grid, fine.log_scale), one.worst(two), difference
+        return Field(values, fine.grid, fine.log_scale), first.worst(second), difference
 
 
 def refinable(tails: Array, before: Array, bounds: Bounds) -> Array:
@@ -271,8 +294,8 @@ def refinable(tails: Array, before: Array, bounds: Bounds) -> Array:
 
     What interpolation adds to the spectrum does not decrease with the spacing, and what a kink adds decreases slowly.
     """
-    enough = max(INTERPOLATED, 100 * bounds.accepted)
-    return np.asarray((tails > bounds.accepted) & ((tails < 0.1 * before) | (tails > enough)))
+    enough = max(INTERPOLATED, 100 * bounds.tail)
+    return np.asarray((tails > 3 * bounds.tail) & ((tails < 0.1 * before) | (tails > enough)))
 
 
 def positive(field: Field) -> Field:
@@ -315,18 +338,18 @@ def advance(
     """
     if tau <= 0:
         return field, NOTHING, control
-    known = control.known(tau, allowed)
+    known = not control.fixed and control.known(tau, allowed)
     error = control.rate * tau**3 if known else np.inf
     singles = np.ceil(np.sqrt(error / allowed)) if np.isfinite(error) else np.inf
     doubles = max(1.0, np.ceil((_EXTRAPOLATED * (0.75 * min(error, 1.0)) ** (5 / 3) / allowed) ** 0.25)) if known else 1.0
     singles, doubles = max(singles, 2.0 * least if least > 1 else 1.0), max(doubles, least)
-    if singles < 2 * doubles and stepper.limit(field, t0, tau / singles) >= tau / singles:
+    if singles < 2 * doubles and stepper.limit(field, t0, t0 + tau / singles) >= t0 + tau / singles:
         parts, report = int(singles), NOTHING
         for i in range(parts):
-            field, _, more = stepper.single(field, t0 + tau * i / parts, t0 + tau * (i + 1) / parts, potential)
+            field, more = stepper.single(field, t0 + tau * i / parts, t0 + tau * (i + 1) / parts, potential)
             field, report = positive(field), report.worst(more)
         return field, report._replace(splitting=error / parts**2), control._replace(age=control.age + 1)
-    if control.measured > 0 and tau > 2 * control.measured:
+    if not control.fixed and control.measured > 0 and tau > 2 * control.measured:
         doubles = max(doubles, np.ceil(min(tau / (1.5 * control.measured), MOST_PARTS)))
     return _adaptively(stepper, field, t0, tau, potential, int(doubles), allowed, 1.0 / least)
 
@@ -338,10 +361,12 @@ def _adaptively(
     done, length, report, rate, count = 0.0, 1.0 / parts, NOTHING, 0.0, 0
     while done < 1 - 1e-12:
         length = min(length, longest, 1 - done)
-        length = min(length, stepper.limit(field, t0 + tau * done, tau * length) / tau)
         if 1 - done - length < 0.3 * length:
             length = 1 - done if 1 - done <= 1.3 * length else 0.5 * (1 - done)
         begin, end = t0 + tau * done, t0 + tau * (done + length)
+        limit = stepper.limit(field, begin, end)
+        if limit < end:
+            end, length = limit, (limit - begin) / tau
         result, more, difference = stepper.double(field, begin, end, potential)
         difference = min(difference, 10.0) if np.isfinite(difference) else 10.0
         error = _EXTRAPOLATED * difference ** (5 / 3)

@@ -12,13 +12,19 @@ from zakai.numerics.compiled import kernel
 from zakai.numerics.space_grid import Grid
 
 Array = NDArray[Any]
+# Squared deviations from the mean beyond which an edge counts for more than its mass, if the bound on edges is above ROUNDING:
+# below it what is at an edge is noise of interpolation, as likely far out as near.
+FAR, ROUNDING = 36.0, 1e-11
 
 
 class Survey(NamedTuple):
-    """The `total` of the values, the mean (n,) and covariance (n, n) of the offsets from the centre in x; for each axis (n,) the
-    largest `edges` relative to the maximum of the marginal, the `tails` of the spectrum at its two highest frequencies relative
-    to the mass, the first and last index `used` (n, 2) above the bound on edges, and the `highest` frequency above the bound on
-    tails, as a share of the highest of the grid.
+    """Moments, edges and spectrum of a density on a grid.
+
+    The `total` of the values, the mean (n,) and covariance (n, n) of the offsets from the centre in x; for each axis (n,) the
+    largest `edges` relative to the maximum of the marginal (times the squared distance where they are far from the mean), the
+    `tails` of the spectrum at its two highest frequencies relative to the mass, the first and last index `used` (n, 2) above the
+    bound on edges, and the `highest` frequency above the bound on tails, as a share of the highest of the grid; and the share of
+    `negative` mass.
     """
 
     total: float
@@ -28,6 +34,7 @@ class Survey(NamedTuple):
     tails: Array
     used: Array
     highest: Array
+    negative: float
 
 
 @kernel("float64(float64[::1], int64, int64, int64, int64, float64[:, ::1])")
@@ -54,8 +61,8 @@ def _wave(u: Any, outer: int, size: int, inner: int, k: int, work: Any) -> float
 
 
 @kernel("void(float64[::1], int64[::1], boolean[::1], float64, float64, float64[::1], float64[:, ::1], float64[:, ::1])")
-def _survey(u: Any, sizes: Any, closed: Any, edge: float, tail: float, mean: Any, second: Any, axes: Any) -> None:
-    """Write the sums of indices and of their products, and for each axis: edge, tail, first, last, highest frequency; total."""
+def _survey(u: Any, sizes: Any, closed: Any, edge: float, tail: float, mean: Any, cov: Any, axes: Any) -> None:
+    """Write the mean and covariance of the indices; of each axis edge, tail, first, last, highest frequency; the totals."""
     n, count = sizes.size, u.size
     last = sizes[n - 1]
     index = np.zeros(n)
@@ -71,17 +78,23 @@ def _survey(u: Any, sizes: Any, closed: Any, edge: float, tail: float, mean: Any
             x = u[line * last + i]
             z = i - last // 2
             total += x
+            axes[n, 1] -= min(x, 0.0)
             first += x * z
             squares += x * z * z
         axes[n, 0] += total
         for d in range(n - 1):
             mean[d] += total * index[d]
-            second[n - 1, d] += first * index[d]
+            cov[n - 1, d] += first * index[d]
             for e in range(d + 1):
-                second[d, e] += total * index[d] * index[e]
+                cov[d, e] += total * index[d] * index[e]
         mean[n - 1] += first
-        second[n - 1, n - 1] += squares
+        cov[n - 1, n - 1] += squares
     total = axes[n, 0]
+    for d in range(n):
+        mean[d] /= total
+        for e in range(d + 1):
+            cov[d, e] = cov[d, e] / total - mean[d] * mean[e]
+            cov[e, d] = cov[d, e]
     inner = 1
     for d in range(n - 1, -1, -1):
         size = sizes[d]
@@ -94,8 +107,11 @@ def _survey(u: Any, sizes: Any, closed: Any, edge: float, tail: float, mean: Any
                     marginal[i] += u[start + q]
         top = marginal.max()
         if not closed[d]:
-            sides = max(max(abs(marginal[0]), abs(marginal[1])), max(abs(marginal[size - 2]), abs(marginal[size - 1])))
-            axes[d, 0] = sides / top
+            lower, upper = max(abs(marginal[0]), abs(marginal[1])), max(abs(marginal[size - 2]), abs(marginal[size - 1]))
+            if edge > ROUNDING:
+                lower *= max(1.0, (size // 2 + mean[d]) ** 2 / (FAR * cov[d, d]))
+                upper *= max(1.0, (size - 1 - size // 2 - mean[d]) ** 2 / (FAR * cov[d, d]))
+            axes[d, 0] = max(lower, upper) / top
         low = size
         high = -1
         for i in range(size):
@@ -116,6 +132,8 @@ def _survey(u: Any, sizes: Any, closed: Any, edge: float, tail: float, mean: Any
                 below = _wave(u, outer, size, inner, k - 1, work) / total
         axes[d, 4] = min((k + 1.0) / (size // 2), 1.0)
         inner *= size
+    if not (math.isfinite(total) and total > 0.0):
+        axes[:n, :2] = 1.0
 
 
 def survey(values: Array, grid: Grid, edge: float = 0.0, tail: float = 1.0) -> Survey:
@@ -127,24 +145,21 @@ def survey(values: Array, grid: Grid, edge: float = 0.0, tail: float = 1.0) -> S
         edge: share of the maximum that counts as zero.
         tail: share of the mass that counts as zero in the spectrum; 1 leaves `highest` unknown.
     """
-    n = grid.n
-    mean, second, axes = np.zeros(n), np.zeros((n, n)), np.zeros((n + 1, 5))
+    n, basis = grid.n, grid.basis
+    mean, cov, axes = np.zeros(n), np.zeros((n, n)), np.zeros((n + 1, 5))
     flat = np.ascontiguousarray(values.real).reshape(-1)
-    _survey(flat, np.array(grid.sizes, np.int64), np.array(grid.closed), edge, tail, mean, second, axes)
-    total = float(axes[n, 0])
-    if not (math.isfinite(total) and total > 0):
-        axes[:, :2] = 1.0
-    mean = mean / total
-    second = np.tril(second) + np.tril(second, -1).T
-    cov = second / total - mean[:, None] * mean
+    _survey(flat, np.array(grid.sizes, np.int64), np.array(grid.closed), edge, tail, mean, cov, axes)
     edges, tails, used, highest = axes[:n, 0], axes[:n, 1], axes[:n, 2:4].astype(int), axes[:n, 4]
-    return Survey(total, grid.basis @ mean, grid.basis @ cov @ grid.basis.T, edges, tails, used, highest)
+    total, negative = axes[n, :2].tolist()
+    return Survey(total, basis @ mean, basis @ cov @ basis.T, edges, tails, used, highest, negative / max(total, 1e-300))
 
 
 def narrowest(found: Survey, grid: Grid, tail: float) -> tuple[Array, Array]:
-    """Return the width of the narrowest feature along each axis, in conditional deviations of a Gaussian (n,), at most 1, and
-    in spacings (n,): it follows from the highest frequency at which the spectrum is above `tail` of the mass."""
-    inverse = np.linalg.inv(grid.basis)
+    """Return the smallest standard deviation along each axis, in conditional deviations (n,), at most 1, and in spacings (n,).
+
+    It follows from the highest frequency at which the spectrum is above `tail` of the mass.
+    """
+    inverse = grid.inverse
     spread = inverse @ found.cov @ inverse.T
     scale = np.sqrt(np.maximum(np.diagonal(spread), 1e-12))
     scaled = spread / np.outer(scale, scale) + 1e-9 * np.eye(grid.n)

@@ -12,6 +12,8 @@ are Chin's (1997), of fourth order where diffusion and V alone do not commute.  
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,16 +31,19 @@ from zakai.numerics.space_grid import (
 )
 
 Array = NDArray[Any]
-_TERMS = 12
+_TERMS = 18
 _LARGEST = 4.0  # of tau L
 _MOST_STEPS = 256
 _LARGEST_VOLUME = 300.0  # nats; points beyond come from outside of the grid
 
 
 class Dynamics(NamedTuple):
-    """`drift(x, t)` gives f and its divergence (J, n + 1) at points (J, n), `jacobian(x, t)` (n, n) at one point, `noise(t0, t1)`
-    the averages of G and of (1 - s) G over an interval; `varying` tells whether f depends on t; `diffusion(x, t)` gives G
-    (J, n, n) at points where it depends on the state, for which `noise` is not used."""
+    """The drift and the noise of a system.
+
+    `drift(x, t)` returns f and its divergence (J, n + 1) at points (J, n), `jacobian(x, t)` (n, n) at one point, `noise(t0, t1)`
+    the averages of G and of (1 - s) G over an interval; `varying` is true if f depends on t; `diffusion(x, t)` returns G
+    (J, n, n) at points where it depends on the state, for which `noise` is not used.
+    """
 
     drift: Callable[[Array, Any], Array]
     jacobian: Callable[[Array, Any], Array]
@@ -55,10 +60,10 @@ def runge_kutta(
     steps: int,
     beyond: Callable[[Array], Array] | None = None,
 ) -> Array:
-    """Return the displacement and the integral of the divergence (J, n + 1) along characteristics from t0 to t1, by steps of
-    the classical formula of order four.
+    """Return the displacement and the integral of the divergence (J, n + 1) along characteristics from t0 to t1.
 
-    Points for which `beyond` is true after a step are given up: their displacement is not a number.
+    The steps are those of the classical formula of order four. A point for which `beyond` is true after a step is given up: its
+    displacement is NaN.
     """
     count, n = x.shape
     h = (t1 - t0) / steps
@@ -92,16 +97,18 @@ def runge_kutta(
     return result
 
 
-def steps_needed(dynamics: Dynamics, x: Array, t0: float, t1: float, scale: Array, tolerance: Array) -> tuple[int, Array]:
+def steps_needed(
+    drift: Callable[[Array, Any], Array], x: Array, t0: float, t1: float, scale: Array, tolerance: Array, varying: bool
+) -> tuple[int, Array]:
     """Return how many Runge-Kutta steps move points x (J, n) to `tolerance` (J,) of `scale` (n, n), and their displacement."""
     n, steps = x.shape[1], 1
-    if dynamics.varying:
-        steps = _fastest(dynamics, x[:: max(1, len(x) // 8)], t0, t1)
+    if varying:
+        steps = _fastest(drift, x[:: max(1, len(x) // 8)], t0, t1)
     inverse = np.linalg.inv(scale)
     with np.errstate(all="ignore"):
-        last = runge_kutta(dynamics.drift, x, t0, t1, steps)[:, :n]
+        last = runge_kutta(drift, x, t0, t1, steps)[:, :n]
         while steps < _MOST_STEPS:
-            finer = runge_kutta(dynamics.drift, x, t0, t1, 2 * steps)[:, :n]
+            finer = runge_kutta(drift, x, t0, t1, 2 * steps)[:, :n]
             error = np.abs((finer - last) @ inverse.T).max(axis=1) / tolerance
             worst = float(np.max(np.where(np.isfinite(error), error, np.inf)))
             if worst <= 1:
@@ -112,12 +119,12 @@ def steps_needed(dynamics: Dynamics, x: Array, t0: float, t1: float, scale: Arra
     return steps, last
 
 
-def _fastest(dynamics: Dynamics, x: Array, t0: float, t1: float) -> int:
+def _fastest(drift: Callable[[Array, Any], Array], x: Array, t0: float, t1: float) -> int:
     """Return steps that are short enough for the fastest variation of f in time that 256 irregular times show."""
     count = 256
     shares = (np.arange(count) + 0.5 + 0.4 * np.sin(7.0 * np.arange(count))) / count
     with np.errstate(all="ignore"):
-        values = dynamics.drift(x[None], t0 + (t1 - t0) * shares[:, None]).real
+        values = drift(x[None], t0 + (t1 - t0) * shares[:, None]).real
     low, high = values.min(axis=0), values.max(axis=0)
     span = np.where(high - low > 1e-9 * np.maximum(np.abs(low), np.abs(high)), high - low, np.inf)
     speed = np.abs(np.diff(values, axis=0)) / np.diff(shares)[:, None, None] / span
@@ -125,36 +132,42 @@ def _fastest(dynamics: Dynamics, x: Array, t0: float, t1: float) -> int:
     return int(np.clip(np.ceil(worst / 4), 1, _MOST_STEPS // 2))
 
 
-class Linearisation(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Linearisation:
     """Phi and the noise Q of a linear system over an interval."""
 
     map: Array
     noise: Array
 
-    @property
+    @cached_property
     def before(self) -> Array:
         """The half of the noise before the motion, Phi^-1 (Q / 2) Phi^-T."""
         inverse = np.linalg.inv(self.map)
         return np.asarray(0.5 * inverse @ self.noise @ inverse.T)
 
+    def then(self, other: Linearisation) -> Linearisation:
+        """Return the linear system over both intervals."""
+        return Linearisation(other.map @ self.map, other.map @ self.noise @ other.map.T + other.noise)
 
-def linearised(matrix: Array, mean: Array, falling: Array, tau: float, basis: Array) -> Linearisation:
+
+def linearised(matrix: Array, mean: Array, falling: Array, tau: float, span: float, basis: Array) -> Linearisation:
     """Return exp(tau L) and the integral of exp((tau - s) L) G exp((tau - s) L') for averages of G and of (1 - s) G.
 
-    Where the eigenvalues of tau L are large L is reduced: it is a means to a smaller error of the splitting only.
+    Where the eigenvalues of L times the span are large L is reduced: it is a means to a smaller error of the splitting only.
     """
-    rate = tau * np.abs(np.linalg.eigvals(matrix.real)).max()
-    L = matrix * (_LARGEST / rate) if rate > _LARGEST else matrix
-    size = tau * np.abs(np.linalg.inv(basis) @ L.real @ basis).sum(axis=1).max()
-    doublings = int(np.clip(np.ceil(np.log2(max(size, 1e-3))), 0, 30))
+    size = np.abs(np.linalg.inv(basis) @ matrix.real @ basis).sum(axis=1).max()
+    rate = span * np.abs(np.linalg.eigvals(matrix.real)).max() if span * size > _LARGEST else 0.0
+    shrunk = _LARGEST / rate if rate > _LARGEST else 1.0
+    L = shrunk * matrix
+    doublings = int(np.clip(np.ceil(np.log2(max(tau * size * shrunk, 1e-3))), 0, 30))
     n, step = len(L), tau / 2**doublings
     # The exponential of [[L, G], [0, -L']] holds exp(L) and the noise times exp(-L') (Van Loan 1978).
     block = np.zeros((2 * n, 2 * n), np.result_type(L, mean))
     block[:n, :n], block[:n, n:], block[n:, n:] = step * L, step * mean, -step * L.T
-    result = term = np.eye(2 * n) + 0.0 * block
-    for k in range(1, _TERMS + 6):
-        term = term @ block / k
-        result = result + term
+    one = np.eye(2 * n)
+    result = one + block / _TERMS
+    for k in range(_TERMS - 1, 0, -1):
+        result = one + (block / k) @ result
     transition = result[:n, :n]
     noise = result[:n, n:] @ transition.T
     if doublings == 0:
@@ -166,30 +179,31 @@ def linearised(matrix: Array, mean: Array, falling: Array, tau: float, basis: Ar
     return Linearisation(transition, 0.5 * (noise + noise.T))
 
 
-class Characteristics(NamedTuple):
-    """The indices `at` (J, n) in the source grid from which the points of a target grid come, and the log of the change of
-    volume (J,)."""
-
-    at: Array
-    log_volume: Array
-
-
 def characteristics(
-    dynamics: Dynamics, source: Grid, target: Grid, t0: float, t1: float, steps: int, periodic: tuple[bool, ...]
-) -> Characteristics:
-    """Return the characteristics that end in the points of the target grid."""
-    n, offsets = source.n, target.offsets
+    dynamics: Dynamics,
+    source: Grid,
+    target: Grid,
+    t0: float,
+    t1: float,
+    steps: int,
+    periodic: tuple[bool, ...],
+    begun: tuple[float, Array] | None,
+) -> Array:
+    """Return the displacement along characteristics to the points of the target grid, and the log of the change of volume.
+
+    The result is (J, n + 1); `begun` is a time between t0 and t1, and what is known from t1 back to it.
+    """
+    inverse, sizes, open_axes = source.inverse, np.array(source.sizes), ~np.array(source.closed)
+
+    def beyond(x: Array) -> Array:
+        z = np.abs(transformed(x.real - source.centre, inverse))
+        return np.asarray(np.any(~(z < sizes) & open_axes, axis=1))
+
+    points, end = target.points, None if any(periodic) else beyond
     with np.errstate(all="ignore"):
-        inverse, half = np.linalg.inv(source.basis), np.array(source.sizes) / 2.0
-        closed = np.array(source.closed)
-
-        def beyond(x: Array) -> Array:
-            z = np.abs(transformed(x.real - source.centre, inverse))
-            return np.asarray(np.any(~(z < 2.0 * half) & ~closed, axis=1))
-
-        moved = runge_kutta(dynamics.drift, target.centre + offsets, t1, t0, steps, None if any(periodic) else beyond)
-        at = relative_index(offsets + moved[:, :n], target.centre, source, periodic)
-        return Characteristics(at, np.where(np.abs(moved[:, n].real) < _LARGEST_VOLUME, moved[:, n], 0.0))
+        if begun is None:
+            return runge_kutta(dynamics.drift, points, t1, t0, steps, end)
+        return begun[1] + runge_kutta(dynamics.drift, points + begun[1][:, : source.n], begun[0], t0, steps, end)
 
 
 class Factor(NamedTuple):
@@ -213,8 +227,9 @@ def transported(
     values: Array,
     source: Grid,
     target: Grid,
-    moved: Characteristics,
+    moved: Array,
     linear: Linearisation,
+    periodic: tuple[bool, ...],
     before: Factor | None = None,
     after: Factor | None = None,
     noises: tuple[Array, Array, float] | None = None,
@@ -224,7 +239,7 @@ def transported(
     `noises` are G (J, n, n) at the points of both grids, and half of the substep, where the noise depends on the state.
     """
     top: Any = 0.0
-    inverse = np.linalg.inv(source.basis)
+    inverse = source.inverse
     half = inverse @ linear.before @ inverse.T
     if before is None and noises is None:
         coefficients = filtered(values, gaussian_response(half, source.sizes, spline=True))
@@ -237,8 +252,9 @@ def transported(
         values, second = weighed(values, before.log / 3 + before.correction)
         coefficients = filtered(values, gaussian_response(0.0 * half, source.sizes, spline=True))
         top = first + second
-    result = gather(coefficients, moved.at, source) * np.exp(moved.log_volume)
-    result = result.reshape(target.sizes)
+    at = relative_index(target.offsets + moved[:, :-1], target.centre, source, periodic)
+    volume = np.exp(np.where(np.abs(moved[:, -1].real) < _LARGEST_VOLUME, moved[:, -1], 0.0))
+    result = (gather(coefficients, at, source) * volume).reshape(target.sizes)
     if after is not None:
         result, third = weighed(result, after.log / 3 + after.correction)
         top = top + third

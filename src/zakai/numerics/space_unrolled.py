@@ -72,7 +72,7 @@ def wrapped(values: Array, grid: Grid, angles: tuple[bool, ...]) -> tuple[Array,
     """Return a density on the line as one on the circle, on an aligned grid."""
     angle = np.array(angles)
     reach = np.where(angle, np.pi, 0.5 * widths(grid))
-    sizes = tuple(int(2 * np.ceil(r * k)) for r, k in zip(reach, np.abs(np.linalg.inv(grid.basis)).sum(axis=0), strict=True))
+    sizes = tuple(int(2 * np.ceil(r * k)) for r, k in zip(reach, np.abs(grid.inverse).sum(axis=0), strict=True))
     new = Grid(grid.centre, np.diag(2 * reach / np.array(sizes)), sizes, angles)
     return _sum_of_turns(values, grid, new, angle, sinc_resampled), new
 

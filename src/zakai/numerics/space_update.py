@@ -26,8 +26,11 @@ _TRIES = 16
 
 
 class Update(NamedTuple):
-    """The product, the edges and tails of its grid, how many nats below its maximum the prediction is where the product is
-    largest, and whether the product reaches the end of the predicted window."""
+    """The product of a prediction and a likelihood, and its errors.
+
+    The edges and tails of its grid, how many nats below its maximum the prediction is where the product is largest, and whether
+    the product reaches the end of the predicted window.
+    """
 
     field: Field
     edges: float
@@ -135,10 +138,10 @@ def _next(
         narrow = np.ones(grid.n)
     else:
         tempered, noise = product, np.zeros((grid.n, grid.n))
-        narrow, _ = narrowest(survey(_exp(product - product.max()), grid, bounds.edge, bounds.accepted), grid, bounds.accepted)
-        if late and (found.tails > bounds.accepted).any() and not (found.edges > 3 * bounds.edge).any():
+        narrow, _ = narrowest(survey(_exp(product - product.max()), grid, bounds.edge, bounds.tail), grid, bounds.tail)
+        if late and (found.tails > bounds.tail).any() and not (found.edges > 3 * bounds.edge).any():
             ratio = np.clip(bounds.spacings / deviations_in_spacings(found.tails), 1.1, 2)
-            finer = np.where(found.tails > bounds.accepted, ratio, 1.0)
+            finer = np.where(found.tails > bounds.tail, ratio, 1.0)
             return adjusted(grid, np.zeros(grid.n), np.zeros(grid.n), finer, bounds)
     used = tempered > tempered.max() + np.log(bounds.edge)
     flat = np.flatnonzero(used)

@@ -17,13 +17,14 @@ _OPEN, _CLOSED = 0.6, 0.85  # shares of a circle below which an axis is cut open
 
 
 class Bounds(NamedTuple):
-    """What a grid must keep: `edge`, the share of the maximum that counts as zero; `tail`, the share of the mass in the spectrum
-    at the highest frequencies for which a grid is chosen, and `accepted`, with which it is used (interpolation adds to the
-    spectrum); `most` points along an axis; which coordinates are `periodic`."""
+    """The requirements for a grid.
+
+    `edge` is the share of the maximum that counts as zero; `tail` the share of the mass in the spectrum at the highest
+    frequencies with which a grid is used; `most` points along an axis; which coordinates are `periodic`.
+    """
 
     edge: float
     tail: float
-    accepted: float
     most: int
     periodic: tuple[bool, ...]
 
@@ -39,7 +40,14 @@ class Bounds(NamedTuple):
 
 
 def fitted_grid(
-    offsets: Array, logs: Array, start: Array, noise: Array, narrowness: Array, bounds: Bounds, previous: Grid
+    offsets: Array,
+    logs: Array,
+    start: Array,
+    noise: Array,
+    narrowness: Array,
+    bounds: Bounds,
+    previous: Grid,
+    extra: float = 0.0,
 ) -> Grid:
     """Return a grid for points with a Gaussian N(0, noise) added.
 
@@ -48,9 +56,10 @@ def fitted_grid(
         logs: logarithms of their densities (J,), at most 0.
         start: a point nearby (n,).
         noise: covariance that is added (n, n).
-        narrowness: width of the narrowest feature along each axis, in conditional deviations of a Gaussian (n,), at most 1.
+        narrowness: smallest standard deviation along each axis, in conditional deviations of a Gaussian (n,), at most 1.
         bounds: what the grid must keep.
         previous: the grid of the points; its axes are kept where they still fit.
+        extra: share of its width by which the grid is wider at each end.
     """
     n = len(start)
     weights = np.exp(logs)
@@ -67,8 +76,9 @@ def fitted_grid(
     shape = _shape(cov, previous, bounds.periodic)
     inverse = np.linalg.inv(shape)
     z, spread, added = apart @ inverse.T, inverse @ cov @ inverse.T, inverse @ noise @ inverse.T
-    room = np.sqrt(np.maximum(bounds.reach**2 + 2 * np.minimum(logs, 0.0), 0.0))[:, None] * np.sqrt(np.diagonal(added))
-    low, high = (z - room).min(axis=0), (z + room).max(axis=0)
+    spreading = np.sqrt(np.maximum(bounds.reach**2 + 2 * np.minimum(logs, 0.0), 0.0))[:, None] * np.sqrt(np.diagonal(added))
+    low, high = (z - spreading).min(axis=0), (z + spreading).max(axis=0)
+    low, high = low - extra * (high - low), high + extra * (high - low)
     scale = np.sqrt(np.diagonal(spread))
     scaled = spread / np.outer(scale, scale) + 1e-10 * np.eye(n)
     conditional = scale / np.sqrt(np.diagonal(np.linalg.inv(scaled)))
@@ -113,8 +123,10 @@ def _sized(centre: Array, shape: Array, low: Array, high: Array, spacing: Array,
 
 
 def adjusted(grid: Grid, below: Array, above: Array, finer: Array, bounds: Bounds) -> Grid | None:
-    """Return the grid with its ends moved outwards by `below` and `above` (n,), shares of its width, and its spacings divided by
-    `finer` (n,); None where nothing can be changed."""
+    """Return a wider or finer grid; None where nothing can be changed.
+
+    Its ends are moved outwards by `below` and `above` (n,), shares of its width, and its spacings divided by `finer` (n,).
+    """
     n = grid.n
     sizes, basis, centre = [], grid.basis.copy(), grid.centre
     changed = False
@@ -133,7 +145,7 @@ def adjusted(grid: Grid, below: Array, above: Array, finer: Array, bounds: Bound
 
 def padded_sizes(grid: Grid, noise: Array, bounds: Bounds) -> tuple[int, ...]:
     """Return the sizes that a density needs to be spread by N(0, noise) without running over the ends of its grid."""
-    inverse = np.linalg.inv(grid.basis)
+    inverse = grid.inverse
     variances = np.diagonal(inverse @ noise @ inverse.T)
     sizes = []
     for d, size in enumerate(grid.sizes):
@@ -146,7 +158,7 @@ def padded_sizes(grid: Grid, noise: Array, bounds: Bounds) -> tuple[int, ...]:
 
 def enlargement(grid: Grid, noise: Array, bounds: Bounds) -> float:
     """Return the largest ratio of the width that a density needs to be spread by N(0, noise) to the width of its grid."""
-    inverse = np.linalg.inv(grid.basis)
+    inverse = grid.inverse
     variances = np.diagonal(inverse @ noise @ inverse.T)
     half = 0.5 * np.array(grid.sizes)
     ratios = bounds.reach * np.sqrt((half / bounds.reach) ** 2 + variances) / half
@@ -164,7 +176,7 @@ def whitened_grid(offsets: Array, logs: Array, noise: Array, narrowness: Array, 
         grid: the grid of the points.
     """
     n = grid.n
-    inverse = np.linalg.inv(grid.basis)
+    inverse = grid.inverse
     z, added = offsets @ inverse.T, inverse @ noise @ inverse.T
     weights = np.exp(logs)
     weights = weights / weights.sum()
@@ -173,8 +185,8 @@ def whitened_grid(offsets: Array, logs: Array, noise: Array, narrowness: Array, 
     factor = np.linalg.cholesky(cov + 1e-12 * np.diag(np.diagonal(cov)) + 1e-20 * np.eye(n))
     white = (z - mean) @ np.linalg.inv(factor).T
     spread = np.linalg.inv(factor) @ added @ np.linalg.inv(factor).T
-    room = np.sqrt(np.maximum(bounds.reach**2 + 2 * np.minimum(logs, 0.0), 0.0))[:, None] * np.sqrt(np.diagonal(spread))
-    low, high = (white - room).min(axis=0), (white + room).max(axis=0)
+    extra = np.sqrt(np.maximum(bounds.reach**2 + 2 * np.minimum(logs, 0.0), 0.0))[:, None] * np.sqrt(np.diagonal(spread))
+    low, high = (white - extra).min(axis=0), (white + extra).max(axis=0)
     spacing = np.full(n, max(float(np.min(narrowness)), 1e-3) / bounds.spacings)
     sizes = tuple(rounded_size((high[d] - low[d]) / spacing[d] + 3, LEAST[n], bounds.most) for d in range(n))
     width = high - low + 3 * spacing

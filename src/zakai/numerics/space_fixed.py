@@ -1,0 +1,132 @@
+"""Short substeps on a grid that stays where it is: the splitting of `space_transport`, without its linearised noise.
+
+What depends on the grid alone is prepared once, for intervals of any length: along the characteristics that end in a point the
+displacement and the change of volume are polynomials in the length, the continuous extension of the classical Runge-Kutta
+formula (of order three).
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai.numerics.space_grid import Grid, filtered, gather, gaussian_response, indices, resampled
+from zakai.numerics.space_step import Field
+from zakai.numerics.space_survey import Survey, narrowest, survey
+from zakai.numerics.space_transport import Dynamics
+from zakai.numerics.space_window import LEAST, Bounds, fitted_grid
+
+Array = NDArray[Any]
+STEEPEST = 0.3  # largest tau |L|
+MARGIN = 0.07  # share of its width by which a grid that is to stay is wider at each end
+LARGEST_NOISE = 0.2  # of the variance of a density that fills its grid
+LARGEST_RANGE = 300.0  # nats between the largest and the smallest factor of a potential
+# The continuous extension of the classical formula: powers of the share of a step (rows), its four slopes (columns).
+EXTENSION = np.array([[1.0, 0.0, 0.0, 0.0], [-1.5, 1.0, 1.0, -0.5], [2 / 3, -2 / 3, -2 / 3, 2 / 3]])
+
+
+class Motion(NamedTuple):
+    """The motion of the points of a grid along characteristics backward in time.
+
+    `coefficients` (3, (n + 1) J) of tau / `unit`, ... of the displacement in spacings and of the log of the change of volume; the
+    indices `start` (n, J) of the points; the noise `variances` (n, n) per unit of time, in spacings; the `longest` time for which
+    a density that fills the grid can stay on it.
+    """
+
+    coefficients: Array
+    unit: float
+    start: Array
+    variances: Array
+    longest: float
+
+
+def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
+    """Return the motion of a grid for lengths up to the power of two that is not below tau."""
+    unit = math.ldexp(1.0, math.ceil(math.log2(tau)))
+    n, points, inverse = grid.n, np.asfortranarray(grid.points), grid.inverse
+    rate = float(np.abs(inverse @ dynamics.jacobian(grid.centre, 0.0).real @ grid.basis).sum(axis=1).max())
+    slopes: list[Array] = []
+    with np.errstate(all="ignore"):
+        for share in (0.0, 0.5, 0.5, 1.0):
+            at = points - (unit * share) * slopes[-1][:, :n] if slopes else points
+            slopes.append(dynamics.drift(at, 0.0))
+    moved = np.stack([-unit * slope.T for slope in slopes])
+    moved[:, :n] = inverse @ moved[:, :n]
+    moved[:, n] = np.where(np.abs(moved[:, n].real) < LARGEST_RANGE, moved[:, n], 0.0)
+    variances = inverse @ dynamics.noise(0.0, 1.0)[0] @ inverse.T
+    noise = float((np.diagonal(variances).real / (np.array(grid.sizes) / 11.0) ** 2).max())
+    longest = 1.0 / max(rate / STEEPEST, noise / LARGEST_NOISE, 1e-300)
+    start = indices(grid.sizes).T + (np.array(grid.sizes) // 2)[:, None]
+    return Motion(EXTENSION @ moved.reshape(4, -1), unit, start, variances, longest if np.isfinite(rate) else 0.0)
+
+
+@lru_cache(maxsize=64)
+def _fourier(size: int) -> tuple[Array, Array]:
+    """Return the orthonormal real Fourier basis (size, size) in its columns, and the numbers of their frequencies."""
+    number = (np.arange(size) + 1) // 2
+    angle = 2 * np.pi / size * np.arange(size)[:, None] * number
+    basis = np.where(np.arange(size) % 2 == 1, np.cos(angle), np.sin(angle))
+    basis[:, 0] = 1.0
+    return basis / np.sqrt((basis**2).sum(axis=0)), number
+
+
+@lru_cache(maxsize=256)
+def _circulant(variance: complex, size: int, spline: bool) -> Array:
+    """Return the matrix of spreading by a variance in index units, or of the coefficients of a spline."""
+    basis, number = _fourier(size)
+    return np.asarray((basis * gaussian_response(np.array([[variance]]), (size,), spline)[number]) @ basis.T)
+
+
+def _spread(values: Array, cov: Array, separate: bool, spline: bool = False) -> Array:
+    """Return values (*sizes) after spreading by a covariance in index units; with `spline`, the coefficients of their spline."""
+    shape = values.shape
+    if not separate:
+        return filtered(values, gaussian_response(cov, shape, spline))
+    for d, size in enumerate(shape):
+        matrix = _circulant(cov[d, d].item(), size, spline)
+        if d == values.ndim - 1:
+            values = values.reshape(-1, size) @ matrix
+        else:
+            values = matrix @ values.reshape(-1, size, math.prod(shape[d + 1 :]))
+    return values.reshape(shape)
+
+
+def fixed_step(values: Array, grid: Grid, moved: Motion, tau: float, factors: tuple[Array, Array] | None) -> Array:
+    """Return the density after a substep; `factors` are exp(b / 6) and exp(b / 3 - tau g / 144)."""
+    half = 0.5 * tau * moved.variances
+    separate = np.count_nonzero(half) == np.count_nonzero(half.diagonal())
+    s = tau / moved.unit
+    change = (np.array([s, s * s, s**3]) @ moved.coefficients).reshape(grid.n + 1, -1)
+    at, volume = (moved.start + change[:-1]).T, np.exp(change[-1]).reshape(grid.sizes)
+    if factors is None:
+        values = gather(_spread(values, half, separate, True), at, grid).reshape(grid.sizes)
+        return _spread(values * volume, half, separate)
+    outer, inner = factors
+    values = _spread(_spread(values * outer, half, separate) * inner, 0.0 * half, True, True)
+    values = gather(values, at, grid).reshape(grid.sizes) * volume
+    return _spread(values * inner, half, separate) * outer
+
+
+def fits(found: Survey, grid: Grid, bounds: Bounds) -> bool:
+    """Return whether a density that a grid covers and resolves can stay on it: it will soon move and change its width."""
+    sizes = np.array(grid.sizes)
+    needed = np.maximum(found.used[:, 1] - found.used[:, 0] + 4, LEAST[grid.n])
+    return bool(
+        found.edges.max() <= 0.5 * bounds.edge
+        and found.tails.max() <= 0.5 * bounds.tail
+        and np.prod(np.minimum(needed / sizes, 1.0)) > 0.4
+    )
+
+
+def refitted(field: Field, bounds: Bounds) -> Field:
+    """Return a density on a grid that fits it, with a margin for many short substeps."""
+    grid, real = field.grid, field.values.real
+    narrow, _ = narrowest(survey(real, grid, bounds.edge, bounds.tail), grid, bounds.tail)
+    used = np.flatnonzero(real > 0.3 * bounds.edge * real.max())
+    logs = np.log(real.reshape(-1)[used] / real.max())
+    new = fitted_grid(grid.offsets[used], logs, grid.centre, np.zeros((grid.n, grid.n)), narrow, bounds, grid, MARGIN)
+    return Field(resampled(field.values, grid, new, bounds.periodic), new, field.log_scale)
