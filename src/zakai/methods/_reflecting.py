@@ -1,0 +1,184 @@
+"""One state with reflecting ends: the equation of `_line` on Gauss-Lobatto points, without flux at the ends.
+
+    u_t = G u'' / 2 - (f u)' + (h'S^-1 dy/dt - h'S^-1 h / 2) u,      (G u)' / 2 - f u = 0 where the state is reflected
+
+The points cover the part of the domain in which the density is; at an end that is not one of the domain nothing is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.densities import IntervalDensity
+from zakai.errors import InputError
+from zakai.methods._line import forgetting, spread
+from zakai.methods._line_moves import Report
+from zakai.methods._line_system import NOISE, Prepared, outside_tables
+from zakai.methods._line_update import factor_at_end
+from zakai.methods._protocol import Info
+from zakai.methods._reflecting_moves import (
+    SAMPLES,
+    SIZES,
+    domain_of,
+    fitted,
+    logarithm,
+    moments,
+    negligible_of,
+    placed,
+    propagated,
+    sampled,
+    support,
+    without_nan,
+)
+from zakai.models.numeric import numpy_function
+from zakai.models.prior import DensityPrior, GaussianPrior
+from zakai.numerics.line_loop import RELIABLE
+from zakai.numerics.line_posterior import General, Likelihood
+from zakai.numerics.lobatto import Element
+from zakai.numerics.prior_grid import mixture_log_density
+
+Array = Any
+
+
+class State(NamedTuple):
+    """The probabilities (N,) of the Gauss-Lobatto points between `lower` and `upper`, and an estimate of their error so far."""
+
+    values: np.ndarray
+    lower: float
+    upper: float
+    error: float
+
+    @property
+    def element(self) -> Element:
+        """The points."""
+        return Element(float(self.lower), float(self.upper), len(self.values))
+
+
+def init(prepared: Prepared, prior: Any) -> State:
+    """Return the prior, which counts inside of the domain."""
+    model, domain = prepared.model, domain_of(prepared)
+    if isinstance(prior, DensityPrior):
+        function = numpy_function([prior.log_density], model, ())
+
+        def logs(x: Array) -> Array:
+            return function(x[:, None], model.start, prepared.theta)
+
+        centre, scale = (domain.lower if np.isfinite(domain.lower) else domain.upper), 1.0
+    else:
+        single = isinstance(prior, GaussianPrior)
+        weights, means, covs = (
+            (np.ones(1), prior.mean[None], prior.cov[None]) if single else (prior.weights, prior.means, prior.covs)
+        )
+        if np.any(covs[:, 0, 0] <= 1e-28 * means[:, 0] ** 2):
+            raise InputError("prior: a variance is zero; a grid needs a density, so give it a small variance")
+        mixture = mixture_log_density(weights, means, covs, [False])
+        centre, scale = float(np.mean(means[:, 0])), float(np.sqrt(covs.min()))
+
+        def logs(x: Array) -> Array:
+            return mixture(np.zeros(1), x[:, None])
+
+    lower, upper = domain.lower, domain.upper
+    if not np.isfinite(upper - lower):  # powers of two on both sides: the scale of the density is not known
+        steps = scale * 2.0 ** np.arange(-60.0, 61.0, 0.5)
+        points = centre + np.concatenate([-steps[::-1], [0.0], steps])
+        points = np.unique(np.clip(points, lower, upper))
+        lower, upper = support(points, logs(points).real)
+    lower, upper = placed(lambda x: logs(x).real, lower, upper, domain)
+    top = _top(logs, lower, upper)
+    element, values = sampled(lambda x: np.exp(without_nan(logs(x)) - top), lower, upper, negligible_of(prepared))
+    return State(values / np.sum(values), element.lower, element.upper, 0.0)
+
+
+def _top(logs: Callable[[Array], Array], lower: float, upper: float) -> float:
+    return float(np.max(without_nan(logs(np.linspace(lower, upper, SAMPLES))).real))
+
+
+def _multiplied(prepared: Prepared, values: Array, element: Element, likelihood: Likelihood, report: Report) -> tuple[Any, ...]:
+    """Return the product with a likelihood, its points, and the logarithm of its mass."""
+    domain = domain_of(prepared)
+
+    def logs(x: Array) -> Array:
+        return logarithm(element.at(values, x).real) + likelihood.logs(x).real
+
+    lower, upper = placed(logs, element.lower, element.upper, domain)
+    lower, upper = max(lower, element.lower), min(upper, element.upper)
+    top = _top(logs, lower, upper)
+    peak = logarithm(np.max((values / element.weights).real))
+
+    def product(x: Array) -> Array:
+        # Relative to the largest product: neither factor needs to be a number there.
+        density = np.maximum(element.at(values, x).real, 0.0)
+        derivative = element.at(values, x) / np.where(density > 0, density, 1.0)
+        return np.where(density > 0, derivative, 0.0) * np.exp(logarithm(density) + without_nan(likelihood.logs(x)) - top)
+
+    new, found = sampled(product, lower, upper, negligible_of(prepared))
+    report.aliasing = max(report.aliasing, new.unresolved(found))
+    mass = np.sum(found)
+    x, weights = new.points, found.real / mass.real
+    report.depth = float(weights @ (peak - logarithm(element.at(values, x).real)))
+    growth = np.exp(np.minimum(without_nan(likelihood.logs(x)).real + peak - top - np.log(mass.real), 80.0))
+    report.growth = float(np.sum(new.weights * growth))
+    return found / mass, new, np.log(mass) + top
+
+
+def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
+    """Return the state after interval k and the observation at its stop, and the report."""
+    with np.errstate(all="ignore"):
+        return _step(prepared, k, state, observed)
+
+
+def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
+    schedule, length, inside = prepared.schedule, float(prepared.lengths[k]), prepared.inside[k]
+    values, report, gained = np.asarray(state.values), Report(), 0.0
+    element: Any = state.element  # in the place of a grid
+    before = moments(values, element)
+    if length > 0:
+        rates = np.where(inside, observed, 0.0) / length
+        values, element, gained = propagated(prepared, values, element, k, inside, rates, report)
+    predicted, floor = moments(values, element), NOISE + report.aliasing + report.edge
+    at_end = schedule.seen[k] & ~inside
+    if at_end.any():
+        likelihood = factor_at_end(prepared, k, at_end, observed, element)
+        if isinstance(likelihood, General):
+            report.lawless = float(np.sum(values.real[np.isnan(likelihood.log_density(element.points).real)]))
+        values, element, more = _multiplied(prepared, values, element, likelihood, report)
+        gained = gained + more
+    mean, variance = moments(values, element)
+    made = 2.0 * report.aliasing + 10.0 * report.edge + report.time + 10.0 * report.negative + min(floor * report.growth, 1.0)
+    kept = forgetting(before[1], predicted[1], variance, spread(prepared, k, length, float(mean.real)))
+    error = max(made + state.error * kept, RELIABLE * prepared.promised)
+    health = {
+        "error_estimate": error,
+        "tolerance_ratio": made / prepared.promised,
+        "edge_mass": report.edge,
+        "negative_mass": report.negative,
+        "aliasing": report.aliasing,
+        "time_error": report.time,
+        "tail_depth": report.depth / prepared.deepest(floor),
+        "std_in_spacings": float(np.sqrt(max(variance.real, 0.0))) / element.spacing,
+    }
+    if prepared.system.general:
+        health["without_law"] = report.lawless
+    if prepared.system.tabulated:
+        health["outside_tables"] = outside_tables(prepared, values, element, float(schedule.stops[k]))
+    values, element = fitted(prepared, values, element)
+    state = State(values, element.lower, element.upper, float(error))
+    return state, Info(gained, np.array([mean]), np.array([[variance]]), health)
+
+
+def valid(prepared: Prepared, state: State) -> bool:
+    """Return whether the parts of a state fit together."""
+    values, domain = np.asarray(state.values), domain_of(prepared)
+    if values.ndim != 1 or len(values) not in SIZES or not np.isfinite(values).all() or not np.isfinite(state.error):
+        return False
+    return bool(domain.lower <= state.lower < state.upper <= domain.upper and values.real.sum() > 0)
+
+
+def density(prepared: Prepared, state: State) -> IntervalDensity:
+    """Return the density of a state."""
+    element = state.element
+    values = np.asarray(state.values).real / element.weights
+    return IntervalDensity(values, element.points, element.weights, prepared.model.state)

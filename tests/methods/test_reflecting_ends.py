@@ -1,0 +1,226 @@
+"""One state between reflecting ends: series of cosines, images, and finite volumes, which share no code with the package."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.stats import norm
+
+import zakai
+from methods.test_line_features import error, normal, samples
+from zakai.algebra.theorems import conditions_of
+from zakai.engine.driver import filter_from
+from zakai.models.prior import GaussianPrior
+
+TIMES = np.cumsum([0.1, 0.25, 0.1, 0.5, 0.04, 0.5, 0.25])
+
+
+def model_of(drift="-x", upper=None, lower=0.0, **keys):
+    ends = {"lower": lower, "boundary": "reflecting"} | ({} if upper is None else {"upper": upper})
+    return zakai.Model(**{
+        "state": ["x"], "drift": [drift] if isinstance(drift, str) else drift, "observation": ["x"],
+        "observation_kind": "samples", "domain": {"x": ends}, **keys,
+    })  # fmt: skip
+
+
+def bayes(p, points, weights, transition, likelihoods):
+    """Mean, variance and log-likelihood increment after each sample, for a density on quadrature points."""
+    rows = []
+    for k, likelihood in enumerate(likelihoods):
+        p = transition(k, p) * likelihood(points)
+        mass = weights @ p
+        p = p / mass
+        mean = weights @ (points * p)
+        rows.append((mean, weights @ ((points - mean) ** 2 * p), np.log(mass)))
+    return np.array(rows)
+
+
+def lengths(times):
+    return np.diff(np.concatenate([[0.0], times]))
+
+
+def test_reflected_brownian_motion_is_the_series_of_cosines():
+    values, noise = [0.3, 0.9, 0.02, 0.7, 0.4, 0.95, 0.0], 0.02
+    model = model_of("0", 1.0, diffusion=[["0.6"]], observation_noise=[[str(noise)]],
+                     prior={"kind": "density", "log_density": "-2*x"})  # fmt: skip
+    result = zakai.filter(model, samples(TIMES, values), "yau-yau")
+    nodes, weights = np.polynomial.legendre.leggauss(120)
+    x, weights = (nodes + 1) / 2, weights / 2
+    cosines = np.cos(np.pi * np.arange(80)[:, None] * x) * np.where(np.arange(80) == 0, 1.0, np.sqrt(2.0))[:, None]
+
+    def transition(k, p):
+        decay = np.exp(-0.18 * (np.pi * np.arange(80)) ** 2 * lengths(TIMES)[k])
+        return cosines.T @ (decay * (cosines @ (weights * p)))
+
+    p = np.exp(-2 * x) / (weights @ np.exp(-2 * x))
+    expected = bayes(p, x, weights, transition, [lambda x, z=z: normal(z, noise)(x) for z in values])
+    assert error(result, expected) < 1e-8
+    assert not result.warnings
+    density = result.density(4)
+    grid = (np.arange(4000) + 0.5) / 4000
+    assert np.mean(density.pdf(grid)) == pytest.approx(1.0, abs=1e-6)
+    assert np.isneginf(density.log_density(np.array([-0.01, 1.01]))).all()
+    assert density.mean()[0] == pytest.approx(result.mean[4, 0], abs=1e-12)
+    assert density.quantile([0.5])[0, 0] == pytest.approx(np.interp(0.5, np.cumsum(density.pdf(grid)) / 4000, grid), abs=1e-3)
+
+
+def test_brownian_motion_above_one_reflecting_end_is_its_image():
+    """The prior is narrow and far from the end, then the state reaches it."""
+    values, noise = [2.3, 1.1, 0.4, 0.2, 0.1, 1.5, 3.0], 0.3
+    model = model_of("0", observation_noise=[[str(noise)]], prior={"kind": "gaussian", "mean": [2.0], "cov": [[0.04]]})
+    result = zakai.filter(model, samples(TIMES, values), "yau-yau")
+    nodes, weights = np.polynomial.legendre.leggauss(400)
+    x, weights = 6.0 * (nodes + 1), 6.0 * weights
+
+    def transition(k, p):
+        s = np.sqrt(lengths(TIMES)[k])
+        return (norm.pdf((x[:, None] - x) / s) + norm.pdf((x[:, None] + x) / s)) / s @ (weights * p)
+
+    expected = bayes(normal(2.0, 0.04)(x), x, weights, transition, [lambda x, z=z: normal(z, noise)(x) for z in values])
+    assert error(result, expected) < 1e-6
+    assert not result.warnings
+
+
+def volumes(f, G, lower, upper, size):
+    """The points of cells and the generator of second order without flux at the ends."""
+    h = (upper - lower) / size
+    x, faces = lower + h * (np.arange(size) + 0.5), lower + h * np.arange(1, size)
+    flux = np.zeros((size + 1, size))
+    inner = np.arange(size - 1)
+    flux[1:-1][inner, inner] = f(faces) / 2 + G(x[:-1]) / (2 * h)
+    flux[1:-1][inner, inner + 1] = f(faces) / 2 - G(x[1:]) / (2 * h)
+    return x, -(flux[1:] - flux[:-1]) / h
+
+
+@pytest.mark.parametrize("kind", ["samples", "increments"])
+def test_a_drift_towards_an_end_is_that_of_finite_volumes(kind):
+    """Richardson's extrapolation of two grids of cells; f and g' are not zero at the ends."""
+    f, G, noise = lambda x: -1.5 + np.sin(3 * x), lambda x: (0.5 + 0.2 * x) ** 2, 0.05
+    values = np.array([0.3, 0.9, 0.02, 0.7, 0.4, 1.2, 0.0]) * (1.0 if kind == "samples" else lengths(TIMES))
+    model = model_of("-1.5 + sin(3*x)", 1.5, diffusion=[["0.5 + 0.2*x"]], observation_noise=[[str(noise)]],
+                     observation_kind=kind, prior={"kind": "density", "log_density": "x"})  # fmt: skip
+    record = zakai.Record(TIMES, values[:, None], kind)
+    result = zakai.filter(model, record, "yau-yau")
+    found = []
+    for size in (100, 200):
+        x, A = volumes(f, G, 0.0, 1.5, size)
+
+        def transition(k, p, x=x, A=A):
+            tau = lengths(TIMES)[k]
+            inside = (x * values[k] - 0.5 * tau * x**2) / noise if kind == "increments" else 0.0 * x
+            return expm(tau * A + np.diag(inside)) @ p
+
+        likelihoods = [(lambda x, z=z: normal(z, noise)(x)) if kind == "samples" else np.ones_like for z in values]
+        weights = np.full(size, 1.5 / size)
+        found.append(bayes(np.exp(x) / (weights @ np.exp(x)), x, weights, transition, likelihoods))
+    expected = (4 * found[1] - found[0]) / 3
+    assert error(result, expected) < 1e-5
+    assert not result.warnings
+
+
+def test_a_sharp_sample_in_a_wide_domain():
+    """The posterior is a hundred thousandth of the domain wide; then the state spreads over all of it."""
+    model = model_of("0", 1.0, observation_noise=[["1e-10"]], prior={"kind": "density", "log_density": "0"})
+    result = zakai.filter(model, samples([0.1, 5.0], [0.4321, np.nan]), "yau-yau")
+    assert result.mean[1, 0] == pytest.approx(0.4321, abs=1e-11)
+    assert result.variance[1, 0] == pytest.approx(1e-10, rel=1e-6)
+    assert result.mean[2, 0] == pytest.approx(0.5, abs=1e-7)
+    assert result.variance[2, 0] == pytest.approx(1 / 12, rel=1e-6)
+
+
+def test_coefficients_in_time_and_inputs():
+    """dx = u(t) dt + dv on [0, 1]: the gauge-free reference takes short steps of finite volumes."""
+    inputs = zakai.Inputs([0.0, 0.15, 0.4], [[1.0], [-2.0], [0.5]])
+    model = model_of("u*(1 + 0.5*sin(5*t))", 1.0, inputs=["u"], observation_noise=[["0.05"]], diffusion=[["0.7"]],
+                     prior={"kind": "density", "log_density": "x"})  # fmt: skip
+    times, values = np.array([0.1, 0.3]), [0.3, 0.9]
+    result = zakai.filter(model, samples(times, values, inputs), "yau-yau")
+    found = []
+    for size in (50, 100):
+        x, still = volumes(lambda x: 0 * x, lambda x: 0.49 + 0 * x, 0.0, 1.0, size)
+        _, moving = volumes(lambda x: 1 + 0 * x, lambda x: 0 * x, 0.0, 1.0, size)
+
+        def transition(k, p, still=still, moving=moving):
+            start = 0.0 if k == 0 else times[k - 1]
+            cuts = np.unique([start, *[t for t in (0.15, 0.4) if start < t < times[k]], times[k]])
+            for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+                count = int(np.ceil((b - a) / 0.01))
+                for t in a + (np.arange(count) + 0.5) * (b - a) / count:
+                    u = [1.0, -2.0, 0.5][np.searchsorted([0.15, 0.4], t)]
+                    p = expm((still + u * (1 + 0.5 * np.sin(5 * t)) * moving) * (b - a) / count) @ p
+            return p
+
+        weights = np.full(size, 1 / size)
+        likelihoods = [lambda x, z=z: normal(z, 0.05)(x) for z in values]
+        found.append(bayes(np.exp(x) / (weights @ np.exp(x)), x, weights, transition, likelihoods))
+    assert error(result, (4 * found[1] - found[0]) / 3) < 1e-4
+    assert not result.warnings
+
+
+def test_online_and_batches_are_records_to_the_bit(tmp_path):
+    values = [0.3, 0.9, 0.02, 0.7, 0.4, 0.95, 0.0]
+    model = model_of("-1", 1.0, observation_noise=[["0.02"]], prior={"kind": "density", "log_density": "-2*x"})
+    record = samples(TIMES, values)
+    result = zakai.filter(model, record, "yau-yau")
+    batch = zakai.filter(model, [record, record], "yau-yau")
+    online = zakai.online(model, method="yau-yau")
+    for k, (time, value) in enumerate(zip(TIMES, values, strict=True)):
+        if k == 3:
+            online.save(tmp_path / "checkpoint")
+            online = zakai.online(model, method="yau-yau")
+            online.restore(tmp_path / "checkpoint")
+        estimate = online.update(time, [value])
+        assert np.array_equal(estimate.mean, result.mean[k + 1]) and np.array_equal(estimate.cov, result.cov[k + 1])
+    assert all(np.array_equal(one.mean, result.mean) for one in batch)
+
+
+def test_gradients_are_differences():
+    model = model_of("a", 1.0, diffusion=[["0.7*b"]], observation_noise=[["0.05"]], parameters={"a": -0.5, "b": 1},
+                     prior={"kind": "density", "log_density": "-2*a*x"})  # fmt: skip
+    likelihood = zakai.log_likelihood(model, samples(TIMES[:3], [0.3, 0.8, 0.1]), method="yau-yau")
+    _, gradient = likelihood.value_and_gradient([-0.5, 1.0])
+    for i, unit in enumerate(np.eye(2) * 1e-3):
+        difference = (likelihood([-0.5, 1.0] + unit) - likelihood([-0.5, 1.0] - unit)) / 2e-3
+        assert gradient[i] == pytest.approx(difference, abs=1e-5)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_the_unit_of_the_state_does_not_matter(scale):
+    values = np.array([0.3, 0.9, 0.02])
+    one, other = (
+        zakai.filter(
+            model_of(f"{-s}", s * 1.0, diffusion=[[s]], observation_noise=[[0.02 * s**2]],
+                     prior={"kind": "density", "log_density": f"-2*x/{s}"}),
+            samples(TIMES[:3], s * values), "yau-yau",
+        )
+        for s in (1.0, scale)
+    )  # fmt: skip
+    assert other.mean[1:, 0] / scale == pytest.approx(one.mean[1:, 0], rel=1e-8)
+
+
+REFUSED = {
+    "two states": ({"state": ["x", "z"], "drift": ["-x", "-z"]}, "one state"),
+    "jumps": ({"drift": ["sign(x - 1)"]}, "do not jump"),
+    "cross noise": ({"observation_kind": "increments", "cross_noise": [["0.1"]]}, "independent"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_does_not_hold_is_said_in_one_line(name):
+    keys, words = REFUSED[name]
+    failed = [condition for condition in conditions_of("yau-yau", model_of(**keys)) if condition.holds is False]
+    assert len(failed) == 1 and words in failed[0].statement
+
+
+def test_the_prior_of_filter_from_is_checked_against_the_domain():
+    model, record = model_of(upper=1.0, prior={"kind": "density", "log_density": "0"}), samples(TIMES[:1], [0.3])
+    outside = GaussianPrior(np.array([1.0]), np.array([[0.01]]))
+    with pytest.raises(zakai.InputError, match="prior: 0.5 of it is outside of the domain of 'x'"):
+        filter_from(outside, model, record)
+
+
+def test_a_smoother_is_refused_in_one_line():
+    model = model_of(upper=1.0, prior={"kind": "density", "log_density": "0"})
+    with pytest.raises(zakai.InputError, match="no backward pass for a state with reflecting ends"):
+        zakai.smooth(model, samples(TIMES[:1], [0.3]))
