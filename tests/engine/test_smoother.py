@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -197,3 +199,20 @@ def test_a_result_is_stored_and_read(tmp_path):
     result.save(tmp_path / "smoothed.nc")
     np.testing.assert_array_equal(zakai.load_result(tmp_path / "smoothed.nc").mean, result.mean)
     assert result.to_dataset().attrs["kind"] == "smoothed" and repr(result).startswith("SmoothingResult(benes")
+
+
+@pytest.mark.parametrize("kind", ["samples", "increments"])
+def test_the_compiled_backward_pass_is_that_of_single_steps(kind, monkeypatch):
+    from zakai.methods import kalman_bucy
+
+    rng = np.random.default_rng(5)
+    times, values = np.cumsum(10.0 ** rng.uniform(-3, 0.5, 300)), rng.normal(size=(300, 2))
+    values[rng.random((300, 2)) < 0.3] = np.nan
+    record = zakai.Record(times, values, kind)
+    compiled = zakai.smooth(pair(kind), record, "kalman-bucy")
+    single = dataclasses.replace(kalman_bucy.METHOD.backward, segment=None)
+    monkeypatch.setattr(kalman_bucy, "METHOD", dataclasses.replace(kalman_bucy.METHOD, backward=single))
+    stepwise = zakai.smooth(pair(kind), record, "kalman-bucy")
+    np.testing.assert_allclose(compiled.mean, stepwise.mean, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(compiled.cov, stepwise.cov, rtol=0, atol=1e-12)
+    assert compiled.health["evidence_error"][1:].max() < 1e-9

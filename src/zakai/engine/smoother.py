@@ -16,11 +16,12 @@ from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.batch import Progress, filter_all
 from zakai.engine.driver import check_noise, check_records, planned
-from zakai.engine.loop import CHUNK, Run, advance, joined, stacked
-from zakai.engine.results import FilterResult, warnings_of_run
+from zakai.engine.health_warnings import warnings_of_run
+from zakai.engine.loop import CHUNK, Run, advance, joined
+from zakai.engine.results import FilterResult
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
-from zakai.methods._protocol import Infos
+from zakai.methods._protocol import Infos, stacked
 from zakai.models.model import Model
 from zakai.records import Record
 
@@ -58,7 +59,6 @@ def smooth(
         ConditionError: the method's theorem does not hold.
 
     Example:
-
         model = zakai.load_model("gallery:benes")
         truth, record = zakai.simulate(model, np.arange(0.01, 1.0, 0.01))
         smoothed = zakai.smooth(model, record)
@@ -87,8 +87,8 @@ class SmoothingRun(Run):
         backward = setting.method.backward
         if backward is None:
             raise InputError(
-                f"smooth: the method {setting.method.name} has no backward pass; take kalman-bucy, benes or hu-yau, where one "
-                "holds"
+                f"smooth: the method {setting.method.name} has no backward pass; take yau-yau for one state, or "
+                "kalman-bucy, benes or hu-yau, where one holds"
             )
         self.backward = backward
         backward.message(self.empty, self.state)  # a model without a smoother is refused before it is filtered
@@ -118,20 +118,33 @@ class SmoothingRun(Run):
         for number in reversed(range(len(self.segments))):
             rows, prepared, begin, states = self._segment(number)
             self.messages[number] = message
-            infos = []
-            for k in reversed(rows):
-                message, info = self.backward.smoothed(self.empty, states[k + 1 - rows.start], message)
-                error = abs(float(info.log_likelihood_increment) - expected)
-                health = {**info.health, "evidence_error": error}
-                infos.append(info._replace(log_likelihood_increment=forward[k], health=health))
-                expected = float(forward[k])
-                message = self.backward.step(prepared, k - begin, message, self.values[k])
-            self.parts.append(stacked(infos[::-1]))
+            message, infos = self._backward(prepared, slice(rows.start - begin, rows.stop - begin), states, message, rows)
+            errors = np.abs(infos.log_likelihood_increment - np.append(forward[rows.start + 1 : rows.stop], expected))
+            health = {**infos.health, "evidence_error": errors}
+            self.parts.append(infos._replace(log_likelihood_increment=forward[rows.start : rows.stop], health=health))
+            expected = float(forward[rows.start])
         self.parts.reverse()
         _, info = self.backward.smoothed(self.empty, self.first, message)
         figure = self.parts[0].health["evidence_error"]
         figure[0] = max(figure[0], abs(float(info.log_likelihood_increment) - expected))
         self.start = info.mean, info.cov
+
+    def _backward(
+        self, prepared: Any, rows: slice, states: list[Any], message: Any, observed: range
+    ) -> tuple[Any, Infos]:
+        """Return the message at the start of the intervals `rows` of what is prepared, and the smoothed moments after each."""
+        values = self.values[observed.start : observed.stop]
+        found = None
+        if self.backward.segment is not None:
+            found = self.backward.segment(prepared, rows, states, message, values)
+        if found is not None:
+            return found
+        infos = []
+        for i in reversed(range(len(values))):
+            message, info = self.backward.smoothed(self.empty, states[i + 1], message)
+            infos.append(info)
+            message = self.backward.step(prepared, rows.start + i, message, values[i], states[i])
+        return message, stacked(infos[::-1])
 
     def density(self, index: int) -> Density:
         """Return the smoothed density at an index of the result, made from the nearest checkpoints."""
@@ -140,7 +153,7 @@ class SmoothingRun(Run):
         message = self.messages[number]
         for k in reversed(range(max(index, rows.start), rows.stop)):
             message, _ = self.backward.smoothed(self.empty, states[k + 1 - rows.start], message)
-            message = self.backward.step(prepared, k - begin, message, self.values[k])
+            message = self.backward.step(prepared, k - begin, message, self.values[k], states[k - rows.start])
         return self.backward.density(self.empty, states[index - rows.start], message)
 
     def result(

@@ -24,7 +24,7 @@ Rules:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
@@ -53,6 +53,16 @@ class Infos(NamedTuple):
     health: Mapping[str, np.ndarray]
 
 
+def stacked(infos: Sequence[Info]) -> Infos:
+    """Return the reports of single steps as arrays with a leading axis."""
+    return Infos(
+        np.array([info.log_likelihood_increment for info in infos]),
+        np.array([info.mean for info in infos]),
+        np.array([info.cov for info in infos]),
+        {name: np.array([info.health[name] for info in infos]) for name in infos[0].health},
+    )
+
+
 class Prepared(Protocol):
     """What is known without data."""
 
@@ -71,19 +81,25 @@ class Backward(Generic[P, S, M]):
     """The backward pass of a smoother.  A message is p(observations after t | x at t), up to a constant factor.
 
     `message(prepared, state)` returns the message at the last time, constant one; it raises InputError where this model has no
-    smoother, and is asked for that before the record is filtered.  `step(prepared, k, message, values)` returns the message at
-    the start of interval k from that at its end.  `smoothed(prepared, state, message)` returns the message normalised, so that
-    its product with the filtered state at the same time has mass one, and the Info of that product, whose
-    `log_likelihood_increment` is the logarithm of the mass before: what the step over interval k has gained must be the
-    increment of the filter over interval k.  `density(prepared, state, message)` returns the smoothed density.
+    smoother, and is asked for that before the record is filtered.  `step(prepared, k, message, values, state)` returns the
+    message at the start of interval k from that at its end; `state` is the filtered one at the start.
+    `smoothed(prepared, state, message)` returns the message normalised, so that its product with the filtered state at the same
+    time has mass one, and the Info of that product, whose `log_likelihood_increment` is the logarithm of the mass before: what
+    the step over interval k has gained must be the increment of the filter over interval k.  `density(prepared, state, message)`
+    returns the smoothed density.
+
+    Optional: `segment(prepared, rows, states, message, values)` takes the message from the end of a slice of intervals to its
+    start; `states` are the filtered ones at the start and after each interval.  It returns the message and what `smoothed`
+    reports after each interval; or None, where the single steps are to be taken.
 
     `message`, `smoothed` and `density` use of `prepared` only what does not depend on the schedule.
     """
 
     message: Callable[[P, S], M]
-    step: Callable[[P, int, M, np.ndarray], M]
+    step: Callable[[P, int, M, np.ndarray, S], M]
     smoothed: Callable[[P, S, M], tuple[M, Info]]
     density: Callable[[P, S, M], Density]
+    segment: Callable[[P, slice, Sequence[S], M, np.ndarray], tuple[M, Infos] | None] | None = None
 
 
 @dataclass(frozen=True)

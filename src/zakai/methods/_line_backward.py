@@ -1,0 +1,486 @@
+"""The backward pass for one state: what the observations after t say of the state at t, as a function on a grid.
+
+Backward in time a message b obeys the adjoint of the filter's equation,
+
+    -b_t = G b'' / 2 + f b' + V b.
+
+Only the product of b with the filter's density matters.  A grid covers the support of this product at the end of an interval
+and the density at its start; b need not decrease beyond.  What is moved is therefore psi = e^s b with s' = (mu - G'/2) / G, where
+mu is the drift of a process that keeps to the grid: f in its middle, f + G F'/F towards its ends, with an F that falls to zero.
+Where no coefficient depends on t, psi obeys a symmetric equation (`numerics/line_operator.py`, Spectral).  Where s has
+such a range that rounding would count, s is replaced by a bounded function of it.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import erfc, erfcx
+
+from zakai.densities import Density
+from zakai.errors import InputError
+from zakai.methods import _line, _line_moves
+from zakai.methods._line_system import Prepared, State, covariance_at, covariance_between, drift_at, finite, state_moments
+from zakai.methods._line_update import exponential_factor, factor_at_end
+from zakai.methods._protocol import Backward, Info
+from zakai.numerics import line_window as lw
+from zakai.numerics.line_operator import Spectral, derivatives, exponential_action
+from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
+
+Array = Any
+
+FALL = 3.3  # spacings over which F falls
+HALF = 14.0  # spacings from where F is one to where it is one half
+PAD = 28  # spacings over which F falls to zero
+MOST_SUBSTEPS = 2000
+BOUND = 12.0  # range of a bounded gauge
+NOISE = 1e-11  # of the maximum: what is rounding in psi
+SMALLEST = 1e-13  # value of a smoothed density relative to its maximum that is not rounding
+REACH = 8.0  # standard deviations of the noise of a substep that a grid must hold
+
+
+class Message(NamedTuple):
+    """The function b(x_i) = exp(log_scale - gauge_i) values_i / spacing on a grid.
+
+    The values (N,) have the sum one; `gauge` (N,) is s.  `low` and `high`, relative to the origin, are the ends of where b
+    matters; `needed` is the spacing that its product with the density needs; `error` is the estimate of its relative error.
+    """
+
+    values: np.ndarray
+    gauge: np.ndarray
+    origin: float
+    centre: float
+    spacing: float
+    unit: float
+    closed: bool
+    low: float
+    high: float
+    needed: float
+    log_scale: float
+    error: float
+
+    @property
+    def window(self) -> lw.Window:
+        """The grid."""
+        return lw.Window(self.origin, self.centre, self.spacing, len(self.values), self.closed, self.unit)
+
+    def on(self, window: lw.Window, gauge: Array) -> Message:
+        """Return the same function on another grid, in another gauge."""
+        own = _smooth(self.gauge, self.window, window.offsets)
+        if not self.closed and np.ptp(gauge - own) > 0.5 * BOUND:
+            return self._plain().on(window, gauge) if np.any(self.gauge) else self._moved(window, gauge, own)
+        return self._moved(window, gauge, own)
+
+    def _moved(self, window: lw.Window, gauge: Array, own: Array) -> Message:
+        values = lw.resampled(self.values, self.window, window)
+        logs = np.where(values > 0.0, gauge - own + np.log(np.where(values > 0.0, values, 1.0)), -np.inf)
+        top = float(np.max(logs))
+        return self.changed(np.exp(logs - top), window, gauge, top)
+
+    def _plain(self) -> Message:
+        """Return b itself, continued by straight lines of its logarithm where psi is rounding."""
+        counts = np.flatnonzero(self.values > NOISE * np.max(self.values))
+        first, last = int(counts[0]), int(counts[-1])
+        logs = np.log(np.maximum(self.values, 1e-300)) - self.gauge
+        i = np.arange(len(logs))
+        for end, inner in ((first, first + 1), (last, last - 1)):
+            slope = float(np.clip((logs[end] - logs[inner]) * (end - inner), -0.1, 0.1))
+            logs = np.where((i - end) * (end - inner) > 0, logs[end] + slope * (i - end), logs)
+        offsets = self.window.offsets
+        beyond = np.maximum(self.low - offsets, offsets - self.high) / self.spacing
+        top = float(np.max(logs[beyond < HALF]))
+        values = np.exp(np.minimum(logs - top, 5.0)) * 0.5 * erfc((beyond - HALF) / FALL)
+        return self.changed(values, self.window, np.zeros(len(values)), top)
+
+    def changed(self, values: Array, window: lw.Window, gauge: Array, gained: float) -> Message:
+        """Return the message with other values of any sum, multiplied by exp(gained)."""
+        total = float(np.sum(values))
+        origin, centre, spacing, _, closed, unit = window
+        log_scale = self.log_scale + gained + float(np.log(total))
+        own = values / total, gauge, origin, centre, spacing, unit, closed
+        return Message(*own, self.low, self.high, self.needed, log_scale, self.error)
+
+
+def _smooth(values: Array, window: lw.Window, offsets: Array) -> Array:
+    """Return the polynomial through the nearest eight values of a function at offsets (J,), constant beyond the grid."""
+    at = (offsets - window.centre) / window.spacing + window.size // 2
+    near = np.floor(at).astype(int)
+    if not window.closed:
+        at, near = np.clip(at, 0.0, window.size - 1.0), np.clip(near, 3, window.size - 5)
+    distance = (at - near)[:, None] - _STENCIL
+    exact = np.abs(distance) < 1e-9
+    weights = np.where(exact.any(axis=1, keepdims=True), exact, _WEIGHTS / np.where(exact, 1.0, distance))
+    own = values[(near[:, None] + _STENCIL) % window.size]
+    return np.asarray(np.sum(weights * own, axis=1) / np.sum(weights, axis=1))
+
+
+_STENCIL = np.arange(-3, 5)
+_WEIGHTS = np.array([1.0 / np.prod([float(i - j) for j in _STENCIL if j != i]) for i in _STENCIL])
+
+
+def _covering(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:
+    """Return the grid of at most this spacing for offsets from `low` to `high` and the fall of F beyond, of any size."""
+    if window.closed:
+        size = lw.size_for(2 * np.pi / spacing * 0.999)
+        return window._replace(size=size, spacing=2 * np.pi / size)
+    spacing = lw.quantized(window, low, high, spacing).spacing
+    centre = 8.0 * spacing * np.round((low + high) / (16.0 * spacing))
+    size = int(np.ceil(((high - low) / spacing + 2 * PAD + 8) / 16.0)) * 16
+    return window._replace(centre=float(centre), spacing=spacing, size=size)
+
+
+def message(prepared: Prepared, state: State) -> Message:
+    """Return the message one at the last time.
+
+    Raises:
+        InputError: the model has more than one state, reflecting ends, or cross_noise.
+    """
+    if prepared.model.n > 1:
+        raise InputError(
+            f"{prepared.model.source}: smooth: density grids have a backward pass for one state only; take kalman-bucy, benes or "
+            "hu-yau, where one holds"
+        )
+    if prepared.system.reflecting:
+        raise InputError(f"{prepared.model.source}: smooth: there is no backward pass for a state with reflecting ends yet")
+    if prepared.system.cross is not None:
+        raise InputError(f"{prepared.model.source}: smooth: grids have no backward pass with cross_noise yet; take kalman-bucy")
+    window = state.window
+    low, high = float(window.offsets[0]), float(window.offsets[-1])
+    new = _covering(window, low, high, window.spacing)
+    values = _fall(new.size, new.closed)[0]
+    blank = Message(values, values, *new[:3], new.unit, new.closed, low, high, new.spacing, float(np.log(new.spacing)), 0.0)
+    return blank.changed(values, new, np.zeros(new.size), 0.0)
+
+
+@lru_cache(maxsize=64)
+def _fall(size: int, closed: bool) -> tuple[Array, Array, Array]:
+    """Return F, F'/F and its derivative at the points of a grid (size,) with the spacing one."""
+    if closed:
+        return np.ones(size), np.zeros(size), np.zeros(size)
+    i = np.arange(size)
+    y = (np.maximum(PAD - i, PAD - i[::-1]) - HALF) / FALL
+    side = np.where(i < size / 2, -1.0, 1.0)
+    with np.errstate(over="ignore"):
+        slope = -2.0 / (np.sqrt(np.pi) * erfcx(y)) / FALL  # of log(erfc(y) / 2)
+    return 0.5 * erfc(y), slope * side, -slope * (2.0 * y / FALL + slope)
+
+
+class _Product(NamedTuple):
+    """The product of a state and a message on the finer of their grids, of sum one, and the logarithm of the sum before."""
+
+    values: Array
+    window: lw.Window
+    log_mass: float
+
+
+def _product(state: State, later: Message) -> _Product:
+    own, other = state.window, later.window
+    finer = own if own.spacing <= 1.0001 * other.spacing else other
+    density = lw.resampled(np.asarray(state.values).real, own, finer)
+    psi, gauge = lw.resampled(later.values, other, finer), _smooth(later.gauge, other, finer.offsets)
+    logs = np.where((density > 0) & (psi > 0), np.log(density) + np.log(psi) - gauge, -np.inf)
+    top = float(np.max(logs))
+    values = np.exp(logs - top)
+    first, last = _support(values, SMALLEST)
+    values[:first], values[last + 1 :] = 0.0, 0.0
+    total = float(np.sum(values))
+    return _Product(values / total, finer, float(np.log(total)) + top + later.log_scale - float(np.log(finer.spacing)))
+
+
+@np.errstate(all="ignore")
+def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message, Info]:
+    """Return the message, normalised and without what is negligible in its product with the state, and the product's report."""
+    found = _product(state, later)
+    window = found.window
+    look = lw.figures(found.values, window.closed, prepared.negligible)
+    mean, variance = lw.moments(found.values, window)
+    spacings = float(np.sqrt(max(variance, 0.0))) / window.spacing
+    mean, variance = state_moments(prepared, found.values, window, mean, variance)
+    if window.closed:
+        mean = mean - 2 * np.pi * np.ceil((mean - np.pi) / (2 * np.pi))
+    health = {
+        "error_estimate": float(state.error) + later.error,
+        "tolerance_ratio": later.error / max(prepared.tolerance, 1e-8),
+        "edge_mass": max(look.left, look.right),
+        "negative_mass": look.negative,
+        "aliasing": look.aliasing,
+        "std_in_spacings": spacings,
+    }
+    ends = float(window.offsets[0]), float(window.offsets[-1])
+    values = later.values
+    if not window.closed:
+        first, last = _support(found.values, negligible(prepared))
+        ends = float(window.offsets[first]), float(window.offsets[last])
+        offsets, spacing = later.window.offsets, later.spacing
+        beyond = np.maximum(ends[0] - offsets, offsets - ends[1]) / spacing
+        values = values * (0.5 * erfc((beyond - HALF) / FALL))
+    needed = min(later.needed, window.spacing * max(look.resolving, 1.0), float(state.spacing))
+    kept = later.changed(values, later.window, later.gauge, -found.log_mass)._replace(low=ends[0], high=ends[1], needed=needed)
+    return kept, Info(found.log_mass, np.array([mean]), np.array([[variance]]), health)
+
+
+def negligible(prepared: Prepared) -> float:
+    """Return the values relative to the maximum that do not count."""
+    return float(np.clip(1e-5 * prepared.tolerance, 1e-13, 1e-10))
+
+
+def _support(values: Array, cut: float) -> tuple[int, int]:
+    counts = np.flatnonzero(values > cut * np.max(values))
+    return (int(counts[0]), int(counts[-1])) if len(counts) else (0, len(values) - 1)
+
+
+@np.errstate(all="ignore")
+def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state: State) -> Message:
+    """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
+    length = float(prepared.lengths[k])
+    finer = _covering(later.window, later.low, later.high, later.needed)
+    if finer.spacing < 0.999 * later.spacing:
+        later = later.on(finer, _smooth(later.gauge, later.window, finer.offsets))
+    window, values = later.window, later.values
+    inside = prepared.inside[k]
+    if prepared.lie and not inside.all():
+        inside = np.zeros_like(inside)
+    at_end = prepared.schedule.seen[k] & ~inside
+    _, before = lw.moments(values, window)
+    if at_end.any() or (prepared.lie and inside.any()):
+        exact = bool(at_end.any())
+        likelihood = factor_at_end(prepared, k, at_end, observed, window) if exact else exponential_factor(prepared, k, observed)
+        logs = likelihood.logs(window.points).real
+        top = float(np.max(logs[values > 0.0], initial=-np.inf))
+        later = later.changed(values * np.exp(np.minimum(logs - top, 0.0)), window, later.gauge, top)
+    if length == 0:
+        return later
+    _, between = lw.moments(later.values, window)
+    rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
+    way = _Way(prepared, k, inside, rates, state)
+    later = way.back(later)
+    _, after = lw.moments(later.values, later.window)
+    kept = float(np.clip(between / np.sqrt(max(before * after, 1e-300)), 0.3, 1.0))
+    return later._replace(error=way.error + kept * later.error)
+
+
+class _Way:
+    """One interval backward in time, in substeps; `error` adds up what they leave."""
+
+    def __init__(self, prepared: Prepared, k: int, inside: np.ndarray, rates: np.ndarray, state: State):
+        self.prepared, self.inside, self.rates, self.state = prepared, inside, rates, state
+        self.start, self.length = float(prepared.schedule.starts[k]), float(prepared.lengths[k])
+        self.accepted = max(negligible(prepared), 30.0 * prepared.negligible)
+        self.error = 0.0
+        self.bounded = prepared.system.varying
+        own = state.window
+        first, last = _support(np.asarray(state.values).real, 1e-13)
+        self.ends = float(own.offsets[first]), float(own.offsets[last])
+
+    def back(self, later: Message) -> Message:
+        """Return the message at the start of the interval."""
+        report = _line_moves.Report()
+        stack, count = [(0.0, self.length)], 0
+        if self.prepared.system.varying:
+            stack = _line_moves._panels(
+                self.prepared, later.values, later.window, self.start, self.length, self.inside, report
+            )
+        self.error += report.time
+        longest = max(last - first for first, last in stack)
+        while stack:
+            first, last = stack.pop()
+            count += 1
+            forced = count + len(stack) >= MOST_SUBSTEPS or last - first <= 2e-3 * min(self.length, longest)
+            found = self._substep(later, first, last, forced)
+            if found is None:
+                middle = 0.5 * (first + last)
+                stack += [(first, middle), (middle, last)]
+                continue
+            later = found
+            if not np.isfinite(later.log_scale):
+                break
+        if count >= MOST_SUBSTEPS:
+            self.error = np.inf
+        return later
+
+    def _substep(self, later: Message, first: float, last: float, forced: bool) -> Message | None:
+        """Return the message at the start of a substep; None where a shorter one is needed."""
+        low, high = min(later.low, self.ends[0]), max(later.high, self.ends[1])
+        spacing = later.needed
+        for attempt in range(7):
+            window = _covering(later.window, low, high, spacing)
+            if window.size > lw.LARGEST and not forced:
+                # A narrow message becomes wide in short substeps first.
+                low, high = self._spread(later, first, last)
+                window = _covering(later.window, low, high, spacing)
+                if window.size > 256:
+                    return None
+            gauge = self._gauge(window, self.bounded or last - first < self.length)
+            moving = later.on(window, gauge.values)
+            found = self._attempt(moving.values, window, gauge, first, last)
+            if found is None or not np.isfinite(found[0]).all() or not found[0].any():
+                return later._replace(log_scale=np.nan) if forced else None
+            moved, offset, error = found
+            if gauge.modes is not None and not self._exact(moved, gauge, window, error):
+                self.bounded = True
+                continue
+            look = lw.figures(moved, window.closed, self.accepted)
+            coarse = look.aliasing > self.accepted and not (look.rough and look.aliasing < 1e-3 * self.prepared.tolerance)
+            if not coarse or window.size >= lw.LARGEST or (look.rough and attempt > 1):
+                break
+            spacing = window.spacing / 1.5
+        self.error += error + 2.0 * look.aliasing + 10.0 * max(look.left, look.right)
+        needed = window.spacing * float(np.clip(look.resolving, 1.0, 2.0))
+        moved = np.where(moved > 0.0, moved, 0.0)
+        return moving.changed(moved, window, gauge.values, offset)._replace(low=low, high=high, needed=needed)
+
+    def _spread(self, later: Message, first: float, last: float) -> tuple[float, float]:
+        """Return about the range to which a message that matters on its own range spreads."""
+        points = later.origin + np.linspace(later.low, later.high, 9)
+        system, theta, t = self.prepared.system, self.prepared.theta.real, self.start + last
+        speed = float(np.max(np.abs(system.drift(points[:, None], t, theta))))
+        covariance = float(np.max(system.covariance(points[:, None], t, theta)))
+        more = REACH * np.sqrt(covariance * (last - first)) + 1.5 * speed * (last - first)
+        return later.low - more, later.high + more
+
+    def _attempt(
+        self, values: Array, window: lw.Window, gauge: _Gauge, first: float, last: float
+    ) -> tuple[Array, float, float] | None:
+        """Return psi at the start of a substep, the logarithm of its scale, and its error; None asks for a shorter substep."""
+        prepared, inside, length = self.prepared, self.inside, last - first
+        steady = not prepared.system.varying
+        if steady and gauge.modes is not None and not inside.any():
+            decay = np.exp(-length * gauge.modes.rates)
+            moved = gauge.modes.modes @ (decay * (gauge.modes.modes.T @ values))
+            noise = 4e-16 * float(np.sqrt(np.sum(values * values))) * max(1.0, float(decay.max()))
+            return moved, 0.0, noise / float(np.max(moved))
+        times = self.start + first + length * (np.full(1, 0.5) if steady else GAUSS_NODES)
+        drift, covariance, potential, constant = _line_moves._coefficients(prepared, window, times, inside, self.rates, values)
+        generators = self._generators(window, gauge, drift, covariance)
+        zeroth, moment = length * GAUSS_WEIGHTS, 2.0 * length * GAUSS_WEIGHTS * (GAUSS_NODES - 0.5)
+        weights = [np.full(1, length)] if steady else [0.5 * zeroth - moment, 0.5 * zeroth + moment]
+        offset, split = _line_moves._offset(sum(weights) @ potential, values)
+        if split or any(np.any(w @ covariance < 0) for w in weights):
+            return None
+        parts = [generators(w) + np.diag(w @ potential - offset / len(weights)) for w in weights]
+        error = 0.0
+        if not steady:  # what the commutator-free integrator of order four omits, as in the filter
+            total, difference = parts[0] + parts[1], parts[1] - parts[0]
+            commutator = 0.25 * (total @ (difference @ values) - difference @ (total @ values))
+            error = 5.0 * float(np.sum(np.abs(commutator)) / np.sum(values)) ** (5.0 / 3.0)
+            if error > _line_moves.MAGNUS * prepared.tolerance:
+                return None
+        moved = values
+        for part in reversed(parts):
+            moved, more = exponential_action(np.ascontiguousarray(part), moved)
+            error += more
+        return moved, offset + float(sum(weights) @ constant), error
+
+    def _generators(self, window: lw.Window, gauge: _Gauge, drift: Array, covariance: Array) -> Any:
+        """Return the function that integrates the operator of psi over time with given weights.
+
+        G psi'' / 2 + (mu - G s') psi' + (G (s'^2 - s'') / 2 - mu s') psi.
+        """
+        first, second = derivatives(window.size, window.closed)
+        scale = 1.0 if window.closed else window.spacing
+        _, slope, _ = _fall(window.size, window.closed)
+        spread = covariance if np.ndim(covariance) == np.ndim(drift) else np.asarray(covariance)[..., None]
+        mu = drift + spread * slope / window.spacing
+
+        def integrated(weights: Array) -> Array:
+            if gauge.modes is not None and not self.prepared.system.varying:
+                return -weights[0] * (gauge.modes.modes * gauge.modes.rates) @ gauge.modes.modes.T
+            G, m = weights @ (spread * np.ones(window.size)), weights @ mu
+            found = (0.5 * G / scale**2)[:, None] * second + ((m - G * gauge.slope) / scale)[:, None] * first
+            return found + np.diag(0.5 * G * (gauge.slope**2 - gauge.curvature) - m * gauge.slope)
+
+        return integrated
+
+    def _exact(self, psi: Array, gauge: _Gauge, window: lw.Window, error: float) -> bool:
+        """Return whether the error of psi, relative to its maximum, is small in the product with the density at the start."""
+        density = lw.resampled(np.asarray(self.state.values).real, self.state.window, window)
+        weights = np.where(density > 0.0, np.exp(np.log(density) - gauge.values), 0.0)
+        top = float(np.max(psi))
+        return bool(max(error, 1e-15) * top * np.sum(weights) < max(1e-9, 1e-2 * self.prepared.tolerance) * (weights @ psi))
+
+    def _gauge(self, window: lw.Window, bounded: bool) -> _Gauge:
+        """Return the gauge of the interval on a grid."""
+        prepared = self.prepared
+        if prepared.system.varying:
+            return _bounded(_gauge_of(prepared, window, self.start + 0.5 * self.length), window)
+        found: _Gauge = prepared.once(("gauge", window), lambda: _gauge_of(prepared, window, prepared.model.start))
+        return _bounded(found, window) if bounded and not window.closed else found
+
+
+class _Gauge(NamedTuple):
+    """s, s' and s'' at the points of a grid (N,), and the decomposition of the operator where no coefficient depends on t."""
+
+    values: Array
+    slope: Array
+    curvature: Array
+    modes: Spectral | None
+
+
+def _gauge_of(prepared: Prepared, window: lw.Window, t: float) -> _Gauge:
+    """Return the gauge for the coefficients at a time; that of F alone where f or G is not smooth, or s is not periodic."""
+    system, theta, spacing = prepared.system, prepared.theta.real, window.spacing
+    fall, slope, curvature = _fall(window.size, window.closed)
+    slope, curvature = slope / spacing, curvature / spacing**2
+    with np.errstate(divide="ignore"):
+        plain = _Gauge(np.log(fall), slope, curvature, None)
+    if system.slope is None or system.spread is None:
+        return plain._replace(values=np.zeros(window.size))
+    points = window.points[:, None]
+    G, spread = covariance_at(system, window.points, t, theta) * np.ones(window.size), np.zeros(window.size)
+    if system.state_dependent:
+        spread = finite(system.spread(points, t, theta)[:, 0])
+    if not (G > 0).all():
+        return plain._replace(values=np.zeros(window.size))
+    f, f_slope = drift_at(system, window, t, theta), finite(system.slope(points, t, theta)[:, 0])
+    nodes = (points + spacing * GAUSS_NODES).reshape(-1, 1)
+    inner = finite(system.drift(nodes, t, theta)[:, 0]) / (covariance_at(system, nodes[:, 0], t, theta) * np.ones(len(nodes)))
+    steps = spacing * (inner.reshape(window.size, -1) @ GAUSS_WEIGHTS)
+    if window.closed and abs(np.sum(steps)) > 1e-12 * max(1.0, float(np.sum(np.abs(steps)))):
+        return plain._replace(values=np.zeros(window.size))
+    s = np.concatenate([np.zeros(1), np.cumsum(steps[:-1])]) - 0.5 * np.log(G)
+    s = s - s[window.size // 2]
+    mu, mu_slope = f + G * slope, f_slope + spread * slope + G * curvature
+    own = (mu - 0.5 * spread) / G
+    modes = None
+    if not system.varying and window.size <= lw.SIZES[-1]:
+        potential, between = 0.5 * ((mu - 0.5 * spread) ** 2 / G + mu_slope), float(G[0])
+        if system.state_dependent:
+            potential = potential - 0.25 * finite(system.spread(points, t, theta)[:, 1])
+            between = covariance_between(system, window, t, theta)
+        modes = Spectral(window.closed, spacing, between, potential, s)
+    change = mu_slope / G - mu * spread / G**2
+    if system.state_dependent:
+        change = _derivative(own, spacing, window.closed)
+    return _Gauge(s, own, change, modes)
+
+
+def _bounded(gauge: _Gauge, window: lw.Window) -> _Gauge:
+    """Return S = -B (1 - exp((s - top) / B)) + log F for the gauge s, without the decomposition."""
+    if window.closed:
+        return gauge._replace(modes=None)
+    fall, slope, curvature = _fall(window.size, False)
+    slope, curvature = slope / window.spacing, curvature / window.spacing**2
+    s, first, second = gauge.values, gauge.slope - slope, gauge.curvature - curvature
+    share = np.exp((s - np.max(s[PAD:-PAD])) / BOUND)
+    share, first = np.minimum(share, 1.0), np.where(share < 1.0, first, 0.0)
+    return _Gauge(-BOUND * (1.0 - share), share * first + slope, share * (second + first**2 / BOUND) + curvature, None)
+
+
+def _derivative(values: Array, spacing: float, closed: bool) -> Array:
+    """Return the derivative of a function on a grid by differences of order six."""
+    found = np.gradient(values, spacing, edge_order=2)
+    inner = sum(c * (np.roll(values, -j) - np.roll(values, j)) for j, c in ((1, 0.75), (2, -0.15), (3, 1 / 60))) / spacing
+    return inner if closed else np.concatenate([found[:3], inner[3:-3], found[-3:]])
+
+
+@np.errstate(all="ignore")
+def density(prepared: Prepared, state: State, later: Message) -> Density:
+    """Return the smoothed density."""
+    found = _product(state, later)
+    origin, centre, spacing, _, closed, unit = found.window
+    return _line.density(prepared, State(found.values, origin, centre, spacing, unit, closed, state.error, state.log_floor))
+
+
+BACKWARD: Backward[Prepared, State, Message] = Backward(message, step, smoothed, density)

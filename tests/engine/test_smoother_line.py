@@ -1,0 +1,91 @@
+"""The smoother of one-state density grids against dense forward-backward sums in plain NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import zakai
+
+TIMES, VALUES = np.array([0.05, 0.1, 0.9, 1.0, 2.5]), np.array([0.6, np.nan, -0.3, 0.8, 0.2])
+
+
+def derivatives(x, closed):
+    """The matrices of d/dx and d^2/dx^2: of waves on the circle, else differences of order eight."""
+    size, spacing = len(x), x[1] - x[0]
+    if closed:
+        k, waves = np.fft.fftfreq(size, 1 / size)[:, None], np.fft.fft(np.eye(size), axis=0)
+        return np.fft.ifft(1j * k * waves, axis=0).real, np.fft.ifft(-(k**2) * waves, axis=0).real
+    first, second = np.zeros((size, size)), np.diag(np.full(size, -205 / 72))
+    for j, (a, b) in enumerate(zip((4 / 5, -1 / 5, 4 / 105, -1 / 280), (8 / 5, -1 / 5, 8 / 315, -1 / 560), strict=True), 1):
+        first += a * (np.eye(size, k=j) - np.eye(size, k=-j))
+        second += b * (np.eye(size, k=j) + np.eye(size, k=-j))
+    return first / spacing, second / spacing**2
+
+
+def forward_backward(x, drift, covariance, h, noise, prior, kind, closed):
+    """The smoothed densities at the start and at each time, by sums over a fine grid."""
+    first, second = derivatives(x, closed)
+    operator, spacing = 0.5 * covariance * second - first * drift, x[1] - x[0]
+    states, matrices = [prior / prior.sum() / spacing], []
+    for length, value in zip(np.diff(np.concatenate([[0.0], TIMES])), VALUES, strict=True):
+        inside, factor = np.zeros_like(x), np.ones_like(x)
+        if not np.isnan(value) and kind == "samples":
+            factor = np.exp(-0.5 * (value - h) ** 2 / noise)
+        elif not np.isnan(value):
+            inside = (h * value / length - 0.5 * h**2) / noise
+        matrices.append(factor[:, None] * expm(length * (operator + np.diag(inside))))
+        state = matrices[-1] @ states[-1]
+        states.append(state / state.sum() / spacing)
+    message, found = np.ones_like(x), []
+    for k in reversed(range(len(states))):
+        product = states[k] * message
+        found.append(product / product.sum() / spacing)
+        if k:
+            message = matrices[k - 1].T @ message
+            message /= message.max()
+    return found[::-1]
+
+
+LINE, CIRCLE = np.linspace(-3.4, 3.4, 321), np.linspace(-np.pi, np.pi, 128, endpoint=False)
+CASES = {
+    "double well": (LINE, "x - x**3", LINE - LINE**3, 0.5, "x", LINE, False),
+    "circle": (CIRCLE, "0.3 + sin(x)", 0.3 + np.sin(CIRCLE), 0.4, "cos(x)", np.cos(CIRCLE), True),
+}
+
+
+@pytest.mark.parametrize("kind", ["samples", "increments"])
+@pytest.mark.parametrize("case", CASES)
+def test_a_smoothed_density_agrees_with_sums_over_a_fine_grid(case, kind):
+    x, drift, f, covariance, observation, h, closed = CASES[case]
+    model = zakai.Model(
+        state=["x"], drift=[drift], observation=[observation], observation_kind=kind, observation_noise=[[0.3]],
+        process_noise=[[covariance]], periodic=["x"] if closed else [],
+        prior={"kind": "gaussian", "mean": [0.4], "cov": [[0.04]]},
+    )  # fmt: skip
+    result = zakai.smooth(model, zakai.Record(TIMES, VALUES[:, None], kind), "yau-yau")
+    expected = forward_backward(x, f, covariance, h, 0.3, np.exp(-((x - 0.4) ** 2) / 0.08), kind, closed)
+    for k, density in enumerate(expected):
+        with np.errstate(divide="ignore"):
+            own = np.exp(result.density(k).log_density(x[:, None]))
+        np.testing.assert_allclose(own, density, atol=1e-6 * density.max())
+    assert result.warnings == [] and result.log_likelihood == result.filtered.log_likelihood
+    np.testing.assert_allclose(result.mean[-1], result.filtered.mean[-1], atol=1e-9)
+
+
+def test_a_grid_and_a_gaussian_smoother_agree():
+    model = zakai.Model(
+        state=["x"], drift=["-x"], observation=["x"], prior={"kind": "gaussian", "mean": [0.5], "cov": [[0.2]]}
+    )
+    record = zakai.Record(TIMES, 0.3 * VALUES[:, None], "increments")
+    grid, exact = (zakai.smooth(model, record, method) for method in ("yau-yau", "kalman-bucy"))
+    np.testing.assert_allclose(grid.mean, exact.mean, atol=1e-6)
+    np.testing.assert_allclose(grid.variance, exact.variance, atol=1e-6)
+
+
+def test_two_states_on_a_grid_are_refused_before_they_are_filtered():
+    prior = {"kind": "gaussian", "mean": [0, 0], "cov": [[1, 0], [0, 1]]}
+    model = zakai.Model(state=["x", "y"], drift=["-x + y", "-y**3 - x"], observation=["x"], prior=prior)
+    with pytest.raises(zakai.InputError, match="one state only"):
+        zakai.smooth(model, zakai.Record([0.1], [[0.1]], "increments"), "yau-yau")
