@@ -13,7 +13,7 @@ from zakai.numerics.complex_step import STEP
 from zakai.numerics.families import log_terms
 
 LINE = ["a*tanh(a*x + b)"], lambda x, a, b: np.logaddexp(a * x[..., 0] + b, -a * x[..., 0] - b) - np.log(2)
-BENT = ["a*(2/sqrt(pi))*exp(-a**2*x**2)/(1 + b + erf(a*x))"], lambda x, a, b: np.log(1 + b + erf(a * x[..., 0]))
+KINKED = ["a*(2/sqrt(pi))*exp(-a**2*x**2)/(1 + b + erf(a*x))"], lambda x, a, b: np.log(1 + b + erf(a * x[..., 0]))
 TURNED = (
     ["a*tanh(a*x + b*y)", "b*tanh(a*x + b*y)"],
     lambda x, a, b: np.logaddexp(x @ [a, b], -x @ [a, b]) - np.log(2),
@@ -63,7 +63,7 @@ CASES = {
     "benes, wide": (LINE, gaussian([0.4], [[400.0]]), line(180.0, 200001), lambda x: normal(x, [0.4], [[400.0]])),
     "benes, mixture": (LINE, MIXTURE, line(6.0, 4001), mixture),
     "benes, density": (LINE, DENSITY, line(6.0, 4001), lambda x: np.exp(-((x[..., 0] ** 2 - 1) ** 2))),
-    "erf": (BENT, MIXTURE, line(6.0, 4001), mixture),
+    "erf": (KINKED, MIXTURE, line(6.0, 4001), mixture),
     "turned": (TURNED, gaussian([0.3, -0.2], OBLIQUE), plane(), lambda x: normal(x, [0.3, -0.2], OBLIQUE)),
     "turned, thin": (TURNED, gaussian([0.3, -0.2], THIN.tolist()), thin(), lambda x: 1.0),
     "turned, a point": (TURNED, gaussian([0.3, -0.2], [0.0, 0.0]), (np.array([[0.3, -0.2]]), 1.0), lambda x: 1.0),

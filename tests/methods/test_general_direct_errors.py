@@ -53,16 +53,16 @@ def on_a_line(name, seed):
     x, record = LINE, record_of(name, seed)
     density = np.exp(-0.5 * (x - mean[0]) ** 2)
     density /= density.sum()
-    told, before = [], 0.0
+    found, before = [], 0.0
     for time, value in zip(record.times, record.values[:, 0]):
         density = transition(round(time - before, 12)) @ density
         density *= np.exp(-0.5 * (value - h(x)) ** 2 / noise) / np.sqrt(2 * np.pi * noise)
         mass = density.sum()
         density /= mass
         centre = density @ x
-        told.append((centre, density @ (x - centre) ** 2, np.log(mass)))
+        found.append((centre, density @ (x - centre) ** 2, np.log(mass)))
         before = time
-    return np.array(told).T
+    return np.array(found).T
 
 
 def distance(result, mean, variance, increments):
@@ -123,7 +123,7 @@ def paths(record, count=20000, turns=(-1, 0, 1)):
     prior = np.triu(across[:, :, 0]) + np.triu(across[:, :, 0], 1).T
     centre = np.array([m[0] for m in means])
     angle, radius = np.arctan2(z[:, 0], z[:, 1]), np.hypot(z[:, 0], z[:, 1])
-    normals, told = np.random.default_rng(0).standard_normal((count, K)), []
+    normals, found = np.random.default_rng(0).standard_normal((count, K)), []
     normals = np.concatenate([normals, -normals])
     for k in range(1, K + 1):
         inverse = np.linalg.inv(prior[:k, :k])
@@ -131,10 +131,10 @@ def paths(record, count=20000, turns=(-1, 0, 1)):
         for turn in turns:
             u = np.unwrap(angle[:k] + 2 * np.pi * np.round((centre[:k] - angle[:k]) / (2 * np.pi))) + 2 * np.pi * turn
             for _ in range(40):
-                bend = np.maximum(radius[:k] * np.cos(u - angle[:k]), 0.05) / noise
+                curvature = np.maximum(radius[:k] * np.cos(u - angle[:k]), 0.05) / noise
                 slope = -radius[:k] * np.sin(u - angle[:k]) / noise - inverse @ (u - centre[:k])
-                u = u + np.linalg.solve(np.diag(bend) + inverse, slope)
-            root = 1.03 * np.linalg.cholesky(np.linalg.inv(np.diag(bend) + inverse))
+                u = u + np.linalg.solve(np.diag(curvature) + inverse, slope)
+            root = 1.03 * np.linalg.cholesky(np.linalg.inv(np.diag(curvature) + inverse))
             e = normals[:, :k]
             path = u + e @ root.T
             apart = path - centre[:k]
@@ -152,8 +152,8 @@ def paths(record, count=20000, turns=(-1, 0, 1)):
         total = np.logaddexp.reduce(masses)
         share = np.exp(masses - total)
         mean = share @ np.array([part[1] for part in parts])
-        told.append((mean, share @ np.array([part[2] for part in parts]) - mean**2, total))
-    return np.array([t[0] for t in told]), np.array([t[1] for t in told]), np.diff([t[2] for t in told], prepend=0.0)
+        found.append((mean, share @ np.array([part[2] for part in parts]) - mean**2, total))
+    return np.array([t[0] for t in found]), np.array([t[1] for t in found]), np.diff([t[2] for t in found], prepend=0.0)
 
 
 def test_sine_and_cosine_samples_of_three_states_are_near_the_density():

@@ -20,7 +20,7 @@ def test_paths_that_begin_anywhere_in_the_prior_keep_the_weights_of_their_modes(
     # Two whole paths, and the beginnings of six.
     steps = [1000] * 2 + [100] * 6
     truths, records = zip(*(zakai.simulate(model, np.arange(1, K + 1) * 0.01, seed=4000 + i) for i, K in enumerate(steps)))
-    exact, told = (
+    exact, filtered = (
         zakai.filter(model, list(records), method, keep="moments") for method in ("limited-direct", "general-direct")
     )
 
@@ -28,8 +28,8 @@ def test_paths_that_begin_anywhere_in_the_prior_keep_the_weights_of_their_modes(
         pairs = zip(results, truths)
         return np.array([np.mean((one.mean[-1000:, 0] - truth.values[-1000:, 0]) ** 2) for one, truth in pairs])
 
-    ratio = squared(told) / squared(exact)
-    assert abs(squared(told).mean() / squared(exact).mean() - 1) <= 0.02 and np.abs(ratio - 1).max() <= 0.1
-    away = [(one.mean - other.mean)[:, 0] / np.sqrt(other.variance[:, 0]) for one, other in zip(told, exact)]
+    ratio = squared(filtered) / squared(exact)
+    assert abs(squared(filtered).mean() / squared(exact).mean() - 1) <= 0.02 and np.abs(ratio - 1).max() <= 0.1
+    away = [(one.mean - other.mean)[:, 0] / np.sqrt(other.variance[:, 0]) for one, other in zip(filtered, exact)]
     assert np.sqrt(np.mean(np.square(np.concatenate(away)))) <= 0.015
-    assert all(result.warnings or np.abs(error).max() <= 0.1 for result, error in zip(told, away))
+    assert all(result.warnings or np.abs(error).max() <= 0.1 for result, error in zip(filtered, away))

@@ -161,7 +161,7 @@ def test_an_angle_that_is_cut_is_the_prior_still():
     assert zakai.filter(model, record, "general-direct").health["start_error"][1] <= 1e-3
 
 
-def readings(step):
+def record_of(step):
     """Eight increments: small ones over a step of 1e-6 say that x is far out in the tails."""
     return zakai.Record(step * np.arange(1, 9), np.random.default_rng(2).normal(size=(8, 1)) * 0.1 + 0.2, "increments")
 
@@ -175,7 +175,7 @@ VARIANCES = [1e-8, 1e-4, 1e-2, 1.0, 10.0, 1e2, 1e4, 1e6, 1e8]
     + [(v, h) for v in VARIANCES for h in (1e-6, 10.0)],
 )
 def test_a_prior_of_any_width_over_the_bend_of_the_gauge_is_right_or_warned_of(variance, step):
-    model, record = benes(variance), readings(step)
+    model, record = benes(variance), record_of(step)
     exact, result = zakai.filter(model, record, "benes"), zakai.filter(model, record, "general-direct")
     assert np.isfinite(result.mean).all() and np.isfinite(result.log_likelihood) and (result.variance > 0).all()
     assert result.variance[0, 0] == pytest.approx(variance, rel=1e-3)

@@ -1,4 +1,4 @@
-"""The gradient of the log-likelihood against central differences of ordinary runs, each with lattices of its own."""
+"""The gradient of the log-likelihood against central differences of ordinary filters, each with its own grids."""
 
 from __future__ import annotations
 

@@ -14,7 +14,6 @@ from scipy.stats import ncx2
 from scipy.stats import t as student
 
 import zakai
-from zakai.algebra.theorems import conditions_of
 
 
 def model_of(drift="-x", observation="x", **keys):
@@ -284,24 +283,27 @@ def test_gradients_are_differences(name):
         assert gradient[i] == pytest.approx(difference, abs=3e-6 * (1 + abs(difference)))
 
 
-@pytest.mark.parametrize("name", ["counts", "inputs", "domain"])
-def test_online_filters_are_records_to_the_bit(name):
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_records_batches_online_filters_and_checkpoints_agree_to_the_bit(name, tmp_path):
     keys, values = GRADIENTS[name]
     model = model_of(**{"drift": "-0.8*x" if "inputs" not in keys else "-x**3 + a*u", **keys}, parameters={"a": 0.7, "c": 0.9})
     inputs = zakai.Inputs(np.array([0.0, 0.2, 0.61]), np.array([[1.0], [-2.0], [0.5]])) if "inputs" in keys else None
-    result = zakai.filter(model, samples(TIMES, values, inputs), method="yau-yau")
+    record = samples(TIMES, values, inputs)
+    result = zakai.filter(model, record, method="yau-yau")
+    shorter = samples(TIMES[:3], values[:3], inputs)
+    for one in zakai.filter(model, [shorter, record], method="yau-yau"):
+        count = len(one.mean)
+        assert np.array_equal(one.mean, result.mean[:count]) and np.array_equal(one.variance, result.variance[:count])
     online = zakai.online(model, method="yau-yau")
     for k, (time, value) in enumerate(zip(TIMES, values, strict=True)):
-        estimate = online.update(time, [float(value)], **({} if inputs is None else {"inputs": inputs}))
+        if k == 4:
+            online.save(tmp_path / "checkpoint")
+            online = zakai.online(model, method="yau-yau")
+            online.restore(tmp_path / "checkpoint")
+        given = {"inputs": inputs} if inputs is not None and k == 0 else {}
+        estimate = online.update(time, [float(value)], **given)
         assert np.array_equal(estimate.mean, result.mean[k + 1])
         assert np.array_equal(estimate.cov, result.cov[k + 1])
-
-
-def test_reflecting_ends_are_refused_in_one_line():
-    model = model_of("-x", "x", domain={"x": {"lower": 0.0, "boundary": "reflecting"}},
-                     prior={"kind": "density", "log_density": "-x"})  # fmt: skip
-    failed = [condition for condition in conditions_of("yau-yau", model) if condition.holds is False]
-    assert failed and "natural" in failed[0].statement
 
 
 def test_a_narrow_posterior_with_a_mode_far_away_is_that_of_bayes_rule():
@@ -318,3 +320,12 @@ def test_a_narrow_posterior_with_a_mode_far_away_is_that_of_bayes_rule():
     assert abs(result.mean[1, 0] - mean) < 1e-7 * deviation
     assert abs(np.sqrt(result.variance[1, 0]) - deviation) < 1e-7 * deviation
     assert not result.warnings
+
+
+def test_a_log_density_that_depends_on_time_is_that_of_its_time():
+    values = [0.3, -1.1, 0.02, 0.7, -0.4, 1.5, 0.0]
+    keys = {"observation": None, "observation_log_density": "-(z - x)**2/2 - t*x", "observed": ["z"]}
+    result = zakai.filter(model_of(**keys), samples(TIMES, values), method="yau-yau")
+    likelihoods = [lambda x, z=z, t=t: np.exp(-((z - x) ** 2) / 2 - t * x) for z, t in zip(values, TIMES, strict=True)]
+    expected = dense(X, -X, np.ones(len(X)), likelihoods, np.diff(np.concatenate([[0.0], TIMES])), normal(0.2, 0.5))
+    assert error(result, expected) < 1e-6

@@ -55,3 +55,10 @@ def test_increments_of_a_steep_drift_against_matrix_exponentials(seed):
         std = np.sqrt(u @ (x - mean) ** 2)
         error = max(abs(result.mean[row, 0] - mean), abs(np.sqrt(result.variance[row, 0]) - std)) / std
         assert error < 10 * result.health["error_estimate"][row] + 1e-9
+
+
+def test_a_mode_beyond_values_that_are_rounding_is_kept():
+    model = zakai.load_model("gallery:spiral-sensor")
+    record = zakai.simulate(model, 0.01 * np.arange(1, 401), seed=3)[1]
+    coarse, fine = (zakai.filter(model, record, "limited-direct", tolerance=tolerance) for tolerance in (1e-6, 1e-9))
+    assert np.max(np.abs(coarse.mean - fine.mean) / np.sqrt(fine.variance)) < 1e-6

@@ -181,8 +181,8 @@ def test_a_passive_state_that_is_not_linear_is_as_the_equation_says():
     record = record_of(model, np.arange(1, 11) * 0.05)
 
     def drift(x, t):
-        bent = np.sin(x[..., 0] + x[..., 1])
-        return np.stack([x[..., 1] - x[..., 0] + bent, x[..., 0] - x[..., 1] + bent + 0.5], axis=-1)
+        curved = np.sin(x[..., 0] + x[..., 1])
+        return np.stack([x[..., 1] - x[..., 0] + curved, x[..., 0] - x[..., 1] + curved + 0.5], axis=-1)
 
     as_the_equation_says(
         model,

@@ -165,7 +165,7 @@ def test_the_gradient_with_a_sample_at_the_start_is_that_of_finite_differences()
 
 
 def test_what_a_try_has_cut_away_is_there_for_the_next():
-    """The ninth reading makes heavy what the first lattice that is tried for it does not hold."""
+    """The ninth observation moves the mass to where its first grid has no points."""
     model = zakai.Model(
         state=["x"], drift=["x - x**3"], observation=["x"], observation_kind="samples",
         prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},

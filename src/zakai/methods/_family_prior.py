@@ -1,7 +1,7 @@
 """A prior as families of Gaussians: v_0 = e^-phi sigma_0, with nodes only along the directions on which phi depends.
 
 A Gaussian component is, given z = D x, still Gaussian, so that only v_0(z) = N(z; D m, D P D') e^-phi is put on nodes.  Where
-phi is asymptotically linear, e^-phi N is again a Gaussian, and a component that is wide against the region where phi bends
+phi is asymptotically linear, e^-phi N is again a Gaussian, and a component that is wide against the region where phi is nonlinear
 (the kink) is first written as a sum of narrower ones, level by level: their weights, themselves Gaussian, are known exactly.
 """
 
@@ -32,8 +32,11 @@ _SPACING = 0.186  # their spacing, in standard deviations of what they make up: 
 
 
 class Prior(NamedTuple):
-    """The families of v_0 (leading axis J), with for each node the logarithm of the error that its place brings, and whether
-    it is at the edge; `error` is the largest error relative to the maximum of the prior."""
+    """The families of v_0 (leading axis J), and their errors.
+
+    `log_error` is the logarithm of the error that a node causes, `edge` marks the nodes at the edge, and `error` is the
+    largest error relative to the maximum of the prior.
+    """
 
     families: Family
     log_error: Any
@@ -128,7 +131,7 @@ def _edge(sizes: tuple[int, ...]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Level:
-    """Gaussians of standard deviation `width` at `points` (N,) that make up those before; `near` (N,) are written anew."""
+    """Return Gaussians of deviation `width` at `points` (N,) that add up to the previous ones, replaced at `near` (N,)."""
 
     points: np.ndarray
     spacing: float
@@ -196,7 +199,7 @@ class _GaussianPlan:
         return low, high
 
     def _split(self, mean: float, width: float) -> tuple[float, float]:
-        """The levels of a component that is wide against the kink, and the ends of what is left to the last grid."""
+        """The levels of a component that is wide against the kink, and the ends of the region of the last grid."""
         low, high = mean - self._margin(width), mean + self._margin(width)
         assert self.kink is not None
         while width * self.gap > 8.0 and low < self.kink[1] and high > self.kink[0]:
@@ -333,7 +336,7 @@ def _from_density(gauge: Gauge, model: Model, prior: DensityPrior) -> Prior:
     found = prior_grid(lambda z: log_u(z, theta.real), model.n, tolerance=TOLERANCE, aligned=False, source=name)
     sizes = np.array(found.log_values.shape)
     basis, centre = found.basis, found.centre
-    # As many points as the narrowest feature along an axis needs.
+    # As many points as the smallest standard deviation along an axis needs.
     finer = np.clip(_narrowest(found.log_values.real) / 2.5, 0.1, 1e3)
     spacings = np.maximum(np.ceil((sizes - 1) / finer), 8).astype(int)
     grid = NodeGrid(centre - basis @ (sizes // 2), basis * ((sizes - 1) / spacings), tuple(int(c) + 1 for c in spacings))
@@ -350,7 +353,7 @@ def _from_density(gauge: Gauge, model: Model, prior: DensityPrior) -> Prior:
 
 
 def _narrowest(log_values: Array) -> Array:
-    """Return the standard deviation (n,), in grid spacings, of the narrowest feature along each axis, from the curvature."""
+    """Return the standard deviation (n,), in grid spacings, the smallest along each axis, from the curvature."""
     found = []
     matters = log_values > log_values.max() - 14.0
     for axis in range(log_values.ndim):

@@ -108,8 +108,11 @@ def lifted(directions: Array, z: Array) -> Array:
 
 
 class Posterior(NamedTuple):
-    """u as Gaussians: the log-mass of u, its `mean` and `cov`; `logs` (J, N, E) and `signs` (J, N, 1) are the weights of
-    N(centres (J, E) + R (J) s (J, N), covs (J)), and `doubt` an estimate of the relative error of the sums over z."""
+    """The posterior u as a sum of Gaussians: its log-mass, `mean` and `cov`.
+
+    `logs` (J, N, E) and `signs` (J, N, 1) are the weights of N(centres (J, E) + R (J) s (J, N), covs (J)), and `doubt`
+    estimates the relative error of the sums over z.
+    """
 
     log_mass: Any
     mean: Array

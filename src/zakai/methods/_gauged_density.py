@@ -9,8 +9,12 @@ from functools import cached_property
 
 import numpy as np
 
-from zakai.densities import GaussianMixture, GridDensity
-from zakai.densities._density import as_states
+from zakai.densities import Density, GaussianMixture, GridDensity
+from zakai.densities._density import DensityMethods, as_states
+from zakai.methods._gauge import Gauge, Posterior, posterior
+from zakai.models.model import Model
+from zakai.numerics.families import Family, log_terms
+from zakai.numerics.transition import Array, transposed
 
 # Half the points along an axis of the first grid and of the last one, by the number of states.
 _HALVES = {1: (200, 12_800), 2: (64, 256)}
@@ -21,44 +25,44 @@ _RESOLVED = 1e-8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class GaugedDensity:
-    """The density exp(potential(x)) bare(x), whose moments are known.
+class GaugedDensity(DensityMethods):
+    """The density exp(potential(x)) times a mixture of Gaussians, with known moments.
 
-    `bare` is v of mass one, `potential` takes x (..., n) to phi and what normalises (...), `average` (n,) and `spread` (n, n)
-    are mean and covariance; `points` (K, n) and `margins` (K, n) tell where the mass is: around each point, and how far.
+    `mixture` is v of mass one, `potential` takes x (..., n) to phi and what normalises (...), `average` (n,) and `spread` (n, n)
+    are mean and covariance; `points` (K, n) and `margins` (K, n) say where the mass is: around each point, and how far.
     Densities and moments need no grid; the mode, quantiles, marginals and samples are those of one that is as fine as these
     moments ask for, and a warning says where none is.
     """
 
-    bare: GaussianMixture
+    mixture: GaussianMixture
     potential: Callable[[np.ndarray], np.ndarray]
     average: np.ndarray
     spread: np.ndarray
     points: np.ndarray
     margins: np.ndarray
 
-    def __repr__(self) -> str:
-        return f"GaugedDensity({', '.join(self.names)}: mean {self.average.tolist()})"
-
     @property
     def names(self) -> tuple[str, ...]:
-        return self.bare.names
+        return self.mixture.names
 
     @property
     def periodic(self) -> tuple[bool, ...]:
-        return self.bare.periodic
+        return self.mixture.periodic
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
         n = len(self.names)
         x = as_states(x, n)
         flat = x.reshape(-1, n)
-        return np.reshape(self.bare.log_density(flat) + self.potential(flat), x.shape[:-1])
+        return np.reshape(self.mixture.log_density(flat) + self.potential(flat), x.shape[:-1])
 
     def mean(self) -> np.ndarray:
         return self.average
 
     def cov(self) -> np.ndarray:
         return self.spread
+
+    def resultant(self) -> np.ndarray:
+        return self.grid.resultant()
 
     def mode(self) -> np.ndarray:
         return self.grid.mode()
@@ -90,7 +94,7 @@ class GaugedDensity:
             error = self._error(GridDensity(logs[(slice(None, None, 2),) * n], centre, 2.0 * basis, *named), whiten)
             if error <= _RESOLVED:
                 return GridDensity(logs, centre, basis, *named)
-            if half >= most or 2**n * logs.size * len(self.bare.weights) > _MOST_TERMS:
+            if half >= most or 2**n * logs.size * len(self.mixture.weights) > _MOST_TERMS:
                 break
             half *= 2
         warnings.warn(
@@ -109,3 +113,51 @@ class GaugedDensity:
             cov = whiten.T @ density.cov() @ whiten - np.eye(len(whiten))
         error = max(abs(mass - 1.0), np.abs(mean).max(), np.abs(cov).max())
         return float(error) if np.isfinite(error) else np.inf
+
+
+def density_of(model: Model, gauge: Gauge, time: float, families: Family) -> Density:
+    """Return e^phi times the families, normalised."""
+    found = posterior(gauge, gauge.at_one(time), time, families)
+    # A density without width in some direction, as of a known start, is on no grid.
+    if not gauge.exact and np.all(np.linalg.eigvalsh(families.cov)[:, 0] > 1e-14 * np.trace(families.cov, axis1=1, axis2=2)):
+        return _gauged(model, gauge, time, families, found)
+    return mixture_of(model, gauge.origin, families, found)
+
+
+def _weighted(origin: Array, families: Family, found: Posterior) -> tuple[Array, Array]:
+    """Return the weights (J, N, E) of the Gaussians of a posterior and their means (J, N, E, n)."""
+    moved = families.nodes @ transposed(families.response)
+    return found.signs * np.exp(found.logs - found.log_mass), found.centres[:, None] + moved[:, :, None] + origin
+
+
+def mixture_of(model: Model, origin: Array, families: Family, found: Posterior) -> GaussianMixture:
+    """Return the Gaussians of a posterior as a density."""
+    weights, means = _weighted(origin, families, found)
+    covs = np.broadcast_to(found.covs[:, None, None], (*weights.shape, model.n, model.n))
+    used = weights != 0.0
+    return GaussianMixture(weights[used], means[used], covs[used], model.state, (False,) * model.n)
+
+
+def _gauged(model: Model, gauge: Gauge, time: float, families: Family, found: Posterior) -> GaugedDensity:
+    """Return e^phi v by its formula."""
+    shares, points = _weighted(gauge.origin, families, found)
+    shares = np.abs(shares)
+    logs = log_terms(families)
+    weights = families.signs * np.exp(logs - logs.max())
+    means = families.mean[:, None] + families.nodes @ transposed(families.response) + gauge.origin
+    covs = np.broadcast_to(families.cov[:, None], (*weights.shape, model.n, model.n))
+    used, mass = weights != 0.0, weights.sum()
+    mixture = GaussianMixture(weights[used] / mass, means[used], covs[used], model.state, (False,) * model.n)
+    scale = logs.max() + np.log(mass) - float(found.log_mass)
+    # A Gaussian is followed to ten deviations, where it is e^-50 of its maximum: its points end at nine.
+    rest, own = (np.sqrt(np.maximum(np.diagonal(c, axis1=1, axis2=2), 0.0)) for c in (found.covs, families.cov))
+    margins = np.broadcast_to((10.0 * rest + own)[:, None, None], points.shape)
+    near = shares >= np.exp(-50.0) * shares.max()
+    return GaugedDensity(
+        mixture,
+        lambda x: gauge.potential(x - gauge.origin, time) + scale,
+        found.mean + gauge.origin,
+        found.cov,
+        points[near],
+        margins[near],
+    )

@@ -19,6 +19,7 @@ import numpy as np
 from zakai.densities import Density, GridDensity, MappedDensity
 from zakai.errors import InputError
 from zakai.methods import _line_loop as loop
+from zakai.methods._line_cross import OMITTED
 from zakai.methods._line_domain import on_the_line, variable_of
 from zakai.methods._line_model import System
 from zakai.methods._line_moves import Report, propagated
@@ -60,7 +61,9 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
     negligible = 1e-13 if system.samples else float(np.clip(1e-6 * tolerance, 1e-13, 1e-10))
     generous = lw.LARGEST if system.samples and not system.moving else 96
     lengths, inside = schedule.lengths, schedule.inside
-    return Prepared(model, schedule, theta, system, float(tolerance), lengths, inside, negligible, generous, float(tolerance))
+    found = Prepared(model, schedule, theta, system, float(tolerance), lengths, inside, negligible, generous, float(tolerance))
+    found.notes = (OMITTED,) if system.cross is not None and (schedule.seen & ~inside).any() else ()
+    return found
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -109,7 +112,7 @@ def init(prepared: Prepared, prior: Any) -> State:
         origin = 0.5 * (low + high)
         window = lw.Window(origin, 0.0, spacing, 0, False, spacing)
         window = lw.quantized(window, low - origin, high - origin, spacing, margin=0.0, most=lw.SIZES[-1])
-    for _ in range(8):
+    for attempt in range(8):
         if log_density is None:
             points = window.points[:, None]
             logs = evaluate(np.pi - np.mod(np.pi - points, 2 * np.pi) if closed else points)
@@ -120,7 +123,7 @@ def init(prepared: Prepared, prior: Any) -> State:
         values = values / np.sum(values)
         look = lw.figures(values, closed, cut=prepared.cut)
         new = lw.fitted(look, window, lw.SIZES[-1])
-        if new == window:
+        if new == window or attempt == 7:  # the values belong to this window
             break
         window = new
     return _state(values, window, max(0.0, look.aliasing - 1e-12), -700.0)
@@ -185,7 +188,7 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
         values, window, gained, look = propagated(prepared, values, window, start, length, inside, rates, kernel, report)
     predicted, log_floor = lw.moments(values, window), float(state.log_floor)
     if report.positive:
-        # A positive kernel fills the tails anew.
+        # A positive kernel fills the tails again.
         wider = predicted[1].real / max(contraction**2 * before[1].real, 1e-300)
         log_floor = max(log_floor * float(np.clip(wider, 1.0, 20.0)), float(np.log(prepared.cut)))
         floor = float(np.exp(log_floor)) + report.edge
@@ -252,7 +255,7 @@ def _kernel(prepared: Prepared, k: int, window: lw.Window, rates: np.ndarray, re
 
 
 def forgetting(before: Any, predicted: Any, after: Any, spread: float) -> float:
-    """Return what is left of an old relative error after a step, from the variances: that of an error of the mean in deviations.
+    """Return the remainder of an old relative error after a step, from the variances: that of an error of the mean in deviations.
 
     `spread` is the integral of G over the interval, which counts where the observation acts inside.
     """

@@ -17,7 +17,8 @@ import sympy as sp
 from zakai.models.model import Model
 
 Array = Any
-_DERIVED = ("text", "observation_law", "covariance", "features")  # attributes that a model computes from its formulas
+# attributes that a model computes from its formulas
+_DERIVED = ("text", "observation_law", "covariance", "features", "depends_on_time")
 
 
 class Variable(NamedTuple):
@@ -72,10 +73,10 @@ class Variable(NamedTuple):
 
 
 def variable_of(model: Model) -> Variable | None:
-    """Return the variable of a model whose state has a domain."""
-    if not model.domain:
+    """Return the variable of a model whose state has a domain with natural ends."""
+    interval = model.domain.get(model.state[0])
+    if interval is None or interval.reflecting:
         return None
-    interval = model.domain[model.state[0]]
     return Variable(interval.lower, interval.upper)
 
 

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
-from zakai.models.features import OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
+from zakai.models.features import CROSS_NOISE, OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
 from zakai.models.functions import Floor, Maximum, Minimum, TableFunction
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-from zakai.models.tables import Table
+from zakai.models.table import Table
 from zakai.records.inputs import Inputs
 
 Array = Any
@@ -26,7 +26,8 @@ _KINKS = (sp.Abs, Minimum, Maximum)
 class Formulas(NamedTuple):
     """Functions of x (..., 1), t (...), theta (p,) and the inputs; None where a derivative is not that of a smooth function.
 
-    `slope` is f', `spread` G', `observation_slope` h' and `curvature` h''.
+    `slope` is f', `spread` G' and G'', `observation_slope` h' and `curvature` h''; `cross` is g C with its
+    derivative and h' (3, m), None for independent noises.
     """
 
     drift: Function
@@ -37,6 +38,7 @@ class Formulas(NamedTuple):
     noise: Function
     observation_slope: Function | None
     curvature: Function | None
+    cross: Function | None
     arguments: tuple[Function, ...]
 
 
@@ -47,15 +49,18 @@ def _formulas(model: Model) -> Formulas:
     f, G, h = model.drift[0], model.covariance[0], list(model.observation)
     smooth = all(_continuous(entry, x) and not _rough(entry, x) for entry in h)
     first, second = [sp.diff(entry, x) for entry in h], [sp.diff(entry, x, 2) for entry in h]
+    joint = list(model.diffusion * model.cross_noise) if CROSS_NOISE in model.features else []
+    cross = [*joint, *[sp.diff(entry, x) for entry in joint], *first]
     return Formulas(
         numpy_function(model.drift, model, (1,)),
         numpy_function([sp.diff(f, x)], model, (1,)) if _continuous(f, x) else None,
         numpy_function(model.covariance, model, (1, 1)),
-        numpy_function([sp.diff(G, x)], model, (1,)) if _continuous(G, x) and not _rough(G, x) else None,
+        numpy_function([sp.diff(G, x), sp.diff(G, x, 2)], model, (2,)) if _continuous(G, x) and not _rough(G, x) else None,
         numpy_function(model.observation, model, (m,)),
         numpy_function(model.observation_noise, model, (m, m)),
         numpy_function(first, model, (m,)) if smooth else None,
         numpy_function(second, model, (m,)) if smooth else None,
+        numpy_function(cross, model, (3, m)) if joint else None,
         tuple(numpy_function(list(call.args), model, (len(call.args),)) for call in _tables(model)),
     )
 
@@ -90,17 +95,23 @@ class System:
         self.observation, self.noise = self._bound(formulas.observation), self._bound(formulas.noise)
         self.slope, self.spread = self._optional(formulas.slope), self._optional(formulas.spread)
         self.observation_slope, self.curvature = self._optional(formulas.observation_slope), self._optional(formulas.curvature)
+        self.cross = self._optional(formulas.cross)
         self._tables: list[tuple[Table, Function]] = [
             (call.table, self._bound(arguments)) for call, arguments in zip(_tables(model), formulas.arguments, strict=True)
         ]
         # Whether G depends on the state, and whether samples have a law that is not N(h, S(t)).
         self.state_dependent = STATE_DEPENDENT_DIFFUSION in model.features
+        self.reflecting = any(interval.reflecting for interval in model.domain.values())
         self.general = bool(OF_OBSERVATION & model.features.keys())
         self.rough = any(not _continuous(part, x) or _rough(part, x) for part in (model.drift[0], model.covariance[0]))
         self.moving = bool((model.drift.free_symbols | model.covariance.free_symbols) & given)
         self.steady_observation = not model.observation.free_symbols & given
         self.steady_noise = not model.observation_noise.free_symbols & given
-        self.varying = self.moving or not (self.samples or (self.steady_observation and self.steady_noise))
+        self.steady_cross = not (model.diffusion.free_symbols | model.cross_noise.free_symbols) & given
+        # Whether the equation of an interval has constant coefficients, and whether they need not be computed for each.
+        steady_noises = self.steady_observation and self.steady_noise and self.steady_cross
+        self.steady = not self.moving and (self.samples or steady_noises)
+        self.varying = not self.steady or self.cross is not None
 
     @property
     def tabulated(self) -> bool:

@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zakai.methods._line_cross import with_cross_noise
 from zakai.methods._line_model import within
 from zakai.methods._line_system import Prepared, covariance_at, drift_at, finite, spectral, tables
 from zakai.methods._line_yau import moved
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel
-from zakai.numerics.line_operator import exponential_action, generator
+from zakai.numerics.line_operator import Exponential, exponential_action
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS, panels
 from zakai.numerics.line_transition import WIDE, wrapped
 
@@ -174,7 +175,6 @@ def _attempt(
 ) -> _Attempt:
     """Return the density after the part from start + first to start + last of an interval."""
     system, length = prepared.system, last - first
-    closed, spacing = window.closed, window.spacing
     if not system.varying:
         known = tables(prepared, window)
         if not inside.any():
@@ -182,25 +182,23 @@ def _attempt(
             if decomposed is not None:
                 found, error = decomposed(values, length)
                 # Tails that were cut off are jumps in the gauge of the decomposition, which show at the highest frequencies.
-                smooth = lw.figures(found, closed, prepared.negligible).aliasing <= 30.0 * prepared.negligible
-                if error < max(1e-11, 1e-5 * prepared.tolerance) and smooth:
+                allowed = 1e-5 * prepared.tolerance
+                aliasing = lw.figures(found, window.closed, prepared.negligible).aliasing
+                if error < max(1e-11, allowed) and aliasing <= max(allowed, 30.0 * prepared.negligible):
                     return _Attempt(found, 0.0, error, False)
-            matrix = length * generator(closed, spacing, known.covariance, known.drift)
-            return _Attempt(*_without_offset(matrix, values), False)
+            key = ("exponential", window, length)
+            transition = prepared.once(key, lambda: Exponential(length * window.generator(known.covariance, known.drift)))
+            found, error = transition(values)
+            return _Attempt(found, 0.0, error, False)
         potential, constant = _potential(known.observation, _precision(prepared, start, inside), rates, values)
         potential, constant = length * potential, length * constant
         offset, split = _offset(potential, values)
         if split:
             return _Attempt(values, 0.0, 0.0, True)
-        matrix = generator(closed, spacing, length * known.covariance, length * known.drift, potential - offset)
+        matrix = window.generator(length * known.covariance, length * known.drift, potential - offset)
         found, error = exponential_action(matrix, values)
         return _Attempt(found, offset + constant, error, False)
     return _magnus(prepared, values, window, start, first, last, inside, rates)
-
-
-def _without_offset(matrix: Array, values: Array) -> tuple[Array, float, float]:
-    found, error = exponential_action(matrix, values)
-    return found, 0.0, error
 
 
 def _magnus(
@@ -213,7 +211,7 @@ def _magnus(
     inside: np.ndarray,
     rates: np.ndarray,
 ) -> _Attempt:
-    """Two exponentials of moments of the coefficients over the substep: the commutator-free Magnus integrator of order four,
+    """Advance a substep by two exponentials: the commutator-free Magnus integrator of order four.
 
         exp(B0 / 2 + 2 B1 / tau) exp(B0 / 2 - 2 B1 / tau),   B0 = int L dt,   B1 = int (t - middle) L dt.
     """
@@ -225,10 +223,13 @@ def _magnus(
     offset, split = _offset(zeroth @ potential, values)
     if split or np.any((early @ covariance).real < 0) or np.any((late @ covariance).real < 0):
         return _Attempt(values, 0.0, 0.0, True)
-    closed, spacing = window.closed, window.spacing
+    if prepared.system.steady:
+        matrix = window.generator(zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset)
+        found, error = exponential_action(matrix, values)
+        return _Attempt(found, offset + zeroth @ constant, error, False)
     shift = np.full(window.size, offset / 2)
     first_half, second_half = (
-        generator(closed, spacing, w @ covariance, w @ drift, w @ potential - shift) for w in (early, late)
+        window.generator(w @ covariance, w @ drift, w @ potential - shift) for w in (early, late)
     )
     total, difference = (first_half + second_half).real, (second_half - first_half).real
     now = values.real
@@ -257,7 +258,7 @@ def _coefficients(
         covariance = np.broadcast_to(known.covariance, (len(times), *np.shape(known.covariance)))
     if not inside.any():
         return drift, covariance, np.zeros((len(times), window.size)), np.zeros(len(times))
-    if system.steady_observation and system.steady_noise:
+    if system.steady_observation and system.steady_noise and system.cross is None:
         h = tables(prepared, window).observation
         value, constant = _potential(h, _precision(prepared, times, inside), rates, values)
         return drift, covariance, np.broadcast_to(value, (len(times), len(value))), np.full(len(times), constant)
@@ -267,7 +268,8 @@ def _coefficients(
         h = np.moveaxis(system.observation(points, times[:, None], theta), -1, 1)
     precision = np.broadcast_to(_precision(prepared, times, inside), (len(times), system.m, system.m))
     potentials, constants = zip(*[_potential(*pair, rates, values) for pair in zip(h, precision, strict=True)], strict=True)
-    return drift, covariance, np.stack(potentials), np.array(constants)
+    found = drift, covariance, np.stack(potentials), np.array(constants)
+    return found if system.cross is None else with_cross_noise(prepared, window, times, rates, h, precision, found)
 
 
 def _precision(prepared: Prepared, times: Any, inside: np.ndarray) -> Array:
@@ -329,6 +331,8 @@ def _panels(
             if inside.any() and not system.steady_noise:
                 noise = system.noise(np.zeros((len(t), 1)), t, theta)[:, inside][..., inside]
                 columns.append(np.linalg.inv(noise).reshape(len(t), -1))
+            if inside.any() and system.cross is not None and not system.steady_cross:
+                columns.append(system.cross(x[:, None], t[:, None], theta).reshape(len(t), -1))
             return finite(np.concatenate(columns, axis=1)) if columns else np.zeros((len(t), 1))
 
         found = panels(coefficients, low - start, length if high == start + length else high - start)

@@ -185,7 +185,8 @@ def kinds_of(prepared: Prepared) -> np.ndarray:
     none = np.full(len(schedule), -1)
     if np.iscomplexobj(prepared.theta) or prepared.lie or (prepared.model.periodic and not system.samples):
         return none
-    splits = system.steady_observation and system.steady_noise and system.curvature is not None and not system.state_dependent
+    splits = system.steady_observation and system.steady_noise and system.curvature is not None
+    splits = splits and not system.state_dependent and system.cross is None
     silent = ~schedule.seen.any(axis=1)
     regular = positive & np.all(schedule.seen == prepared.inside, axis=1)
     if not prepared.gaussian or yau is None:
@@ -194,7 +195,7 @@ def kinds_of(prepared: Prepared) -> np.ndarray:
         if system.samples:
             return np.where(positive & (silent | (not system.general)), FACTOR, -1)
         return np.where(regular, SPLIT, -1) if splits else none
-    if not yau.bare or not yau.steady_gauge:
+    if not yau.unobserved or not yau.steady_gauge:
         return none
     if kernels is None:
         whole = np.zeros(len(schedule), bool)
@@ -290,23 +291,31 @@ def covariance_at(system: System, points: Array, t: Array, theta: Array) -> Arra
     return system.covariance(np.zeros((*np.shape(t), 1)), t, theta)[..., 0, 0]
 
 
+def covariance_between(system: System, window: lw.Window, t: Array, theta: Array) -> Array:
+    """Return G half a spacing below each point of a grid, on the line also above the last one."""
+    ends = np.concatenate([window.points - 0.5 * window.spacing, window.points[-1:] + 0.5 * window.spacing])
+    return covariance_at(system, ends[:-1] if window.closed else ends, t, theta)
+
+
 def _decomposed(prepared: Prepared, window: lw.Window) -> Spectral | None:
     known = tables(prepared, window)
     drift, covariance = known.drift, known.covariance
     system, theta, start = prepared.system, prepared.theta, prepared.model.start
-    if system.moving or system.slope is None or system.spread is None or window.size > lw.LARGEST:
+    if system.moving or system.slope is None or system.spread is None or window.size > lw.LARGEST or system.reflecting:
         return None
     if not (covariance.real > 0).all():
         return None
     points = window.points[:, None]
     nodes = (points + window.spacing * GAUSS_NODES).reshape(-1, 1)
-    slope, spread = system.slope(points, start, theta)[:, 0], 0.0
+    slope, spread, curvature = system.slope(points, start, theta)[:, 0], 0.0, 0.0
     inner = system.drift(nodes, start, theta)[:, 0] / covariance_at(system, nodes[:, 0], start, theta)
     scale = 1.0
     if system.state_dependent:
-        spread, scale = system.spread(points, start, theta)[:, 0], 1.0 / np.sqrt(covariance)
+        spread, curvature = np.moveaxis(system.spread(points, start, theta), -1, 0)
+        scale = 1.0 / np.sqrt(covariance)
+        covariance = covariance_between(system, window, start, theta)
     steps = window.spacing * (inner.reshape(window.size, -1) @ GAUSS_WEIGHTS)
-    potential = 0.5 * ((drift - 0.5 * spread) ** 2 / covariance + slope)
+    potential = 0.5 * ((drift - 0.5 * spread) ** 2 / known.covariance + slope - 0.5 * curvature)
     if not np.isfinite(potential.real).all() or not np.isfinite(steps.real).all():
         return None
     if window.closed and abs(np.sum(steps).real) > 1e-12 * max(1.0, float(np.sum(np.abs(steps.real)))):

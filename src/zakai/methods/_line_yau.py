@@ -35,7 +35,7 @@ class YauLine:
         assert yau is not None
         zero = sp.Integer(0)
         self.affine = yau.slope is not None and model.observation_kind != "samples"
-        self.bare, self.full = yau.bare is not None, yau.full is not None
+        self.unobserved, self.full = yau.unobserved is not None, yau.full is not None
         m = model.m
         slope = yau.slope if self.affine and yau.slope is not None else sp.zeros(m, 1)
         intercept = yau.intercept if self.affine and yau.intercept is not None else sp.zeros(m, 1)
@@ -45,16 +45,17 @@ class YauLine:
                 return [zero, zero, zero]
             return [quadratic.matrix[0, 0], quadratic.linear[0], quadratic.constant]
 
-        own = [yau.form.matrix[0, 0], yau.form.offset[0], model.covariance[0, 0], *numbers(yau.bare)]
+        own = [yau.form.matrix[0, 0], yau.form.offset[0], model.covariance[0, 0], *numbers(yau.unobserved)]
         if model.drift.has(model.t) or model.covariance.has(model.t):
             found = _unexpanded(model, yau)
-            self.bare = self.bare and found is not None
+            self.unobserved = self.unobserved and found is not None
             own = own if found is None else found
-        entries = [*own, *numbers(yau.full), *slope, *intercept, *model.observation_noise]
+        noise = sp.eye(m) if model.observation_kind == "samples" else model.observation_noise
+        entries = [*own, *numbers(yau.full), *slope, *intercept, *noise]
         self.m, self.blocks = m, entries[:9]
         self._numbers = numpy_function(entries, model)
         # Whether the kernel of an interval depends on x - y alone.
-        self.flat = self.bare and all(entry == 0 for entry in (own[0], own[3], own[4], yau.form.potential))
+        self.flat = self.unobserved and all(entry == 0 for entry in (own[0], own[3], own[4], yau.form.potential))
         self.gauged = yau.form.potential != 0
         self.steady_gauge = not sp.sympify(yau.form.potential, strict=True).has(model.t)
         self._potential = numpy_function([yau.form.potential], model, (1,))
@@ -69,10 +70,10 @@ class YauLine:
     def serves(self, inside: np.ndarray, lie: bool) -> bool:
         """Return whether the equation of an interval is linear-quadratic with these coordinates acting inside."""
         if not inside.any():
-            return self.bare
+            return self.unobserved
         if lie:
             return self.full and bool(inside.all())
-        return self.affine and self.bare
+        return self.affine and self.unobserved
 
     def coefficients(self, t: Array, theta: Array, inside: np.ndarray, lie: bool, origin: float) -> Coefficients:
         """Return the coefficients at times (K, T) for x relative to `origin`; the inputs are 1 and the rates of the coordinates.
@@ -82,7 +83,7 @@ class YauLine:
         numbers = np.moveaxis(self._numbers(np.zeros((*t.shape, 1)), t, theta), -1, 0)
         m, whole = self.m, np.asarray(inside.all(axis=1) & lie)[:, None]
         L, l, G = numbers[:3]
-        Q, p, r = (np.where(whole, full, bare) for bare, full in zip(numbers[3:6], numbers[6:9], strict=True))
+        Q, p, r = (np.where(whole, full, unobserved) for unobserved, full in zip(numbers[3:6], numbers[6:9], strict=True))
         l, p, r = l + L * origin, p + 2.0 * Q * origin, r + (p + Q * origin) * origin
         inputs = np.zeros((3, *t.shape, 1 + m), numbers.dtype)
         inputs[:, ..., 0] = l, p, r

@@ -23,6 +23,7 @@ from zakai.errors import InputError
 from zakai.methods import _gaussian_families as families
 from zakai.methods._affine_system import AffineSystem, affine_system_of
 from zakai.methods._gauge import posterior, tilts_at
+from zakai.methods._gauged_density import density_of
 from zakai.methods._protocol import Info
 from zakai.models.model import Model
 from zakai.numerics.complex_step import cholesky, is_complex
@@ -76,8 +77,10 @@ def constants(system: AffineSystem, theta: Array, origin: Array) -> Constants:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """The families of u~, prepared as in the stepwise form, and the flow (K, 11, 2n, 2n + m) of (b, a~, dy/dt) to ten times in
-    each interval and to its end."""
+    """The families of u~, prepared as in the stepwise form, and the flow of (b, a~, dy/dt).
+
+    `maps` (K, 11, 2n, 2n + m) is the flow to ten times in each interval and to its end.
+    """
 
     base: families.Prepared
     constants: Constants
@@ -199,4 +202,4 @@ def density(prepared: Prepared, state: State) -> Density:
     """Return the posterior."""
     base = prepared.base
     sigma = Family(*(array.real for array in _sigma(prepared, state)))
-    return families.density_of(base.model, base.gauge.real(), state.own.time, sigma)
+    return density_of(base.model, base.gauge.real(), state.own.time, sigma)

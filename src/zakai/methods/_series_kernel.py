@@ -56,7 +56,8 @@ class PowerSeries:
         """Return the transitions without inputs, and their errors; each depends on its own interval alone, to the last bit.
 
         Args:
-            starts, lengths: the intervals (K,).
+            starts: start times (K,) of the intervals.
+            lengths: lengths (K,) of the intervals.
             theta: parameters (p,), may be complex.
             origin: point (n,) to which x is relative.
             full: whether -h'S^-1 h / 2 is in the potential.

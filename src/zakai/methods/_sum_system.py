@@ -29,7 +29,9 @@ from zakai.records.schedule import Schedule
 
 
 class Factor(NamedTuple):
-    """The factor of an interval's observations: with h_j = h(x, times_j), log factor(x) is
+    """The factor of an interval's observations.
+
+    With h_j = h(x, times_j), log factor(x) is
 
         at the start  sum_j dy'before_j h_j,
         at the end    sum_j (after_j dy).h_j - (h_j - spread dy)'energy_j (h_j - spread dy) / 2 + offset + dy'weight dy / 2.
@@ -55,7 +57,7 @@ class System:
         n, m = model.n, model.m
         self.n, self.m, self.lie = n, m, splitting == "lie"
         self.sampled = model.observation_kind == "samples"
-        self.affine, self.bare = yau.slope is not None, yau.bare is not None
+        self.affine, self.unobserved = yau.slope is not None, yau.unobserved is not None
         # Whether the increments drive the equation inside an interval.
         self.rates = self.affine and not self.sampled and not self.lie
         # Whether a part of the factor of an increment is at the start of its interval.
@@ -65,7 +67,7 @@ class System:
         self.potential, self.sensors = yau.form.potential, Sensors.of(model)
         centre = sp.Matrix([sp.Rational(float(value)) for value in self.origin])
         blocks = [yau.form.matrix, yau.form.offset + yau.form.matrix * centre, model.covariance]
-        for q in (yau.bare or yau.full, yau.full or yau.bare):
+        for q in (yau.unobserved or yau.full, yau.full or yau.unobserved):
             assert q is not None
             constant = q.constant + (q.linear.T * centre)[0] + (centre.T * q.matrix * centre)[0]
             blocks += [q.matrix, q.linear + 2 * q.matrix * centre, sp.Matrix([constant])]
@@ -122,7 +124,7 @@ class System:
             inside, seen, length = schedule.inside[k], schedule.seen[k], float(schedule.lengths[k])
             whole = bool(inside.all()) and not self.sampled
             early = late = none
-            if (whole and not self.rates) or not (whole or self.bare or self.rates or self.sampled) and length > 0:
+            if (whole and not self.rates) or not (whole or self.unobserved or self.rates or self.sampled) and length > 0:
                 if any(self.sensors.varies):
                     *ends, error = self.sensors.inside(complete, k, np.zeros(self.m), theta, self.probes)
                     worst = max(worst, error)

@@ -149,7 +149,7 @@ def _notes(static: Sum, schedule: Schedule, errors: tuple[float, float]) -> tupl
         notes.append(f"the coefficients vary so fast within an interval that its flow is {known}; give shorter intervals")
     if static.reduction != "split-merge":
         notes.append(f'the reduction "{static.reduction}" has no error figures: its error is not known')
-    elif not static.system.bare and not static.system.sampled and not schedule.inside.all():
+    elif not static.system.unobserved and not static.system.sampled and not schedule.inside.all():
         notes.append(
             "where observations are missing the transition without the observation's potential is not linear-quadratic: its "
             "potential is kept inside and removed again at the end, which is exact only as the intervals shrink"

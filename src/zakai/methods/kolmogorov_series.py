@@ -27,12 +27,11 @@ from zakai.errors import InputError
 from zakai.methods._heat_series import FORMS, heat_series
 from zakai.methods._protocol import Info, Method
 from zakai.methods._residuals import Factor, Sensors
+from zakai.methods._space_system import prior_on_grid
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-from zakai.models.prior import DensityPrior, GaussianPrior
 from zakai.numerics.composed_kernels import SHORTEST, Kernels
 from zakai.numerics.dyadic_grid import SUPPORT, Field, Grid, edge_masses, quadrature_error
-from zakai.numerics.prior_grid import mixture_grid, prior_grid
 from zakai.records.schedule import Schedule
 
 MOST_POINTS = 16384  # of a grid
@@ -140,14 +139,7 @@ def prepare(
 
 def init(prepared: Prepared, prior: Any) -> State:
     """Return the prior on a grid."""
-    model, theta = prepared.system.model, prepared.system.theta
-    if isinstance(prior, DensityPrior):
-        function = numpy_function([prior.log_density], model)
-        found = prior_grid(lambda x: function(x, model.start, theta)[..., 0], 1, source=f"{model.source}: prior: log_density")
-    else:
-        gaussian = isinstance(prior, GaussianPrior)
-        parts = (np.ones(1), prior.mean[None], prior.cov[None]) if gaussian else (prior.weights, prior.means, prior.covs)
-        found = mixture_grid(*parts, source=f"{model.source}: prior")
+    found = prior_on_grid(prepared.system.model, prior, prepared.system.theta, 1e-12, (False,))
     logs = found.log_values
     size = len(logs)
     return State(logs - found.log_mass, float(found.centre[0]), float(found.basis[0, 0]), 0, -(size // 2), -60)
@@ -190,7 +182,7 @@ class Attempt(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """A density after a transition, its relative error, and figures; `lost` is the part of the error that left the grid."""
+    """A density after a transition, its relative error, and figures."""
 
     field: Field
     error: Array
@@ -217,7 +209,7 @@ def _grid_for(prepared: Prepared, field: Field, t: float, attempt: Attempt) -> t
     growth, share = np.exp(rate), np.expm1(rate) / rate if abs(rate) > 1e-9 else 1.0
     spread = 8.5 * np.sqrt(system.G * t * (np.expm1(2 * rate) / (2 * rate) if abs(rate) > 1e-9 else 1.0))
     shift = np.clip(speed * t * share, -3 * (x[last] - x[first] + spread), 3 * (x[last] - x[first] + spread))
-    # The tails at its ends are those of its narrowest feature, or shorter.
+    # The tails at its ends are at most as long as those of its smallest standard deviation.
     tail = 8.5 * growth * spacing * field.cells
     more = np.hypot(tail, spread) - tail
     low = min(x[first], mean + shift - growth * (mean - x[first]) - more) - 3 * spacing

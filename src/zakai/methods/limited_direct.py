@@ -13,10 +13,12 @@ import numpy as np
 from zakai.algebra.theorems import limited_direct
 from zakai.errors import InputError
 from zakai.methods import _line
+from zakai.methods._line_backward import BACKWARD
 from zakai.methods._line_system import State
 from zakai.methods._line_yau import power_series_of, yau_line_of
 from zakai.methods._protocol import Method
 from zakai.methods.yau_yau import BOUNDS, density, init, segment, step, valid
+from zakai.models import features
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior, MixturePrior
 from zakai.records.schedule import Schedule
@@ -93,5 +95,7 @@ METHOD: Method[Any, Any] = Method(
     bounds=BOUNDS,
     shorter="raise the option tolerance (command: --option tolerance=...)",
     valid=valid,
+    handles=features.OF_OBSERVATION | {features.INPUTS, features.JUMPS, features.KINKS, features.SINC, features.TABLES},
     segment=segment,
+    backward=BACKWARD,
 )

@@ -27,12 +27,12 @@ from zakai.densities import GridDensity
 from zakai.errors import ConditionError, InputError
 from zakai.methods._protocol import Info, Method
 from zakai.methods._residuals import Factor, Sensors
+from zakai.methods._space_system import prior_on_grid
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-from zakai.models.prior import DensityPrior, GaussianPrior
+from zakai.models.prior import DensityPrior
 from zakai.numerics import sinc_grid
 from zakai.numerics.complex_step import is_complex
-from zakai.numerics.prior_grid import mixture_grid, prior_grid
 from zakai.numerics.sinc_grid import Field, Generator, moments, resolution_of
 from zakai.records.schedule import Schedule
 
@@ -191,13 +191,7 @@ def prepare(model: Model, schedule: Schedule, theta: Array, *, points: int | Non
 def init(prepared: Prepared, prior: Any) -> State:
     """Return the prior on a grid."""
     model, theta, n = prepared.system.model, prepared.system.theta, prepared.system.n
-    if isinstance(prior, DensityPrior):
-        function = numpy_function([prior.log_density], model)
-        found = prior_grid(lambda x: function(x, model.start, theta)[..., 0], n, source=f"{model.source}: prior: log_density")
-    else:
-        gaussian = isinstance(prior, GaussianPrior)
-        parts = (np.ones(1), prior.mean[None], prior.cov[None]) if gaussian else (prior.weights, prior.means, prior.covs)
-        found = mixture_grid(*parts, source=f"{model.source}: prior")
+    found = prior_on_grid(model, prior, theta, 1e-12, (False,) * n)
     real = found.log_values.real
     held = found.points[real > real.max() + np.log(sinc_grid.SUPPORT)]
     sizes = np.full(n, prepared.points or POINTS[n])
@@ -205,7 +199,7 @@ def init(prepared: Prepared, prior: Any) -> State:
     low = 0.5 * (held.max(axis=0) + held.min(axis=0)) - 0.5 * spacing * (sizes - 1)
     points = Field(np.zeros(tuple(sizes)), low, spacing).points
     if isinstance(prior, DensityPrior):
-        logs = function(points, model.start, theta)[..., 0]
+        logs = numpy_function([prior.log_density], model, ())(points, model.start, theta)
         logs = np.where(np.isnan(logs.real), -np.inf, logs)
     else:
         logs = prior.log_density(points)
@@ -250,7 +244,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
             if part > (PATIENCE if whole else 4 * PATIENCE) and MOST_PARTS * tau < left:
                 break
             if not whole and state.values.shape == before.values.shape and np.array_equal(state.low, before.low):
-                if np.max(np.abs(state.values - before.values)) < STILL:  # what is left changes the mass only
+                if np.max(np.abs(state.values - before.values)) < STILL:  # further terms change the mass only
                     state = state._replace(log_scale=state.log_scale + left / tau * (state.log_scale - before.log_scale))
                     left = 0.0
         late = schedule.seen[k] & ~inside

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from zakai.algebra.theorems import any_smooth_system
-from zakai.methods import _line
+from zakai.methods import _line, _reflecting
+from zakai.methods._line_backward import BACKWARD
 from zakai.methods._line_system import State
 from zakai.methods._protocol import Info, Infos, Method
 from zakai.models import features
@@ -28,6 +29,7 @@ BOUNDS = {
     "without_law": (1e-6, "share of the mass where the law of the observation has no value, as for counts with a negative mean"),
 }
 HANDLES = features.OF_OBSERVATION | {
+    features.CROSS_NOISE,
     features.DOMAIN,
     features.INPUTS,
     features.JUMPS,
@@ -39,9 +41,9 @@ HANDLES = features.OF_OBSERVATION | {
 
 
 def module_of(model: Model) -> Any:
-    """Return the module with `prepare`, `init`, `step`, `density` and `valid` for the model's number of states."""
+    """Return the module with `init`, `step`, `density` and `valid` for the model's number of states and its domain."""
     if model.n == 1:
-        return _line
+        return _reflecting if any(interval.reflecting for interval in model.domain.values()) else _line
     from zakai.methods import _space
 
     return _space
@@ -118,4 +120,5 @@ METHOD: Method[Any, Any] = Method(
     valid=valid,
     handles=HANDLES,
     segment=segment,
+    backward=BACKWARD,
 )

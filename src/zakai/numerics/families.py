@@ -21,8 +21,11 @@ from zakai.numerics.transition import Array, Transition, symmetric, transposed
 
 
 class Family(NamedTuple):
-    """Equation (1): `nodes` s (J, N, k), `log_weights` log |w| and `signs` (J, N); `mean` m (J, n), `cov` P (J, n, n), `response`
-    R (J, n, k), `tilt` rho (J, k), `curvature` Pi (J, k, k), `log_mass` kappa (J,)."""
+    """The arrays of equation (1).
+
+    `nodes` s (J, N, k), `log_weights` log |w| and `signs` (J, N); `mean` m (J, n), `cov` P (J, n, n), `response` R (J, n, k),
+    `tilt` rho (J, k), `curvature` Pi (J, k, k), `log_mass` kappa (J,).
+    """
 
     nodes: Array
     log_weights: Array

@@ -322,7 +322,7 @@ _F, _C = float64, complex128
 def _collocated(
     L: Array, l: Array, G: Array, Q: Array, p: Array, r: Array, lengths: Array, matrix: Array, weights: Array, found: Array
 ) -> None:
-    """Write a, V, k2, b, k1, k0 of each interval, by quadrature of
+    """Write a, V, k2, b, k1, k0 of each interval, by quadrature.
 
     V' = G + 2 (L + Q V) V,   a' = F a,   b' = F b + l + V p,   F = L + 2 Q V,
     k2' = Q a^2,   k1' = (2 Q b + p) a,   k0' = Q b^2 + p b + r + Q V + L.
@@ -395,7 +395,7 @@ def applied(
     found = np.zeros(size, weights.dtype)
     half = 0.5 / variance
     top = 1.0 / np.sqrt(2.0 * np.pi * variance)
-    bend = np.exp(-2.0 * half * spacing * spacing)
+    falloff = np.exp(-2.0 * half * spacing * spacing)
     for j in range(sources.size):
         w = weights[j] * top
         if w == 0:
@@ -410,14 +410,14 @@ def applied(
         for i in range(near, size):
             found[i] += value
             value *= ratio
-            ratio *= bend
+            ratio *= falloff
             if abs(value.real) < 1e-300:
                 break
         value = peak
         ratio = np.exp(-half * (-2.0 * rest * spacing + spacing * spacing))
         for i in range(near - 1, -1, -1):
             value *= ratio
-            ratio *= bend
+            ratio *= falloff
             if abs(value.real) < 1e-300:
                 break
             found[i] += value

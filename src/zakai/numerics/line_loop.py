@@ -208,8 +208,8 @@ def _attempt(
                     rounding += wrapped(now, inner, shift / spacing, time / (spacing * spacing), 8.0 - np.log(cut))
                 else:
                     exponent -= 0.5 * shift * shift / variance
-                    pull, bend = k1 - a * shift / variance, k2 + 0.5 * a * (1.0 - a) / variance
-                    quadratic(early, pull * spacing, bend * spacing**2, scale, True)
+                    pull, square = k1 - a * shift / variance, k2 + 0.5 * a * (1.0 - a) / variance
+                    quadratic(early, pull * spacing, square * spacing**2, scale, True)
                     quadratic(late, shift / variance * spacing, 0.5 * (a - 1.0) / variance * spacing**2, scale, False)
                     noise, end = filtered(now, early, late, time / (spacing * spacing), 8.0 - np.log(cut))
                     rounding, clipped = rounding + noise, max(clipped, end)

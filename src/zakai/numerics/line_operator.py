@@ -44,6 +44,14 @@ def derivatives(size: int, closed: bool) -> tuple[Array, Array]:
     return first, second
 
 
+@lru_cache(maxsize=64)
+def derivative_between(size: int, closed: bool) -> Array:
+    """Return the matrix of d/dx of the interpolant half a spacing below each point, on the line also above the last one."""
+    offset = np.subtract.outer(np.arange(size if closed else size + 1) - 0.5, np.arange(size))
+    sign = np.sin(np.pi * offset)
+    return np.asarray(-0.5 * sign / (size * np.sin(np.pi * offset / size) ** 2) if closed else -sign / (np.pi * offset**2))
+
+
 def generator(closed: bool, spacing: float, covariance: Any, drift: Array, potential: Array | None = None) -> Array:
     """Return L (N, N) for G, one number or (N,), f (N,) and V (N,), or integrals over time of these."""
     size = len(drift)
@@ -100,24 +108,42 @@ def exponential_action(matrix: Array, vector: Array) -> tuple[Array, float]:
         matrix: (N, N), real, or complex with an infinitesimal imaginary part.
         vector: (N,).
     """
-    size = len(vector)
-    if np.iscomplexobj(matrix) != np.iscomplexobj(vector):
-        matrix, vector = matrix.astype(complex), vector.astype(complex)
-    shift = float(np.trace(matrix.real)) / size
-    centred = matrix - shift * np.eye(size)
-    norm = norm_of(centred)
-    if not np.isfinite(norm):
-        return np.full_like(vector, np.nan), np.inf
-    if norm * _DENSE <= size**2:
-        return _taylor(np.ascontiguousarray(centred), np.ascontiguousarray(vector), shift, norm), 1e-16 * (1.0 + norm)
-    squarings = int(np.ceil(np.log2(norm))) + 1
-    powers = min(squarings, 4)
-    transition = exponential(centred * 0.5**squarings) * np.exp(shift * 0.5**squarings)
-    for _ in range(squarings - powers):
-        transition = transition @ transition
-    for _ in range(2**powers):
-        vector = transition @ vector
-    return vector, 1e-16 * 2.0**squarings
+    return Exponential(matrix)(vector)
+
+
+class Exponential:
+    """exp(A) for A (N, N), real, or complex with an infinitesimal imaginary part: it multiplies any number of vectors.
+
+    Of a matrix with a large norm the exponential is computed once, by scaling and squaring; of another one only its products
+    with vectors are.
+    """
+
+    def __init__(self, matrix: Array):
+        size = len(matrix)
+        self.shift = float(np.trace(matrix.real)) / size
+        self.matrix = np.ascontiguousarray(matrix - self.shift * np.eye(size))
+        self.norm = norm_of(self.matrix)
+        self.dense = np.isfinite(self.norm) and self.norm * _DENSE > size**2
+        if self.dense:
+            squarings = int(np.ceil(np.log2(self.norm))) + 1
+            self.powers = min(squarings, 4)
+            self.error = 1e-16 * 2.0**squarings
+            self.matrix = exponential(self.matrix * 0.5**squarings) * np.exp(self.shift * 0.5**squarings)
+            for _ in range(squarings - self.powers):
+                self.matrix = self.matrix @ self.matrix
+
+    def __call__(self, vector: Array) -> tuple[Array, float]:
+        """Return exp(A) vector, and an estimate of its relative rounding error."""
+        matrix = self.matrix
+        if not np.isfinite(self.norm):
+            return np.full_like(vector, np.nan), np.inf
+        if np.iscomplexobj(matrix) != np.iscomplexobj(vector):
+            matrix, vector = matrix.astype(complex), vector.astype(complex)
+        if not self.dense:
+            return _taylor(matrix, np.ascontiguousarray(vector), self.shift, self.norm), 1e-16 * (1.0 + self.norm)
+        for _ in range(2**self.powers):
+            vector = matrix @ vector
+        return vector, self.error
 
 
 def exponential(matrix: Array) -> Array:
@@ -138,26 +164,33 @@ _INVERSE_FACTORIALS = 1.0 / np.cumprod(np.concatenate([[1.0], np.arange(1.0, 16.
 
 
 class Spectral:
-    """exp(tau L) for every tau where L is similar to a symmetric operator: u = s v with s'/s = (f - G'/2) / G,
+    """The operators exp(tau L), for every tau, where L is similar to a symmetric operator.
 
-        v_t = (G v')' / 2 - ((f - G'/2)^2 / G + f') / 2 v = -H v,      exp(tau L) = s U exp(-tau lambda) U' / s.
+    With u = s v and s'/s = (f - G'/2) / G,
+
+        v_t = (G v')' / 2 - ((f - G'/2)^2 / G + f' - G''/2) / 2 v = -H v,      exp(tau L) = s U exp(-tau lambda) U' / s.
     """
 
     def __init__(self, closed: bool, spacing: float, covariance: Any, potential: Array, gauge: Array, scale: Any = 1.0):
         """Decompose H.
 
-        With the second derivative D, (G v')' is (G D + D G) v / 2 - G'' v / 2, and the two terms of G'' cancel.
+        Of a G that depends on the state, -(G v')' is D' G D v with the derivative D of the interpolant between the points: no
+        eigenvalue lies below the least value of the potential, however much G varies.
 
         Args:
-            covariance: G, one number or (N,).
-            potential: ((f - G'/2)^2 / G + f') / 2 at the points (N,).
+            covariance: G, one number, or its values between the points: (N + 1,) half a spacing below and above each, (N,) below
+                each on the circle.
+            potential: ((f - G'/2)^2 / G + f' - G''/2) / 2 at the points (N,).
             gauge: int f / G (N,).
             scale: G^(-1/2) where G depends on the state.
         """
         size = len(potential)
-        second = derivatives(size, closed)[1] / (1.0 if closed else spacing) ** 2
-        columns = second * covariance
-        operator = -0.25 * (columns + columns.T) + np.diag(potential)
+        unit = 1.0 if closed else spacing
+        if np.ndim(covariance) == 0:
+            operator = -0.5 * covariance * derivatives(size, closed)[1] / unit**2 + np.diag(potential)
+        else:
+            slope = derivative_between(size, closed) / unit
+            operator = 0.5 * (slope.T * covariance) @ slope + np.diag(potential)
         self.rates, self.modes = np.linalg.eigh(operator.real)
         self.change = self.modes.T @ operator.imag @ self.modes if np.iscomplexobj(operator) else None
         self.scale = np.exp(gauge - gauge.real.max()) * scale

@@ -35,7 +35,7 @@ def residual(
     size, G = values.size, covariance
     mass, mean, variance = moments(values)
     mean, variance = mean + size // 2, variance * spacing * spacing
-    third = third_square = bent = upward = flow = seen = moving = 0.0
+    third = third_square = fourth_power = upward = flow = seen = moving = 0.0
     twice_mean = twice_square = four_mean = four_square = 0.0
     # b, L b, ..., L^4 b, L the backward operator by differences.
     powers = np.zeros((5, size))
@@ -43,8 +43,8 @@ def residual(
     for i in range(1, 4):
         for j in range(i + 1, size - i - 1):
             rise = (powers[i, j + 1] - powers[i, j - 1]) / (2.0 * spacing)
-            bend = (powers[i, j + 1] - 2.0 * powers[i, j] + powers[i, j - 1]) / (spacing * spacing)
-            powers[i + 1, j] = drift[j] * rise + 0.5 * G * bend
+            second_difference = (powers[i, j + 1] - 2.0 * powers[i, j] + powers[i, j - 1]) / (spacing * spacing)
+            powers[i + 1, j] = drift[j] * rise + 0.5 * G * second_difference
     for j in range(4, size - 4):
         p = values[j] / mass
         if p < 1e-12:
@@ -53,7 +53,7 @@ def residual(
         part = G * G * first[j] * first[j] * second[j]
         third += p * part
         third_square += p * part * part
-        bent += p * (G * second[j]) ** 4
+        fourth_power += p * (G * second[j]) ** 4
         moving += p * (change[j] * first[j] + 0.5 * acceleration * second[j]) ** 2
         upward += p * G * ((powers[1, j + 1] - powers[1, j - 1]) / (2.0 * spacing)) ** 2
         twice_mean += p * powers[2, j]
@@ -65,7 +65,7 @@ def residual(
         return np.inf
     growth, turning = G / variance, abs(flow) / variance
     spread = np.sqrt(max(third_square - third * third, 0.0))
-    curved = np.sqrt(bent)
+    curved = np.sqrt(fourth_power)
     twice = np.sqrt(max(twice_square - twice_mean * twice_mean, 0.0))
     four = np.sqrt(max(four_square - four_mean * four_mean, 0.0))
     commutator = twice + 2.0 * np.sqrt(upward * growth) + growth * np.sqrt(2.0 * curved)

@@ -146,9 +146,9 @@ def taps_of(variance: float, depth: float, most: int) -> Array:
 def filtered(now: Array, before: Array, after: Array, variance: float, depth: float) -> tuple[float, float]:
     """Replace values by after times the convolution of before values with a Gaussian.
 
-    The filter is short, so that the rounding of a value is relative to values nearby.  For a narrow kernel, values beyond the
-    first that are rounding become zero.  Returns the rounding error relative to the sum, and the value at the ends of what was
-    kept relative to the maximum, zero if all was kept.
+    The filter is short, so that the rounding of a value is relative to values nearby.  A narrow kernel has negative parts: values
+    that are rounding become zero, each by itself, because a mode may lie beyond them.  Returns the rounding error relative to the
+    sum, and the largest value that may have become zero relative to the maximum.
     """
     taps, size = taps_of(variance, depth, now.size), now.size
     count = 1 + min(size, taps.size) // 2 * 2
@@ -168,28 +168,18 @@ def filtered(now: Array, before: Array, after: Array, variance: float, depth: fl
             near, far = abs(near), abs(far)
             for j in range(size):
                 moduli[j] += near * (below[j] + above[j]) + far * (lower[j] + higher[j])
-    left, right = 0, size - 1
-    if variance < WIDE:
-        middle = int(np.argmax(now))
-        left, right = middle, middle
-        while left > 0 and now[left - 1] > 1e-12 * moduli[left - 1]:
-            left -= 1
-        while right < size - 1 and now[right + 1] > 1e-12 * moduli[right + 1]:
-            right += 1
-    now[:left], now[right + 1 :] = 0.0, 0.0
-    total, top, noise, end = 0.0, 0.0, 0.0, 0.0
-    for j in range(left, right + 1):
+    total, top, noise, lost = 0.0, 0.0, 0.0, 0.0
+    for j in range(size):
+        if variance < WIDE and not now[j] > 1e-12 * moduli[j]:
+            now[j] = 0.0
+            lost = max(lost, 1e-12 * moduli[j] * after[j])
         now[j] *= after[j]
         noise += 4e-16 * moduli[j] * after[j]
         total += now[j]
         top = max(top, now[j])
     if not (0.0 < total < np.inf):
         return np.inf, 1.0
-    if left > 0:
-        end = now[left]
-    if right < size - 1:
-        end = max(end, now[right])
-    return 2e-15 + noise / total, end / top
+    return 2e-15 + noise / total, lost / top
 
 
 @kernel(float64(_V, _V, float64, float64, float64))

@@ -16,6 +16,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
+from zakai.numerics.line_operator import generator
 
 Array = NDArray[Any]
 
@@ -51,6 +52,10 @@ class Window(NamedTuple):
         """The points (size,)."""
         return self.origin + self.offsets
 
+    def generator(self, covariance: Any, drift: Array, potential: Array | None = None) -> Array:
+        """Return the Kolmogorov operator L (size, size) for G, f and V at the points, or integrals over time of these."""
+        return generator(self.closed, self.spacing, covariance, drift, potential)
+
 
 @lru_cache(maxsize=64)
 def index(size: int) -> Array:
@@ -85,7 +90,7 @@ class Figures(NamedTuple):
     """What decisions about a density are made of.
 
     `left` and `right` are the largest moduli of the two outermost points on each side, relative to the maximum; `first` and
-    `last` the support; `negative` the negative share of the mass; `aliasing` the largest spectrum in the highest eighth of the
+    `last` the support; the negative share of the mass; `aliasing` the largest spectrum in the highest eighth of the
     frequencies, relative to the mass; `rough` tells that the spectrum falls like a power of the frequency, as that of kinks does,
     or not at all, as that of noise; `resolving` is the spacing that is needed, in spacings.
     """

@@ -159,8 +159,13 @@ def mixture_grid(
     """Return a grid for a mixture of Gaussians (one Gaussian: k = 1), wrapped where periodic.
 
     Args:
-        weights, means, covs: (k,), (k, n), (k, n, n).
-        periodic, tolerance, aligned, source: as for `prior_grid`.
+        weights: (k,).
+        means: (k, n).
+        covs: (k, n, n).
+        periodic: as for `prior_grid`.
+        tolerance: as for `prior_grid`.
+        aligned: as for `prior_grid`.
+        source: as for `prior_grid`.
 
     Raises:
         InputError: a variance is zero, relative to the square of the mean and the other variances.

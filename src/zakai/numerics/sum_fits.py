@@ -1,4 +1,4 @@
-"""Two ways to fit a Gaussian sum anew, kept for comparison: the papers' Algorithm 1, and non-negative least squares.
+"""Two ways to fit a Gaussian sum again, kept for comparison: the papers' Algorithm 1, and non-negative least squares.
 
 Algorithm 1 fits a Gaussian to each peak of a density, then to the negative peaks of the residual.  A peak below alpha times the
 maximum is not fitted: what lies there is deleted, and a filter cannot get it back.

@@ -1,0 +1,60 @@
+"""`limited-direct` with laws of samples, inputs and tables in h: the transition is exact, a sample is a factor at its time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zakai
+from methods.test_line_features import LAWS, TIMES, dense, error, model_of, normal, samples
+from zakai.algebra.theorems import conditions_of
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_laws_of_samples_are_those_of_dense_bayes(name):
+    keys, values, law = LAWS[name]
+    result = zakai.filter(model_of("-0.8*x", **keys), samples(TIMES, values), method="limited-direct")
+    x = np.linspace(-5, 5, 601) if name.startswith("noise") else np.linspace(-6, 6, 241)
+    lengths = np.diff(np.concatenate([[0.0], TIMES]))
+    expected = dense(x, -0.8 * x, np.ones(len(x)), [law(z) for z in values], lengths, normal(0.2, 0.5))
+    assert error(result, expected) < 1e-6
+    assert not result.warnings
+
+
+def test_inputs_of_the_observation():
+    """z = x^3 + u: the input moves each sample."""
+    values, u = np.array([0.3, -0.6, 0.02, 0.7, -0.4, 0.9, 0.0]), np.array([1.0, -2.0, 3.0, 0.0, 2.0, -1.0, 0.5])
+    keys = {"observation_noise": [["0.1"]]}
+    moved = zakai.filter(
+        model_of("-x", "x**3 + u", inputs=["u"], **keys), samples(TIMES, values + u, zakai.Inputs([0.0, *TIMES], [0.0, *u])),
+        "limited-direct",
+    )  # fmt: skip
+    plain = zakai.filter(model_of("-x", "x**3", **keys), samples(TIMES, values), "limited-direct")
+    assert moved.mean == pytest.approx(plain.mean, abs=1e-9)
+    assert moved.log_likelihood == pytest.approx(plain.log_likelihood, abs=1e-8)
+
+
+def test_tables_and_kinks_of_the_observation():
+    points = np.linspace(-6, 6, 13)
+    table = {"sensor": {"x": points.tolist(), "values": (points + 0.5 * np.abs(points)).tolist(), "kind": "linear"}}
+    values, keys = [0.3, -0.6, 0.02, 0.7, -0.4, 0.9, 0.0], {"observation_noise": [["0.1"]]}
+    tabulated = zakai.filter(model_of("-x", "sensor(x)", tables=table, **keys), samples(TIMES, values), "limited-direct")
+    kinked = zakai.filter(model_of("-x", "max(1.5*x, 0.5*x)", **keys), samples(TIMES, values), "limited-direct")
+    assert tabulated.mean == pytest.approx(kinked.mean, abs=1e-9)
+    x = np.linspace(-5, 5, 401)
+    likelihoods = [lambda x, z=z: normal(x + 0.5 * np.abs(x), 0.1)(z) for z in values]
+    lengths = np.diff(np.concatenate([[0.0], TIMES]))
+    assert error(kinked, dense(x, -x, np.ones(len(x)), likelihoods, lengths, normal(0.2, 0.5))) < 1e-3
+
+
+REFUSED = {
+    "an input in f": {"drift": "-x + u", "inputs": ["u"]},
+    "a table in f": {"drift": "-x + bump(x)", "tables": {"bump": {"x": [-1.0, 0.0, 1.0], "values": [0.0, 1.0, 0.0]}}},
+    "increments": {"observation": "min(x, 1)", "observation_kind": "increments"},
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_does_not_hold_is_refused(name):
+    failed = [condition for condition in conditions_of("limited-direct", model_of(**REFUSED[name])) if condition.holds is False]
+    assert len(failed) == 1
