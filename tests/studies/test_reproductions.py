@@ -7,11 +7,12 @@ import json
 import numpy as np
 import pytest
 
+import zakai
 from zakai import studies
 from zakai.errors import InputError
 from zakai.studies import _published as published
+from zakai.studies import al_jarrah_2024, dong_chen_yau_2021, heng_doob, lorenz_63_sakov_2012, survey, yau_1993
 from zakai.studies import cubic_sensor as cubic
-from zakai.studies import dong_chen_yau_2021, lorenz_63_sakov_2012, survey, yau_1993
 from zakai.studies._reference_density import conditional_densities, crank_nicolson
 
 PNG, PDF = b"\x89PNG", b"%PDF"
@@ -64,7 +65,7 @@ def test_wrong_names_options_and_folders_are_said(tmp_path):
     wrong = {
         "chen-luo-yau-2017": {"settings": "all"}, "cubic-sensor": {"paths": 0}, "yau-1993": {"order": 9},
         "hu-yau-2002": {"forms": 2.5}, "survey": {"methods": 0}, "dong-chen-yau-2021": {"largest": True},
-        "lorenz-63-sakov-2012": {"observations": 64},
+        "lorenz-63-sakov-2012": {"observations": 64}, "heng-doob": {"observations": 1}, "al-jarrah-2024": {"largest": 11},
     }  # fmt: skip
     assert tuple(wrong) == studies.names()
     for name, options in wrong.items():
@@ -196,3 +197,32 @@ def test_equation_6_of_theorem_6_has_a_factor_one_half_too_much():
     means = kalman_bucy(increments, 0.1, -1.0, 1.0, 0.5)[0]
     np.testing.assert_allclose(yau_1993.statistics_mean(times, increments, 1.0, 0.5, 1.0), means, rtol=0, atol=1e-8)
     assert np.abs(yau_1993.statistics_mean(times, increments, 1.0, 0.5, 0.5) - means).max() > 1e-3
+
+
+def test_the_bootstrap_filter_of_the_cell_model_gives_the_evidence_of_one_observation():
+    """Without noise every particle follows the solution of the differential equation from near the start."""
+    short = heng_doob.bootstrap(zakai.Record([1.0], np.array([[1.2, 1.1]]), "samples"), 1e-12, 4, 3, 1)
+    path = np.array([1.0, 1.0])
+    for _ in range(50):
+        power = path**4
+        path = path + heng_doob.EULER * (power / (0.0625 + power) + 0.0625 / (0.0625 + power[::-1]) - path)
+    expected = -0.5 * np.sum((np.array([1.2, 1.1]) - path) ** 2) / heng_doob.NOISE**2 - np.log(2 * np.pi * heng_doob.NOISE**2)
+    assert np.allclose(short, expected, atol=0.2)
+
+
+def test_the_discrepancy_of_two_shifted_gaussians_is_that_of_the_formula():
+    rng = np.random.default_rng(0)
+    a, b = rng.standard_normal((4000, 2)), rng.standard_normal((4000, 2)) + [2.0, 0.0]
+    width = al_jarrah_2024.WIDTH / 2  # exp(-d^2 / 2 width); the difference of two draws has variance 2
+    factor = width / (width + 2)
+    expected = np.sqrt(2 * factor * (1 - np.exp(-0.5 * 4.0 / (width + 2))))
+    assert al_jarrah_2024.discrepancy(a, b) == pytest.approx(expected, rel=0.05)
+
+
+def test_the_posterior_of_the_bimodal_problem_is_symmetric_and_has_two_modes():
+    weights = al_jarrah_2024.posterior(np.array([[1.0, 0.0]] * 3))
+    assert np.allclose(weights, weights[::-1]) and np.allclose(weights.sum(axis=0), 1.0)
+    assert abs(abs(al_jarrah_2024.AXIS[np.argmax(weights[:, 0])]) - 1.0) < 0.05
+    assert weights[600, 0] < 0.05 * weights[:, 0].max() and weights[600, 1] > 0.9 * weights[:, 1].max()
+    draws = al_jarrah_2024.drawn(weights, 2000, np.random.default_rng(1))
+    assert abs(np.mean(draws[:, 0] > 0) - 0.5) < 0.05

@@ -38,6 +38,20 @@ def test_an_ensemble_follows_lorenz_better_than_its_readings(tmp_path, monkeypat
     assert (tmp_path / "errors.png").exists() and (tmp_path / "first-record.png").exists()
 
 
+def test_the_log_likelihood_of_the_cell_model_is_near_that_of_particles(tmp_path):
+    found = studies.reproduce("heng-doob", tmp_path, observations=3, particles=2000, repeats=20)
+    assert verdicts(found).count("agrees") == 2
+    assert all(abs(row[5]) < 4 * row[4] for row in found.tables[0].rows)
+    assert (tmp_path / "log-likelihoods.png").exists()
+
+
+def test_blocks_give_the_posterior_of_the_bimodal_problem(tmp_path):
+    found = studies.reproduce("al-jarrah-2024", tmp_path, largest=4, records=2, samples=400)
+    assert "agrees" in verdicts(found)
+    assert all(row[1] < 2 * row[3] < row[4] for row in found.tables[0].rows)
+    assert (tmp_path / "discrepancies.png").exists()
+
+
 def test_every_filter_and_theorem_that_is_left(tmp_path):
     short = studies.reproduce("cubic-sensor", paths=2, steps=100)
     assert [row[0] for row in short.tables[0].rows] == [*cubic_sensor.FILTERS, cubic_sensor.REFERENCE]

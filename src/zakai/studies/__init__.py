@@ -16,6 +16,7 @@ _STUDIES = {
     name: f"zakai.studies.{name.replace('-', '_')}"
     for name in (
         "chen-luo-yau-2017", "cubic-sensor", "yau-1993", "hu-yau-2002", "survey", "dong-chen-yau-2021", "lorenz-63-sakov-2012",
+        "heng-doob", "al-jarrah-2024",
     )
 }  # fmt: skip
 
@@ -40,7 +41,6 @@ def reproduce(
     Raises InputError for another name or option, a folder that cannot be made, or pictures without matplotlib.
 
     Example:
-
         figures = reproduce("chen-luo-yau-2017", "chen-luo-yau-2017", paths=20)
     """
     if name not in _STUDIES:

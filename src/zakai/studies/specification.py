@@ -22,8 +22,9 @@ from zakai.engine.results import versions
 from zakai.errors import ConditionError, InputError
 from zakai.models import _entries
 from zakai.models._errors import did_you_mean, echo, listing, named
+from zakai.models._text import read_text
 from zakai.models.clock import clock
-from zakai.models.files import load_model, read_keys, read_text
+from zakai.models.files import load_model, read_keys
 from zakai.models.model import Model
 from zakai.records import Inputs, Record, read_inputs, read_record, read_truth
 from zakai.records.writing import shown

@@ -55,7 +55,6 @@ def run_study(
     does not hold for a model.
 
     Example:
-
         outcome = run_study("three-filters.toml", "three-filters")
         outcome.summary["points"][0]["methods"]["kalman-bucy"]["squared_error"]["mean"]
     """
