@@ -19,7 +19,7 @@ def test_what_is_connected_stays_together():
     diffusion = np.eye(7).tolist()
     diffusion[1][4] = 0.5  # b has noise in common with e
     noise = np.eye(3).tolist()
-    noise[0][1] = noise[1][0] = 0.5  # the readings of a and f share noise
+    noise[0][1] = noise[1][0] = 0.5  # the observations of a and f share noise
     observation = ["a", "f", "c"]
     model = zakai.Model(state=states, drift=drift, diffusion=diffusion, observation=observation, observation_noise=noise)
     assert names(model) == [("a", "f"), ("b", "e"), ("c", "d"), ("g",)]

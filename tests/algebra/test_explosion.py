@@ -1,4 +1,4 @@
-"""Drifts that take states to infinity in a finite time are told from those that only grow or fall."""
+"""Drifts that take states to infinity in a finite time are distinguished from those that only grow or decay."""
 
 import json
 import math

@@ -95,8 +95,8 @@ def test_blocks_with_the_same_formulas_share_one_model():
 def test_a_named_method_is_taken_for_the_whole_where_it_holds():
     model = system({"kind": "gaussian", "mean": [0, 0, 0], "cov": [1, 1, 1]})
     assert divided(model, model.prior) is None and divided(model, model.prior, "kalman-bucy") is None
-    bent = system(None, observation=["x**2", "y**2", "z**2"], drift=["0"] * 3, observation_kind="samples")
-    assert divided(bent, bent.prior).method == "blocks: 3 x limited-direct"
+    curved = system(None, observation=["x**2", "y**2", "z**2"], drift=["0"] * 3, observation_kind="samples")
+    assert divided(curved, curved.prior).method == "blocks: 3 x limited-direct"
     five = zakai.Model(
         state=list("abcde"), drift=["0"] * 5, observation=[f"sin({s})" for s in "abcde"], observation_kind="samples"
     )

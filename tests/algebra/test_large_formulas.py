@@ -1,4 +1,4 @@
-"""Short formulas whose expansions, integrals or values are without end: a stranger's file may hold them."""
+"""Short formulas whose expansions, integrals or values are unbounded: an untrusted file may hold them."""
 
 import pytest
 import sympy as sp

@@ -1,0 +1,1 @@
+"""Exact decisions about a model: which theorem holds, and the certificate of it."""

@@ -8,13 +8,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import sympy as sp
 
+from zakai import _display
 from zakai.algebra import _json, _page
 from zakai.algebra.blocks import Block, blocks
 from zakai.algebra.choice import Division, divided, recommended
-from zakai.algebra.conditions import Condition
+from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
 from zakai.algebra.explosion import Explosion, explosion
 from zakai.algebra.observed_block import ObservedBlock, observed_block
@@ -33,7 +35,7 @@ from zakai.algebra.yau import eta as wong_eta
 from zakai.models.model import Model
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Analysis:
     """What the equations of a model say.
 
@@ -89,8 +91,34 @@ class Analysis:
         """A state that the drift takes to infinity in a finite time."""
         return explosion(self.model)
 
+    def __repr__(self) -> str:
+        holding = [name for name, conditions in self.methods.items() if all_hold(conditions) is True]
+        said = f"recommended {self.recommended}, {', '.join(holding) or 'no method'} holding"
+        return f"Analysis({self.model.name!r}, state {_display.short_names(self.model.state)}: {said})"
+
     def __str__(self) -> str:
         return _page.text(self)
+
+    def _repr_html_(self) -> str:
+        words = {True: "holds", False: "does not hold", None: "undecided"}
+        rows = [(name, words[all_hold(conditions)], _first_failure(conditions)) for name, conditions in self.methods.items()]
+        return _display.html_table(repr(self), ("method", "", "because"), rows)
+
+    def plot(self, *, ax: Any = None) -> Any:
+        """Draw which state enters which equation of drift and observation, linearly or not.
+
+        Args:
+            ax: the Matplotlib Axes to draw in; a new figure without it.
+
+        Returns:
+            The Matplotlib Axes.
+
+        Raises:
+            InputError: Matplotlib is not installed (extra `plots`).
+        """
+        from zakai.report.axes import draw_structure
+
+        return draw_structure(self, ax)
 
     def to_latex(self) -> str:
         """The equations, Omega, eta, the Yau form, q and the algebra as LaTeX displays (amsmath), and a table of the methods."""
@@ -102,13 +130,20 @@ class Analysis:
 
 
 def analyze(model: Model) -> Analysis:
-    """Decide, from the equations alone, which methods hold for a system and why.
+    """Decide from the equations which methods hold for a system, and why.
 
-    `model` needs no prior, and may have undetermined functions.  Nothing numerical is run.  What can be neither
-    proved nor refuted is undecided, and said so.
+    No record is filtered. An assumption that can be neither proved nor refuted is reported as undecided.
 
-    Source: Wong (1987) for Omega and eta; the source of every assumption stands beside it.
+    Args:
+        model: the system; it needs no prior and may have undetermined functions.
 
+    Returns:
+        The analysis: Omega, eta, the Yau form, and the conditions of every method.
+
+    References:
+        Wong 1987 for Omega and eta. Each condition names the source of its assumption.
+
+    Example:
         >>> print(zakai.analyze(zakai.load_model("gallery:benes")).yau_form.potential)
         log(cosh(x))
     """
@@ -127,6 +162,12 @@ def analyze(model: Model) -> Analysis:
     )
 
 
+def _first_failure(conditions: tuple[Condition, ...]) -> str:
+    """Return the first condition that does not hold, else the first undecided one."""
+    listed = sorted((one for one in conditions if one.holds is not True), key=lambda one: one.holds is None)
+    return listed[0].statement if listed else ""
+
+
 def _q(model: Model, form: YauForm) -> sp.Expr:
     q = q_without_observation(model, form)
     return _shortest(q if model.observation_kind == "samples" else q + observation_energy(model), model)
@@ -138,4 +179,3 @@ def _shortest(expression: sp.Expr, model: Model) -> sp.Expr:
     if quadratic is not None:
         return quadratic_expression(quadratic, model.x)
     return tidy_state(expression, model.x)
-

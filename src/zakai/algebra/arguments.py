@@ -36,15 +36,15 @@ def argument_basis(arguments: Sequence[sp.Expr], x: Sequence[sp.Symbol], kind: s
     monomials = sorted({m for p in polynomials for m in p.monoms()}, reverse=True)
     rows = [[p.coeff_monomial(m) for m in monomials] for p in polynomials]
     scale = lcm(*(int(sp.Rational(c).q) for row in rows for c in row))
-    lattice = fmpz_mat([[int(c * scale) for c in row] for row in rows])
-    reduced = lattice.hnf()
+    integers = fmpz_mat([[int(c * scale) for c in row] for row in rows])
+    reduced = integers.hnf()
     basis = [[int(c) for c in row] for row in reduced.tolist() if any(row)]
     moving = [j for j, m in enumerate(monomials) if any(m[: len(x)])]
     if fmpz_mat([[row[j] for j in moving] for row in basis]).rank() < len(basis):
         raise Unreadable(f"arguments of {kind} differ by a constant, whose function is an irrational factor")
     pivots = [next(j for j, c in enumerate(row) if c) for row in basis]
     coordinates = []
-    for row in lattice.tolist():
+    for row in integers.tolist():
         left, found = [int(c) for c in row], []
         for vector, pivot in zip(basis, pivots):
             times = left[pivot] // vector[pivot]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from zakai._registry import AUTO
+from zakai.algebra.advice import nearest, what_to_do
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.independent import IndependentBlock, independent_blocks
 from zakai.algebra.theorems import conditions_of
@@ -18,14 +19,14 @@ from zakai.models.prior import GaussianPrior
 Conditions = tuple[Condition, ...]
 # A linear system of so few states is one Kalman-Bucy filter, though it may fall into blocks.
 FEW = 8
-# Beyond so many states a system that falls into blocks is not looked at as a whole.
+# A system of independent blocks with more states than this is not analysed as a whole.
 MANY = 32
 _SHOWN = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Division:
-    """A system block by block: of each shared model the name of its method, and the conditions of all that were looked at."""
+    """A system block by block: of each shared model the name of its method, and the conditions of all that were checked."""
 
     blocks: tuple[IndependentBlock, ...]
     methods: Mapping[Model, str]
@@ -50,27 +51,27 @@ class Division:
 
 
 def chosen(model: Model, method: str) -> tuple[str, str, Mapping[str, Conditions]]:
-    """The method of that name, or for "auto" the first that holds; why; and the conditions of all that were looked at.
+    """Return the method of that name, or for "auto" the first that holds; the reason; and all conditions that were checked.
 
-    Raises ConditionError, with what fails, if it does not hold, or none does.
+    Raises:
+        ConditionError: the method does not hold, or none does; the message names the assumption that fails.
     """
     if method != "auto":
         conditions = conditions_of(method, model)
         if all_hold(conditions) is not True:
-            raise ConditionError(f"{model.source}: {method} does not hold: {failure(conditions)}")
+            advice = what_to_do(model, method)
+            raise ConditionError(f"{model.source}: {method} does not hold: {failure(conditions)}\n{advice}")
         return method, "asked for by name, and every assumption of its theorem holds", {method: conditions}
     considered: dict[str, Conditions] = {}
     for name in AUTO:
         considered[name] = conditions_of(name, model)
         if all_hold(considered[name]) is True:
             return name, "the first method whose every assumption holds for this system", considered
-    by_reason: dict[str, list[str]] = {}
-    for name, conditions in considered.items():
-        by_reason.setdefault(failure(conditions), []).append(name)
-    reasons = "; ".join(f"{', '.join(names)}: {reason}" for reason, names in by_reason.items())
-    named = all_hold(conditions_of("extended-kalman-bucy", model)) is True
-    hint = "; if it is named, `extended-kalman-bucy` approximates any smooth system" if named else ""
-    raise ConditionError(f"{model.source}: no method holds for this system ({reasons}){hint}")
+    name = nearest(considered)
+    reason = failure(considered[name])
+    raise ConditionError(
+        f"{model.source}: no method holds for this system; the nearest is {name}: {reason}\n{what_to_do(model, method)}"
+    )
 
 
 def divided(model: Model, prior: Any, method: str = "auto", by_value: bool = True) -> Division | None:
@@ -97,8 +98,8 @@ def divided(model: Model, prior: Any, method: str = "auto", by_value: bool = Tru
         except ConditionError as error:
             if method == "auto" or model.n > MANY:
                 raise
-            whole = failure(conditions_of(method, model))
-            raise ConditionError(f"{model.source}: {method} does not hold: {whole}; nor block by block: {error}") from None
+            whole, first = failure(conditions_of(method, model)), str(error).splitlines()[0]
+            raise ConditionError(f"{model.source}: {method} does not hold: {whole}; nor block by block: {first}") from None
     return Division(blocks, methods, conditions, method != "auto")
 
 

@@ -1,4 +1,4 @@
-"""The Lie algebra that L_0 and h_1, ..., h_m generate: closed under brackets, or explored as far as a budget goes.
+"""The Lie algebra that L_0 and h_1, ..., h_m generate: closed under brackets, or explored within a budget.
 
 Left-normed brackets [g_1, [g_2, ... [g_k-1, g_k]]] of generators span the algebra, so that only new elements are bracketed,
 and only with the generators; such a bracket is named by its word (1, ..., k), L_0 being 0.  The words of one length are all

@@ -21,10 +21,17 @@ from zakai.models.model import Model
 
 
 class DmzOperators:
-    """`L0`, `f` (n), `h` and `driven` = S^-1 h (m), `covariance` G (n, n), `g` (n) or None, `eta` or None and `omega` of a model
-    as elements of `ring`.
+    """The operators of the Zakai equation of a model, as elements of `ring`.
 
-    `values` are numbers for parameters, the others stay symbols; raises Unreadable.
+    `L0`, `f` (n), `h` and `driven` = S^-1 h (m), `covariance` G (n, n), `g` (n) or None, `eta` or None and `omega`.
+
+    Args:
+        model: the system.
+        values: numbers for parameters; the other parameters stay symbols.
+        jets: the order up to which derivatives of undetermined functions are elements of the ring.
+
+    Raises:
+        Unreadable: a coefficient is not an element of such a ring.
     """
 
     def __init__(self, model: Model, values: Mapping[sp.Symbol, sp.Expr], jets: int = 6):

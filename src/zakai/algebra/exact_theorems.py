@@ -86,10 +86,12 @@ def _yau_conditions(model: Model, source: str, covariance: str) -> tuple[Conditi
     statement = f"f = L(t) x + l(t) + {covariance}(t) grad phi(t, x)"
     if affine_parts(model.drift, model.x) is not None:
         return first, observed, Condition(statement, True, "f is affine, phi = 0", source)
-    definite = definite_covariance(model)
     form = cached_yau_form(model)
     if isinstance(form, NoYauForm):
-        return first, observed, definite, Condition(statement, form.holds, form.evidence, source)
+        # With inputs in G there is no Yau form, and no number to decide whether G is definite.
+        known = () if model.covariance.free_symbols & set(model.u) else (definite_covariance(model),)
+        return first, observed, *known, Condition(statement, form.holds, form.evidence, source)
+    definite = definite_covariance(model)
     system = affine_system(model)
     assert system is not None
     _, _, holds, evidence = system
@@ -100,8 +102,8 @@ def _yau_conditions(model: Model, source: str, covariance: str) -> tuple[Conditi
 
 def _affine(statement: str, field: sp.MatrixBase, model: Model, source: str) -> Condition:
     parts = affine_observation(model) if field is model.observation else affine_parts(field, model.x)
-    bent = next((entry for entry in field if affine_parts(sp.Matrix([entry]), model.x) is None), None)
-    evidence = "affine" if parts is not None else f"{short(str(bent))} is not affine in {', '.join(map(str, model.x))}"
+    curved = next((entry for entry in field if affine_parts(sp.Matrix([entry]), model.x) is None), None)
+    evidence = "affine" if parts is not None else f"{short(str(curved))} is not affine in {', '.join(map(str, model.x))}"
     return Condition(statement, parts is not None, evidence, source)
 
 

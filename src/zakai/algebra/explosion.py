@@ -33,7 +33,7 @@ class Explosion:
         start = ", ".join(f"{value:.3g}" for value in self.start)
         return (
             f"the drift alone takes x = ({start}) to infinity within t = {self.time:.2g}: where the noise reaches such states, "
-            "paths explode with positive probability, and a simulation or a lattice cannot follow them"
+            "paths explode with positive probability, and a simulation or a grid cannot follow them"
         )
 
 

@@ -59,11 +59,11 @@ def exponentials(model: Model, algebra: EstimationAlgebra) -> tuple[Exponential,
 
 @lru_cache(maxsize=64)
 def wei_norman_filter(model: Model) -> tuple[Condition, ...]:
-    """A finite estimation algebra whose exponentials are shifts and multipliers, in few enough states for a lattice."""
-    lattice = "the lattice of exp(t L_0)"
+    """A finite estimation algebra whose exponentials are shifts and multipliers, in few enough states for a grid."""
+    grid = "the grid of exp(t L_0)"
     conditions = [
         determined(model),
-        Condition(f"the state has at most {_MOST_STATES} coordinates", model.n <= _MOST_STATES, f"n = {model.n}", lattice),
+        Condition(f"the state has at most {_MOST_STATES} coordinates", model.n <= _MOST_STATES, f"n = {model.n}", grid),
         Condition(
             "the observations act in continuous time",
             model.observation_kind != "samples",
@@ -72,7 +72,7 @@ def wei_norman_filter(model: Model) -> tuple[Condition, ...]:
             else model.observation_kind,
             _SOURCE,
         ),
-        Condition("no state is an angle", not model.periodic, f"periodic: {list(model.periodic)}", lattice),
+        Condition("no state is an angle", not model.periodic, f"periodic: {list(model.periodic)}", grid),
     ]
     if any(condition.holds is not True for condition in conditions):
         return tuple(conditions)

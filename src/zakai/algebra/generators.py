@@ -94,7 +94,7 @@ class Reader:
         return function.xreplace({PI: sp.pi})
 
     def is_smooth(self) -> bool:
-        """Whether every formula is smooth on all of R^n, as far as the signs of coefficients show.
+        """Return whether the signs of coefficients show that every formula is smooth on all of R^n.
 
         A denominator, or the argument of a logarithm, is positive if it is a sum of positive multiples of even powers of
         states and any powers of exponentials, one of them without a state.

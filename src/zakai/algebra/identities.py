@@ -2,7 +2,7 @@
 
 A point where it is clearly not zero, found in 50-digit arithmetic, refutes.  The proof is algebra: trigonometric and
 hyperbolic functions become exponentials, exponentials of rationally independent arguments are independent variables, and
-what is left is a rational function whose numerator is expanded.  This knows sin^2 + cos^2, 1 - tanh^2 - sech^2, double angles
+the result is a rational function whose numerator is expanded.  This knows sin^2 + cos^2, 1 - tanh^2 - sech^2, double angles
 and the like.  Where that would be too long, an expression that is analytic on the whole line and vanishes to 40 digits at a
 dozen random points is taken to be zero.  Everything else is undecided, and said so.
 """
@@ -209,8 +209,10 @@ def _underflows(known: Mapping[sp.Expr, mpmath.mpf]) -> bool:
 
 
 def _is_analytic(expression: sp.Expr) -> bool:
-    """Whether the expression, as far as its form shows, is analytic on the real line but for isolated points that a path through
-    the complex plane goes around, so that what holds somewhere holds everywhere."""
+    """Return whether the form of the expression shows that it is analytic on the real line, except at isolated points.
+
+    A path through the complex plane goes around such points: an identity that holds somewhere holds everywhere.
+    """
     for e in sp.preorder_traversal(expression):
         if isinstance(e, sp.Function):
             inside = isinstance(e, sp.log) and isinstance(e.args[0], sp.cosh)
@@ -222,9 +224,9 @@ def _is_analytic(expression: sp.Expr) -> bool:
 
 
 def is_in_one_piece(expression: sp.Expr, x: Sequence[sp.Symbol]) -> bool:
-    """Whether what the expression is, as a function of x, on an interval, as far as its form shows, it is wherever it exists.
+    """Return whether the form of the expression shows that one analytic formula in x holds wherever it exists.
 
-    asin(sin(x)), atan(tan(x)), atan(1/x) and sqrt(x**2) have different formulas in different places, each as smooth as can be.
+    asin(sin(x)), atan(tan(x)), atan(1/x) and sqrt(x**2) have different formulas on different intervals, each of them smooth.
     """
     for e in sp.preorder_traversal(expression):
         if not e.has(*x):
@@ -241,7 +243,7 @@ def is_in_one_piece(expression: sp.Expr, x: Sequence[sp.Symbol]) -> bool:
 
 
 def _has_poles(expression: sp.Expr) -> bool:
-    """Whether the expression may have no value at some real point, as far as its form shows."""
+    """Return whether the form of the expression allows that it has no value at some real point."""
     return any(
         isinstance(e, sp.tan | sp.cot | sp.sec | sp.csc | sp.coth | sp.csch)
         or (isinstance(e, sp.Pow) and e.exp.is_negative is not False and not (e.base.is_positive or e.base.is_negative))
@@ -341,7 +343,7 @@ def normal_form(expression: sp.Expr, variables: Sequence[sp.Symbol]) -> sp.Expr:
 
 
 def terms_of(expression: sp.Expr) -> int:
-    """How many terms an expression has when it is expanded, at most, as far as `MANY_TERMS`."""
+    """Return an upper bound, at most `MANY_TERMS`, of the number of terms of the expanded expression."""
     if isinstance(expression, sp.Add):
         return min(MANY_TERMS, sum(terms_of(part) for part in expression.args))
     if isinstance(expression, sp.Mul):

@@ -35,11 +35,10 @@ class IndependentBlock:
 
 @lru_cache(maxsize=8)
 def independent_blocks(model: Model, prior: Any, by_value: bool = True) -> tuple[IndependentBlock, ...]:
-    """The connected parts of (f, G, h, S) and of a prior (or None): p(x, t | y) is the product of theirs.
+    """Return the connected parts of (f, G, h, S) and of a prior (or None): p(x, t | y) is the product of their densities.
 
-    A Gaussian couples states that are correlated, a mixture those whose components do not factorise, a density those that
-    its logarithm, as far as it is a sum, does not part.  Blocks are the same if their formulas are, but for the names of
-    states and, `by_value`, of parameters.
+    A Gaussian couples correlated states, a mixture those for which its components do not factorise, a density those that share
+    a term of its logarithm. Blocks are equal if their formulas are, up to the names of states and, `by_value`, of parameters.
     """
 
     def join(groups: Groups) -> None:

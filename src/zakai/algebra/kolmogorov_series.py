@@ -79,8 +79,8 @@ class Ring:
 class KolmogorovSeries:
     """The coefficients of the series up to t^`order` as polynomials in `x` and `y` (n symbols each), exact.
 
-    `exponent` is a, `potential` W, `coefficients` A_0 = 1, A_1, ... and `logarithms` L_1, L_2, ..., of the kernel of G =
-    `covariance`.  The paper's a_k(x, xi) are e^a A_k.
+    The exponent a, the potential W, the coefficients A_0 = 1, A_1, ... and the logarithms L_1, L_2, ... belong to the kernel of
+    G = `covariance`. The paper's a_k(x, xi) are e^a A_k.
     """
 
     order: int

@@ -110,7 +110,7 @@ class Span:
         return len(self.rows)
 
     def reduce(self, vector: Vector) -> tuple[Vector, Vector]:
-        """(what is left of a vector modulo the span, the combination of words that was taken from it)."""
+        """Return (the remainder of a vector modulo the span, the combination of words that was subtracted)."""
         left, taken = dict(vector), Vector()
         for pivot in [key for key in vector if key in self.rows]:
             factor = left[pivot]

@@ -30,12 +30,12 @@ CLY = "Chen, Luo and Yau 2017"
 class YauSystem:
     """A time-varying Yau system whose transition between observations is linear-quadratic after the gauge u = e^phi v.
 
-    `bare` is -q/2 without the observation's energy h'S^-1 h and `full` with it, each None where it is not quadratic.
+    `unobserved` is -q/2 without the observation's energy h'S^-1 h and `full` with it, each None where it is not quadratic.
     `slope` C (m, n) and `intercept` c (m, 1) are those of an affine h = C x + c, else None.
     """
 
     form: YauForm
-    bare: Quadratic | None
+    unobserved: Quadratic | None
     full: Quadratic | None
     slope: sp.ImmutableMatrix | None
     intercept: sp.ImmutableMatrix | None
@@ -52,9 +52,9 @@ def q_parts(model: Model):
     """(-q/2 as a quadratic, whether q is one, why) without and with the observation's energy."""
     form = cached_yau_form(model)
     assert isinstance(form, YauForm)
-    bare = q_without_observation(model, form)
-    first = as_quadratic(bare, model.x)
-    return first, as_quadratic(bare + observation_energy(model), model.x)
+    unobserved = q_without_observation(model, form)
+    first = as_quadratic(unobserved, model.x)
+    return first, as_quadratic(unobserved + observation_energy(model), model.x)
 
 
 @lru_cache(maxsize=64)
@@ -86,9 +86,9 @@ def yau_system(model: Model) -> YauSystem | None:
     form = cached_yau_form(model)
     if not isinstance(form, YauForm):
         return None
-    (bare, _, _), (full, _, _) = q_parts(model)
+    (unobserved, _, _), (full, _, _) = q_parts(model)
     slope, intercept = affine_observation(model) or (None, None)
-    return YauSystem(form, bare, full, slope, intercept)
+    return YauSystem(form, unobserved, full, slope, intercept)
 
 
 def determined(model: Model) -> Condition:

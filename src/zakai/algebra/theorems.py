@@ -47,7 +47,8 @@ def limited_direct(model: Model) -> tuple[Condition, ...]:
             "the grid of this method",
         ),
     ]
-    if conditions[0].holds is not True:
+    conditions.extend(_features_of_samples(model))
+    if any(condition.holds is not True for condition in (conditions[0], *conditions[2:])):
         return tuple(conditions)
     conditions.append(definite_covariance(model))
     form = cached_yau_form(model)
@@ -68,16 +69,29 @@ def limited_direct(model: Model) -> tuple[Condition, ...]:
     return tuple(conditions)
 
 
+def _features_of_samples(model: Model) -> tuple[Condition, ...]:
+    """Return what holds where formulas have features: these may be in what a sample of one state depends on."""
+    if not model.features:
+        return ()
+    own, source = features.of_dynamics(model), "a sample enters only at its time"
+    found, words = list(own.values()), "; ".join(model.features.values())
+    sampled = model.n == 1 and model.observation_kind == "samples"
+    return (
+        Condition("f and g are formulas of the class", not found, "; ".join(found) or words, source),
+        Condition("there is one state, which samples observe, where h has features", sampled, words, source),
+    )
+
+
 def _quadratic_condition(model: Model) -> Condition:
-    bare, full = q_parts(model)
+    unobserved, full = q_parts(model)
     sampled = model.observation_kind == "samples"
-    _, holds, evidence = bare if sampled else full
+    _, holds, evidence = unobserved if sampled else full
     statement = (
         "q = 2 phi_t + G:Hess phi + grad phi'G grad phi + 2 (L x + l).grad phi + 2 tr L"
         + ("" if sampled else " + h'S^-1 h")
         + " is quadratic in x"
     )
-    if sampled and bare[1]:
+    if sampled and unobserved[1]:
         evidence += " (a sample enters only at its time, so that h may be any function)"
     return Condition(statement, holds, evidence, f"{CLY}, Assumption 3 with 2 phi_t")
 
@@ -89,8 +103,8 @@ def _angle_conditions(model: Model, form: YauForm):
         symbol = model.x[i]
         column = [form.matrix[j, i] for j in range(model.n)]
         turned = form.potential.subs(symbol, symbol + 2 * sp.pi) - form.potential
-        (bare, _, _), (full, _, _) = q_parts(model)
-        q = bare if model.observation_kind == "samples" else full
+        (unobserved, _, _), (full, _, _) = q_parts(model)
+        q = unobserved if model.observation_kind == "samples" else full
         parts = [*column, turned]
         if q is not None:
             parts += [*q.matrix.row(i), q.linear[i]]
@@ -137,8 +151,8 @@ def gaussian_sum(model: Model) -> tuple[Condition, ...]:
 
 def _few_directions(model: Model, form: YauForm) -> Condition:
     """Quadrature is in the coordinates of a nonlinear h and of phi."""
-    bent = [] if affine_observation(model) else list(model.observation)
-    used = {name for name, symbol in zip(model.state, model.x) if any(f.has(symbol) for f in (*bent, form.potential))}
+    nonlinear = [] if affine_observation(model) else list(model.observation)
+    used = {name for name, symbol in zip(model.state, model.x) if any(f.has(symbol) for f in (*nonlinear, form.potential))}
     listed = ", ".join(name for name in model.state if name in used) or "none"
     return Condition(
         "a nonlinear h and phi depend on at most five coordinates, in which quadrature is done",
@@ -166,7 +180,8 @@ def any_smooth_system(model: Model) -> tuple[Condition, ...]:
             "the grid of this method",
         ),
         *_in_many_states(model),
-        *_natural_ends(model),
+        *_correlated(model),
+        *_reflecting_ends(model),
     )
 
 
@@ -184,12 +199,29 @@ def _in_many_states(model: Model) -> tuple[Condition, ...]:
     return tuple(found)
 
 
-def _natural_ends(model: Model) -> tuple[Condition, ...]:
-    """Return a condition that fails for every state with reflecting ends."""
-    return tuple(
-        Condition("the ends of the domain are natural", False, f"domain: {name} {interval}", "the grid of this method")
-        for name, interval in model.domain.items()
-        if interval.reflecting
+def _correlated(model: Model) -> tuple[Condition, ...]:
+    """Return what fails of the equation with correlated noise, which contains derivatives of h and g."""
+    if features.CROSS_NOISE not in model.features:
+        return ()
+    source, words = "the Zakai equation with correlated noise on a grid", model.features[features.CROSS_NOISE]
+    one = Condition("there is one state where dv and dw are correlated", model.n == 1, f"n = {model.n}, and {words}", source)
+    parts = [*model.observation, *model.diffusion]
+    jumps = [call for part in parts for call in part.atoms(*features.JUMP_FUNCTIONS) if call.has(*model.x)]
+    words = f"a formula contains {short(str(jumps[0]))}" if jumps else "neither jumps"
+    return one, Condition("h and g do not jump where dv and dw are correlated", not jumps, words, source)
+
+
+def _reflecting_ends(model: Model) -> tuple[Condition, ...]:
+    """Return the conditions of a state with reflecting ends."""
+    reflecting = [f"{name} {interval}" for name, interval in model.domain.items() if interval.reflecting]
+    if not reflecting:
+        return ()
+    source, words = "the equation without flux at the ends", f"domain: {', '.join(reflecting)}"
+    jumps = [call for part in (*model.drift, *model.diffusion) for call in part.atoms(*features.JUMP_FUNCTIONS)]
+    return (
+        Condition("there is one state where ends reflect", model.n == 1, f"n = {model.n}, {words}", source),
+        Condition("dv and dw are independent where ends reflect", model.cross_noise.is_zero_matrix, words, source),
+        Condition("f and g do not jump where ends reflect", not jumps, words, source),
     )
 
 
@@ -204,7 +236,7 @@ def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
     if conditions[0].holds is not True:
         return tuple(conditions)
     varying = [part for part in (*model.drift, *model.covariance) if model.t in part.free_symbols]
-    bent = [part for part in model.drift if part.has(sp.Abs, sp.sign)]
+    kinked = [part for part in model.drift if part.has(sp.Abs, sp.sign)]
     return (
         *conditions,
         Condition(
@@ -214,7 +246,7 @@ def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
             source,
         ),
         definite_covariance(model),
-        Condition("f is smooth", not bent, f"f contains {short(str(bent[0]))}" if bent else "no absolute value", source),
+        Condition("f is smooth", not kinked, f"f contains {short(str(kinked[0]))}" if kinked else "no absolute value", source),
         Condition("there is one state", model.n == 1, f"n = {model.n}", "the grid of this method"),
         Condition("the state is no angle", not model.periodic, f"periodic: {list(model.periodic)}", "the grid of this method"),
     )
@@ -246,15 +278,18 @@ def theorem_of(name: str) -> Callable[[Model], tuple[Condition, ...]]:
     return THEOREMS[name] if name in THEOREMS else PEERS[name]
 
 
+NOT_HANDLED = "what this method handles"  # the source of a condition about a feature
+
+
 def conditions_of(name: str, model: Model) -> tuple[Condition, ...]:
-    """Return the conditions under which a method or a peer holds for a model: the one place where that is decided.
+    """Return the conditions under which a method, own or of another library, holds for a model; nothing else decides this.
 
     Features of the model that the method does not handle fail first, and its theorem, which does not know them, is not asked.
     """
     if model.features:
         handled = _registry.load(name).handles if name in _registry.METHODS else frozenset()
         refused = tuple(
-            Condition(ASSUMPTIONS[feature], False, words, "what this method handles")
+            Condition(ASSUMPTIONS[feature], False, words, NOT_HANDLED)
             for feature, words in model.features.items()
             if feature not in handled
         )

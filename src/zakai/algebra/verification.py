@@ -25,7 +25,7 @@ Operator = Mapping[tuple[int, ...], Any]
 
 
 def verify(certificate: Certificate) -> bool:
-    """Whether the witness of a certificate meets the assumption of its statement, computed anew from the model."""
+    """Return whether the witness of a certificate meets the assumption of its statement, computed from the model again."""
     check: dict[str, Callable[[_Plain, Certificate], bool]] = {
         CLOSED: _is_closed,
         QUADRATIC: lambda plain, c: (

@@ -1,0 +1,142 @@
+"""What to do where no method holds: the nearest one, and a change of the model for which a method holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import sympy as sp
+
+from zakai import _display
+from zakai._registry import AUTO
+from zakai.algebra._readable import readable
+from zakai.algebra.conditions import Condition, all_hold
+from zakai.algebra.theorems import NOT_HANDLED, conditions_of
+from zakai.errors import ZakaiError
+from zakai.models.features import DOMAIN, STATE_DEPENDENT_DIFFUSION
+from zakai.models.model import Model
+
+Conditions = tuple[Condition, ...]
+_MOST_STATES = 8  # of a model that is rewritten
+_MOST_CHARACTERS = 90  # of a formula in a sentence
+
+
+def nearest(considered: Mapping[str, Conditions]) -> str:
+    """Return the method with the fewest assumptions that fail, of equals the most general.
+
+    Of a method that does not handle a feature of the model no other assumption was checked: it comes last.
+    """
+
+    def distance(name: str) -> tuple[bool, int, int]:
+        failing = [condition for condition in considered[name] if condition.holds is False]
+        return any(one.source == NOT_HANDLED for one in failing), len(failing), -list(considered).index(name)
+
+    return min(considered, key=distance)
+
+
+def what_to_do(model: Model, method: str) -> str:
+    """Return a sentence: a method that holds, or a rewriting of the model for which one does, or where to read on."""
+    parts = []
+    if method != "auto" and (other := _first(model)):
+        parts.append(f'{other} holds: method="auto" takes it')
+    for words, rewritten in _rewritings(model):
+        named = method != "auto" and _holds(rewritten, method)
+        if found := method if named else None if parts else _first(rewritten):
+            parts.append(f"{words}, for which {found} holds")
+            break
+    if not parts and all_hold(conditions_of("extended-kalman-bucy", model)) is True:
+        parts.append('method="extended-kalman-bucy" approximates any smooth system')
+    return "; ".join([*parts, "`zakai methods MODEL` lists every assumption"])
+
+
+def _holds(model: Model, method: str) -> bool:
+    return all_hold(conditions_of(method, model)) is True
+
+
+def _first(model: Model) -> str | None:
+    """Return the first method of "auto" that holds."""
+    return next((name for name in AUTO if _holds(model, name)), None)
+
+
+def _rewritings(model: Model) -> Iterator[tuple[str, Model]]:
+    """Yield changed models, with the words that describe the change."""
+    if model.n > _MOST_STATES or model.functions:
+        return
+    for change in (_logarithms, _without_periodic):
+        try:
+            found = change(model)
+        except (ZakaiError, ArithmeticError, ValueError):
+            continue
+        if found is not None:
+            yield found
+
+
+def _without_periodic(model: Model) -> tuple[str, Model] | None:
+    """Return the model with angles that are not wrapped."""
+    if not model.periodic:
+        return None
+    return f"leave out periodic = {list(model.periodic)}", Model(**{**_keys(model), "periodic": None})
+
+
+def _logarithms(model: Model) -> tuple[str, Model] | None:
+    """Return the model in z = log x for each state whose noise is proportional to it, by Ito's formula.
+
+    dx = f dt + x s dv  gives  dz = (f / x - G / (2 x^2)) dt + s dv,  G = g Q g'.
+    """
+    if STATE_DEPENDENT_DIFFUSION not in model.features:
+        return None
+    covariance, states = model.covariance, set(model.x)
+    names, values = list(model.state), dict(zip(model.x, model.x, strict=True))
+    drift, diffusion, changed = list(model.drift), model.diffusion.as_mutable(), []
+    for i, x in enumerate(model.x):
+        row = [sp.cancel(entry / x) for entry in model.diffusion.row(i)]
+        if not model.diffusion.row(i).free_symbols & states or any(entry.free_symbols & states for entry in row):
+            continue
+        names[i] = f"log_{model.state[i]}"
+        values[x] = sp.exp(sp.Symbol(names[i], real=True))
+        drift[i] = drift[i] / x - covariance[i, i] / (2 * x**2)
+        diffusion[i, :] = sp.Matrix([row])
+        changed.append(i)
+    if not changed or len({*names, *model.parameters, *model.inputs}) < len(names) + len(model.parameters) + len(model.inputs):
+        return None
+
+    def moved(formula: Any) -> sp.Expr:
+        return sp.expand(sp.simplify(formula.subs(values, simultaneous=True)))
+
+    keys = {
+        **_keys(model),
+        "state": names,
+        "drift": [moved(formula) for formula in drift],
+        "observation": [moved(formula) for formula in model.observation],
+        "diffusion": [[moved(entry) for entry in row] for row in diffusion.tolist()],
+        "domain": {name: interval.keys() for name, interval in model.domain.items() if model.state.index(name) not in changed},
+    }
+    if DOMAIN in model.features and not keys["domain"]:
+        keys.pop("domain")
+    rewritten = Model(**keys)
+    first = changed[0]
+    formula = str(readable(rewritten.drift[first]))
+    shown = formula if len(formula) <= _MOST_CHARACTERS else formula[: _MOST_CHARACTERS - 3] + "..."
+    if len(changed) == 1:
+        what = f"{names[first]} = log({model.state[first]})"
+    else:
+        what = f"the logarithms of {_display.short_names([model.state[i] for i in changed])}"
+    words = f"write the model in {what}: d{names[first]} = ({shown}) dt + ..."
+    return words, rewritten
+
+
+def _keys(model: Model) -> dict[str, Any]:
+    """Return the keywords of the same model, without its prior and name."""
+    matrices = ("diffusion", "process_noise", "observation_noise")
+    keys: dict[str, Any] = {
+        "state": list(model.state),
+        "drift": list(model.drift),
+        "observation_kind": model.observation_kind,
+        "parameters": dict(model.parameters),
+        "periodic": list(model.periodic) or None,
+        **{name: getattr(model, name).tolist() for name in matrices},
+        **model.keys_of_features,
+    }
+    if model.log_density is None:
+        keys["observation"] = list(model.observation)
+    return keys
