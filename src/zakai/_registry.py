@@ -1,4 +1,4 @@
-"""Every method and peer by its name: the one list of what there is, loaded when it is asked for.
+"""Every method by its name, own or of another library: one list; a module is loaded when its method is used.
 
 When one holds is said by `algebra.theorems.theorem_of` under the same name.
 """
@@ -76,7 +76,7 @@ AUTO = ("kalman-bucy", "benes", "hu-yau", "limited-direct", "general-direct", "y
 
 
 def load(name: str) -> Any:
-    """The METHOD of that name; InputError for an unknown one, and for a peer whose library is not installed."""
+    """The METHOD of that name; InputError for an unknown one, and where its library is not installed."""
     if name in METHODS:
         return import_module(METHODS[name].module).METHOD
     if name in PEERS:
@@ -86,7 +86,8 @@ def load(name: str) -> Any:
             missing = (error.name or "a library").partition(".")[0]
             if missing == "zakai":
                 raise
-            raise InputError(f"{name}: {missing} is not installed; the peers need it: pip install 'zakai[{EXTRA}]'") from error
+            raise InputError(f"{name}: {missing} is not installed; pip install 'zakai[{EXTRA}]'") from error
     close = difflib.get_close_matches(name, [*METHODS, *PEERS], n=1)
     hint = f'; did you mean "{close[0]}"?' if close else ""
-    raise InputError(f'there is no method "{name}"{hint}; methods: auto, {", ".join(METHODS)}; peers: {", ".join(PEERS)}')
+    names = f"auto, {', '.join(METHODS)}; of other libraries: {', '.join(PEERS)}"
+    raise InputError(f'there is no method "{name}"{hint}; methods: {names}')

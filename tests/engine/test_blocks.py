@@ -55,7 +55,7 @@ def whole(kind, names=None):
     )  # fmt: skip
 
 
-def readings(model, times=TIMES, gaps=True):
+def record_of(model, times=TIMES, gaps=True):
     record = zakai.simulate(model, times, seed=4)[1]
     values = record.values.copy()
     if gaps:
@@ -65,7 +65,7 @@ def readings(model, times=TIMES, gaps=True):
 
 def check_whole_and_parts(kind, times=TIMES):
     model = whole(kind)
-    record = readings(model, times)
+    record = record_of(model, times)
     result = zakai.filter(model, record)
     alone = [
         zakai.filter(part, zakai.Record(times, record.values[:, list(rows)], kind))
@@ -124,7 +124,7 @@ def pairs(count, means, names="x"):
 
 def test_linear_blocks_are_one_kalman_bucy_filter():
     model = pairs(2, np.linspace(-1, 1, 4))
-    record = readings(model)
+    record = record_of(model)
     blocks, one = zakai.filter(model, record), zakai.filter(model, record, "kalman-bucy")
     assert blocks.method == "blocks: 2 x kalman-bucy" and one.method == "kalman-bucy"
     assert np.allclose(blocks.mean, one.mean, rtol=0, atol=1e-11)
@@ -138,7 +138,7 @@ def test_linear_blocks_are_one_kalman_bucy_filter():
 def test_names_and_their_order_do_not_matter():
     means = np.linspace(-1, 1, 6)
     model, other = pairs(3, means), pairs(3, means, names="other_")
-    record = readings(model)
+    record = record_of(model)
     first, second = zakai.filter(model, record), zakai.filter(other, record)
     assert np.array_equal(first.mean, second.mean) and first.log_likelihood == second.log_likelihood
     order = [2, 0, 1]
@@ -154,7 +154,7 @@ def test_two_spirals_are_one_system_of_two_states():
         state=state, drift=["0", "0"], observation=[f"{s}*{f}({s})" for s in state for f in ("sin", "cos")],
         observation_kind="samples", prior=gaussian([0.5, 1.0], [0.5, 0.3]),
     )  # fmt: skip
-    record = readings(model, gaps=False)
+    record = record_of(model, gaps=False)
     blocks, one = zakai.filter(model, record), zakai.filter(model, record, "limited-direct")
     assert blocks.method == "blocks: 2 x limited-direct" and one.method == "limited-direct"
     assert np.allclose(blocks.mean, one.mean, rtol=0, atol=1e-8) and np.allclose(blocks.cov, one.cov, rtol=0, atol=1e-8)
@@ -170,16 +170,16 @@ def sines(count, **keys):
 
 def test_a_named_method_is_taken_block_by_block_where_it_holds_only_so():
     model = sines(5)
-    result = zakai.filter(model, readings(model), "limited-direct", order=3, kernel="power-series")
+    result = zakai.filter(model, record_of(model), "limited-direct", order=3, kernel="power-series")
     assert result.method == "blocks: 5 x limited-direct" and "the method asked for holds for each" in result.why
     assert result.mean.shape == (len(TIMES) + 1, 5)
     with pytest.raises(ConditionError, match="benes does not hold: .* nor block by block"):
-        zakai.filter(model, readings(model), "benes")
+        zakai.filter(model, record_of(model), "benes")
 
 
 def test_an_option_goes_to_the_blocks_whose_method_has_it():
     model = whole("samples")
-    record = readings(model)
+    record = record_of(model)
     with pytest.raises(InputError, match='order: 0 must be a whole number from 1, and needs kernel="power-series"'):
         zakai.filter(model, record, order=0)
     wrong = 'none of kalman-bucy and limited-direct and benes has an option "speed"; their options are: .*kernel'
@@ -189,7 +189,7 @@ def test_an_option_goes_to_the_blocks_whose_method_has_it():
 
 def test_a_prior_that_couples_blocks_joins_them():
     model = pairs(3, np.zeros(6))
-    record = readings(model)
+    record = record_of(model)
     coupled = model.prior.cov.copy()
     coupled[0, 2] = coupled[2, 0] = 0.6
     mixed = type(model.prior)(model.prior.mean, coupled)
@@ -203,7 +203,7 @@ def test_a_prior_that_couples_blocks_joins_them():
 
 def test_a_block_that_is_not_observed_follows_its_prior():
     model = pairs(3, np.ones(6))
-    record = readings(model)
+    record = record_of(model)
     seen = zakai.filter(model, record)
     keys = {"state": model.state, "drift": list(model.drift), "prior": model.prior}
     fewer = zakai.Model(**keys, observation=list(model.observation)[:2])
@@ -216,10 +216,10 @@ def test_a_block_that_is_not_observed_follows_its_prior():
 
 def test_records_of_a_list_and_what_is_kept_and_progress():
     model = pairs(2, np.linspace(-1, 1, 4))
-    first, second = readings(model), readings(model, gaps=False)
-    told = []
-    both = zakai.filter(model, [first, second], progress=lambda done, total: told.append((done, total)), keep="moments")
-    assert told[-1] == (20, 20) and all(done <= total for done, total in told) and told == sorted(told)
+    first, second = record_of(model), record_of(model, gaps=False)
+    reported = []
+    both = zakai.filter(model, [first, second], progress=lambda done, total: reported.append((done, total)), keep="moments")
+    assert reported[-1] == (20, 20) and all(done <= total for done, total in reported) and reported == sorted(reported)
     for result, record in zip(both, (first, second), strict=True):
         assert result.record is record and result.model is model
         assert np.allclose(result.mean, zakai.filter(model, record).mean, rtol=0, atol=1e-12)
@@ -242,18 +242,18 @@ def test_the_same_warning_of_many_blocks_is_said_once():
     assert warnings[0].startswith("x0: at 1 of 10 times a path is observed after a gap")
     assert warnings[0].endswith("the same, in other numbers, of 11 more blocks: x1, x2, x3 and 8 more")
     same = np.where(np.arange(10)[:, None] == 3, np.nan, record.values)
-    told = zakai.filter(model, zakai.Record(TIMES, same, "path")).warnings
-    assert len(told) == 1 and told[0].startswith("x0, x1, x2 and 9 more (12 blocks): at 1 of 10 times")
+    reported = zakai.filter(model, zakai.Record(TIMES, same, "path")).warnings
+    assert len(reported) == 1 and reported[0].startswith("x0, x1, x2 and 9 more (12 blocks): at 1 of 10 times")
 
 
 def test_a_result_is_stored_and_its_covariances_are_not_where_they_are_many(tmp_path, monkeypatch):
     model = pairs(2, np.zeros(4))
-    result = zakai.filter(model, readings(model))
+    result = zakai.filter(model, record_of(model))
     result.save(tmp_path / "few.nc")
     again = zakai.load_result(tmp_path / "few.nc")
     assert np.array_equal(again.cov, result.cov) and again.method == "blocks: 2 x kalman-bucy"
     many = pairs(20, np.zeros(40))
-    result = zakai.filter(many, readings(many, gaps=False))
+    result = zakai.filter(many, record_of(many, gaps=False))
     result.save(tmp_path / "many.nc")
     again = zakai.load_result(tmp_path / "many.nc")
     assert np.array_equal(again.variance, result.variance)
@@ -275,7 +275,7 @@ def decaying():
 
 def test_the_likelihood_of_blocks_is_their_sum_at_any_parameters():
     model = decaying()
-    record = readings(model)
+    record = record_of(model)
     likelihood = log_likelihood(model, record)
     result = zakai.filter(model, record)
     assert result.method == "blocks: 3 x kalman-bucy"
@@ -288,7 +288,7 @@ def test_the_likelihood_of_blocks_is_their_sum_at_any_parameters():
 
 def test_the_gradient_of_blocks_is_that_of_the_whole():
     model = decaying()
-    record = readings(model)
+    record = record_of(model)
     gradients = [log_likelihood(model, record, method).value_and_gradient(model.theta())[1] for method in ("auto", "kalman-bucy")]
     assert np.allclose(*gradients, rtol=0, atol=1e-8) and abs(gradients[0][0] - gradients[0][1]) > 0.01
 

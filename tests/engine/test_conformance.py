@@ -44,7 +44,7 @@ def system(name: str, kind: str = "increments", prior: str = "gaussian") -> zaka
 
 
 @cache
-def readings(name: str, kind: str, gaps: bool = False, seed: int = 0) -> zakai.Record:
+def record_of(name: str, kind: str, gaps: bool = False, seed: int = 0) -> zakai.Record:
     record = zakai.simulate(system(name, kind), TIMES, seed=seed)[1]
     values = record.values.copy()
     if gaps:
@@ -83,7 +83,7 @@ def test_a_method_says_what_it_is(name):
 
 @on_every_system
 def test_a_result_is_whole(method, name):
-    model, record = system(name), readings(name, "increments", gaps=True)
+    model, record = system(name), record_of(name, "increments", gaps=True)
     result = zakai.filter(model, record, method)
     assert result.mean.shape == (len(TIMES) + 1, 1) and result.cov.shape == (len(TIMES) + 1, 1, 1)
     assert np.isfinite(result.mean).all() and (result.variance > 0).all()
@@ -102,9 +102,9 @@ def test_a_result_is_whole(method, name):
 def test_a_batch_an_online_filter_and_a_restart_give_what_a_record_gives_to_the_bit(method, name, kind, tmp_path):
     if not holds(method, name, kind):
         pytest.skip(f"the theorem of {method} does not hold for {kind}")
-    model, record = system(name, kind), readings(name, kind, gaps=True)
+    model, record = system(name, kind), record_of(name, kind, gaps=True)
     expected = zakai.filter(model, record, method)
-    other = zakai.filter(model, [readings(name, kind, seed=3), record], method)[1]
+    other = zakai.filter(model, [record_of(name, kind, seed=3), record], method)[1]
     assert np.array_equal(other.mean, expected.mean) and np.array_equal(other.cov, expected.cov)
     assert np.array_equal(other.log_likelihood_increments, expected.log_likelihood_increments)
     online = zakai.online(model, method)
@@ -120,7 +120,7 @@ def test_a_batch_an_online_filter_and_a_restart_give_what_a_record_gives_to_the_
 
 @on_every_system
 def test_increments_paths_and_rates_say_the_same(method, name):
-    record = readings(name, "increments")
+    record = record_of(name, "increments")
     expected = zakai.filter(system(name), record, method)
     lengths = np.diff(TIMES, prepend=0.0)[:, None]
     for kind, values in (("path", np.cumsum(record.values, axis=0)), ("rates", record.values / lengths)):
@@ -132,16 +132,16 @@ def test_where_nothing_is_read_the_evidence_does_not_change(method, name):
     for kind in ("increments", "samples"):
         if not holds(method, name, kind):
             with pytest.raises(zakai.ConditionError, match=kind):
-                zakai.filter(system(name, kind), readings(name, kind), method)
+                zakai.filter(system(name, kind), record_of(name, kind), method)
             continue
-        result = zakai.filter(system(name, kind), readings(name, kind, gaps=True), method)
+        result = zakai.filter(system(name, kind), record_of(name, kind, gaps=True), method)
         assert abs(result.log_likelihood_increments[4]) < (1e-9 if name != "spiral" or kind == "samples" else 1e-2)
 
 
 @on_every_system
 @pytest.mark.parametrize("prior", ["mixture", "density"])
 def test_one_prior_said_in_two_ways_gives_one_posterior(method, name, prior):
-    record = readings(name, "increments")
+    record = record_of(name, "increments")
     other, expected = zakai.filter(system(name, prior=prior), record, method), zakai.filter(system(name), record, method)
     same(other, expected, NEAR.get(method, 1e-7))
 
@@ -151,7 +151,7 @@ def test_one_prior_said_in_two_ways_gives_one_posterior(method, name, prior):
 def test_the_gradient_is_that_of_differences(method, name, kind):
     if not holds(method, name, kind):
         pytest.skip(f"the theorem of {method} does not hold for {kind}")
-    model, record, options = system(name, kind), readings(name, kind, gaps=True), OPTIONS.get(method, {})
+    model, record, options = system(name, kind), record_of(name, kind, gaps=True), OPTIONS.get(method, {})
     assert _registry.load(method).differentiable
     likelihood = log_likelihood(model, record, method, **options)
     theta = model.theta()

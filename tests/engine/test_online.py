@@ -29,15 +29,15 @@ def simulated(model, times, seed=1, gaps=()):
     return zakai.Record(record.times, values, record.kind)
 
 
-def told(online, record):
+def estimates_of(online, record):
     return [online.update(time, value) for time, value in zip(record.times, record.values, strict=True)]
 
 
 def compare(model, record, method, tolerance=1e-12, **options):
-    """Every number of the live filter beside that of the record's; the live filter."""
+    """Assert that an online filter returns the numbers of the filter of a record; return the online filter."""
     whole = zakai.filter(model, record, method, **options)
     online = zakai.online(model, method, **options)
-    estimates = told(online, record)
+    estimates = estimates_of(online, record)
     assert online.method == whole.method
     assert np.allclose([e.time for e in estimates], record.times, rtol=0, atol=0)
     assert np.allclose([e.mean for e in estimates], whole.mean[1:], rtol=tolerance, atol=tolerance)
@@ -100,7 +100,7 @@ def test_a_prediction_is_an_observation_of_nothing_and_leaves_the_filter_alone()
     record = simulated(model, UNIFORM[:4], gaps=[(3, 0)])
     whole, online = zakai.filter(model, record, "kalman-bucy"), zakai.online(model, "kalman-bucy")
     assert np.allclose(online.predict(0.0).mean, [0.3]) and np.allclose(online.last.cov, [[2.0]])
-    told(online, zakai.Record(record.times[:3], record.values[:3], "samples"))
+    estimates_of(online, zakai.Record(record.times[:3], record.values[:3], "samples"))
     for _ in range(2):
         ahead = online.predict(record.times[3])
         assert np.allclose(ahead.mean, whole.mean[4], rtol=0, atol=1e-13) and abs(ahead.log_likelihood_increment) < 1e-14
@@ -186,12 +186,12 @@ def test_many_filters_in_threads_do_not_disturb_each_other():
     model = zakai.Model(**TIMED, observation_kind="increments")
     other = zakai.Model(**TWO, observation_kind="samples")
     records = [simulated(m, UNIFORM, seed) for seed in range(3) for m in (model, other)]
-    alone = [[e.mean.copy() for e in told(zakai.online(m), r)] for m, r in zip([model, other] * 3, records, strict=True)]
+    alone = [[e.mean.copy() for e in estimates_of(zakai.online(m), r)] for m, r in zip([model, other] * 3, records, strict=True)]
     found = [[] for _ in records]
 
     def work(index):
         online = zakai.online((model, other)[index % 2])
-        found[index] = [e.mean.copy() for e in told(online, records[index])]
+        found[index] = [e.mean.copy() for e in estimates_of(online, records[index])]
 
     threads = [Thread(target=work, args=(index,)) for index in range(len(records))]
     for thread in threads:
@@ -231,7 +231,7 @@ def test_a_system_of_blocks_is_filtered_block_by_block():
     record = simulated(model, UNIFORM[:12], gaps=[(3, 0), (4, 1)])
     online = zakai.online(model, "extended-kalman-bucy")
     whole = zakai.filter(model, record, "extended-kalman-bucy")
-    estimates = told(online, record)
+    estimates = estimates_of(online, record)
     assert np.allclose([e.mean for e in estimates], whole.mean[1:], rtol=0, atol=1e-12)
     assert np.allclose([e.cov for e in estimates], whole.cov[1:], rtol=0, atol=1e-12)
 

@@ -1,4 +1,4 @@
-"""Offline work that is saved and loaded gives what is prepared anew, to the bit, and is not done again."""
+"""Prepared work that is saved and loaded equals what is prepared again, to the bit, and is not computed twice."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PAIR = dict(
 )
 
 
-def readings(model):
+def record_of(model):
     record = zakai.simulate(model, TIMES, seed=1)[1]
     values = record.values.copy()
     values[3, 0] = np.nan
@@ -48,19 +48,19 @@ def same(a, b):
         (PAIR, "auto"),
     ],
 )
-def test_what_was_saved_is_what_is_prepared_anew(tmp_path, keys, method):
+def test_saved_work_equals_what_is_prepared_again(tmp_path, keys, method):
     model = zakai.Model(**keys)
-    record = readings(model)
+    record = record_of(model)
     zakai.prepare(model, record, method).save(tmp_path / "offline")
     expected = zakai.filter(model, record, method)
     loaded = zakai.Prepared.load(tmp_path / "offline")
     same(loaded.filter(record), expected)
 
 
-def test_for_other_times_it_prepares_anew():
+def test_other_times_are_prepared_again():
     model = zakai.Model(**LINEAR)
     prepared = zakai.prepare(model, TIMES[:5])
-    record = readings(model)
+    record = record_of(model)
     same(prepared.filter(record), zakai.filter(model, record))
 
 
@@ -69,7 +69,7 @@ def test_a_file_of_another_model_or_that_is_none_is_refused(tmp_path):
     zakai.prepare(model, TIMES, "kalman-bucy").save(path)
     with pytest.raises(zakai.InputError, match="another model"):
         zakai.Prepared.load(path, zakai.Model(**{**LINEAR, "drift": ["-x"]}))
-    assert zakai.Prepared.load(path, model).filter(readings(model)).method == "kalman-bucy"
+    assert zakai.Prepared.load(path, model).filter(record_of(model)).method == "kalman-bucy"
     about, arrays = read_checkpoint(path, "prepared")
     for changed in ({}, {"times": arrays["times"]}, {**arrays, "seen": arrays["times"]}, {**arrays, "times": arrays["seen"]}):
         write_checkpoint(path, about, changed, "prepared")

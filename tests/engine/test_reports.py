@@ -1,6 +1,7 @@
 """What a result and a run report beside the posterior."""
 
 import logging
+from itertools import chain, repeat
 from types import SimpleNamespace
 
 import numpy as np
@@ -34,18 +35,22 @@ def test_long_work_is_announced_with_what_would_shorten_it(monkeypatch, caplog):
         assert caplog.text == ""
         monkeypatch.setattr(batch, "LONG", 0.0)
         zakai.filter(model, record)
-    assert "kalman-bucy: 991 more observations take about" in caplog.text and "to shorten it," in caplog.text
+    assert "kalman-bucy: 927 more observations take about" in caplog.text and "to shorten it," in caplog.text
     assert len(caplog.records) == 1
 
 
-def test_the_first_interval_which_may_compile_does_not_count(monkeypatch, caplog):
+# Seconds at the end of the first interval, of 8 more and of 64 more: slow work, and a kernel that is compiled late.
+@pytest.mark.parametrize(
+    ("seconds", "announced"), [((100, 102, 118), "927 more observations take about 232 s"), ((100, 130, 130.5), "")]
+)
+def test_intervals_that_may_compile_do_not_count(monkeypatch, caplog, seconds, announced):
     model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], prior=PRIOR)
     record = zakai.Record(0.01 * np.arange(1, 1001), np.zeros(1000), "increments")
-    clock = iter([100.0, 102.0] + [103.0] * 100)  # after the first interval, and after eight more
+    clock = chain(seconds, repeat(seconds[-1] + 0.5))
     monkeypatch.setattr(batch, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     with caplog.at_level(logging.WARNING, "zakai"):
         zakai.filter(model, record)
-    assert "991 more observations take about 248 s" in caplog.text
+    assert (announced in caplog.text) if announced else caplog.text == ""
 
 
 def test_results_of_earlier_versions_are_read_with_their_old_names(tmp_path):
@@ -55,3 +60,11 @@ def test_results_of_earlier_versions_are_read_with_their_old_names(tmp_path):
     result.bounds = {}
     result.save(tmp_path / "old.nc")
     assert set(zakai.load_result(tmp_path / "old.nc").health) == {"tolerance_ratio", "tail_depth"}
+
+
+def test_a_first_observation_that_takes_long_is_announced(monkeypatch, caplog):
+    monkeypatch.setattr(batch, "FIRST", 0.0)
+    model = zakai.load_model("gallery:pendulum")
+    with caplog.at_level(logging.WARNING, "zakai"):
+        zakai.filter(model, zakai.simulate(model, [0.5], seed=0)[1])
+    assert "the first observation takes more than 0 s; to shorten it" in caplog.text

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.stats import kstest, norm
+from scipy.linalg import expm
+from scipy.stats import kstest, norm, poisson
 
 import zakai
 
@@ -31,10 +32,11 @@ def test_residuals_of_samples_equal_a_kalman_filter(method):
     assert np.allclose(found, expected, atol=2e-5)
 
 
-def test_coordinates_are_conditional_on_those_before_and_missing_ones_are_nan():
+@pytest.mark.parametrize("method", ["kalman-bucy", "yau-yau"])
+def test_coordinates_are_conditional_on_those_before_and_missing_ones_are_nan(method):
     model = _model(observation=["x", "2*x"], observation_noise=[["0.3", "0.1"], ["0.1", "0.5"]], parameters={})
     values = np.array([[0.4, -0.3], [np.nan, 1.0]])
-    found = zakai.filter(model, zakai.Record([0.0, 1.0], values, "samples")).residuals()
+    found = zakai.filter(model, zakai.Record([0.0, 1.0], values, "samples"), method).residuals()
     cov = np.outer([1, 2], [1, 2]) + [[0.3, 0.1], [0.1, 0.5]]
     slope = cov[0, 1] / cov[0, 0]
     conditional = (-0.3 - slope * 0.4) / np.sqrt(cov[1, 1] - slope * cov[0, 1])
@@ -51,6 +53,56 @@ def test_the_true_model_is_accepted_and_a_halved_noise_detected(seed):
     assert np.array_equal(true, zakai.filter(model, record).residuals(seed=7))
     halved = zakai.filter(model.with_parameters(s=0.5), record).residuals()
     assert kstest(halved[:, 0], "uniform").pvalue < 0.05
+
+
+@pytest.mark.parametrize(
+    "method, step, tolerance", [("kalman-bucy", 0.05, 1e-5), ("yau-yau", 0.05, 1e-5), ("kalman-bucy", 0.3, 1e-3)]
+)
+def test_residuals_of_increments_equal_the_exact_law(method, step, tolerance):
+    """The exact law is that of the state and its integral, two states whose transition is a matrix exponential."""
+    model = _model(0.5, observation_kind="increments")
+    _, record = zakai.simulate(model, np.arange(1, 9) * step, seed=2)
+    found = zakai.filter(model, record, method).residuals()[:, 0]
+    A, Q = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.diag([1.0, 0.0])
+    blocks = expm(np.block([[-A, Q], [np.zeros((2, 2)), A.T]]) * step)
+    transition = blocks[2:, 2:].T
+    noise = transition @ blocks[:2, 2:] + np.diag([0.0, 0.5 * step])
+    mean, variance, expected = 0.0, 1.0, []
+    for value in record.values[:, 0]:
+        (state, integral), cov = transition @ [mean, 0.0], transition @ np.diag([variance, 0.0]) @ transition.T + noise
+        expected.append(norm.cdf((value - integral) / np.sqrt(cov[1, 1])))
+        gain = cov[0, 1] / cov[1, 1]
+        mean, variance = state + gain * (value - integral), cov[0, 0] - gain * cov[0, 1]
+    assert np.allclose(found, expected, atol=tolerance)
+
+
+def test_residuals_of_counts_are_drawn_between_the_two_probabilities():
+    model = _model(observation=["exp(x)"], observation_noise=None, observation_family="poisson", parameters={})
+    times, values = [0.0, 0.5], np.array([[2.0], [np.nan]])
+    first = np.linspace(-9, 9, 4001)
+    prior, rate = norm.pdf(first) / norm.pdf(first).sum(), np.exp(first)
+    low, high = prior @ poisson.cdf(1, rate), prior @ poisson.cdf(2, rate)
+    filtered = zakai.filter(model, zakai.Record(times, values, "samples"))
+    found = np.array([filtered.residuals(seed=seed)[0, 0] for seed in range(20)])
+    draws = np.array([np.random.default_rng(seed).uniform(size=(2, 1))[0, 0] for seed in range(20)])
+    assert np.allclose(found, low + draws * (high - low), atol=1e-6)
+
+
+def test_an_observation_much_sharper_than_the_prediction_has_an_accurate_residual():
+    model = _model(1e-8)
+    record = zakai.Record([1.0], np.array([[0.3]]), "samples")
+    found = zakai.filter(model, record, "yau-yau").residuals()[0, 0]
+    variance = np.exp(-2.0) + (1 - np.exp(-2.0)) / 2 + 1e-8
+    assert np.isclose(found, norm.cdf(0.3 / np.sqrt(variance)), atol=2e-3)
+
+
+def test_a_gap_in_a_path_needs_no_special_case():
+    model = _model(0.5, observation_kind="path")
+    values = np.array([[0.02], [np.nan], [0.11]])
+    found = zakai.filter(model, zakai.Record([0.01, 0.02, 0.03], values, "path")).residuals()[:, 0]
+    assert np.isnan(found[1])
+    scores = np.array([0.02, 0.09]) / np.sqrt([0.5 * 0.01, 0.5 * 0.02])
+    assert np.allclose(found[[0, 2]], norm.cdf(scores), atol=0.01)
 
 
 def test_residuals_of_increments_are_uniform():

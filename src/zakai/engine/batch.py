@@ -7,11 +7,14 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from threading import Lock
+from contextlib import nullcontext
+from threading import Lock, Timer
 
+from zakai._progress import bar
 from zakai.engine.loop import Run
 
 LONG = 10.0  # seconds of work that are announced
+FIRST = 10.0  # seconds after which a first observation that is not done is announced
 SURE = 1.0  # seconds after which the rest can be estimated
 
 _LOG = logging.getLogger("zakai")
@@ -23,18 +26,25 @@ def filter_all(runs: Sequence[Run], progress: Progress | None, blocks: float = 1
 
     Args:
         runs: what is to be run.
-        progress: called with the number of observations done and their total.
+        progress: called with the number of observations done and their total; without it long work has a bar on a terminal.
         blocks: how many runs share an observation.
     """
     threads = min(os.cpu_count() or 1, len(runs))
-    watch = _Watch(sum(len(run.schedule) for run in runs), threads, progress, blocks)
-    if threads == 1:
-        for run in runs:
-            run.all(watch.report)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        for finished in [pool.submit(run.all, watch.report) for run in runs]:
-            finished.result()
+    with bar("filtering") if progress is None else nullcontext(progress) as advance:
+        watch = _Watch(sum(len(run.schedule) for run in runs), threads, advance, blocks)
+        first = Timer(FIRST, watch.report_nothing, runs[:1])
+        first.daemon = True
+        first.start()
+        try:
+            if threads == 1:
+                for run in runs:
+                    run.all(watch.report)
+                return
+            with ThreadPoolExecutor(threads) as pool:
+                for finished in [pool.submit(run.all, watch.report) for run in runs]:
+                    finished.result()
+        finally:
+            first.cancel()
 
 
 class _Watch:
@@ -45,7 +55,13 @@ class _Watch:
         self.lock = Lock()
         self.done = self.counted = 0
         self.began, self.waiting = 0.0, threads
-        self.announced = False
+        self.slow = 0  # successive measurements by which the rest takes long
+
+    def report_nothing(self, run: Run) -> None:
+        """Say that the first observation takes long, and what would shorten it."""
+        if self.done == 0:
+            name, shorter = run.setting.method.name, run.setting.method.shorter
+            _LOG.warning("%s: the first observation takes more than %.0f s; to shorten it, %s", name, FIRST, shorter)
 
     def report(self, run: Run, count: int) -> None:
         """Add intervals that a run has done; say once that the rest takes long, and what would shorten it."""
@@ -58,10 +74,11 @@ class _Watch:
             if self.waiting:  # the first interval of a thread waits for what it compiles: it says nothing of the others
                 self.began, self.counted, self.waiting = now, self.done, self.waiting - 1
             spent = now - self.began
-            if self.announced or spent <= SURE:
+            if spent <= SURE or self.slow == 2:
                 return
-            self.announced = True
             left = spent / (self.done - self.counted) * (self.total - self.done)
-            if left > LONG:
+            # Two successive measurements: other kernels may be compiled during the first.
+            self.began, self.counted, self.slow = now, self.done, self.slow + 1 if left > LONG else 0
+            if self.slow == 2:
                 name, shorter = run.setting.method.name, run.setting.method.shorter
                 _LOG.warning("%s: %d more observations take about %.0f s; to shorten it, %s", name, total - done, left, shorter)

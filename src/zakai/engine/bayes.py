@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +25,6 @@ if TYPE_CHECKING:
     import xarray
 
 Array = NDArray[Any]
-STEP = 1e-4  # of the differences that give the force, in posterior standard deviations
 LARGEST_R_HAT = 1.01
 
 
@@ -74,7 +75,6 @@ def sample(
         Vehtari, Gelman, Simpson, Carpenter and Buerkner 2021, Rank-normalization, folding, and localization: An improved R-hat.
 
     Example:
-
         posterior = zakai.sample(model, record, {"a": "lognormal(0, 1)", "s": "half-normal(1)"})
         posterior["a"].mean(), posterior.attrs["r_hat"]
     """
@@ -92,20 +92,19 @@ def sample(
     report = _line if progress is None and sys.stderr.isatty() else progress
     posterior.whiten(np.array([posterior.priors[i].place(model.parameters[name]) for i, name in enumerate(names)]))
     rng = np.random.default_rng(seed)
-    found, divergences = np.empty((chains, draws, len(names))), 0
-    with _double_precision():
-        for chain in range(chains):
-            start = posterior.start(rng)
-            key = int(rng.integers(2**31))
+    starts = [(posterior.start(rng), int(rng.integers(2**31))) for _ in range(chains)]
+    counts = np.zeros(chains, int)
 
-            def done(count: int, chain: int = chain) -> None:
-                if report is not None:
-                    report(chain * draws + count, chains * draws)
+    def done(chain: int, count: int) -> None:
+        counts[chain] = count
+        if report is not None:
+            report(int(counts.sum()), chains * draws)
 
-            found[chain], diverged = _chain(blackjax, posterior, start, key, warmup, draws, done)
-            divergences += diverged
-    values = np.array([[posterior.values(w) for w in one] for one in found])
-    return _dataset(blackjax, values, names, divergences, posterior.method)
+    with _double_precision(), ThreadPoolExecutor(min(os.cpu_count() or 1, chains)) as pool:
+        run = _chain(blackjax, posterior, warmup, draws)
+        found = list(pool.map(lambda chain: run(*starts[chain], lambda count: done(chain, count)), range(chains)))
+    values = np.array([[posterior.values(w) for w in one] for one, _ in found])
+    return _dataset(blackjax, values, names, sum(diverged for _, diverged in found), posterior.method)
 
 
 class _Posterior:
@@ -123,77 +122,51 @@ class _Posterior:
         """Return the parameters at w."""
         return np.array([prior.value(u) for prior, u in zip(self.priors, self.mode + self.factor @ w, strict=True)])
 
-    def __call__(self, w: Array) -> float:
-        """Return the log posterior density of w, up to a constant; -inf where the model does not exist."""
+    def __call__(self, w: Array) -> tuple[float, Array]:
+        """Return the log posterior density of w, up to a constant, and its gradient; -inf where the model does not exist."""
         with np.errstate(all="ignore"):
             u = self.mode + self.factor @ w
             values = self.values(w)
-            if not np.isfinite(values).all():
-                return -np.inf
-            prior = sum(one.log_density(place) for one, place in zip(self.priors, u, strict=True))
-            total = self.likelihood(values) + prior
-        return float(total) if np.isfinite(total) else -np.inf
-
-    def value_and_force(self, w: Array) -> tuple[float, Array]:
-        """Return the value and its gradient by differences.
-
-        Leapfrog steps are reversible and keep volume for any force that is a function of w, and the value decides on acceptance:
-        the error of the differences does not change what is sampled.
-        """
-        value = self(w)
-        if not np.isfinite(value):
-            return value, np.zeros(len(w))
-        slopes = np.array([(self(w + STEP * row) - value) / STEP for row in np.eye(len(w))])
-        return value, np.where(np.isfinite(slopes), slopes, 0.0)
+            value, gradient = self.likelihood.value_and_gradient(values)
+            value += sum(prior.log_density(place) for prior, place in zip(self.priors, u, strict=True))
+            slopes = np.array([prior.slopes(place) for prior, place in zip(self.priors, u, strict=True)])
+            force = self.factor.T @ (gradient * slopes[:, 0] + slopes[:, 1])
+        if not (np.isfinite(value) and np.isfinite(force).all()):
+            return -np.inf, np.zeros(len(w))
+        return float(value), force
 
     def whiten(self, start: Array) -> None:
         """Set the coordinates by the mode and the Hessian there, where it is negative definite."""
-        self.mode = start
-        if not np.isfinite(self(np.zeros(len(start)))):
+        self.mode, origin = start, np.zeros(len(start))
+        if not np.isfinite(self(origin)[0]):
             raise InputError(
-                f"sample: the log-likelihood is not finite at {self._shown(self.values(np.zeros(len(start))))}; give the model "
-                "parameters at which the record is possible"
+                f"sample: the log-likelihood is not finite at {self._shown(self.values(origin))}; give the model parameters at "
+                "which the record is possible"
             )
 
         def objective(w: Array) -> tuple[float, Array]:
-            value, force = self.value_and_force(w)
+            value, force = self(w)
             return -max(value, -1e300), -force
 
-        found = minimize(objective, np.zeros(len(start)), jac=True, method="L-BFGS-B", options={"maxiter": 100, "ftol": 1e-7})
-        mode = found.x
+        mode = minimize(objective, origin, jac=True, method="L-BFGS-B", options={"maxiter": 100, "ftol": 1e-9}).x
         size = np.full(len(mode), 1e-2)
         for _ in range(2):  # the second time with steps of half a standard deviation
-            hessian = self._hessian(mode, size)
+            columns = [(self(mode + row)[1] - self(mode - row)[1]) / (2 * row.sum()) for row in np.diag(size)]
+            hessian = 0.5 * (np.array(columns) + np.array(columns).T)
             curvature = -np.diag(hessian)
             size = np.where(curvature > 0, 0.5 / np.sqrt(np.abs(curvature) + 1e-300), size)
             size = np.clip(size, 1e-6, 1.0)
-        self.mode = mode + start
+        self.mode = start + mode
         try:
             self.factor = np.linalg.cholesky(np.linalg.inv(-hessian))
         except np.linalg.LinAlgError:
             self.factor = np.diag(size)
-        if not np.isfinite(self.factor).all():
-            self.factor = np.eye(len(mode))
-
-    def _hessian(self, w: Array, size: Array) -> Array:
-        rows = np.diag(size)
-        middle = self(w)
-        second = np.empty((len(w), len(w)))
-        ends = [(self(w + row), self(w - row)) for row in rows]
-        for i, (above, below) in enumerate(ends):
-            second[i, i] = (above - 2 * middle + below) / size[i] ** 2
-        for i in range(len(w)):
-            for j in range(i):
-                both = self(w + rows[i] + rows[j]) + self(w - rows[i] - rows[j]) - 2 * middle
-                mixed = both - size[i] ** 2 * second[i, i] - size[j] ** 2 * second[j, j]
-                second[i, j] = second[j, i] = mixed / (2 * size[i] * size[j])
-        return np.nan_to_num(second, nan=0.0, posinf=0.0, neginf=0.0)
 
     def start(self, rng: np.random.Generator) -> Array:
         """Return a start of a chain, wider than the posterior."""
         for _ in range(100):
             w = 1.5 * rng.standard_normal(len(self.mode))
-            if np.isfinite(self(w)):
+            if np.isfinite(self(w)[0]):
                 return w
         return np.zeros(len(self.mode))
 
@@ -214,17 +187,19 @@ def _double_precision() -> Iterator[None]:
         jax.config.update("jax_enable_x64", before)  # type: ignore[no-untyped-call]
 
 
-def _chain(
-    blackjax: Any, posterior: _Posterior, start: Array, key: int, warmup: int, draws: int, done: Callable[[int], None]
-) -> tuple[Array, int]:
-    """Return the draws (draws, p) of one chain in whitened coordinates, and the number of divergences."""
+def _chain(blackjax: Any, posterior: _Posterior, warmup: int, draws: int) -> Callable[..., tuple[Array, int]]:
+    """Return a function that runs a chain in whitened coordinates: the draws (draws, p) and the number of divergences.
+
+    It takes the start (p,), the seed of the chain, and a function that receives the number of draws done.  All chains share what
+    JAX compiles.
+    """
     import jax
 
-    p = len(start)
+    p = len(posterior.mode)
     shapes = tuple(jax.ShapeDtypeStruct(shape, "float64") for shape in ((), (p,)))  # type: ignore[no-untyped-call]
 
     def host(w: Any) -> tuple[Array, Array]:
-        value, force = posterior.value_and_force(np.asarray(w))
+        value, force = posterior(np.asarray(w))
         return np.asarray(value), force
 
     def both(w: Any) -> Any:
@@ -235,17 +210,29 @@ def _chain(
         return both(w)[0]
 
     log_density.defvjp(both, lambda force, cotangent: (cotangent * force,))
-    adapt_key, draw_key = jax.random.split(jax.random.key(key))
-    adaptation = blackjax.window_adaptation(blackjax.nuts, log_density, is_mass_matrix_diagonal=False)
-    (state, parameters), _ = adaptation.run(adapt_key, jax.numpy.asarray(start), num_steps=warmup)
-    step = jax.jit(blackjax.nuts(log_density, **parameters).step)
-    found, diverged = np.empty((draws, p)), 0
-    for i, one in enumerate(jax.random.split(draw_key, draws)):
-        state, info = step(one, state)
-        found[i] = state.position
-        diverged += int(info.is_divergent)
-        done(i + 1)
-    return found, diverged
+
+    @jax.jit
+    def adapted(key: Any, start: Any) -> Any:
+        adaptation = blackjax.window_adaptation(blackjax.nuts, log_density, is_mass_matrix_diagonal=False)
+        (state, parameters), _ = adaptation.run(key, start, num_steps=warmup)
+        return state, parameters
+
+    @jax.jit
+    def step(key: Any, state: Any, parameters: Any) -> Any:
+        return blackjax.nuts(log_density, **parameters).step(key, state)
+
+    def run(start: Array, seed: int, done: Callable[[int], None]) -> tuple[Array, int]:
+        adapt_key, draw_key = jax.random.split(jax.random.key(seed))
+        state, parameters = adapted(adapt_key, jax.numpy.asarray(start))
+        found, diverged = np.empty((draws, p)), 0
+        for i, key in enumerate(jax.random.split(draw_key, draws)):
+            state, info = step(key, state, parameters)
+            found[i] = state.position
+            diverged += int(info.is_divergent)
+            done(i + 1)
+        return found, diverged
+
+    return run
 
 
 def _dataset(blackjax: Any, values: Array, names: tuple[str, ...], divergences: int, method: str) -> xarray.Dataset:

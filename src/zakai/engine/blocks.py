@@ -102,19 +102,19 @@ def _warnings(blocks: Sequence[IndependentBlock], parts: Sequence[FilterResult])
     for block, part in zip(blocks, parts, strict=True):
         for warning in part.warnings:
             found.setdefault(_NUMBER.sub("0", warning), []).append((block, warning))
-    told = []
+    sentences = []
     for alike in found.values():
         who, texts = [block for block, _ in alike], {text for _, text in alike}
         first = alike[0][1]
         if len(texts) == 1:
             count = f" ({len(who)} blocks)" if len(who) > 1 else ""
-            told.append(f"{listed_blocks(who)}{count}: {first}")
+            sentences.append(f"{listed_blocks(who)}{count}: {first}")
         else:
-            told.append(
+            sentences.append(
                 f"{listed_blocks(who[:1])}: {first}; the same, in other numbers, of {len(who) - 1} more blocks: "
                 f"{listed_blocks(who[1:])}"
             )
-    return told
+    return sentences
 
 
 def _no_density(runs: Sequence[Run]) -> str:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from zakai import _display
 from zakai.engine.results import FilterResult
 from zakai.errors import InputError
 from zakai.models.numeric import numpy_function
@@ -54,9 +54,7 @@ class Comparison:
         return "\n".join(line.rstrip() for line in lines)
 
     def _repr_html_(self) -> str:
-        head = "".join(f"<th>{escape(name)}</th>" for name in ("", *COLUMNS))
-        body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in line) + "</tr>" for line in self._cells())
-        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        return _display.html_table("Comparison", ("", *COLUMNS), self._cells())
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return the table as a DataFrame, with the names as its index.
@@ -82,7 +80,6 @@ def compare(results: Sequence[FilterResult] | Mapping[str, FilterResult]) -> Com
             increments is relative to their noise.
 
     Example:
-
         print(zakai.compare({"linear": zakai.filter(a, record), "cubic": zakai.filter(b, record)}))
     """
     named = dict(results) if isinstance(results, Mapping) else None

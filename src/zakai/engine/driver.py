@@ -15,6 +15,7 @@ from zakai.engine.results import FilterResult
 from zakai.errors import InputError
 from zakai.models._errors import named
 from zakai.models.checks import check_noise_at, check_noise_within
+from zakai.models.domain import check_prior
 from zakai.models.model import Model
 from zakai.records import Record
 
@@ -50,7 +51,7 @@ def filter(
         method: a method's name, or "auto", the first that holds for this system. A system that falls into independent blocks is
             filtered block by block, each by the best method for it.
         keep: "densities", "moments", or None: densities up to 512 MiB in all.
-        progress: called with the number of observations done and K.
+        progress: called with the number of observations done and K; without it long work has a bar on a terminal.
         **options: options of the method.
 
     Returns:
@@ -61,7 +62,6 @@ def filter(
         ConditionError: the method's theorem does not hold.
 
     Example:
-
         model = zakai.load_model("gallery:spiral-sensor")
         truth, record = zakai.simulate(model, np.arange(0.01, 1.0, 0.01))
         result = zakai.filter(model, record)
@@ -131,6 +131,8 @@ def filter_planned(
 
 def planned(model: Model, prior: Any, method: str, options: Mapping[str, Any], by_value: bool = True) -> Plan:
     """Return how a system is filtered from a prior; None stands for the model's own."""
+    if prior is not None:
+        check_prior(model, prior)
     return plan_of(model, model.prior if prior is None else prior, method, options, by_value)
 
 
@@ -175,5 +177,6 @@ def _check(model: Model, record: Record) -> None:
         raise InputError(f"record: it has {record.values.shape[1]} columns of observations, but {model.source} has {model.m}")
     first = record.times[0]
     if first < model.start or (first == model.start and record.kind != "samples"):
-        raise InputError(f"record: row 1: time {first:g} is not after the start {model.start:g} of {model.source}")
+        hint = "" if record.unit is None else "; give the date at which t = 0 as origin"
+        raise InputError(f"record: row 1: time {first:g} is not after the start {model.start:g} of {model.source}{hint}")
     record.check_law(model)

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from zakai import _display
 from zakai.densities import Density, ProductDensity
 from zakai.densities.product import renamed
 from zakai.engine.blocks import SMALLEST_IS_WORST
 from zakai.engine.feed import Feed, Moment
-from zakai.engine.results import warnings_of_step
+from zakai.engine.health_warnings import warnings_of_step
 from zakai.errors import InputError
 from zakai.models.prior import GaussianPrior
 
@@ -32,8 +33,15 @@ class Estimate:
     def __repr__(self) -> str:
         names = self._online.model.state
         deviations = np.sqrt(np.maximum(np.diag(self.cov), 0.0))
-        parts = (f"{name} = {mean:.6g} +- {deviation:.3g}" for name, mean, deviation in zip(names, self.mean, deviations))
-        return f"Estimate(t = {self.time:g}: {', '.join(parts)})"
+        parts = [f"{name} = {mean:.6g} +- {deviation:.3g}" for name, mean, deviation in zip(names, self.mean, deviations)]
+        return f"Estimate(t = {self.time:g}: {_display.short_names(parts)})"
+
+    def _repr_html_(self) -> str:
+        deviations = np.sqrt(np.maximum(np.diag(self.cov), 0.0))
+        parts = zip(self._online.model.state, self.mean, deviations, self.interval(), strict=True)
+        rows = [(name, *map(_display.number, (mean, spread, *ends))) for name, mean, spread, ends in parts]
+        header = ("", "mean", "deviation", "2.5 %", "97.5 %")
+        return _display.html_table(f"Estimate at t = {_display.number(self.time)}", header, rows, self.warnings)
 
     @property
     def time(self) -> float:

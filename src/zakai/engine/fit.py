@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
+from zakai import _display
+from zakai._progress import Advance, bar
+from zakai.densities import GaussianMixture
 from zakai.engine.driver import filter as run_filter
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
 from zakai.errors import InputError
@@ -55,6 +58,38 @@ class Fit:
 
     __repr__ = __str__
 
+    def _repr_html_(self) -> str:
+        rows = [(name, _display.number(value), f"{self.standard_errors[name]:.2g}") for name, value in self.estimates.items()]
+        title = f"Fit({self.method}: {_display.counted(self.observations, 'observation')}, {self.message})"
+        return _display.html_table(title, ("parameter", "estimate", "standard error"), rows, self.warnings)
+
+    def plot(self, parameters: Sequence[str] | None = None, *, ax: Any = None) -> Any:
+        """Draw the Gaussian approximation N(estimates, covariance) of the estimates: one parameter, or regions of two.
+
+        Args:
+            parameters: one or two names; needed where more than two are fitted.
+            ax: the Matplotlib Axes to draw in; a new figure without it.
+
+        Returns:
+            The Matplotlib Axes.
+
+        Raises:
+            InputError: an unknown name, no standard errors, or Matplotlib is not installed (extra `plots`).
+        """
+        from zakai.report.axes import draw_density
+
+        wanted = list(self.estimates) if parameters is None else [parameters] if isinstance(parameters, str) else list(parameters)
+        names = tuple(self.estimates)
+        for name in wanted:
+            if name not in names:
+                raise InputError(f"plot: {name!r} is not among the parameters that were fitted ({listing(names)})")
+        rows = [names.index(name) for name in wanted]
+        covariance = self.covariance[np.ix_(rows, rows)]
+        if not np.isfinite(covariance).all():
+            raise InputError(f"plot: there are no standard errors of {listing(wanted)}; see the warnings of the fit")
+        mean = np.array([self.estimates[name] for name in wanted])
+        return draw_density(GaussianMixture.gaussian(mean, covariance, tuple(wanted), (False,) * len(wanted)), ax)
+
 
 def fit(
     model: Model,
@@ -66,21 +101,32 @@ def fit(
     bounds: Mapping[str, tuple[float | None, float | None]] | None = None,
     **options: Any,
 ) -> Fit:
-    """The parameters of largest likelihood given the record.
+    """Return the parameters of largest likelihood given the record.
 
         maximise l(theta) = log p(observations | theta);  standard errors: (-Hessian of l)^-1/2, on the diagonal
 
-    model: what the system is, with a prior; its values are where the search starts unless `start` gives others. record: K
-    observations. parameters: the names to estimate, by default all. method, options: as of `filter`. bounds: (lowest,
-    highest) by name, None where there is none; a noise that is no noise is never accepted, with or without bounds.
+    The likelihood and its gradient are those of `log_likelihood`, maximised by L-BFGS-B and Newton's steps. Check `converged`
+    and `warnings` of the result.
 
-    The likelihood and its gradient are those of `log_likelihood`, maximised by L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995) and
-    Newton's steps. Check `converged` and `warnings` of what is returned.
+    Args:
+        model: the system, with a prior; the search starts from its parameters.
+        record: K observations.
+        parameters: the names to estimate; by default all.
+        method: as for `filter`.
+        start: values by name from which the search starts instead.
+        bounds: (lowest, highest) by name, None for no bound. A noise covariance that is not positive is never accepted.
+        **options: as for `filter`.
 
-    Raises InputError for an unknown parameter, wrong bounds, or a start where the likelihood does not exist, and as `filter`.
+    Returns:
+        The estimates, their standard errors, and the model with the estimates.
+
+    Raises:
+        InputError: an unknown parameter, wrong bounds, or a start at which the likelihood does not exist; and as for `filter`.
+
+    References:
+        Byrd, Lu, Nocedal and Zhu 1995, A limited memory algorithm for bound constrained optimization.
 
     Example:
-
         fitted = zakai.fit(model, record, parameters=["a"], bounds={"a": (0, None)})
         fitted.estimates["a"], fitted.standard_errors["a"], fitted.converged
     """
@@ -88,7 +134,8 @@ def fit(
     values = _start(model, names, start)
     box = _box(model, names, values, bounds)
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
-    found = _maximum(LogLikelihood(now, record, method, names, options), values, box, names, model)
+    with bar("fitting") as advance:
+        found = _maximum(_Counted(LogLikelihood(now, record, method, names, options), advance), values, box, names, model)
     values = found.values
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
     result = run_filter(now, record, method, keep="moments", **options)
@@ -111,6 +158,19 @@ def fit(
         observations=len(record.times),
         warnings=warnings,
     )
+
+
+class _Counted:
+    """The log-likelihood and its gradient; every evaluation is reported."""
+
+    def __init__(self, function: LogLikelihood, advance: Advance | None):
+        self._function, self._advance, self._count = function, advance, 0
+
+    def value_and_gradient(self, values: np.ndarray) -> tuple[float, np.ndarray]:
+        self._count += 1
+        if self._advance is not None:
+            self._advance(self._count, None)
+        return self._function.value_and_gradient(values)
 
 
 def _number(value: Any, where: str) -> float:
@@ -166,7 +226,7 @@ class _Found:
 class _Objective:
     """The negative log-likelihood of the parameters in units of `scale`, and its gradient; finite everywhere."""
 
-    def __init__(self, function: LogLikelihood, origin: np.ndarray, scale: np.ndarray):
+    def __init__(self, function: _Counted, origin: np.ndarray, scale: np.ndarray):
         self._both = function.value_and_gradient
         self.origin, self.scale = origin, scale
         self.best: tuple[float, np.ndarray, np.ndarray] | None = None
@@ -199,7 +259,7 @@ class _Objective:
         return np.asarray(0.5 * (matrix + matrix.T))
 
 
-def _maximum(function: LogLikelihood, values: np.ndarray, box: np.ndarray, names: tuple[str, ...], model: Model) -> _Found:
+def _maximum(function: _Counted, values: np.ndarray, box: np.ndarray, names: tuple[str, ...], model: Model) -> _Found:
     """The maximum of the replayed likelihood from `values`: L-BFGS-B, and then Newton's steps in the free parameters."""
     scale = np.where(values != 0, np.abs(values), 1.0)
     objective = _Objective(function, values, scale)

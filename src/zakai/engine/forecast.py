@@ -35,7 +35,7 @@ def forecast(result: FilterResult, times: Any, inputs: Inputs | None = None) -> 
     plan, states, record = origin_of(result, "forecast")
     values = np.full((np.size(times), record.values.shape[1]), np.nan)
     known = record.inputs if inputs is None or record.inputs is None else record.inputs.followed_by(inputs)
-    future = Record(times, values, record.kind, known)
+    future = Record(times, values, record.kind, known, record.unit, record.origin)
     last = float(record.times[-1])
     if future.times[0] <= last:
         raise InputError(f"forecast: the time {future.times[0]:g} is not after the end of the record, {last:g}; give later times")

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.engine.batch import filter_all
 from zakai.engine.driver import check_noise, check_records, planned
-from zakai.engine.loop import Run
+from zakai.engine.loop import CHUNK, PIECE, Run, advance
 from zakai.engine.setting import Setting
 from zakai.errors import ConditionError, InputError
 from zakai.models._errors import did_you_mean, listing
-from zakai.models.checks import check_noise_at
+from zakai.models.checks import COEFFICIENTS, depends_on_state, noise_check
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
 from zakai.numerics.complex_step import STEP
 from zakai.records import Record
+from zakai.records.schedule import Schedule
 
+SHORT = 0.02  # seconds of one evaluation below which threads do not pay
 DIFFERENCE = 1e-5  # relative step of the differences of gradients that give second derivatives
 
 
@@ -50,7 +54,6 @@ def log_likelihood(
         Squire and Trapp 1998, Using complex variables to estimate derivatives of real functions.
 
     Example:
-
         l = zakai.log_likelihood(model, record, parameters=["a"])
         value, gradient = l.value_and_gradient([0.5])
     """
@@ -91,8 +94,10 @@ class LogLikelihood:
                 )
         self.model, self.record, self.names, self._plan = model, record, names, plan
         self._where = [list(model.parameters).index(name) for name in names]
-        self._depends = [_parameters_of(setting) for setting in plan.settings]
+        self._parts = [_Part.of(run) for run in plan.runs(record, "moments")]
         self._times = np.concatenate([[model.start], record.times])
+        keys = [key for key in COEFFICIENTS if not depends_on_state(getattr(model, key), model)]
+        self._checks = [check for key in keys if (check := noise_check(model, key)) is not None]
         self._traced: Callable[[Any], Any] | None = None
 
     def __repr__(self) -> str:
@@ -102,44 +107,47 @@ class LogLikelihood:
         """Return l at the values (p,)."""
         if "jax" in sys.modules and isinstance(values, sys.modules["jax"].core.Tracer):
             return self._in_jax()(values)
-        return float(self._evaluated(values, [])[0])
+        return self._evaluated(values, False)[0]
 
     def value_and_gradient(self, values: Any) -> tuple[float, np.ndarray]:
         """Return l and its gradient (p,) at the values (p,)."""
-        value, *slopes = self._evaluated(values, range(len(self.names)))
-        return float(value), np.array(slopes)
+        return self._evaluated(values, True)
 
-    def _evaluated(self, values: Any, directions: Sequence[int]) -> list[float]:
-        """Return l, and its derivatives with respect to some of the parameters."""
+    def _evaluated(self, values: Any, derivatives: bool) -> tuple[float, np.ndarray]:
+        """Return l and its gradient, zero unless `derivatives` are wanted; NaN where l does not exist."""
         given = np.asarray(values, dtype=float)
         if given.shape != (len(self.names),):
             raise InputError(f"log_likelihood: the values have shape {given.shape}; expected ({len(self.names)},)")
         theta = self.model.theta()
         theta[self._where] = given
+        missing = np.nan, np.full(len(given), np.nan)
+        with np.errstate(all="ignore"):
+            if not np.isfinite(given).all() or any(check(self._times, theta) for check in self._checks):
+                return missing
+
+        def evidence(job: tuple[_Part, int | None]) -> Any:
+            part, direction = job
+            if direction is None:
+                return part.evidence(theta)
+            moved = theta.astype(complex)
+            moved[self._where[direction]] += 1j * STEP
+            return part.evidence(moved)
+
+        work: list[tuple[_Part, int | None]] = []
+        for part in self._parts:
+            directions = [i for i, name in enumerate(self.names) if derivatives and name in part.depends]
+            work += [(part, None), *((part, i) for i in directions)]
         try:
-            changed = self.model.with_parameters(**dict(zip(self.names, given.tolist(), strict=True)))
-            check_noise_at(changed, self._times)
+            found = _each(evidence, work)
         except InputError:
-            return [np.nan] * (1 + len(directions))
-        runs: list[tuple[int, Run]] = []
-        for column, direction in enumerate([None, *directions]):
-            moved = theta
-            if direction is not None:
-                moved = theta + 0j
-                moved[self._where[direction]] += 1j * STEP
-            for run, depends in zip(self._plan.runs(self.record, "moments", theta=moved), self._depends, strict=True):
-                if direction is None or self.names[direction] in depends:
-                    runs.append((column, run))
-        try:
-            with np.errstate(all="ignore"):
-                filter_all([run for _, run in runs], None)
-        except InputError:
-            return [np.nan] * (1 + len(directions))
-        totals = [0.0] * (1 + len(directions))
-        for column, run in runs:
-            evidence = sum(part.log_likelihood_increment.sum() for part in run.parts)
-            totals[column] += float(evidence.real if column == 0 else evidence.imag / STEP)
-        return totals
+            return missing
+        value, gradient = 0.0, np.zeros(len(given))
+        for (_, direction), total in zip(work, found, strict=True):
+            if direction is None:  # the filter's own value: with derivatives a density may have another grid
+                value += float(total)
+            else:
+                gradient[direction] += total.imag / STEP
+        return value, gradient
 
     def _in_jax(self) -> Callable[[Any], Any]:
         """Return the function for values that JAX traces."""
@@ -148,10 +156,50 @@ class LogLikelihood:
         return self._traced
 
 
+class _Part(NamedTuple):
+    """One run of the filter: its setting, its schedule and observations, and the names of the parameters that it depends on."""
+
+    setting: Setting
+    schedule: Schedule
+    values: np.ndarray
+    depends: set[str]
+
+    @classmethod
+    def of(cls, run: Run) -> _Part:
+        return cls(run.setting, run.schedule, run.values, _parameters_of(run.setting))
+
+    def evidence(self, theta: np.ndarray) -> Any:
+        """Return the log-likelihood at the parameters, complex where they are."""
+        setting, state, increments = self.setting.at(theta), None, []
+        for first in range(0, len(self.schedule), CHUNK):
+            prepared = setting.prepared(self.schedule.part(slice(first, first + CHUNK)))
+            values = self.values[first : first + CHUNK]
+            if state is None:
+                state = setting.method.init(prepared, setting.prior)
+            for begin in range(0, len(values), PIECE):
+                rows = slice(begin, min(begin + PIECE, len(values)))
+                with np.errstate(all="ignore"):  # of this thread
+                    states, infos = advance(setting, prepared, rows, state, values[rows])
+                state = states[-1]
+                increments.append(infos.log_likelihood_increment)
+        return np.sum(np.concatenate(increments))
+
+
+def _each(function: Callable[[Any], Any], arguments: Sequence[Any]) -> list[Any]:
+    """Return the values of a function, computed on the threads of the machine unless the first one took no time."""
+    began = time.monotonic()
+    found, rest = [function(argument) for argument in arguments[:1]], arguments[1:]
+    if len(rest) < 2 or time.monotonic() - began < SHORT:
+        return found + [function(argument) for argument in rest]
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, len(rest))) as pool:
+        return found + list(pool.map(function, rest))
+
+
 def _parameters_of(setting: Setting) -> set[str]:
     """Return the names of the parameters on which a part of the likelihood depends."""
     model, prior = setting.model, setting.prior
-    parts = [model.drift, model.diffusion, model.process_noise, model.observation, model.observation_noise]
+    coefficients = [model.diffusion, model.process_noise, model.observation_noise, model.cross_noise]
+    parts = [model.drift, model.observation, *coefficients]
     symbols = set().union(*(part.free_symbols for part in parts))
     if isinstance(prior, DensityPrior):
         symbols |= prior.log_density.free_symbols

@@ -9,10 +9,11 @@ import numpy as np
 
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
-from zakai.engine.results import FilterResult, versions, warnings_of_run
+from zakai.engine.health_warnings import warnings_of_run
+from zakai.engine.results import FilterResult, versions
 from zakai.engine.setting import KEPT, Setting
 from zakai.errors import InputError
-from zakai.methods._protocol import Info, Infos
+from zakai.methods._protocol import Infos, stacked
 from zakai.models.numeric import explain_nonfinite, numpy_function
 from zakai.records import Record
 from zakai.records.noise import notes_on_noise
@@ -40,16 +41,6 @@ def advance(setting: Setting, prepared: Any, rows: slice, state: Any, values: np
     return states, stacked(infos)
 
 
-def stacked(infos: Sequence[Info]) -> Infos:
-    """Return the reports of single steps as arrays with a leading axis."""
-    return Infos(
-        np.array([info.log_likelihood_increment for info in infos]),
-        np.array([info.mean for info in infos]),
-        np.array([info.cov for info in infos]),
-        {name: np.array([info.health[name] for info in infos]) for name in infos[0].health},
-    )
-
-
 def joined(parts: Sequence[Infos]) -> Infos:
     """Return the reports of consecutive segments as one."""
     health = {name: np.concatenate([part.health[name] for part in parts]) for name in parts[0].health}
@@ -59,7 +50,7 @@ def joined(parts: Sequence[Infos]) -> Infos:
 
 def size_of(state: Any) -> int:
     """Return the bytes of the arrays of a state."""
-    return sum(size_of(part) if isinstance(part, tuple) else np.asarray(part).nbytes for part in state)
+    return sum(size_of(part) if isinstance(part, tuple) else getattr(part, "nbytes", 8) for part in state)
 
 
 class Run:

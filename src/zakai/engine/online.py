@@ -21,7 +21,7 @@ from zakai.models.checks import check_noise_at
 from zakai.models.model import Model
 from zakai.records.checkpoint import read_checkpoint, write_checkpoint
 from zakai.records.inputs import Inputs, known_inputs
-from zakai.records.record import LARGEST
+from zakai.records.numbers import LARGEST
 from zakai.records.writing import shown
 
 
@@ -40,7 +40,6 @@ def online(model: Model, method: str = "auto", **options: Any) -> Online:
         ConditionError: the method's theorem does not hold.
 
     Example:
-
         online = zakai.online(zakai.load_model("gallery:spiral-sensor"))
         estimate = online.update(0.01, [0.02, -0.01])
         estimate.mean, estimate.interval()
@@ -70,6 +69,9 @@ class Online:
 
     def __repr__(self) -> str:
         return f"Online({self.method} of {self.model.source}, at t = {self.time:g})"
+
+    def _repr_html_(self) -> str:
+        return self.last._repr_html_()
 
     @property
     def time(self) -> float:
@@ -164,7 +166,7 @@ class Online:
                 for feed, moment in zip(self.feeds, moments, strict=True):
                     feed.now = moment
         except (KeyError, TypeError, ValueError):
-            raise InputError(f"{shown(path)}: the checkpoint does not fit this filter; remove it to begin anew") from None
+            raise InputError(f"{shown(path)}: the checkpoint does not fit this filter; remove it to start again") from None
         return more
 
     @property

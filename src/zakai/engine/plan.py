@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from zakai import _registry
 from zakai.algebra.choice import Conditions, Division, chosen, divided
+from zakai.algebra.conditions import all_hold
+from zakai.algebra.theorems import conditions_of
 from zakai.engine.blocks import joined_blocks, record_of_block
 from zakai.engine.loop import KEPT_BYTES, Run
 from zakai.engine.results import FilterResult
@@ -14,6 +18,7 @@ from zakai.engine.setting import Setting
 from zakai.errors import InputError
 from zakai.methods._protocol import Method
 from zakai.models.model import Model
+from zakai.models.prior import GaussianPrior, MixturePrior
 from zakai.records import Record
 
 
@@ -58,6 +63,7 @@ class ByBlocks(NamedTuple):
 
 
 Plan = Whole | ByBlocks
+_KEPT_PRIOR = 1e-3  # difference of moments, in deviations and relative, beyond which "auto" takes another method
 
 
 def _with_origin(result: FilterResult, plan: Plan, runs: Sequence[Run]) -> FilterResult:
@@ -77,14 +83,50 @@ def plan_of(model: Model, prior: Any, method: str, options: Mapping[str, Any], b
         _registry.load(method)  # an unknown name is refused before anything is computed
     division = divided(model, prior, method, by_value)
     if division is None:
-        name, why, considered = chosen(model, method)
-        loaded = _registry.load(name)
-        return Whole(Setting.of(model, prior, loaded, _own_options([loaded], options)[0]), why, considered)
+        return _whole(model, prior, method, options)
     names = dict.fromkeys(division.methods.values())
     methods = [_registry.load(name) for name in names]
     own = dict(zip(names, zip(methods, _own_options(methods, options), strict=True), strict=True))
     settings = (Setting.of(b.model, b.prior, *own[division.methods[b.model]]) for b in division.blocks)
     return ByBlocks(model, division, tuple(settings))
+
+
+def _whole(model: Model, prior: Any, method: str, options: Mapping[str, Any]) -> Whole:
+    """Return the plan of one method; "auto" goes on to the next one that holds where a method loses the density at the prior."""
+    name, why, considered = chosen(model, method)
+    lost: list[str] = []
+    while True:
+        loaded = _registry.load(name)
+        setting = Setting.of(model, prior, loaded, _own_options([loaded], options)[0])
+        exact = name == "kalman-bucy" and isinstance(prior, GaussianPrior)
+        later = _registry.AUTO[_registry.AUTO.index(name) + 1 :] if method == "auto" and not exact else ()
+        others = [one for one in later if all_hold(conditions_of(one, model)) is True]
+        fault = _fault_at_prior(setting) if others else ""
+        if not fault:
+            return Whole(setting, "; ".join([why, *lost]), considered)
+        lost.append(f"{name} holds too, but loses the density at the prior: {fault}")
+        name, considered = others[0], {**considered, others[0]: conditions_of(others[0], model)}
+
+
+def _fault_at_prior(setting: Setting) -> str:
+    """Return how a method's density at the start differs from the prior, or nothing; a formula's moments are not compared."""
+    prior, model = setting.prior, setting.model
+    try:
+        with np.errstate(all="ignore"):
+            prepared, state = setting.begin()
+            density = setting.method.density(prepared, state)
+            mean, cov = density.mean(), density.cov()
+    except InputError as wrong:
+        return str(wrong)
+    if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
+        return "it is not finite"
+    if not isinstance(prior, GaussianPrior | MixturePrior) or model.periodic:
+        return ""
+    expected, spread = np.asarray(prior.mean), np.diag(prior.cov)
+    wide = spread > 0
+    apart = np.abs(mean - expected)[wide] / np.sqrt(spread[wide])
+    off = max(apart.max(initial=0.0), np.abs(np.diag(cov)[wide] / spread[wide] - 1.0).max(initial=0.0))
+    return f"its moments are off by {off:.1g} deviations" if off > _KEPT_PRIOR else ""
 
 
 def _own_options(methods: Sequence[Method[Any, Any]], options: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from zakai import _display
 from zakai.engine.batch import Progress
 from zakai.engine.driver import check_model, check_noise, check_records, filter_planned
-from zakai.engine.plan import plan_of
+from zakai.engine.plan import ByBlocks, plan_of
 from zakai.engine.results import FilterResult, other_versions, versions
 from zakai.errors import InputError
 from zakai.models.files import read_model
@@ -36,7 +37,6 @@ def prepare(model: Model, times: Any, method: str = "auto", **options: Any) -> P
         ConditionError: the method's theorem does not hold.
 
     Example:
-
         model = zakai.load_model("gallery:spiral-sensor")
         prepared = zakai.prepare(model, np.arange(0.01, 1.0, 0.01))
         prepared.save("spiral-sensor.prepared")
@@ -75,7 +75,13 @@ class Prepared:
             run.prepare()
 
     def __repr__(self) -> str:
-        return f"Prepared({self.method} of {self.model.source})"
+        method = self._plan.division.method if isinstance(self._plan, ByBlocks) else self._plan.setting.method.name
+        return f"Prepared({method} of {self.model.source}: {_display.counted(len(self.record), 'time')})"
+
+    def _repr_html_(self) -> str:
+        first, last = map(_display.number, self.record.times[[0, -1]])
+        rows = [("model", repr(self.model)), ("times", f"{len(self.record):,}, {first} to {last}"), *self.options.items()]
+        return _display.html_table(repr(self), ("", ""), rows)
 
     def filter(self, record: Record, *, keep: str | None = None, progress: Progress | None = None) -> FilterResult:
         """Return what `zakai.filter` returns for this model, method and options, to the bit."""
@@ -108,9 +114,9 @@ class Prepared:
             model = read_model(text, source) if model is None else model
             check_model(model)
             if about["model"] != model.text:
-                raise InputError(f"{name}: was prepared for another model; prepare anew")
+                raise InputError(f"{name}: was prepared for another model; prepare again")
             if wrong := other_versions(about["versions"]):
-                raise InputError(f"{name}: was prepared with another version of {wrong}; prepare anew")
+                raise InputError(f"{name}: was prepared with another version of {wrong}; prepare again")
             if arrays["seen"].dtype != bool or arrays["seen"].shape != (len(arrays["times"]), model.m):
                 raise ValueError
             values = np.where(arrays["seen"], 0.0, np.nan)
@@ -119,7 +125,7 @@ class Prepared:
             check_records(model, record)
             return cls(model, method, options, record)
         except (KeyError, IndexError, TypeError, ValueError, AttributeError):
-            raise InputError(f"{name}: does not hold what zakai.prepare makes; prepare anew") from None
+            raise InputError(f"{name}: does not hold what zakai.prepare makes; prepare again") from None
 
     @property
     def _bound(self) -> dict[str, Any]:

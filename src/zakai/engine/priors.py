@@ -12,6 +12,7 @@ from scipy.special import betaln, expit, gammaln, log_expit, logit
 from zakai.errors import InputError
 from zakai.models._errors import did_you_mean, listing
 
+DIFFERENCE = 1e-5  # of u in derivatives; their relative error is about 1e-10
 _TEXT = re.compile(r"\s*([A-Za-z-]+)\s*\(([^()]*)\)\s*")
 
 
@@ -33,9 +34,7 @@ def _log_normal(u: float, mean: float, deviation: float) -> float:
 
 
 _FAMILIES: Mapping[str, _Family] = {
-    "normal": _Family(
-        ("mean", "standard deviation"), ("standard deviation",), lambda u, m, s: u, lambda x, m, s: x, _log_normal
-    ),
+    "normal": _Family(("mean", "standard deviation"), ("standard deviation",), lambda u, m, s: u, lambda x, m, s: x, _log_normal),
     "lognormal": _Family(
         ("mean of the logarithm", "standard deviation of the logarithm"),
         ("standard deviation of the logarithm",),
@@ -107,6 +106,12 @@ class Prior:
     def log_density(self, u: float) -> float:
         """Return the log density of u."""
         return float(self.family.log_density(u, *self.numbers))
+
+    def slopes(self, u: float) -> tuple[float, float]:
+        """Return the derivatives of the parameter and of the log density by u, by central differences."""
+        above, below = u + DIFFERENCE, u - DIFFERENCE
+        value = self.value(above) - self.value(below)
+        return value / (above - below), (self.log_density(above) - self.log_density(below)) / (above - below)
 
     def place(self, value: float) -> float:
         """Return u for a value of the parameter; where the prior excludes it, u = 0."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
@@ -12,38 +12,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zakai import _display
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.errors import InputError
 from zakai.models.model import Model
 from zakai.records import Record
-from zakai.records.netcdf import load_variables, save_variables
-from zakai.records.writing import shown
+from zakai.records.dates import Clock
+from zakai.records.netcdf import save_variables
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
 
     from zakai.engine.plan import Plan
     from zakai.records import Inputs
 
 _LARGEST_COV = 32
-_LONGEST_NAME = 64  # of a state, or a method
-# All others are over the time.
-_DIMENSIONS = {
-    **{name: (name,) for name in ("time", "state", "state_")},
-    **{name: ("time", "state") for name in ("mean", "variance")},
-    "cov": ("time", "state", "state_"),
-}
-# Names that health figures had in version 0.1.
-_RENAMED = {
-    "missed": "tolerance_ratio",
-    "lost": "tail_truncation",
-    "surprise": "tail_depth",
-    "exponent": "gauge_exponent",
-    "splitting": "splitting_error",
-    "resolution": "std_in_spacings",
-    "negative": "negative_mass",
-}
 _MOST_ASSEMBLED = 4 * 2**30  # bytes of the covariances of independent blocks, when they are put together
 
 
@@ -79,11 +64,17 @@ class FilterResult:
     _no_density: str = "the densities were not kept"
 
     def __repr__(self) -> str:
-        names = self.state if len(self.state) <= 8 else (*self.state[:6], "...", self.state[-1])
         return (
-            f"FilterResult({self.method}, {len(self.times) - 1} observations of {', '.join(names)}, "
-            f"log-likelihood {self.log_likelihood:.6g}, {len(self.warnings)} warnings)"
+            f"{type(self).__name__}({self.method}: {_display.counted(len(self.times) - 1, 'observation')}, "
+            f"state {_display.short_names(self.state)}, log-likelihood {_display.number(self.log_likelihood)}, "
+            f"{_display.counted(len(self.warnings), 'warning')})"
         )
+
+    def _repr_html_(self) -> str:
+        deviation = np.sqrt(np.maximum(self.variance[-1], 0.0))
+        rows = [(name, *map(_display.number, row)) for name, *row in zip(self.state, self.mean[-1], deviation, strict=True)]
+        when = _display.number(self.times[-1]) if self.dates is None else str(self.dates[-1].astype("datetime64[s]"))
+        return _display.html_table(repr(self), ("", f"mean at {when}", "deviation"), rows, self.warnings)
 
     @property
     def cov(self) -> np.ndarray:
@@ -118,6 +109,25 @@ class FilterResult:
         return float(np.sum(self.log_likelihood_increments))
 
     @property
+    def clock(self) -> Clock | None:
+        """The unit and the date at which t = 0, of a record with dates."""
+        if self.record is not None:
+            return self.record.clock
+        unit, origin = (self.attributes.get(f"time_{name}") for name in ("unit", "origin"))
+        return None if unit is None or origin is None else Clock.of(origin, unit)
+
+    @property
+    def dates(self) -> np.ndarray | None:
+        """The dates (K+1,) of `times` as datetime64, of a record with dates."""
+        clock = self.clock
+        if clock is None:
+            return None
+        dates = clock.dates(self.times)
+        if self.record is not None and self.record.dates is not None and len(self.record) == len(dates) - 1:
+            dates[1:] = self.record.dates
+        return dates
+
+    @property
     def has_densities(self) -> bool:
         """Whether `density` can be asked."""
         return self._density is not None
@@ -134,6 +144,59 @@ class FilterResult:
             raise InputError(f"density: there is no time number {k!r}; numbers run from 0 to {count - 1}")
         return self._density(k % count)
 
+    def quantile(self, q: float | Sequence[float]) -> np.ndarray:
+        """Return quantiles of the marginal posteriors at all times.
+
+        Args:
+            q: probabilities from 0 to 1.
+
+        Returns:
+            (len(q), K+1, n), or (K+1, n) for one probability.  Quantiles of an angle are counted from the point opposite to its
+            mean.
+
+        Raises:
+            InputError: the densities were not kept.
+
+        Example:
+            low, median, high = result.quantile([0.05, 0.5, 0.95])
+        """
+        wanted = np.asarray(q, float)
+        listed = np.atleast_1d(wanted).tolist()
+        found = np.stack([self.density(k).quantile(listed) for k in range(len(self.times))], axis=1)
+        return found if wanted.ndim else found[0]
+
+    def circular_deviation(self) -> np.ndarray:
+        """Return the circular standard deviation of each angle at all times (K+1, n); NaN for other states.
+
+        `mean` has the circular mean of an angle, and `variance` that of its deviations from it, wrapped to (-pi, pi].
+
+        Raises:
+            InputError: the densities were not kept.
+        """
+        return np.stack([self.density(k).circular_deviation() for k in range(len(self.times))])
+
+    def plot(
+        self, state: int | str = 0, truth: Any = None, *, start: int | None = None, stop: int | None = None, ax: Any = None
+    ) -> Any:
+        """Draw the posterior of one state over time: its density, mean, 95% band, and observations of the state itself.
+
+        Args:
+            state: a name or a number.
+            truth: the true states (K+1, n) or what `zakai.simulate` returns, where they are known.
+            start: number of the first time that is drawn.
+            stop: number after the last one.
+            ax: the Matplotlib Axes to draw in; a new figure without it.
+
+        Returns:
+            The Matplotlib Axes.
+
+        Raises:
+            InputError: an unknown state, a truth of the wrong shape, or Matplotlib is not installed (extra `plots`).
+        """
+        from zakai.report.axes import plot_result
+
+        return plot_result(self, state, truth, start, stop, ax)
+
     def forecast(self, times: Any, inputs: Inputs | None = None) -> FilterResult:
         """Return the density of the state at times after the record, when nothing more is observed.
 
@@ -148,7 +211,6 @@ class FilterResult:
             InputError: a time before the end of the record, missing inputs, or a result that was read from a file.
 
         Example:
-
             ahead = result.forecast([11.0, 12.0])
             ahead.mean, ahead.density(-1).quantile([0.05, 0.95])
         """
@@ -175,7 +237,6 @@ class FilterResult:
             Czado, Gneiting and Held 2009, Predictive model assessment for count data.
 
         Example:
-
             u = result.residuals()
             scipy.stats.kstest(u[~np.isnan(u)], "uniform").pvalue
         """
@@ -214,7 +275,9 @@ class FilterResult:
         return variables
 
     def _attributes(self) -> dict[str, Any]:
+        clock = {} if self.clock is None else {f"time_{name}": str(value) for name, value in self.clock._asdict().items()}
         return {
+            **clock,
             "method": self.method,
             "why": self.why,
             "log_likelihood": self.log_likelihood,
@@ -224,98 +287,38 @@ class FilterResult:
         }
 
     def to_dataset(self) -> xarray.Dataset:
-        """Return the result as an xarray Dataset with dimensions `time` and `state`."""
+        """Return the result as an xarray Dataset with dimensions `time`, of dates if the record has some, and `state`."""
         import xarray
 
         variables = self._variables()
+        if self.dates is not None:
+            variables["time"] = (["time"], self.dates, {})
         coordinates = {name: variables.pop(name) for name in ("time", "state", "state_")}
         return xarray.Dataset(variables, coords=coordinates, attrs=self._attributes())
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return means and standard deviations as a DataFrame, a row for each time, or date if the record has some.
+
+        The columns are the names of the states, each followed by that name with `_deviation`, and `log_likelihood_increment`.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise InputError("to_dataframe needs pandas: pip install 'zakai[pandas]'") from None
+        columns = {}
+        for i, name in enumerate(self.state):
+            columns[name] = self.mean[:, i]
+            columns[f"{name}_deviation"] = np.sqrt(np.maximum(self.variance[:, i], 0.0))
+        columns["log_likelihood_increment"] = self.log_likelihood_increments
+        index = pandas.Index(self.times if self.dates is None else self.dates, name="time")
+        return pandas.DataFrame(columns, index=index)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as NetCDF, atomically."""
         save_variables(self._variables(), self._attributes(), path)
-
-
-def load_result(path: str | os.PathLike[str]) -> FilterResult:
-    """A result that was written by `FilterResult.save`; densities are not stored.
-
-    Raises InputError for a file that is not such a result.
-    """
-    return result_of(*load_variables(path), shown(path))
-
-
-def result_of(variables: Mapping[str, Any], attributes: Mapping[str, Any], source: str) -> FilterResult:
-    """The result that a file's variables and attributes are; `source` is what errors call it.
-
-    Raises InputError where they are none.
-    """
-    from zakai.models.files import read_model
-
-    _check_layout(variables, source)
-    arrays = {name: values for name, (_, values, _) in variables.items()}
-    method, state = str(attributes.get("method", "")), tuple(str(name) for name in arrays["state"])
-    for word in (method, *state):
-        if not word.isprintable() or len(word) > _LONGEST_NAME:
-            fault = f"{ascii(word[:40])} is no name of a method or a state"
-            raise InputError(f"{source}: {fault}; give a result written by zakai filter")
-    text = str(attributes.get("model", ""))
-    known = {*_DIMENSIONS, "log_likelihood_increment"}
-    return FilterResult(
-        times=arrays["time"],
-        mean=arrays["mean"],
-        variance=arrays["variance"],
-        log_likelihood_increments=arrays["log_likelihood_increment"],
-        health={_RENAMED.get(name, name): values for name, values in arrays.items() if name not in known},
-        warnings=[line for line in str(attributes.get("warnings", "")).split("\n") if line],
-        method=method,
-        why=str(attributes.get("why", "")),
-        model=read_model(text, source) if text else None,
-        state=state,
-        _cov=arrays.get("cov"),
-        _no_density=f"{source}: a stored result has no densities; filter again to have them",
-    )
-
-
-def warnings_of_step(health: Mapping[str, Any], bounds: Mapping[str, tuple[float, str]]) -> list[str]:
-    """A sentence for every bound that one step did not keep."""
-    return [
-        f"{name} is {float(health[name]):.2g} and exceeds {bound:g}: {what}"
-        for name, (bound, what) in bounds.items()
-        if name in health and float(health[name]) > bound
-    ]
-
-
-def _check_layout(variables: Mapping[str, Any], source: str) -> None:
-    """Raise InputError unless the variables are those of a result, over the right dimensions."""
-    for name in ("time", "state", "mean", "variance", "log_likelihood_increment"):
-        if name not in variables:
-            raise InputError(f"{source}: has no variable {name!r}; give a result written by zakai filter")
-    sizes = {name: np.size(variables[of][1]) for name, of in (("time", "time"), ("state", "state"), ("state_", "state"))}
-    for name, (dimensions, values, _) in variables.items():
-        expected = _DIMENSIONS.get(name, ("time",))
-        numbers = values.dtype.kind == "f" or name in ("state", "state_")
-        if tuple(dimensions) != expected or not numbers or values.shape != tuple(sizes[axis] for axis in expected):
-            over = ", ".join(map(str, dimensions))[:60]
-            fault = f"{name[:40]!r} is over {over!r} of shape {values.shape}, or holds no floating-point numbers"
-            raise InputError(f"{source}: {fault}; give a result written by zakai filter")
-
-
-def warnings_of_run(result: FilterResult) -> list[str]:
-    """Return a sentence for every bound that was exceeded, and for values that are not finite."""
-    said = []
-    bad = ~np.isfinite(result.log_likelihood_increments)
-    if bad.any():
-        time = result.times[np.argmax(bad)]
-        said.append(f"the density was lost at t = {time:g}; nothing after that time is to be trusted")
-    for name, (bound, what) in result.bounds.items():
-        over = result.health[name] > bound if name in result.health else np.zeros(0, bool)
-        if over.any():
-            worst = int(np.nanargmax(np.where(over, result.health[name], -np.inf)))
-            said.append(
-                f"{name} exceeded {bound:g} at {int(over.sum())} of {len(over) - 1} times, most at t = "
-                f"{result.times[worst]:g} ({result.health[name][worst]:.2g}): {what}"
-            )
-    return said
 
 
 @lru_cache(maxsize=1)

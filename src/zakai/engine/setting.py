@@ -36,9 +36,8 @@ class Setting(NamedTuple):
     @classmethod
     def of(cls, model: Model, prior: Any, method: Method[Any, Any], options: Mapping[str, Any]) -> Setting:
         """Return the setting with the model's own parameters."""
-        parts = (model.drift, model.diffusion, model.process_noise, model.observation, model.observation_noise)
-        depends = any(part.has(model.t) for part in parts) or (method.absolute is not None and method.absolute(options))
-        return cls(model, prior, method, options, model.theta(), not (depends or model.inputs))
+        depends = model.depends_on_time or (method.absolute is not None and method.absolute(options))
+        return cls(model, prior, method, options, model.theta(), not depends)
 
     def at(self, theta: np.ndarray | None) -> Setting:
         """Return the setting with other values of the parameters; None stands for these."""

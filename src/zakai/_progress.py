@@ -1,0 +1,72 @@
+"""A progress bar for long work, on a terminal or in a notebook; nothing is printed elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from threading import Lock
+from typing import Any
+
+PATIENCE = 1.0  # seconds of work before a bar appears
+
+Advance = Callable[[int, int | None], None]
+_LOCK = Lock()  # one bar at a time: work inside of other work has none of its own
+
+
+def shown() -> bool:
+    """Return whether a bar can be drawn: standard error is a terminal, or this is a notebook that can show it."""
+    if "ipykernel" in sys.modules:
+        return find_spec("ipywidgets") is not None
+    return sys.stderr is not None and sys.stderr.isatty()
+
+
+@contextmanager
+def bar(what: str, patience: float = PATIENCE) -> Iterator[Advance | None]:
+    """Yield a function of (done, total) to call at every step, which draws a bar; None where nothing is drawn.
+
+    Args:
+        what: the word before the bar.
+        patience: seconds of work before the bar appears; total is None where it is not known.
+    """
+    if not shown() or not _LOCK.acquire(blocking=False):
+        yield None
+        return
+    drawn = _Bar(what, patience)
+    try:
+        yield drawn.advance
+    finally:
+        drawn.close()
+        _LOCK.release()
+
+
+class _Bar:
+    def __init__(self, what: str, patience: float):
+        self.what, self.begins = what, time.monotonic() + patience
+        self.display: Any = None
+        self.task: Any = None
+
+    def advance(self, done: int, total: int | None) -> None:
+        """Draw how much is done; nothing before its time, or if all is done by then."""
+        if self.display is None:
+            if time.monotonic() < self.begins or done == total:
+                return
+            self._open(total)
+        self.display.update(self.task, completed=done, total=total)
+
+    def _open(self, total: int | None) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        last = TimeElapsedColumn() if total is None else TimeRemainingColumn()
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), last)
+        self.display = Progress(*columns, console=Console(stderr=True), transient=True)
+        self.task = self.display.add_task(self.what, total=total)
+        self.display.start()
+
+    def close(self) -> None:
+        """Remove the bar."""
+        if self.display is not None:
+            self.display.stop()

@@ -1,0 +1,76 @@
+"""Warnings: a sentence for each bound that a health figure exceeds, with what to change."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from zakai.engine.results import FilterResult
+
+Bounds = Mapping[str, tuple[float, str]]
+_MORE_OBSERVATIONS = "give more frequent observations"
+_MORE_COMPONENTS = "raise the option components"
+_WIDER_PRIOR = "give a wider prior, if it is not meant so narrow"
+_OTHER_METHOD = "take another method that holds"
+# What to change, for the figures whose words do not say it.
+ADVICE = {
+    "negative_variance": "give variances of the noise and of the prior that are nearer in size",
+    "representation_error": _WIDER_PRIOR,
+    "edge_weight": _WIDER_PRIOR,
+    "gauge_error": _OTHER_METHOD,
+    "tolerance_ratio": f"{_MORE_OBSERVATIONS}, or a larger tolerance (command: --option tolerance=...)",
+    "tail_depth": "check that observation and its noise",
+    "outside_tables": "extend the table",
+    "without_law": "change the formula of the observation where it has no value",
+    "mean_error": _MORE_COMPONENTS,
+    "deviation_error": _MORE_COMPONENTS,
+    "evidence_error": f"{_OTHER_METHOD}, or raise its accuracy",
+    "start_error": _MORE_COMPONENTS,
+    "nonlinearity": _MORE_COMPONENTS,
+    "quadrature": _MORE_COMPONENTS,
+    "pruned": _MORE_COMPONENTS,
+    "merged": _MORE_COMPONENTS,
+    "edge_mass": _OTHER_METHOD,
+    "quadrature_error": _OTHER_METHOD,
+    "time_quadrature_error": _MORE_OBSERVATIONS,
+    "unfinished": _MORE_OBSERVATIONS,
+    "indefinite_cov": _MORE_OBSERVATIONS,
+}
+
+
+def warnings_of_step(health: Mapping[str, Any], bounds: Bounds) -> list[str]:
+    """Return a sentence for every bound that one step exceeds."""
+    return [
+        f"{name} is {float(health[name]):.2g} and exceeds {bound:g}: {advised(name, what)}"
+        for name, (bound, what) in bounds.items()
+        if name in health and float(health[name]) > bound
+    ]
+
+
+def warnings_of_run(result: FilterResult) -> list[str]:
+    """Return a sentence for every bound that a result exceeds, and for values that are not finite."""
+    said = []
+    bad = ~np.isfinite(result.log_likelihood_increments)
+    if bad.any():
+        time = result.times[np.argmax(bad)]
+        said.append(
+            f"the density was lost at t = {time:g}: nothing after that time can be trusted; check that observation and its noise"
+        )
+    for name, (bound, what) in result.bounds.items():
+        over = result.health[name] > bound if name in result.health else np.zeros(0, bool)
+        if over.any():
+            worst = int(np.nanargmax(np.where(over, result.health[name], -np.inf)))
+            said.append(
+                f"{name} exceeds {bound:g} at {int(over.sum())} of {len(over) - 1} times, most at t = "
+                f"{result.times[worst]:g} ({result.health[name][worst]:.2g}): {advised(name, what)}"
+            )
+    return said
+
+
+def advised(name: str, what: str) -> str:
+    """Return the words of a figure with what to change."""
+    what = what.split(". ")[0]  # one sentence
+    return what if ";" in what or name not in ADVICE else f"{what}; {ADVICE[name]}"

@@ -1,0 +1,202 @@
+"""The law of the observations of a row by sums over densities of the state: points of a grid, or Gaussians.
+
+Samples: P(Z <= z) = E F(z | x) over the predicted density.  An increment over an interval of length tau is the integral I of h
+plus noise.  I has the law of tau h(x) with x drawn from the densities at the two ends with equal weights, but for the variance,
+which is less by tau^3 E(H G H') / 6, H = dh/dx, with an error of higher order in tau.  So an increment has the law of this
+mixture of N(tau h, S tau - tau^3 H G H' / 6).  Coordinates of a row are taken in order, each given those before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai.algebra.systems import affine_observation
+from zakai.densities import Density, GaussianMixture, GridDensity
+from zakai.densities.mapped import MappedDensity
+from zakai.engine.setting import Setting
+from zakai.models.checks import depends_on_state
+from zakai.models.numeric import numpy_function
+from zakai.numerics.complex_step import STEP
+from zakai.records.schedule import Schedule
+
+Array = NDArray[Any]
+Pair = tuple[Array, Array]
+ROUGH = 0.05  # difference of the sums over even and odd points above which a grid is too coarse; the error is about its 4th power
+NEGLIGIBLE = 1e-15  # weight of a point, relative to the largest
+CORRECTION = 0.02  # share of the noise that the correction of an increment's variance may have
+
+
+class Mixture(NamedTuple):
+    """A density as points (N, n) with `weights` (N,); with `covs` (N, n, n) they are Gaussians.
+
+    `signs` are alternating signs (N,) along each axis of a grid.
+    """
+
+    weights: Array
+    points: Array
+    covs: Array | None
+    signs: Sequence[Array]
+
+    @classmethod
+    def of(cls, density: Density) -> Mixture | None:
+        """Return a density as a mixture, without what is negligible; None where it is none."""
+        if isinstance(density, GaussianMixture):
+            return None if any(density.periodic) else cls(density.weights, density.means, density.covs, ())
+        if not isinstance(density, GridDensity | MappedDensity):
+            return None
+        weights = density.weights
+        used = weights > NEGLIGIBLE * weights.max()
+        signs = [np.where(np.indices(weights.shape)[axis] % 2, -1.0, 1.0)[used] for axis in range(weights.ndim)]
+        return cls(weights[used], density.points[used], None, signs)
+
+    def joined(self, other: Mixture) -> Mixture:
+        """Return the mean of two mixtures of one kind."""
+        covs = None if self.covs is None or other.covs is None else np.concatenate([self.covs, other.covs])
+        signs = [np.concatenate(pair) for pair in zip(self.signs, other.signs, strict=True)]
+        weights = 0.5 * np.concatenate([self.weights, other.weights])
+        return Mixture(weights, np.concatenate([self.points, other.points]), covs, signs)
+
+    def probabilities(self, seen: Array, terms: Array, below: Array, upto: Array) -> Pair | None:
+        """Return P(Z_j < z_j) and P(Z_j <= z_j) (m,) given the coordinates before; None where the grid is too coarse.
+
+        Args:
+            seen: the observed coordinates (m,).
+            terms: the log densities (N, m) of the coordinates, each given the point and the coordinates before.
+            below: P(Z_j < z_j) (N, m), likewise.
+            upto: P(Z_j <= z_j) (N, m), likewise.
+        """
+        found = np.full((2, len(seen)), np.nan)
+        logs = np.zeros(len(self.weights))
+        for j in np.flatnonzero(seen):
+            shares = self.weights * np.exp(logs - logs.max())
+            both = np.stack([np.ones(len(shares)), below[:, j], upto[:, j]])
+            total, *sums = both @ shares
+            for sign in self.signs:
+                if not np.all(np.abs(both @ (sign * shares)) <= ROUGH * total):
+                    return None
+            found[:, j] = np.array(sums) / total
+            if not np.isfinite(found[:, j]).all():
+                return None
+            logs = logs + terms[:, j]
+        return found[0], found[1]
+
+
+class PredictiveSums:
+    """The laws of the rows of one run by sums; `row` returns None where another way is needed."""
+
+    def __init__(self, setting: Setting, schedule: Schedule):
+        self.setting, self.model, self.theta = setting, setting.model, setting.theta
+        self.schedule, self.inside, self.lengths = schedule, schedule.inside, schedule.lengths
+        model, symbols = self.model, self.model.observation.free_symbols
+        self.samples = model.observation_kind == "samples"
+        fixed = not symbols & {model.t, *model.u} and not model.cross_noise.todok()
+        self.possible = model.log_density is None if self.samples else fixed
+        gaussian = not self.samples or model.observation_law.is_gaussian
+        self.gaussian = gaussian and not depends_on_state(model.observation_noise, model)
+        self.h = numpy_function(model.observation, model)
+        self.noise = numpy_function(model.observation_noise, model, (model.m, model.m))
+        self.spread = numpy_function(model.covariance, model, (model.n, model.n))
+
+    @cached_property
+    def affine(self) -> bool:
+        """Whether h is an affine function of the state."""
+        return affine_observation(self.model) is not None
+
+    def inputs(self, t: float) -> Array | None:
+        """Return the known inputs at a time."""
+        known = self.schedule.inputs
+        return None if known is None else known.at(t, self.model.input_hold)
+
+    def slopes(self, points: Array, t: float) -> Array:
+        """Return the Jacobian of h (N, m, n) at points."""
+        moved = points[:, None] + 1j * STEP * np.eye(self.model.n)
+        found = self.h(moved, t, self.theta, self.inputs(t)).imag / STEP
+        return np.swapaxes(found, 1, 2)
+
+    def noise_of_increments(self, k: int) -> Array:
+        """Return the covariance (m, m) of the noise of the increments at the end of interval k, over the time they share."""
+        elapsed, stop = self.schedule.elapsed[k], float(self.schedule.stops[k])
+        common = np.minimum.outer(elapsed, elapsed)
+        origin = np.zeros(self.model.n)
+        if not self.model.observation_noise.has(self.model.t):
+            return np.asarray(common * self.noise(origin, stop, self.theta))
+        times = stop - common[..., None] * _NODES
+        row, column = np.indices(common.shape)
+        values = self.noise(origin, times, self.theta)[row, column, :, row, column]
+        return np.asarray(common * (values @ _WEIGHTS))
+
+    def row(self, k: int, densities: Sequence[Density], values: Array) -> Pair | None:
+        """Return P(Z_j < z_j) and P(Z_j <= z_j) (m,) of the observations at the end of interval k.
+
+        Args:
+            k: the interval.
+            densities: the density of the state there before the observations; for increments also that at the start.
+            values: the observations (m,).
+        """
+        seen, mixtures = self.schedule.seen[k], [Mixture.of(density) for density in densities]
+        known = [mixture for mixture in mixtures if mixture is not None]
+        if not self.possible or len(known) < len(densities):
+            return None
+        mixture = known[0]
+        if self.samples:
+            found = self._samples(k, mixture, values)
+        elif np.any(self.inside[k] != seen):
+            return None
+        else:
+            mixture = mixture.joined(known[1])
+            found = self._increments(k, mixture, values)
+        return None if found is None else mixture.probabilities(seen, *found)
+
+    def _samples(self, k: int, mixture: Mixture, values: Array) -> tuple[Array, Array, Array] | None:
+        model, t, seen = self.model, float(self.schedule.stops[k]), self.schedule.seen[k]
+        inputs, points = self.inputs(t), mixture.points
+        if mixture.covs is None:
+            given = np.where(seen, values, np.nan)
+            law = model.observation_law
+            return law.terms(given, points, t, self.theta, inputs), *law.cdf(given, points, t, self.theta, inputs)
+        if not (self.gaussian and self.affine):
+            return None
+        slopes = self.slopes(points, t)
+        covs = self.noise(np.zeros(model.n), t, self.theta, inputs) + slopes @ mixture.covs @ np.swapaxes(slopes, 1, 2)
+        return _gaussian(seen, values - self.h(points, t, self.theta, inputs), covs)
+
+    def _increments(self, k: int, mixture: Mixture, values: Array) -> tuple[Array, Array, Array] | None:
+        t, seen, length = float(self.schedule.stops[k]), self.schedule.seen[k], float(self.lengths[k])
+        points, inputs, noise = mixture.points, self.inputs(t), self.noise_of_increments(k)
+        slopes = self.slopes(points, t)
+        back = np.swapaxes(slopes, 1, 2)
+        excess = length**3 / 6.0 * (slopes @ self.spread(points, t, self.theta, inputs) @ back)
+        share = np.diagonal(excess, axis1=1, axis2=2)[:, seen] / np.diagonal(noise)[seen]
+        if not np.all(mixture.weights @ share <= CORRECTION):
+            return None
+        covs = noise - excess
+        if mixture.covs is not None:
+            if not self.affine:
+                return None
+            covs = covs + length**2 * slopes @ mixture.covs @ back
+        return _gaussian(seen, values - length * self.h(points, t, self.theta, inputs), covs)
+
+
+_NODES, _WEIGHTS = (0.5 * part for part in np.polynomial.legendre.leggauss(4))
+_NODES = _NODES + 0.5
+
+
+def _gaussian(seen: Array, apart: Array, covs: Array) -> tuple[Array, Array, Array] | None:
+    """Return the log densities and (twice) the distribution functions (N, m) of z - mean = `apart`, each given those before."""
+    from scipy.special import ndtr
+
+    which = np.flatnonzero(seen)
+    try:
+        factors = np.linalg.cholesky(covs[:, which[:, None], which])
+    except np.linalg.LinAlgError:
+        return None
+    white = np.linalg.solve(factors, apart[:, which, None])[..., 0]
+    terms, cdf = np.zeros(apart.shape), np.full(apart.shape, np.nan)
+    terms[:, which] = -0.5 * white**2 - np.log(np.diagonal(factors, axis1=1, axis2=2))
+    cdf[:, which] = ndtr(white)
+    return terms, cdf, cdf

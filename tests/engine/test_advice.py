@@ -1,0 +1,48 @@
+"""Warnings say in one sentence what is wrong, when, how much, and what to change; "auto" keeps the prior."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+import zakai
+from zakai._registry import METHODS, load
+from zakai.engine.health_warnings import warnings_of_step
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_warning_is_one_sentence_with_what_to_change(name):
+    bounds = load(name).bounds
+    said = warnings_of_step({figure: 2 * bound + 1 for figure, (bound, _) in bounds.items()}, bounds)
+    assert len(said) == len(bounds)
+    for sentence in said:
+        assert not re.search(r"[.!] [A-Z]", sentence) and sentence.isprintable()
+        wrong, _, change = sentence.partition(": ")[2].rpartition("; ")
+        assert wrong and change, sentence
+
+
+def test_a_warning_has_the_time_the_size_and_the_count():
+    model = zakai.Model(
+        state=["x"], drift=["-x"], observation=["x"], observation_kind="samples", observation_noise=[[0.01]],
+        prior={"kind": "gaussian", "mean": [0], "cov": [[1]]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record([0.5, 1.0, 1.5], [0.2, 60.0, 0.1], "samples"), "yau-yau")
+    worst = int(np.nanargmax(result.health["tail_depth"]))
+    sentence = next(line for line in result.warnings if line.startswith("tail_depth"))
+    assert f"most at t = {result.times[worst]:g} ({result.health['tail_depth'][worst]:.2g})" in sentence
+    count = int((result.health["tail_depth"] > 1).sum())
+    assert f"exceeds 1 at {count} of 3 times" in sentence and sentence.endswith("; check that observation and its noise")
+
+
+def test_auto_goes_on_where_a_method_loses_the_prior():
+    certain = zakai.load_model("gallery:spiral-sensor").with_prior({"kind": "gaussian", "mean": [0.3], "cov": [[0]]})
+    record = zakai.Record([0.01, 0.02], [[0.001, 0.002], [0.0, 0.1]])
+    with pytest.raises(zakai.InputError, match="a variance is zero"):
+        zakai.filter(certain, record, "limited-direct")
+    result = zakai.filter(certain, record)
+    assert result.method == "general-direct" and "limited-direct holds too, but loses the density at the prior" in result.why
+    near = certain.with_prior({"kind": "gaussian", "mean": [0.3], "cov": [[1e-8]]})
+    other = zakai.filter(near, record, "limited-direct")
+    np.testing.assert_allclose(result.mean, other.mean, atol=1e-3 * np.sqrt(other.variance[-1, 0]))
