@@ -1,6 +1,4 @@
-"""Pictures and the HTML report of a filtering run; plotly and matplotlib are imported only when they are
-used.
-"""
+"""Pictures and the HTML report of a result; plotly and matplotlib are imported when they are used."""
 
 from __future__ import annotations
 

@@ -79,12 +79,11 @@ def section(result: Any) -> str:
         title = f"<h3>Observation {j + 1}</h3>" if u.shape[1] > 1 else ""
         said = "" if found.p_value >= 0.01 else " The residuals are not uniform: model and data disagree."
         note = f"{len(found.u):,} residuals; Kolmogorov-Smirnov test of uniformity: p = {found.p_value:.3g}.{said}"
-        figure = plots.html(calibration_figure(found), f"calibration-{j}")
-        parts.append(f"{title}<figure>{figure}<figcaption>{escape(note)}</figcaption></figure>")
+        parts.append(title + plots.framed(calibration_figure(found, getattr(result, "clock", None)), f"calibration-{j}", note))
     return "".join(parts)
 
 
-def calibration_figure(found: Calibration) -> Any:
+def calibration_figure(found: Calibration, clock: Any = None) -> Any:
     """Return the three panels for one observed coordinate."""
     from scipy.stats import binom
 
@@ -115,8 +114,8 @@ def calibration_figure(found: Calibration) -> Any:
     dots = {"color": style.SERIES_COLOUR, "size": 4, "opacity": 0.75}
     figure.add_trace(
         go.Scatter(
-            x=found.times, y=found.scores, mode="markers", marker=dots, showlegend=False, name="normal score",
-            hovertemplate="t = %{x:.6g}<br>%{y:.3g}<extra></extra>",
+            x=plots.moments(found.times, clock), y=found.scores, mode="markers", marker=dots, showlegend=False,
+            name="normal score", hovertemplate="%{x}<br>%{y:.3g}<extra></extra>",
         ), row=2, col=1,
     )  # fmt: skip
     figure.add_hrect(y0=-1.96, y1=1.96, row=2, col=1, **band)
@@ -128,6 +127,6 @@ def calibration_figure(found: Calibration) -> Any:
     figure.update_yaxes(title_text="density", rangemode="tozero", row=1, col=1)
     figure.update_xaxes(title_text="lag (observations)", row=1, col=2)
     figure.update_yaxes(range=[-size, size], row=1, col=2)
-    figure.update_xaxes(title_text="time", row=2, col=1)
+    plots.time_axis(figure, clock, row=2, col=1)
     figure.update_yaxes(title_text="standard deviations", row=2, col=1)
     return figure

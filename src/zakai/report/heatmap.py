@@ -76,9 +76,7 @@ class DensityOverTime:
 
     @property
     def relative(self) -> np.ndarray:
-        """The density divided by its highest value at the same time, in [0, 1]: the shape, whatever the
-        spread.
-        """
+        """Return the density divided by its highest value at the same time, in [0, 1]: the shape at any spread."""
         if not self.kept:
             return 0.35 * self.density
         peak = np.max(self.density, axis=0, initial=0.0)
@@ -196,9 +194,7 @@ def profile(result: Any, k: int, state: int) -> Profile:
 def chosen_times(
     count: int, start: int = 0, stop: int | None = None, columns: int = 600, extra: tuple[int, ...] = ()
 ) -> np.ndarray:
-    """Positions of at most `columns` evenly spaced times in [start, stop), and of those `extra` times that
-    lie there.
-    """
+    """Return the positions of at most `columns` evenly spaced times in [start, stop), and of the `extra` times in it."""
     inside = np.arange(count)[start:stop]
     if inside.size == 0:
         raise InputError(f"start={start}, stop={stop}: no time of the result lies there (it has {count})")
@@ -217,14 +213,29 @@ def state_names(result: Any) -> tuple[str, ...]:
     return tuple(result.state if result.model is None else result.model.state)
 
 
+def direct_observations(result: Any, state: int, first: float, last: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the times and values of samples of a state itself, h_j = x_i, from one time to another; None without any."""
+    model, record = result.model, result.record
+    if model is None or record is None or model.observation_kind != "samples" or getattr(model, "log_density", None) is not None:
+        return None
+    columns = [j for j, formula in enumerate(model.observation) if formula == model.x[state]]
+    if not columns:
+        return None
+    rows = (record.times >= first) & (record.times <= last)
+    values = record.values[rows][:, columns]
+    times = np.broadcast_to(record.times[rows][:, None], values.shape)
+    seen = np.isfinite(values)
+    shown = wrapped(values) if is_periodic(result, state) else values
+    return (times[seen], shown[seen]) if seen.any() else None
+
+
 def wrapped(angle: np.ndarray) -> np.ndarray:
     """The same angle in (-pi, pi]."""
     return np.pi - np.mod(np.pi - np.asarray(angle, dtype=float), 2 * np.pi)
 
 
 def circle_line(times: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A line on the circle, cut where it goes through +-pi: it leaves at one edge and comes back at the
-    other.
+    """Return a line on the circle, cut where it passes +-pi: it leaves at one edge and comes back at the other.
 
     Between two points the shorter way round is taken. Returns (times, angles) with a nan at each cut.
     """
@@ -272,9 +283,7 @@ def true_states(truth: Any, result: Any) -> np.ndarray | None:
 
 
 def _edges(mean: np.ndarray, lower: np.ndarray, upper: np.ndarray, truth: np.ndarray | None, index: np.ndarray) -> np.ndarray:
-    """The range of the common grid: it follows mean, band and truth, but not a wide prior or a few wide
-    moments.
-    """
+    """Return the range of the common grid: it follows mean, band and truth, but not a wide prior or a few wide moments."""
     data = index > 0 if (index > 0).sum() > 1 else np.ones(len(index), dtype=bool)
     inside = [mean[data]] + ([] if truth is None else [truth])
     values = np.concatenate([v[np.isfinite(v)] for v in inside])

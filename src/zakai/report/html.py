@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from zakai.report import _style, calibration, plots, sections, words
+from zakai.report import _style, calibration, observed, plots, sections, words
 from zakai.report.heatmap import is_periodic, state_names, true_states, wrapped
 from zakai.report.words import signed
 
@@ -39,7 +39,9 @@ def page(result: Any, truth: Any = None) -> str:
     states = true_states(truth, result)
     parts = [
         ("posterior", "The posterior over time", sections.posterior(result, states)),
+        *([("joint", "The joint density of two states", observed.joint(result))] if len(state_names(result)) > 1 else []),
         ("snapshots", "The density at moments of note", sections.snapshots(result, states)),
+        *([("observations", "The observations", observed.observations(result))] if result.record is not None else []),
         ("log-likelihood", "Log-likelihood", sections.likelihood(result)),
         ("calibration", "Calibration", calibration.section(result)),
         ("health", "Health of the computation", sections.health(result)),
@@ -73,15 +75,16 @@ def _warnings(result: Any) -> str:
 
 def _facts(result: Any, truth: np.ndarray | None) -> str:
     model, times = result.model, result.times
-    observed = []
+    seen = []
     if model is not None:
-        observed = [("observed as", f"{model.m} × {model.observation_kind}" if model.m > 1 else model.observation_kind)]
+        seen = [("observed as", f"{model.m} × {model.observation_kind}" if model.m > 1 else model.observation_kind)]
     facts = [
         ("observations", f"{len(times) - 1:,}"),
-        ("time", signed(f"{times[0]:.6g} to {times[-1]:.6g}")),
+        ("time", " to ".join(words.moment(result, k).removeprefix("t = ") for k in (0, -1))),
         ("states", f"{len(state_names(result))}"),
-        *observed,
+        *seen,
         ("log-likelihood", signed(f"{result.log_likelihood:,.2f}")),
+        *words.angles(result),
         *words.errors(result, _errors(result, truth)),
     ]
     return '<dl class="facts">' + "".join(f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in facts) + "</dl>"

@@ -1,6 +1,4 @@
-"""Static pictures of a filtering run for papers and slides, drawn with matplotlib, without pyplot's global
-state.
-"""
+"""Static pictures of a result for papers and slides, drawn with matplotlib without the global state of pyplot."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ from zakai.errors import InputError
 from zakai.report import _style as style
 from zakai.report import words
 from zakai.report._extra import plotting
-from zakai.report.heatmap import circle_line, density_over_time, state_names, true_states
+from zakai.report.axes import plain, plot_result
 from zakai.report.plots import on_log_scale, thinned
 
 _FORMATS = ("png", "pdf", "svg")
@@ -22,8 +20,7 @@ _FORMATS = ("png", "pdf", "svg")
 def posterior_figure(
     result: Any, state: int | str = 0, truth: Any = None, start: int | None = None, stop: int | None = None
 ) -> Any:
-    """Draw the marginal posterior of one state over time: heat map, mean, 95% credible band and, if given,
-    the truth.
+    """Draw the marginal posterior of one state over time: heat map, mean, 95 % credible band and, if given, the truth.
 
     Arguments: `result`, a `FilterResult`; `state`, a number or a name; `truth`, (K+1, n) or an object with
     `times` and `values`; `start`, `stop`: positions in `result.times`, as in a slice. Returns a
@@ -32,46 +29,8 @@ def posterior_figure(
 
     Example: `save_figure(posterior_figure(result, "theta"), "theta.png")`.
     """
-    colours = plotting("matplotlib.colors")
-    number = _state_number(result, state)
-    picture = density_over_time(result, number, true_states(truth, result), start or 0, stop)
     figure = _figure(8.0, 3.6)
-    axes = figure.add_subplot()
-    shades = colours.LinearSegmentedColormap.from_list("density", style.DENSITY_COLOURS)
-    axes.pcolormesh(
-        picture.times,
-        picture.grid,
-        picture.relative,
-        cmap=shades,
-        vmin=0,
-        vmax=1,
-        shading="nearest",
-        rasterized=True,
-    )
-
-    def line(values: np.ndarray, **kind: Any) -> None:
-        if not picture.joined:
-            axes.plot(picture.times, values, **{**kind, "linestyle": "none", "marker": ".", "markersize": 2.5})
-            return
-        times, values = circle_line(picture.times, values) if picture.periodic else (picture.times, values)
-        axes.plot(times, values, **kind)
-
-    if picture.joined:
-        line(picture.lower, color=style.BAND_COLOUR, linewidth=0.6, label="95% band")
-        line(picture.upper, color=style.BAND_COLOUR, linewidth=0.6)
-    line(picture.mean, color=style.INK, linewidth=1.1, label="mean")
-    if picture.truth is not None:
-        line(picture.truth, color=style.TRUTH_COLOUR, linewidth=1.1, linestyle=(0, (3, 1.5)), label="truth")
-    axes.set_ylim(picture.edges[0], picture.edges[-1])
-    axes.set_xlim(picture.times[0], picture.times[-1] if len(picture.times) > 1 else None)
-    if picture.periodic:
-        axes.set_yticks(np.pi * np.array([-1, -0.5, 0, 0.5, 1]), ["−π", "−π/2", "0", "π/2", "π"])
-    axes.set_xlabel("time")
-    axes.set_ylabel(_plain(picture.name) + (" (radians)" if picture.periodic else ""))
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False, borderaxespad=0.2, handlelength=1.6)
-    said = "shade: density relative to its peak at each time" if picture.kept else "densities not kept: Gaussian 95% band"
-    axes.set_title(said, loc="right", fontsize=8, color=style.FAINT)
-    axes.spines[["top", "right"]].set_visible(False)
+    plot_result(result, state, truth, start, stop, figure.add_subplot())
     return figure
 
 
@@ -97,7 +56,7 @@ def diagnostics_figure(result: Any) -> Any:
         few = thinned(drawn, 1600)
         axes.plot(times[few], drawn[few], color=style.SERIES_COLOUR, linewidth=0.7)
         axes.set_yscale("log" if logarithmic else "linear")
-        axes.set_title(_plain(words.spoken(name)), loc="left", fontsize=9)
+        axes.set_title(plain(words.spoken(name)), loc="left", fontsize=9)
         bound = words.health_bound(result, name)
         if bound is not None and np.nanmax(drawn, initial=0.0) > 1e-3 * bound:
             axes.axhline(bound, color=style.TRUTH_COLOUR, linewidth=0.9, linestyle=":")
@@ -126,19 +85,3 @@ def _figure(width: float, height: float) -> Any:
     figure = plotting("matplotlib.figure").Figure(figsize=(width, height), layout="constrained")
     plotting("matplotlib.backends.backend_agg").FigureCanvasAgg(figure)
     return figure
-
-
-def _state_number(result: Any, state: int | str) -> int:
-    names = state_names(result)
-    if isinstance(state, str):
-        if state not in names:
-            raise InputError(f"state '{state}' is not in the model; its states are {', '.join(names)}")
-        return names.index(state)
-    if not 0 <= state < len(names):
-        raise InputError(f"state {state} is not in the model; numbers run from 0 to {len(names) - 1}")
-    return int(state)
-
-
-def _plain(text: str) -> str:
-    """Text that matplotlib does not read as a formula."""
-    return text.replace("$", r"\$")

@@ -41,7 +41,19 @@ def html(figure: Any, identifier: str) -> str:
     )
 
 
-def posterior(picture: DensityOverTime, height: int = 430, label: str | None = None) -> Any:
+def framed(figure: Any, identifier: str, note: str) -> str:
+    """The figure with its caption."""
+    caption = f"<figcaption>{escape(note)}</figcaption>" if note else ""
+    return f"<figure>{html(figure, identifier)}{caption}</figure>"
+
+
+def posterior(
+    picture: DensityOverTime,
+    height: int = 430,
+    label: str | None = None,
+    observed: tuple[np.ndarray, np.ndarray] | None = None,
+    clock: Any = None,
+) -> Any:
     """Heat map of the marginal density with mean, 95% band and, where it is known, the truth."""
     go = plotting("plotly.graph_objects")
     figure = go.Figure()
@@ -50,16 +62,18 @@ def posterior(picture: DensityOverTime, height: int = 430, label: str | None = N
     percent = np.round(100 * picture.relative).astype(np.uint8)
     figure.add_trace(
         go.Heatmap(
-            x=picture.times, y=picture.grid.astype(np.float32), z=percent, zmin=0, zmax=100, colorscale=scale,
+            x=moments(picture.times, clock), y=picture.grid.astype(np.float32), z=percent, zmin=0, zmax=100, colorscale=scale,
             hovertemplate="%{z}% of the peak density at %{y:.4g}<extra></extra>" if picture.kept else None,
             hoverinfo=None if picture.kept else "skip", showscale=False, name="density",
         )
     )  # fmt: skip
     if picture.joined:
         band = {"color": style.BAND_COLOUR, "width": 0.8}
-        _line(figure, picture, picture.lower, "95% lower", band)
-        _line(figure, picture, picture.upper, "95% upper", band, legend=False)
-    _line(figure, picture, picture.mean, "mean", {"color": style.INK, "width": 1.5})
+        _line(figure, picture, picture.lower, "95% lower", band, clock)
+        _line(figure, picture, picture.upper, "95% upper", band, clock, legend=False)
+    _line(figure, picture, picture.mean, "mean", {"color": style.INK, "width": 1.5}, clock)
+    if observed is not None:
+        dots(figure, moments(observed[0], clock), observed[1])
     if picture.truth is not None:
         _line(
             figure,
@@ -67,12 +81,13 @@ def posterior(picture: DensityOverTime, height: int = 430, label: str | None = N
             picture.truth,
             "truth",
             {"color": style.TRUTH_COLOUR, "width": 1.4, "dash": "4px,2px"},
+            clock,
         )
     layout(figure, height)
     figure.update_layout(hovermode="x unified")
-    figure.update_xaxes(title_text="time", hoverformat=".6g")
-    if not picture.joined:  # plotly leaves a margin around dots
-        figure.update_xaxes(range=[picture.times[0], picture.times[-1]])
+    time_axis(figure, clock)
+    if not picture.joined or observed is not None:  # plotly leaves a margin around dots
+        figure.update_xaxes(range=list(moments(picture.times[[0, -1]], clock)))
     figure.update_yaxes(title_text=escape(label or picture.name), range=[picture.edges[0], picture.edges[-1]])
     if picture.periodic:
         angle = [-np.pi, -np.pi / 2, 0.0, np.pi / 2, np.pi]
@@ -80,13 +95,37 @@ def posterior(picture: DensityOverTime, height: int = 430, label: str | None = N
     return figure
 
 
-def snapshots(shots: list[tuple[str, float, Profile, float | None]], name: str, periodic: bool) -> Any:
+def moments(times: np.ndarray, clock: Any) -> np.ndarray:
+    """Return the dates of times, or the times where there are no dates."""
+    return times if clock is None else clock.dates(times)
+
+
+def time_axis(figure: Any, clock: Any, **where: int) -> None:
+    """Name the time axis; numbers have six digits."""
+    figure.update_xaxes(title_text="time" if clock is None else "date", **where)
+    if clock is None:
+        figure.update_xaxes(hoverformat=".6g", **where)
+
+
+def dots(figure: Any, times: np.ndarray, values: np.ndarray, **where: Any) -> None:
+    """Draw observations as dots."""
+    go = plotting("plotly.graph_objects")
+    legend = where.pop("showlegend", True)
+    figure.add_trace(
+        go.Scatter(
+            x=times, y=values, mode="markers", marker={"color": style.FAINT, "size": 4}, name="observations",
+            legendgroup="observations", showlegend=legend,
+        ), **where,
+    )  # fmt: skip
+
+
+def snapshots(shots: list[tuple[str, str, Profile, float | None]], name: str, periodic: bool) -> Any:
     """The density itself at a few times: panels of (title, time, profile, truth)."""
     go, make_subplots = plotting("plotly.graph_objects"), plotting("plotly.subplots").make_subplots
     columns = min(3, len(shots))
     rows = -(-len(shots) // columns)
     # A panel is about thirty letters wide.
-    titles = [f"{title},{'<br>' if len(title) > 18 else ' '}t = {time:.6g}" for title, time, _, _ in shots]
+    titles = [f"{title},{'<br>' if len(title) + len(time) > 28 else ' '}{time}" for title, time, _, _ in shots]
     figure = make_subplots(rows=rows, cols=columns, subplot_titles=titles, vertical_spacing=0.3 / rows, horizontal_spacing=0.07)
     for position, (_, _, shot, truth) in enumerate(shots):
         row, column = divmod(position, columns)
@@ -118,11 +157,11 @@ def snapshots(shots: list[tuple[str, float, Profile, float | None]], name: str, 
     return figure
 
 
-def log_likelihood(times: np.ndarray, increments: np.ndarray, surprise: int | None) -> Any:
+def log_likelihood(times: np.ndarray, increments: np.ndarray, surprise: int | None, clock: Any = None) -> Any:
     """The log-likelihood of each observation above its cumulative sum."""
     go, make_subplots = plotting("plotly.graph_objects"), plotting("plotly.subplots").make_subplots
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.07)
-    keep = thinned(increments)
+    keep, times = thinned(increments), moments(times, clock)
     dots = {
         "color": style.SERIES_COLOUR,
         "size": 4 if len(keep) < 500 else 3,
@@ -152,14 +191,14 @@ def log_likelihood(times: np.ndarray, increments: np.ndarray, surprise: int | No
     layout(figure, 480)
     figure.update_yaxes(title_text="per observation", row=1, col=1)
     figure.update_yaxes(title_text="cumulative", row=2, col=1)
-    figure.update_xaxes(title_text="time", row=2, col=1)
+    time_axis(figure, clock, row=2, col=1)
     return figure
 
 
-def health(times: np.ndarray, series: dict[str, np.ndarray], bounds: dict[str, float | None]) -> Any:
+def health(times: np.ndarray, series: dict[str, np.ndarray], bounds: dict[str, float | None], clock: Any = None) -> Any:
     """One panel for each figure of health; a logarithmic scale where no value is negative."""
     go, make_subplots = plotting("plotly.graph_objects"), plotting("plotly.subplots").make_subplots
-    rows = len(series)
+    rows, times = len(series), moments(times, clock)
     titles = [escape(words.spoken(name)) for name in series]
     figure = make_subplots(rows=rows, cols=1, shared_xaxes=True, vertical_spacing=0.22 / rows, subplot_titles=titles)
     for row, (name, values) in enumerate(series.items(), start=1):
@@ -169,7 +208,7 @@ def health(times: np.ndarray, series: dict[str, np.ndarray], bounds: dict[str, f
             go.Scatter(
                 x=times[keep], y=drawn[keep], mode="lines", line={"color": style.SERIES_COLOUR, "width": 0.9},
                 name=titles[row - 1], showlegend=False,
-                hovertemplate="t = %{x:.6g}<br>%{y:.3g}<extra></extra>",
+                hovertemplate="%{x}<br>%{y:.3g}<extra></extra>",
             ), row=row, col=1,
         )  # fmt: skip
         if logarithmic:
@@ -183,14 +222,12 @@ def health(times: np.ndarray, series: dict[str, np.ndarray], bounds: dict[str, f
     layout(figure, 150 * rows + 70)
     figure.update_annotations(font={"size": 13, "color": style.INK}, x=0, xanchor="left")
     figure.update_layout(margin={"t": 62})
-    figure.update_xaxes(title_text="time", row=rows, col=1)
+    time_axis(figure, clock, row=rows, col=1)
     return figure
 
 
 def on_log_scale(values: np.ndarray) -> tuple[np.ndarray, bool]:
-    """The values as they are drawn, and whether on a logarithmic scale, where zeros lie a decade below the
-    rest.
-    """
+    """Return the values to draw, and whether the scale is logarithmic; zeros are then a decade below the rest."""
     finite = values[np.isfinite(values)]
     if not finite.size or finite.min() < 0 or finite.max() == 0:
         return values, False
@@ -199,9 +236,7 @@ def on_log_scale(values: np.ndarray) -> tuple[np.ndarray, bool]:
 
 
 def thinned(values: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
-    """Positions of at most `most` values, the smallest and the largest of every stretch, so that no
-    extreme is lost.
-    """
+    """Return the positions of at most `most` values: the smallest and the largest of every part, so that no extreme is lost."""
     count = len(values)
     if count <= most:
         return np.arange(count)
@@ -212,7 +247,9 @@ def thinned(values: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
     return np.unique(np.array(kept))
 
 
-def _line(figure: Any, picture: DensityOverTime, values: np.ndarray, name: str, line: dict, legend: bool = True) -> None:
+def _line(
+    figure: Any, picture: DensityOverTime, values: np.ndarray, name: str, line: dict, clock: Any, legend: bool = True
+) -> None:
     go = plotting("plotly.graph_objects")
     times = picture.times
     if picture.periodic and picture.joined:
@@ -220,7 +257,7 @@ def _line(figure: Any, picture: DensityOverTime, values: np.ndarray, name: str, 
     shown = "95% band" if name.startswith("95%") else name
     figure.add_trace(
         go.Scatter(
-            x=times, y=values.astype(np.float32), mode="lines" if picture.joined else "markers", line=line,
+            x=moments(times, clock), y=values.astype(np.float32), mode="lines" if picture.joined else "markers", line=line,
             marker={"color": line["color"], "size": 3.5}, name=shown, showlegend=legend, legendgroup=shown,
             hovertemplate=f"{name} %{{y:.5g}}<extra></extra>", connectgaps=False,
         )
@@ -228,6 +265,7 @@ def _line(figure: Any, picture: DensityOverTime, values: np.ndarray, name: str, 
 
 
 def layout(figure: Any, height: int) -> None:
+    """Apply the common style to a plotly figure, in place."""
     axis = {
         "showline": True, "linecolor": style.RULE, "ticks": "outside", "tickcolor": style.RULE, "ticklen": 4,
         "zeroline": False, "showgrid": False, "automargin": True, "title_font": {"size": 13},

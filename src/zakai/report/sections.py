@@ -9,7 +9,15 @@ import numpy as np
 
 from zakai.report import plots, words
 from zakai.report.equations import equations
-from zakai.report.heatmap import density_over_time, is_periodic, profile, state_names, wrapped
+from zakai.report.heatmap import (
+    DensityOverTime,
+    density_over_time,
+    direct_observations,
+    is_periodic,
+    profile,
+    state_names,
+    wrapped,
+)
 from zakai.report.words import signed
 
 _COLUMNS = 600
@@ -25,7 +33,7 @@ def posterior(result: Any, truth: np.ndarray | None) -> str:
     parts = [f"<p>{_how_to_read(result, truth)}</p>"]
     if shown < len(names):
         parts.append(f"<p>The first {shown} of {len(names)} states are drawn.</p>")
-    moments = tuple(k for k, _ in special_moments(result))
+    moments, clock = tuple(k for k, _ in special_moments(result)), getattr(result, "clock", None)
     for i in range(shown):
         picture = density_over_time(result, i, truth, columns=_COLUMNS, extra=moments)
         note = "Every time is drawn." if total <= _COLUMNS else (
@@ -37,11 +45,15 @@ def posterior(result: Any, truth: np.ndarray | None) -> str:
         if picture.coverage is not None:
             note += f" The band holds the true state at {picture.coverage:.1%} of them."
         title = f"<h3>{escape(names[i])}</h3>" if len(names) > 1 else ""
-        parts.append(title + _figure(plots.posterior(picture), f"posterior-{i}", note))
+        parts.append(
+            title
+            + plots.framed(plots.posterior(picture, observed=_seen(result, i, picture), clock=clock), f"posterior-{i}", note)
+        )
         if total > _COLUMNS:
             last = density_over_time(result, i, truth, start=total - _DETAIL)
             note = f"The last {_DETAIL} times, every one drawn."
-            parts.append(_figure(plots.posterior(last, 330), f"detail-{i}", note))
+            drawn = plots.posterior(last, 330, observed=_seen(result, i, last), clock=clock)
+            parts.append(plots.framed(drawn, f"detail-{i}", note))
         spread = np.median(np.abs(wrapped(picture.upper - picture.lower) if picture.periodic else picture.upper - picture.lower))
         if not picture.periodic and spread < 0.05 * (picture.edges[-1] - picture.edges[0]):
             close = density_over_time(
@@ -49,8 +61,17 @@ def posterior(result: Any, truth: np.ndarray | None) -> str:
             )
             note = "The same about its mean, since the band is thin against the range above."
             label = f"{names[i]} − mean"
-            parts.append(_figure(plots.posterior(close, 330, label), f"about-mean-{i}", note))
+            parts.append(plots.framed(plots.posterior(close, 330, label, clock=clock), f"about-mean-{i}", note))
     return "".join(parts)
+
+
+def _seen(result: Any, state: int, picture: DensityOverTime) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the observations of a state itself at the times of a picture, of many the extremes."""
+    found = direct_observations(result, state, float(picture.times[0]), float(picture.times[-1]))
+    if found is None:
+        return None
+    keep = plots.thinned(found[1])
+    return found[0][keep], found[1][keep]
 
 
 def _how_to_read(result: Any, truth: np.ndarray | None) -> str:
@@ -78,7 +99,7 @@ def _how_to_read(result: Any, truth: np.ndarray | None) -> str:
 
 
 def special_moments(result: Any) -> list[tuple[int, str]]:
-    """At most six positions worth a look, in the order of time, each with a name."""
+    """At most six times of note, in their order, each with a name."""
     last = len(result.times) - 1
     named: dict[int, str] = {0: "prior"}
     if last:
@@ -121,7 +142,7 @@ def snapshots(result: Any, truth: np.ndarray | None) -> str:
         shots = [
             (
                 name[0].upper() + name[1:],
-                float(result.times[k]),
+                words.moment(result, k),
                 profile(result, k, i),
                 None if truth is None else float(truth[k, i]),
             )
@@ -129,7 +150,7 @@ def snapshots(result: Any, truth: np.ndarray | None) -> str:
         ]
         drawn = plots.snapshots(shots, names[i], is_periodic(result, i))
         title = f"<h3>{escape(names[i])}</h3>" if len(names) > 1 else ""
-        parts.append(title + _figure(drawn, f"snapshots-{i}", ""))
+        parts.append(title + plots.framed(drawn, f"snapshots-{i}", ""))
     return "".join(parts)
 
 
@@ -153,11 +174,13 @@ def likelihood(result: Any) -> str:
     note = signed(f"The sum is {result.log_likelihood:,.4f}.")
     if surprise is not None:
         worst = signed(f"{increments[surprise]:.4g}")
-        note += f" The largest surprise, {worst}, came at time {times[surprise]:.6g} (circled)."
+        note += f" The largest surprise, {worst}, came at {words.moment(result, surprise)} (circled)."
     if len(times) - 1 > plots.MOST_POINTS:
         note += " The record is long: of every stretch of observations, the best and the worst are drawn."
-    drawn = plots.log_likelihood(times[1:], increments[1:], None if surprise is None else surprise - 1)
-    return f"<p>{text}</p>" + _figure(drawn, "log-likelihood-figure", note)
+    drawn = plots.log_likelihood(
+        times[1:], increments[1:], None if surprise is None else surprise - 1, getattr(result, "clock", None)
+    )
+    return f"<p>{text}</p>" + plots.framed(drawn, "log-likelihood-figure", note)
 
 
 def health(result: Any) -> str:
@@ -170,7 +193,8 @@ def health(result: Any) -> str:
     if varying:
         bounds = {name: words.health_bound(result, name) for name in varying}
         note = "Dotted line: the bound beyond which to worry. On a logarithmic scale an exact zero lies a decade below the rest."
-        figure = _figure(plots.health(np.asarray(result.times, dtype=float), varying, bounds), "health-figures", note)
+        drawn = plots.health(np.asarray(result.times, dtype=float), varying, bounds, getattr(result, "clock", None))
+        figure = plots.framed(drawn, "health-figures", note)
     meaning = "".join(
         f"<dt>{escape(words.spoken(name))}</dt><dd>{escape(words.health_span(v))} {escape(words.health_words(result, name))}</dd>"
         for name, v in series.items()
@@ -234,8 +258,3 @@ def model(result: Any) -> str:
         )
     parts.append(f"<details><summary>The model file</summary><pre>{escape(model.text)}</pre></details>")
     return "".join(parts)
-
-
-def _figure(figure: Any, identifier: str, note: str) -> str:
-    caption = f"<figcaption>{escape(note)}</figcaption>" if note else ""
-    return f"<figure>{plots.html(figure, identifier)}{caption}</figure>"

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from zakai.report import _style as style
+from zakai.report.axes import plain
 from zakai.report.comparisons import LEVEL, MOST, Curve, error_curves, log_range, nees_curves, spans_decades, works
-from zakai.report.pictures import _figure, _plain
+from zakai.report.pictures import _figure
 
 # Okabe and Ito's colours in the order of their lightness; dashes and markers tell them apart in grey.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#1d2430")
@@ -52,7 +53,7 @@ def work_figure(outcome: Any, point: int = 0) -> Any:
     panels = figure.subplots(1, 2 if both else 1, squeeze=False)[0]
     for number, one in enumerate(found):
         look = {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)], "markersize": 7}
-        label = _plain(one.label) + (" (reference)" if one.label == reference else "")
+        label = plain(one.label) + (" (reference)" if one.label == reference else "")
         panels[0].errorbar(1e6 * one.seconds, one.error, one.spread, linestyle="none", capsize=3, label=label, **look)
         if both and np.isfinite(one.distance):
             panels[1].plot(1e6 * one.seconds, one.distance, linestyle="none", **look)
@@ -99,7 +100,7 @@ def _lines(axes: Any, curves: list[Curve]) -> None:
         look = {"color": colour, "linestyle": DASHES[number % len(DASHES)]}
         if curve.high is not None and len(curves) <= FEW:
             axes.plot(curve.times, curve.high, linewidth=0.6, **look)
-        axes.plot(curve.times, curve.middle, linewidth=1.6, label=_plain(curve.label), **look)
+        axes.plot(curve.times, curve.middle, linewidth=1.6, label=plain(curve.label), **look)
 
 
 def _logarithmic(axes: Any, curves: list[Curve]) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from zakai.report.heatmap import state_names
+from zakai.report.heatmap import is_periodic, state_names
 
 _MOST_STATES = 12  # states whose errors are listed one by one
 
@@ -78,6 +78,14 @@ def health_span(values: Any) -> str:
     return f"From {finite.min():.2g} to {finite.max():.2g}, median {np.median(finite):.2g}."
 
 
+def moment(result: Any, k: int) -> str:
+    """Return time number k as text: its date, or its time."""
+    dates = getattr(result, "dates", None)
+    if dates is None:
+        return signed(f"t = {float(result.times[k]):.6g}")
+    return str(dates[k].astype("datetime64[s]")).replace("T", " ")
+
+
 def spoken(name: str) -> str:
     """Return a variable's name as a phrase: `mass_at_edge` is "mass at edge"."""
     return name.replace("_", " ")
@@ -115,6 +123,21 @@ def verdict(result: Any) -> str:
     kind = exactness(result)
     what = "What they are" if len({block.method for block in by_blocks}) > 1 else "It is" if by_blocks else "The method is"
     return text + (f" {what}{':' if what.startswith('What') else ''} {kind.rstrip('.')}." if kind else "")
+
+
+def angles(result: Any) -> list[tuple[str, str]]:
+    """Return (label, figure) pairs for the page's head: circular mean and deviation of each angle at the end."""
+    names = state_names(result)
+    periodic = [i for i in range(min(len(names), _MOST_STATES)) if is_periodic(result, i)]
+    if not periodic:
+        return []
+    deviation = result.density(len(result.times) - 1).circular_deviation() if result.has_densities else None
+    facts = []
+    for i in periodic:
+        mean = signed(f"{float(result.mean[-1, i]):.4g}")
+        spread = "" if deviation is None else f" ± {deviation[i]:.3g}"
+        facts.append((f"{names[i]} at the end, circular", f"{mean}{spread} rad"))
+    return facts
 
 
 def errors(result: Any, error: np.ndarray | None) -> list[tuple[str, str]]:
