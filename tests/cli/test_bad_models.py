@@ -1,4 +1,4 @@
-"""Model files with each key wrong in turn, and model files from a stranger: exit code 2 and one line that helps."""
+"""Model files with each key wrong in turn, and untrusted model files: exit code 2 and one line that helps."""
 
 from __future__ import annotations
 

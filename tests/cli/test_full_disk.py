@@ -49,7 +49,7 @@ def test_what_was_there_stays_and_nothing_half_written_is_left(zakai, fails_at, 
     answer = zakai(*arguments)
     if isinstance(end, OSError):
         assert answer.code == 2 and answer.err.count("\n") == 1, answer
-        assert "cannot be written: No space left on device; choose another place or make room" in answer.err
+        assert "cannot be written: No space left on device; choose another place or free some space" in answer.err
     else:
         assert answer.code == 130
     assert (tmp_path / output).read_text() == "old"
@@ -76,6 +76,6 @@ def test_a_stream_whose_checkpoint_cannot_be_saved_answers_the_line_and_ends(zak
         patch.setattr(writing, "_sync", full)
         answer = stream(6)
     assert answer.code == 2 and answer.out.splitlines() == whole[1:4]
-    assert answer.err == "error: state: cannot be written: No space left on device; choose another place or make room\n"
+    assert answer.err == "error: state: cannot be written: No space left on device; choose another place or free some space\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == before and (tmp_path / "state").read_bytes() == saved
-    assert stream(6).out.splitlines() == whole[1:]  # once there is room
+    assert stream(6).out.splitlines() == whole[1:]  # once there is space

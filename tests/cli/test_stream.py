@@ -42,13 +42,13 @@ def test_every_line_is_answered_with_what_a_record_gives(stream, tmp_path):
     model = package.load_model("model.toml")
     given = [json.loads(line) for line in LINES]
     record = package.Record([one["time"] for one in given], [one["y"] for one in given], "increments")
-    result, told = package.filter(model, record), read(answer)
-    assert list(told[0]) == ["time", "mean", "cov", "interval", "log_likelihood_increment", "health"]
-    assert np.allclose([one["mean"] for one in told], result.mean[1:], rtol=0, atol=1e-12)
-    assert np.allclose([one["cov"] for one in told], result.cov[1:], rtol=0, atol=1e-12)
+    result, answers = package.filter(model, record), read(answer)
+    assert list(answers[0]) == ["time", "mean", "cov", "interval", "log_likelihood_increment", "health"]
+    assert np.allclose([one["mean"] for one in answers], result.mean[1:], rtol=0, atol=1e-12)
+    assert np.allclose([one["cov"] for one in answers], result.cov[1:], rtol=0, atol=1e-12)
     deviations = 1.959963984540054 * np.sqrt(result.variance[1:])
     both = np.stack([result.mean[1:] - deviations, result.mean[1:] + deviations], axis=2)
-    assert np.allclose([one["interval"] for one in told], both, rtol=0, atol=1e-9)
+    assert np.allclose([one["interval"] for one in answers], both, rtol=0, atol=1e-9)
 
 
 def test_csv_is_read_as_json_lines_are(stream):
@@ -111,10 +111,10 @@ BAD = [
     (b'{"time": 0.55}', '"y"'),
     (b"[0.55, 1]", "not an object"),
     (b'{"time": 0.55, "y": [1e300]}', "1e+300"),
-    (b'{"time": 0.55, "y": [Infinity]}', "Infinity is no number of JSON; null says"),
-    (b'{"time": 0.55, "y": [NaN]}', "NaN is no number of JSON; null says"),
-    (b'{"time": 0.55, "y": -Infinity}', "-Infinity is no number"),
-    (b'{"time": 0.55, "y": [0.1], "more": NaN}', "NaN is no number"),
+    (b'{"time": 0.55, "y": [Infinity]}', "Infinity is not a JSON number; null says"),
+    (b'{"time": 0.55, "y": [NaN]}', "NaN is not a JSON number; null says"),
+    (b'{"time": 0.55, "y": -Infinity}', "-Infinity is not a JSON number"),
+    (b'{"time": 0.55, "y": [0.1], "more": NaN}', "NaN is not a JSON number"),
     (b'{"time": 0.55, "y": [1e999]}', "observation 1 is beyond the range of numbers"),
     (b'{"time": 0.55, "y": ["1"]}', 'observation 1 is "1"; give a number, or null'),
     (b'{"time": 0.55, "y": ["\x7f"]}', 'observation 1 is "\\u007f"'),
@@ -122,7 +122,7 @@ BAD = [
     (b'{"time": 0.55, "y": [[1]]}', "observation 1 is a list"),
     (b'{"time": 0.55, "y": [{}]}', "observation 1 is an object"),
     (b'{"time": null, "y": [1]}', "the time is null; give a number"),
-    (b'{"time": NaN, "y": [1]}', "NaN is no number"),
+    (b'{"time": NaN, "y": [1]}', "NaN is not a JSON number"),
     (b'{"time": true, "y": [1]}', "the time is true"),
     (b'{"time": 0.25, "y": [1]}', "late by 0.25"),
     (b'{"time": 0.5, "y": [1]}', "repeats"),

@@ -55,7 +55,7 @@ def test_a_study_that_cannot_be_is_code_2_and_one_line(study, tmp_path):
 
 def test_a_method_that_does_not_hold_is_code_3(study):
     answer = study(text=STUDY.replace('kalman-bucy-1d', 'cubic-sensor'))
-    assert answer.code == 3 and "methods.kalman-bucy" in answer.err and answer.err.count("\n") == 1
+    assert answer.code == 3 and "methods.kalman-bucy" in answer.err and answer.err.count("\n") == 2
 
 
 def test_an_interrupted_study_is_code_130_and_goes_on(study, tmp_path, monkeypatch):

@@ -62,7 +62,7 @@ def _run(arguments: Sequence[str] | None) -> int:
         if error.filename is not None:
             raise
         _discard_output()
-        return _refused(f"standard output: cannot be written: {error.strerror}; make room or choose another place", 2)
+        return _refused(f"standard output: cannot be written: {error.strerror}; free some space or choose another place", 2)
     except ZakaiError as error:
         return _refused(str(error), error.exit_code)
     except Exception as error:
@@ -73,7 +73,8 @@ def _run(arguments: Sequence[str] | None) -> int:
 
 
 def _refused(message: str, code: int) -> int:
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    lines = [" ".join(line.split()) for line in message.splitlines()]
+    print("error: " + "\n".join(lines), file=sys.stderr)
     return code
 
 

@@ -19,7 +19,7 @@ app = typer.Typer(
 
 _Model = Annotated[str, typer.Argument(metavar="MODEL", help="A model file (TOML), or gallery:NAME.")]
 _Inputs = Annotated[Path | None, typer.Option("--inputs", metavar="FILE.csv", help="The known inputs: time, a column for each.")]
-
+_Unit = Annotated[str | None, typer.Option(metavar="UNIT", help="The unit of time, for a record with dates: s, min, h, d.")]
 _Output = Annotated[Path, typer.Option("-o", "--output", metavar="RESULT.nc", help="Where the result goes (NetCDF).")]
 
 
@@ -77,11 +77,12 @@ def filter(
     truth: Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="The true states, for the report.")] = None,
     report: Annotated[Path | None, typer.Option(metavar="REPORT.html", help="Write a report with pictures.")] = None,
     inputs: _Inputs = None,
+    unit: _Unit = None,
 ) -> None:
     """Compute the conditional density of the state at every time of a record."""
     from zakai.cli import filtering
 
-    filtering.filter(model, record, output, method, option or [], truth, report, inputs)
+    filtering.filter(model, record, output, method, option or [], truth, report, inputs, unit=unit)
 
 
 @app.command()
@@ -94,11 +95,12 @@ def smooth(
     truth: Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="The true states, for the report.")] = None,
     report: Annotated[Path | None, typer.Option(metavar="REPORT.html", help="Write a report with pictures.")] = None,
     inputs: _Inputs = None,
+    unit: _Unit = None,
 ) -> None:
     """Compute the conditional density of the state given all observations, at every time of the record."""
     from zakai.cli import filtering
 
-    filtering.filter(model, record, output, method, option or [], truth, report, inputs, smoothed=True)
+    filtering.filter(model, record, output, method, option or [], truth, report, inputs, smoothed=True, unit=unit)
 
 
 @app.command()
@@ -111,11 +113,12 @@ def forecast(
     method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
     option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
     inputs: _Inputs = None,
+    unit: _Unit = None,
 ) -> None:
     """Compute the density of the state at times after a record."""
     from zakai.cli import filtering
 
-    filtering.forecast(model, record, until, step, output, method, option or [], inputs)
+    filtering.forecast(model, record, until, step, output, method, option or [], inputs, unit)
 
 
 @app.command()
@@ -129,11 +132,12 @@ def fit(
     method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
     option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
     inputs: _Inputs = None,
+    unit: _Unit = None,
 ) -> None:
     """Estimate parameters of a model by maximum likelihood, with their standard errors."""
     from zakai.cli import filtering
 
-    filtering.fit(model, record, parameters, output, method, option or [], inputs)
+    filtering.fit(model, record, parameters, output, method, option or [], inputs, unit)
 
 
 @app.command()

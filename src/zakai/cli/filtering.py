@@ -1,4 +1,4 @@
-"""zakai filter, smooth, forecast and fit"""
+"""Run zakai filter, smooth, forecast and fit."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from zakai.cli._files import check_outputs
 from zakai.cli._progress import progress
 from zakai.errors import InputError
 from zakai.models.files import load_model
-from zakai.models.simulate import Truth
-from zakai.records import Record, read_inputs, read_record, read_truth
+from zakai.records import Record, Truth, read_inputs, read_record, read_truth
 
 if TYPE_CHECKING:
     from zakai.engine.results import FilterResult
@@ -32,6 +31,7 @@ def filter(
     report: Path | None,
     inputs_path: Path | None = None,
     smoothed: bool = False,
+    unit: str | None = None,
 ) -> None:
     """Filter or smooth a record, print a summary, and write the result and the report.
 
@@ -45,7 +45,7 @@ def filter(
 
         plotting("plotly")
     model = load_model(source)
-    record = record_with_inputs(record_path, model, inputs_path)
+    record = record_with_inputs(record_path, model, inputs_path, unit)
     truth = None if truth_path is None else _truth(truth_path, model, record)
 
     if smoothed:
@@ -89,6 +89,7 @@ def forecast(
     method: str,
     settings: list[str],
     inputs_path: Path | None = None,
+    unit: str | None = None,
 ) -> None:
     """Filter a record, and write the density of the state at times after it."""
     from zakai.engine.driver import filter as run
@@ -97,7 +98,7 @@ def forecast(
     check_outputs([output], [source, record_path, inputs_path])
     options = options_of(settings)
     model = load_model(source)
-    record = record_with_inputs(record_path, model, inputs_path)
+    record = record_with_inputs(record_path, model, inputs_path, unit)
     last = float(record.times[-1])
     if not until > last:
         raise InputError(f"--until {until:g}: must be after the end of the record, {last:g}")
@@ -123,6 +124,7 @@ def fit(
     method: str,
     settings: list[str],
     inputs_path: Path | None = None,
+    unit: str | None = None,
 ) -> None:
     """Print the parameters of largest likelihood, and write the model with them."""
     from zakai.engine.fit import fit as run
@@ -131,7 +133,7 @@ def fit(
     check_outputs([output], [source, record_path, inputs_path])
     options = options_of(settings)
     model = load_model(source)
-    record = record_with_inputs(record_path, model, inputs_path)
+    record = record_with_inputs(record_path, model, inputs_path, unit)
     names = [name.strip() for name in parameters.split(",") if name.strip()] or None
     found = run(model, record, names, method, **options)
     for warning in found.warnings:
@@ -144,9 +146,9 @@ def fit(
         print(f"written  {output}")
 
 
-def record_with_inputs(path: Path, model: Any, inputs_path: Path | None) -> Record:
+def record_with_inputs(path: Path, model: Any, inputs_path: Path | None, unit: str | None = None) -> Record:
     """Read a record, and its inputs from a file of their own where there is one."""
-    record = read_record(path, model)
+    record = read_record(path, model, unit)
     if inputs_path is None:
         return record
     if record.inputs is not None:

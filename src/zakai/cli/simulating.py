@@ -1,4 +1,4 @@
-"""zakai simulate"""
+"""Run zakai simulate."""
 
 from __future__ import annotations
 

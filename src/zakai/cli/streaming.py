@@ -1,4 +1,4 @@
-"""zakai stream"""
+"""Run zakai stream."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class _Stream:
 def _count(said: Any, checkpoint: Path) -> int:
     """Return the number of observations that a checkpoint has used."""
     if type(said) is not int or not 0 <= said < 2**53:
-        raise InputError(f"{shown(checkpoint)}: does not say how many observations it knows; remove it to begin anew")
+        raise InputError(f"{shown(checkpoint)}: does not say how many observations it knows; remove it to start again")
     return said
 
 

@@ -1,4 +1,4 @@
-"""zakai study and zakai reproduce"""
+"""Run zakai study and zakai reproduce."""
 
 from __future__ import annotations
 

@@ -1,0 +1,1 @@
+"""Filters of other libraries, run by `zakai.filter`."""

@@ -36,7 +36,6 @@ def jax_function(expressions: Any, model: Model, shape: Sequence[int] | None = N
         InputError: an undetermined function.
 
     Example:
-
         model = zakai.load_model("gallery:benes")
         jax_function(model.drift, model)(jnp.zeros(1), 0.0, model.theta())
     """

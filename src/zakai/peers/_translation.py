@@ -116,7 +116,7 @@ def real_number(option: str, value: Any, what: str, fits: Callable[[Any], Any]) 
     """Return the value of an option that measures something.
 
     Raises:
-        InputError: it is no number, or does not satisfy `fits`, which `what` describes.
+        InputError: it is not a number, or does not satisfy `fits`, which `what` describes.
     """
     if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not fits(value):
         raise InputError(f"option {option}: {value!r} is not {what}")

@@ -100,7 +100,7 @@ def _advanced(system: System, interval: Interval, state: State, observation: Obs
         return observation.whiten @ system.observation(x, interval.stop, interval.theta)
 
     # cuthbert asks the first function for nothing but the shape of a member.
-    peer = build_filter(
+    built = build_filter(
         lambda key: jnp.zeros(system.n),
         lambda inputs: lambda x, key: moved(system, interval, key, x),
         lambda inputs: (h, jnp.eye(system.m), observation.values),
@@ -110,7 +110,7 @@ def _advanced(system: System, interval: Interval, state: State, observation: Obs
     )
     inputs = jnp.zeros(())
     before = EnKFState(key, state.members, inputs, jnp.array(0.0), state.members)
-    after = peer.filter_combine(before, peer.filter_prepare(inputs, key=key))
+    after = built.filter_combine(before, built.filter_prepare(inputs, key=key))
 
     equal = jnp.full(rule.members, 1.0 / rule.members)
     mean, cov = moments(equal, after.ensemble, system.angles)

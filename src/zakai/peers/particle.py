@@ -128,7 +128,7 @@ def _advanced(system: System, interval: Interval, state: State, observation: Obs
         return observation.values @ value - 0.5 * value @ value
 
     # cuthbert asks the first function for nothing but the shape of a particle.
-    peer = build_filter(
+    built = build_filter(
         lambda key: jnp.zeros(system.n),
         lambda key, x, inputs: moved(system, interval, key, x),
         log_potential,
@@ -139,7 +139,7 @@ def _advanced(system: System, interval: Interval, state: State, observation: Obs
     before = ParticleFilterState(
         own, state.particles, state.log_weights, jnp.arange(rule.particles), inputs, jnp.array(0.0)
     )
-    after = peer.filter_combine(before, peer.filter_prepare(inputs, key=following))
+    after = built.filter_combine(before, built.filter_prepare(inputs, key=following))
 
     log_weights = after.log_weights - jax.nn.logsumexp(after.log_weights)
     share = jnp.exp(log_weights)

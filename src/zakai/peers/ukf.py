@@ -4,7 +4,7 @@
     weights of the mean: lambda / (n + lambda), then 1 / (2 (n + lambda)); of the covariance the first has 1 - alpha^2 + beta more
 
 (Saerkka 2013, algorithm 5.14).  dynamax' own defaults, alpha = sqrt 3, beta = 2, kappa = 1, put the points sqrt(3 n + 3)
-deviations away, twice as far as a Gaussian reaches.  Here alpha = 1 and beta = 0, so that both sets of weights are the same.
+deviations away, twice the reach of a Gaussian.  Here alpha = 1 and beta = 0, so that both sets of weights are the same.
 kappa is 3 - n where that is not negative, which matches the fourth moment of a Gaussian along each axis (Julier and Uhlmann
 1997); for more than three states it is 0, the cubature rule (Arasaratnam and Haykin 2009), whose weights are never negative.
 """
