@@ -24,7 +24,7 @@ def test_six_years_of_returns_agree_with_bayes_rule_on_a_grid():
     values = {name: float(value) for name, value in model.parameters.items()}
     mean, increments, below = module.grid_filter(record.values[:, 0], values)
     result = zakai.filter(model, record, keep="moments")
-    assert result.method == "yau-yau" and result.warnings == []
+    assert result.method == "limited-direct" and result.warnings == []
     # The file rounds the variance of the prior, which the first days remember.
     np.testing.assert_allclose(result.log_likelihood_increments[1:], increments, atol=1e-4)
     np.testing.assert_allclose((result.mean[1:, 0] - mean) / np.sqrt(result.variance[1:, 0]), 0, atol=1e-3)

@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from zakai.cli import main
-from zakai.engine.results import load_result
+from zakai.engine.stored import load_result
 from zakai.models.expressions import ExpressionError, Name, Negative, Node, Number, Power, Product, Sum, parse
 
 CORPUS = Path(__file__).parents[2] / "fuzz" / "corpus"

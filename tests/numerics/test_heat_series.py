@@ -27,7 +27,7 @@ def system(drift: str, **more) -> zakai.Model:
 
 @cache
 def spectrum(drift: str, half_width: float, count: int):
-    """The lattice, and the eigenvalues and vectors of -1/2 d^2 + (f^2 + f') / 2 by sinc collocation."""
+    """The grid, and the eigenvalues and vectors of -1/2 d^2 + (f^2 + f') / 2 by sinc collocation."""
     f, slope, _ = DRIFTS[drift]
     x = np.linspace(-half_width, half_width, count)
     apart = np.arange(count)[:, None] - np.arange(count)
@@ -36,7 +36,7 @@ def spectrum(drift: str, half_width: float, count: int):
 
 
 def spectral_kernel(drift: str, t: float, half_width: float, count: int, gauged: bool = False):
-    """The lattice and the kernel on it, of u or, `gauged`, of exp(-F) u."""
+    """The grid and the kernel on it, of u or, `gauged`, of exp(-F) u."""
     x, values, vectors = spectrum(drift, half_width, count)
     kernel = (vectors * np.exp(-values * t)) @ vectors.T / (x[1] - x[0])
     if gauged:
@@ -75,12 +75,12 @@ def cosh_drift(x, y, t):
 
 def cubic(x, y, t):
     """From the eigenfunctions, interpolated by their own sinc series."""
-    lattice, values, vectors = spectrum("x - x**3", 4.5, 361)
-    cell = lattice[1] - lattice[0]
+    grid, values, vectors = spectrum("x - x**3", 4.5, 361)
+    spacing = grid[1] - grid[0]
     F = DRIFTS["x - x**3"][2]
-    at_x = np.sinc((x[..., None] - lattice) / cell) @ vectors
-    at_y = np.sinc((y[:, None] - lattice) / cell) @ vectors
-    return np.einsum("pyk,yk,k->py", at_x, at_y, np.exp(-values * t)) / cell * np.exp(F(x) - F(y))
+    at_x = np.sinc((x[..., None] - grid) / spacing) @ vectors
+    at_y = np.sinc((y[:, None] - grid) / spacing) @ vectors
+    return np.einsum("pyk,yk,k->py", at_x, at_y, np.exp(-values * t)) / spacing * np.exp(F(x) - F(y))
 
 
 def slopes(drift: str, reference, orders: int = 4) -> dict:
@@ -97,7 +97,7 @@ def test_the_orders_for_ornstein_and_uhlenbeck_are_one_more_than_that_of_the_ser
 def test_the_orders_for_the_tangent_are_one_more_and_its_logarithmic_form_is_exact():
     found = slopes("tanh(x)", cosh_drift)
     assert all(abs(found["sum", order] - order - 1) < 0.1 for order in range(4))
-    # What is left of it is that a is a Taylor polynomial of degree 17 in z, |z| <= 0.45.
+    # The remainder comes from a, which is a Taylor polynomial of degree 17 in z, |z| <= 0.45.
     assert max(errors("tanh(x)", 0.05, cosh_drift, 4)["log", order] for order in (1, 2, 3)) < 1e-9
 
 
@@ -116,7 +116,7 @@ def test_the_order_is_one_more_for_four_terms_too():
 
 @pytest.fixture(scope="module")
 def moved_density():
-    """A density, the same after a time of one by the spectral kernel, the lattice, and the series on it."""
+    """A density, the same after a time of one by the spectral kernel, the grid, and the series on it."""
     x, kernel = spectral_kernel("x - x**3", 1.0, 4.0, 321)
     density = np.exp(-((x - 0.5) ** 2) / 0.2)
     density = density / (density.sum() * (x[1] - x[0]))

@@ -60,13 +60,13 @@ def test_the_series_gives_the_density_of_an_independent_solution_through_every_i
     starts = np.r_[system.start, system.times[:-1]]
     kernels = kernel_of(transitions(series(*texts(system)), starts, system.times))
     axes, window = [axis[keep] for axis in box.axes], (keep,) * system.n
-    lattice = box.x[window]
-    u = system.initial(lattice)
+    inside = box.x[window]
+    u = system.initial(inside)
     for k, (before, _) in enumerate(filter_system(box, system)):
         kernel = [field[k] for field in kernels]
         u = trapezoid(kernel, system, starts[k], system.times[k], u, axes, box.cell).reshape(u.shape)
         assert np.max(np.abs(u - before[window])) <= allowed * np.max(before)
-        u = u * system.jump(lattice, system.times[k], system.increments[k])
+        u = u * system.jump(inside, system.times[k], system.increments[k])
 
 
 @pytest.mark.parametrize("system", [scalar(), planar()], ids=["one state", "two states"])

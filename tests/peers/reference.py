@@ -1,4 +1,4 @@
-"""The exact filter of the linear system of `systems`, plain and slow: moments by Runge-Kutta, readings by Bayes' rule."""
+"""The exact filter of the linear system of `systems`, plain and slow: moments by Runge-Kutta, observations by Bayes' rule."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def spiral(kind: str) -> zakai.Model:
     return zakai.Model(observation_kind=kind, **SPIRAL)
 
 
-def readings(model: zakai.Model, times: np.ndarray, seed: int = 0, gaps: bool = False) -> zakai.Record:
+def record_of(model: zakai.Model, times: np.ndarray, seed: int = 0, gaps: bool = False) -> zakai.Record:
     record = zakai.simulate(model, times, seed=seed)[1]
     values = record.values.copy()
     if gaps:

@@ -1,4 +1,4 @@
-"""The peers against exact filters, and against FilterPy, a third library."""
+"""The filters of other libraries against exact filters, and against FilterPy, a third library."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 
 import zakai
 from peers.reference import filtered
-from peers.systems import linear, readings, spiral
+from peers.systems import linear, record_of, spiral
 
 TIMES = np.cumsum([0.1, 0.05, 0.2, 0.1, 0.1, 0.15, 0.05, 0.1, 0.3, 0.1])
 
@@ -22,13 +22,13 @@ def apart(result: zakai.FilterResult, exact: tuple[np.ndarray, ...]) -> np.ndarr
 
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
 def test_a_sampled_linear_system_is_filtered_exactly_but_for_the_substeps(name):
-    record = readings(linear("samples"), TIMES, gaps=True)
+    record = record_of(linear("samples"), TIMES, gaps=True)
     assert (apart(zakai.filter(linear("samples"), record, name, substeps=8), filtered(record)) < 2e-5).all()
 
 
 @pytest.mark.parametrize(("scheme", "order"), [("midpoint", 2), ("euler", 1)])
 def test_the_order_of_the_substeps_is_as_it_is_said(scheme, order):
-    record = readings(linear("samples"), TIMES, gaps=True)
+    record = record_of(linear("samples"), TIMES, gaps=True)
     results = [zakai.filter(linear("samples"), record, "ekf", scheme=scheme, substeps=k) for k in (8, 16)]
     coarse, fine = (apart(result, filtered(record)) for result in results)
     assert np.log2(coarse / fine) == pytest.approx(order, abs=0.2)
@@ -37,7 +37,7 @@ def test_the_order_of_the_substeps_is_as_it_is_said(scheme, order):
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
 def test_increments_of_a_linear_system_are_exact_to_first_order_in_the_interval(name):
     model = linear("increments")
-    path = np.cumsum(readings(model, np.arange(1, 129) / 64).values, axis=0)
+    path = np.cumsum(record_of(model, np.arange(1, 129) / 64).values, axis=0)
     errors = []
     for every in (2, 1):
         times, values = np.arange(every, 129, every) / 64, np.diff(path[every - 1 :: every], axis=0, prepend=0.0)
@@ -51,12 +51,12 @@ def test_increments_of_a_linear_system_are_exact_to_first_order_in_the_interval(
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
 def test_a_nonlinear_system_with_gaps_is_filtered_as_by_filterpy(name, kind):
     model = spiral(kind)
-    record = readings(model, TIMES, gaps=True)
+    record = record_of(model, TIMES, gaps=True)
     result = zakai.filter(model, record, name, scheme="euler")
     ukf = UnscentedKalmanFilter(1, 2, None, None, None, MerweScaledSigmaPoints(1, alpha=1.0, beta=0.0, kappa=2.0))
     ekf = ExtendedKalmanFilter(1, 2)
-    for peer in (ukf, ekf):
-        peer.x, peer.P = np.array([0.3]), np.array([[0.5]])
+    for other in (ukf, ekf):
+        other.x, other.P = np.array([0.3]), np.array([[0.5]])
     S = np.array([[1 / 2, 1 / 8], [1 / 8, 1 / 3]])
     before = 0.0
     for k, (time, value) in enumerate(zip(TIMES, record.values, strict=True)):
@@ -81,9 +81,9 @@ def test_a_nonlinear_system_with_gaps_is_filtered_as_by_filterpy(name, kind):
             evidence = (ukf if name == "ukf" else ekf).log_likelihood
             if kind == "increments":
                 evidence -= multivariate_normal.logpdf(reading, np.zeros(seen.sum()), noise)
-        peer = ukf if name == "ukf" else ekf
-        assert np.allclose(result.mean[k + 1], peer.x, rtol=0, atol=1e-6)
-        assert np.allclose(result.cov[k + 1], peer.P, rtol=0, atol=1e-6)
+        other = ukf if name == "ukf" else ekf
+        assert np.allclose(result.mean[k + 1], other.x, rtol=0, atol=1e-6)
+        assert np.allclose(result.cov[k + 1], other.P, rtol=0, atol=1e-6)
         assert result.log_likelihood_increments[k + 1] == pytest.approx(evidence, abs=1e-6)
 
 
@@ -97,7 +97,7 @@ def over_seeds(record: zakai.Record, name: str, size: int, seeds: int) -> list[z
 
 @pytest.mark.parametrize("name", SIZES)
 def test_sampling_peers_come_to_the_exact_posterior_as_one_over_the_root_of_their_size(name):
-    record = readings(linear("samples"), TIMES, gaps=True)
+    record = record_of(linear("samples"), TIMES, gaps=True)
     mean, cov, _ = filtered(record)
     errors = {}
     for size in (100, 1600):
@@ -112,9 +112,9 @@ def test_sampling_peers_come_to_the_exact_posterior_as_one_over_the_root_of_thei
 
 
 def test_the_likelihood_of_the_particle_filter_is_unbiased():
-    record = readings(linear("increments"), TIMES / 8, gaps=True)
+    record = record_of(linear("increments"), TIMES / 8, gaps=True)
     exact = filtered(record)[2].sum()
     ratios = np.exp([run.log_likelihood - exact for run in over_seeds(record, "particle", 400, 30)])
-    # What is left for increments is the interval, over which the state stands still.
+    # Increments leave one error: the filter holds the state constant over the interval.
     assert abs(ratios.mean() - 1) < 0.02 + 4 * ratios.std(ddof=1) / np.sqrt(30)
     assert ratios.std() < 0.3

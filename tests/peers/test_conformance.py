@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import zakai
-from peers.systems import linear, readings, spiral
+from peers.systems import linear, record_of, spiral
 from zakai import _registry
 
 TIMES = np.cumsum([0.1, 0.05, 0.2, 0.1, 0.1, 0.15, 0.05, 0.1, 0.3, 0.1])
@@ -16,7 +16,7 @@ SMALL = {"particle": {"particles": 50}, "enkf": {"members": 20}}
 @pytest.mark.parametrize("name", _registry.PEERS)
 def test_record_batch_and_online_agree_to_the_last_bit(name, tmp_path):
     model, options = spiral("path"), SMALL.get(name, {})
-    records = [readings(model, TIMES, seed=seed, gaps=True) for seed in range(2)]
+    records = [record_of(model, TIMES, seed=seed, gaps=True) for seed in range(2)]
     whole = zakai.filter(model, records[0], name, **options)
     many = zakai.filter(model, records, name, **options)
     assert np.array_equal(many[0].mean, whole.mean) and np.array_equal(many[0].cov, whole.cov)
@@ -33,7 +33,7 @@ def test_record_batch_and_online_agree_to_the_last_bit(name, tmp_path):
 @pytest.mark.parametrize("name", _registry.PEERS)
 def test_the_density_has_the_reported_moments(name):
     model = linear("samples")
-    result = zakai.filter(model, readings(model, TIMES, gaps=True), name, **SMALL.get(name, {}))
+    result = zakai.filter(model, record_of(model, TIMES, gaps=True), name, **SMALL.get(name, {}))
     for k in (0, 5, -1):
         assert result.density(k).mean() == pytest.approx(result.mean[k], abs=1e-9)
         assert result.density(k).cov() == pytest.approx(result.cov[k], abs=1e-9)
@@ -65,7 +65,7 @@ def test_an_interval_is_the_same_whatever_else_is_in_the_schedule():
     from zakai.records.schedule import schedule_of
 
     model = linear("increments")
-    schedule, _ = schedule_of(model, readings(model, TIMES, gaps=True))
+    schedule, _ = schedule_of(model, record_of(model, TIMES, gaps=True))
     for name in _registry.PEERS:
         method = _registry.load(name)
         whole = method.prepare(model, schedule, model.theta())

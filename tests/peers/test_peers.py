@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import zakai
-from peers.systems import LINEAR, SPIRAL, linear, readings, spiral
+from peers.systems import LINEAR, SPIRAL, linear, record_of, spiral
 from zakai import _registry
 from zakai.algebra.theorems import theorem_of
 from zakai.cli import main
@@ -63,13 +63,13 @@ def test_a_library_that_is_not_installed_is_said_in_a_line_with_the_extra(name, 
 )
 def test_an_option_that_cannot_be_is_refused(name, options, said):
     with pytest.raises(zakai.InputError, match=said):
-        zakai.filter(spiral("samples"), readings(spiral("samples"), TIMES), name, **options)
+        zakai.filter(spiral("samples"), record_of(spiral("samples"), TIMES), name, **options)
 
 
 def test_sigma_points_need_a_prior_that_is_not_singular():
     model = zakai.Model(observation_kind="samples", **(SPIRAL | {"prior": {"kind": "gaussian", "mean": [0.3], "cov": [[0.0]]}}))
     with pytest.raises(zakai.InputError, match="prior: its covariance is singular"):
-        zakai.filter(model, readings(model, TIMES), "ukf")
+        zakai.filter(model, record_of(model, TIMES), "ukf")
 
 
 def test_a_density_in_three_coordinates_cannot_be_drawn_from():
@@ -82,7 +82,7 @@ def test_a_density_in_three_coordinates_cannot_be_drawn_from():
 
 def test_the_particle_filter_is_the_same_again_with_its_seed():
     model, options = spiral("increments"), FEW["particle"]
-    record = readings(model, TIMES)
+    record = record_of(model, TIMES)
     first, again = (zakai.filter(model, record, "particle", **options) for _ in range(2))
     other = zakai.filter(model, record, "particle", seed=1, **options)
     assert np.array_equal(first.mean, again.mean) and first.log_likelihood == again.log_likelihood
@@ -94,7 +94,7 @@ def test_the_particle_filter_is_the_same_again_with_its_seed():
 @pytest.mark.parametrize("name", ["ukf", "particle"])
 def test_many_records_give_what_each_gives_alone(name):
     model, options = spiral("increments"), FEW.get(name, {})
-    records = [readings(model, TIMES, seed=seed) for seed in range(3)]
+    records = [record_of(model, TIMES, seed=seed) for seed in range(3)]
     for many, record in zip(zakai.filter(model, records, name, **options), records, strict=True):
         alone = zakai.filter(model, record, name, **options)
         assert np.allclose(many.mean, alone.mean, rtol=0, atol=1e-9)
@@ -105,7 +105,7 @@ def test_many_records_give_what_each_gives_alone(name):
 @pytest.mark.parametrize("name", ["ekf", "enkf"])
 def test_what_was_not_observed_is_as_if_there_were_no_such_sensor(name):
     model, options = linear("samples"), FEW.get(name, {})
-    values = readings(model, TIMES).values.copy()
+    values = record_of(model, TIMES).values.copy()
     values[:, 0] = np.nan
     values[3] = np.nan
     result = zakai.filter(model, zakai.Record(TIMES, values, "samples"), name, **options)
@@ -122,7 +122,7 @@ def test_what_was_not_observed_is_as_if_there_were_no_such_sensor(name):
 
 
 def test_increments_paths_and_rates_say_the_same():
-    record = readings(spiral("increments"), TIMES, gaps=False)
+    record = record_of(spiral("increments"), TIMES, gaps=False)
     expected = zakai.filter(spiral("increments"), record, "ukf")
     lengths = np.diff(TIMES, prepend=0.0)[:, None]
     for kind, values in (("path", np.cumsum(record.values, axis=0)), ("rates", record.values / lengths)):
@@ -133,7 +133,7 @@ def test_increments_paths_and_rates_say_the_same():
 
 def test_every_way_of_resampling_gives_one_posterior_and_says_how_often():
     model = spiral("increments")
-    record = readings(model, TIMES)
+    record = record_of(model, TIMES)
     results = [zakai.filter(model, record, "particle", resampling=how, particles=4000, ess_threshold=1.0) for how in
                ("systematic", "multinomial", "killing")]  # fmt: skip
     for result in results:
@@ -143,14 +143,14 @@ def test_every_way_of_resampling_gives_one_posterior_and_says_how_often():
 
 def test_a_collapse_of_the_particles_is_said():
     model = zakai.Model(observation_kind="samples", **(SPIRAL | {"observation_noise": [["1e-6", "0"], ["0", "1e-6"]]}))
-    result = zakai.filter(model, readings(model, TIMES), "particle", **FEW["particle"])
+    result = zakai.filter(model, record_of(model, TIMES), "particle", **FEW["particle"])
     assert result.health["effective_sample_size"][1:].min() < 2
     assert any("few particles carry the weight" in said for said in result.warnings)
 
 
 def test_without_process_noise_the_copies_are_counted_as_one():
     model = zakai.Model(observation_kind="samples", **(SPIRAL | {"process_noise": [["0"]]}))
-    record = readings(model, np.arange(1, 81) / 4)
+    record = record_of(model, np.arange(1, 81) / 4)
     result = zakai.filter(model, record, "particle", **FEW["particle"])
     assert result.health["effective_sample_size"][-1] <= len(np.unique(result.density(-1).points)) < 20
     assert any("no process noise" in said for said in result.warnings)
@@ -164,7 +164,7 @@ def test_a_filter_that_lost_the_state_is_said():
     values = np.stack([x * np.sin(x), x * np.cos(x)], axis=1)
     result = zakai.filter(model, zakai.Record(truth.times[1:], values, "samples"), "ekf")
     assert any("innovations are larger" in said for said in result.warnings)
-    well = zakai.filter(model, readings(model, np.arange(1, 41) / 4, seed=2), "ekf")
+    well = zakai.filter(model, record_of(model, np.arange(1, 41) / 4, seed=2), "ekf")
     assert well.warnings == []
 
 
