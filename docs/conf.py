@@ -26,6 +26,8 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.mathjax",
     "executed_blocks",
+    "notebooks",
+    "docstring_examples",
 ]
 exclude_patterns = ["_build", "_generated"]
 templates_path: list[str] = []

@@ -36,20 +36,20 @@ def most_likely(score: Callable[[dict], float]) -> dict[str, float]:
 def main() -> None:
     model = zakai.load_model(HERE / "sunspots.toml")
     record = zakai.read_record(HERE / "observations.csv", model)
-    readings = record.values[:, 0]
+    observations = record.values[:, 0]
 
     def extended_kalman(values: dict) -> float:
         return zakai.filter(model.with_parameters(**values), record, "extended-kalman-bucy", keep="moments").log_likelihood
 
     # The plain filter on the circle is smooth in the parameters and takes a tenth of a second.
     found = {
-        "fit": most_likely(lambda values: reference.grid_filter(record.times, readings, values, 256, 16)[1].sum()),
+        "fit": most_likely(lambda values: reference.grid_filter(record.times, observations, values, 256, 16)[1].sum()),
         "fit_extended_kalman": most_likely(extended_kalman),
     }
     result = zakai.filter(model, record, "yau-yau")
     extended = zakai.filter(model, record, "extended-kalman-bucy")
     values = {name: float(value) for name, value in model.parameters.items()}
-    field, increments, below = reference.grid_filter(record.times, readings, values)
+    field, increments, below = reference.grid_filter(record.times, observations, values)
     densities = [result.density(k) for k in range(1, len(field) + 1)]
     ours = np.array([density.weights.ravel() @ np.sin(density.points.ravel()) for density in densities])
     found["yau_yau"] = {

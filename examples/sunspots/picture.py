@@ -1,4 +1,4 @@
-"""Draw the Sun's signed field, and the readings: `python picture.py [sunspots.png]`."""
+"""Draw the Sun's signed field and the observations: `python picture.py [sunspots.png]`."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ import zakai
 HERE = Path(__file__).parent
 PARTICLES, REPETITIONS = 40_000, 8
 RATE_HOURS = 500
-# A density per radian at which a hundred particles or so are within reach of the reading; and the hours it takes to come back.
+# A density per radian at which some hundred particles are near the observation; and the hours that it takes to come back.
 IMPROBABLE, AFTER = 1e-2, 3
 # Where sigma and r are looked for, and from how many of the best points there a local search begins: few where the likelihood is
 # smooth, many for the extended Kalman filter's, which is rough.
@@ -34,17 +34,17 @@ class Year:
     def __init__(self) -> None:
         self.model = zakai.load_model(HERE / "wind-vane.toml")
         self.record = zakai.read_record(HERE / "observations.csv", self.model)
-        self.times, self.readings = self.record.times, self.record.values
-        self.seen = ~np.isnan(self.readings).any(axis=1)
-        self.angles = np.arctan2(self.readings[:, 1], self.readings[:, 0])
+        self.times, self.observations = self.record.times, self.record.values
+        self.seen = ~np.isnan(self.observations).any(axis=1)
+        self.angles = np.arctan2(self.observations[:, 1], self.observations[:, 0])
 
     def direct(self, sigma: float, r: float):
-        """The direct method's result, and the log score of the direction of each reading."""
+        """The direct method's result, and the log score of the direction of each observation."""
         result = zakai.filter(self.model.with_parameters(sigma=sigma, r=r), self.record, "limited-direct")
         return result, np.where(self.seen, result.log_likelihood_increments[1:] - reference.log_length_density(r), 0.0)
 
     def extended_kalman(self, sigma: float, r: float):
-        """The same for the extended Kalman filter; its mean does not move between readings and its variance grows evenly."""
+        """The same for the extended Kalman filter; its mean does not move between observations and its variance grows evenly."""
         result = zakai.filter(self.model.with_parameters(sigma=sigma, r=r), self.record, "extended-kalman-bucy", keep="moments")
         variance = result.variance[:-1, 0] + sigma**2 * np.diff(result.times)
         length = reference.log_length_density_gaussian(variance, np.full(len(variance), r))
@@ -52,7 +52,7 @@ class Year:
 
     def extended_kalman_scores(self, sigmas: np.ndarray, rs: np.ndarray) -> np.ndarray:
         """Its log score of the year at many sigmas and rs, side by side in plain NumPy, for the search."""
-        return reference.extended_kalman_scores(self.times, self.readings, sigmas, rs)
+        return reference.extended_kalman_scores(self.times, self.observations, sigmas, rs)
 
     def angle_kalman(self, sigma: float, r: float):
         """The same for the Kalman filter of the angle itself with a wrapped innovation."""
@@ -71,7 +71,7 @@ def most_likely(
 
     `scores` takes sigmas (P,) and rs (P,) and gives the year's log scores (P,). One local search is enough where the likelihood
     is smooth. That of the extended Kalman filter is not: where sigma and r are such that its mean comes to lie half a turn from
-    the readings, sin(angle - mean) is small, the mean stays there for hours, and the likelihood has a narrow crevice, at which a
+    the observations, sin(angle - mean) is small, the mean stays there for hours, and the likelihood has a narrow gap, at which a
     local search turns back.
     """
 
@@ -107,7 +107,7 @@ def standard_errors(score: Callable[[float, float], tuple], sigma: float, r: flo
 
 
 def advantage(year: Year, better: np.ndarray, worse: np.ndarray) -> dict[str, float]:
-    """The gain in log score a reading, its error from the weeks' sums, and what the best 1 % of the readings give of it."""
+    """The gain in log score an observation, its error from the weeks' sums, and the share of the best 1 % of them."""
     gain = (better - worse)[year.seen]
     whole = len(year.times) // WEEK * WEEK
     weeks = (better - worse)[:whole].reshape(-1, WEEK).sum(axis=1)
@@ -119,7 +119,7 @@ def advantage(year: Year, better: np.ndarray, worse: np.ndarray) -> dict[str, fl
 def against_grid(year: Year, sigma: float, r: float) -> dict[str, float]:
     """The largest differences from Bayes' rule on 720 points of the circle."""
     result, _ = year.direct(sigma, r)
-    direction, increments = reference.grid_filter(year.times, year.readings, sigma, r)
+    direction, increments = reference.grid_filter(year.times, year.observations, sigma, r)
     known = abs(direction) > 1e-6  # a uniform angle has no mean direction
     turned = np.angle(direction * np.exp(-1j * result.mean[1:, 0]))
     return {
@@ -139,7 +139,7 @@ def against_particles(year: Year, sigma: float, r: float) -> dict[str, float]:
     """
     result, score = year.direct(sigma, r)
     runs = [
-        reference.particle_filter(year.times, year.readings, sigma, r, PARTICLES, np.random.default_rng(seed))
+        reference.particle_filter(year.times, year.observations, sigma, r, PARTICLES, np.random.default_rng(seed))
         for seed in range(REPETITIONS)
     ]
     excess = np.array([increments for _, increments in runs]) - result.log_likelihood_increments[1:]
@@ -183,7 +183,7 @@ def with_rate() -> dict[str, float]:
 
 def main() -> None:
     year = Year()
-    found: dict[str, dict] = {"readings": {"hours": len(year.times), "with_a_direction": int(year.seen.sum())}}
+    found: dict[str, dict] = {"observations": {"hours": len(year.times), "with_a_direction": int(year.seen.sum())}}
     filters = {"direct": (year.direct, one_by_one(year.direct), COARSE),
                "extended_kalman": (year.extended_kalman, year.extended_kalman_scores, FINE),
                "angle_kalman": (year.angle_kalman, one_by_one(year.angle_kalman), COARSE)}  # fmt: skip
@@ -199,7 +199,7 @@ def main() -> None:
         found[f"advantage_over_{name}"] = advantage(year, scores["direct"], scores[name])
     ekf = found["extended_kalman"]
     result, _ = year.extended_kalman(ekf["sigma"], ekf["r"])
-    mean, increments, _, _ = reference.extended_kalman_filter(year.times, year.readings, ekf["sigma"], ekf["r"])
+    mean, increments, _, _ = reference.extended_kalman_filter(year.times, year.observations, ekf["sigma"], ekf["r"])
     found["extended_kalman_check"] = {
         "increment_difference": np.max(abs(increments - result.log_likelihood_increments[1:])),
         "mean_difference": np.max(abs(np.angle(np.exp(1j * (mean - result.mean[1:, 0]))))),

@@ -2,9 +2,9 @@
 
     dtheta = sigma dv,    z_k = (cos theta, sin theta) + r e_k,    e_k ~ N(0, I),    theta uniform on the circle at first
 
-`times` is (K,), `readings` (K, 2), with nan where the vane said nothing.  Every filter gives (direction, increments): the complex
-mean E exp(i theta) after each reading, (K,), and the log density of each reading given those before it, (K,), zero where
-nothing was read.
+`times` is (K,), `observations` (K, 2), with NaN where no direction was reported. A filter gives (direction, increments): the
+complex mean E exp(i theta) after each observation, (K,), and the log density of each observation given the past, (K,), zero
+where no direction was reported.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import i0e
 
 
-def grid_filter(times: np.ndarray, readings: np.ndarray, sigma: float, r: float, bins: int = 720):
+def grid_filter(times: np.ndarray, observations: np.ndarray, sigma: float, r: float, bins: int = 720):
     """Bayes' rule on a circle of `bins` points.
 
     The prediction sums wrapped normal densities: all terms are positive, so that an improbable turn of the wind keeps its digits.
@@ -23,7 +23,7 @@ def grid_filter(times: np.ndarray, readings: np.ndarray, sigma: float, r: float,
     density = np.full(bins, 1 / (2 * np.pi))
     cell, kernels = 2 * np.pi / bins, {}
     direction, increments = np.empty(len(times), complex), np.zeros(len(times))
-    for k, (length, z) in enumerate(zip(np.diff(times, prepend=0.0), readings, strict=True)):
+    for k, (length, z) in enumerate(zip(np.diff(times, prepend=0.0), observations, strict=True)):
         if length > 0:
             if length not in kernels:
                 row = sum(_normal(theta + 2 * np.pi * turn, sigma**2 * length) for turn in range(-4, 5)) * cell
@@ -40,12 +40,12 @@ def grid_filter(times: np.ndarray, readings: np.ndarray, sigma: float, r: float,
 
 
 def particle_filter(
-    times: np.ndarray, readings: np.ndarray, sigma: float, r: float, particles: int, generator: np.random.Generator
+    times: np.ndarray, observations: np.ndarray, sigma: float, r: float, particles: int, generator: np.random.Generator
 ):
-    """The bootstrap filter: move at random, weigh, resample systematically after every reading."""
+    """The bootstrap filter: move at random, weigh, resample systematically after every observation."""
     theta = generator.uniform(-np.pi, np.pi, particles)
     direction, increments = np.empty(len(times), complex), np.zeros(len(times))
-    for k, (length, z) in enumerate(zip(np.diff(times, prepend=0.0), readings, strict=True)):
+    for k, (length, z) in enumerate(zip(np.diff(times, prepend=0.0), observations, strict=True)):
         theta = theta + sigma * np.sqrt(length) * generator.standard_normal(particles)
         cos, sin = np.cos(theta), np.sin(theta)
         if np.isnan(z).any():
@@ -61,15 +61,15 @@ def particle_filter(
     return direction, increments
 
 
-def extended_kalman_filter(times: np.ndarray, readings: np.ndarray, sigma: float, r: float):
+def extended_kalman_filter(times: np.ndarray, observations: np.ndarray, sigma: float, r: float):
     """A Gaussian for the angle, h = (cos, sin) linearised at its mean; from the mean and variance of a uniform angle.
 
-    Gives (mean (K,), increments (K,), predicted reading (K, 2), its covariance (K, 2, 2)).
+    Gives (mean (K,), increments (K,), predicted observation (K, 2), its covariance (K, 2, 2)).
     """
     mean, variance = 0.0, np.pi**2 / 3
     means, increments = np.empty(len(times)), np.zeros(len(times))
     predicted, spread = np.empty((len(times), 2)), np.empty((len(times), 2, 2))
-    for k, (length, z) in enumerate(zip(np.diff(times, prepend=0.0), readings, strict=True)):
+    for k, (length, z) in enumerate(zip(np.diff(times, prepend=0.0), observations, strict=True)):
         variance = variance + sigma**2 * length
         predicted[k] = np.cos(mean), np.sin(mean)
         slope = np.array([-np.sin(mean), np.cos(mean)])
@@ -78,7 +78,7 @@ def extended_kalman_filter(times: np.ndarray, readings: np.ndarray, sigma: float
             residual = z - predicted[k]
             increments[k] = -0.5 * residual @ np.linalg.solve(spread[k], residual) - np.log(2 * np.pi)
             increments[k] -= 0.5 * np.log(np.linalg.det(spread[k]))
-            # The slope is a unit vector: the gain and the new variance are those of one reading of the angle.
+            # The slope is a unit vector: the gain and the new variance are those of one observation of the angle.
             gain = variance / (variance + r**2)
             mean, variance = mean + gain * (slope @ residual), (1 - gain) * variance
         mean = np.angle(np.exp(1j * mean))
@@ -87,7 +87,7 @@ def extended_kalman_filter(times: np.ndarray, readings: np.ndarray, sigma: float
 
 
 def angle_kalman_filter(times: np.ndarray, angles: np.ndarray, sigma: float, r: float):
-    """The engineer's way out: the reading is the angle itself with noise of deviation r, and its innovation is wrapped.
+    """The engineer's way out: the observation is the angle itself with noise of deviation r, and its innovation is wrapped.
 
     Gives (mean (K,), the log density of each angle on the circle (K,)): the predicted Gaussian, wrapped.
     """
@@ -106,9 +106,9 @@ def angle_kalman_filter(times: np.ndarray, angles: np.ndarray, sigma: float, r: 
 
 
 def log_length_density(r: float) -> float:
-    """The log density of a reading's length at 1, |z| = 1, per unit of length; it is the same for every theta.
+    """The log density of an observation's length at 1, |z| = 1, per unit of length; it is the same for every theta.
 
-    In polar coordinates a reading is rho exp(i alpha) and, with kappa = 1 / r^2,
+    In polar coordinates an observation is rho exp(i alpha) and, with kappa = 1 / r^2,
 
         p(rho, alpha | theta) = rho kappa / (2 pi) exp(-kappa (rho^2 + 1 - 2 rho cos(alpha - theta)) / 2),
 
@@ -119,9 +119,9 @@ def log_length_density(r: float) -> float:
 
 
 def log_length_density_gaussian(variance: np.ndarray, r: np.ndarray, points: int = 720) -> np.ndarray:
-    """The same for the extended Kalman filter, whose angle has `variance` before the reading; all of one shape.
+    """The same for the extended Kalman filter, whose angle has `variance` before the observation; all of one shape.
 
-    Its prediction of the reading is a Gaussian about a point of the unit circle, of variance r^2 across the circle and
+    Its prediction of the observation is a Gaussian about a point of the unit circle, of variance r^2 across the circle and
     variance + r^2 along it; this is the integral of its density over the circle, wherever the point is.
     """
     angle = 2 * np.pi * np.arange(points) / points
@@ -131,10 +131,10 @@ def log_length_density_gaussian(variance: np.ndarray, r: np.ndarray, points: int
     return np.log(total) - np.log(2 * np.pi) - 0.5 * np.log(across * along)
 
 
-def extended_kalman_scores(times: np.ndarray, readings: np.ndarray, sigma: np.ndarray, r: np.ndarray) -> np.ndarray:
+def extended_kalman_scores(times: np.ndarray, observations: np.ndarray, sigma: np.ndarray, r: np.ndarray) -> np.ndarray:
     """The log density of all the directions under the extended Kalman filter, (P,), for many sigma (P,) and r (P,) at once."""
     mean, variance, total = np.zeros(len(sigma)), np.full(len(sigma), np.pi**2 / 3), np.zeros(len(sigma))
-    for length, z in zip(np.diff(times, prepend=0.0), readings, strict=True):
+    for length, z in zip(np.diff(times, prepend=0.0), observations, strict=True):
         variance = variance + sigma**2 * length
         if not np.isnan(z).any():
             cos, sin = np.cos(mean), np.sin(mean)
@@ -146,7 +146,7 @@ def extended_kalman_scores(times: np.ndarray, readings: np.ndarray, sigma: np.nd
     return total
 
 
-def grid_filter_with_rate(times: np.ndarray, readings: np.ndarray, model: dict[str, float], angles: int = 96, rates: int = 112):
+def grid_filter_with_rate(times: np.ndarray, values: np.ndarray, model: dict[str, float], angles: int = 96, rates: int = 112):
     """Bayes' rule on a grid for the vane with a rate: dtheta = rate dt + sigma dv, drate = -k rate dt + sigma_rate dv'.
 
     `model` holds k, sigma, sigma_rate, r and the prior's variances about zero, `angle_variance` and `rate_variance`. Given the
@@ -163,7 +163,7 @@ def grid_filter_with_rate(times: np.ndarray, readings: np.ndarray, model: dict[s
     points = np.column_stack([np.cos(theta), np.sin(theta)])
     direction, mean_rate = np.empty(len(times), complex), np.empty(len(times))
     increments, kernels = np.zeros(len(times)), {}
-    for k, (length, z) in enumerate(zip(np.diff(times, prepend=0.0), readings, strict=True)):
+    for k, (length, z) in enumerate(zip(np.diff(times, prepend=0.0), values, strict=True)):
         if length > 0:
             if length not in kernels:
                 kernels[length] = _rate_kernel(theta, rate, length, k_, sigma, sigma_rate) * cell
