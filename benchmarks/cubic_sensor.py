@@ -3,8 +3,8 @@
     python benchmarks/cubic_sensor.py [--paths 100] [--references 3] [--seed 0]
 
 The public Yau-Yau codes take this system as their default.  Printed are, over all paths, the root mean square error of the mean
-over time, the normalised squared error (1 where the variance is right) and the time of an observation when nothing is left to
-compile.  The first `references` paths are filtered once more by a plain Crank-Nicolson solution on a fixed fine lattice that is
+over time, the normalised squared error (1 where the variance is right) and the time of an observation when everything is
+compiled.  The first `references` paths are filtered once more by a plain Crank-Nicolson solution on a fixed fine grid that is
 wide enough for every path; it shares nothing with zakai but the record.
 """
 

@@ -2,7 +2,7 @@
 
     python benchmarks/cubic_sensors.py [sensors] [observations]
 
-1,000 and 4,000 unless told otherwise.  Printed are the seconds of the first call, with all compilation, the root mean square
+1,000 and 4,000 by default.  Printed are the seconds of the first call, with all compilation, the root mean square
 error and the normalised squared error (1 where the variances are right), and how far three of them are from the same sensors
 filtered alone.
 """

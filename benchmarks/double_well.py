@@ -62,8 +62,8 @@ def main() -> None:
     result = zakai.filter(model, record, "yau-yau", keep="moments", progress=watch)
     start = own.observations - LATE
     late = zakai.Model(**KEYS, start=float(record.times[start - 1]))
-    anew = zakai.filter(late, zakai.Record(record.times[start:], record.values[start:], record.kind), "yau-yau", keep="moments")
-    apart = (anew.mean[-100:, 0] - result.mean[-100:, 0]) / np.sqrt(result.variance[-100:, 0])
+    later = zakai.filter(late, zakai.Record(record.times[start:], record.values[start:], record.kind), "yau-yau", keep="moments")
+    apart = (later.mean[-100:, 0] - result.mean[-100:, 0]) / np.sqrt(result.variance[-100:, 0])
     error = result.mean[1:, 0] - x
     switches = np.count_nonzero(np.diff(np.sign(x[np.abs(x) > 0.7])))
     figures = {

@@ -17,7 +17,7 @@ import zakai
 
 
 class Problem(NamedTuple):
-    """A model, the step and the number of its readings, and what gives the true answer."""
+    """A model, the step and the number of its observations, and the method of the reference."""
 
     keys: dict[str, Any]
     step: float
@@ -84,8 +84,9 @@ def main() -> None:
                 true = zakai.filter(model, record, "yau-yau", keep="moments", tolerance=1e-8)
             for tolerance in own.tolerance:
                 result = zakai.filter(model, record, "yau-yau", keep="moments", tolerance=tolerance)
-                off, told = error(result, true), float(np.nanmax(result.health["error_estimate"]))
-                print(f"{name:34}{tolerance:10.0e}{off:10.1e}{told:10.1e}{off / told:8.2f}  {len(result.warnings)}", flush=True)
+                off, estimate = error(result, true), float(np.nanmax(result.health["error_estimate"]))
+                print(f"{name:34}{tolerance:10.0e}{off:10.1e}{estimate:10.1e}{off / estimate:8.2f}  "
+                      f"{len(result.warnings)}", flush=True)
 
 
 if __name__ == "__main__":

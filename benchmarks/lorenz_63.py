@@ -4,7 +4,7 @@
 
 The truth is without process noise, by Runge and Kutta's formula with steps of .01; the model of the filter has the noise that
 its operator needs, `--noise` times the identity a unit of time.  Printed are the root mean square error over the three
-coordinates, its mean in time after 100 readings (a quarter of a short record), the seconds of the call with all compilation,
+coordinates, its mean in time after 100 observations (a quarter of a short record), the seconds of the call with all compilation,
 the health and the warnings.
 """
 
@@ -34,8 +34,8 @@ def moved(x: np.ndarray, count: int) -> np.ndarray:
     return x
 
 
-def truth_and_readings(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The state at the start, a point of the attractor; the states (count, 3) and their readings."""
+def simulated(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The state at the start, a point of the attractor; the states (count, 3) and their observations."""
     rng = np.random.default_rng(seed)
     start = x = moved(np.array([1.509, -1.531, 25.46]) + rng.normal(size=3), 2000)
     states = []
@@ -65,9 +65,9 @@ def main() -> None:
     parser.add_argument("--tolerance", type=float, default=0.1)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
-    start, states, readings = truth_and_readings(given.observations, given.seed)
+    start, states, values = simulated(given.observations, given.seed)
     first = start + np.random.default_rng([given.seed, 1]).normal(size=3)
-    record = zakai.Record(EVERY * np.arange(1, given.observations + 1), readings, "samples")
+    record = zakai.Record(EVERY * np.arange(1, given.observations + 1), values, "samples")
     begin, cpu = time.perf_counter(), time.process_time()
     result = zakai.filter(
         system(first, given.noise), record, "yau-yau", tolerance=given.tolerance, keep="moments"

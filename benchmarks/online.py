@@ -29,7 +29,7 @@ import zakai
 WARM = 5000
 BATCH = 10_000
 STEP = 0.01
-LIFE = 1000  # observations after which the spiral begins anew: its drift, t x / 40, takes the state from every sensor
+LIFE = 1000  # observations after which the spiral starts again: its drift, t x / 40, takes the state from every sensor
 OSCILLATORS = dict(
     state=["p", "v", "q", "w"],
     drift=["v", "-p - v/4 + q/2", "w", "-2*q - w/3 + p/2"],
@@ -44,8 +44,8 @@ def system(name: str) -> zakai.Model:
     return zakai.load_model("gallery:spiral-sensor") if name == "spiral" else zakai.Model(**OSCILLATORS)
 
 
-def readings(name: str, step: float, seed: int = 0):
-    """Increments of a simulated path; the spiral's begins anew after `LIFE` of them."""
+def increments(name: str, step: float, seed: int = 0):
+    """Increments of a simulated path; the spiral's starts again after `LIFE` of them."""
     rng, k = np.random.default_rng(seed), 0
     x = np.zeros(4)
     while True:
@@ -81,7 +81,7 @@ def mass_error(online: Any) -> float:
 def measure(name: str, count: int, watch: bool) -> dict[str, Any]:
     model, step, life = system(name), STEP, LIFE if name == "spiral" else count + WARM
     begin = time.perf_counter()
-    online, source = zakai.online(model), readings(name, step)
+    online, source = zakai.online(model), increments(name, step)
     online.update(step, next(source))
     first = time.perf_counter() - begin
     # Filled and read once, so that the memory of this script is allocated before the first observation.

@@ -3,10 +3,10 @@
     python benchmarks/peers.py [spiral|cubic] [--paths 3] [--observations 1000] [--json FILE] [--picture FILE.png]
 
 Each contestant filters one record after the other, and all contestants filter a record before the next is begun, so that a
-machine that slows down slows them all; what is compiled and prepared is so before a clock starts, and is told beside it.  Printed
+machine that slows down slows them all; compilation and preparation end before a clock starts, and are printed beside it.  Printed
 are, for each, the median time of an observation over the paths, that of the processor and that of the clock on the wall, which is
 longer where others use the machine, and the root mean square distance of its mean from the optimal mean, which is found by plain
-NumPy on a fixed lattice:
+NumPy on a fixed grid:
 
 spiral   dx = t/40 x dt + dv, dy = (x sin x, x cos x) dt + dw, step .01, by Euler's paths; the optimal filter of Euler's model
 cubic    two coordinates dx_i = cos x_i dt + dv_i, dy_i = x_i^3 dt + dw_i, step .001; the solution of the Zakai equation
@@ -158,16 +158,16 @@ def by_cuthbert(problem: Problem, particles: int, resampling: str, threshold: fl
         return log_weight(before, inputs)
 
     resample = ess_decorator(RESAMPLING[resampling].resampling, threshold)
-    peer = particle_filter.build_filter(problem.first, propagate, potential, particles, resample)
+    built = particle_filter.build_filter(problem.first, propagate, potential, particles, resample)
 
     def one(state: Any, inputs: Any) -> tuple[Any, Any]:
-        state = peer.filter_combine(state, peer.filter_prepare(inputs[:2], key=inputs[2]))
+        state = built.filter_combine(state, built.filter_prepare(inputs[:2], key=inputs[2]))
         return state, jax.nn.softmax(state.log_weights) @ state.particles
 
     @jax.jit
     def run(times: Any, values: Any, key: Any) -> Any:
         start, *keys = jax.random.split(key, 2)
-        state = peer.init_prepare(key=start)
+        state = built.init_prepare(key=start)
         inputs = times, values, jax.random.split(keys[0], len(times))
         state = state._replace(model_inputs=jax.tree.map(lambda a: a[0], inputs[:2]))
         return jax.lax.scan(one, state, inputs)[1]
@@ -180,7 +180,7 @@ def by_cuthbert(problem: Problem, particles: int, resampling: str, threshold: fl
 
 def contestants(problem: Problem, which: str) -> list[Contestant]:
     """Who takes part."""
-    zakai_, peer = partial(by_zakai, problem), partial(by_cuthbert, problem)
+    zakai_, cuthbert = partial(by_zakai, problem), partial(by_cuthbert, problem)
     ours = ["limited-direct" if which == "spiral" else "auto", "yau-yau", "extended-kalman-bucy"]
     all_ = [Contestant("zakai", name, zakai_(name)) for name in ours]
     if which == "cubic":
@@ -190,7 +190,7 @@ def contestants(problem: Problem, which: str) -> list[Contestant]:
     sizes = (100, 1000, 10_000) if which == "spiral" else (300, 1000, 3000, 10_000, 30_000)
     for size in sizes:
         hows = RESAMPLING if size == 10_000 else ("systematic",)
-        all_ += [Contestant("cuthbert", f"particle, {size}, {how}", peer(size, how, 0.5)) for how in hows]
+        all_ += [Contestant("cuthbert", f"particle, {size}, {how}", cuthbert(size, how, 0.5)) for how in hows]
     all_.append(Contestant("cuthbert", "particle, 1000, by zakai.filter", zakai_("particle", scheme="euler")))
     return all_
 
@@ -200,7 +200,7 @@ def measured(problem: Problem, which: str) -> list[dict[str, Any]]:
     runners = contestants(problem, which)
     rows: list[dict[str, Any]] = []
     for one in runners:
-        # The second path may need a lattice of a size that was not compiled for the first.
+        # The second path may need a grid of a size that was not compiled for the first.
         begin = time.perf_counter()
         one.means(problem.records[0])
         rows.append(row_of(one.library, one.name, time.perf_counter() - begin))
@@ -310,7 +310,7 @@ def draw(path: str, rows: list[dict[str, Any]], which: str) -> None:
             axes.annotate(row["name"], (x, y), xytext=(5, 4 if turn > 0 else -4), rotation_mode="anchor", **look)
     axes.set(xscale="log", yscale="log", xlabel="processor time per observation (microseconds)")
     axes.set(ylabel="rms distance from the optimal mean", title=f"{which} sensor: cost against accuracy")
-    axes.margins(0.28, 0.25)  # room for the names
+    axes.margins(0.28, 0.25)  # space for the names
     axes.grid(alpha=0.3)
     axes.legend()
     figure.savefig(path, dpi=130)

@@ -1,1 +1,1 @@
-"""Fuzzing of everything that reads what a stranger wrote; see README.md."""
+"""Fuzzing of everything that reads untrusted files; see README.md."""

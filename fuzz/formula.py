@@ -3,7 +3,7 @@
 import sympy
 
 from fuzz.oracle import value_or_one_line
-from zakai.models.expressions import parse_expression
+from zakai.models.formulas import parse_expression
 
 _NAMES = {name: sympy.Symbol(name, real=True) for name in ("x", "y", "t", "a")}
 

@@ -1,4 +1,4 @@
-"""Lines of a stream, JSON or CSV: each is an observation or one short reason; a live filter takes or refuses what they say."""
+"""Lines of a stream, JSON or CSV: each is an observation or one short reason; an online filter takes or refuses what they say."""
 
 import io
 from types import SimpleNamespace

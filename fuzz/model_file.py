@@ -2,7 +2,8 @@
 
 from fuzz.oracle import value_or_one_line
 from zakai.errors import InputError
-from zakai.models.files import decoded, read_model
+from zakai.models._text import decoded
+from zakai.models.files import read_model
 from zakai.models.model import Model
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from fuzz.oracle import value_or_one_line
 from zakai.errors import InputError
 from zakai.records import csv
-from zakai.records.record import LARGEST
+from zakai.records.numbers import LARGEST
 
 
 def one_input(data: bytes) -> None:

@@ -20,7 +20,8 @@ from multiprocessing.connection import Connection
 import h5py
 
 from fuzz.oracle import value_or_one_line
-from zakai.engine.results import FilterResult, result_of
+from zakai.engine.results import FilterResult
+from zakai.engine.stored import result_of
 from zakai.errors import InputError
 from zakai.records import _hdf5
 

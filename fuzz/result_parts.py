@@ -9,7 +9,7 @@ import numpy as np
 
 from fuzz.oracle import value_or_one_line
 from fuzz.result import check_result
-from zakai.engine.results import result_of
+from zakai.engine.stored import result_of
 from zakai.errors import InputError
 
 NAMES = ("time", "state", "state_", "mean", "variance", "cov", "log_likelihood_increment", "edge_weight", "\u202e", "x" * 300)

@@ -28,13 +28,13 @@ def printed(node: Node) -> str:
     raise AssertionError(node)
 
 
-def _within(node: Node, bare: tuple[type, ...]) -> str:
-    return printed(node) if isinstance(node, bare) else f"({printed(node)})"
+def _within(node: Node, allowed: tuple[type, ...]) -> str:
+    return printed(node) if isinstance(node, allowed) else f"({printed(node)})"
 
 
-def _chain(parts: tuple[tuple[bool, Node], ...], forward: str, backward: str, bare: tuple[type, ...]) -> str:
+def _chain(parts: tuple[tuple[bool, Node], ...], forward: str, backward: str, allowed: tuple[type, ...]) -> str:
     (_, first), *rest = parts
-    return _within(first, bare) + "".join((forward if sign else backward) + _within(node, bare) for sign, node in rest)
+    return _within(first, allowed) + "".join((forward if sign else backward) + _within(node, allowed) for sign, node in rest)
 
 
 def decimal(value: Fraction) -> str:
