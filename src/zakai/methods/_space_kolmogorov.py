@@ -18,7 +18,6 @@ from zakai.methods._protocol import Info
 from zakai.methods._space import State
 from zakai.methods._space_observed import MOST_PANELS, Observations
 from zakai.methods._space_system import System, grid_of, moments_of, prior_on_grid, system_of, valid_noise
-from zakai.models.features import JUMPS
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.space_fixed import LARGEST_RANGE, Motion, fits, fixed_step, motion, refitted
@@ -296,8 +295,8 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: f
     if n > 4:
         raise InputError(f"{model.source}: a density grid is for at most four states, and there are {n}")
     periodic = tuple(name in model.periodic for name in model.state)
-    # Across a jump the spectrum decays slowly, and what is beyond the grid is not small.
-    tail = min(tolerance**2, (1e-5 if JUMPS in model.features else 1e-3) * tolerance)
+    # With more at the highest frequencies the substeps of skew densities do not converge.
+    tail = min(tolerance**2, 1e-5 * tolerance)
     bounds = Bounds(1e-3 * tolerance, tail, MOST[n], periodic)
     system, theta = system_of(model), np.asarray(theta)
     tables, motions = ({}, {}) if is_complex(theta) else system.caches(theta)
