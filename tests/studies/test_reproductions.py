@@ -169,7 +169,7 @@ def test_the_survey_and_we_admit_the_same_methods_but_where_more_is_true():
 
 
 def test_the_algebras_of_dong_chen_and_yau_are_told_with_their_misprints(tmp_path, capsys):
-    told = studies.reproduce("dong-chen-yau-2021", tmp_path, largest=1, paths=40, readings=0)
+    told = studies.reproduce("dong-chen-yau-2021", tmp_path, largest=1, paths=40, observations=0)
     said = verdicts(told)
     differing = {what for what, verdict in said.items() if verdict.startswith("differs")}
     assert differing == {
@@ -184,7 +184,7 @@ def test_the_algebras_of_dong_chen_and_yau_are_told_with_their_misprints(tmp_pat
 
 
 def test_the_theorems_of_yau_are_told_with_their_misprints(tmp_path, capsys):
-    told = studies.reproduce("yau-1993", tmp_path, order=1, terms=1, readings=0)
+    told = studies.reproduce("yau-1993", tmp_path, order=1, terms=1, observations=0)
     differing = [what for what, verdict in verdicts(told).items() if verdict.startswith("differs")]
     assert [what.partition(":")[0] for what in differing] == ["Theorem 6, first line", "(14) as printed", "Theorem 12"]
     assert (tmp_path / "kolmogorov-series.png").exists()

@@ -14,7 +14,7 @@ def verdicts(reproduction) -> list[str]:
 
 
 def test_theorem_4_of_hu_and_yau_gives_the_converged_density(tmp_path):
-    told = studies.reproduce("hu-yau-2002", tmp_path, systems=1, forms=1, readings=3)
+    told = studies.reproduce("hu-yau-2002", tmp_path, systems=1, forms=1, observations=3)
     assert verdicts(told) == ["agrees", "differs", "differs"]
     assert (tmp_path / "density-1.png").exists() and (tmp_path / "density-1.pdf").exists()
 
@@ -56,7 +56,7 @@ def test_every_filter_and_theorem_that_is_left(tmp_path):
     short = studies.reproduce("cubic-sensor", paths=2, steps=100)
     assert [row[0] for row in short.tables[0].rows] == [*cubic_sensor.FILTERS, cubic_sensor.REFERENCE]
     assert all(row[5] == "0" for row in short.tables[0].rows)
-    assert set(verdicts(studies.reproduce("hu-yau-2002", forms=1, readings=3))[:-2]) == {"agrees"}
+    assert set(verdicts(studies.reproduce("hu-yau-2002", forms=1, observations=3))[:-2]) == {"agrees"}
 
     def said(name, folder=None, **options):
         return {one.what: one.verdict for one in studies.reproduce(name, folder, **options).comparisons}
@@ -65,7 +65,7 @@ def test_every_filter_and_theorem_that_is_left(tmp_path):
     assert (tmp_path / "converged.png").exists() and (tmp_path / "distances.png").exists()
     assert survey["(3) Algorithm 3: error of the density"] == "agrees"
     assert survey["(2) Algorithms 1 and 2: error of the density"] == "agrees"
-    filtered = said("dong-chen-yau-2021", largest=1, paths=10, readings=1)
+    filtered = said("dong-chen-yau-2021", largest=1, paths=10, observations=1)
     assert filtered["Theorem 4.1 on a member of the class: error of E[x1], deviations"] == "agrees"
     yau = said("yau-1993")
     assert yau["Theorem 6, corrected, f = tanh x: error of the density"] == "agrees"

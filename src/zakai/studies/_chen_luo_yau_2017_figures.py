@@ -20,7 +20,7 @@ _LINES = {
 
 
 def draw(study: Study, spread: float, number: int) -> Any:
-    """The paper's picture (state and estimates, averaged over the paths) above the averaged squared error, for both readings."""
+    """Draw the paper's picture (averaged state and estimates) above the averaged squared error, for both observations."""
     figure = new_figure(10.0, 6.4)
     columns = [i for i, setting in enumerate(study.settings) if setting.spread == spread]
     panels = figure.subplots(2, len(columns), sharex=True, sharey="row", squeeze=False)

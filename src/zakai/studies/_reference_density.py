@@ -1,6 +1,6 @@
 """Converged solutions of the filtering equation in plain NumPy and SciPy, which share no code with the filters.
 
-    sigma_t = G:Hess sigma / 2 - div(f sigma) - |h|^2 sigma / 2 + h . y' sigma,     y linear between readings
+    sigma_t = G:Hess sigma / 2 - div(f sigma) - |h|^2 sigma / 2 + h . y' sigma,     y linear between observations
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ def conditional_densities(
     tolerance: float = 1e-11,
     frozen: bool = False,
 ) -> Solution:
-    """The density after each reading, by Fourier collocation on a periodic box and DOP853, in one or two states.
+    """The density after each observation, by Fourier collocation on a periodic box and DOP853, in one or two states.
 
     drift, observation: of points (..., n), giving (..., n) and (..., m); observation noise is white. covariance: G (n, n).
     prior: the initial density up to a factor. increments: (K, m). The box reaches from -half_width to half_width, `count` points
-    an axis, and must be wide enough for the density to vanish at its edge. frozen: y stays where it is until a reading.
+    an axis, and must be wide enough for the density to vanish at its edge. frozen: y stays where it is until an observation.
     """
     n = len(covariance)
     axis = half_width * (2 * np.arange(count) / count - 1)

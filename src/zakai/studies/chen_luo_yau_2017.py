@@ -44,7 +44,7 @@ CUT = 11.0  # half the width of the window that would explain the paper's figure
 
 @dataclass(frozen=True)
 class Setting:
-    """One column of the table: a reading of P0 and its value."""
+    """One column of the table: an observation of P0 and its value."""
 
     reading: str
     spread: float
@@ -207,7 +207,7 @@ def _figures(settings, states, means, lost) -> dict[str, Any]:
 
 
 def _comparisons(figures: dict[str, Any]) -> list[Comparison]:
-    """Table II line by line, for each reading of P0."""
+    """Table II line by line, for each observation of P0."""
     found = []
     for setting in figures["settings"]:
         published, where = PAPER[setting["P0"]], f"P0 = {setting['P0']:g} as {setting['reading']}"

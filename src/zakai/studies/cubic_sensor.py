@@ -79,7 +79,7 @@ def run(
 
     progress: called with the work done and all of it. pictures: where they go; the first shows the first path's converged
     solution.
-    paths: how many, with the seeds from `seed` on. steps: readings of a path.
+    paths: how many, with the seeds from `seed` on. steps: observations of a path.
     """
     whole_number("paths", paths, 1, 10_000)
     whole_number("steps", steps, 10, 10**6)
@@ -146,7 +146,7 @@ def reproduction(scores: dict[str, dict[str, np.ndarray]], missing: str, setting
     def against(what: str, own: dict[str, Any], known: Known) -> Comparison:
         mean, error = own["mean"], own["standard_error"]
         if settings["steps"] != STEPS:
-            return Comparison(what, known.rmse, mean, error, f"not comparable: known of paths of {STEPS:,} readings")
+            return Comparison(what, known.rmse, mean, error, f"not comparable: known of paths of {STEPS:,} observations")
         # A figure whose standard error is not known has that of ours, for its number of runs.
         other = known.standard_error or (error or 0.0) * np.sqrt(own["runs"] / known.runs)
         return by_chance(what, known.rmse, mean, error, "", float(other))
@@ -186,7 +186,7 @@ def reproduction(scores: dict[str, dict[str, np.ndarray]], missing: str, setting
         "The cubic sensor: dx = cos x dt + dv, dy = x^3 dt + dw, the default problem of public Yau-Yau codes",
         "Published are the system and the codes, without a table. The figures in the first column are known from running "
         "those codes and plain filters on it (100 paths; 40 for YauYauAL): the root mean square error over time, averaged "
-        f"over paths. Ours: {settings['paths']} paths of {settings['steps']} readings, seeds from {settings['seed']}; +- one "
+        f"over paths. Ours: {settings['paths']} paths of {settings['steps']} observations, seeds from {settings['seed']}; +- one "
         "standard error.",
         tuple(comparisons),
         verdict,

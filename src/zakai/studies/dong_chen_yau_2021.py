@@ -50,18 +50,18 @@ def run(
     *,
     largest: int = 6,
     paths: int = 1000,
-    readings: int = 5,
+    observations: int = 5,
     seed: int = 1,
 ) -> Reproduction:
     """Every example.
 
     progress: called with the work done and all of it. pictures: where they go. largest: Example 3.6 is computed for k = 1 to
-    this. paths: of Example 3.4, simulated for the share that explodes. readings: of the record on which the filter of Theorem
+    this. paths: of Example 3.4, simulated for the share that explodes. observations: of the record on which the filter of Theorem
     4.1 is run; 0 leaves it out. seed: of the paths and the record.
     """
     whole_number("largest", largest, 1, 12)
     whole_number("paths", paths, 2, 10**6)
-    whole_number("readings", readings, 0, 50)
+    whole_number("observations", observations, 0, 50)
     whole_number("seed", seed, 0, 2**31)
     pictures = pictures or Pictures()
     work = Progress(progress, 5)
@@ -77,10 +77,10 @@ def run(
     comparisons.append(Comparison(f"Example 3.4: share of paths that explode before t = {TIME:g}", None, share, error, said))
     pictures.add("explosion", partial(draw, times, exploded, paths))
     work.add()
-    if readings:
-        comparisons.append(filtered(readings, seed))
+    if observations:
+        comparisons.append(filtered(observations, seed))
     work.add()
-    return reproduction(comparisons, {"largest": largest, "paths": paths, "readings": readings, "seed": seed})
+    return reproduction(comparisons, {"largest": largest, "paths": paths, "observations": observations, "seed": seed})
 
 
 def verdict(model: Model) -> str:
@@ -191,10 +191,10 @@ def explosions(paths: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return STEP * np.arange(1, len(share) + 1), np.array(share)
 
 
-def filtered(readings: int, seed: int) -> Comparison:
+def filtered(observations: int, seed: int) -> Comparison:
     """The mean of x1 by Wei and Norman's filter in three states, against Kalman and Bucy's of (x1, x2 + x3)."""
     model = load_model("gallery:passive-drift")
-    times = 0.1 * np.arange(1, readings + 1)
+    times = 0.1 * np.arange(1, observations + 1)
     _, record = simulate(model, times, seed=seed)
     result = filter_record(model, record, "wei-norman", keep="moments")
     means, deviations = kalman_bucy(record)
@@ -204,7 +204,7 @@ def filtered(readings: int, seed: int) -> Comparison:
 
 
 def kalman_bucy(record: Record) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and deviation (K,) of x1 by Kalman and Bucy's equations, y running linearly between readings.
+    """Mean and deviation (K,) of x1 by Kalman and Bucy's equations, y running linearly between observations.
 
         dx1 = (x1 + s) dt + dv,    ds = (2 x1 - s + 1/10) dt + sqrt(2) dv',    dy = 2 x1 dt + dw,    s = x2 + x3
     """
@@ -232,7 +232,8 @@ def reproduction(comparisons: list[Comparison], settings: dict[str, Any]) -> Rep
         "Dong, Chen and Yau 2021: estimation algebras of dimension four and linear rank one in four states",
         "Published are algebras, Omega matrices and the equations of a filter; nothing is simulated. Checked, in exact "
         "arithmetic, are the bases, the linear rank, every entry of Omega and the equations; and, on a system of the class "
-        f"whose paths do not explode, the filter on {settings['readings']} readings beside a Kalman-Bucy filter that shares no "
+        f"whose paths do not explode, the filter on {settings['observations']} observations beside a "
+        f"Kalman-Bucy filter that shares no "
         "code with it.",
         tuple(comparisons),
         "the algebras of Examples 3.4 to 3.6 and of Wong's system are those of the paper, every entry of Omega too (the "

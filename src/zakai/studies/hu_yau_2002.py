@@ -91,24 +91,24 @@ def run(
     progress: Callable[[int, int], None] | None = None,
     pictures: Pictures | None = None,
     *,
-    readings: int = 10,
+    observations: int = 10,
     systems: int = len(SYSTEMS),
     forms: int = len(ALL),
     seed: int = 1,
 ) -> Reproduction:
     """Every theorem on every system.
 
-    progress: called with the work done and all of it. pictures: where they go. readings: of each record, 0.1 apart. systems,
+    progress: called with the work done and all of it. pictures: where they go. observations: of each record, 0.1 apart. systems,
     forms: how many of the systems are run, and of the forms on each. seed: of the records.
     """
-    whole_number("readings", readings, 1, 50)
+    whole_number("observations", observations, 1, 50)
     whole_number("systems", systems, 1, len(SYSTEMS))
     whole_number("forms", forms, 1, len(ALL))
     whole_number("seed", seed, 0, 2**31)
     pictures = pictures or Pictures()
     used = dict(list(SYSTEMS.items())[:systems])
     work = Progress(progress, sum(1 + len(one.forms[:forms]) for one in used.values()))
-    times = STEP * np.arange(1, readings + 1)
+    times = STEP * np.arange(1, observations + 1)
     comparisons, rows = [], []
     for name, system in used.items():
         model = Model(**system.keys, observation_kind="increments")
@@ -129,11 +129,11 @@ def run(
         number = list(SYSTEMS).index(name) + 1
         pictures.add(f"density-{number}", partial(draw, name, system, converged, result))
     comparisons += [statistics(), equation_14(times, seed)]
-    return reproduction(comparisons, rows, {"readings": readings, "seed": seed})
+    return reproduction(comparisons, rows, {"observations": observations, "seed": seed})
 
 
 def distances(converged: Solution, result: FilterResult) -> tuple[float, float]:
-    """The largest error of the density over all readings, relative to its maximum, and that of the evidence in nats."""
+    """The largest error of the density over all observations, relative to its maximum, and that of the evidence in nats."""
     apart = [
         np.abs(np.exp(result.density(k).log_density(converged.points)) - density).max() / density.max()
         for k, density in enumerate(converged.densities, 1)
@@ -172,7 +172,7 @@ def reproduction(comparisons: list[Comparison], rows: list[tuple[str, str, str]]
     """The figures and what they say."""
     right = sum(one.verdict == "agrees" for one in comparisons)
     table = Table(
-        "Largest errors over the readings, of the density relative to its maximum and of the evidence in nats",
+        "Largest errors over the observations, of the density relative to its maximum and of the evidence in nats",
         ("system, theorem and form", "density", "evidence"),
         tuple(rows),
     )
@@ -180,12 +180,13 @@ def reproduction(comparisons: list[Comparison], rows: list[tuple[str, str, str]]
         f"{right} of {len(rows)} runs of Theorems 4 to 6 give the density of the converged solution: for a G that is not the "
         "identity, a state of which one coordinate is observed, and starts that are no Gaussian. One formula is misprinted, "
         "(14), which changes the evidence alone. From time 0 the statistics cancel more digits the longer the record is; "
-        "started anew at every reading they do not."
+        "started anew at every observation they do not."
     )
     return Reproduction(
         "Hu and Yau 2002: the universal finite-dimensional filter, for any initial density",
         "Published are theorems without an example; each says that its formulas solve the equation, so that its error is 0. "
-        f"Checked are Theorems 4 to 6 on systems of their class, on records of {settings['readings']} readings, 0.1 apart, from "
+        f"Checked are Theorems 4 to 6 on systems of their class, on records of {settings['observations']} "
+        f"observations, 0.1 apart, from "
         "starts with two peaks, against a converged solution of the Duncan-Mortensen-Zakai equation.",
         tuple(comparisons),
         verdict,
@@ -195,7 +196,7 @@ def reproduction(comparisons: list[Comparison], rows: list[tuple[str, str, str]]
 
 
 def draw(name: str, system: System, converged: Solution, result: FilterResult) -> Any:
-    """The start and the density after some readings: the filter's as a line, the converged one below it."""
+    """The start and the density after some observations: the filter's as a line, the converged one below it."""
     figure = new_figure(8.0, 4.4)
     panel = plain(figure.subplots())
     x = converged.points

@@ -69,7 +69,7 @@ SYSTEMS: dict[str, tuple[dict[str, Any], str, str]] = {
 
 
 class Run(NamedTuple):
-    """A method's result and the microseconds that a reading takes when nothing is left to compile."""
+    """A method's result and the microseconds that an observation takes when nothing is left to compile."""
 
     result: FilterResult
     microseconds: float
@@ -79,16 +79,17 @@ def run(
     progress: Callable[[int, int], None] | None = None,
     pictures: Pictures | None = None,
     *,
-    readings: int = 20,
+    observations: int = 20,
     seed: int = 1,
     methods: int = len(METHODS),
 ) -> Reproduction:
     """The comparison by assumptions, and by distance from the converged solution.
 
-    progress: called with the work done and all of it. pictures: where they go. readings: of the record, 0.1 apart. seed: of the
+    progress: called with the work done and all of it. pictures: where they go. observations: of the record, 0.1
+    apart. seed: of the
     record. methods: how many of the rows are run.
     """
-    whole_number("readings", readings, 1, 100)
+    whole_number("observations", observations, 1, 100)
     whole_number("seed", seed, 0, 2**31)
     whole_number("methods", methods, 1, len(METHODS))
     pictures = pictures or Pictures()
@@ -96,7 +97,7 @@ def run(
         state=["x"], drift=["tanh(x)"], observation=["x"], observation_kind="increments",
         prior={"kind": "density", "log_density": "-(x**2 - 1)**2"},
     )  # fmt: skip
-    times = STEP * np.arange(1, readings + 1)
+    times = STEP * np.arange(1, observations + 1)
     _, record = simulate(model, times, seed=seed)
     work = Progress(progress, methods + 1)
 
@@ -112,14 +113,14 @@ def run(
         filter_record(model, record, method.method, **method.options)
         begin = time.perf_counter()
         result = filter_record(model, record, method.method, **method.options)
-        runs[name] = Run(result, 1e6 * (time.perf_counter() - begin) / readings)
+        runs[name] = Run(result, 1e6 * (time.perf_counter() - begin) / observations)
         work.add()
     pictures.add("distances", partial(draw_distances, times, linear, frozen, runs))
-    return reproduction(linear, frozen, runs, {"readings": readings, "seed": seed})
+    return reproduction(linear, frozen, runs, {"observations": observations, "seed": seed})
 
 
 def distances(converged: Solution, result: FilterResult) -> tuple[np.ndarray, np.ndarray, float]:
-    """Of each reading: of the densities, relative to the maximum, and of the means in standard deviations; of the evidence."""
+    """Errors at each observation: of the densities (of the maximum), the means (deviations) and the evidence."""
     x = converged.points
     found = np.array([np.exp(result.density(k).log_density(x)) for k in range(1, len(result.times))])
     apart = np.abs(found - converged.densities).max(axis=-1) / converged.densities.max(axis=-1)
@@ -143,10 +144,12 @@ def reproduction(linear: Solution, frozen: Solution, runs: dict[str, Run], setti
         rows.append((f"({name.replace(':', ')', 1)}", f"{worst:.1e}", f"{apart[-1]:.1e}", f"{means.max():.1e}",
                      f"{evidence:.1e}", f"{otherwise:.1e}", f"{microseconds:.0f}"))  # fmt: skip
     table = Table(
-        "Against the equation that the method solves, in which y runs linearly between readings, or for (3) stays where it is "
-        "until a reading: the largest error of the density, of its maximum; that after the last reading; of the mean, in "
+        "Against the equation that the method solves, in which y runs linearly between observations, or for (3) "
+        "stays where it is "
+        "until an observation: the largest error of the density, of its maximum; that after the last "
+        "observation; of the mean, in "
         "standard deviations; of the evidence, in nats. The largest error of the density where y runs linearly. Microseconds "
-        "a reading, when compiled, all of the call counted",
+        "an observation, when compiled, all of the call counted",
         ("method", "density", "at the end", "mean", "evidence", "y linear", "us"),
         tuple(rows),
     )
@@ -154,15 +157,15 @@ def reproduction(linear: Solution, frozen: Solution, runs: dict[str, Run], setti
     verdict = (
         f"{right} of {len(runs)} runs do what the survey promises: (1) and (3) give the converged density of the equation that "
         "each solves, and the Gaussian sums (2) and (4) stay within the threshold of their fits. For an affine observation a "
-        "Gaussian stays one, so that one fit of the start is enough and better than one at every reading. That y stays where "
-        "it is between readings, as in the survey's Proposition 1, costs far more than any of the methods. The assumptions "
+        "Gaussian stays one, so that one fit of the start is enough and better than one at every observation. That y stays where "
+        "it is between observations, as in the survey's Proposition 1, costs far more than any of the methods. The assumptions "
         "are decided as the survey states them, but that more is true of (1) and (3)."
     )
     return Reproduction(
         "Chen and Dong, A survey of direct methods for Yau filtering systems: four methods, dx = tanh x dt + dv, dy = x dt + dw",
         "Published are theorems, algorithms and a comparison of assumptions, without figures or an example. Checked are the "
         "assumptions, for four systems dx = f dt + dv (which of the methods (1) to (4) hold), and, where all four hold, the "
-        f"error of each on one record of {settings['readings']} readings, 0.1 apart, from a start with two peaks.",
+        f"error of each on one record of {settings['observations']} observations, 0.1 apart, from a start with two peaks.",
         tuple(comparisons),
         verdict,
         (table,),
@@ -214,7 +217,7 @@ def draw_distances(times: np.ndarray, linear: Solution, frozen: Solution, runs: 
     left.set_xlabel("t")
     left.set_ylabel("error of the density, of its maximum")
     right.set_xlabel("x")
-    right.set_ylabel("density after the last reading")
+    right.set_ylabel("density after the last observation")
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     figure.suptitle("Four direct methods on one record", fontsize=11)
     return figure

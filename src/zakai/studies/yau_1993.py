@@ -72,25 +72,26 @@ def run(
     *,
     order: int = 3,
     terms: int = 2,
-    readings: int = 10,
+    observations: int = 10,
     seed: int = 1,
 ) -> Reproduction:
     """Every theorem.
 
     progress: called with the work done and all of it. pictures: where they go. order: the highest of the series. terms: of the
-    convergent series, each ten times the work of the one before. readings: of the record for the filter of Theorem 6; 0 leaves
+    convergent series, each ten times the work of the one before. observations: of the record for the filter of
+    Theorem 6; 0 leaves
     it out. seed: of the record.
     """
     whole_number("order", order, 1, 5)
     whole_number("terms", terms, 0, 3)
-    whole_number("readings", readings, 0, 100)
+    whole_number("observations", observations, 0, 100)
     whole_number("seed", seed, 0, 2**31)
     pictures = pictures or Pictures()
     work = Progress(progress, 5)
     comparisons = classification()
     work.add()
-    if readings:
-        comparisons += theorem_6(readings, seed)
+    if observations:
+        comparisons += theorem_6(observations, seed)
     work.add()
     spectrum, model = Spectrum.of(), Model(state=["x"], drift=["x - x**3"], observation=["0"])
     y = np.linspace(-1, 1, 9)
@@ -105,7 +106,7 @@ def run(
     comparisons.append(corrections(corrected))
     work.add()
     pictures.add("kolmogorov-series", partial(draw, errors, joined, corrected))
-    settings = {"order": order, "terms": terms, "readings": readings, "seed": seed}
+    settings = {"order": order, "terms": terms, "observations": observations, "seed": seed}
     return reproduction(comparisons, errors, joined, corrected, settings)
 
 
@@ -142,9 +143,9 @@ def classification() -> list[Comparison]:
     return [*found, by_computation("Theorem 6, first line: eta of a finite algebra", "degree 2", ours, degree <= 2, because)]
 
 
-def theorem_6(readings: int, seed: int) -> list[Comparison]:
+def theorem_6(observations: int, seed: int) -> list[Comparison]:
     """The filter of Theorem 6 from a start with two peaks, and its equation (6) as printed and without the factor 1/2."""
-    times = STEP * np.arange(1, readings + 1)
+    times = STEP * np.arange(1, observations + 1)
     benes = Model(
         state=["x"], drift=["tanh(x)"], observation=["x"], prior={"kind": "density", "log_density": "-(x**2 - 1)**2"}
     )
@@ -170,7 +171,7 @@ def theorem_6(readings: int, seed: int) -> list[Comparison]:
 
 
 def statistics_mean(times: np.ndarray, increments: np.ndarray, mean: float, variance: float, factor: float) -> np.ndarray:
-    """The posterior means of f = -x, h = x from N(mean, variance) by Theorem 6, y linear between readings.
+    """The posterior means of f = -x, h = x from N(mean, variance) by Theorem 6, y linear between observations.
 
         s' = r + y,    r' = factor 2 s,    exp(t L_0) N(mean, variance) ~ N(m, P),  P' = 1 - 2 P - P^2,  m' = -(1 + P) m
 
