@@ -408,6 +408,12 @@ def test_a_long_gap_of_a_double_well_and_a_wide_prior_with_weak_noise():
     assert np.abs(found[1:] - expected[1:])[:, :2].max() < 1e-3 and abs(found[0, 2] - expected[0, 2]) < 1e-3
 
 
+def test_the_large_grid_of_a_wide_prior_is_left_again():
+    model = model_of("1.2*(x - x**3)", "x", gaussian(0.0, 1.0), "samples", 0.2, diffusion=[["0.7"]])
+    record = Record(0.1 * np.arange(1, 11), np.linspace(0.9, 1.1, 10)[:, None], "samples")
+    assert len(zakai.filter(model, record).density(-1).points) <= 128
+
+
 def test_an_interval_in_which_the_evidence_underflows():
     model = model_of("-x", "x", gaussian(0.1, 1.0), noise=1)
     times, dy = np.array([0.5, 2e4, 2e4 + 1]), np.array([0.2, 3.0, 0.1])

@@ -47,6 +47,8 @@ from zakai.records.schedule import Schedule
 
 Array = Any
 
+GENEROUS = 96  # points of a grid that is kept though fewer would do
+
 
 def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: float) -> Prepared:
     """Return what `step` needs for the intervals of a schedule.
@@ -59,7 +61,7 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
     system = System(on_the_line(model), schedule.inputs)
     # A sample may lead deep into the tails, where a small error counts; increments do not.
     negligible = 1e-13 if system.samples else float(np.clip(1e-6 * tolerance, 1e-13, 1e-10))
-    generous = lw.LARGEST if system.samples and not system.moving else 96
+    generous = lw.LARGEST if system.samples and not system.moving else GENEROUS
     lengths, inside = schedule.lengths, schedule.inside
     found = Prepared(model, schedule, theta, system, float(tolerance), lengths, inside, negligible, generous, float(tolerance))
     found.notes = (OMITTED,) if system.cross is not None and (schedule.seen & ~inside).any() else ()
@@ -209,7 +211,9 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
         look = lw.figures(values, window.closed, prepared.negligible, prepared.cut)
         report.density(look)
     look = lw.figures(values, window.closed, prepared.negligible, prepared.cut) if look is None else look
-    new = lw.fitted(look, window, prepared.largest, prepared.generous)
+    # A large grid is kept only where its decomposition serves the next intervals too.
+    generous = prepared.generous if report.decomposed else min(prepared.generous, GENEROUS)
+    new = lw.fitted(look, window, prepared.largest, generous)
     moved = lw.resampled(values, window, new)
     if new != window:  # the largest grid may be too coarse for all that the density has
         moved = moved / np.sum(moved)

@@ -34,6 +34,7 @@ class Report:
     def __init__(self) -> None:
         self.aliasing = self.edge = self.time = self.depth = self.growth = self.negative = self.lawless = 0.0
         self.positive = True  # small values are accurate
+        self.decomposed = True  # the operator has a decomposition on the grid that serves every interval
 
     def density(self, look: lw.Figures) -> None:
         """Note the figures of a density."""
@@ -85,6 +86,7 @@ def propagated(
         known = lw.figures(values, window.closed, negligible).aliasing
         while True:
             attempt = _attempt(prepared, values, window, start, first, last, inside, rates)
+            report.decomposed = attempt.decomposed
             total = float(np.sum(attempt.values.real))
             lost = not 1e-250 < total < 1e6 or (not inside.any() and abs(total - 1.0) > 1e-3)
             split = (attempt.split or lost) and last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
@@ -155,12 +157,16 @@ def _around(prepared: Prepared, values: Array, window: lw.Window, kernel: Channe
 
 
 class _Attempt(NamedTuple):
-    """The density after a substep, times exp(-offset); its error; whether a shorter substep is needed."""
+    """The density after a substep, times exp(-offset); its error; whether a shorter substep is needed.
+
+    `decomposed` tells whether the decomposition of the operator gave it.
+    """
 
     values: Array
     offset: Any
     error: float
     split: bool
+    decomposed: bool = False
 
 
 def _attempt(
@@ -185,7 +191,7 @@ def _attempt(
                 allowed = 1e-5 * prepared.tolerance
                 aliasing = lw.figures(found, window.closed, prepared.negligible).aliasing
                 if error < max(1e-11, allowed) and aliasing <= max(allowed, 30.0 * prepared.negligible):
-                    return _Attempt(found, 0.0, error, False)
+                    return _Attempt(found, 0.0, error, False, True)
             key = ("exponential", window, length)
             transition = prepared.once(key, lambda: Exponential(length * window.generator(known.covariance, known.drift)))
             found, error = transition(values)
