@@ -61,7 +61,7 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
     system = System(on_the_line(model), schedule.inputs)
     # A sample may lead deep into the tails, where a small error counts; increments do not.
     negligible = 1e-13 if system.samples else float(np.clip(1e-6 * tolerance, 1e-13, 1e-10))
-    generous = lw.LARGEST if system.samples and not system.moving else GENEROUS
+    generous = loop.SHARED if system.samples and not system.moving else GENEROUS
     lengths, inside = schedule.lengths, schedule.inside
     found = Prepared(model, schedule, theta, system, float(tolerance), lengths, inside, negligible, generous, float(tolerance))
     found.notes = (OMITTED,) if system.cross is not None and (schedule.seen & ~inside).any() else ()

@@ -15,8 +15,21 @@ from zakai.methods._line_yau import Kernels
 from zakai.methods._protocol import Info, Infos
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channels
-from zakai.numerics.line_loop import AFTER, COLUMNS, KERNEL, RANGE, SPLIT, SUBSTEPS, Grid, Limits, Steps, advance
-from zakai.numerics.line_transition import BAND
+from zakai.numerics.line_loop import (
+    AFTER,
+    COLUMNS,
+    FACTOR,
+    KERNEL,
+    RANGE,
+    SPLIT,
+    SUBSTEPS,
+    Grid,
+    Limits,
+    Steps,
+    advance,
+    narrow,
+)
+from zakai.numerics.line_transition import BAND, support
 
 MARGIN = 0.2  # of a new grid, relative to the range of the density
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one increment with Gaussian kernels may leave
@@ -24,6 +37,7 @@ SHARE = 5e-3  # of the tolerance that the splitting of one increment may leave
 BLOCK = 2048  # points by which the tables of a spacing are apart; a table has twice as many
 TOGETHER = 4  # parts of which the kernels of all intervals are computed where one interval needs them
 FINEST = 1024  # points of the largest grid
+SHARED = 128  # points of the largest grid on which many steps share a decomposition
 HEALTH = {
     "edge_mass": "edge",
     "negative_mass": "negative",
@@ -64,6 +78,8 @@ def tables_covariance(prepared: Prepared) -> Any:
 
 
 def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
+    if window.size > SHARED and not window.closed:  # the decomposition takes longer than steps on a coarser grid
+        return None
     decomposed = spectral(prepared, window)
     if decomposed is None or not (decomposed.scale > 0).all():
         return None
@@ -182,6 +198,8 @@ def run(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> 
     parts: list[Infos] = []
     attempts = 0
     while len(states) < rows.stop - rows.start and attempts < 8:
+        if not prepared.gaussian and _narrow(prepared, rows.start + len(states), state, limits.cut):
+            break
         grid = grid_of(prepared, state.window)
         if grid is None:
             break
@@ -211,6 +229,15 @@ def run(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> 
     if not states:
         return None
     return states, joined(parts)
+
+
+def _narrow(prepared: Prepared, k: int, state: State, cut: float) -> bool:
+    """Return whether the loop leaves interval k to another grid, before the present one is decomposed."""
+    if prepared.kinds[k] != FACTOR or state.closed:
+        return False
+    covariance = float(np.max(tables(prepared, state.window).covariance))
+    low, high = support(np.ascontiguousarray(state.values), max(cut, min(30.0 * np.exp(state.log_floor), lw.CUT)))
+    return narrow(high - low, state.spacing, covariance * prepared.lengths[k])
 
 
 def joined(parts: list[Infos]) -> Infos:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zakai.methods._line_coarse import EDGE, coarsened
 from zakai.methods._line_cross import with_cross_noise
 from zakai.methods._line_model import within
 from zakai.methods._line_system import Prepared, covariance_at, drift_at, finite, spectral, tables
@@ -21,7 +22,6 @@ from zakai.numerics.line_transition import WIDE, wrapped
 
 Array = Any
 
-EDGE = 1e-11  # density at the outermost points, relative to the maximum
 GROWTH = 12.0  # largest growth by the potential in one substep where there is no mass, as a logarithm
 GROSS = 1e-4  # spectrum at the highest frequencies from which a shorter substep is taken at once
 MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
@@ -72,6 +72,11 @@ def propagated(
             mass = np.sum(direct.values)
             return direct.values / mass, direct.window, np.log(mass) + direct.offset, direct.look
     report.positive = False
+    if not system.varying and not inside.any():
+        carried = coarsened(prepared, values, window, length)
+        if carried is not None:
+            report.decomposed = True
+            return _normalised(*carried, report, negligible)
     bounds = [(0.0, length)]
     if system.varying:
         bounds = _panels(prepared, values, window, start, length, inside, report)
@@ -144,6 +149,17 @@ def propagated(
     return values, window, gained, look
 
 
+def _normalised(
+    found: Array, window: lw.Window, error: float, report: Report, negligible: float
+) -> tuple[Array, lw.Window, Any, lw.Figures]:
+    look = lw.figures(found, window.closed, negligible)
+    report.density(look)
+    report.time += error
+    found = np.where(found.real > 0, found, 0.0)
+    mass = np.sum(found)
+    return found / mass, window, np.log(mass), look
+
+
 def _around(prepared: Prepared, values: Array, window: lw.Window, kernel: Channel) -> Array | None:
     """Return a density on the circle convolved with a wrapped Gaussian, None where the kernel is none or too narrow."""
     if np.iscomplexobj(values) or np.iscomplexobj(kernel.variance) or np.iscomplexobj(kernel.shift):
@@ -187,10 +203,13 @@ def _attempt(
             decomposed = spectral(prepared, window)
             if decomposed is not None:
                 found, error = decomposed(values, length)
-                # Tails that were cut off are jumps in the gauge of the decomposition, which show at the highest frequencies.
+                # Tails that were cut off are jumps in the gauge of the decomposition, which show at the highest frequencies, as
+                # does a density that reaches the ends of the grid: that one needs another grid, not another transition.
                 allowed = 1e-5 * prepared.tolerance
-                aliasing = lw.figures(found, window.closed, prepared.negligible).aliasing
-                if error < max(1e-11, allowed) and aliasing <= max(allowed, 30.0 * prepared.negligible):
+                look = lw.figures(found, window.closed, prepared.negligible)
+                aliased = look.aliasing > max(allowed, 30.0 * prepared.negligible)
+                ended = max(look.left, look.right) > max(EDGE, 4.0 * look.aliasing)
+                if error < max(1e-11, allowed) and (ended or not aliased):
                     return _Attempt(found, 0.0, error, False, True)
             key = ("exponential", window, length)
             transition = prepared.once(key, lambda: Exponential(length * window.generator(known.covariance, known.drift)))

@@ -23,7 +23,7 @@ from zakai.records.schedule import Schedule
 Array = Any
 
 NOISE = 3e-15  # error of a density relative to its maximum, which matters in its tails
-KEPT = 60  # tables and decompositions of grids that are kept for a model
+KEPT = 120  # tables and decompositions of grids that are kept for a model
 
 
 @lru_cache(maxsize=8)
@@ -166,7 +166,7 @@ class Prepared:
 
     def once(self, key: Any, make: Callable[[], Any]) -> Any:
         """Return what `make` returns for a key, from the last ones that were kept; a value depends on its key alone."""
-        found = self.kept.get(key)
+        found = self.kept.pop(key, None)
         if found is None:
             found = make()
             while len(self.kept) >= KEPT:
@@ -174,7 +174,7 @@ class Prepared:
                     self.kept.pop(next(iter(self.kept)), None)
                 except (StopIteration, RuntimeError):  # another thread was faster
                     break
-            self.kept[key] = found
+        self.kept[key] = found  # the last one that was used is the last one to go
         return found
 
 

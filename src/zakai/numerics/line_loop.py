@@ -44,6 +44,7 @@ FACTOR, SPLIT, KERNEL = 0, 1, 2  # the observation acts after the transition, in
 OK, FAILED, SUBSTEPS, RANGE, AFTER = 0, 1, 2, 3, 4  # why the loop ends
 LOG_NOISE = -33.4  # logarithm of the error of a decomposition relative to the maximum
 MOST_SUBSTEPS = 16
+NARROW = 7.0  # support of a density, in standard deviations of the noise, below which a step is left to another grid
 RELIABLE = 1e-3  # of the promised error: smaller estimates are not reported
 
 
@@ -119,6 +120,13 @@ class Taken(NamedTuple):
 _V, _M, _T = float64[::1], float64[:, ::1], float64[:, :, ::1]
 
 
+@kernel(boolean(float64, float64, float64))
+def narrow(points: float, spacing: float, variance: float) -> bool:
+    """Whether noise of a variance makes the support of a density far wider: its grid cannot serve after the interval."""
+    within: bool = points * spacing < NARROW * np.sqrt(variance)
+    return within
+
+
 @kernel(
     int64(
         _V, _M, _M, _V, _M, _M, int64, float64, _V, _M, float64, _M, float64, float64, float64, boolean, _V, float64, _V, _V
@@ -146,6 +154,8 @@ def _attempt(
     begin = now.copy()
     low, high = support(now, cut)
     width_before = moments(now)[2]
+    if kind == FACTOR and not gaussian and not closed and narrow(high - low, spacing, covariance * tau):
+        return FAILED
     share = 0.0 if kind == KERNEL else (tau if kind == SPLIT else 1.0)
     seen = exponent_of(h, slope, curvature, precision, observed, at, share, b, first, second) > 0.0
     for i in range(m):

@@ -193,16 +193,19 @@ class Spectral:
             operator = 0.5 * (slope.T * covariance) @ slope + np.diag(potential)
         self.rates, self.modes = np.linalg.eigh(operator.real)
         self.change = self.modes.T @ operator.imag @ self.modes if np.iscomplexobj(operator) else None
-        self.scale = np.exp(gauge - gauge.real.max()) * scale
-        self.largest = 1.0
+        self.top = float(gauge.real.max())
+        self.scale = np.exp(gauge - self.top) * scale
 
     def __call__(self, values: Array, length: float) -> tuple[Array, float]:
         """Return exp(length L) values, and an estimate of its rounding error relative to its maximum."""
         with np.errstate(all="ignore"):
-            inner = values / self.scale
+            return self.carried(values / self.scale, length)
+
+    def carried(self, inner: Array, length: float) -> tuple[Array, float]:
+        """Return s U exp(-length lambda) U' inner, and an estimate of its rounding error relative to its maximum."""
         reach = float(np.sqrt(np.sum(inner.real**2)))
         if not np.isfinite(reach):
-            return values, np.inf
+            return inner, np.inf
         decay = np.exp(-length * self.rates)
         coefficients = self.modes.T @ inner
         moved = decay * coefficients
