@@ -94,7 +94,7 @@ def modules_imported(file: str, known: dict[str, str]) -> set[str]:
 
 
 def circle(graph: dict[str, set[str]]) -> list[str]:
-    """Some modules that import one another in a circle, or none: what is left when those that import nothing else are removed."""
+    """The modules that remain when those that import no other are removed: some import one another in a circle, or none."""
     left = {name: set(targets) for name, targets in graph.items()}
     while leaves := [name for name, targets in left.items() if not targets & left.keys() - {name}]:
         for name in leaves:

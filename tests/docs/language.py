@@ -43,6 +43,7 @@ WORDS = {
 }
 _PATTERNS = {word: re.compile(rf"(?<![\w`]){word}(?!\w)" if word[0] != "`" else word, re.IGNORECASE) for word in WORDS}
 _KINDS = {".py", ".md", ".toml", ".css", ".js", ""}
+FOLDERS = ("README.md", "CONTRIBUTING.md", "docs", "src", "tests", "benchmarks", "examples", "fuzz")
 _NOT_TEXT = ("katex", "corpus", "_build", "_generated", "generated", "__pycache__")
 
 
@@ -73,7 +74,7 @@ def hits(path: Path) -> Iterator[tuple[str, int, str, str]]:
 def main(arguments: list[str]) -> None:
     """Print the counts of each folder."""
     names = [name for name in arguments if not name.startswith("-")]
-    for name in names or ["README.md", "CONTRIBUTING.md", "docs", "src", "tests", "benchmarks", "examples", "fuzz"]:
+    for name in names or FOLDERS:
         found = list(hits(ROOT / name))
         counts = Counter(what.lower() for _, _, what, _ in found).most_common()
         print(f"{name}: {len(found)}" + "".join(f", {what} {count}" for what, count in counts))

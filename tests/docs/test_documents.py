@@ -49,8 +49,8 @@ def test_every_test_that_a_page_of_figures_names_exists():
     assert names and [name for pair in names for name in pair if name and not (ROOT / name).exists()] == []
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs"])
-def test_the_documentation_uses_the_standard_terms(name):
+@pytest.mark.parametrize("name", language.FOLDERS)
+def test_the_project_uses_the_standard_terms(name):
     assert list(language.hits(ROOT / name)) == []
 
 

@@ -74,7 +74,7 @@ def test_wrong_names_options_and_folders_are_said(tmp_path):
 
 
 def kalman_bucy(increments, step, slope, mean, variance, parts=40, frozen=False):
-    """Means, variances and evidence of f = slope x, h = x, y linear between readings, or frozen; Runge and Kutta's formula."""
+    """Means, variances, evidence of f = slope x, h = x, y linear between observations, or frozen; Runge and Kutta's formula."""
 
     def rate(m, P, evidence, z):
         return np.array([slope * m + P * (z - m), 2 * slope * P + 1 - P**2, z * m - (m**2 + P) / 2])
@@ -142,24 +142,24 @@ def test_the_errors_of_the_cubic_sensor_are_told_with_the_failures():
         if name == "ekf":
             mean[2, 30:] = np.nan
         scores[name] = cubic.score(truth, cubic.Estimates(mean, np.full(truth.shape, 0.16)))
-    told = cubic.reproduction(scores, "", {"paths": 4, "steps": cubic.STEPS, "seed": 0})
-    rows = {row[0]: row[1:] for row in told.tables[0].rows}
+    reproduction = cubic.reproduction(scores, "", {"paths": 4, "steps": cubic.STEPS, "seed": 0})
+    rows = {row[0]: row[1:] for row in reproduction.tables[0].rows}
     assert rows["ekf"][4] == "1" and rows["yau-yau"][4] == "0"
     assert rows["yau-yau"][0] == pytest.approx(0.4, abs=0.05) and rows["yau-yau"][5] == pytest.approx(1.0, abs=0.2)
-    assert "differs" in verdicts(told)["RMSE, ekf"] and "not run here" in verdicts(told)["RMSE, YauYauAL 0.1.0"]
+    assert "differs" in verdicts(reproduction)["RMSE, ekf"] and "not run here" in verdicts(reproduction)["RMSE, YauYauAL 0.1.0"]
     short = cubic.reproduction(scores, "", {"paths": 4, "steps": 50, "seed": 0})
     assert "not comparable" in verdicts(short)["RMSE, ekf"]
 
 
 def test_the_paths_of_lorenz_keep_to_the_attractor_and_their_errors_are_told():
-    truth, readings = lorenz_63_sakov_2012.paths(np.random.default_rng(0), 2, 120)
-    assert np.std(readings - truth) == pytest.approx(np.sqrt(2), rel=0.1) and 40 < truth[..., 2].max() < 50
+    truth, samples = lorenz_63_sakov_2012.paths(np.random.default_rng(0), 2, 120)
+    assert np.std(samples - truth) == pytest.approx(np.sqrt(2), rel=0.1) and 40 < truth[..., 2].max() < 50
     good = np.array([lorenz_63_sakov_2012.root_mean_square(truth, truth + c) for c in (9.0, 0.9, 0.3, 0.6, 0.8)])
     errors = {"extended Kalman": good * 2, "ensemble, 100 members": good}
-    told = lorenz_63_sakov_2012.reproduction(errors, {"observations": 120, "records": 2, "seed": 0})
-    assert [row[1] for row in told.tables[0].rows] == ["18.00", "9.00"]
-    assert [comparison.what for comparison in told.comparisons] == [f"{name}, q = 0.1" for name in errors]
-    assert "is the known one" in told.verdict
+    reproduction = lorenz_63_sakov_2012.reproduction(errors, {"observations": 120, "records": 2, "seed": 0})
+    assert [row[1] for row in reproduction.tables[0].rows] == ["18.00", "9.00"]
+    assert [comparison.what for comparison in reproduction.comparisons] == [f"{name}, q = 0.1" for name in errors]
+    assert "is the known one" in reproduction.verdict
 
 
 def test_the_survey_and_we_admit_the_same_methods_but_where_more_is_true():
@@ -169,8 +169,8 @@ def test_the_survey_and_we_admit_the_same_methods_but_where_more_is_true():
 
 
 def test_the_algebras_of_dong_chen_and_yau_are_told_with_their_misprints(tmp_path, capsys):
-    told = studies.reproduce("dong-chen-yau-2021", tmp_path, largest=1, paths=40, observations=0)
-    said = verdicts(told)
+    reproduction = studies.reproduce("dong-chen-yau-2021", tmp_path, largest=1, paths=40, observations=0)
+    said = verdicts(reproduction)
     differing = {what for what, verdict in said.items() if verdict.startswith("differs")}
     assert differing == {
         "Examples: coefficient of x1^2 in eta", "(53), Example 3.4: r1'", "Example 3.4 with phi_3 of the text",
@@ -184,12 +184,12 @@ def test_the_algebras_of_dong_chen_and_yau_are_told_with_their_misprints(tmp_pat
 
 
 def test_the_theorems_of_yau_are_told_with_their_misprints(tmp_path, capsys):
-    told = studies.reproduce("yau-1993", tmp_path, order=1, terms=1, observations=0)
-    differing = [what for what, verdict in verdicts(told).items() if verdict.startswith("differs")]
+    reproduction = studies.reproduce("yau-1993", tmp_path, order=1, terms=1, observations=0)
+    differing = [what for what, verdict in verdicts(reproduction).items() if verdict.startswith("differs")]
     assert [what.partition(":")[0] for what in differing] == ["Theorem 6, first line", "(14) as printed", "Theorem 12"]
     assert (tmp_path / "kolmogorov-series.png").exists()
     stored = json.loads((tmp_path / "figures.json").read_text())
-    assert stored["verdict"] == told.verdict and len(stored["comparisons"]) == len(told.comparisons)
+    assert stored["verdict"] == reproduction.verdict and len(stored["comparisons"]) == len(reproduction.comparisons)
 
 
 def test_equation_6_of_theorem_6_has_a_factor_one_half_too_much():

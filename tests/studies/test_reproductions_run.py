@@ -14,27 +14,27 @@ def verdicts(reproduction) -> list[str]:
 
 
 def test_theorem_4_of_hu_and_yau_gives_the_converged_density(tmp_path):
-    told = studies.reproduce("hu-yau-2002", tmp_path, systems=1, forms=1, observations=3)
-    assert verdicts(told) == ["agrees", "differs", "differs"]
+    reproduction = studies.reproduce("hu-yau-2002", tmp_path, systems=1, forms=1, observations=3)
+    assert verdicts(reproduction) == ["agrees", "differs", "differs"]
     assert (tmp_path / "density-1.png").exists() and (tmp_path / "density-1.pdf").exists()
 
 
 def test_yau_yau_is_the_converged_solution_on_a_short_cubic_sensor(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(cubic_sensor, "FILTERS", {"yau-yau": cubic_sensor.FILTERS["yau-yau"]})
-    told = studies.reproduce("cubic-sensor", tmp_path, paths=2, steps=120)
-    rows = {row[0]: row for row in told.tables[0].rows}
+    reproduction = studies.reproduce("cubic-sensor", tmp_path, paths=2, steps=120)
+    rows = {row[0]: row for row in reproduction.tables[0].rows}
     assert abs(rows["yau-yau"][1] / rows["converged solution"][1] - 1) < 1e-3
     assert abs(rows["yau-yau"][6] / rows["converged solution"][6] - 1) < 1e-2
     assert capsys.readouterr().out.startswith(f"written: {tmp_path / 'first-path.png'}")
 
 
-def test_an_ensemble_follows_lorenz_better_than_its_readings(tmp_path, monkeypatch):
+def test_an_ensemble_follows_lorenz_better_than_its_samples(tmp_path, monkeypatch):
     pytest.importorskip("cuthbert")
     name = "ensemble, 100 members"
     monkeypatch.setattr(lorenz_63_sakov_2012, "LEVELS", (0.0,))
     monkeypatch.setattr(lorenz_63_sakov_2012, "FILTERS", {name: lorenz_63_sakov_2012.FILTERS[name]})
-    told = studies.reproduce("lorenz-63-sakov-2012", tmp_path, observations=90, records=2)
-    assert 0.3 < told.comparisons[0].ours < 0.9 < np.sqrt(lorenz_63_sakov_2012.NOISE)
+    reproduction = studies.reproduce("lorenz-63-sakov-2012", tmp_path, observations=90, records=2)
+    assert 0.3 < reproduction.comparisons[0].ours < 0.9 < np.sqrt(lorenz_63_sakov_2012.NOISE)
     assert (tmp_path / "errors.png").exists() and (tmp_path / "first-record.png").exists()
 
 

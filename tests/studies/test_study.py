@@ -265,8 +265,8 @@ def test_a_run_without_a_truth_is_nobodys_number_and_a_lost_one_is_counted(tmp_p
     failed = outcome.points[0]["failed"].values[:, 0]
     words = [_batch.FAILURES[code] for code in failed]
     assert "no truth" in words and "lost" in words
-    told = str(outcome.points[0]["said"].values[words.index("no truth"), 0])
-    assert "x**3" in told or "drift" in told
+    reason = str(outcome.points[0]["said"].values[words.index("no truth"), 0])
+    assert "x**3" in reason or "drift" in reason
     assert outcome.summary["points"][0]["methods"]["euler"]["failures"] == (failed > 0).sum()
 
 
@@ -430,12 +430,12 @@ def cluster(tmp_path):
             started.append(subprocess.Popen(program, stdout=log, stderr=log, cwd=tmp_path))
 
     try:
-        told = tmp_path / "scheduler.json"
-        start("scheduler", "--port", "0", "--scheduler-file", str(told))
+        address_file = tmp_path / "scheduler.json"
+        start("scheduler", "--port", "0", "--scheduler-file", str(address_file))
         until = time.monotonic() + 60
-        while not told.exists() and time.monotonic() < until:
+        while not address_file.exists() and time.monotonic() < until:
             time.sleep(0.05)
-        address = json.loads(told.read_text())["address"]
+        address = json.loads(address_file.read_text())["address"]
         for _ in range(2):
             start("worker", address, "--nthreads", "1", "--no-nanny")
         yield address, started[1:]

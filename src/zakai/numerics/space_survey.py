@@ -23,8 +23,8 @@ class Survey(NamedTuple):
     The `total` of the values, the mean (n,) and covariance (n, n) of the offsets from the centre in x; for each axis (n,) the
     largest `edges` relative to the maximum of the marginal (times the squared distance where they are far from the mean), the
     `tails` of the spectrum at its two highest frequencies relative to the mass, the first and last index `used` (n, 2) above the
-    bound on edges, and the `highest` frequency above the bound on tails, as a share of the highest of the grid; and the share of
-    `negative` mass.
+    bound on edges, and the `highest` frequency above the bound on tails, as a share of the highest of the grid; and the
+    negative mass as a share of the total.
     """
 
     total: float

@@ -1,4 +1,4 @@
-"""Many runs: published experiments, done again."""
+"""Monte-Carlo studies, and reproductions of published experiments."""
 
 from __future__ import annotations
 

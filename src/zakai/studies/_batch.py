@@ -63,8 +63,8 @@ def _dataset(job: Job, advance: Advance) -> xarray.Dataset:
         if entry.method != "auto":
             _registry.load(entry.method)
     times = times_of(study, model)
-    room = MOST_NUMBERS // (job.total * len(study.methods) * (model.n + 2))
-    most = min(MOST_SAMPLES, max(LEAST_SAMPLES, room))
+    affordable = MOST_NUMBERS // (job.total * len(study.methods) * (model.n + 2))
+    most = min(MOST_SAMPLES, max(LEAST_SAMPLES, affordable))
     sampled = Sampled(_spread(len(times), most), _spread(len(times), study.densities or most))
     truths, records, faults = _observed(job, model, times)
     batch = _Batch(job, model, truths, records, faults, sampled)

@@ -26,9 +26,9 @@ def draw(study: Study, spread: float, number: int) -> Any:
     panels = figure.subplots(2, len(columns), sharex=True, sharey="row", squeeze=False)
     for column, index in enumerate(columns):
         above, below = panels[:, column]
-        above.set_title(f"$P_0$ = {spread:g} read as {study.settings[index].reading}", fontsize=10)
+        above.set_title(f"$P_0$ = {spread:g} read as {study.settings[index].interpretation}", fontsize=10)
         above.plot(study.times, study.states.mean(axis=0), color="#d55e00", linewidth=1.6, label="state")
-        survivors = ~study.lost[index]
+        survivors = ~study.diverged[index]
         for name, (label, style) in _LINES.items():
             kept = survivors if name == "ekf-euler" else np.ones(len(survivors), bool)
             means = study.means[name][index][kept]
@@ -44,5 +44,5 @@ def draw(study: Study, spread: float, number: int) -> Any:
     handles = {label: line for line, label in zip(*panels[0, 0].get_legend_handles_labels(), strict=True)}
     handles |= {label: line for line, label in zip(*panels[0, -1].get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, fontsize=9, frameon=False)
-    figure.suptitle(f"Chen, Luo and Yau 2017, Figure {number}, done again", fontsize=11)
+    figure.suptitle(f"Chen, Luo and Yau 2017, Figure {number}, reproduced", fontsize=11)
     return figure

@@ -42,10 +42,10 @@ def text_of(figures: Mapping[str, Any], paper: Mapping[float, Mapping[str, float
         _row("paper, EKF", [_plain(paper[p]["ekf-euler"]) for p in spreads]),
         _row("paper, EKF lost, of 100", [_plain(paper[p]["lost"]) for p in spreads]),
     ]
-    for reading in dict.fromkeys(s["reading"] for s in settings):
-        chosen = [s for s in settings if s["reading"] == reading]
-        centre = "sqrt(P0)" if reading == "variance" else "P0"
-        lines += ["", f"P0 read as {reading}: xhat(0) = 0.1 + {centre} eta, prior N(xhat(0), P0)"]
+    for interpretation in dict.fromkeys(s["interpretation"] for s in settings):
+        chosen = [s for s in settings if s["interpretation"] == interpretation]
+        centre = "sqrt(P0)" if interpretation == "variance" else "P0"
+        lines += ["", f"P0 read as {interpretation}: xhat(0) = 0.1 + {centre} eta, prior N(xhat(0), P0)"]
         for key, name in _NAMES.items():
             lines.append(_row(name, [_measured(s["mse"][key], s["standard_error"][key]) for s in chosen]))
         lines.append(_row(f"EKF, explicit Euler, lost of {paths}", [f"{s['lost']}" for s in chosen]))

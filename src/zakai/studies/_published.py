@@ -56,7 +56,7 @@ def by_computation(what: str, published: Cell, ours: Cell, holds: bool, because:
 
 @dataclass(frozen=True)
 class Table:
-    """More figures of ours: a heading, the names of the columns, and a row of cells a line."""
+    """Further figures: a heading, the names of the columns, and a row of cells a line."""
 
     heading: str
     columns: tuple[str, ...]
@@ -72,7 +72,7 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Reproduction:
-    """A published experiment, done again.
+    """A published experiment, reproduced.
 
     `scope` says what is published and what is checked; `figures` are all numbers, ready for JSON.
     """
@@ -124,12 +124,12 @@ def comparison_lines(comparisons: Sequence[Comparison]) -> list[str]:
     rows = [("", "published", "ours", "")]
     rows += [(c.what, _plain(c.published), measured(c.ours, c.standard_error), c.verdict) for c in comparisons]
     widths = [max(len(row[i]) for row in rows) + 2 for i in range(3)]
-    room = max(40, WIDTH - sum(widths))
+    width = max(40, WIDTH - sum(widths))
     lines = []
     for what, published, ours, verdict in rows:
         front = what.ljust(widths[0]) + published.rjust(widths[1] - 2) + "  " + ours.rjust(widths[2] - 2) + "  "
-        said = textwrap.wrap(verdict, room) or [""]
-        lines += [(front + said[0]).rstrip(), *(" " * len(front) + more for more in said[1:])]
+        said = textwrap.wrap(verdict, width) or [""]
+        lines += [(front + said[0]).rstrip(), *(" " * len(front) + line for line in said[1:])]
     return lines
 
 

@@ -98,7 +98,7 @@ def crank_nicolson(
     """Means and variances (paths, K) of one state with G = 1 and one observation, for many paths (paths, K) at once.
 
     Half of the likelihood exp(h dy - h^2 dt / 2), Crank and Nicolson's step of the Kolmogorov equation in finite volumes, which
-    keeps the mass, and the other half. `axis` is an equidistant lattice wide enough for every path; `progress` is called now and
+    keeps the mass, and the other half. `axis` is an equidistant grid wide enough for every path; `progress` is called now and
     then.
     """
     cell = axis[1] - axis[0]

@@ -20,7 +20,7 @@ from zakai.studies.specification import Job, Study
 
 MOST_DEATHS = 3  # of the workers of one batch, after which it is the batch's fault
 _ANSWER = "10s"  # how long a scheduler may take to answer
-_PATIENCE = 0.3  # seconds between looks at whether the user has interrupted
+_PATIENCE = 0.3  # seconds between checks whether the user has interrupted
 
 Finished = Iterator[tuple[int, xarray.Dataset]]
 Advance = Callable[[float], None]  # called with the number of batches that are done, parts of one included

@@ -44,15 +44,15 @@ CUT = 11.0  # half the width of the window that would explain the paper's figure
 
 @dataclass(frozen=True)
 class Setting:
-    """One column of the table: an observation of P0 and its value."""
+    """One column of the table: an interpretation of P0 and its value."""
 
-    reading: str
+    interpretation: str
     spread: float
 
     @property
     def deviation(self) -> float:
         """The standard deviation with which the first estimate is drawn."""
-        return self.spread if self.reading == "standard deviation" else float(np.sqrt(self.spread))
+        return self.spread if self.interpretation == "standard deviation" else float(np.sqrt(self.spread))
 
     @property
     def expected_losses(self) -> float:
@@ -61,29 +61,29 @@ class Setting:
         return float(ndtr((-edge - START) / self.deviation) + ndtr((START - edge) / self.deviation))
 
 
-READINGS = ("variance", "standard deviation")
-SETTINGS = tuple(Setting(reading, spread) for reading in READINGS for spread in PAPER)
+INTERPRETATIONS = ("variance", "standard deviation")
+SETTINGS = tuple(Setting(interpretation, spread) for interpretation in INTERPRETATIONS for spread in PAPER)
 
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """What was run: `times` (N+1,), `states` (paths, N+1), `means[method]` (settings, paths, N+1), `lost` (settings, paths).
+    """What was run: `times` (N+1,), `states` (paths, N+1), `means[method]` (settings, paths, N+1), `diverged` (settings, paths).
 
-    `lost` marks the paths on which explicit Euler lost its variance. `figures` are the table's, ready for JSON.
+    `diverged` marks the paths on which the variance of explicit Euler became negative. `figures` are the table's, ready for JSON.
     """
 
     settings: tuple[Setting, ...]
     times: np.ndarray
     states: np.ndarray
     means: dict[str, np.ndarray]
-    lost: np.ndarray
+    diverged: np.ndarray
     figures: dict[str, Any]
 
     def text(self) -> str:
         """Table II beside our figures, the comparison on the same paths, and what can be reproduced."""
         comparisons = [Comparison(**one) for one in self.figures["comparisons"]]
-        agree = {reading: [c.verdict.startswith("agrees") for c in comparisons if reading in c.what] for reading in READINGS}
-        said = "; ".join(f"with P0 read as {reading} {sum(found)} of {len(found)}" for reading, found in agree.items() if found)
+        agree = {word: [c.verdict.startswith("agrees") for c in comparisons if word in c.what] for word in INTERPRETATIONS}
+        said = "; ".join(f"with P0 read as {word} {sum(found)} of {len(found)}" for word, found in agree.items() if found)
         verdict = f"Verdict: of the paper's figures these agree within chance: {said}; the reasons are above."
         return "\n".join([text_of(self.figures, PAPER), "", *comparison_lines(comparisons), "", verdict])
 
@@ -192,7 +192,7 @@ def _figures(settings, states, means, lost) -> dict[str, Any]:
         rms = np.sqrt(np.mean((means["direct"][number] - means["grid-optimal"][number]) ** 2))
         out.append(
             {
-                "reading": setting.reading,
+                "interpretation": setting.interpretation,
                 "P0": setting.spread,
                 "mse": {name: float(e.mean()) if len(e) else None for name, e in errors.items()},
                 "standard_error": {name: _standard_error(e) for name, e in errors.items()},
@@ -207,10 +207,10 @@ def _figures(settings, states, means, lost) -> dict[str, Any]:
 
 
 def _comparisons(figures: dict[str, Any]) -> list[Comparison]:
-    """Table II line by line, for each observation of P0."""
+    """Table II line by line, for each interpretation of P0."""
     found = []
     for setting in figures["settings"]:
-        published, where = PAPER[setting["P0"]], f"P0 = {setting['P0']:g} as {setting['reading']}"
+        published, where = PAPER[setting["P0"]], f"P0 = {setting['P0']:g} as {setting['interpretation']}"
         for key, name, because in (
             ("direct", "direct method, MSE", "an exact filter is better; a window cut at about 11 comes nearer"),
             ("ekf-euler", "EKF, MSE", "a few paths that lost track decide the mean"),

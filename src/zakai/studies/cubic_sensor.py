@@ -3,7 +3,7 @@
     dx = cos x dt + dv,    dy = x^3 dt + dw,    x(0) = 0,    prior proportional to exp(-10 x^2),    0 <= t <= 20, dt = 0.001
 
 The error of a run is the root of the mean over time of (x - mean)^2.  All filters take the same records; the reference is
-Crank and Nicolson's solution on a fixed lattice, which shares nothing with them.
+Crank and Nicolson's solution on a fixed grid, which shares nothing with them.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def reproduction(scores: dict[str, dict[str, np.ndarray]], missing: str, setting
         mean, error = own["mean"], own["standard_error"]
         if settings["steps"] != STEPS:
             return Comparison(what, known.rmse, mean, error, f"not comparable: known of paths of {STEPS:,} observations")
-        # A figure whose standard error is not known has that of ours, for its number of runs.
+        # A figure whose standard error is not known is given ours, scaled to its number of runs.
         other = known.standard_error or (error or 0.0) * np.sqrt(own["runs"] / known.runs)
         return by_chance(what, known.rmse, mean, error, "", float(other))
 

@@ -200,7 +200,7 @@ def filtered(observations: int, seed: int) -> Comparison:
     means, deviations = kalman_bucy(record)
     worst = float((np.abs(result.mean[1:, 0] - means) / deviations).max())
     what = "Theorem 4.1 on a member of the class: error of E[x1], deviations"
-    return by_computation(what, "0", f"{worst:.1e}", worst < 1e-4, "the lattice is too coarse")
+    return by_computation(what, "0", f"{worst:.1e}", worst < 1e-4, "the grid is too coarse")
 
 
 def kalman_bucy(record: Record) -> tuple[np.ndarray, np.ndarray]:

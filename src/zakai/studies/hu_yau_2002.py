@@ -180,7 +180,7 @@ def reproduction(comparisons: list[Comparison], rows: list[tuple[str, str, str]]
         f"{right} of {len(rows)} runs of Theorems 4 to 6 give the density of the converged solution: for a G that is not the "
         "identity, a state of which one coordinate is observed, and starts that are no Gaussian. One formula is misprinted, "
         "(14), which changes the evidence alone. From time 0 the statistics cancel more digits the longer the record is; "
-        "started anew at every observation they do not."
+        "restarted at every observation they do not."
     )
     return Reproduction(
         "Hu and Yau 2002: the universal finite-dimensional filter, for any initial density",
@@ -206,7 +206,7 @@ def draw(name: str, system: System, converged: Solution, result: FilterResult) -
         for colour, k in zip(SERIES, sorted({1, len(converged.densities) // 2, len(converged.densities)} - {0})):
             panel.plot(x[:, 0], converged.densities[k - 1], color=colour, linewidth=3.5, alpha=0.35)
             own = np.exp(result.density(k).log_density(fine))
-            panel.plot(fine[:, 0], own, color=colour, linewidth=1.1, label=f"reading {k}")
+            panel.plot(fine[:, 0], own, color=colour, linewidth=1.1, label=f"observation {k}")
         panel.set_xlim(-4, 4)
         panel.set_xlabel("x")
         panel.set_ylabel("density (wide: converged, narrow: Hu and Yau)")

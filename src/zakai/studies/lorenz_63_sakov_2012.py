@@ -3,7 +3,7 @@
     dx1 = 10 (x2 - x1) dt,  dx2 = (x1 (28 - x3) - x2) dt,  dx3 = (x1 x2 - 8/3 x3) dt,    z_k = x(t_k) + N(0, 2 I),  t_k = k/4
 
 without process noise; paths by the classical Runge-Kutta formula with steps of 0.01.  The error is the root of the mean of the
-squared error over the three coordinates, averaged over the times of the readings after the first 16 units of time.
+squared error over the three coordinates, averaged over the times of the observations after the first 16 units of time.
 
 The known figures are of filters that were tuned for it: covariances inflated, particles spread.  Ours are given process noise
 instead, of variance q in a unit of time and coordinate, for some fixed q.
@@ -26,9 +26,9 @@ from zakai.studies.metrics import over_runs
 
 STEP, EACH, NOISE = 0.01, 25, 2.0
 START = np.array([1.509, -1.531, 25.46])
-SPIN_UP = 64  # readings, 16 units of time
+SPIN_UP = 64  # observations, 16 units of time
 LEVELS = (0.0, 0.01, 0.1, 1.0, 10.0)
-ALL = 1000  # readings of the known figures
+ALL = 1000  # observations of the known figures
 
 
 class Filter(NamedTuple):
@@ -43,9 +43,9 @@ class Filter(NamedTuple):
 FILTERS = {
     "extended Kalman": Filter("ekf", {}, 0.92, "covariance inflated 180-fold in a unit of time"),
     "ensemble, 100 members": Filter("enkf", {"members": 100, "inflation": 0.01}, 0.56, "inflation 1.01"),
-    "particles, 100": Filter("particle", {"particles": 100}, 0.38, "resampled particles spread anew"),
-    "particles, 800": Filter("particle", {"particles": 800}, 0.28, "resampled particles spread anew"),
-    "particles, 4000": Filter("particle", {"particles": 4000}, 0.27, "resampled particles spread anew"),
+    "particles, 100": Filter("particle", {"particles": 100}, 0.38, "resampled particles spread again"),
+    "particles, 800": Filter("particle", {"particles": 800}, 0.28, "resampled particles spread again"),
+    "particles, 4000": Filter("particle", {"particles": 4000}, 0.27, "resampled particles spread again"),
 }
 
 
@@ -60,7 +60,7 @@ def run(
 ) -> Reproduction:
     """The whole experiment.
 
-    progress: called with the work done and all of it. pictures: where they go. observations: readings of a record, of which the
+    progress: called with the work done and all of it. pictures: where they go. observations: number in a record, of which the
     first 64 are not counted; the known figures have 1,000. records: how many, each from a start of its own. largest: particle
     filters with more particles are left out. seed: of NumPy's generator, which draws starts and noise.
     """
@@ -69,9 +69,9 @@ def run(
     whole_number("largest", largest, 0, 10**6)
     whole_number("seed", seed, 0, 2**31)
     pictures = pictures or Pictures()
-    truth, readings = paths(np.random.default_rng(seed), records, observations)
+    truth, samples = paths(np.random.default_rng(seed), records, observations)
     times = STEP * EACH * np.arange(1, observations + 1)
-    given = [Record(times, values, "samples") for values in readings]
+    given = [Record(times, values, "samples") for values in samples]
     used = {name: one for name, one in FILTERS.items() if one.options.get("particles", 0) <= largest}
     work = Progress(progress, len(used) * len(LEVELS))
     errors: dict[str, np.ndarray] = {}
@@ -87,7 +87,7 @@ def run(
             work.add()
         errors[name] = np.array(found)
         if len(errors) == 1:
-            pictures.add("first-record", partial(draw_record, times, truth[0], readings[0], name, best[name]))
+            pictures.add("first-record", partial(draw_record, times, truth[0], samples[0], name, best[name]))
     pictures.add("errors", partial(draw_errors, errors))
     return reproduction(errors, {"observations": observations, "records": records, "seed": seed, "levels": list(LEVELS)})
 
@@ -107,7 +107,7 @@ def model(level: float) -> Model:
 
 
 def paths(rng: np.random.Generator, records: int, observations: int) -> tuple[np.ndarray, np.ndarray]:
-    """States and readings (records, observations, 3), every quarter of a unit of time."""
+    """States and samples (records, observations, 3), every quarter of a unit of time."""
     x = START + np.sqrt(2.0) * rng.standard_normal((records, 3))
     states = np.empty((observations, records, 3))
     for k in range(observations):
@@ -163,19 +163,19 @@ def reproduction(errors: dict[str, np.ndarray], settings: dict[str, Any]) -> Rep
     )
     agreeing = [one.what.split(", q")[0] for one in comparisons if one.verdict.startswith("agrees")]
     worst = "; ".join(f"{name} ({np.mean(found[0]):.1f})" for name, found in errors.items() if np.mean(found[0]) > 1)
-    left = "" if len(agreeing) == len(errors) else " What is left of the differences is between cures, not filters."
+    left = "" if len(agreeing) == len(errors) else " The remaining differences are between tunings, not filters."
     verdict = (
         f"the order of the filters is {'' if same else 'not '}the known one; from the worst to the best: "
         f"{', '.join(f'{name} {best[name]:.2f}' for name in order)}. Within chance of the known figure: {len(agreeing)} of "
         f"{len(errors)}. Without process noise the path is lost by {worst or 'none here'}, which is why the known filters are "
         f"tuned; ours have process noise in place of that.{left} yau-yau is not part of it: by its characteristics it takes a "
-        "sixth of a second a reading, which a benchmark of its own measures."
+        "sixth of a second an observation, which a benchmark of its own measures."
     )
     return Reproduction(
         "Lorenz 1963, all coordinates sampled every 0.25 with variance 2, without process noise (Sakov, Oliver and Bertino 2012)",
         "Known are the mean errors of filters that are tuned for this system, of a public collection of benchmarks that "
-        f"repeats Table 1 of that paper with {ALL:,} readings. Ours: {settings['records']} records of "
-        f"{settings['observations']} readings, the first {SPIN_UP} of which are not counted; +- one standard error over "
+        f"repeats Table 1 of that paper with {ALL:,} observations. Ours: {settings['records']} records of "
+        f"{settings['observations']} observations, the first {SPIN_UP} of which are not counted; +- one standard error over "
         "records. The process noise q of each row is the best of those in the table below.",
         tuple(comparisons),
         verdict,
@@ -184,13 +184,13 @@ def reproduction(errors: dict[str, np.ndarray], settings: dict[str, Any]) -> Rep
     )
 
 
-def draw_record(times: np.ndarray, truth: np.ndarray, readings: np.ndarray, name: str, means: np.ndarray) -> Any:
-    """The state, its samples and a filter's mean, the last 60 readings."""
+def draw_record(times: np.ndarray, truth: np.ndarray, samples: np.ndarray, name: str, means: np.ndarray) -> Any:
+    """The state, its samples and a filter's mean, the last 60 observations."""
     figure = new_figure(10.0, 5.4)
     last = slice(-60, None)
     for i, panel in enumerate(figure.subplots(3, sharex=True)):
         plain(panel).plot(times[last], truth[last, i], color=TRUTH, linewidth=1.4, label="state")
-        panel.plot(times[last], readings[last, i], ".", color="#6b7480", markersize=4, label="samples")
+        panel.plot(times[last], samples[last, i], ".", color="#6b7480", markersize=4, label="samples")
         panel.plot(times[last], means[last, i], color=INK, linewidth=0.9, label=f"{name}, mean")
         panel.set_ylabel(f"x{i + 1}")
     panel.set_xlabel("t")

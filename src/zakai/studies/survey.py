@@ -138,7 +138,7 @@ def reproduction(linear: Solution, frozen: Solution, runs: dict[str, Run], setti
         comparisons.append(
             by_computation(
                 f"({name.replace(':', ')', 1)}: error of the density", METHODS[name].published, f"{worst:.1e}",
-                worst <= (EXACT if exact else ALPHA), "errors of the fits add up from reading to reading",
+                worst <= (EXACT if exact else ALPHA), "errors of the fits add up from observation to observation",
             )
         )  # fmt: skip
         rows.append((f"({name.replace(':', ')', 1)}", f"{worst:.1e}", f"{apart[-1]:.1e}", f"{means.max():.1e}",

@@ -51,7 +51,7 @@ class Spectrum:
         return cls(x, *np.linalg.eigh(second / (2 * (x[1] - x[0]) ** 2) + np.diag(potential)))
 
     def gauged(self, t: float) -> np.ndarray:
-        """The kernel of exp(-F) u on the lattice."""
+        """The kernel of exp(-F) u on the grid."""
         return (self.vectors * np.exp(-self.values * t)) @ self.vectors.T / (self.x[1] - self.x[0])
 
     def kernel(self, x: np.ndarray, y: np.ndarray, t: float) -> np.ndarray:
@@ -227,11 +227,11 @@ def compositions(spectrum: Spectrum, model: Model) -> dict[str, list[float]]:
     cell = x[1] - x[0]
     heat = heat_series(model, x, 2)
     start = np.exp(-((x - 0.5) ** 2) / 0.2) / np.sqrt(0.2 * np.pi)
-    lattice = spectrum.x
-    inner = np.exp(-((lattice - 0.5) ** 2) / 0.2 - primitive(lattice)) / np.sqrt(0.2 * np.pi)
-    moved = np.exp(primitive(lattice)) * (spectrum.gauged(1.0) @ inner) * (lattice[1] - lattice[0])
-    interpolation = np.sinc((x[:, None] - lattice) / (lattice[1] - lattice[0]))
-    exact = interpolation @ moved
+    grid = spectrum.x
+    inner = np.exp(-((grid - 0.5) ** 2) / 0.2 - primitive(grid)) / np.sqrt(0.2 * np.pi)
+    evolved = np.exp(primitive(grid)) * (spectrum.gauged(1.0) @ inner) * (grid[1] - grid[0])
+    interpolation = np.sinc((x[:, None] - grid) / (grid[1] - grid[0]))
+    exact = interpolation @ evolved
 
     def error(form: str, K: int) -> float:
         matrix = np.asarray(transition(heat, cell, 1.0, substeps=K, form=form))
