@@ -123,6 +123,46 @@ class DensityMethods:
         return _display.html_table(type(self).__name__, ("", "mean", "deviation", "2.5 %", "97.5 %"), rows)
 
 
+class _Weighted(Density, Protocol):
+    """A density that is known by `points` (..., n) and their probabilities `weights` (...)."""
+
+    @property
+    def points(self) -> np.ndarray: ...
+
+    @property
+    def weights(self) -> np.ndarray: ...
+
+
+class WeightedPoints(DensityMethods):
+    """The moments of a density with `points` (..., n) and their probabilities `weights` (...)."""
+
+    def resultant(self: _Weighted) -> np.ndarray:
+        """Return E exp(i x) of each angle (n,); 1 for other states."""
+        angles = np.where(self.periodic, states(self), 0.0)
+        return np.asarray(self.weights.ravel() @ np.exp(1j * angles))
+
+    def mean(self: _Weighted) -> np.ndarray:
+        resultant = self.resultant()
+        # The direction of a uniform angle would be rounding.
+        direction = np.where(np.abs(resultant) < 1e-9, 0.0, np.angle(resultant))
+        return np.where(self.periodic, direction, self.weights.ravel() @ states(self))
+
+    def cov(self: _Weighted) -> np.ndarray:
+        apart = deviations(self)
+        return np.asarray((self.weights.ravel()[:, None] * apart).T @ apart)
+
+
+def states(density: _Weighted) -> np.ndarray:
+    """Return the points as (N, n)."""
+    return density.points.reshape(-1, len(density.names))
+
+
+def deviations(density: _Weighted) -> np.ndarray:
+    """Return the points less the mean (N, n), angles in (-pi, pi]."""
+    difference = states(density) - density.mean()
+    return np.where(density.periodic, wrap(difference), difference)
+
+
 def coordinate_numbers(names: tuple[str, ...], coordinates: int | str | Sequence[int | str]) -> list[int]:
     """Return the numbers of coordinates that are given by names or numbers.
 

@@ -9,13 +9,13 @@ from functools import cached_property
 
 import numpy as np
 
-from zakai.densities._density import DensityMethods, as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
+from zakai.densities._density import WeightedPoints, as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 
 _BLOCK = 4_000_000  # numbers held at once while a density is interpolated
 
 
 @dataclass(frozen=True, repr=False)
-class GridDensity(DensityMethods):
+class GridDensity(WeightedPoints):
     """A density by its `log_values` on the grid x = `centre` + `basis` (i - size // 2), i the index (n,).
 
     A smooth density that the grid resolves is band-limited, so its sums over the grid are integrals and its values
@@ -153,23 +153,6 @@ class GridDensity(DensityMethods):
             at = (index[~high] + shape // 2).T
             logs[~high] = map_coordinates(np.maximum(self.log_values, floor), at, order=1, mode=modes)
         return np.where(inside & (logs > floor), logs, -np.inf)
-
-    def mean(self) -> np.ndarray:
-        flat = self.points.reshape(-1, len(self.names))
-        resultant = self.resultant()
-        # The direction of a uniform angle would be rounding.
-        circular = np.where(np.abs(resultant) < 1e-9, 0.0, np.angle(resultant))
-        return np.where(self.periodic, circular, self.weights.ravel() @ flat)
-
-    def resultant(self) -> np.ndarray:
-        """Return E exp(i x) of each angle (n,); 1 for other states."""
-        flat = self.points.reshape(-1, len(self.names))
-        return np.asarray(self.weights.ravel() @ np.exp(1j * np.where(self.periodic, flat, 0.0)))
-
-    def cov(self) -> np.ndarray:
-        deviation = self.points.reshape(-1, len(self.names)) - self.mean()
-        deviation = np.where(self.periodic, wrap(deviation), deviation)
-        return np.einsum("k,ki,kj->ij", self.weights.ravel(), deviation, deviation)
 
     def mode(self) -> np.ndarray:
         at = np.array(np.unravel_index(np.argmax(self.log_values), self.log_values.shape))

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from zakai.densities._density import DensityMethods, as_states, coordinate_numbers, generator, probabilities, sample_size
+from zakai.densities._density import WeightedPoints, as_states, coordinate_numbers, generator, probabilities, sample_size
 
 _FINE = 4001  # points between which the distribution function is interpolated
 
 
 @dataclass(frozen=True, repr=False)
-class IntervalDensity(DensityMethods):
+class IntervalDensity(WeightedPoints):
     """A polynomial density by its `values` (N,) at Gauss-Lobatto `nodes` with weights `rule`; zero beyond the nodes."""
 
     values: np.ndarray
@@ -45,17 +45,6 @@ class IntervalDensity(DensityMethods):
             found = np.log((terms @ self.values) / terms.sum(axis=-1) / np.sum(self.values * self.rule))
         inside = (at >= self.nodes[0]) & (at <= self.nodes[-1]) & ~np.isnan(found)
         return np.where(inside, found, -np.inf)
-
-    def mean(self) -> np.ndarray:
-        return np.asarray(self.weights @ self.points)
-
-    def resultant(self) -> np.ndarray:
-        """Return E exp(i x) (1,)."""
-        return np.asarray(self.weights @ np.exp(1j * self.points))
-
-    def cov(self) -> np.ndarray:
-        apart = self.points - self.mean()
-        return np.asarray((self.weights[:, None] * apart).T @ apart)
 
     def mode(self) -> np.ndarray:
         fine = np.linspace(self.nodes[0], self.nodes[-1], _FINE)

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from zakai.densities._density import DensityMethods, as_states, coordinate_numbers
+from zakai.densities._density import WeightedPoints, as_states, coordinate_numbers
 from zakai.densities.grid import GridDensity
 
 
@@ -23,7 +23,7 @@ class Map(Protocol):
 
 
 @dataclass(frozen=True, repr=False)
-class MappedDensity(DensityMethods):
+class MappedDensity(WeightedPoints):
     """The density of one state x in an interval: `grid` is that of w on the line, `map` gives x; outside it is zero."""
 
     grid: GridDensity
@@ -52,17 +52,6 @@ class MappedDensity(DensityMethods):
         inside = np.isfinite(w)
         at = np.where(inside, w, 0.0)
         return np.where(inside[..., 0], self.grid.log_density(at) - self.map.log_slope(at)[..., 0], -np.inf)
-
-    def mean(self) -> np.ndarray:
-        return np.asarray(self.weights @ self.points)
-
-    def resultant(self) -> np.ndarray:
-        """Return E exp(i x) (1,)."""
-        return np.asarray(self.weights @ np.exp(1j * self.points))
-
-    def cov(self) -> np.ndarray:
-        apart = self.points - self.mean()
-        return np.asarray((self.weights[:, None] * apart).T @ apart)
 
     def mode(self) -> np.ndarray:
         w = self.grid.points[:, 0]

@@ -8,13 +8,22 @@ from functools import cached_property
 
 import numpy as np
 
-from zakai.densities._density import DensityMethods, as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
+from zakai.densities._density import (
+    WeightedPoints,
+    as_states,
+    coordinate_numbers,
+    deviations,
+    generator,
+    probabilities,
+    sample_size,
+    wrap,
+)
 from zakai.densities.gaussian import GaussianMixture
 from zakai.errors import InputError
 
 
 @dataclass(frozen=True, repr=False)
-class PointMasses(DensityMethods):
+class PointMasses(WeightedPoints):
     """sum_i w_i delta(x - x_i): `weights` (N,), which sum to one, at `points` (N, n); angles (`periodic`) on (-pi, pi].
 
     Moments, quantiles, marginals and samples are those of the points.  Points have no density: `log_density` and `mode` are
@@ -29,22 +38,6 @@ class PointMasses(DensityMethods):
     points: np.ndarray
     names: tuple[str, ...]
     periodic: tuple[bool, ...]
-
-    def mean(self) -> np.ndarray:
-        return np.asarray(np.where(self.periodic, np.angle(self.resultant()), self.weights @ self.points))
-
-    def resultant(self) -> np.ndarray:
-        """Return E exp(i x) of each coordinate (n,)."""
-        return np.asarray(self.weights @ np.exp(1j * self.points))
-
-    def cov(self) -> np.ndarray:
-        deviation = self._deviations
-        return np.asarray((self.weights[:, None] * deviation).T @ deviation)
-
-    @cached_property
-    def _deviations(self) -> np.ndarray:
-        difference = self.points - self.mean()
-        return np.where(self.periodic, wrap(difference), difference)
 
     @cached_property
     def smoothed(self) -> GaussianMixture:
@@ -63,7 +56,7 @@ class PointMasses(DensityMethods):
             ) from None
         width = min(1.0, (4.0 / (n + 2.0) * np.sum(self.weights**2)) ** (2.0 / (n + 4.0)))
         used = self.weights > 0
-        means = mean + np.sqrt(1.0 - width) * self._deviations[used]
+        means = mean + np.sqrt(1.0 - width) * deviations(self)[used]
         covs = np.broadcast_to(width * cov, (len(means), n, n))
         return GaussianMixture(self.weights[used], means, covs, self.names, self.periodic)
 
@@ -76,7 +69,7 @@ class PointMasses(DensityMethods):
     def quantile(self, q: Sequence[float]) -> np.ndarray:
         wanted = probabilities(q)
         out = np.empty((len(wanted), len(self.names)))
-        values = self.mean() + self._deviations
+        values = self.mean() + deviations(self)
         for i in range(len(self.names)):
             order = np.argsort(values[:, i])
             total = np.cumsum(self.weights[order])
