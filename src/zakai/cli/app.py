@@ -18,6 +18,13 @@ app = typer.Typer(
 )
 
 _Model = Annotated[str, typer.Argument(metavar="MODEL", help="A model file (TOML), or gallery:NAME.")]
+_Record = Annotated[Path, typer.Argument(metavar="RECORD", help="The observations (CSV).")]
+_Method = Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")]
+_Options = Annotated[
+    list[str] | None, typer.Option("--option", metavar="KEY=VALUE", help="An option of the method; repeatable.")
+]
+_Truth = Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="The true states, for the report.")]
+_Report = Annotated[Path | None, typer.Option(metavar="REPORT.html", help="Write a report with pictures.")]
 _Inputs = Annotated[Path | None, typer.Option("--inputs", metavar="FILE.csv", help="The known inputs: time, a column for each.")]
 _Unit = Annotated[str | None, typer.Option(metavar="UNIT", help="The unit of time, for a record with dates: s, min, h, d.")]
 _Output = Annotated[Path, typer.Option("-o", "--output", metavar="RESULT.nc", help="Where the result goes (NetCDF).")]
@@ -70,12 +77,12 @@ def simulate(
 @app.command()
 def filter(
     model: _Model,
-    record: Annotated[Path, typer.Argument(metavar="RECORD", help="The observations (CSV).")],
+    record: _Record,
     output: _Output,
-    method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
-    option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
-    truth: Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="The true states, for the report.")] = None,
-    report: Annotated[Path | None, typer.Option(metavar="REPORT.html", help="Write a report with pictures.")] = None,
+    method: _Method = "auto",
+    option: _Options = None,
+    truth: _Truth = None,
+    report: _Report = None,
     inputs: _Inputs = None,
     unit: _Unit = None,
 ) -> None:
@@ -88,12 +95,12 @@ def filter(
 @app.command()
 def smooth(
     model: _Model,
-    record: Annotated[Path, typer.Argument(metavar="RECORD", help="The observations (CSV).")],
+    record: _Record,
     output: _Output,
-    method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
-    option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
-    truth: Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="The true states, for the report.")] = None,
-    report: Annotated[Path | None, typer.Option(metavar="REPORT.html", help="Write a report with pictures.")] = None,
+    method: _Method = "auto",
+    option: _Options = None,
+    truth: _Truth = None,
+    report: _Report = None,
     inputs: _Inputs = None,
     unit: _Unit = None,
 ) -> None:
@@ -106,12 +113,12 @@ def smooth(
 @app.command()
 def forecast(
     model: _Model,
-    record: Annotated[Path, typer.Argument(metavar="RECORD", help="The observations (CSV).")],
+    record: _Record,
     until: Annotated[float, typer.Option(metavar="T", help="Forecast up to this time.")],
     step: Annotated[float, typer.Option(metavar="DT", help="One forecast every DT after the end of the record.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FORECAST.nc", help="Where the result goes (NetCDF).")],
-    method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
-    option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
+    method: _Method = "auto",
+    option: _Options = None,
     inputs: _Inputs = None,
     unit: _Unit = None,
 ) -> None:
@@ -124,13 +131,13 @@ def forecast(
 @app.command()
 def fit(
     model: _Model,
-    record: Annotated[Path, typer.Argument(metavar="RECORD", help="The observations (CSV).")],
+    record: _Record,
     parameters: Annotated[str, typer.Option(metavar="a,b", help="The parameters to estimate; by default all.")] = "",
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FITTED.toml", help="Where the model with the estimates goes.")
     ] = None,
-    method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
-    option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
+    method: _Method = "auto",
+    option: _Options = None,
     inputs: _Inputs = None,
     unit: _Unit = None,
 ) -> None:
@@ -143,8 +150,8 @@ def fit(
 @app.command()
 def stream(
     model: _Model,
-    method: Annotated[str, typer.Option(metavar="NAME", help="A method, or auto: the first that holds.")] = "auto",
-    option: Annotated[list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the method; repeatable.")] = None,
+    method: _Method = "auto",
+    option: _Options = None,
     checkpoint: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the state there, and continue from it.")] = None,
     checkpoint_every: Annotated[int | None, typer.Option(metavar="N", min=1, help="Save after every N observations.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Stop at the first line that cannot be used.")] = False,

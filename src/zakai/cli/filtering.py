@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from zakai.records import Record, Truth, read_inputs, read_record, read_truth
 
 if TYPE_CHECKING:
     from zakai.engine.results import FilterResult
+    from zakai.models.model import Model
 
 _SHOWN = 20  # states whose last estimates are printed
 
@@ -38,14 +40,12 @@ def filter(
     Wrong input is refused before the work begins.
     """
     check_outputs([output, report], [source, record_path, truth_path, inputs_path])
-    options = options_of(settings)
     if report is not None:
         from zakai.report import write_report
         from zakai.report._extra import plotting
 
         plotting("plotly")
-    model = load_model(source)
-    record = record_with_inputs(record_path, model, inputs_path, unit)
+    model, record, options = _given(source, record_path, settings, inputs_path, unit)
     truth = None if truth_path is None else _truth(truth_path, model, record)
 
     if smoothed:
@@ -59,25 +59,15 @@ def filter(
         with progress("filtering") as advance:
             # Only the report uses the densities.
             result = run(model, record, method, keep=None if report else "moments", progress=advance, **options)
-    for warning in result.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+    _warn(result.warnings)
     result.save(output)
     if report is not None:
         write_report(result, report, truth=truth)
     lines = [
-        ("method", f"{result.method}: {result.why}"),
         ("observations", f"{len(record):,}, times {record.times[0]:g} to {record.times[-1]:g}"),
         ("log-likelihood", f"{result.log_likelihood:.6f}"),
     ]
-    row, when = (0, "start") if smoothed else (-1, "end")
-    last = list(zip(result.state, result.mean[row], np.sqrt(result.variance[row]), strict=True))
-    lines += [(f"{name} at the {when}", f"{mean:.6g} +- {deviation:.3g}") for name, mean, deviation in last[:_SHOWN]]
-    if len(last) > _SHOWN:
-        lines.append(("and", f"{len(last) - _SHOWN} more states, in the result"))
-    lines += [("written", str(path)) for path in (output, report) if path is not None]
-    width = max(len(what) for what, _ in lines)
-    for what, said in lines:
-        print(f"{what:<{width}}  {said}")
+    _summarise(result, lines, (0, "start") if smoothed else (-1, "end"), [output, report])
 
 
 def forecast(
@@ -96,9 +86,7 @@ def forecast(
     from zakai.models.clock import clock
 
     check_outputs([output], [source, record_path, inputs_path])
-    options = options_of(settings)
-    model = load_model(source)
-    record = record_with_inputs(record_path, model, inputs_path, unit)
+    model, record, options = _given(source, record_path, settings, inputs_path, unit)
     last = float(record.times[-1])
     if not until > last:
         raise InputError(f"--until {until:g}: must be after the end of the record, {last:g}")
@@ -106,14 +94,9 @@ def forecast(
     with progress("filtering") as advance:
         result = run(model, record, method, keep="moments", progress=advance, **options)
     found = result.forecast(times)
-    for warning in dict.fromkeys([*result.warnings, *found.warnings]):
-        print(f"warning: {warning}", file=sys.stderr)
+    _warn(dict.fromkeys([*result.warnings, *found.warnings]))
     found.save(output)
-    print(f"method          {found.method}: {found.why}")
-    print(f"forecast times  {len(times):,}, {times[0]:g} to {times[-1]:g}")
-    for name, mean, deviation in list(zip(found.state, found.mean[-1], np.sqrt(found.variance[-1]), strict=True))[:_SHOWN]:
-        print(f"{name} at the end  {mean:.6g} +- {deviation:.3g}")
-    print(f"written         {output}")
+    _summarise(found, [("forecast times", f"{len(times):,}, {times[0]:g} to {times[-1]:g}")], (-1, "end"), [output])
 
 
 def fit(
@@ -131,13 +114,10 @@ def fit(
     from zakai.records.writing import atomic_write
 
     check_outputs([output], [source, record_path, inputs_path])
-    options = options_of(settings)
-    model = load_model(source)
-    record = record_with_inputs(record_path, model, inputs_path, unit)
+    model, record, options = _given(source, record_path, settings, inputs_path, unit)
     names = [name.strip() for name in parameters.split(",") if name.strip()] or None
     found = run(model, record, names, method, **options)
-    for warning in found.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+    _warn(found.warnings)
     if output is not None:
         with atomic_write(output) as temporary:
             temporary.write_text(found.model.text, encoding="utf-8")
@@ -146,17 +126,42 @@ def fit(
         print(f"written  {output}")
 
 
-def record_with_inputs(path: Path, model: Any, inputs_path: Path | None, unit: str | None = None) -> Record:
-    """Read a record, and its inputs from a file of their own where there is one."""
+def _given(
+    source: str, path: Path, settings: list[str], inputs_path: Path | None, unit: str | None
+) -> tuple[Model, Record, dict[str, Any]]:
+    """Read the model, the record with its inputs, and the options."""
+    options = options_of(settings)
+    model = load_model(source)
     record = read_record(path, model, unit)
-    if inputs_path is None:
-        return record
-    if record.inputs is not None:
-        raise InputError(f"--inputs {inputs_path}: {path} has columns for the inputs too; give them once")
-    return replace(record, inputs=read_inputs(inputs_path, model))
+    if inputs_path is not None:
+        if record.inputs is not None:
+            raise InputError(f"--inputs {inputs_path}: {path} has columns for the inputs too; give them once")
+        record = replace(record, inputs=read_inputs(inputs_path, model))
+    return model, record, options
 
 
-def _truth(path: Path, model: Any, record: Record) -> Truth:
+def _warn(warnings: Iterable[str]) -> None:
+    for warning in warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+
+
+def _summarise(
+    result: FilterResult, lines: Sequence[tuple[str, str]], row: tuple[int, str], written: Sequence[Path | None]
+) -> None:
+    """Print the method, the lines, the estimate of one row and the files that were written, in two columns."""
+    index, when = row
+    estimates = list(zip(result.state, result.mean[index], np.sqrt(result.variance[index]), strict=True))
+    table = [("method", f"{result.method}: {result.why}"), *lines]
+    table += [(f"{name} at the {when}", f"{mean:.6g} +- {deviation:.3g}") for name, mean, deviation in estimates[:_SHOWN]]
+    if len(estimates) > _SHOWN:
+        table.append(("and", f"{len(estimates) - _SHOWN} more states, in the result"))
+    table += [("written", str(path)) for path in written if path is not None]
+    width = max(len(name) for name, _ in table)
+    for name, text in table:
+        print(f"{name:<{width}}  {text}")
+
+
+def _truth(path: Path, model: Model, record: Record) -> Truth:
     truth = read_truth(path, model)
     times = np.concatenate([[model.start], record.times])
     nearest = truth.times[np.clip(np.searchsorted(truth.times, times - 1e-9 * np.abs(times)), 0, len(truth.times) - 1)]
