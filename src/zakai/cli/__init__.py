@@ -23,6 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return _run(arguments)
     except KeyboardInterrupt:
+        _interrupt.end()
         print("interrupted; nothing half-written was left behind", file=sys.stderr, flush=True)
         if arguments is None and "jax" in sys.modules:
             os._exit(130)  # JAX, in a filter of another library, may still be compiling and reports an orderly exit as a crash

@@ -39,6 +39,14 @@ def insist() -> None:
     _insists = _timed
 
 
+def end() -> None:
+    """Stop raising: the interruption has had its effect, and Python no longer handles an alarm while it shuts down."""
+    global _insists
+    _insists = False
+    if _timed:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
 def _note(_: int = 0, frame: FrameType | None = None) -> None:
     global _asked, _since
     _since = _since if _asked else time.monotonic()
