@@ -88,6 +88,6 @@ def load(name: str) -> Any:
                 raise
             raise InputError(f"{name}: {missing} is not installed; pip install 'zakai[{EXTRA}]'") from error
     close = difflib.get_close_matches(name, [*METHODS, *PEERS], n=1)
-    hint = f'; did you mean "{close[0]}"?' if close else ""
+    hint = f'; did you mean "{close[0]}"? The' if close else "; the"
     names = f"auto, {', '.join(METHODS)}; of other libraries: {', '.join(PEERS)}"
-    raise InputError(f'there is no method "{name}"{hint}; methods: {names}')
+    raise InputError(f'there is no method "{name}"{hint} methods are {names}')

@@ -56,7 +56,7 @@ def test_csv_is_read_as_json_lines_are(stream):
     assert stream(rows).out == stream(LINES).out
     assert stream([rows[0], "", "0.1,", "0.2,nan"]).out == stream(['{"time": 0.1, "y": [null]}', '{"time": 0.2, "y": null}']).out
     wrong = stream(["time,a,b", "1,2,3"])
-    assert wrong.code == 2 and "line 1: 3 columns; the model needs time and 1" in wrong.err and wrong.err.count("\n") == 1
+    assert wrong.code == 2 and "line 1: 3 columns; the model needs 2: time" in wrong.err and wrong.err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -182,7 +182,7 @@ def test_an_option_goes_to_the_blocks_whose_method_has_it():
     record = record_of(model)
     with pytest.raises(InputError, match='order: 0 must be a whole number from 1, and needs kernel="power-series"'):
         zakai.filter(model, record, order=0)
-    wrong = 'none of kalman-bucy and limited-direct and benes has an option "speed"; their options are: .*kernel'
+    wrong = 'none of kalman-bucy and limited-direct and benes has an option "speed"; the options are .*kernel'
     with pytest.raises(InputError, match=wrong):
         zakai.filter(model, record, speed=3)
 

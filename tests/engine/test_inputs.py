@@ -251,7 +251,7 @@ def test_a_stream_takes_inputs_in_its_lines_and_in_columns(folder, capsys):
         ('{"time": 1, "y": [1], "inputs": {"u": "1"}}', 'line 1: the input "u" is "1"; give a number'),
         ('{"time": 1, "y": [1], "inputs": {"u": 1, "u": 2}}', 'line 1: the key "u" stands twice'),
         ('{"time": 1, "y": [1], "inputs": {"v": 1}}', "line 1: update: inputs: 'v' is not an input"),
-        ("time,u\n1,2", "line 1: 1 columns; the model needs time and 1 observations"),
+        ("time,u\n1,2", "line 1: 1 columns; the model needs 2: time, and one for each"),
         ("time,u,z\n1,2", "line 2: 2 columns; the header has 3"),
         ("time,u,z\n1,,2", "line 2: update: inputs: u of model.toml are missing"),
     ],

@@ -95,7 +95,7 @@ def test_a_file_with_dates_is_read_and_written(tmp_path):
 @pytest.mark.parametrize(
     ("row", "unit", "says"),
     [
-        ("2024-13-01,1", "h", "row 3: '2024-13-01' in column 'time' is not a date; write dates as 2024-01-31T12:30"),
+        ("2024-13-01,1", "h", "row 3: '2024-13-01' in column 'time' is not a date; write 2024-01-31T12:30, or omit the unit"),
         ("2023-01-01,1", "h", "row 3: the time .* comes after the time 0.0; .* sort the rows"),
         ("0.5,1", "h", "row 3: '0.5' in column 'time' is not a date"),
         ("2024-02-01,1", None, "row 2: '2024-01-01' in column 'time' is not a number; for dates give .* --unit h"),

@@ -61,7 +61,7 @@ def test_columns_of_a_record_with_the_names_of_inputs_are_the_inputs(tmp_path):
     for text, words in [
         ("time,heater,air\n1,0.5,18\n", "row 1: no column for the input outdoor"),
         ("time,heater,air,outdoor\n1,0.5,18,\n", "row 2: only some inputs"),
-        ("time,heater,air,outdoor,more\n1,0.5,18,1,1\n", "row 1: 3 columns; the model needs time and 1 observations"),
+        ("time,heater,air,outdoor,more\n1,0.5,18,1,1\n", "row 1: 3 columns; the model needs 2: time, and one for each"),
     ]:
         with pytest.raises(InputError, match=words):
             read_record(written(tmp_path, text), MODEL)

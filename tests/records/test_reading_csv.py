@@ -106,7 +106,7 @@ def test_the_careful_road_gives_the_same_numbers_as_the_fast_one(read):
         (b"\0" * 4096, 1, "NUL byte"),
         ("1,2,3\n2,3,4\n", 1, "the header must begin with time (is the header missing?)"),
         ("t,a,b\n1,2,3\n", 1, "the first column is 't'; the header must begin with time"),
-        ("time,a\n1,2\n", 1, "2 columns; the model needs time and 2 observations, 3 columns in all"),
+        ("time,a\n1,2\n", 1, "2 columns; the model needs 3: time, and one for each of its observations"),
         (
             "time,y2,y1\n1,2,3\n",
             1,

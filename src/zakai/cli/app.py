@@ -12,6 +12,8 @@ import zakai
 app = typer.Typer(
     name="zakai",
     help="The conditional density of the state of a continuous-time stochastic system, given noisy observations.",
+    epilog="To begin: zakai simulate gallery:benes --until 8 --step 0.1 -o record.csv, then zakai filter gallery:benes "
+    "record.csv -o result.nc. zakai gallery lists the models, zakai methods MODEL the methods that hold, with their reasons.",
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -166,7 +168,7 @@ def stream(
 
 @app.command()
 def methods(
-    model: Annotated[str | None, typer.Argument(metavar="[MODEL]", help="Print which hold for this model.")] = None,
+    model: Annotated[str | None, typer.Argument(metavar="MODEL", help="Print which hold for this model.")] = None,
 ) -> None:
     """List the methods; for a model, print whether each holds."""
     from zakai.cli import inspecting
@@ -176,7 +178,7 @@ def methods(
 
 @app.command()
 def gallery(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Print the file of this model.")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Print the file of this model.")] = None,
 ) -> None:
     """List the models that come with zakai, or print one of them."""
     from zakai.cli import inspecting

@@ -134,10 +134,11 @@ def _own_options(methods: Sequence[Method[Any, Any]], options: Mapping[str, Any]
     for name in sorted(options):
         if not any(name in method.options for method in methods):
             what = " and ".join(method.name for method in methods)
-            listed = ", ".join(sorted({option for method in methods for option in method.options})) or "none"
+            known = sorted({option for method in methods for option in method.options})
+            listed = f"the options are {', '.join(known)}" if known else "there is no option"
             if len(methods) == 1:
-                raise InputError(f'{what} has no option "{name}"; its options are: {listed}')
-            raise InputError(f'none of {what} has an option "{name}"; their options are: {listed}')
+                raise InputError(f'{what} has no option "{name}"; {listed}')
+            raise InputError(f'none of {what} has an option "{name}"; {listed}')
     return [
         {**method.options, **{name: value for name, value in options.items() if name in method.options}} for method in methods
     ]

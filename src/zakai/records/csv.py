@@ -113,7 +113,7 @@ class Dates:
         for number, (cell, _, rest) in enumerate(cells, part.number):
             found.append(date_of(cell.strip().strip('"')) if cell.strip() or rest else np.datetime64("NaT", "ns"))
             if found[-1] is None:
-                wrong = number, f"{_quoted(cell)} in column 'time' is not a date; write dates as 2024-01-31T12:30"
+                wrong = number, f"{_quoted(cell)} in column 'time' is not a date; write 2024-01-31T12:30, or omit the unit"
                 found.pop()
                 break
         dates = np.array(found, "datetime64[ns]")
@@ -166,7 +166,7 @@ def table_of(
     parts = _parts(file, source)
     first = next(parts, None)
     if first is None:
-        raise InputError(f"{source}: is empty; expected a header of time and {columns} names, then rows")
+        raise InputError(f"{source}: is empty; expected a header of {columns + 1} names, the first of them time, then rows")
     header = _header(source, first.lines[0], columns, what, names)
     numbers, row, before = array("d"), 0, np.empty((0, len(header)))
     for part in chain([first._replace(number=2, lines=first.lines[1:])], parts):
@@ -254,7 +254,7 @@ def columns_with_inputs(names: Sequence[str], m: int, inputs: Sequence[str]) -> 
 def columns_fault(names: Sequence[str], m: int, what: str, expected: Sequence[str] | None = None) -> str | None:
     """What is wrong with the columns of a header, of which the first is the time, or None."""
     if len(names) != m + 1:
-        return f"{len(names)} columns; the model needs time and {m} {what}, {m + 1} columns in all"
+        return f"{len(names)} columns; the model needs {m + 1}: time, and one for each of its {what}"
     if expected is not None:
         wrong = next((name for name, wanted in zip(names[1:], expected) if name != wanted), None)
         return None if wrong is None else f"a column is {_quoted(wrong)}; expected time, {', '.join(expected)}"
