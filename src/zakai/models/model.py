@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,48 +15,21 @@ from zakai.densities import Density
 from zakai.errors import InputError
 from zakai.models import _entries, checks
 from zakai.models._errors import did_you_mean, listing, named
-from zakai.models._law_keys import read_law, read_observed
+from zakai.models._keys import read_formulas, read_names, read_parameters, reader
 from zakai.models._toml import to_toml
 from zakai.models.domain import Interval, check_prior, read_domain
-from zakai.models.expressions import MAX_LENGTH
 from zakai.models.features import features_of, formulas_of
-from zakai.models.formulas import parse_expression
 from zakai.models.observation_law import ObservationLaw
 from zakai.models.prior import Prior, read_prior
 from zakai.models.tables import Table, read_tables
 
 KEYS = (
-    "name",
-    "state",
-    "drift",
-    "observation",
-    "observation_kind",
-    "diffusion",
-    "process_noise",
-    "observation_noise",
-    "start",
-    "periodic",
-    "functions",
-    "parameters",
-    "prior",
-    "inputs",
-    "input_hold",
-    "cross_noise",
-    "observation_family",
-    "degrees_of_freedom",
-    "concentration",
-    "observation_log_density",
-    "observed",
-    "domain",
-    "tables",
-)
-HOLDS = ("zero", "linear")
+    "name", "state", "drift", "observation", "observation_kind", "diffusion", "process_noise", "observation_noise", "start",
+    "periodic", "functions", "parameters", "prior", "inputs", "input_hold", "cross_noise", "observation_family",
+    "degrees_of_freedom", "concentration", "observation_log_density", "observed", "domain", "tables",
+)  # fmt: skip
 Formulas = Sequence[str | float | sympy.Expr]
 FormulaRows = Sequence[Formulas]
-MOST_STATES = 1024  # of states, sensors and noises: a default identity matrix has this many squared entries
-MOST_CHARACTERS = 250_000  # of all different formulas together: what a computer reads in seconds
-MOST_PARENTHESES = 8_192
-OBSERVATION_KINDS = ("increments", "path", "rates", "samples")
 
 
 class Model:
@@ -174,8 +146,8 @@ class Model:
                 _entries.allowed_name(name)
         if any(isinstance(table, Mapping) and "file" in table for table in (keys.get("tables") or {}).values()):
             text = None  # the text of a model stands for itself, and this one needs a file
-        self._read_names(keys)
-        self._read_formulas(keys)
+        read_names(self, keys)
+        read_formulas(self, keys)
         with named("domain"):
             vars(self)["domain"] = read_domain(keys.get("domain") or {}, self.state, self.periodic)
             canonical["domain"] = {name: interval.keys() for name, interval in self.domain.items()}
@@ -209,138 +181,6 @@ class Model:
             rows += [(f"{left}{j}", right.format(_short(formula))) for j, formula in zip(place, self.observation, strict=True)]
         rows += [(f"{name} =", _display.number(float(value))) for name, value in self.parameters.items()]
         return _display.html_table(repr(self), ("", ""), rows)
-
-    def _read_names(self, keys: Mapping[str, Any]) -> None:
-        canonical, attributes = self._keys, vars(self)
-        with named("name"):
-            name = keys.get("name", "unnamed")
-            if not isinstance(name, str):
-                raise InputError(f"expected a text, got {_entries.kind_of(name)}")
-            attributes["name"] = canonical["name"] = name
-        with named("state"):
-            state = _entries.names(keys["state"], "a list of names")
-            if not 1 <= len(state) <= MOST_STATES:
-                raise InputError(f"expected a list of 1 to {MOST_STATES} names, got {len(state)}")
-        with named("functions"):
-            functions = _entries.names(keys.get("functions", ()), "a list of names")
-            if len(functions) > MOST_STATES:
-                raise InputError(f"expected a list of at most {MOST_STATES} names, got {len(functions)}")
-            _refuse_clash(functions, state, "a state")
-            _refuse_clash(functions, tuple(self.tables), "a table")
-        with named("parameters"):
-            parameters = _read_parameters(keys.get("parameters") or {})
-            _refuse_clash(parameters, state, "a state")
-            _refuse_clash(parameters, functions, "an undetermined function")
-        with named("inputs"):
-            inputs = _entries.names(keys.get("inputs", ()), "a list of names of known signals")
-            if len(inputs) > MOST_STATES:
-                raise InputError(f"expected a list of at most {MOST_STATES} names, got {len(inputs)}")
-            for others, what in ((state, "a state"), (functions, "an undetermined function"), (parameters, "a parameter")):
-                _refuse_clash(inputs, tuple(others), what)
-        with named("tables"):
-            for others, what in ((state, "a state"), (parameters, "a parameter"), (inputs, "an input")):
-                _refuse_clash(self.tables, tuple(others), what)
-        with named("input_hold"):
-            hold = _one_of(keys.get("input_hold", "zero"), HOLDS)
-            if "input_hold" in keys and not inputs:
-                raise InputError("there are no inputs to hold; give inputs, or leave it out")
-        with named("periodic"):
-            periodic = _entries.names(keys.get("periodic", ()), "a list of states that are angles")
-            for angle in periodic:
-                if angle not in state:
-                    hint = did_you_mean(angle, state)
-                    raise InputError(f"{angle!r} is not a state{hint} (the states are {listing(state)})")
-        with named("observation_kind"):
-            kind = _one_of(keys.get("observation_kind", "increments"), OBSERVATION_KINDS)
-        attributes.update(
-            state=state,
-            functions=functions,
-            parameters=parameters,
-            periodic=periodic,
-            observation_kind=kind,
-            inputs=inputs,
-            input_hold=hold,
-            u=tuple(sympy.Symbol(name, real=True) for name in inputs),
-            n=len(state),
-            x=tuple(sympy.Symbol(name, real=True) for name in state),
-            t=sympy.Symbol("t", real=True),
-            parameter_symbols=tuple(sympy.Symbol(name, real=True) for name in parameters),
-        )
-        canonical.update(state=state, functions=functions, parameters=parameters, periodic=periodic, observation_kind=kind)
-        canonical.update(inputs=inputs, input_hold=hold)
-
-    def _read_formulas(self, keys: Mapping[str, Any]) -> None:
-        canonical, n = self._keys, self.n
-        with named("drift"):
-            canonical["drift"] = _entries.vector_of_formulas(keys["drift"], n, f"a list of {n} formulas (one a state)")
-        custom = keys.get("observation_log_density") is not None
-        if custom:
-            canonical["observation"] = ["0"] * read_observed(self, keys)
-        with nullcontext() if custom else named("observation"):
-            if not custom:
-                formulas = "a list of formulas (one a sensor)"
-                canonical["observation"] = _entries.vector_of_formulas(keys["observation"], None, formulas)
-            if not 1 <= len(canonical["observation"]) <= MOST_STATES:
-                raise InputError(f"expected a list of 1 to {MOST_STATES} formulas (one a sensor)")
-        m = vars(self)["m"] = len(canonical["observation"])
-        given = {key: keys.get(key) for key in checks.COEFFICIENTS}
-        if given["diffusion"] is not None:
-            with named("diffusion"):
-                rows = f"{n} rows (one a state) of formulas (one a noise)"
-                canonical["diffusion"] = _entries.matrix_of_formulas(given["diffusion"], n, None, rows)
-        else:
-            canonical["diffusion"] = _identity(n)
-        r = len(canonical["diffusion"][0])
-        if r > MOST_STATES:
-            raise InputError(f"diffusion: at most {MOST_STATES} noises are read, got rows of {r}")
-        with named("cross_noise"):
-            if given["cross_noise"] is None:
-                canonical["cross_noise"] = [["0"] * m for _ in range(r)]
-            else:
-                if self.observation_kind == "samples":
-                    raise InputError("samples have no noise between their times; it is for increments, path and rates")
-                rows = f"{r} rows (one a noise) of {m} formulas (one a sensor)"
-                canonical["cross_noise"] = _entries.matrix_of_formulas(given["cross_noise"], r, m, rows)
-        for key, size, what in (("process_noise", r, "noise"), ("observation_noise", m, "sensor")):
-            if given[key] is None:
-                canonical[key] = _identity(size)
-                continue
-            with named(key):
-                rows = f"{size} rows of {size} formulas (one a {what})"
-                canonical[key] = _entries.matrix_of_formulas(given[key], size, size, rows)
-        _refuse_long(canonical)
-        read = self._reader()
-        for key in ("drift", "observation"):
-            with named(key):
-                column = [[read(text, f"[{i}]")] for i, text in enumerate(canonical[key])]
-            vars(self)[key] = sympy.ImmutableMatrix(column)
-        for key in checks.COEFFICIENTS:
-            with named(key):
-                entries = {
-                    (i, j): read(text, f"[{i}][{j}]")
-                    for i, row in enumerate(canonical[key])
-                    for j, text in enumerate(row)
-                    if text != "0"
-                }
-                vars(self)[key] = _matrix(len(canonical[key]), len(canonical[key][0]), entries)
-                if key != "diffusion" and not (key == "observation_noise" and self.observation_kind == "samples"):
-                    checks.check_independent_of_state(vars(self)[key], self)
-        read_law(self, keys, read)
-
-    def _reader(self, in_time: bool = True) -> Callable[..., sympy.Expr]:
-        """A function that reads a formula at a place; it remembers, for large matrices repeat few formulas."""
-        symbols = dict(zip((*self.state, *self.parameters), (*self.x, *self.parameter_symbols), strict=True))
-        if in_time:
-            symbols |= {"t": self.t, **dict(zip(self.inputs, self.u, strict=True))}
-        known: dict[str, sympy.Expr] = {}
-
-        def read(text: str, place: str = "") -> sympy.Expr:
-            if text not in known:
-                with named(place) if place else nullcontext():
-                    known[text] = parse_expression(text, symbols, self.functions, self.tables)
-            return known[text]
-
-        return read
 
     @cached_property
     def covariance(self) -> sympy.ImmutableMatrix:
@@ -387,7 +227,7 @@ class Model:
                 if name not in self.parameters:
                     known = f"(the parameters are {listing(self.parameters)})"
                     raise InputError(f"unknown parameter {name!r}{did_you_mean(name, self.parameters)} {known}")
-            parameters = {**self.parameters, **_read_parameters(values)}
+            parameters = {**self.parameters, **read_parameters(values)}
         other = object.__new__(Model)
         kept = {key: value for key, value in vars(self).items() if key not in ("text", "observation_law")}
         vars(other).update({**kept, "parameters": parameters, "_keys": {**self._keys, "parameters": parameters}})
@@ -427,7 +267,7 @@ class Model:
         return other
 
     def _prior(self, given: Any) -> tuple[Prior | None, dict[str, Any] | None]:
-        return read_prior(given, self.x, self._reader(in_time=False), tuple(name in self.periodic for name in self.state))
+        return read_prior(given, self.x, reader(self, in_time=False), tuple(name in self.periodic for name in self.state))
 
     def to_toml(self) -> str:
         """The model as the text of a model file that gives this model again."""
@@ -448,49 +288,3 @@ class Model:
 def _short(formula: sympy.Expr) -> str:
     text = str(formula)
     return text if len(text) <= 80 else f"{text[:77]}..."
-
-
-def _matrix(rows: int, columns: int, entries: Mapping[tuple[int, int], sympy.Expr]) -> sympy.ImmutableMatrix:
-    """The matrix with these entries and zeros; noises of a thousand states are a million zeros, which SymPy need not see."""
-    return sympy.ImmutableDenseMatrix._fromrep(sympy.SparseMatrix(rows, columns, entries)._rep)
-
-
-def _refuse_long(canonical: Mapping[str, Any]) -> None:
-    """Raise InputError if all formulas together are more than can be read in a moment, before any of them is."""
-    rows = [row for key in checks.COEFFICIENTS for row in canonical[key]]
-    texts = set(canonical["drift"]).union(canonical["observation"], *rows)
-    characters, parentheses = sum(map(len, texts)), sum(text.count("(") for text in texts)
-    if characters > MOST_CHARACTERS and max(map(len, texts)) <= MAX_LENGTH:
-        raise InputError(f"its formulas have {characters} characters together; at most {MOST_CHARACTERS} are read")
-    if parentheses > MOST_PARENTHESES and max(text.count("(") for text in texts) <= MOST_PARENTHESES:
-        raise InputError(f"its formulas have {parentheses} parentheses together; at most {MOST_PARENTHESES} are read")
-
-
-def _identity(size: int) -> list[list[str]]:
-    return [["1" if i == j else "0" for j in range(size)] for i in range(size)]
-
-
-def _read_parameters(table: Any) -> dict[str, sympy.Rational]:
-    if not isinstance(table, Mapping):
-        raise InputError(f"expected a table of names and numbers, got {_entries.kind_of(table)}")
-    if len(table) > MOST_STATES:
-        raise InputError(f"expected a table of at most {MOST_STATES} numbers, got {len(table)}")
-    parameters = {}
-    for name, value in table.items():
-        _entries.allowed_name(str(name))
-        with named(name):
-            parameters[name] = _entries.exact_number(value)
-    return parameters
-
-
-def _one_of(value: Any, options: tuple[str, ...]) -> str:
-    if not isinstance(value, str) or value not in options:
-        hint = did_you_mean(value, options) if isinstance(value, str) else ""
-        raise InputError(f"expected one of {listing(options)}, got {_entries.kind_of(value)}{hint}")
-    return value
-
-
-def _refuse_clash(names: Any, others: tuple[str, ...], what: str) -> None:
-    for name in names:
-        if name in others:
-            raise InputError(f"the name {name!r} is already {what}")
