@@ -52,7 +52,7 @@ def curve(axes, label):
 def test_a_result_is_drawn_with_its_observations_and_the_truth(result):
     found, truth = result
     axes = found.plot("x", truth)
-    assert labels(axes) == ["95% band", "mean", "observations", "truth"]
+    assert labels(axes) == ["density / its peak", "95% band", "mean", "observations", "truth"]
     np.testing.assert_allclose(curve(axes, "mean").get_ydata(), found.mean[:, 0])
     np.testing.assert_allclose(curve(axes, "observations").get_ydata(), found.record.values[:, 0])
     band = curve(axes, "95% band").get_ydata()

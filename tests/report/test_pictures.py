@@ -16,7 +16,7 @@ from zakai.report._style import DENSITY_COLOURS
 def test_the_posterior_is_drawn_with_mean_band_and_truth():
     result, truth = fake_result(observations=50)
     axes = posterior_figure(result, "x", truth).axes[0]
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["95% band", "mean", "truth"]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["density / its peak", "95% band", "mean", "truth"]
     assert axes.get_xlabel() == "time" and axes.get_ylabel() == "x"
 
 

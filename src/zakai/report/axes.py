@@ -55,7 +55,7 @@ def draw_posterior(axes: Any, picture: DensityOverTime, result: Any, number: int
         axes.plot(when(times), values, **kind)
 
     if picture.joined:
-        line(picture.lower, color=style.BAND_COLOUR, linewidth=0.6, label="95% band")
+        line(picture.lower, color=style.BAND_COLOUR, linewidth=0.6, label="95% band" if picture.kept else "95% band (Gaussian)")
         line(picture.upper, color=style.BAND_COLOUR, linewidth=0.6)
     line(picture.mean, color=style.INK, linewidth=1.1, label="mean")
     filtered = getattr(result, "filtered", None)
@@ -75,10 +75,20 @@ def draw_posterior(axes: Any, picture: DensityOverTime, result: Any, number: int
         axes.xaxis.set_major_formatter(plotting("matplotlib.dates").ConciseDateFormatter(axes.xaxis.get_major_locator()))
     axes.set_xlabel("time" if clock is None else "date")
     axes.set_ylabel(plain(picture.name) + (" (radians)" if picture.periodic else ""))
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=5, frameon=False, borderaxespad=0.2, handlelength=1.6, fontsize=9)
-    said = "shade: density relative to its peak" if picture.kept else "densities not kept: Gaussian 95% band"
-    axes.set_title(said, loc="right", fontsize=8, color=style.FAINT)
+    shade = [plotting("matplotlib.patches").Patch(color=style.DENSITY_COLOURS[3], label="density / its peak")]
+    _legend_below(axes, shade if picture.kept else [])
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def _legend_below(axes: Any, handles: list[Any]) -> None:
+    """Draw the legend below the label of the x-axis, so that a title has its place."""
+    below = plotting("matplotlib.transforms").ScaledTranslation(0, -36 / 72, axes.figure.dpi_scale_trans)
+    width = axes.get_position().width * axes.figure.get_size_inches()[0]
+    axes.legend(
+        handles=[*handles, *axes.get_legend_handles_labels()[0]], loc="upper left", bbox_to_anchor=(0, 0),
+        bbox_transform=axes.transAxes + below, ncols=6 if width > 6 else 3, frameon=False, borderaxespad=0.0, handlelength=1.4,
+        columnspacing=1.2, fontsize=8,
+    )  # fmt: skip
 
 
 def draw_density(density: Density, ax: Any) -> Any:
