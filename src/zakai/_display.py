@@ -33,9 +33,9 @@ def html_table(
     """Return a table for a notebook: a title, columns, rows (of `total` or of many the first ones), and notes below."""
     listed = list(rows)
     left = max(len(listed), total) - min(len(listed), MOST_ROWS)
-    more = [f"... {left:,} more"] if left else []
+    omitted = [f"... {left:,} more"] if left else []
     head = "".join(f"<th>{escape(name)}</th>" for name in header)
     body = "".join("<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in listed[:MOST_ROWS])
-    below = "".join(f"<div>{escape(note)}</div>" for note in [*more, *notes])
+    below = "".join(f"<div>{escape(note)}</div>" for note in [*omitted, *notes])
     top = f"<thead><tr>{head}</tr></thead>" if any(header) else ""
     return f"<div><b>{escape(title)}</b><table>{top}<tbody>{body}</tbody></table>{below}</div>"

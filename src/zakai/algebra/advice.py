@@ -100,15 +100,15 @@ def _logarithms(model: Model) -> tuple[str, Model] | None:
     if not changed or len({*names, *model.parameters, *model.inputs}) < len(names) + len(model.parameters) + len(model.inputs):
         return None
 
-    def moved(formula: Any) -> sp.Expr:
+    def substituted(formula: Any) -> sp.Expr:
         return sp.expand(sp.simplify(formula.subs(values, simultaneous=True)))
 
     keys = {
         **_keys(model),
         "state": names,
-        "drift": [moved(formula) for formula in drift],
-        "observation": [moved(formula) for formula in model.observation],
-        "diffusion": [[moved(entry) for entry in row] for row in diffusion.tolist()],
+        "drift": [substituted(formula) for formula in drift],
+        "observation": [substituted(formula) for formula in model.observation],
+        "diffusion": [[substituted(entry) for entry in row] for row in diffusion.tolist()],
         "domain": {name: interval.keys() for name, interval in model.domain.items() if model.state.index(name) not in changed},
     }
     if DOMAIN in model.features and not keys["domain"]:

@@ -70,7 +70,7 @@ class Groups:
         return [(tuple(states), tuple(rows)) for states, rows in found.values()]
 
 
-def connected(model: Model, more: Callable[[Groups], None] | None = None) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+def connected(model: Model, join: Callable[[Groups], None] | None = None) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
     """The places of the states and of the observations of each connected part; `more` may join some."""
     if model.features:
         return [(tuple(range(model.n)), tuple(range(model.m)))]
@@ -83,8 +83,8 @@ def connected(model: Model, more: Callable[[Groups], None] | None = None) -> lis
         for (i, j), entry in matrix.todok().items():
             if i < j and tidy(entry) != 0:
                 groups.join((first + i, first + j))
-    if more is not None:
-        more(groups)
+    if join is not None:
+        join(groups)
     return groups.parts()
 
 

@@ -81,9 +81,9 @@ class Certificate:
         return f"{self.code}: {self.statement} [{self.source}] Witness: {self.witness}"
 
 
-def certificate(code: str, witness: str, model: Model, elements: tuple, **more: Any) -> Certificate:
+def certificate(code: str, witness: str, model: Model, elements: tuple, **details: Any) -> Certificate:
     """The certificate of a code, with its statement and source."""
-    return Certificate(code, *STATEMENTS[code], witness, model, elements, **more)
+    return Certificate(code, *STATEMENTS[code], witness, model, elements, **details)
 
 
 def spoken(word: Word) -> str:

@@ -109,14 +109,14 @@ def _exploding(model: Model, drift: NumericFunction, starts: np.ndarray) -> int 
         three = slowed(path + 0.5 * MOVE * two)
         four = slowed(path + MOVE * three)
         new = path + MOVE / 6 * (one + 2 * two + 2 * three + four)
-        there = np.all(np.isfinite(new), axis=-1)
-        path = np.where((going & there)[:, None], new, path)
+        finite = np.all(np.isfinite(new), axis=-1)
+        path = np.where((going & finite)[:, None], new, path)
         x = path[:, :-1]
         far = np.linalg.norm(x, axis=-1) > FAR * np.linalg.norm(starts, axis=-1)
-        exploded = np.flatnonzero(going & (far | ~there) & (_outward(model, drift, x) > fast))
+        exploded = np.flatnonzero(going & (far | ~finite) & (_outward(model, drift, x) > fast))
         if len(exploded):
             return int(exploded[0])
-        going &= there
+        going &= finite
     return None
 
 
@@ -136,11 +136,11 @@ def _confirmed(model: Model, drift: NumericFunction, start: np.ndarray, left: li
     while solver.status == "running" and left[0] > 0:
         before = solver.y
         solver.step()
-        there = np.all(np.isfinite(solver.y)) and solver.status != "failed"
-        path = solver.y if there else before
+        finite = np.all(np.isfinite(solver.y)) and solver.status != "failed"
+        path = solver.y if finite else before
         far = np.linalg.norm(path[:-1]) > FAR * np.linalg.norm(start)
-        if (far or not there) and _outward(model, drift, path[None, :-1])[0] > fast:
+        if (far or not finite) and _outward(model, drift, path[None, :-1])[0] > fast:
             return float(path[-1])
-        if not there:
+        if not finite:
             break
     return None

@@ -122,9 +122,9 @@ def _gathered(powers: list[tuple[Terms, sp.Expr]], terms: Terms, count: sp.Expr)
     for index, (known, before) in enumerate(powers):
         for key in known if len(known) == len(terms) else ():
             shift = [a - b for a, b in zip(key, first, strict=True)]
-            moved = {tuple(sp.expand(a + b) for a, b in zip(slope, shift, strict=True)): c for slope, c in terms.items()}
+            shifted = {tuple(sp.expand(a + b) for a, b in zip(slope, shift, strict=True)): c for slope, c in terms.items()}
             ratio = terms[first] / known[key]
-            if moved.keys() == known.keys() and all(is_zero(moved[slope] - ratio * known[slope]) is True for slope in known):
+            if shifted.keys() == known.keys() and all(is_zero(shifted[slope] - ratio * known[slope]) is True for slope in known):
                 powers[index] = known, tidy(before + count)
                 return {tuple(sp.expand(-count * entry) for entry in shift): ratio**count}
     powers.append((terms, count))

@@ -126,17 +126,17 @@ def kolmogorov_series(model: Model, order: int) -> KolmogorovSeries:
         sum((ring.covariance[i][j] * slope[j] for j in range(n)), ring.zero) - drift[i] for i in range(n)
     ]
 
-    def moved(p: Polynomial) -> Polynomial:
+    def diffused(p: Polynomial) -> Polynomial:
         """G : Hess p / 2 + (G grad a - f) . grad p."""
         return ring.laplacian(p) / 2 + sum((t * d for t, d in zip(transport, ring.gradient(p))), ring.zero)
 
     divergence = sum((drift[i].derivative(i) for i in range(n)), ring.zero)
-    W = moved(a) - ring.weighted(slope, slope) / 2 - divergence - ring.read(potential, model.x)
+    W = diffused(a) - ring.weighted(slope, slope) / 2 - divergence - ring.read(potential, model.x)
     coefficients: list[Polynomial] = [ring.one]
     logarithms: list[Polynomial] = []
     for k in range(1, order + 1):
-        coefficients.append(ring.radial(W * coefficients[-1] + moved(coefficients[-1]), k))
-        rate = W if k == 1 else moved(logarithms[-1])
+        coefficients.append(ring.radial(W * coefficients[-1] + diffused(coefficients[-1]), k))
+        rate = W if k == 1 else diffused(logarithms[-1])
         gradients = [ring.gradient(p) for p in logarithms]
         rate = rate + sum((ring.weighted(gradients[i - 1], gradients[k - 2 - i]) for i in range(1, k - 1)), ring.zero) / 2
         logarithms.append(ring.radial(rate, k))
@@ -165,9 +165,9 @@ def _polynomial_system(model: Model) -> tuple[list[sp.Expr], sp.Expr, sp.Immutab
 
 def _readable(model, ring, G, order, a, W, coefficients, logarithms) -> KolmogorovSeries:
     """The polynomials in x and y instead of z and y."""
-    taken = {symbol.name for symbol in (*model.x, *model.parameter_symbols)}
+    used_names = {symbol.name for symbol in (*model.x, *model.parameter_symbols)}
     prefix = "y_"
-    while any(prefix + name in taken for name in model.state):
+    while any(prefix + name in used_names for name in model.state):
         prefix += "_"
     y = tuple(sp.Symbol(prefix + name, real=True) for name in model.state)
     # The places of z are taken by x.

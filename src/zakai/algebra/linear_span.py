@@ -111,23 +111,23 @@ class Span:
 
     def reduce(self, vector: Vector) -> tuple[Vector, Vector]:
         """Return (the remainder of a vector modulo the span, the combination of words that was subtracted)."""
-        left, taken = dict(vector), Vector()
+        left, subtracted = dict(vector), Vector()
         for pivot in [key for key in vector if key in self.rows]:
             factor = left[pivot]
             row, words = self.rows[pivot]
             _subtract(left, factor, row)
-            _subtract(taken, -factor, words)
-        return left, taken
+            _subtract(subtracted, -factor, words)
+        return left, subtracted
 
     def add(self, vector: Vector, word: Any) -> bool:
         """Whether the vector is new; then it is in the span from now on."""
-        left, taken = self.reduce(vector)
+        left, subtracted = self.reduce(vector)
         if not left:
             return False
         pivot = max(left)
         scale = self._one / left[pivot]
         combination = {word: self._one}
-        _subtract(combination, self._one, taken)
+        _subtract(combination, self._one, subtracted)
         row = {key: scale * c for key, c in left.items()}
         combination = {key: scale * c for key, c in combination.items()}
         for other, words in self.rows.values():

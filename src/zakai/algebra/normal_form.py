@@ -17,11 +17,11 @@ from zakai.models.model import Model
 
 def operator_symbols(model: Model) -> tuple[sp.Symbol, tuple[sp.Symbol, ...]]:
     """L_0 and the D_i = d/dx_i - g_i: L0, D1, D2, ...; with a letter twice, or more, where the model has such a name."""
-    taken = {*model.state, *model.parameters, *model.functions}
+    used_names = {*model.state, *model.parameters, *model.functions}
     first, letter = "L", "D"
-    while f"{first}0" in taken:
+    while f"{first}0" in used_names:
         first += "L"
-    while any(f"{letter}{i + 1}" in taken for i in range(model.n)):
+    while any(f"{letter}{i + 1}" in used_names for i in range(model.n)):
         letter += "D"
     D = tuple(sp.Symbol(f"{letter}{i + 1}", commutative=False) for i in range(model.n))
     return sp.Symbol(f"{first}0", commutative=False), D

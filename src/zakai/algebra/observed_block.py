@@ -111,14 +111,14 @@ def _gradient(operators: DmzOperators, p: Symbol) -> dict[Any, Vector]:
 def _at(field: sp.MatrixBase, model: Model, pivots: Mapping[sp.Symbol, sp.Symbol]) -> tuple[sp.Expr, ...] | None:
     """A function of W x as one of z."""
     for value in (sp.Integer(0), sp.Rational(1, 2), sp.Rational(7, 5)):
-        moved = field.xreplace({x: pivots.get(x, value) for x in model.x}).doit()
-        if not moved.has(sp.nan, sp.zoo, sp.oo):
-            return tuple(tidy(sp.expand(entry)) for entry in moved)
+        substituted = field.xreplace({x: pivots.get(x, value) for x in model.x}).doit()
+        if not substituted.has(sp.nan, sp.zoo, sp.oo):
+            return tuple(tidy(sp.expand(entry)) for entry in substituted)
     return None
 
 
-def _symbols(count: int, taken: AbstractSet[str]) -> tuple[sp.Symbol, ...]:
+def _symbols(count: int, used_names: AbstractSet[str]) -> tuple[sp.Symbol, ...]:
     letter = "z"
-    while taken & {f"{letter}{k + 1}" for k in range(count)}:
+    while used_names & {f"{letter}{k + 1}" for k in range(count)}:
         letter += "_"
     return tuple(sp.Symbol(f"{letter}{k + 1}", real=True) for k in range(count))

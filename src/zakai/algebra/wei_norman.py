@@ -94,9 +94,9 @@ def wei_norman(
     observation: (m, d + 1), the coordinates of S^-1 h; names: what no new symbol may be called.  Raises NoFactorisation.
     """
     given = [entry for row in (*constants.values(), *observation) for entry in row]
-    taken = names | {symbol.name for part in (*basis, *given) for symbol in part.free_symbols}
-    (r,) = _symbols(("r",), range(1, len(basis)), taken)
-    y, rates = path_symbols(len(observation), taken)
+    used_names = names | {symbol.name for part in (*basis, *given) for symbol in part.free_symbols}
+    (r,) = _symbols(("r",), range(1, len(basis)), used_names)
+    y, rates = path_symbols(len(observation), used_names)
     domain, _ = sp.construct_domain(given, field=True)
     polynomials, *variables = ring([*r, *y], domain)
     statistics, path = variables[: len(r)], variables[len(r) :]
@@ -182,16 +182,16 @@ def _add(target: Element, element: Element, factor: Any) -> None:
             target.pop(k, None)
 
 
-def path_symbols(count: int, taken: AbstractSet[str]) -> tuple[tuple[sp.Symbol, ...], tuple[sp.Symbol, ...]]:
+def path_symbols(count: int, used_names: AbstractSet[str]) -> tuple[tuple[sp.Symbol, ...], tuple[sp.Symbol, ...]]:
     """y, or y1, ..., ym, and their rates ydot, with names that are not taken."""
-    y, rates = _symbols(("y", "ydot"), [""] if count == 1 else range(1, count + 1), taken)
+    y, rates = _symbols(("y", "ydot"), [""] if count == 1 else range(1, count + 1), used_names)
     return y, rates
 
 
-def _symbols(stems: tuple[str, ...], endings: Iterable[Any], taken: AbstractSet[str]) -> tuple[tuple[sp.Symbol, ...], ...]:
+def _symbols(stems: tuple[str, ...], endings: Iterable[Any], used_names: AbstractSet[str]) -> tuple[tuple[sp.Symbol, ...], ...]:
     """A symbol of every stem for each ending; the stems begin with their letter twice, or more, where a name is taken."""
     endings, letter = list(endings), stems[0]
-    while taken & {f"{stem}{ending}" for stem in stems for ending in endings}:
+    while used_names & {f"{stem}{ending}" for stem in stems for ending in endings}:
         stems = tuple(f"{letter}{stem}" for stem in stems)
     return tuple(tuple(sp.Symbol(f"{stem}{ending}", real=True) for ending in endings) for stem in stems)
 

@@ -27,7 +27,7 @@ def stored(moment: Moment) -> tuple[dict[str, Any], list[np.ndarray]]:
     """Return a moment as words and arrays."""
     arrays: list[np.ndarray] = []
     info = moment.info
-    said = {
+    data = {
         "time": moment.time,
         "length": moment.length,
         "state": _encoded(moment.state, arrays),
@@ -38,10 +38,10 @@ def stored(moment: Moment) -> tuple[dict[str, Any], list[np.ndarray]]:
         "notes": list(moment.notes),
         "inputs": None if moment.inputs is None else _encoded((moment.inputs.times, moment.inputs.values), arrays),
     }
-    return said, arrays
+    return data, arrays
 
 
-def restored(feed: Feed, said: Mapping[str, Any], arrays: list[np.ndarray]) -> Moment:
+def restored(feed: Feed, data: Mapping[str, Any], arrays: list[np.ndarray]) -> Moment:
     """Return the moment that words and arrays describe; it is not yet the filter's own.
 
     Raises:
@@ -49,36 +49,36 @@ def restored(feed: Feed, said: Mapping[str, Any], arrays: list[np.ndarray]) -> M
     """
     try:
         with np.errstate(all="ignore"):
-            return _restored(feed, said, arrays)
+            return _restored(feed, data, arrays)
     except Exception as error:  # a forged file can make any part of a method fail
         raise ValueError(str(error)) from None
 
 
-def _restored(feed: Feed, said: Mapping[str, Any], arrays: list[np.ndarray]) -> Moment:
+def _restored(feed: Feed, data: Mapping[str, Any], arrays: list[np.ndarray]) -> Moment:
     keys = ("time", "length", "state", "info", "health", "values", "times", "notes", "inputs")
-    _check(isinstance(said, dict) and set(said) == set(keys))
-    start, time, length = float(feed.setting.model.start), _number(said["time"]), _number(said["length"])
+    _check(isinstance(data, dict) and set(data) == set(keys))
+    start, time, length = float(feed.setting.model.start), _number(data["time"]), _number(data["length"])
     _check(0.0 <= length <= time - start)
     numbered = iter(enumerate(arrays))
-    state = _decoded(feed.now.state, said["state"], numbered)
-    values, times = _numbers(said["values"], feed.m), _numbers(said["times"], feed.m)
-    notes = said["notes"]
+    state = _decoded(feed.now.state, data["state"], numbered)
+    values, times = _numbers(data["values"], feed.m), _numbers(data["times"], feed.m)
+    notes = data["notes"]
     _check(type(notes) is list and all(type(note) is str and note.isprintable() for note in notes))
     if feed.kind == "path":
         _check(all(start <= at <= time for at in times))
     else:
         _check(values == (0.0,) * feed.m and times == (start,) * feed.m)
-    if said["info"] is None:
-        _check(said["health"] is None and said["inputs"] is None and time == start)
+    if data["info"] is None:
+        _check(data["health"] is None and data["inputs"] is None and time == start)
         moment = Moment(time, length, state, None, values, times, tuple(notes))
         fresh, own = stored(feed.now), stored(moment)
         _check(fresh[0] == own[0] and all(a.tobytes() == b.tobytes() for a, b in zip(fresh[1], own[1], strict=True)))
         return moment
     n = feed.setting.model.n
     template = (0.0, np.zeros(n), np.zeros((n, n)))
-    increment, mean, cov = _decoded(template, said["info"], numbered)
-    health = said["health"]
-    inputs = _inputs(feed.setting.model, time, said["inputs"], numbered)
+    increment, mean, cov = _decoded(template, data["info"], numbered)
+    health = data["health"]
+    inputs = _inputs(feed.setting.model, time, data["inputs"], numbered)
     _check(next(numbered, None) is None and type(health) is dict and all(type(one) is float for one in health.values()))
     _check(time > start or (time == start and feed.kind == "samples"))
     moment = Moment(time, length, state, Info(increment, mean, cov, health), values, times, tuple(notes), inputs)
@@ -112,12 +112,12 @@ def _check_believable(feed: Feed, moment: Moment) -> None:
         follower.moved(moment.time + moment.length, [math.nan] * feed.m, moment.inputs)
 
 
-def _inputs(model: Model, time: float, said: Any, arrays: Iterator[tuple[int, np.ndarray]]) -> Inputs | None:
+def _inputs(model: Model, time: float, data: Any, arrays: Iterator[tuple[int, np.ndarray]]) -> Inputs | None:
     """Return the known inputs from the time of a moment on."""
-    if said is None:
+    if data is None:
         _check(not model.inputs)
         return None
-    inputs = Inputs(*_decoded((np.zeros(0), np.zeros((0, 0))), said, arrays))
+    inputs = Inputs(*_decoded((np.zeros(0), np.zeros((0, 0))), data, arrays))
     inputs.check(model, time, time)
     return inputs
 
@@ -133,26 +133,26 @@ def _encoded(part: Any, arrays: list[np.ndarray]) -> Any:
     return [_encoded(one, arrays) for one in part]
 
 
-def _decoded(template: Any, said: Any, arrays: Iterator[tuple[int, np.ndarray]]) -> Any:
+def _decoded(template: Any, data: Any, arrays: Iterator[tuple[int, np.ndarray]]) -> Any:
     """Return the part that JSON describes, of the kind of the template."""
     template = template.item() if isinstance(template, np.generic) else template
-    if isinstance(said, dict):
-        _check(set(said) == {"array"} and (template is None or isinstance(template, np.ndarray)))
+    if isinstance(data, dict):
+        _check(set(data) == {"array"} and (template is None or isinstance(template, np.ndarray)))
         number, array = next(arrays, (None, np.zeros(0)))
-        _check(type(said["array"]) is int and said["array"] == number)
+        _check(type(data["array"]) is int and data["array"] == number)
         if template is not None:
             _check(array.dtype == np.asarray(template).dtype and array.ndim == np.ndim(template))
         return array
-    if isinstance(said, list):
-        _check(isinstance(template, tuple) and len(template) == len(said))
-        parts = [_decoded(own, one, arrays) for own, one in zip(template, said, strict=True)]
+    if isinstance(data, list):
+        _check(isinstance(template, tuple) and len(template) == len(data))
+        parts = [_decoded(own, one, arrays) for own, one in zip(template, data, strict=True)]
         return type(template)(*parts) if hasattr(template, "_fields") else tuple(parts)
-    if said is None:
+    if data is None:
         _check(template is None or isinstance(template, np.ndarray))
         return None
-    _check(type(said) is type(template))
-    _check(type(said) is not float or abs(said) <= LARGEST)
-    return said
+    _check(type(data) is type(template))
+    _check(type(data) is not float or abs(data) <= LARGEST)
+    return data
 
 
 def _check(holds: Any) -> None:
@@ -160,11 +160,11 @@ def _check(holds: Any) -> None:
         raise ValueError("not a moment of this filter")
 
 
-def _number(said: Any) -> float:
-    _check(type(said) is float and abs(said) <= LARGEST)
-    return float(said)
+def _number(data: Any) -> float:
+    _check(type(data) is float and abs(data) <= LARGEST)
+    return float(data)
 
 
-def _numbers(said: Any, count: int) -> tuple[float, ...]:
-    _check(type(said) is list and len(said) == count)
-    return tuple(map(_number, said))
+def _numbers(data: Any, count: int) -> tuple[float, ...]:
+    _check(type(data) is list and len(data) == count)
+    return tuple(map(_number, data))

@@ -68,18 +68,18 @@ class Feed:
         seen = tuple([value == value for value in values])
         if self.kind == "path":
             spans = [time - last for last in last_times]
-            late = any([there and one > (1 + ROUNDING) * span for one, there in zip(spans, seen)])
-            elapsed = tuple([_rounded(one, length) if there else 0.0 for one, there in zip(spans, seen)])
+            late = any([is_seen and one > (1 + ROUNDING) * span for one, is_seen in zip(spans, seen)])
+            elapsed = tuple([_rounded(one, length) if is_seen else 0.0 for one, is_seen in zip(spans, seen)])
             increments = [value - last for value, last in zip(values, last_values)]
-            last_values = tuple([value if there else last for value, last, there in zip(values, last_values, seen)])
-            last_times = tuple([time if there else last for last, there in zip(last_times, seen)])
+            last_values = tuple([value if is_seen else last for value, last, is_seen in zip(values, last_values, seen)])
+            last_times = tuple([time if is_seen else last for last, is_seen in zip(last_times, seen)])
             values = increments
         else:
             elapsed = (0.0 if self.kind == "samples" else _rounded(span, length),) * self.m
             if self.kind == "rates":
                 values = [value * span for value in values]
         if False in seen:
-            values = [value if there else 0.0 for value, there in zip(values, seen)]
+            values = [value if is_seen else 0.0 for value, is_seen in zip(values, seen)]
         if self._kept is None:
             prepared, notes = self._prepared(start, time, seen, elapsed, inputs)
         else:

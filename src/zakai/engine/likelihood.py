@@ -129,9 +129,9 @@ class LogLikelihood:
             part, direction = job
             if direction is None:
                 return part.evidence(theta)
-            moved = theta.astype(complex)
-            moved[self._where[direction]] += 1j * STEP
-            return part.evidence(moved)
+            shifted = theta.astype(complex)
+            shifted[self._where[direction]] += 1j * STEP
+            return part.evidence(shifted)
 
         work: list[tuple[_Part, int | None]] = []
         for part in self._parts:

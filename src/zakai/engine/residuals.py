@@ -81,8 +81,8 @@ def _by_sums(sums: PredictiveSums, evidence: PredictiveEvidence, k: int, state: 
     if not sums.possible:
         return None
     method, (_, prepared) = sums.setting.method, evidence.prefix(0)
-    moved, _ = method.step(prepared, k, state, np.zeros(len(values)))
-    states = [moved] if sums.samples else [moved, state]
+    advanced, _ = method.step(prepared, k, state, np.zeros(len(values)))
+    states = [advanced] if sums.samples else [advanced, state]
     return sums.row(k, [method.density(prepared, one) for one in states], values)
 
 

@@ -27,15 +27,15 @@ from zakai.numerics.transition import Array
 TOLERANCE = 1e-12
 _MOST_NODES = {1: 2**13, 2: 2**15, 3: 2**17}
 _REACH = 8.6  # standard deviations to which a Gaussian is followed: there it is 1e-16 of its maximum
-_NARROWER = 4.0  # by how much the Gaussians of one level are narrower than those before
-_SPACING = 0.186  # their spacing, in standard deviations of what they make up: flat to 1e-14
+_NARROWER = 4.0  # ratio of the standard deviations of two successive levels
+_SPACING = 0.186  # spacing of a level's Gaussians, in standard deviations of the previous level: their sum is exact to 1e-14
 
 
 class Prior(NamedTuple):
     """The families of v_0 (leading axis J), and their errors.
 
-    `log_error` is the logarithm of the error that a node causes, `edge` marks the nodes at the edge, and `error` is the
-    largest error relative to the maximum of the prior.
+    `log_error` is the logarithm of the error of each node, `edge` marks the nodes at the edge, and `error` is the largest error
+    relative to the maximum of the prior.
     """
 
     families: Family
@@ -56,7 +56,7 @@ class Nodes(NamedTuple):
 
 
 def prior_families(gauge: Gauge, model: Model, prior: Any) -> Prior:
-    """Return the families of a prior; where the nodes are follows from the real parts of the parameters."""
+    """Return the families of a prior; the real parts of the parameters alone decide the places of the nodes."""
     if isinstance(prior, DensityPrior):
         return _from_density(gauge, model, prior)
     if isinstance(prior, GaussianPrior):
@@ -79,14 +79,14 @@ def prior_families(gauge: Gauge, model: Model, prior: Any) -> Prior:
 
 
 def _like(own: Array, directions: Array) -> Array:
-    """Return directions that span the same as `directions`, along which a state moves as along `own`."""
+    """Return directions with the span of `directions` and the scale of `own`."""
     if not is_complex(directions):
         return directions
     return np.linalg.solve(directions @ np.linalg.pinv(own), directions)
 
 
 def _conditional(plan: _GaussianPlan, directions: Any, nodes: Nodes, log_mass: Any) -> Family:
-    """The family of sum_i w_i N(z; z_i, W) N(x | z), x given z being that of N(mean, cov)."""
+    """Return the family of sum_i w_i N(z; z_i, W) N(x | z), with the law of x given z under N(mean, cov)."""
     gain = plan.gain(directions)
     centre = directions @ plan.mean
     narrowed = plan.cov - gain @ (directions @ plan.cov @ directions.T - nodes.cov) @ gain.T
@@ -105,7 +105,7 @@ def _conditional(plan: _GaussianPlan, directions: Any, nodes: Nodes, log_mass: A
 
 
 def _joined(parts: list[tuple[Family, Nodes]], error: float) -> Prior:
-    """Return all parts with as many nodes each, those that are added without weight."""
+    """Return all parts, padded to the same number of nodes by nodes of weight zero."""
     most = max(len(family.log_weights) for family, _ in parts)
 
     def padded(array: Array, value: float) -> Array:
@@ -123,7 +123,7 @@ def _joined(parts: list[tuple[Family, Nodes]], error: float) -> Prior:
 
 
 def _edge(sizes: tuple[int, ...]) -> np.ndarray:
-    """One at the outermost two layers of a grid."""
+    """Return one at the outermost two layers of a grid and zero elsewhere."""
     index = np.stack(np.meshgrid(*[np.arange(s) for s in sizes], indexing="ij"), axis=-1)
     outside = (index < 2) | (index >= np.array(sizes) - 2)
     return np.asarray(np.any(outside & (np.array(sizes) > 1), axis=-1), float).ravel()
@@ -131,7 +131,7 @@ def _edge(sizes: tuple[int, ...]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Level:
-    """Return Gaussians of deviation `width` at `points` (N,) that add up to the previous ones, replaced at `near` (N,)."""
+    """Gaussians of standard deviation `width` at `points` (N,), whose sum is the previous level; `near` (N,) are split again."""
 
     points: np.ndarray
     spacing: float
@@ -140,7 +140,7 @@ class _Level:
 
 
 class _GaussianPlan:
-    """Where the nodes of one Gaussian component are, decided for the model's own parameters; they move with D mean."""
+    """The places of the nodes of one Gaussian component for the model's own parameters; other parameters shift them by D mean."""
 
     def __init__(self, gauge: Gauge, model: Model, tilts: Tilts, mean: np.ndarray, cov: np.ndarray):
         self.gauge, self.model, self.mean, self.cov = gauge, model, mean, cov
@@ -182,7 +182,7 @@ class _GaussianPlan:
             raise InputError(f"{model.source}: prior: e^phi is not finite, or zero, where the prior is; give a narrower prior")
 
     def _kink(self, tilts: Tilts) -> tuple[float, float]:
-        """Outside of these z one exponential is all of e^phi, to 1e-16."""
+        """Return the ends of the kink: outside of them one exponential equals e^phi to 1e-16."""
         along, logs = _along(tilts), tilts.logs
         assert logs is not None
         self.order = np.argsort(along)
@@ -199,7 +199,7 @@ class _GaussianPlan:
         return low, high
 
     def _split(self, mean: float, width: float) -> tuple[float, float]:
-        """The levels of a component that is wide against the kink, and the ends of the region of the last grid."""
+        """Divide a component that is wide against the kink into levels, and return the ends of the last grid."""
         low, high = mean - self._margin(width), mean + self._margin(width)
         assert self.kink is not None
         while width * self.gap > 8.0 and low < self.kink[1] and high > self.kink[0]:
@@ -214,22 +214,22 @@ class _GaussianPlan:
         return low, high
 
     def _margin(self, width: float) -> float:
-        """How far from the kink a Gaussian must be for one exponential to be all of e^phi in it, tilted by the others too."""
+        """Return the distance from the kink beyond which one exponential equals e^phi for a Gaussian, tilted or not."""
         return max(_REACH * width, 0.5 * self.gap * width**2)
 
     def gain(self, directions: Any) -> Any:
-        """What x follows z by, (n, k): P D'V (V'D P D'V)^-1 V', where V spans what has width."""
+        """Return the gain (n, k) of x given z: P D'V (V'D P D'V)^-1 V', V the directions of positive variance."""
         across = self.cov @ directions.T @ self.vectors
         return across @ np.linalg.inv(self.vectors.T @ directions @ across) @ self.vectors.T
 
     def _shift(self, tilts: Tilts) -> Any:
-        """By how much the nodes are elsewhere than for the model's own parameters."""
+        """Return the shift of the nodes against those for the model's own parameters."""
         return tilts.directions @ self.mean - self.centre
 
     def _potential(self, gauge: Gauge, tilts: Tilts) -> Callable[[Any], Any]:
         def phi(z: Array) -> Array:
             if self.vectors.shape[1] < len(z[0]):
-                # Where z has no width there may be no x; that of the mean is meant.
+                # In a direction of zero variance z is replaced by the mean, for which there is an x.
                 centre = tilts.directions @ self.mean
                 z = centre + (z - centre) @ self.gain(tilts.directions).T @ tilts.directions.T
             x = lifted(tilts.directions, z)
@@ -240,7 +240,7 @@ class _GaussianPlan:
         return phi
 
     def _source(self, tilts: Tilts) -> tuple[Any, Any, Any]:
-        """(points, log-weights, covariance) of the Gaussians of z that the last grid is to represent."""
+        """Return points, log-weights and covariance of the Gaussians of z that the last grid represents."""
         directions = tilts.directions
         points, logs = (directions @ self.mean)[None], np.zeros(1)
         cov = self.vectors.T @ (directions @ self.cov @ directions.T) @ self.vectors
@@ -250,7 +250,7 @@ class _GaussianPlan:
         return points, logs, cov
 
     def _weights(self, level: _Level, shift: Any, points: Any, logs: Any, cov: Any) -> Any:
-        """The log-weights of a level's Gaussians, of those at `points` that they make up."""
+        """Return the log-weights of a level's Gaussians, whose sum is the Gaussians at `points`."""
         variance = cov[0, 0] - level.width**2
         away = (level.points + shift)[:, None] - points[:, 0]
         each = logs - 0.5 * away**2 / variance - 0.5 * np.log(2 * np.pi * variance)
@@ -265,11 +265,11 @@ class _GaussianPlan:
         return log_sum_exp(each) - 0.5 * log_determinant(2 * np.pi * cov)
 
     def nodes(self, tilts: Tilts) -> Iterator[Nodes]:
-        """The parts of v_0(z) for the parameters theta."""
+        """Yield the parts of v_0(z) for the parameters theta."""
         shift = self._shift(tilts)
         points, logs = (tilts.directions @ self.mean)[None], np.zeros(1)
         cov = self.vectors.T @ (tilts.directions @ self.cov @ tilts.directions.T) @ self.vectors
-        # The outermost Gaussians are those of the first level, or what they are written as.
+        # The outermost Gaussians are those of the first level, or the levels that replace them.
         ends = np.array([True, True])
         for level in self.levels:
             weights = self._weights(level, shift, points, logs, cov)
@@ -297,7 +297,7 @@ class _GaussianPlan:
         yield _represented(self.grid, z, log_u, phi, self.error, edge)
 
     def _tilted(self, tilts: Tilts, points: Any, log_weights: Any, cov: Any, which: np.ndarray, edge: np.ndarray) -> Nodes:
-        """Gaussians that lie where one exponential, `which`, is all of e^phi: e^{-q z} N(z; s, W) / c."""
+        """Return the nodes where one exponential, `which`, equals e^phi: e^{-q z} N(z; s, W) / c."""
         along, variance = _along(tilts)[which], cov[0, 0]
         assert tilts.logs is not None
         logs = log_weights - along * points[:, 0] + 0.5 * along**2 * variance - tilts.logs[which]
@@ -306,7 +306,7 @@ class _GaussianPlan:
 
 
 def _along(tilts: Tilts) -> Any:
-    """The slopes (K,) in z, of one direction."""
+    """Return the slopes (K,) in z of one direction."""
     assert tilts.slopes is not None
     return tilts.slopes @ tilts.directions[0] / (tilts.directions[0] @ tilts.directions[0])
 
@@ -336,7 +336,7 @@ def _from_density(gauge: Gauge, model: Model, prior: DensityPrior) -> Prior:
     found = prior_grid(lambda z: log_u(z, theta.real), model.n, tolerance=TOLERANCE, aligned=False, source=name)
     sizes = np.array(found.log_values.shape)
     basis, centre = found.basis, found.centre
-    # As many points as the smallest standard deviation along an axis needs.
+    # The smallest standard deviation along an axis decides the number of points.
     finer = np.clip(_narrowest(found.log_values.real) / 2.5, 0.1, 1e3)
     spacings = np.maximum(np.ceil((sizes - 1) / finer), 8).astype(int)
     grid = NodeGrid(centre - basis @ (sizes // 2), basis * ((sizes - 1) / spacings), tuple(int(c) + 1 for c in spacings))
@@ -357,9 +357,9 @@ def _narrowest(log_values: Array) -> Array:
     found = []
     matters = log_values > log_values.max() - 14.0
     for axis in range(log_values.ndim):
-        moved, used = np.moveaxis(log_values, axis, 0), np.moveaxis(matters, axis, 0)[1:-1]
+        along, used = np.moveaxis(log_values, axis, 0), np.moveaxis(matters, axis, 0)[1:-1]
         with np.errstate(invalid="ignore"):
-            curvature = 2 * moved[1:-1] - moved[:-2] - moved[2:]
+            curvature = 2 * along[1:-1] - along[:-2] - along[2:]
         largest = np.max(np.where(used & np.isfinite(curvature), curvature, 0.0), initial=1e-12)
         found.append(1.0 / np.sqrt(largest))
     return np.array(found)

@@ -147,10 +147,10 @@ def posterior(gauge: Gauge, tilts: Tilts, t: Any, families: Family) -> Posterior
     second = transposed(s) @ (share.sum(axis=2)[:, :, None] * s)
     here = centres + (families.response @ near[:, :, None])[:, :, 0][:, None]
     reference = np.einsum("je,jen->n", zeroth, here)
-    moved = first @ transposed(families.response)
-    mean = reference + moved.sum(axis=(0, 1))
+    displacement = first @ transposed(families.response)
+    mean = reference + displacement.sum(axis=(0, 1))
     away = here - mean
-    cross = np.einsum("jen,jem->nm", away, moved)
+    cross = np.einsum("jen,jem->nm", away, displacement)
     cov = (
         np.einsum("je,jen,jem->nm", zeroth, away, away)
         + cross
@@ -197,7 +197,7 @@ def _summed(gauge: Gauge, tilts: Tilts, t: Any, families: Family) -> tuple[Array
         factor = np.full(inner.shape, np.nan)
     with np.errstate(invalid="ignore"):
         along = transposed(np.linalg.solve(factor, across))
-    moved = points @ transposed(along)
+    displacement = points @ transposed(along)
     shifted = families.nodes @ transposed(families.response)
-    x = families.mean[:, None, None] + shifted[:, :, None] + moved[:, None]
-    return families.mean[:, None] + moved, families.cov - along @ transposed(along), gauge.potential(x, t) + log_weights
+    x = families.mean[:, None, None] + shifted[:, :, None] + displacement[:, None]
+    return families.mean[:, None] + displacement, families.cov - along @ transposed(along), gauge.potential(x, t) + log_weights

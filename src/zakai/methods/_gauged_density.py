@@ -18,9 +18,9 @@ from zakai.numerics.transition import Array, transposed
 
 # Half the points along an axis of the first grid and of the last one, by the number of states.
 _HALVES = {1: (200, 12_800), 2: (64, 256)}
-# The most points times Gaussians of a grid after the first.
+# Bound on points times Gaussians of a refined grid.
 _MOST_TERMS = 2**26
-# How far the sums over a grid may be from the moments that are known, in standard deviations.
+# Bound on the error of the sums over a grid against the known moments, in standard deviations.
 _RESOLVED = 1e-8
 
 
@@ -29,9 +29,8 @@ class GaugedDensity(DensityMethods):
     """The density exp(potential(x)) times a mixture of Gaussians, with known moments.
 
     `mixture` is v of mass one, `potential` takes x (..., n) to phi and what normalises (...), `average` (n,) and `spread` (n, n)
-    are mean and covariance; `points` (K, n) and `margins` (K, n) say where the mass is: around each point, and how far.
-    Densities and moments need no grid; the mode, quantiles, marginals and samples are those of one that is as fine as these
-    moments ask for, and a warning says where none is.
+    are mean and covariance; the mass lies within `margins` (K, n) around `points` (K, n).  Densities and moments need no grid;
+    the mode, quantiles, marginals and samples are those of a grid that reproduces these moments; otherwise there is a warning.
     """
 
     mixture: GaussianMixture
@@ -78,7 +77,7 @@ class GaugedDensity(DensityMethods):
 
     @cached_property
     def grid(self) -> GridDensity:
-        """The values on a grid that holds the mass, with twice the points until half of them would give the moments."""
+        """The values on a grid that covers the mass; its points are doubled until every other point gives the known moments."""
         n = len(self.names)
         half, most = _HALVES[n]
         named = self.names, self.periodic
@@ -90,7 +89,7 @@ class GaugedDensity(DensityMethods):
             basis = vectors * (0.5 * (high - low) / half)
             index = np.stack(np.meshgrid(*[np.arange(-half, half + 1.0)] * n, indexing="ij"), axis=-1)
             logs = self.log_density(centre + index @ basis.T)
-            # Sums over every other point err as much as what is read between the points.
+            # The sums over every other point have the error of the interpolation.
             error = self._error(GridDensity(logs[(slice(None, None, 2),) * n], centre, 2.0 * basis, *named), whiten)
             if error <= _RESOLVED:
                 return GridDensity(logs, centre, basis, *named)
@@ -105,7 +104,7 @@ class GaugedDensity(DensityMethods):
         return GridDensity(logs, centre, basis, *named)
 
     def _error(self, density: GridDensity, whiten: np.ndarray) -> float:
-        """How far the mass, mean and covariance that a grid sums up are from what they are, in standard deviations."""
+        """Return the largest error of the mass, mean and covariance summed over a grid, in standard deviations."""
         with np.errstate(invalid="ignore"):
             values = np.exp(density.log_values)
             mass = values.sum() * abs(np.linalg.det(density.basis))
@@ -126,8 +125,8 @@ def density_of(model: Model, gauge: Gauge, time: float, families: Family) -> Den
 
 def _weighted(origin: Array, families: Family, found: Posterior) -> tuple[Array, Array]:
     """Return the weights (J, N, E) of the Gaussians of a posterior and their means (J, N, E, n)."""
-    moved = families.nodes @ transposed(families.response)
-    return found.signs * np.exp(found.logs - found.log_mass), found.centres[:, None] + moved[:, :, None] + origin
+    displacements = families.nodes @ transposed(families.response)
+    return found.signs * np.exp(found.logs - found.log_mass), found.centres[:, None] + displacements[:, :, None] + origin
 
 
 def mixture_of(model: Model, origin: Array, families: Family, found: Posterior) -> GaussianMixture:

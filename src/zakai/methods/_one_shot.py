@@ -162,7 +162,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     rates = families.inputs_of(base, k, values)
     silent = np.zeros_like(rates)
     silent[0] = 1.0
-    moved_families = families.move_families(base, k, state.own.families, silent)
+    own_families = families.move_families(base, k, state.own.families, silent)
     rate = own.whiten @ rates[1:]
     inside = prepared.maps[k] @ np.concatenate([state.b, state.a, rate])
     growth = 0.0
@@ -172,11 +172,11 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
         growth = growth + weight * c_rate(own, b, a + own.slope.T @ (state.y + share * length * rate), b_rate)
     c = state.c + length * growth
     y = state.y + length * rate
-    moved = families.State(*moved_families, state.own.log_error, state.own.edge, float(base.stops[k]))
-    new = State(moved, inside[-1, :n], inside[-1, n:], y, c, state.log_scale, state.steps + 1.0)
+    own_state = families.State(*own_families, state.own.log_error, state.own.edge, float(base.stops[k]))
+    new = State(own_state, inside[-1, :n], inside[-1, n:], y, c, state.log_scale, state.steps + 1.0)
     sigma = _sigma(prepared, new)
     found = posterior(base.gauge, tilts_at(base.tilts, k), base.stops[k], sigma)
-    health = families.health_of(moved, sigma, found)
+    health = families.health_of(own_state, sigma, found)
     health = {"lost_digits": _rounding(own, new), **health}
     increment = found.log_mass - state.log_scale
     return new._replace(log_scale=np.asarray(found.log_mass)), Info(increment, found.mean + base.setup.origin, found.cov, health)

@@ -38,8 +38,8 @@ MOST_POINTS = 16384  # of a grid
 MOST_REFINED = 2048  # of a grid that is refined for the sake of the series
 MOST_SUBSTEPS = 1024
 KEPT = 24  # grids whose kernels are kept
-CELLS = 2.5  # spacings that the smallest standard deviation has on a new grid, and
-FEW = 1.8  # that it must have
+CELLS = 2.5  # grid spacings in the smallest standard deviation, on a new grid
+FEW = 1.8  # the same, at least
 ACCURATE = 1e-6  # the estimated error of an interval to which kernels are shortened
 EDGE = 1e-10  # probability near an edge from which a grid is enlarged
 ATTEMPTS = 16
@@ -91,7 +91,7 @@ def _system(model: Model, theta: bytes, dtype: str, order: int, form: str) -> Sy
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What is known without data."""
+    """The functions, the intervals and the options; no data."""
 
     system: System
     schedule: Schedule
@@ -147,20 +147,20 @@ def init(prepared: Prepared, prior: Any) -> State:
 
 def _times(system: System, field: Field, factor: Factor | None) -> Field:
     """Multiply by a factor, on a finer grid where the product needs it."""
-    source = field  # a part of it, which ends abruptly, must not be interpolated
+    source = field  # interpolate the whole field only: a part of it ends abruptly
     while factor is not None and factor.roots.size:
         grid = field.grid
         residuals = factor.residuals(system.sensors.observed, grid.points[:, None], system.theta)
         product = Field(grid, field.logs - 0.5 * np.sum(residuals * residuals, axis=0))
         e = residuals.real
-        # The most that the factor can be between two points: a residual that changes its sign is zero somewhere.
+        # Upper bound of the factor between two points: a residual that changes its sign is zero there.
         least = np.where(e[:, 1:] * e[:, :-1] <= 0, 0.0, np.minimum(np.abs(e[:, 1:]), np.abs(e[:, :-1])))
         logs = field.logs.real
         upper = np.maximum(logs[1:], logs[:-1]) - 0.5 * np.sum(least * least, axis=0)
         place = int(np.argmax(product.logs.real))
         top = product.logs.real[place]
         if not 2 <= place < grid.size - 2 or not np.isfinite(product.logs[place - 2 : place + 3]).all():
-            return product  # beyond the grid or the reach of the kernels
+            return product  # the maximum is at the edge or beyond the reach of the kernels
         cells = product.cells
         if cells >= FEW and np.max(upper) < top + 3.0:
             return product
@@ -175,13 +175,13 @@ def _times(system: System, field: Field, factor: Factor | None) -> Field:
 
 
 class Attempt(NamedTuple):
-    """What a step is tried with: how much wider grids are on each side, and the least level of a grid."""
+    """One attempt of a step: the factor by which grids are wider on each side, and the least level of a grid."""
 
     wider: tuple[float, float]
     fineness: int
 
 
-class Moved(NamedTuple):
+class Prediction(NamedTuple):
     """A density after a transition, its relative error, and figures."""
 
     field: Field
@@ -193,7 +193,7 @@ class Moved(NamedTuple):
 
 
 def _grid_for(prepared: Prepared, field: Field, t: float, attempt: Attempt) -> tuple[Grid, int]:
-    """Return the grid for a transition over a time t, and how many points the density needs in all; it may be too large."""
+    """Return the grid for a transition over a time t, and the number of points that the density needs, which may be too large."""
     system, grid, spacing = prepared.system, field.grid, field.grid.spacing
     first, last = field.support
     weights = np.exp((field.logs - np.max(field.logs.real)).real)
@@ -204,16 +204,16 @@ def _grid_for(prepared: Prepared, field: Field, t: float, attempt: Attempt) -> t
     f = np.where(np.isfinite(f), f, 0.0)
     mean, speed = weights @ x, weights @ f
     variance = max(weights @ (x - mean) ** 2, spacing**2)
-    # Where the density goes if the drift is linear in it; a wrong forecast is found at the edges.
+    # Forecast for a drift that is linear over the density; the mass at the edges shows where it is wrong.
     rate = np.clip(t * (weights @ ((x - mean) * (f - speed))) / variance, -30.0, 3.0)
     growth, share = np.exp(rate), np.expm1(rate) / rate if abs(rate) > 1e-9 else 1.0
     spread = 8.5 * np.sqrt(system.G * t * (np.expm1(2 * rate) / (2 * rate) if abs(rate) > 1e-9 else 1.0))
     shift = np.clip(speed * t * share, -3 * (x[last] - x[first] + spread), 3 * (x[last] - x[first] + spread))
     # The tails at its ends are at most as long as those of its smallest standard deviation.
     tail = 8.5 * growth * spacing * field.cells
-    more = np.hypot(tail, spread) - tail
-    low = min(x[first], mean + shift - growth * (mean - x[first]) - more) - 3 * spacing
-    high = max(x[last], mean + shift + growth * (x[last] - mean) + more) + 3 * spacing
+    reach = np.hypot(tail, spread) - tail
+    low = min(x[first], mean + shift - growth * (mean - x[first]) - reach) - 3 * spacing
+    high = max(x[last], mean + shift + growth * (x[last] - mean) + reach) + 3 * spacing
     width = high - low
     low, high = low - (attempt.wider[0] - 1) * width, high + (attempt.wider[1] - 1) * width
     # The comparison with kernels of twice the length halves the shortest one.
@@ -235,9 +235,9 @@ def _grid_for(prepared: Prepared, field: Field, t: float, attempt: Attempt) -> t
     return Grid(grid.origin, grid.unit, level, begin, -(-(end - begin + 1) // 32) * 32), needed
 
 
-def _transition(prepared: Prepared, field: Field, length: float, attempt: Attempt) -> list[Moved]:
-    """Return the density after each part of an interval; a narrow one is taken through grids that become coarser."""
-    system, left, part, moved = prepared.system, length, 0.0, []
+def _transition(prepared: Prepared, field: Field, length: float, attempt: Attempt) -> list[Prediction]:
+    """Return the density after each part of an interval; a narrow density passes through successively coarser grids."""
+    system, left, part, predictions = prepared.system, length, 0.0, []
     while left > 0:
         t = left
         grid, needed = _grid_for(prepared, field, t, attempt)
@@ -265,15 +265,15 @@ def _transition(prepared: Prepared, field: Field, length: float, attempt: Attemp
         truncation = float(share * np.abs((fine - coarse).real).sum() / max(positive.real.sum(), 1e-300)) + lost
         negative = float(-np.minimum(fine.real, 0.0).sum() / max(np.abs(fine.real).sum(), 1e-300))
         field = Field(grid, logs)
-        moved.append(Moved(field, share * error + lost, truncation, lost, defect, negative))
+        predictions.append(Prediction(field, share * error + lost, truncation, lost, defect, negative))
         left = left - t
         if not np.isfinite(truncation):
             break
-    return moved
+    return predictions
 
 
 def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
-    """Advance one interval: the factor at its start, the transition, the factor at its end; tried until the grid serves."""
+    """Advance one interval: the factor at its start, the transition, the factor at its end; repeat it on better grids."""
     system, schedule, length = prepared.system, prepared.schedule, float(prepared.lengths[k])
     before: Factor | None = None
     start, in_time = Field(state.grid, state.logs), 0.0
@@ -289,48 +289,48 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     else:
         after = system.sensors.at_end(schedule, k, values, system.theta, seen)
     start = _times(system, start, before)
-    attempt, moved = Attempt((1.0, 1.0), state.fineness), []
+    attempt, predictions = Attempt((1.0, 1.0), state.fineness), []
     for trial in range(ATTEMPTS):
-        moved = _transition(prepared, start, length, attempt) if length > 0 else []
-        final = _times(system, moved[-1].field if moved else start, after)
-        if not moved:
+        predictions = _transition(prepared, start, length, attempt) if length > 0 else []
+        final = _times(system, predictions[-1].field if predictions else start, after)
+        if not predictions:
             break
-        better = _better(prepared, attempt, moved, final)
+        better = _better(prepared, attempt, predictions, final)
         if better is None or better == attempt or trial == ATTEMPTS - 1:
             break
         attempt = better
-    split = _splitting_error(prepared, state, before, after, length, final) if within and moved else 0.0
-    return _reported(prepared, attempt, start, moved, final, after.constant, in_time, split)
+    split = _splitting_error(prepared, state, before, after, length, final) if within and predictions else 0.0
+    return _reported(prepared, attempt, start, predictions, final, after.constant, in_time, split)
 
 
-def _better(prepared: Prepared, attempt: Attempt, moved: list[Moved], final: Field) -> Attempt | None:
-    """Return what to try next, or None where the step is within its bounds."""
-    order, level = prepared.system.order, moved[-1].field.grid.level
+def _better(prepared: Prepared, attempt: Attempt, predictions: list[Prediction], final: Field) -> Attempt | None:
+    """Return the next attempt, or None if the step is within its bounds or cannot be improved."""
+    order, level = prepared.system.order, predictions[-1].field.grid.level
     free = prepared.substeps is None and prepared.system.form == "log"
-    truncation = sum(part.truncation for part in moved)
-    fields = [part.field for part in moved]
+    truncation = sum(part.truncation for part in predictions)
+    fields = [part.field for part in predictions]
     finite = np.isfinite(truncation) and all(np.isfinite(np.max(f.logs.real)) for f in (*fields, final))
     if not finite:
         wider = (1.5 * attempt.wider[0], 1.5 * attempt.wider[1])
         return Attempt(wider, level + 1) if free and max(f.grid.size for f in fields) < MOST_REFINED else None
     left, right = np.max([edge_masses(f.logs) for f in (*fields, final)], axis=0)
     small = max(f.grid.size for f in fields) < MOST_REFINED
-    # Kernels that are too long for the series carry mass anywhere: they come first.
-    if max(left, right) > EDGE and small and not (free and truncation - sum(part.lost for part in moved) > 1e-3):
+    # Kernels that are too long for the series put mass anywhere: shorten them before the grid is widened.
+    if max(left, right) > EDGE and small and not (free and truncation - sum(part.lost for part in predictions) > 1e-3):
         a, b = attempt.wider
         return attempt._replace(wider=(1.5 * a if left > EDGE else a, 1.5 * b if right > EDGE else b))
     if any(f.cells < FEW for f in fields) and small:
         return attempt._replace(fineness=level + 1)
-    worst = max(truncation, 0.01 * _weighted(moved[-1], final))
+    worst = max(truncation, 0.01 * _weighted(predictions[-1], final))
     if free and worst > ACCURATE and small:
         return attempt._replace(fineness=level + int(np.clip(np.ceil(np.log2(worst / ACCURATE) / (2 * order + 2)), 1, 3)))
     return None
 
 
-def _weighted(moved: Moved, final: Field) -> float:
-    """Return the relative error of a transition where an observation puts the density."""
+def _weighted(prediction: Prediction, final: Field) -> float:
+    """Return the relative error of a transition, averaged over the posterior."""
     weights = np.exp((final.logs - np.max(final.logs.real)).real)
-    return float(weights @ np.interp(final.grid.offsets, moved.field.grid.offsets, moved.error) / weights.sum())
+    return float(weights @ np.interp(final.grid.offsets, prediction.field.grid.offsets, prediction.error) / weights.sum())
 
 
 def _splitting_error(
@@ -356,43 +356,43 @@ def _splitting_error(
         logs = logs + g
         top = np.max(logs)
         with np.errstate(divide="ignore", invalid="ignore"):
-            moved = system.kernels(grid).moved(np.exp(logs - top), 0.5 * length, prepared.substeps)[0].real
-            logs = np.log(np.maximum(moved, 0.0)) + top
-    (mass, mean, deviation), (other, there, _) = (
+            predicted = system.kernels(grid).moved(np.exp(logs - top), 0.5 * length, prepared.substeps)[0].real
+            logs = np.log(np.maximum(predicted, 0.0)) + top
+    (mass, mean, deviation), (other, mean_of_halves, _) = (
         Field(f.grid, f.logs.real).moments for f in (final, Field(grid, logs + 0.5 * late))
     )  # fmt: skip
-    error = max(abs(mean - there) / deviation, abs(mass - other))
+    error = max(abs(mean - mean_of_halves) / deviation, abs(mass - other))
     return float(error if before is None else 4 / 3 * error)
 
 
 def _reported(
-    prepared: Prepared, attempt: Attempt, start: Field, moved: list[Moved], final: Field, constant: Any, in_time: float,
-    splitting: float,
+    prepared: Prepared, attempt: Attempt, start: Field, predictions: list[Prediction], final: Field, constant: Any,
+    in_time: float, splitting: float,
 ) -> tuple[State, Info]:
-    """Normalise the density and say how the step went."""
+    """Return the normalised state and the moments and health of the step."""
     grid = final.grid
     log_mass, mean, deviation = final.moments
     logs = final.logs - log_mass
     weights = np.exp(logs.real) * grid.spacing
     cells = min(start.cells, final.cells)
     truncation = depth = 0.0
-    if moved:
-        predicted = moved[-1].field.on(grid).logs.real
-        truncation = _weighted(moved[-1], final) + sum(part.truncation for part in moved[:-1])
+    if predictions:
+        predicted = predictions[-1].field.on(grid).logs.real
+        truncation = _weighted(predictions[-1], final) + sum(part.truncation for part in predictions[:-1])
         known = weights > 0
-        depth = float(np.sum(weights[known] * (np.max(moved[-1].field.logs.real) - predicted[known])))
+        depth = float(np.sum(weights[known] * (np.max(predictions[-1].field.logs.real) - predicted[known])))
     health = {
-        "edge_mass": max(sum(edge_masses(f.logs)) for f in (final, *(part.field for part in moved))),
+        "edge_mass": max(sum(edge_masses(f.logs)) for f in (final, *(part.field for part in predictions))),
         "quadrature_error": quadrature_error(cells),
         "truncation": truncation,
-        "mass_defect": sum(part.defect for part in moved),
-        "negative_mass": max((part.negative for part in moved), default=0.0),
+        "mass_defect": sum(part.defect for part in predictions),
+        "negative_mass": max((part.negative for part in predictions), default=0.0),
         "tail_depth": depth,
         "time_quadrature_error": in_time,
         "splitting_error": splitting,
     }
     fineness = attempt.fineness
-    if moved and sum(part.truncation for part in moved) < ACCURATE / 8.0 / 4.0 ** (prepared.system.order + 1):
+    if predictions and sum(part.truncation for part in predictions) < ACCURATE / 8.0 / 4.0 ** (prepared.system.order + 1):
         fineness = max(min(fineness, grid.level) - 1, -60)
     state = State(logs, grid.origin, grid.unit, grid.level, grid.first, fineness)
     return state, Info(log_mass + constant, np.array([grid.origin + mean]), np.array([[deviation**2]]), health)

@@ -37,7 +37,7 @@ from zakai.numerics.sinc_grid import Field, Generator, moments, resolution_of
 from zakai.records.schedule import Schedule
 
 POINTS = {1: 96, 2: 56, 3: 44}  # along an axis at the start, and
-MORE_POINTS = {1: 256, 2: 112, 3: 72}  # at most
+MOST_POINTS = {1: 256, 2: 112, 3: 72}  # at most
 RESOLVED = 1e-10  # share of the density at the highest frequency from which the grid gets more points
 RESTART = 3.0  # nats over which the multiplier may range where the density matters, before the statistics restart
 SHIFT = 0.1  # how far the product may shift the density, as a share of the grid
@@ -45,9 +45,9 @@ DRIVE = 2.0  # nats that one part of an interval may add
 STEP = 0.25  # length of a part in units of the linear part of the statistics' equations
 MATTERS = 1e-10  # of the maximum
 TRAVEL = 0.04  # share of an axis over which the drift may carry the density in one part
-STILL = 1e-13  # relative change of a density in a part from which it does not change any more
-MOST_PARTS = 2048  # of an interval, and
-PATIENCE = 200  # parts after which a step that would need more of them ends
+STATIONARY = 1e-13  # relative change of a density in a part, below which it is stationary
+MOST_PARTS = 2048  # of an interval
+PATIENCE = 200  # parts after which a step that would need more than MOST_PARTS ends
 _SUBSTEPS = np.array([2, 4, 6, 8, 10])  # of the midpoint rule, which is extrapolated to order ten
 _EXTRAPOLATION = np.array([np.prod([1 / (1 - (b / a) ** 2) for b in _SUBSTEPS if b != a]) for a in _SUBSTEPS.astype(float)])
 Array = np.ndarray
@@ -131,8 +131,8 @@ class System:
 class State(NamedTuple):
     """v = exp(t L_0) sigma_0 since the last restart, `values` at `low` + `spacing` * index, and the `statistics` (d,).
 
-    The density of mass one is exp(`log_scale`) times their product, and has this `mean` (n,); `driven` (n,) is the number of
-    deviations by which the observations drove it, of late, to where the tails may have been cut.
+    The density of mass one is exp(`log_scale`) times their product, with the `mean` (n,); `driven` (n,) is the number of standard
+    deviations by which recent observations shifted it into its tails, which may have been cut.
     """
 
     values: Array
@@ -216,7 +216,7 @@ class Health:
         self.figures = {"aliasing": aliasing, "edge_mass": 0.0, "gauge_exponent": 0.0, "tail_depth": 0.0, "unfinished": 0.0}
 
     def add(self, **figures: float) -> None:
-        """Take figures into account."""
+        """Keep the larger of each figure and the stored one; NaN stays."""
         for name, value in figures.items():
             self.figures[name] = max(self.figures[name], float(value)) if value == value else np.nan
 
@@ -230,7 +230,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     rates = np.where(inside, values, 0.0) / (length or 1.0)
     precision = np.linalg.inv(system.sensors.noise_at(np.zeros(1), system.theta, which)[0]) if len(which) else np.zeros((0, 0))
     if not whole:
-        # L_0 and the algebra are others where a coordinate is missing: the observation acts inside, on the density.
+        # A missing coordinate changes L_0 and the algebra: the other coordinates then act on the density within the interval.
         state = _formed(system, state)
     health = Health(resolution_of(state.values).aliasing)
     left, shift, logs = length, np.zeros(system.n), np.zeros(state.values.shape)
@@ -238,13 +238,13 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
         for part in range(MOST_PARTS):
             if not left > 0 or not np.isfinite(state.log_scale):
                 break
-            before, more = state, prepared.points is None and health.aliasing > RESOLVED
-            state, tau, shift, logs = _part(system, state, left, rates, which, precision, whole, health, more)
+            before, refine = state, prepared.points is None and health.aliasing > RESOLVED
+            state, tau, shift, logs = _part(system, state, left, rates, which, precision, whole, health, refine)
             left = left - tau if tau < left else 0.0
             if part > (PATIENCE if whole else 4 * PATIENCE) and MOST_PARTS * tau < left:
                 break
             if not whole and state.values.shape == before.values.shape and np.array_equal(state.low, before.low):
-                if np.max(np.abs(state.values - before.values)) < STILL:  # further terms change the mass only
+                if np.max(np.abs(state.values - before.values)) < STATIONARY:  # further terms change the mass only
                     state = state._replace(log_scale=state.log_scale + left / tau * (state.log_scale - before.log_scale))
                     left = 0.0
         late = schedule.seen[k] & ~inside
@@ -262,11 +262,11 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
 
 def _part(
     system: System, state: State, left: float, rates: Array, which: Array, precision: Array, whole: bool, health: Health,
-    more: bool,
+    refine: bool,
 ) -> tuple[State, float, Array, Array]:
-    """Advance by as much of an interval as the grid and the statistics allow; return that, the shift and the multiplier."""
+    """Advance by the longest part that the grid and the statistics allow; return its length, the shift and the multiplier."""
     sizes = state.field.sizes
-    if more and (bigger := sizes + 8 * (4 - system.n)).max() <= MORE_POINTS[system.n]:
+    if refine and (bigger := sizes + 8 * (4 - system.n)).max() <= MOST_POINTS[system.n]:
         sizes = bigger
     field = sinc_grid.fitted(state.field, sizes)
     points = field.points
@@ -289,7 +289,7 @@ def _part(
     state = state.on(field)._replace(statistics=statistics, log_scale=state.log_scale + scale - level * tau)
     shift, logs = system.product(statistics, points, field.spacing)
     spread, exponent, density = _reach(field.values, logs)
-    # By how much more of its deviation the density moved than the drift did; diffusion makes the tails again.
+    # Shift of the mean beyond the drift, in standard deviations; diffusion restores the tails.
     _, mean, cov = moments(Field(density, field.low - shift, field.spacing))
     variance = np.diagonal(cov)
     drifted = np.array([np.sum(field.values * one).real for one in f]) / field.values.real.sum()
@@ -306,10 +306,10 @@ def _part(
 
 
 def _reach(values: Array, logs: Array) -> tuple[float, float, Array]:
-    """Return how a multiplier acts.
+    """Return the effect of a multiplier.
 
-    Over how many nats it ranges where the density matters; by how many it amplifies the rounding of the tails, relative to the
-    density's maximum; and that density, up to a factor.
+    Its range in nats where the density matters, the nats by which it amplifies the rounding of the tails, relative to the maximum
+    of the density, and the density up to a factor.
     """
     values, logs = values.real, logs.real
     top = np.max(logs[values > 0], initial=-np.inf)
@@ -327,7 +327,7 @@ def _formed(system: System, state: State) -> State:
 
 
 def _as_one(state: State, shift: Array, logs: Array) -> State:
-    """Return the product of the multiplier and v, on a grid that is shifted, as the v of new statistics."""
+    """Return the product of the multiplier and v on the shifted grid as a new v, with statistics of zero."""
     top = np.max(logs.real)
     field, scale, _ = sinc_grid.cleaned(Field(state.values * np.exp(logs - top), state.low - shift, state.spacing))
     return state.on(field)._replace(statistics=np.zeros(len(state.statistics)), log_scale=state.log_scale + top + scale)
@@ -347,7 +347,7 @@ def _observed(system: System, state: State, factor: Factor, health: Health) -> S
 
 
 def density(prepared: Prepared, state: State) -> GridDensity:
-    """Return the posterior on its grid; zero where rounding leaves nothing of it."""
+    """Return the posterior on its grid; values below rounding are zero."""
     field = _formed(prepared.system, state).field
     with np.errstate(divide="ignore"):
         logs = np.log(np.maximum(field.values.real, 0.0))
@@ -361,7 +361,7 @@ def valid(prepared: Prepared, state: State) -> bool:
     n, d = prepared.system.n, prepared.system.count
     shapes = [np.shape(a) for a in (state.low, state.spacing, state.mean, state.driven)]
     sizes = np.array(np.shape(state.values))
-    fits = len(sizes) == n and 16 <= sizes.min() and sizes.max() <= max(prepared.points or 0, MORE_POINTS[n])
+    fits = len(sizes) == n and 16 <= sizes.min() and sizes.max() <= max(prepared.points or 0, MOST_POINTS[n])
     return bool(fits) and shapes == [(n,)] * 4 and np.shape(state.statistics) == (d,)
 
 

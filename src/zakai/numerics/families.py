@@ -112,10 +112,10 @@ def weigh(family: Family, information: Array, vector: Array, constant: Any) -> F
     # m.(g - Omega m / 2) + pull'W P pull / 2
     log_mass = log_mass + (_dot(mean, vector + pull) + _dot(pull, step) - log_volume) * 0.5 + constant
     if k:
-        moved = solved[:, :, n:]
-        tilt = tilt + _apply(transposed(moved), pull)
-        curvature = symmetric(curvature + transposed(response) @ information @ moved)
-        response = moved
+        new_response = solved[:, :, n:]
+        tilt = tilt + _apply(transposed(new_response), pull)
+        curvature = symmetric(curvature + transposed(response) @ information @ new_response)
+        response = new_response
     return Family(nodes, log_weights, signs, mean + step, new_cov, response, tilt, curvature, log_mass)
 
 

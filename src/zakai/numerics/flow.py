@@ -196,8 +196,8 @@ def _integrate_varying(problem: _Problem) -> tuple[Transition, Array]:
         fresh = np.flatnonzero(~checked)
         if len(fresh):
             probes = max(FEWEST_PROBES, PROBES >> min(level, 8))
-            some = panels if len(fresh) == len(checked) else panels.take(fresh)
-            mismatch[fresh], scales = _unresolved(problem, some, probes, scales)
+            pending_panels = panels if len(fresh) == len(checked) else panels.take(fresh)
+            mismatch[fresh], scales = _unresolved(problem, pending_panels, probes, scales)
         estimate = panels.width * mismatch * np.minimum(1.0, 1e3 * mismatch)
         if level == 0 and count <= FEW and (estimate <= TOLERANCE).all():
             whole, coarse = problem.solve(panels)

@@ -98,19 +98,19 @@ def compose(first: Transition, second: Transition) -> Transition:
     system = np.eye(n) + first.noise @ second.information
     meeting = first.offset + first.noise @ second.vector
     solved = np.linalg.solve(system, np.concatenate([first.map, first.noise, meeting, first.offset], axis=-1))
-    moved, noise = solved[..., :n], symmetric(solved[..., n : 2 * n])
+    inner_map, noise = solved[..., :n], symmetric(solved[..., n : 2 * n])
     k = first.offset.shape[-1]
     met, offset = solved[..., 2 * n : 2 * n + k], solved[..., 2 * n + k :]
     pull = second.vector - second.information @ first.offset
-    backward = transposed(moved)
+    backward = transposed(inner_map)
     constant = transposed(second.vector) @ offset - 0.5 * transposed(first.offset) @ second.information @ offset
     constant = first.constant + second.constant + symmetric(constant + 0.5 * transposed(second.vector) @ noise @ second.vector)
     constant[..., 0, 0] -= 0.5 * log_determinant(system)
     return Transition(
-        second.map @ moved,
+        second.map @ inner_map,
         second.map @ met + second.offset,
         symmetric(second.noise + second.map @ noise @ transposed(second.map)),
-        symmetric(first.information + transposed(first.map) @ second.information @ moved),
+        symmetric(first.information + transposed(first.map) @ second.information @ inner_map),
         first.vector + backward @ pull,
         constant,
     )

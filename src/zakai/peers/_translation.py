@@ -167,7 +167,7 @@ class Prepared:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, model: Model, system: System, schedule: Schedule, theta: np.ndarray, **more: Any) -> Prepared:
+    def of(cls, model: Model, system: System, schedule: Schedule, theta: np.ndarray, **extra: Any) -> Prepared:
         """Return what is prepared for a schedule."""
         seen, count = schedule.seen, len(schedule)
         noise = np.broadcast_to(
@@ -186,7 +186,7 @@ class Prepared:
         if model.observation_kind == "samples":
             log_volume = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
             constants = -log_volume - 0.5 * np.log(2 * np.pi) * seen.sum(axis=1)
-        return cls(model, system, theta, schedule, schedule.lengths, spans, whiten, constants, **more)
+        return cls(model, system, theta, schedule, schedule.lengths, spans, whiten, constants, **extra)
 
     def intervals(self, rows: slice) -> Interval:
         """Return intervals with a leading axis."""

@@ -100,8 +100,8 @@ def _prior(model: Any) -> list[str]:
         return [_words(said), _block([body])]
     if hasattr(prior, "weights"):
         rows = [_row(_number(w), _normal(m, c)) for w, m, c in list(zip(prior.weights, prior.means, prior.covs, strict=True))[:8]]
-        more = len(prior.weights) - len(rows)
-        said += f": a mixture of {len(prior.weights)} Gaussians" + (f", of which the first {len(rows)}" if more else "")
+        omitted = len(prior.weights) - len(rows)
+        said += f": a mixture of {len(prior.weights)} Gaussians" + (f", of which the first {len(rows)}" if omitted else "")
         return [_words(said), _block(rows)]
     return [_words(said), _block([_normal(prior.mean, prior.cov)])]
 

@@ -50,9 +50,9 @@ def page(outcome: Any) -> str:
     name = escape(outcome.study.name)
     shown = range(min(MOST_POINTS, len(outcome.points)))
     body = "".join(_section(outcome, point) for point in shown)
-    more = len(outcome.points) - len(shown)
-    if more:
-        body += f"<p>{more} more points are in summary.json and study.nc.</p>"
+    omitted = len(outcome.points) - len(shown)
+    if omitted:
+        body += f"<p>{omitted} more points are in summary.json and study.nc.</p>"
     reference = outcome.summary["reference"]
     said = f"{outcome.summary['runs']:,} runs of {len(outcome.study.methods)} methods on the same records"
     said += f"; distances are from {escape(reference)}." if reference else "."

@@ -48,7 +48,7 @@ def grid_optimal(
     return means
 
 
-def _transition(points: np.ndarray, moved: np.ndarray, step: float, density: np.ndarray) -> np.ndarray:
+def _transition(points: np.ndarray, images: np.ndarray, step: float, density: np.ndarray) -> np.ndarray:
     """sum_j N(x_i; moved_j, step) density_j, a block of rows at a time, for the rows that anything can reach.
 
     Beyond `REACH` deviations the Gaussian is zero, and so is a probability below `NEGLIGIBLE`.
@@ -56,11 +56,11 @@ def _transition(points: np.ndarray, moved: np.ndarray, step: float, density: np.
     flat = density.reshape(len(points), -1)
     out = np.zeros_like(flat)
     reach = REACH * np.sqrt(step)
-    used = moved[np.flatnonzero(flat.max(axis=1) > NEGLIGIBLE)[[0, -1]]]
+    used = images[np.flatnonzero(flat.max(axis=1) > NEGLIGIBLE)[[0, -1]]]
     begin, end = np.searchsorted(points, [used[0] - reach, used[1] + reach])
     for first in range(begin, end, _BLOCK):
         rows = points[first : min(first + _BLOCK, end)]
-        low, high = np.searchsorted(moved, [rows[0] - reach, rows[-1] + reach])
-        kernel = np.exp(-((rows[:, None] - moved[low:high]) ** 2) / (2 * step))
+        low, high = np.searchsorted(images, [rows[0] - reach, rows[-1] + reach])
+        kernel = np.exp(-((rows[:, None] - images[low:high]) ** 2) / (2 * step))
         out[first : first + len(rows)] = kernel @ flat[low:high]
     return out.reshape(density.shape)

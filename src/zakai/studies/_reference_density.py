@@ -71,9 +71,9 @@ def conditional_densities(
 
         def slope(t: float, values: np.ndarray, rate: np.ndarray = rate) -> np.ndarray:
             now = values.reshape(diffusion.shape)
-            moved = diffusion * np.fft.fftn(now)
-            moved = moved - sum(1j * waves[..., i] * np.fft.fftn(f[..., i] * now, axes=over) for i in range(n))
-            return (np.fft.ifftn(moved, axes=over).real + rate * now).ravel()
+            spectrum = diffusion * np.fft.fftn(now)
+            spectrum = spectrum - sum(1j * waves[..., i] * np.fft.fftn(f[..., i] * now, axes=over) for i in range(n))
+            return (np.fft.ifftn(spectrum, axes=over).real + rate * now).ravel()
 
         solved = solve_ivp(
             slope, (before, time), sigma.ravel(), "DOP853", rtol=tolerance, atol=tolerance * sigma.max(), t_eval=[time]

@@ -125,11 +125,11 @@ class Innovations:
     def _rates(self, z: np.ndarray, sigma: np.ndarray, t: np.ndarray, u: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         n = self.model.n
         x = z[:, :n]
-        moved = self._matrix(x, t, u) @ sigma
-        moved = moved + np.swapaxes(moved, 1, 2)
-        moved[:, :n, :n] += self.covariance(x, t, self.theta, u)
-        moved[:, n:, n:] += self.noise(x, t, self.theta, u)
-        return np.concatenate([self.drift(x, t, self.theta, u), self.observation(x, t, self.theta, u)], axis=1), moved
+        rate = self._matrix(x, t, u) @ sigma
+        rate = rate + np.swapaxes(rate, 1, 2)
+        rate[:, :n, :n] += self.covariance(x, t, self.theta, u)
+        rate[:, n:, n:] += self.noise(x, t, self.theta, u)
+        return np.concatenate([self.drift(x, t, self.theta, u), self.observation(x, t, self.theta, u)], axis=1), rate
 
 
 def _pieces(schedule: Schedule) -> list[tuple[np.ndarray, np.ndarray]]:
