@@ -34,7 +34,6 @@ from zakai.errors import ConditionError
 from zakai.models.model import Model
 
 Polynomial = Any  # a flint.fmpq_mpoly in z and y
-SOURCE = "Yau 1993, Theorems 10 and 11"
 
 
 class Ring:

@@ -41,12 +41,6 @@ def erf(values: Any) -> Array:
     return np.asarray(real_erf(values.real) + 1j * slope * values.imag)
 
 
-def log_cosh(values: Any) -> Array:
-    """Return log cosh without overflow."""
-    size = absolute(values)
-    return size + np.log1p(np.exp(-2.0 * size)) - np.log(2.0)
-
-
 def log_sum_exp(logs: Any, axis: int = -1, signs: Any = 1.0) -> Array:
     """Return log sum_i signs_i exp(logs_i) along an axis; -inf for an empty sum."""
     logs = np.asarray(logs)
