@@ -18,7 +18,9 @@ from scipy.special import ive
 from zakai.numerics.space_grid import Grid
 
 Array = NDArray[Any]
-_NEGLIGIBLE = 1e-15  # terms of the series relative to the density
+_REST = 1e-12  # terms of the series that are left out, relative to the density
+NEGLIGIBLE = 1e-8  # of the maximum, below which the noise need not be exact
+SPARE = 2.0  # times the largest noise elsewhere
 MOST_TERMS = 4000
 
 
@@ -45,6 +47,10 @@ def diffused(values: Array, grid: Grid, noise: Array, tau: float) -> Array:
     """
     inverse = grid.inverse
     noise = inverse @ noise @ inverse.T
+    # Where the density is negligible the noise may be so too, which bounds the spectrum of the operator.
+    size, real = np.trace(noise.real, axis1=1, axis2=2), values.real.reshape(-1)
+    largest = SPARE * float(np.max(size, where=real > NEGLIGIBLE * real.max(), initial=0.0))
+    noise = noise * np.minimum(1.0, largest / np.maximum(size, 1e-300))[:, None, None]
     axes, parts = tuple(range(grid.n)), []
     for (i, j), multiplier in _multipliers(grid.sizes).items():
         entry = (0.5 * tau) * noise[:, i, j].reshape(grid.sizes)
@@ -53,7 +59,7 @@ def diffused(values: Array, grid: Grid, noise: Array, tau: float) -> Array:
     if not parts:
         return values
     # A bound on the spectrum, whose eigenvalues are in [-radius, 0].
-    radius = 0.5 * tau * np.pi**2 * float(np.trace(noise.real, axis1=1, axis2=2).max())
+    radius = 0.5 * tau * np.pi**2 * min(largest, float(size.max()))
 
     def transformed(fields: list[Array]) -> Array:
         spectrum = sum((np.fft.rfftn(field) * multiplier for field, (_, multiplier) in zip(fields, parts, strict=True)))
@@ -68,7 +74,7 @@ def diffused(values: Array, grid: Grid, noise: Array, tau: float) -> Array:
         return u + (2.0 / radius) * change
 
     weights = ive(np.arange(min(MOST_TERMS, int(20 + 2 * radius))), 0.5 * radius)
-    weights = weights[: 1 + int(np.flatnonzero(weights > _NEGLIGIBLE * weights[0])[-1])]
+    weights = weights[: 1 + int(np.flatnonzero(weights > _REST * weights[0])[-1])]
     before, last = values, moved(values)
     result = weights[0] * values + 2.0 * weights[1] * last if len(weights) > 1 else weights[0] * values
     for weight in weights[2:]:
