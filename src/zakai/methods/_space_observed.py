@@ -84,7 +84,7 @@ class Observations:
         found = self.tables.get(key)
         if found is None:
             found = make()
-            if sum(sum(a.size for a in kept) for kept in list(self.tables.values())) > CACHED:
+            if len(self.tables) * sum(a.size for a in found) > CACHED:
                 self.tables.clear()
             self.tables[key] = found
         return found
