@@ -10,6 +10,7 @@ import numpy as np
 from zakai.densities._density import DensityMethods, as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 
 _AT_ONCE = 2**21  # points times components in one array
+_PROPOSALS = 1000  # of a draw from a mixture with negative weights
 
 
 @dataclass(frozen=True, repr=False)
@@ -17,8 +18,8 @@ class GaussianMixture(DensityMethods):
     """sum_k w_k N(m_k, P_k): `weights` (k,), `means` (k, n), `covs` (k, n, n); one component is a Gaussian.
 
     Weights sum to one and may be slightly negative, as those of nodes that represent a smooth density are; a density is then
-    -inf in the logarithm where rounding leaves nothing, and samples are drawn from the positive weights.  A coordinate in
-    `periodic` is wrapped to the circle: its density is summed over the windings that matter.
+    -inf in the logarithm where rounding leaves nothing.  A coordinate in `periodic` is wrapped to the circle: its density is summed
+    over the windings that matter.
     """
 
     weights: np.ndarray
@@ -146,8 +147,17 @@ class GaussianMixture(DensityMethods):
 
     def sample(self, key: object, count: int) -> np.ndarray:
         rng, count = generator(key), sample_size(count)
-        positive = np.maximum(self.weights, 0.0)
-        which = rng.choice(len(self.weights), size=count, p=positive / positive.sum())
-        noise = rng.standard_normal((count, len(self.names)))
-        x = self.means[which] + np.einsum("cij,cj->ci", np.linalg.cholesky(self.covs)[which], noise)
+        variances, axes = np.linalg.eigh(self.covs)  # which may be singular
+        roots = axes * np.sqrt(np.maximum(variances, 0.0))[:, None]
+        size, signed = np.abs(self.weights), bool((self.weights < 0.0).any())
+        positive = GaussianMixture(size / size.sum(), self.means, self.covs, self.names, self.periodic)
+        x, rest = np.empty((count, len(self.names))), np.arange(count)
+        for _ in range(_PROPOSALS):
+            which = rng.choice(len(size), size=len(rest), p=positive.weights)
+            x[rest] = self.means[which] + np.einsum("cij,cj->ci", roots[which], rng.standard_normal((len(rest), len(self.names))))
+            if not signed or not len(rest):
+                break
+            # With negative weights a proposal is accepted by the share of the density in that of the sizes of the weights.
+            share = np.exp(self.log_density(x[rest]) - positive.log_density(x[rest])) * self.weights.sum() / size.sum()
+            rest = rest[rng.random(len(rest)) >= share]
         return np.where(self.periodic, wrap(x), x)

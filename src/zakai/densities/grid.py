@@ -11,6 +11,7 @@ import numpy as np
 
 from zakai.densities._density import WeightedPoints, as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 
+_FINER = 8  # points of a distribution function for each of a grid
 _BLOCK = 4_000_000  # numbers held at once while a density is interpolated
 
 
@@ -254,9 +255,21 @@ class GridDensity(WeightedPoints):
 
     def sample(self, key: object, count: int) -> np.ndarray:
         rng, count = generator(key), sample_size(count)
+        if len(self.names) == 1:
+            return self._sample_of_line(rng, count)
         which = rng.choice(self.weights.size, size=count, p=self.weights.ravel())
         x = self.points.reshape(-1, len(self.names))[which]
         x = x + (rng.random((count, len(self.names))) - 0.5) @ self.basis.T
+        return np.where(self.periodic, wrap(x), x)
+
+    def _sample_of_line(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Draws by the distribution function on points that are closer than those of the grid, linear between them."""
+        spacing = self.basis[0, 0] / _FINER
+        fine = self.points[0, 0] + spacing * (np.arange(len(self.points) * _FINER) - _FINER // 2)
+        steps = np.maximum(np.exp(self.log_density(fine[:, None])), 0.0)
+        distribution = np.concatenate([[0.0], np.cumsum(steps)])
+        edges = fine[0] + spacing * (np.arange(len(distribution)) - 0.5)
+        x = np.interp(rng.random(count) * distribution[-1], distribution, edges)[:, None]
         return np.where(self.periodic, wrap(x), x)
 
 
