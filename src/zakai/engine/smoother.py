@@ -37,6 +37,38 @@ class SmoothingResult(FilterResult):
     """
 
     filtered: FilterResult | None = None
+    _runs: tuple[SmoothingRun, ...] = ()
+
+    def sample_paths(self, count: int, seed: int = 0) -> np.ndarray:
+        """Return draws from the joint law of the state at all times given all observations.
+
+            x_K ~ p(x_K | all observations),      x_k ~ p(x_k | x_(k+1), observations until k + 1)
+
+        Args:
+            count: number of paths.
+            seed: the same seed gives the same paths.
+
+        Returns:
+            (count, K+1, n); index 0 is the model's start.  Angles are in (-pi, pi].
+
+        Raises:
+            InputError: a wrong count, more paths than the memory holds, a method that does not draw paths, or a result that was
+                read from a file.
+
+        References:
+            Godsill, Doucet and West 2004, Monte Carlo smoothing for nonlinear time series.
+
+        Example:
+            paths = smoothed.sample_paths(1000)
+            highest = paths[:, :, 0].max(axis=1)  # draws of the largest value that the state has taken
+        """
+        if not self._runs:
+            raise InputError("sample_paths: a result that was read from a file does not hold its filter; smooth the record again")
+        from zakai.engine.paths import sample_paths
+
+        place = {name: i for i, name in enumerate(self.state)}
+        names = [block.state for block in self.blocks] or [self.state]
+        return sample_paths(self._runs, [[place[name] for name in own] for own in names], len(self.state), count, seed)
 
     def __repr__(self) -> str:
         return super().__repr__().replace("FilterResult", "SmoothingResult", 1)
@@ -76,7 +108,8 @@ def smooth(
     result = plan.result(runs)
     result.record = record
     result.attributes["kind"] = "smoothed"
-    return SmoothingResult(**{field.name: getattr(result, field.name) for field in fields(result)}, filtered=filtered)
+    shared = {field.name: getattr(result, field.name) for field in fields(result)}
+    return SmoothingResult(**shared, filtered=filtered, _runs=tuple(runs))
 
 
 class SmoothingRun(Run):

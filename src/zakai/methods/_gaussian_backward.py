@@ -27,6 +27,7 @@ from zakai.methods._gaussian_families import (
     inputs_of,
     is_single,
 )
+from zakai.methods._gaussian_paths import draw
 from zakai.methods._protocol import Backward, Info, Infos
 from zakai.numerics.families import Family, solve, weigh
 from zakai.numerics.transition import Array, at, symmetric
@@ -161,4 +162,4 @@ def segment(
     return moved, Infos(masses, means + prepared.setup.origin, covs, health_of_gaussians(covs))
 
 
-BACKWARD: Backward[Prepared, State, Message] = Backward(message, backward, smoothed, density, segment)
+BACKWARD: Backward[Prepared, State, Message] = Backward(message, backward, smoothed, density, segment, draw)

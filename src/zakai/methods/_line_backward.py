@@ -22,6 +22,7 @@ from scipy.special import erfc, erfcx
 from zakai.densities import Density
 from zakai.errors import InputError
 from zakai.methods import _line, _line_moves
+from zakai.methods._line_paths import draw
 from zakai.methods._line_system import Prepared, State, covariance_at, covariance_between, drift_at, finite, state_moments
 from zakai.methods._line_update import exponential_factor, factor_at_end
 from zakai.methods._protocol import Backward, Info
@@ -68,7 +69,7 @@ class Message(NamedTuple):
 
     def on(self, window: lw.Window, gauge: Array) -> Message:
         """Return the same function on another grid, in another gauge."""
-        own = _smooth(self.gauge, self.window, window.offsets)
+        own = lw.local_polynomial(self.gauge, self.window, window.offsets)
         if not self.closed and np.ptp(gauge - own) > 0.5 * BOUND:
             return self._plain().on(window, gauge) if np.any(self.gauge) else self._moved(window, gauge, own)
         return self._moved(window, gauge, own)
@@ -101,23 +102,6 @@ class Message(NamedTuple):
         log_scale = self.log_scale + gained + float(np.log(total))
         own = values / total, gauge, origin, centre, spacing, unit, closed
         return Message(*own, self.low, self.high, self.needed, log_scale, self.error)
-
-
-def _smooth(values: Array, window: lw.Window, offsets: Array) -> Array:
-    """Return the polynomial through the nearest eight values of a function at offsets (J,), constant beyond the grid."""
-    at = (offsets - window.centre) / window.spacing + window.size // 2
-    near = np.floor(at).astype(int)
-    if not window.closed:
-        at, near = np.clip(at, 0.0, window.size - 1.0), np.clip(near, 3, window.size - 5)
-    distance = (at - near)[:, None] - _STENCIL
-    exact = np.abs(distance) < 1e-9
-    weights = np.where(exact.any(axis=1, keepdims=True), exact, _WEIGHTS / np.where(exact, 1.0, distance))
-    own = values[(near[:, None] + _STENCIL) % window.size]
-    return np.asarray(np.sum(weights * own, axis=1) / np.sum(weights, axis=1))
-
-
-_STENCIL = np.arange(-3, 5)
-_WEIGHTS = np.array([1.0 / np.prod([float(i - j) for j in _STENCIL if j != i]) for i in _STENCIL])
 
 
 def _covering(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:
@@ -179,7 +163,7 @@ def _product(state: State, later: Message) -> _Product:
     own, other = state.window, later.window
     finer = own if own.spacing <= 1.0001 * other.spacing else other
     density = lw.resampled(np.asarray(state.values).real, own, finer)
-    psi, gauge = lw.resampled(later.values, other, finer), _smooth(later.gauge, other, finer.offsets)
+    psi, gauge = lw.resampled(later.values, other, finer), lw.local_polynomial(later.gauge, other, finer.offsets)
     logs = np.where((density > 0) & (psi > 0), np.log(density) + np.log(psi) - gauge, -np.inf)
     top = float(np.max(logs))
     values = np.exp(logs - top)
@@ -237,7 +221,7 @@ def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state
     length = float(prepared.lengths[k])
     finer = _covering(later.window, later.low, later.high, later.needed)
     if finer.spacing < 0.999 * later.spacing:
-        later = later.on(finer, _smooth(later.gauge, later.window, finer.offsets))
+        later = later.on(finer, lw.local_polynomial(later.gauge, later.window, finer.offsets))
     window, values = later.window, later.values
     inside = prepared.inside[k]
     if prepared.lie and not inside.all():
@@ -483,4 +467,4 @@ def density(prepared: Prepared, state: State, later: Message) -> Density:
     return _line.density(prepared, State(found.values, origin, centre, spacing, unit, closed, state.error, state.log_floor))
 
 
-BACKWARD: Backward[Prepared, State, Message] = Backward(message, step, smoothed, density)
+BACKWARD: Backward[Prepared, State, Message] = Backward(message, step, smoothed, density, draw=draw)

@@ -92,6 +92,10 @@ class Backward(Generic[P, S, M]):
     start; `states` are the filtered ones at the start and after each interval.  It returns the message and what `smoothed`
     reports after each interval; or None, where the single steps are to be taken.
 
+    Optional: `draw(prepared, k, later, values, state, rng)` returns draws (P, n) of the state at the start of interval k given
+    the draws `later` (P, n) at its end, and how far their law is from what is drawn: zero where it is exact, else a figure that
+    falls with the length of the interval, which is divided above a bound.
+
     `message`, `smoothed` and `density` use of `prepared` only what does not depend on the schedule.
     """
 
@@ -100,6 +104,7 @@ class Backward(Generic[P, S, M]):
     smoothed: Callable[[P, S, M], tuple[M, Info]]
     density: Callable[[P, S, M], Density]
     segment: Callable[[P, slice, Sequence[S], M, np.ndarray], tuple[M, Infos] | None] | None = None
+    draw: Callable[[P, int, np.ndarray, np.ndarray, S, np.random.Generator], tuple[np.ndarray, float]] | None = None
 
 
 @dataclass(frozen=True)

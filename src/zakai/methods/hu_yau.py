@@ -167,6 +167,14 @@ def smoothed_density(prepared: Any, state: State, later: Message) -> Density:
     return BACKWARD.density(prepared, state.own, later)
 
 
+def draw(
+    prepared: Any, k: int, later: Array, values: Array, state: State, rng: np.random.Generator
+) -> tuple[Array, float]:
+    """Return draws of the state at the start of interval k given those at its end."""
+    assert BACKWARD.draw is not None
+    return BACKWARD.draw(prepared, k, later, values, state.own, rng)
+
+
 def valid(prepared: Prepared, state: State) -> bool:
     """Return whether the arrays of a state fit together."""
     base = prepared.base if isinstance(prepared, one_shot.Prepared) else prepared
@@ -194,5 +202,5 @@ METHOD: Method[Prepared, State] = Method(
     absolute=lambda options: bool(options["form"] == "one-shot"),
     valid=valid,
     handles=frozenset({INPUTS}),
-    backward=Backward(message, cast(Any, BACKWARD.step), smoothed, smoothed_density),
+    backward=Backward(message, cast(Any, BACKWARD.step), smoothed, smoothed_density, draw=draw),
 )
