@@ -140,6 +140,17 @@ def test_mass_outside_of_a_table_and_mass_without_a_law_warn():
     assert np.nanmax(result.health["without_law"]) == pytest.approx(norm.cdf(-2.16 / 0.71), rel=0.5)
 
 
+def test_the_mass_outside_of_a_table_in_the_drift_is_counted_on_the_grid_of_the_result():
+    restoring = {"pull": {"kind": "linear", "x": [-3, -1, 0, 1, 3], "values": [3, 1, 0, -1, -3]}}
+    keys = {"state": ["x", "v"], "drift": ["v", "pull(x) - v"], "diffusion": [["0"], ["1"]], "tables": restoring}
+    model = zakai.Model(
+        **keys, observation=["x"], observation_noise=[["0.1"]], prior={"kind": "gaussian", "mean": [0, 0], "cov": [0.5, 0.5]}
+    )
+    truth, record = zakai.simulate(model, 0.1 * np.arange(1, 9), seed=3)
+    health = zakai.filter(model, record, "yau-yau").health["outside_tables"][1:]
+    assert (0 <= health).all() and (health < 1e-2).all()
+
+
 def test_a_drift_that_jumps_is_refused():
     model = zakai.Model(**{**LINEAR, "drift": ["-sign(x)", "-y"]}, observation=["x"])
     record = zakai.Record([0.2], [[1.0]], "samples")

@@ -131,7 +131,8 @@ class Prepared:
                 health["without_law"] = float(0.5 * (real.sum(where=lawless) + real.sum(where=near)) / real.sum())
         if self.system.tables:
             stop = float(self.schedule.stops[k])
-            beyond = self.system.outside(update.field.grid.points, stop, self.theta, observations.inputs_at(stop))
+            points = grid_of(new, self.bounds.periodic).points
+            beyond = self.system.outside(points, stop, self.theta, observations.inputs_at(stop))
             health["outside_tables"] = float(new.values.real.reshape(-1)[beyond].sum() / new.values.real.sum())
         return new, info._replace(health=health)
 
