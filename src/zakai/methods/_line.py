@@ -46,6 +46,9 @@ from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 from zakai.records.schedule import Schedule
 
 Array = Any
+# The smallest value that counts of a prior with natural ends, relative to the largest: farther out, rounding in the transition
+# exceeds the mass, since the coefficients of the variable w grow exponentially.
+CUT_OF_DOMAIN = 1e-8
 
 GENEROUS = 96  # points of a grid that is kept though fewer would do
 
@@ -99,8 +102,10 @@ def init(prepared: Prepared, prior: Any) -> State:
             with np.errstate(all="ignore"):
                 return of_state(points) + variable.log_slope(points)[..., 0]
 
+    cut = prepared.cut if variable is None else CUT_OF_DOMAIN
     if log_density is None:
-        grid = prior_grid(lambda points: evaluate(points).real, 1, [closed])
+        tolerance = 1e-12 if variable is None else cut
+        grid = prior_grid(lambda points: evaluate(points).real, 1, [closed], tolerance=tolerance)
         low, high = (float(grid.points[i, 0]) for i in (0, -1))
         spacing = float(grid.basis[0, 0])
     else:
@@ -123,7 +128,7 @@ def init(prepared: Prepared, prior: Any) -> State:
             logs = log_density(np.array([window.origin]), window.offsets[:, None])
         values = np.exp(logs - np.max(logs.real))
         values = values / np.sum(values)
-        look = lw.figures(values, closed, cut=prepared.cut)
+        look = lw.figures(values, closed, cut=cut)
         new = lw.fitted(look, window, lw.SIZES[-1])
         if new == window or attempt == 7:  # the values belong to this window
             break
