@@ -194,8 +194,21 @@ def test_an_increment_after_a_gap_is_reported():
     assert not any("cross_noise" in warning for warning in zakai.filter(correlated("path"), record_of("path")).warnings)
 
 
-@pytest.mark.parametrize("method", ["benes", "hu-yau", "limited-direct", "general-direct", "extended-kalman-bucy", "yau-yau"])
+@pytest.mark.parametrize("method", ["benes", "hu-yau", "limited-direct", "general-direct"])
 def test_other_methods_refuse_it(method):
     record = record_of("increments")
     with pytest.raises((ConditionError, InputError), match="cross_noise is not zero"):
         zakai.filter(correlated(), record, method)
+
+
+def test_the_extended_filter_converges_to_it():
+    record = record_of("increments")
+    exact = zakai.filter(correlated(), record, "kalman-bucy")
+    errors = []
+    for substeps in (8, 16):
+        result = zakai.filter(correlated(), record, "extended-kalman-bucy", substeps=substeps)
+        away = np.abs((result.mean - exact.mean) / np.sqrt(exact.variance)).max()
+        errors.append(max(away, abs(result.log_likelihood - exact.log_likelihood)))
+    assert errors[1] < 0.3 * errors[0] < 0.01
+    with pytest.raises(InputError, match="euler.*cross_noise"):
+        zakai.filter(correlated(), record, "extended-kalman-bucy", riccati="euler")

@@ -170,7 +170,10 @@ def test_a_smoother_on_a_grid_is_refused_in_one_line():
 
 
 REFUSED = {
-    "two states": ({"state": ["x", "z"], "drift": ["-x", "-z"], "cross_noise": [["0.1"], ["0"]]}, "one state"),
+    "five states": (
+        {"state": list("abcde"), "drift": ["-a**3", *"bcde"], "observation": ["a"], "cross_noise": [["0.1"], *[["0"]] * 4]},
+        "at most four",
+    ),
     "jumps": ({"observation": ["sign(x)"]}, "do not jump"),
 }
 

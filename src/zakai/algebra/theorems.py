@@ -204,11 +204,18 @@ def _correlated(model: Model) -> tuple[Condition, ...]:
     if features.CROSS_NOISE not in model.features:
         return ()
     source, words = "the Zakai equation with correlated noise on a grid", model.features[features.CROSS_NOISE]
-    one = Condition("there is one state where dv and dw are correlated", model.n == 1, f"n = {model.n}, and {words}", source)
+    cross = model.diffusion * model.cross_noise
+    depends = next((str(entry) for entry in cross.todok().values() if entry.free_symbols & set(model.x)), "")
+    few = Condition(
+        "the state has at most three coordinates where g C depends on it",
+        model.n <= 3 or not depends,
+        f"n = {model.n}, and {f'g C contains {short(depends)}' if depends else words}",
+        source,
+    )
     parts = [*model.observation, *model.diffusion]
     jumps = [call for part in parts for call in part.atoms(*features.JUMP_FUNCTIONS) if call.has(*model.x)]
     words = f"a formula contains {short(str(jumps[0]))}" if jumps else "neither jumps"
-    return one, Condition("h and g do not jump where dv and dw are correlated", not jumps, words, source)
+    return few, Condition("h and g do not jump where dv and dw are correlated", not jumps, words, source)
 
 
 def _reflecting_ends(model: Model) -> tuple[Condition, ...]:

@@ -11,7 +11,7 @@ import sympy as sp
 from zakai.methods._affine_system import RESOLVED, precision_of
 from zakai.methods._input_pieces import Pieces
 from zakai.models.model import Model
-from zakai.models.numeric import numpy_function
+from zakai.models.numeric import NumericFunction, numpy_function
 from zakai.numerics.flow import Coefficients, integrate
 from zakai.numerics.transition import Array
 
@@ -27,7 +27,24 @@ class Formulas:
         self.motion = numpy_function([*drift, *slope, *model.covariance, *sp.Matrix.hstack(*change)], model)
         self.sensor = numpy_function([*observation, *observation.jacobian(x)], model)
         self.noise = numpy_function(model.observation_noise, model, (m, m))
+        self.cross = None if model.cross_noise.is_zero_matrix else self._cross(model)
         self.noise_varies = bool(model.observation_noise.has(model.t)) and model.observation_kind != "samples"
+
+    @staticmethod
+    def _cross(model: Model) -> NumericFunction:
+        """Return a = g C (n, m) and (a_j.grad) a_i (n) for all i and j, one after the other."""
+        a, x = model.diffusion * model.cross_noise, model.x
+        columns = range(model.m)
+        along = [sum((a[l, j] * sp.diff(a[k, i], x[l]) for l in range(model.n)), sp.S.Zero)
+                 for k in range(model.n) for i in columns for j in columns]  # fmt: skip
+        return numpy_function([*a, *along], model)
+
+    def correlated(self, x: Array, t: float, theta: Array, u: Array | None, gain: Array) -> tuple[Array, Array]:
+        """Return a = g C (n, m), and sum K_ij (a_j.grad) a_i / 2 (n,), Stratonovich's term of y that is linear in time."""
+        assert self.cross is not None
+        n, m = self.shapes
+        values = self.cross(x, np.asarray(t), theta, u)
+        return values[: n * m].reshape(n, m), 0.5 * values[n * m :].reshape(n, m * m) @ gain.ravel()
 
     def drift(self, x: Array, t: float, theta: Array, u: Array | None, rate: Array) -> tuple[Array, Array, Array, Array]:
         """Return f (n,), df/dx (n, n), df/dt (n,) along inputs whose derivative is `rate`, and G (n, n)."""

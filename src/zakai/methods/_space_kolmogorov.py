@@ -7,17 +7,20 @@ increments over more than the interval multiply it at the end.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from zakai.errors import InputError
+from zakai.methods._line_cross import OMITTED
 from zakai.methods._options import tolerance_of
 from zakai.methods._protocol import Info
 from zakai.methods._space import State
+from zakai.methods._space_cross import CrossSystem, potential_of
 from zakai.methods._space_observed import MOST_PANELS, Observations
 from zakai.methods._space_system import System, grid_of, moments_of, prior_on_grid, system_of, valid_noise
+from zakai.models.features import CROSS_NOISE
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.space_fixed import LARGEST_RANGE, Motion, fits, fixed_step, motion, refitted
@@ -81,6 +84,11 @@ class Prepared:
         return self._state(field, mass, control, np.zeros(self.model.n), error, 0.9)
 
     @property
+    def correlated(self) -> bool:
+        """Whether dv and dw are correlated."""
+        return CROSS_NOISE in self.model.features
+
+    @property
     def angles(self) -> tuple[bool, ...]:
         """Which coordinates are angles."""
         return tuple(name in self.model.periodic for name in self.model.state)
@@ -103,7 +111,9 @@ class Prepared:
         last = observations.over(*parts[-1])
         potential = last.potential(inside, values, *parts[-1]) if inside.any() and length > 0 else None
         factor, constant = last.factor(k, inside, values)
-        quick, found = self._fixed(begin, control, allowed, length, potential), None
+        quick, found = None, None
+        if not (self.correlated and inside.any()):
+            quick = self._fixed(begin, control, allowed, length, potential)
         bounds, rates = self.bounds, values / max(length, 1e-300)
         for _ in range(3):
             if quick is not None:
@@ -150,18 +160,25 @@ class Prepared:
         result, report = begin, NOTHING
         for start, length in parts:
             observations = self.observations.over(start, length)
-            if self.schedule.inputs is not None:
-                control = Control(np.inf, 0.0, 0)  # other inputs make another error
-            potential = observations.potential(inside, rates * length, start, length) if inside.any() and length > 0 else None
+            acts, correlated = inside.any() and length > 0, self.correlated and inside.any()
+            if self.schedule.inputs is not None or correlated:
+                control = Control(np.inf, 0.0, 0)  # other inputs and other increments make another error
+            potential = None
+            if acts and correlated:
+                cross = CrossSystem(observations, inside, rates, start, start + length)
+                observations = replace(observations, system=cross)
+                potential = potential_of(observations, start, length)
+            elif acts:
+                potential = observations.potential(inside, rates * length, start, length)
             least = 1
-            if self.system.varies and length > 0:
+            if observations.system.varies and length > 0:
                 mean, cov = moments_of(result.values.real, result.grid, bounds.periodic)
                 points = mean + np.concatenate([np.zeros((1, len(mean))), np.diag(np.sqrt(np.diagonal(cov)))])
                 least = observations.least(points, start, length, inside)
             stepper = Stepper(observations.dynamics, bounds, self.tolerance)
             result, more, control = advance(stepper, result, start, length, potential, control, allowed / len(parts), least)
             unresolved = least >= MOST_PANELS
-            if self.system.state_dependent:
+            if observations.system.state_dependent:
                 valid = valid_noise(observations.system.covariance(result.grid.points, start + length, self.theta))
                 invalid = np.sum(result.values.real, where=~valid.reshape(result.grid.sizes)) / result.values.real.sum()
                 unresolved = unresolved or float(invalid) > 1e-2 * self.tolerance
@@ -301,4 +318,6 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: f
     system, theta = system_of(model), np.asarray(theta)
     tables, motions = ({}, {}) if is_complex(theta) else system.caches(theta)
     observations = Observations(model, schedule, system, theta, tables)
-    return Prepared(model, schedule, theta, system, tolerance, bounds, observations, (), motions)
+    gathered = CROSS_NOISE in model.features and bool((schedule.seen & ~schedule.inside).any())
+    notes = (OMITTED,) if gathered else ()
+    return Prepared(model, schedule, theta, system, tolerance, bounds, observations, notes, motions)

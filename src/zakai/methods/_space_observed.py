@@ -71,6 +71,11 @@ class Observations:
         inputs = self.schedule.inputs
         return self if inputs is None else replace(self, system=self.system.over(inputs, start, start + length))
 
+    def inputs_within(self, times: Array, start: float, stop: float) -> Array | None:
+        """Return the inputs at times of a part of an interval, whose end counts as the limit from inside."""
+        inputs = self.schedule.inputs
+        return None if inputs is None else inputs.at(np.clip(times, start, np.nextafter(stop, start)), self.system.hold)
+
     def inputs_at(self, t: float) -> Array | None:
         """Return the inputs at a time."""
         return None if self.schedule.inputs is None else self.schedule.inputs.at(t, self.system.hold)

@@ -33,13 +33,13 @@ class System:
 
     def __init__(self, model: Model):
         n, m, x = model.n, model.m, model.x
-        divergence = sum((_diff(f, s) for f, s in zip(model.drift, x, strict=True)), start=sympy.S.Zero)
+        divergence = sum((without_jumps(f, s) for f, s in zip(model.drift, x, strict=True)), start=sympy.S.Zero)
         self.n, self.hold = n, model.input_hold
         self.drift = point_function([*model.drift, divergence], model, (n + 1,))
-        self.jacobian = numpy_function([_diff(f, s) for f in model.drift for s in x], model, (n, n))
+        self.jacobian = numpy_function([without_jumps(f, s) for f in model.drift for s in x], model, (n, n))
         self.covariance = numpy_function(model.covariance, model, (n, n))
         self.observe = point_function(list(model.observation), model, (m,))
-        self.slopes = point_function([_diff(h, s) for h in model.observation for s in x], model, (m, n))
+        self.slopes = point_function([without_jumps(h, s) for h in model.observation for s in x], model, (m, n))
         self.noise = numpy_function(model.observation_noise, model, (m, m))
         given = {model.t, *model.u}
         self.drift_varies = bool(model.drift.free_symbols & given)
@@ -113,7 +113,7 @@ def valid_noise(noise: Array) -> Array:
     return np.asarray(np.isfinite(noise.real).all(axis=(1, 2)) & (variances >= 0).all(axis=1))
 
 
-def _diff(formula: sympy.Expr, symbol: sympy.Symbol) -> sympy.Expr:
+def without_jumps(formula: sympy.Expr, symbol: sympy.Symbol) -> sympy.Expr:
     """Return the derivative apart from jumps."""
     return sympy.diff(formula, symbol).replace(sympy.DiracDelta, lambda *_: sympy.S.Zero)
 

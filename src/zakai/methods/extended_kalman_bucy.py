@@ -11,6 +11,9 @@ the step; P stays positive semidefinite whatever the step, and the error is of s
 interval is the integral of S^-1 over it.  An interval is cut where known inputs jump, or their slope does; G(x) is taken at the
 mean.
 
+With correlated noise E dv dw' = C dt and a = g C the gain is (P H' + a) S^-1 in both equations (1).  What is observed enters the
+prediction, f + a S^-1 (dy/dt - h) with the noise G - a S^-1 a', which leaves independent noises; for `riccati="stable"` alone.
+
 A Gaussian prior enters as it is, a mixture or a density by its first two moments.
 """
 
@@ -25,10 +28,11 @@ from zakai.algebra.theorems import smooth_system as theorem
 from zakai.densities import GaussianMixture
 from zakai.errors import InputError
 from zakai.methods._input_pieces import Pieces, pieces_of
+from zakai.methods._line_cross import OMITTED
 from zakai.methods._linearised_system import Formulas, Part, formulas_of, part_of, rate_noise_of, subdivided
 from zakai.methods._moments import prior_moments
 from zakai.methods._protocol import Info, Method
-from zakai.models.features import INPUTS, KINKS, SINC, STATE_DEPENDENT_DIFFUSION, TABLES
+from zakai.models.features import CROSS_NOISE, INPUTS, KINKS, SINC, STATE_DEPENDENT_DIFFUSION, TABLES
 from zakai.models.model import Model
 from zakai.numerics.complex_step import cholesky, is_complex
 from zakai.numerics.linear_flow import linear_flow
@@ -94,6 +98,8 @@ def prepare(model: Model, schedule: Schedule, theta: Array, *, riccati: str = "s
     if isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1:
         raise InputError(f"option substeps: {substeps!r} is not a whole number from 1")
     formulas = formulas_of(model)
+    if riccati == "euler" and formulas.cross is not None:
+        raise InputError('option riccati: "euler" is for independent noises, and there is cross_noise; use "stable"')
     sampled, seen = model.observation_kind == "samples", schedule.seen
     # Observations that all belong to just the interval act inside of it, else all act at its end.
     inside = seen & np.all(schedule.inside == seen, axis=1, keepdims=True) & (not sampled)
@@ -108,6 +114,7 @@ def prepare(model: Model, schedule: Schedule, theta: Array, *, riccati: str = "s
     end_noise = np.where(both, noise * shared, 0.0) + np.eye(model.m) * ~at_end[:, None, :]
     parts = subdivided(pieces_of(schedule, model.input_hold, len(model.u)), substeps)
     rate_noise, notes = rate_noise_of(model, formulas, parts, theta, inside[parts.row])
+    notes = (*notes, OMITTED) if formulas.cross is not None and at_end.any() else notes
     return Prepared(
         model, formulas, theta, schedule, riccati, parts, np.searchsorted(parts.row, np.arange(len(schedule) + 1)),
         list(ends) if model.inputs else [None] * len(schedule), inside, at_end, spans, rate_noise, end_noise, notes,
@@ -149,22 +156,34 @@ def _stable(prepared: Prepared, state: State, observed: list[_Observed] | None, 
     if observed is not None:
         state, first = _update(prepared, state, observed[0], start, part.u)
     # The mean in the middle, to second order, is where the system is linearised.
-    middle, _, _ = _linearised(prepared, state.mean, state.mean, part, start, length / 2)
-    mean, matrix, spread = _linearised(prepared, state.mean, middle, part, start + length / 2, length)
+    middle, *_ = _linearised(prepared, state.mean, state.mean, part, start, length / 2, observed)
+    mean, matrix, spread, gained = _linearised(prepared, state.mean, middle, part, start + length / 2, length, observed)
     cov = matrix @ state.cov @ matrix.T + spread
     state = State(_wrapped(prepared.model, mean), 0.5 * (cov + cov.T))
     if observed is not None:
         state, second = _update(prepared, state, observed[1], start + length, part.at(start + length))
-    return state, first + second
+    return state, first + second + gained
 
 
 def _linearised(
-    prepared: Prepared, mean: Array, centre: Array, part: Part, clock: float, length: float
-) -> tuple[Array, Array, Array]:
-    """Return the mean after `length`, dx/dx0 and the noise gathered, for the system linearised at (centre, clock)."""
-    drift, slope, change, covariance = prepared.formulas.drift(centre, clock, prepared.theta, part.at(clock), part.rate)
+    prepared: Prepared, mean: Array, centre: Array, part: Part, clock: float, length: float, observed: list[_Observed] | None
+) -> tuple[Array, Array, Array, Any]:
+    """Return the mean after `length`, dx/dx0 and the noise gathered, for the system linearised at (centre, clock).
+
+    The last number is what correlated noise adds to the logarithm of the evidence.
+    """
+    formulas, theta, u = prepared.formulas, prepared.theta, part.at(clock)
+    drift, slope, change, covariance = formulas.drift(centre, clock, theta, u, part.rate)
+    gained: Any = 0.0
+    if formulas.cross is not None and observed is not None:
+        seen = observed[0].spans[:, None] * observed[0].spans
+        gain = np.sum([seen * np.linalg.inv(half.noise) for half in observed], axis=0) / part.length
+        (h, H), (a, own) = formulas.observe(centre, clock, theta, u), formulas.correlated(centre, clock, theta, u, gain)
+        drift = drift + a @ gain @ (observed[0].values - h) - own
+        slope, covariance = slope - a @ gain @ H, covariance - a @ gain @ a.T
+        gained = -0.5 * length * (gain * (H @ a)).sum()
     matrix, drifted, spread = linear_flow(slope, change, drift, covariance, length, part.start - clock)
-    return centre + matrix @ (mean - centre) + drifted, matrix, spread
+    return centre + matrix @ (mean - centre) + drifted, matrix, spread, gained
 
 
 def _euler(prepared: Prepared, state: State, observed: list[_Observed] | None, part: Part) -> tuple[State, Any]:
@@ -265,5 +284,5 @@ METHOD: Method[Prepared, State] = Method(
     state=State,
     bounds={"indefinite_cov": (1e-9, "the covariance has a negative eigenvalue (its share of the largest), or is not finite")},
     valid=valid,
-    handles=frozenset({INPUTS, KINKS, SINC, STATE_DEPENDENT_DIFFUSION, TABLES}),
+    handles=frozenset({CROSS_NOISE, INPUTS, KINKS, SINC, STATE_DEPENDENT_DIFFUSION, TABLES}),
 )
