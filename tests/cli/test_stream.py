@@ -88,6 +88,23 @@ FIRST = [
 ]
 
 
+def test_dates_are_times_from_an_origin(stream):
+    numbers = read(stream(['{"time": 6, "y": [0.5]}', '{"time": 30.5, "y": [0.2]}']))
+    days = "2024-01-01T06:00", "2024-01-02T06:30"
+    clock = "--unit", "h", "--origin", "2024-01-01"
+    lines = [f'{{"time": "{day}", "y": [{y}]}}' for day, y in zip(days, (0.5, 0.2), strict=True)]
+    rows = ["time,y", *(f"{day},{y}" for day, y in zip(days, (0.5, 0.2), strict=True))]
+    for given in (lines, rows):
+        found = read(stream(given, *clock))
+        assert [row.pop("date")[:16] for row in found] == list(days)
+        assert found == numbers
+    answer = stream(['{"time": 6, "y": [0.5]}', "{}", lines[0]], *clock)
+    assert "line 1: the time is 6; write dates as" in answer.err and len(read(answer)) == 1
+    assert "give a number (for dates: --unit and --origin)" in stream(lines).err
+    alone = stream(lines, "--unit", "h")
+    assert alone.code == 2 and "give both" in alone.err and "date" not in numbers[0]
+
+
 @pytest.mark.parametrize("first", FIRST)
 def test_another_first_line_is_one_bad_line_before_lines_of_json(stream, first):
     answer = stream([first, *LINES])

@@ -144,3 +144,70 @@ def test_frames_and_arrays_with_dates_are_records():
 def test_durations_are_times_without_dates():
     record = zakai.Record(DATES - DATES[0], VALUES, "samples", unit="h")
     assert record.times[-1] == 30.0 and record.dates is None
+
+
+HEATED = {
+    "state": ["x"], "drift": ["u - x"], "observation": ["x"], "observation_kind": "samples", "inputs": ["u"],
+    "prior": {"kind": "gaussian", "mean": [0], "cov": [[1]]},
+}  # fmt: skip
+
+
+def test_inputs_have_dates_of_their_own():
+    """Their first date is not that of the record, whose origin counts."""
+    model = zakai.Model(**HEATED)
+    days = pandas.date_range("2024-03-29", periods=4, freq="D")
+    inputs = zakai.Inputs(days, [1.0, -1.0, 2.0, 0.0], unit="d")
+    assert inputs.times.tolist() == [0.0, 1.0, 2.0, 3.0] and inputs.origin == days[0]
+    record = zakai.Record(DATES, VALUES, "samples", inputs, unit="d")
+    numbers = zakai.Record(record.times, VALUES, "samples", zakai.Inputs([-1.75, -0.75, 0.25, 1.25], [1.0, -1.0, 2.0, 0.0]))
+    np.testing.assert_array_equal(record.inputs.times, numbers.inputs.times)
+    np.testing.assert_array_equal(zakai.filter(model, record).mean, zakai.filter(model, numbers).mean)
+
+
+def test_inputs_in_a_file_have_the_dates_of_the_record(tmp_path, monkeypatch):
+    from zakai.cli.filtering import record_with_inputs
+
+    rows = "".join(f"{date.isoformat()},{value}\n" for date, value in zip(DATES, VALUES, strict=True) if value == value)
+    (tmp_path / "record.csv").write_text("time,y1\n" + rows)
+    (tmp_path / "inputs.csv").write_text("time,u\n2024-03-29,1.0\n2024-03-31,2.0\n")
+    record = record_with_inputs(tmp_path / "record.csv", zakai.Model(**HEATED), tmp_path / "inputs.csv", "d", "2024-03-30T12:00")
+    assert record.inputs.times.tolist() == [-1.5, 0.5] and record.times[0] == 0.25
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: zakai.Inputs(DATES, VALUES), "inputs: times are dates; give the unit"),
+        (lambda: zakai.Inputs(DATES, VALUES, unit="hours"), "inputs: unit is 'hours'"),
+        (lambda: zakai.Record([0.0], [1.0], "samples", zakai.Inputs(DATES[:1], [1.0], unit="h")), "give dates, a unit"),
+        (lambda: zakai.online(walk(), unit="h"), "online: give both the unit"),
+        (lambda: zakai.online(walk(), unit="h", origin="soon"), "online: origin is 'soon'"),
+        (lambda: zakai.online(walk()).update("2024-01-01", 0.5), "give unit and origin to zakai.online"),
+    ],
+)
+def test_wrong_dates_of_inputs_and_online_filters_are_refused_in_one_line(make, says):
+    with pytest.raises(InputError, match=says) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_an_online_filter_takes_dates_and_gives_the_numbers_of_a_record():
+    model = zakai.Model(**HEATED)
+    inputs = zakai.Inputs(["2024-03-30", "2024-03-31"], [1.0, -1.0], unit="d")
+    result = zakai.filter(model, zakai.Record(DATES, VALUES, "samples", inputs, unit="d", origin="2024-03-30"))
+    online = zakai.online(model, unit="d", origin="2024-03-30")
+    times = [DATES[0], DATES[1].to_pydatetime(), DATES[2].to_datetime64(), *(date.isoformat() for date in DATES[3:])]
+    for k, (time, value) in enumerate(zip(times, VALUES, strict=True)):
+        estimate = online.update(time, value, inputs if k == 0 else None)
+        assert estimate.time == result.times[k + 1] and estimate.date == DATES[k]
+        np.testing.assert_array_equal(estimate.mean, result.mean[k + 1])
+    assert online.predict("2024-04-01").date == np.datetime64("2024-04-01")
+
+
+def test_a_checkpoint_belongs_to_its_origin(tmp_path):
+    online = zakai.online(walk(), unit="d", origin="2024-03-30")
+    online.update(DATES[0], 0.3)
+    online.save(tmp_path / "state")
+    zakai.online(walk(), unit="d", origin="2024-03-30").restore(tmp_path / "state")
+    with pytest.raises(InputError, match="another clock"):
+        zakai.online(walk(), unit="d", origin="2024-03-29").restore(tmp_path / "state")

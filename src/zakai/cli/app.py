@@ -28,6 +28,7 @@ _Options = Annotated[
 _Truth = Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="The true states, for the report.")]
 _Report = Annotated[Path | None, typer.Option(metavar="REPORT.html", help="Write a report with pictures.")]
 _Inputs = Annotated[Path | None, typer.Option("--inputs", metavar="FILE.csv", help="The known inputs: time, a column for each.")]
+_Origin = Annotated[str | None, typer.Option(metavar="DATE", help="The date at which t = 0; by default the first one.")]
 _Unit = Annotated[str | None, typer.Option(metavar="UNIT", help="The unit of time, for a record with dates: s, min, h, d.")]
 _Output = Annotated[Path, typer.Option("-o", "--output", metavar="RESULT.nc", help="Where the result goes (NetCDF).")]
 
@@ -87,11 +88,12 @@ def filter(
     report: _Report = None,
     inputs: _Inputs = None,
     unit: _Unit = None,
+    origin: _Origin = None,
 ) -> None:
     """Compute the conditional density of the state at every time of a record."""
     from zakai.cli import filtering
 
-    filtering.filter(model, record, output, method, option or [], truth, report, inputs, unit=unit)
+    filtering.filter(model, record, output, method, option or [], truth, report, inputs, unit=unit, origin=origin)
 
 
 @app.command()
@@ -105,11 +107,12 @@ def smooth(
     report: _Report = None,
     inputs: _Inputs = None,
     unit: _Unit = None,
+    origin: _Origin = None,
 ) -> None:
     """Compute the conditional density of the state given all observations, at every time of the record."""
     from zakai.cli import filtering
 
-    filtering.filter(model, record, output, method, option or [], truth, report, inputs, smoothed=True, unit=unit)
+    filtering.filter(model, record, output, method, option or [], truth, report, inputs, smoothed=True, unit=unit, origin=origin)
 
 
 @app.command()
@@ -123,11 +126,12 @@ def forecast(
     option: _Options = None,
     inputs: _Inputs = None,
     unit: _Unit = None,
+    origin: _Origin = None,
 ) -> None:
     """Compute the density of the state at times after a record."""
     from zakai.cli import filtering
 
-    filtering.forecast(model, record, until, step, output, method, option or [], inputs, unit)
+    filtering.forecast(model, record, until, step, output, method, option or [], inputs, unit, origin)
 
 
 @app.command()
@@ -142,11 +146,12 @@ def fit(
     option: _Options = None,
     inputs: _Inputs = None,
     unit: _Unit = None,
+    origin: _Origin = None,
 ) -> None:
     """Estimate parameters of a model by maximum likelihood, with their standard errors."""
     from zakai.cli import filtering
 
-    filtering.fit(model, record, parameters, output, method, option or [], inputs, unit)
+    filtering.fit(model, record, parameters, output, method, option or [], inputs, unit, origin)
 
 
 @app.command()
@@ -159,11 +164,13 @@ def stream(
     strict: Annotated[bool, typer.Option("--strict", help="Stop at the first line that cannot be used.")] = False,
     every: Annotated[int, typer.Option(metavar="N", min=1, help="Print every Nth estimate.")] = 1,
     fields: Annotated[str, typer.Option(metavar="a,b", help="What to print: time, mean, cov, interval, ...")] = "",
+    unit: _Unit = None,
+    origin: Annotated[str | None, typer.Option(metavar="DATE", help="The date at which t = 0, with --unit.")] = None,
 ) -> None:
     """Filter observations as they arrive: JSON lines or CSV on standard input, one line of JSON out for each."""
     from zakai.cli import streaming
 
-    streaming.stream(model, method, option or [], checkpoint, checkpoint_every, strict, every, fields)
+    streaming.stream(model, method, option or [], checkpoint, checkpoint_every, strict, every, fields, unit, origin)
 
 
 @app.command()

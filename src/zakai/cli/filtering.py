@@ -34,6 +34,7 @@ def filter(
     inputs_path: Path | None = None,
     smoothed: bool = False,
     unit: str | None = None,
+    origin: str | None = None,
 ) -> None:
     """Filter or smooth a record, print a summary, and write the result and the report.
 
@@ -45,7 +46,7 @@ def filter(
         from zakai.report._extra import plotting
 
         plotting("plotly")
-    model, record, options = _given(source, record_path, settings, inputs_path, unit)
+    model, record, options = _given(source, record_path, settings, inputs_path, unit, origin)
     truth = None if truth_path is None else _truth(truth_path, model, record)
 
     if smoothed:
@@ -80,13 +81,14 @@ def forecast(
     settings: list[str],
     inputs_path: Path | None = None,
     unit: str | None = None,
+    origin: str | None = None,
 ) -> None:
     """Filter a record, and write the density of the state at times after it."""
     from zakai.engine.driver import filter as run
     from zakai.models.clock import clock
 
     check_outputs([output], [source, record_path, inputs_path])
-    model, record, options = _given(source, record_path, settings, inputs_path, unit)
+    model, record, options = _given(source, record_path, settings, inputs_path, unit, origin)
     last = float(record.times[-1])
     if not until > last:
         raise InputError(f"--until {until:g}: must be after the end of the record, {last:g}")
@@ -108,13 +110,14 @@ def fit(
     settings: list[str],
     inputs_path: Path | None = None,
     unit: str | None = None,
+    origin: str | None = None,
 ) -> None:
     """Print the parameters of largest likelihood, and write the model with them."""
     from zakai.engine.fit import fit as run
     from zakai.records.writing import atomic_write
 
     check_outputs([output], [source, record_path, inputs_path])
-    model, record, options = _given(source, record_path, settings, inputs_path, unit)
+    model, record, options = _given(source, record_path, settings, inputs_path, unit, origin)
     names = [name.strip() for name in parameters.split(",") if name.strip()] or None
     found = run(model, record, names, method, **options)
     _warn(found.warnings)
@@ -127,17 +130,26 @@ def fit(
 
 
 def _given(
-    source: str, path: Path, settings: list[str], inputs_path: Path | None, unit: str | None
+    source: str, path: Path, settings: list[str], inputs_path: Path | None, unit: str | None, origin: str | None
 ) -> tuple[Model, Record, dict[str, Any]]:
     """Read the model, the record with its inputs, and the options."""
     options = options_of(settings)
     model = load_model(source)
-    record = read_record(path, model, unit)
-    if inputs_path is not None:
-        if record.inputs is not None:
-            raise InputError(f"--inputs {inputs_path}: {path} has columns for the inputs too; give them once")
-        record = replace(record, inputs=read_inputs(inputs_path, model))
-    return model, record, options
+    return model, record_with_inputs(path, model, inputs_path, unit, origin), options
+
+
+def record_with_inputs(
+    path: Path, model: Any, inputs_path: Path | None, unit: str | None = None, origin: str | None = None
+) -> Record:
+    """Read a record, and its inputs from a file of their own where there is one."""
+    if origin is not None and unit is None:
+        raise InputError("--origin: is the date at which t = 0, and needs --unit, the unit of the model's time, as in --unit h")
+    record = read_record(path, model, unit, origin)
+    if inputs_path is None:
+        return record
+    if record.inputs is not None:
+        raise InputError(f"--inputs {inputs_path}: {path} has columns for the inputs too; give them once")
+    return replace(record, inputs=read_inputs(inputs_path, model, record.clock))
 
 
 def _warn(warnings: Iterable[str]) -> None:

@@ -20,6 +20,7 @@ from zakai.records.writing import shown
 
 FIELDS: dict[str, Callable[[Any], Any]] = {
     "time": lambda estimate: estimate.time,
+    "date": lambda estimate: str(estimate.date),
     "mean": lambda estimate: _plain(estimate.mean.tolist()),
     "cov": lambda estimate: _plain(estimate.cov.tolist()),
     "interval": lambda estimate: _plain(estimate.interval(0.95).tolist()),
@@ -38,18 +39,23 @@ def stream(
     strict: bool,
     every: int,
     fields: str,
+    unit: str | None = None,
+    origin: str | None = None,
 ) -> None:
     """Filter the lines of standard input, and print a line of JSON for each; wrong arguments are refused before the first."""
     if checkpoint is None and checkpoint_every is not None:
         raise InputError("--checkpoint-every: needs --checkpoint FILE")
-    wanted = _wanted(fields)
+    if (unit is None) != (origin is None):
+        raise InputError("--unit and --origin: give both, the unit of the model's time and the date at which t = 0, or none")
+    wanted = _wanted(fields, unit is not None)
     check_outputs([checkpoint], [source])
     options = options_of(settings)
     model = load_model(source)
 
     from zakai.engine.online import online
 
-    _Stream(online(model, method, **options), wanted, every, checkpoint, checkpoint_every or 1, strict).run()
+    found = online(model, method, unit=unit, origin=origin, **options)
+    _Stream(found, wanted, every, checkpoint, checkpoint_every or 1, strict).run()
 
 
 class _Stream:
@@ -69,7 +75,7 @@ class _Stream:
                 self.skip_until = self.online.time
                 self.show(self.online.last)
         _interrupt.insist()
-        for line in lines_of(sys.stdin.buffer, self.online.model.m, self.online.model.inputs):
+        for line in lines_of(sys.stdin.buffer, self.online.model.m, self.online.model.inputs, self.online.clock):
             _interrupt.check()
             try:
                 estimate = self.used(line)
@@ -119,11 +125,12 @@ def _count(said: Any, checkpoint: Path) -> int:
     return said
 
 
-def _wanted(fields: str) -> list[str]:
-    names = [name.strip() for name in fields.split(",")] if fields else list(FIELDS)
+def _wanted(fields: str, dated: bool) -> list[str]:
+    known = [name for name in FIELDS if dated or name != "date"]
+    names = [name.strip() for name in fields.split(",")] if fields else known
     for name in names:
-        if name not in FIELDS:
-            raise InputError(f'--fields: there is no field "{name}"; the fields are {", ".join(FIELDS)}')
+        if name not in known:
+            raise InputError(f'--fields: there is no field "{name}"; the fields are {", ".join(known)}')
     return names
 
 

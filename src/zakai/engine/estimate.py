@@ -49,6 +49,12 @@ class Estimate:
         return self._moments[0].time
 
     @property
+    def date(self) -> np.datetime64 | None:
+        """The date of the estimate, of a filter with a unit and an origin."""
+        clock = self._online.clock
+        return None if clock is None else clock.dates(np.array([self.time]))[0]
+
+    @property
     def mean(self) -> np.ndarray:
         """The mean of the state (n,)."""
         means = [self._part(i).mean() if one.info is None else one.info.mean for i, one in enumerate(self._moments)]

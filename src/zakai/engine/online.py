@@ -20,12 +20,13 @@ from zakai.models._errors import named
 from zakai.models.checks import check_noise_at
 from zakai.models.model import Model
 from zakai.records.checkpoint import read_checkpoint, write_checkpoint
+from zakai.records.dates import Clock, date_of
 from zakai.records.inputs import Inputs, known_inputs
 from zakai.records.numbers import LARGEST
 from zakai.records.writing import shown
 
 
-def online(model: Model, method: str = "auto", **options: Any) -> Online:
+def online(model: Model, method: str = "auto", *, unit: str | None = None, origin: Any = None, **options: Any) -> Online:
     """Return a filter that receives one observation at a time, and gives the estimate after it.
 
     Its estimates are those of `zakai.filter` for the same record, to the bit.
@@ -33,6 +34,8 @@ def online(model: Model, method: str = "auto", **options: Any) -> Online:
     Args:
         model: the system, with a prior.
         method: a method's name, or "auto", as for `zakai.filter`.
+        unit: the model's unit of time, where times are dates, as for `zakai.Record`.
+        origin: the date at which t = 0, with `unit`.
         **options: options of the method.
 
     Raises:
@@ -44,7 +47,9 @@ def online(model: Model, method: str = "auto", **options: Any) -> Online:
         estimate = online.update(0.01, [0.02, -0.01])
         estimate.mean, estimate.interval()
     """
-    return Online(model, method, options)
+    if (unit is None) != (origin is None):
+        raise InputError("online: give both the unit of the model's time and the origin, the date at which t = 0, or none")
+    return Online(model, method, options, None if unit is None else Clock.of(origin, unit, "online"))
 
 
 class Online:
@@ -53,12 +58,12 @@ class Online:
     Several of them do not disturb each other, in threads neither; one that several threads share serves them one after the other.
     """
 
-    def __init__(self, model: Model, method: str, options: dict[str, Any]):
+    def __init__(self, model: Model, method: str, options: dict[str, Any], clock: Clock | None = None):
         check_model(model)
         if options.get("form") == "one-shot":
             raise InputError('option form: "one-shot" needs all times from the start on; an online filter takes "stepwise"')
         plan = planned(model, None, method, options)
-        self.model, self.options = model, options
+        self.model, self.options, self.clock = model, options, clock
         self.blocks: Any = plan.division.blocks if isinstance(plan, ByBlocks) else None
         self.method = plan.division.method if isinstance(plan, ByBlocks) else plan.setting.method.name
         self.why = plan.division.why if isinstance(plan, ByBlocks) else plan.why
@@ -82,7 +87,8 @@ class Online:
         """Return the estimate after an observation.
 
         Args:
-            time: later than that of the last observation, or for samples the model's start itself.
+            time: later than that of the last observation, or for samples the model's start itself; a date (ISO text, `datetime`,
+                pandas or NumPy) where the filter has a unit and an origin.
             value: (m,), of the model's `observation_kind`; NaN or None where a coordinate was not observed. A number is accepted
                 where m is one.
             inputs: of a model with inputs, their values from this time on, as {"u": 1.0} or in the order of the model; the first
@@ -112,7 +118,7 @@ class Online:
         `inputs` as for `update`.
         """
         with self.lock:
-            time = _number(time)
+            time = _number(self._of_date(time))
             if time == self.time:
                 return self.last
             if not time > self.time:
@@ -173,7 +179,8 @@ class Online:
     def _bound(self) -> dict[str, Any]:
         """What a checkpoint belongs to."""
         options = {name: self.options[name] for name in sorted(self.options)}
-        return {"model": self.model.text, "method": self.method, "options": options, "versions": versions()}
+        clock = None if self.clock is None else [str(part) for part in self.clock]
+        return {"model": self.model.text, "method": self.method, "options": options, "clock": clock, "versions": versions()}
 
     def _divided(self, values: list[float]) -> list[list[float]]:
         """Return the observations of each block; a block without sensors has one that is never observed."""
@@ -184,14 +191,25 @@ class Online:
     def _known(self, call: str, time: float, inputs: Any) -> Inputs | None:
         """Return the known inputs from the time of the filter on, None for a model without inputs."""
         now = self.feeds[0].now
+        if isinstance(inputs, Inputs):
+            inputs = inputs.on(self.clock)
         with named(call):
             return known_inputs(self.model, now.inputs, inputs, now.time, time)
+
+    def _of_date(self, time: Any) -> Any:
+        """Return the time of a date, and anything else as it is."""
+        date = None if isinstance(time, float | int) else date_of(time)
+        if date is None:
+            return time
+        if self.clock is None:
+            raise InputError(f"the time {_short(str(time))} is a date; give unit and origin to zakai.online")
+        return self.clock.time(date)
 
     def _time(self, time: Any) -> float:
         now = self.feeds[0].now.time
         if type(time) is float and now < time <= LARGEST:
             return float(time)
-        time = _number(time)
+        time = _number(self._of_date(time))
         if time > now:
             return float(time)
         begins = self.feeds[0].now.info is None

@@ -32,12 +32,16 @@ class Clock(NamedTuple):
     unit: str
 
     @classmethod
-    def of(cls, origin: Any, unit: Any) -> Clock:
+    def of(cls, origin: Any, unit: Any, what: str = "record") -> Clock:
         """Return the clock of a date and the name of a unit; InputError where they are none."""
         found = as_dates(origin)
         if found is None or found.ndim or np.isnat(found):
-            raise InputError(f"record: origin is {echo(origin, 40)}; give the date at which t = 0, as in '2024-01-31T12:00'")
-        return cls(np.datetime64(found.item(), "ns"), unit_name(unit))
+            raise InputError(f"{what}: origin is {echo(origin, 40)}; give the date at which t = 0, as in '2024-01-31T12:00'")
+        return cls(np.datetime64(found.item(), "ns"), unit_name(unit, what))
+
+    def time(self, date: np.datetime64) -> float:
+        """Return the time of one date."""
+        return float(self.times(np.array([date]))[0])
 
     def times(self, dates: np.ndarray) -> np.ndarray:
         """Return the times (...) of dates (...)."""
@@ -62,12 +66,12 @@ class Clock(NamedTuple):
         return start + np.asarray(times, float) * (_NANOSECONDS[self.unit] / _NANOSECONDS["d"])
 
 
-def unit_name(unit: Any) -> str:
-    """Return the name of a unit of time; InputError for an unknown one."""
+def unit_name(unit: Any, what: str = "record") -> str:
+    """Return the name of a unit of time; InputError, which begins with `what`, for an unknown one."""
     name = _OTHER_NAMES.get(unit, unit) if isinstance(unit, str) else unit
     if not isinstance(name, str) or name not in _NANOSECONDS:
         hint = did_you_mean(name, _NANOSECONDS) if isinstance(name, str) else ""
-        raise InputError(f"record: unit is {echo(unit)}; it must be one of {listing(_NANOSECONDS)}{hint}")
+        raise InputError(f"{what}: unit is {echo(unit)}; it must be one of {listing(_NANOSECONDS)}{hint}")
     return name
 
 
@@ -108,7 +112,7 @@ def date_of(value: Any) -> np.datetime64 | None:
     return np.datetime64(value, "ns") if isinstance(value, datetime.date) else None
 
 
-def read_times(values: Any, unit: Any, origin: Any) -> tuple[Any, Clock | None, np.ndarray | None]:
+def read_times(values: Any, unit: Any, origin: Any, what: str = "record") -> tuple[Any, Clock | None, np.ndarray | None]:
     """Return times as numbers, their clock, and the dates; numbers without a unit stay as they are, without a clock.
 
     Raises:
@@ -116,20 +120,20 @@ def read_times(values: Any, unit: Any, origin: Any) -> tuple[Any, Clock | None, 
     """
     if hasattr(values, "dtype") and getattr(values.dtype, "kind", "") == "m":
         if unit is None:
-            raise InputError("record: times are durations; give the unit of the model's time, as in unit='h'")
-        return np.asarray(values).astype("timedelta64[ns]").astype(np.int64) / _NANOSECONDS[unit_name(unit)], None, None
+            raise InputError(f"{what}: times are durations; give the unit of the model's time, as in unit='h'")
+        return np.asarray(values).astype("timedelta64[ns]").astype(np.int64) / _NANOSECONDS[unit_name(unit, what)], None, None
     dates = as_dates(values) if unit is not None or _are_dates(values) else None
     if dates is None:
         if unit is None and origin is None:
             return values, None, None
         if unit is None or origin is None:
-            raise InputError("record: times are numbers; give dates, or both unit and origin, the date at which t = 0")
-        return values, Clock.of(origin, unit), None
+            raise InputError(f"{what}: times are numbers; give dates, or both unit and origin, the date at which t = 0")
+        return values, Clock.of(origin, unit, what), None
     if unit is None:
-        raise InputError("record: times are dates; give the unit of the model's time, as in unit='h'")
+        raise InputError(f"{what}: times are dates; give the unit of the model's time, as in unit='h'")
     if dates.ndim != 1 or not dates.size:
         return np.zeros(dates.shape), None, None
-    clock = Clock.of(dates[0] if origin is None else origin, unit)
+    clock = Clock.of(dates[0] if origin is None else origin, unit, what)
     return clock.times(dates), clock, dates
 
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from zakai.errors import InputError
-from zakai.records.csv import header_of, read_table
+from zakai.records.csv import Dates, header_of, read_table
+from zakai.records.dates import Clock
 from zakai.records.inputs import Inputs
 from zakai.records.writing import shown
 
@@ -17,12 +18,13 @@ if TYPE_CHECKING:
     from zakai.models.model import Model
 
 
-def read_inputs(path: str | os.PathLike[str], model: Model) -> Inputs:
+def read_inputs(path: str | os.PathLike[str], model: Model, clock: Clock | None = None) -> Inputs:
     """Read the inputs of a model from a CSV file: `time`, then one column for each input, in any order.
 
     Args:
         path: the file.
         model: says the names of the inputs.
+        clock: of a record with dates, for ISO dates in the column `time`.
 
     Raises:
         InputError: the file, or its first bad row by its line number, cannot be used, or an input is missing.
@@ -37,7 +39,8 @@ def read_inputs(path: str | os.PathLike[str], model: Model) -> Inputs:
             f"{shown(path)}: row 1: no column for the input {', '.join(missing)}; give time, {', '.join(model.inputs)}"
         )
     wanted = names[1:] if sorted(names[1:]) == sorted(model.inputs) else model.inputs
-    table, row = read_table(path, len(model.inputs), "inputs", wanted)
+    dates = None if clock is None else Dates(clock.unit, clock.origin)
+    table, row = read_table(path, len(model.inputs), "inputs", wanted, dates)
     values = table[:, 1:][:, [wanted.index(name) for name in model.inputs]]
     gaps = np.isnan(values).any(axis=1)
     if gaps.any():

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from zakai import _display
 from zakai.errors import InputError
 from zakai.models._errors import echo
+from zakai.records.dates import Clock, read_times
 from zakai.records.numbers import LARGEST, real_numbers
 
 if TYPE_CHECKING:
@@ -24,8 +25,10 @@ class Inputs:
     """Known inputs at strictly increasing times, which need not be those of a record.
 
     Args:
-        times: (k,), in the model's unit of time.
+        times: (k,), in the model's unit of time; or dates, with a `unit`, as for `Record`.
         values: (k, number of inputs), in the order of the model's `inputs`; (k,) is taken as (k, 1).
+        unit: the model's unit of time, for dates: "ns", "us", "ms", "s", "min", "h", "d", "week" or "year" (365.25 days).
+        origin: the date at which t = 0, by default the first date; with a record of dates its origin counts.
 
     With `input_hold = "zero"` the value at t_k holds on [t_k, t_(k+1)), the last one for ever; with "linear" it is linear between
     the times.
@@ -40,9 +43,12 @@ class Inputs:
 
     times: NDArray[Any]
     values: NDArray[Any]
+    unit: str | None = None
+    origin: Any = None
 
     def __post_init__(self) -> None:
-        times, values = real_numbers(self.times, "times", "inputs"), real_numbers(self.values, "values", "inputs")
+        given, clock, _ = read_times(self.times, self.unit, self.origin, "inputs")
+        times, values = real_numbers(given, "times", "inputs"), real_numbers(self.values, "values", "inputs")
         if values.ndim == 1:
             values = values[:, np.newaxis]
         if times.ndim != 1 or times.size == 0:
@@ -61,8 +67,9 @@ class Inputs:
             row = int(late[0]) + 1
             raise InputError(f"inputs: row {row}, counted from 0: time {times[row]:g} does not increase; sort the rows by time")
         times.flags.writeable = values.flags.writeable = False
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "values", values)
+        found = {"times": times, "values": values, "unit": None, "origin": None}
+        for name, value in (found if clock is None else {**found, **clock._asdict()}).items():
+            object.__setattr__(self, name, value)
 
     def __len__(self) -> int:
         return len(self.times)
@@ -75,6 +82,23 @@ class Inputs:
         rows = [tuple(map(_display.number, (time, *row))) for time, row in zip(self.times[few], self.values[few], strict=True)]
         header = ["time", *(f"u{i + 1}" for i in range(self.values.shape[1]))]
         return _display.html_table(repr(self), header, rows, total=len(self))
+
+    @property
+    def clock(self) -> Clock | None:
+        """The unit and the date at which t = 0, of inputs with dates."""
+        return None if self.unit is None else Clock(self.origin, self.unit)
+
+    def on(self, clock: Clock | None) -> Inputs:
+        """Return the inputs with times of a clock; inputs without dates are returned as they are.
+
+        Raises:
+            InputError: inputs have dates, and there is no clock.
+        """
+        if self.clock is None or self.clock == clock:
+            return self
+        if clock is None:
+            raise InputError("inputs: have dates, but the observations have not; give dates, a unit and an origin to both")
+        return Inputs(clock.times(self.clock.dates(self.times)), self.values, clock.unit, clock.origin)
 
     def at(self, t: Any, hold: str = "zero", before: bool = False) -> NDArray[Any]:
         """Return the inputs (..., number of inputs) at times t (...); `before` takes the limit from the left at a jump.

@@ -76,7 +76,9 @@ class Record:
         if fault is not None:
             raise InputError(f"record: row {fault[0]}, counted from 0: {fault[1]}")
         times.flags.writeable = values.flags.writeable = False
-        found = {"times": times, "values": values, "_dates": dates}
+        found: dict[str, Any] = {"times": times, "values": values, "_dates": dates}
+        if isinstance(self.inputs, Inputs):
+            found["inputs"] = self.inputs.on(clock)
         found |= {"unit": None, "origin": None} if clock is None else clock._asdict()
         for name, value in found.items():
             object.__setattr__(self, name, value)

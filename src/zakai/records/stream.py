@@ -13,6 +13,7 @@ from typing import Any, BinaryIO, NamedTuple
 from zakai.errors import InputError
 from zakai.models._errors import named
 from zakai.records.csv import columns_with_inputs, header_names
+from zakai.records.dates import Clock, date_of
 
 LONGEST = 2**20  # bytes of a line
 MOST_DIGITS = 640  # of an integer: what Python always reads, however it is set
@@ -34,7 +35,7 @@ class Line(NamedTuple):
     fault: str | None = None
 
 
-def lines_of(file: BinaryIO, m: int, inputs: Sequence[str] = ()) -> Iterator[Line]:
+def lines_of(file: BinaryIO, m: int, inputs: Sequence[str] = (), clock: Clock | None = None) -> Iterator[Line]:
     r"""Yield the lines of a stream of observations, each as soon as it is there.
 
     JSON lines are {"time": 0.1, "y": [0.5, null], "inputs": {"u": 1.0}}; other keys are ignored, and no key may stand twice. A
@@ -45,6 +46,7 @@ def lines_of(file: BinaryIO, m: int, inputs: Sequence[str] = ()) -> Iterator[Lin
         file: bytes, as `sys.stdin.buffer`.
         m: how many values an observation has.
         inputs: the names of the known inputs.
+        clock: the times are ISO dates, which become times of this clock.
 
     Raises:
         InputError: the header of a CSV does not fit, or what looks like CSV has none.
@@ -72,7 +74,7 @@ def lines_of(file: BinaryIO, m: int, inputs: Sequence[str] = ()) -> Iterator[Lin
             continue
         if parse is None:
             columns = _columns(text, number, m, inputs)
-            parse = _json if columns is None else partial(_csv, inputs, columns)
+            parse = partial(_json, clock) if columns is None else partial(_csv, clock, inputs, columns)
             if columns is not None:
                 continue
         try:
@@ -86,7 +88,15 @@ def _skip_rest(file: BinaryIO, content: bytes) -> None:
         content = file.readline(LONGEST)
 
 
-def _json(text: str) -> tuple[Any, list[Any], dict[str, Any] | None]:
+def _date(text: Any, clock: Clock) -> float:
+    """Return the time of an ISO date."""
+    date = date_of(text) if isinstance(text, str) else None
+    if date is None:
+        raise ValueError(f"the time is {_said(text)}; write dates as 2024-01-31T12:30")
+    return clock.time(date)
+
+
+def _json(clock: Clock | None, text: str) -> tuple[Any, list[Any], dict[str, Any] | None]:
     try:
         found = _DECODER.decode(text)
     except json.JSONDecodeError:
@@ -96,8 +106,11 @@ def _json(text: str) -> tuple[Any, list[Any], dict[str, Any] | None]:
     if not isinstance(found, dict) or "time" not in found or "y" not in found:
         raise ValueError(f'{_quoted(text.strip())} is not an object with "time" and "y"')
     time, values, inputs = found["time"], found["y"] if isinstance(found["y"], list) else [found["y"]], found.get("inputs")
+    if clock is not None:
+        time = _date(time, clock)
     if not _is_number(time):
-        raise ValueError(f"the time is {_said(time)}; give a number")
+        hint = " (for dates: --unit and --origin)" if isinstance(time, str) and date_of(time) is not None else ""
+        raise ValueError(f"the time is {_said(time)}; give a number{hint}")
     for index, value in enumerate(values):
         if value is not None and not _is_number(value):
             raise ValueError(f"observation {index + 1} is {_said(value)}; give a number, or null where there is none")
@@ -144,9 +157,13 @@ def _no_number(name: str) -> None:
 _DECODER = json.JSONDecoder(object_pairs_hook=_object, parse_int=_integer, parse_constant=_no_number)
 
 
-def _csv(inputs: Sequence[str], columns: tuple[list[int], list[int]], text: str) -> tuple[Any, list[Any], dict[str, Any] | None]:
+def _csv(
+    clock: Clock | None, inputs: Sequence[str], columns: tuple[list[int], list[int]], text: str
+) -> tuple[Any, list[Any], dict[str, Any] | None]:
     """Return the time, the observations and the inputs of a row; `columns` are the places of both, see `_columns`."""
     cells = [cell.strip() for cell in text.split(",")]
+    if clock is not None and cells[0]:
+        cells[0] = repr(_date(cells[0].strip('"'), clock))
     for cell in cells:
         if cell and not _NUMBER.fullmatch(cell):
             raise ValueError(f"{_quoted(cell)} is not a number; leave the cell empty if nothing was observed")
