@@ -18,6 +18,7 @@ from zakai.models.model import Model
 
 Conditions = tuple[Condition, ...]
 _MOST_STATES = 8  # of a model that is rewritten
+_WIDTH = sp.Rational(1, 10)
 _MOST_CHARACTERS = 90  # of a formula in a sentence
 
 
@@ -62,7 +63,7 @@ def _rewritings(model: Model) -> Iterator[tuple[str, Model]]:
     """Yield changed models, with the words that describe the change."""
     if model.n > _MOST_STATES or model.functions:
         return
-    for change in (_logarithms, _without_periodic):
+    for change in (_logarithms, _without_periodic, _without_jumps):
         try:
             found = change(model)
         except (ZakaiError, ArithmeticError, ValueError):
@@ -76,6 +77,26 @@ def _without_periodic(model: Model) -> tuple[str, Model] | None:
     if not model.periodic:
         return None
     return f"leave out periodic = {list(model.periodic)}", Model(**{**_keys(model), "periodic": None})
+
+
+def _without_jumps(model: Model) -> tuple[str, Model] | None:
+    """Return the model with tanh(a / w) for sign(a), of which heaviside is made, in f and g; w is for the user to choose."""
+    keys, found = _keys(model), set[sp.Expr]()
+
+    def smooth(formula: Any) -> sp.Expr:
+        calls = [call for call in formula.atoms(sp.sign) if call.has(*model.x)]
+        found.update(call.args[0] for call in calls)
+        return formula.subs({call: sp.tanh(call.args[0] / _WIDTH) for call in calls})
+
+    keys["drift"] = [smooth(formula) for formula in keys["drift"]]
+    keys["diffusion"] = [[smooth(entry) for entry in row] for row in keys["diffusion"]]
+    if not found:
+        return None
+    a = min(map(str, map(readable, found)), key=len)
+    ratio = f"{a}/w" if a.isidentifier() else f"({a})/w"
+    calls = f"tanh({ratio}) for sign({a}), (1 + tanh({ratio}))/2 for heaviside({a})"
+    words = f"write {calls} with a small w (the error is of order w**2; halve w until the answer stays)"
+    return words, Model(**keys)
 
 
 def _logarithms(model: Model) -> tuple[str, Model] | None:

@@ -32,6 +32,7 @@ from zakai.algebra.yau import (
     wong_omega,
 )
 from zakai.algebra.yau import eta as wong_eta
+from zakai.errors import InputError
 from zakai.models.model import Model
 
 
@@ -147,6 +148,8 @@ def analyze(model: Model) -> Analysis:
         >>> print(zakai.analyze(zakai.load_model("gallery:benes")).yau_form.potential)
         log(cosh(x))
     """
+    if not isinstance(model, Model):
+        raise InputError(f"analyze: expected a Model, got a {type(model).__name__}; zakai.load_model reads one from a file")
     form = cached_yau_form(model)
     omega, energy = wong_omega(model), wong_eta(model)
     methods = {name: conditions_of(name, model) for name in THEOREMS}

@@ -22,7 +22,7 @@ def read_observed(model: Model, keys: Mapping[str, Any]) -> int:
     """Read the names in `observed`, and return how many there are."""
     for key in ("observation", "observation_noise", "observation_family", "degrees_of_freedom", "concentration"):
         if keys.get(key) is not None:
-            raise InputError(f"{key}: goes with observation, and observation_log_density is given instead of it; leave one out")
+            raise InputError(f"{key}: describes the observation, as observation_log_density does; leave one of them out")
     if model.observation_kind != "samples":
         kind = model.observation_kind
         raise InputError(f'observation_log_density: is for samples; give observation_kind = "samples", not "{kind}"')

@@ -19,8 +19,11 @@ def read_text(path: Path, shown: str, what: str = "model") -> str:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
-        gallery = what == "model" and path.suffix == ""
-        hint = "; the models of the gallery are named gallery:NAME" if gallery else f"; give a {what} file (TOML)"
+        hint = f"; give a {what} file (TOML)"
+        if what == "table":
+            hint = "; its path is relative to the model file"
+        elif what == "model" and path.suffix == "":
+            hint = "; the models of the gallery are named gallery:NAME"
         raise InputError(f"{shown}: there is no such file{hint}") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{shown}: cannot be read: {getattr(error, 'strerror', None) or 'not a path'}") from None

@@ -77,7 +77,9 @@ class Record:
             raise InputError(f"record: row {fault[0]}, counted from 0: {fault[1]}")
         times.flags.writeable = values.flags.writeable = False
         found: dict[str, Any] = {"times": times, "values": values, "_dates": dates}
-        if isinstance(self.inputs, Inputs):
+        if self.inputs is not None:
+            if not isinstance(self.inputs, Inputs):
+                raise InputError(f"record: inputs: expected zakai.Inputs(times, values), got a {type(self.inputs).__name__}")
             found["inputs"] = self.inputs.on(clock)
         found |= {"unit": None, "origin": None} if clock is None else clock._asdict()
         for name, value in found.items():
