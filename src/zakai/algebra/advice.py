@@ -8,10 +8,9 @@ from typing import Any
 import sympy as sp
 
 from zakai import _display
-from zakai._registry import AUTO
 from zakai.algebra._readable import readable
 from zakai.algebra.conditions import Condition, all_hold
-from zakai.algebra.theorems import NOT_HANDLED, conditions_of
+from zakai.algebra.theorems import NOT_HANDLED, conditions_of, in_order
 from zakai.errors import ZakaiError
 from zakai.models.features import DOMAIN, STATE_DEPENDENT_DIFFUSION
 from zakai.models.model import Model
@@ -56,7 +55,7 @@ def _holds(model: Model, method: str) -> bool:
 
 def _first(model: Model) -> str | None:
     """Return the first method of "auto" that holds."""
-    return next((name for name in AUTO if _holds(model, name)), None)
+    return next((name for name in in_order(model) if _holds(model, name)), None)
 
 
 def _rewritings(model: Model) -> Iterator[tuple[str, Model]]:

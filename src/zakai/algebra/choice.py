@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from zakai._registry import AUTO
 from zakai.algebra.advice import nearest, what_to_do
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.independent import IndependentBlock, independent_blocks
-from zakai.algebra.theorems import conditions_of
+from zakai.algebra.theorems import conditions_of, in_order
 from zakai.errors import ConditionError
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior
@@ -63,7 +62,7 @@ def chosen(model: Model, method: str) -> tuple[str, str, Mapping[str, Conditions
             raise ConditionError(f"{model.source}: {method} does not hold: {failure(conditions)}\n{advice}")
         return method, "asked for by name, and every assumption of its theorem holds", {method: conditions}
     considered: dict[str, Conditions] = {}
-    for name in AUTO:
+    for name in in_order(model):
         considered[name] = conditions_of(name, model)
         if all_hold(considered[name]) is True:
             return name, "the first method whose every assumption holds for this system", considered

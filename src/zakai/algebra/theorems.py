@@ -124,7 +124,11 @@ def general_direct(model: Model) -> tuple[Condition, ...]:
     Chen and Dong, Theorems 6 and 7, in their corrected form; G may be singular where the drift is affine.
     """
     conditions = [determined(model)]
-    if conditions[0].holds is not True:
+    if model.features:
+        own, sampled = features.of_dynamics(model), model.observation_kind == "samples"
+        words, source = "; ".join(own.values() or model.features.values()), "a sample enters only at its time"
+        conditions.append(Condition("features are in what a sample depends on", sampled and not own, words, source))
+    if any(condition.holds is not True for condition in conditions):
         return tuple(conditions)
     form = cached_yau_form(model)
     statement = "f = L(t) x + l(t) + G(t) grad phi(t, x)"
@@ -143,7 +147,7 @@ def gaussian_sum(model: Model) -> tuple[Condition, ...]:
     conditions = general_direct(model)
     if conditions[0].holds is not True:
         return conditions
-    parts = [*model.drift, *model.covariance, *model.observation, *model.observation_noise]
+    parts = [*model.drift, *model.covariance, *model.observation, *model.observation_noise, *model.family_parameters.values()]
     varying = [part for part in parts if model.t in part.free_symbols]
     evidence = f"{short(str(varying[0]))} depends on t" if varying else "no coefficient depends on t"
     return (*conditions, Condition("f, h, G and S are constant in time", not varying, evidence, f"{_SURVEY}, (14)"))
@@ -151,7 +155,9 @@ def gaussian_sum(model: Model) -> tuple[Condition, ...]:
 
 def _few_directions(model: Model, form: YauForm) -> Condition:
     """Quadrature is in the coordinates of a nonlinear h and of phi."""
-    nonlinear = [] if affine_observation(model) else list(model.observation)
+    law = [*model.observation, *model.observation_noise.diagonal(), *model.family_parameters.values()]
+    nonlinear = law if features.OF_OBSERVATION & model.features.keys() else []
+    nonlinear = nonlinear or ([] if affine_observation(model) else list(model.observation))
     used = {name for name, symbol in zip(model.state, model.x) if any(f.has(symbol) for f in (*nonlinear, form.potential))}
     listed = ", ".join(name for name in model.state if name in used) or "none"
     return Condition(
@@ -288,6 +294,16 @@ def theorem_of(name: str) -> Callable[[Model], tuple[Condition, ...]]:
 NOT_HANDLED = "what this method handles"  # the source of a condition about a feature
 
 
+def in_order(model: Model) -> tuple[str, ...]:
+    """Return the methods that "auto" tries for a model, in order.
+
+    Of a sample with a law of its own a Gaussian sum is less accurate than a density on a grid, which takes up to four states.
+    """
+    if not model.features:
+        return _registry.AUTO
+    return (*(name for name in _registry.AUTO if name != "general-direct"), "general-direct")
+
+
 def conditions_of(name: str, model: Model) -> tuple[Condition, ...]:
     """Return the conditions under which a method, own or of another library, holds for a model; nothing else decides this.
 
@@ -315,6 +331,7 @@ __all__ = [
     "cached_yau_form",
     "conditions_of",
     "hu_yau",
+    "in_order",
     "gaussian_sum",
     "general_direct",
     "inverse",

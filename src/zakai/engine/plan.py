@@ -10,7 +10,7 @@ import numpy as np
 from zakai import _registry
 from zakai.algebra.choice import Conditions, Division, chosen, divided
 from zakai.algebra.conditions import all_hold
-from zakai.algebra.theorems import conditions_of
+from zakai.algebra.theorems import conditions_of, in_order
 from zakai.engine.blocks import joined_blocks, record_of_block
 from zakai.engine.loop import KEPT_BYTES, Run
 from zakai.engine.results import FilterResult
@@ -99,7 +99,8 @@ def _whole(model: Model, prior: Any, method: str, options: Mapping[str, Any]) ->
         loaded = _registry.load(name)
         setting = Setting.of(model, prior, loaded, _own_options([loaded], options)[0])
         exact = name == "kalman-bucy" and isinstance(prior, GaussianPrior)
-        later = _registry.AUTO[_registry.AUTO.index(name) + 1 :] if method == "auto" and not exact else ()
+        order = in_order(model)
+        later = order[order.index(name) + 1 :] if method == "auto" and not exact else ()
         others = [one for one in later if all_hold(conditions_of(one, model)) is True]
         fault = _fault_at_prior(setting) if others else ""
         if not fault:

@@ -11,6 +11,7 @@ exp(int h'S^-1 dt dy/length) is divided between both ends so that its first mome
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from zakai.algebra.theorems import yau_system
 from zakai.methods._affine_system import Matrices, precision_of
 from zakai.methods._residuals import Factor as Residuals
 from zakai.methods._residuals import Sensors
+from zakai.methods._sum_law import SampleLaw, has_own_law
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
 from zakai.numerics.flow import Coefficients, FlowResult, integrate
@@ -36,7 +38,8 @@ class Factor(NamedTuple):
         at the start  sum_j dy'before_j h_j,
         at the end    sum_j (after_j dy).h_j - (h_j - spread dy)'energy_j (h_j - spread dy) / 2 + offset + dy'weight dy / 2.
 
-    `times` (J,), `before`, `after` and `energy` (J, m, m) or None for zero, `spread` and `weight` (m, m).
+    `times` (J,), `before`, `after` and `energy` (J, m, m) or None for zero, `spread` and `weight` (m, m).  Samples with a law of
+    their own have `law`(z, dy) = log p(dy | z), of which the power `share` is taken; `energy` is then that of statistics.
     """
 
     times: Array
@@ -46,6 +49,8 @@ class Factor(NamedTuple):
     spread: Array
     weight: Array
     offset: Any
+    law: Callable[[Array, Array], Array] | None = None
+    share: float = 1.0
 
 
 class System:
@@ -57,7 +62,8 @@ class System:
         n, m = model.n, model.m
         self.n, self.m, self.lie = n, m, splitting == "lie"
         self.sampled = model.observation_kind == "samples"
-        self.affine, self.unobserved = yau.slope is not None, yau.unobserved is not None
+        self.law = SampleLaw(model) if has_own_law(model) else None
+        self.affine, self.unobserved = yau.slope is not None and self.law is None, yau.unobserved is not None
         # Whether the increments drive the equation inside an interval.
         self.rates = self.affine and not self.sampled and not self.lie
         # Whether a part of the factor of an increment is at the start of its interval.
@@ -77,12 +83,20 @@ class System:
         self.autonomous = not (self._equation.varying or self.rates and self._sensor.varying)
 
     def observe(self, z: Array, t: Any, theta: Array) -> Array:
-        """Return h (..., m) at points z (..., n)."""
+        """Return h (..., m) at points z (..., n), or the statistics of a law."""
+        if self.law is not None:
+            return self.law.statistics(self.origin + z, t, theta)
         return self.sensors.observed(self.origin + z, t, theta)
 
     def noise(self, times: Array, theta: Array) -> Array:
         """Return S (R, m, m) at times (R,)."""
         return np.asarray(np.broadcast_to(self.sensors.noise(self.origin, times, theta), (len(times), self.m, self.m)))
+
+    def precision(self, times: Array, theta: Array) -> Array:
+        """Return S^-1 (R, m, m) at times (R,), or the metric of the statistics of a law."""
+        if self.law is not None:
+            return np.broadcast_to(np.eye(len(self.law)), (len(times), len(self.law), len(self.law)))
+        return np.linalg.inv(self.noise(times, theta))
 
     def slope(self, t: float, theta: Array) -> tuple[Array, Array]:
         """Return C (m, n) and c (m,) of an affine h = C z + c at a time."""
@@ -117,6 +131,8 @@ class System:
         """Return the factors of all intervals, and the largest error of their integrals over time."""
         nothing = np.zeros((self.m, self.m))
         none = Factor(np.zeros(1), None, None, None, nothing, nothing, 0.0)
+        if self.law is not None:
+            return [self._of_law(self.law, schedule, k, theta, none) for k in range(len(schedule))], 0.0
         complete = Schedule(schedule.starts, schedule.stops, np.ones_like(schedule.seen), schedule.lengths[:, None] + nothing[0])
         half = 0.5 * np.linalg.inv(self.noise(schedule.stops[:1], theta))
         found, worst = [none] * len(schedule), 0.0
@@ -144,6 +160,14 @@ class System:
             if late.energy is not None:
                 found[k] = _joined(found[k], late)
         return found, worst
+
+    def _of_law(self, law: SampleLaw, schedule: Schedule, k: int, theta: Array, none: Factor) -> Factor:
+        """Return the factor of the samples at the end of interval k."""
+        seen, stop = schedule.seen[k], float(schedule.stops[k])
+        if not seen.any():
+            return none
+        likelihood = law.likelihood(seen, stop, theta, self.origin)
+        return none._replace(times=np.array([stop]), energy=law.energy(seen)[None], law=likelihood)
 
     def _at_end(self, schedule: Schedule, k: int, theta: Array, at_end: Array) -> Factor:
         """Return the factor of observations that act at the end of interval k."""

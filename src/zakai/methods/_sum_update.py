@@ -20,6 +20,7 @@ from zakai.numerics.gaussian_sum import (
     joined,
     log_volumes,
     moments,
+    regression,
     selected,
     shares,
     solve,
@@ -31,6 +32,8 @@ from zakai.numerics.sum_fits import fit_dictionary, fit_peaks
 from zakai.numerics.sum_quadrature import (
     SEARCH,
     Refitted,
+    gauss_hermite,
+    points,
     refit,
     refit_affine,
     rows_of,
@@ -63,7 +66,8 @@ class Sum:
         self.gauge = SumGauge(self.system.potential, model, self.system.origin)
         self.angles = tuple(model.state.index(name) for name in model.periodic)
         self.affine = self.system.affine
-        self.directions = np.zeros((model.n, 0)) if self.affine else directions_of(list(model.observation), model)
+        formulas = list(model.observation) if self.system.law is None else self.system.law.formulas
+        self.directions = np.zeros((model.n, 0)) if self.affine else directions_of(formulas, model)
         self.start_directions = span(np.hstack([self.directions, self.gauge.directions]))
         k = self.start_directions.shape[1]
         if max(k, self.directions.shape[1]) > MOST_DIRECTIONS:
@@ -153,6 +157,14 @@ class Moment(NamedTuple):
     def multiply(self, v: Components, factor: Factor, values: Array, corrections: int = 0, start: bool = False) -> Refitted:
         """Return v times the factor of an interval at its `start` or at its end."""
         static, theta = self.static, self.theta
+        if factor.law is not None:
+            law, share = factor.law, factor.share
+
+            def log_law(z: Array, _: Array) -> Array:
+                logs = share * law(z, values)
+                return np.where(np.isnan(logs), -np.inf, logs)
+
+            return refit(v, log_law, static.directions, True)
         forces, energy = (factor.before, None) if start else (factor.after, factor.energy)
         constant = 0.0 if start else factor.offset + 0.5 * values @ factor.weight @ values
         linear = None if forces is None or not np.any(values) else forces @ values
@@ -188,6 +200,7 @@ class Moment(NamedTuple):
         static = self.static
         curved = bool(static.directions.shape[1])
         health = dict.fromkeys(("nonlinearity", "quadrature", "pruned", "merged"), 0.0)
+        health["without_law"] = self._without_law(v, factor, values)
         remaining = 1.0
         while remaining > 0.0:
             if curved and static.split_merge and (static.system.sampled or factor.energy is not None):
@@ -214,6 +227,16 @@ class Moment(NamedTuple):
             "edge_weight": float(np.sum(share * edge)) if len(edge) == len(share) else 0.0,
         }
         return v, Info(log_mass, wrapped(static.system.origin + mean, static.angles), cov, health)
+
+    def _without_law(self, v: Components, factor: Factor, values: Array) -> float:
+        """Return the share of the mass where the law of a sample has no value."""
+        if factor.law is None:
+            return 0.0
+        directions = self.static.directions
+        rule = gauss_hermite(directions.shape[1])
+        real = Components(*(array.real for array in v))
+        logs = factor.law(points(real, regression(real.covs, directions), rule.nodes), values)
+        return average(self.share(v)[0], np.isnan(logs.real) @ rule.weights)
 
     def _fraction(self, v: Components, factor: Factor) -> float:
         """Return the power of a factor, 1/2^i, that is smooth enough for the nodes over the components that count."""
@@ -290,4 +313,6 @@ def part_of(factor: Factor, fraction: float) -> Factor:
     if fraction == 1.0:
         return factor
     after, energy = (None if array is None else fraction * array for array in (factor.after, factor.energy))
+    if factor.law is not None:
+        return factor._replace(energy=energy, share=fraction * factor.share)
     return factor._replace(after=after, energy=energy, weight=fraction * factor.weight, offset=fraction * factor.offset)

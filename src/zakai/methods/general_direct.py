@@ -20,6 +20,7 @@ from zakai.methods import _sum_start as start
 from zakai.methods._protocol import Info, Method
 from zakai.methods._sum_system import Factor
 from zakai.methods._sum_update import SPLIT_FACTOR, Moment, Sum, average, move, sum_of
+from zakai.models.features import OBSERVATION_FAMILY, SINC, STATE_DEPENDENT_OBSERVATION_NOISE
 from zakai.models.model import Model
 from zakai.numerics.flow import Transition, at
 from zakai.numerics.gaussian_sum import Array, Components, selected, shares, wrapped
@@ -115,9 +116,7 @@ def prepare(
     system = static.system
     flow = system.transitions(schedule, theta)
     factors, error = system.factors(schedule, theta)
-    precision = np.linalg.inv(system.noise(np.array([model.start]), theta.real))
-    if len(schedule):
-        precision = np.linalg.inv(np.broadcast_to(system.noise(schedule.stops, theta.real), (len(schedule), model.m, model.m)))
+    precision = system.precision(schedule.stops if len(schedule) else np.array([model.start]), theta.real)
     errors = float(flow.error.max(initial=0.0)), error
     return Prepared(static, schedule, theta, flow.transition, factors, precision, _notes(static, schedule, errors))
 
@@ -272,6 +271,7 @@ BOUNDS = {
     "pruned": (1e-3, "weight of components that were dropped in one step"),
     "merged": (0.1, "loss by merging components because their number is limited"),
     "edge_weight": (1e-6, "weight of the outermost Gaussians of the start: the posterior is in tails that it has not"),
+    "without_law": (1e-6, "share of the mass where the law of the observation has no value, as for counts with a negative mean"),
     "tail_depth": (1.0, "distance by which the observation moves the density into the tails of single Gaussians"),
 }
 
@@ -289,4 +289,5 @@ METHOD = Method(
     bounds=BOUNDS,
     valid=valid,
     shorter="give fewer components",
+    handles=frozenset({OBSERVATION_FAMILY, SINC, STATE_DEPENDENT_OBSERVATION_NOISE}),
 )
