@@ -42,7 +42,7 @@ FAULTS = [
     ({"observation_family": '"student-t"', "degrees_of_freedom": "-3"}, "degrees_of_freedom", "positive"),
     ({"degrees_of_freedom": "3"}, "degrees_of_freedom", "goes with the family student-t"),
     ({"observation_family": '"von-mises"'}, "concentration", "missing"),
-    ({**LOG_DENSITY, "observation": '["x"]'}, "observation", "observation_log_density is given instead"),
+    ({**LOG_DENSITY, "observation": '["x"]'}, "observation", "as observation_log_density does"),
     ({**LOG_DENSITY, "observed": None}, "observed", "1 to 64 names"),
     ({**LOG_DENSITY, "observed": '["x"]'}, "observed", "already a state"),
     ({**LOG_DENSITY, "observed": '["w"]'}, "observation_log_density", "unknown name 'z'"),
