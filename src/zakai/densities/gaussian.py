@@ -18,8 +18,8 @@ class GaussianMixture(DensityMethods):
     """sum_k w_k N(m_k, P_k): `weights` (k,), `means` (k, n), `covs` (k, n, n); one component is a Gaussian.
 
     Weights sum to one and may be slightly negative, as those of nodes that represent a smooth density are; a density is then
-    -inf in the logarithm where rounding leaves nothing.  A coordinate in `periodic` is wrapped to the circle: its density is summed
-    over the windings that matter.
+    -inf in the logarithm where rounding leaves nothing.  A coordinate in `periodic` is wrapped to the circle: its density is
+    summed over the windings that matter.
     """
 
     weights: np.ndarray

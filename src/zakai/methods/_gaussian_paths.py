@@ -69,7 +69,7 @@ def _root(cov: Array) -> Array:
     scale = np.sqrt(np.maximum(np.diag(cov), 0.0))
     scale = np.where(scale > 0, scale, 1.0)
     sizes, axes = np.linalg.eigh(cov / scale[:, None] / scale)
-    return scale[:, None] * axes * np.sqrt(np.maximum(sizes, 0.0))
+    return np.asarray(scale[:, None] * axes * np.sqrt(np.maximum(sizes, 0.0)))
 
 
 def _drawn(prepared: Prepared, parts: list[Gaussians], signs: Array, rng: np.random.Generator) -> Array:
@@ -105,4 +105,4 @@ def _share(x: Array, shares: Array, means: Array, roots: Array, signs: Array) ->
         white = (x - means[:, c]) @ left[:, used] / sizes[used]
         terms[:, c] = np.exp(-0.5 * np.sum(white * white, axis=1)) / np.prod(sizes[used])
     terms *= shares
-    return np.maximum(terms @ signs, 0.0) / np.maximum(terms.sum(axis=1), 1e-300)
+    return np.asarray(np.maximum(terms @ signs, 0.0) / np.maximum(terms.sum(axis=1), 1e-300))
