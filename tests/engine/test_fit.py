@@ -154,7 +154,7 @@ def test_the_likelihood_of_a_double_well_and_its_gradient_are_right():
     )  # fmt: skip
     times = np.cumsum(np.random.default_rng(2).uniform(0.1, 0.5, 25))
     record = zakai.simulate(model, times, seed=3)[1]
-    x = np.linspace(-3.2, 3.2, 129)
+    x = np.linspace(-2.6, 2.6, 129)
     d = x[1] - x[0]
     offset = np.subtract.outer(np.arange(129), np.arange(129)) + 0.0
     with np.errstate(divide="ignore", invalid="ignore"):

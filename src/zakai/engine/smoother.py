@@ -59,6 +59,9 @@ class SmoothingResult(FilterResult):
             Godsill, Doucet and West 2004, Monte Carlo smoothing for nonlinear time series.
 
         Example:
+            model = zakai.load_model("gallery:benes")
+            truth, record = zakai.simulate(model, np.arange(0.01, 1.0, 0.01))
+            smoothed = zakai.smooth(model, record)
             paths = smoothed.sample_paths(1000)
             highest = paths[:, :, 0].max(axis=1)  # draws of the largest value that the state has taken
         """
