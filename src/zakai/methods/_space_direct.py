@@ -388,7 +388,7 @@ class Prepared(base.Prepared):
         factors = [one for one in (factor, extra) if one is not None]
         update = Update(predicted, report.edges, report.tails, 0.0, False)
         if factors:
-            update = updated(predicted, lambda grid: sum(one(grid) for one in factors), bounds, report.tails, band_limited=True)
+            update = updated(predicted, lambda grid: sum(one(grid) for one in factors), bounds, band_limited=True)
         update = update._replace(field=regridded(self._folded(update.field), bounds))
         if potential is None:
             after = Control(state.rate, state.measured, state.age)

@@ -122,7 +122,7 @@ class Prepared:
                 predicted, report, after = self._predicted(begin, parts, inside, rates, control, allowed, bounds)
             update = Update(predicted, report.edges, report.tails, 0.0, False)
             if factor is not None:
-                update = updated(predicted, factor, bounds, report.tails)
+                update = updated(predicted, factor, bounds)
             if not update.truncated or length == 0 or bounds.edge <= OUTLIER_EDGE:
                 break
             # The observation is where the prediction was cut off; so wide a grid leaves rounding, which no substep makes smaller.
@@ -313,7 +313,8 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: f
     if n > 4:
         raise InputError(f"{model.source}: a density grid is for at most four states, and there are {n}")
     periodic = tuple(name in model.periodic for name in model.state)
-    tail = min(tolerance**2, 1e-3 * tolerance)
+    # With more at the highest frequencies the substeps of skew densities do not converge.
+    tail = min(tolerance**2, 1e-5 * tolerance)
     bounds = Bounds(1e-3 * tolerance, tail, MOST[n], periodic)
     system, theta = system_of(model), np.asarray(theta)
     tables, motions = ({}, {}) if is_complex(theta) else system.caches(theta)

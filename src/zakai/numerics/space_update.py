@@ -16,7 +16,7 @@ from zakai.numerics.space_grid import (
     relative_index,
     triangular_resampled,
 )
-from zakai.numerics.space_step import Field, better, positive, refinable
+from zakai.numerics.space_step import Field, positive, refinable
 from zakai.numerics.space_survey import deviations_in_spacings, narrowest, survey
 from zakai.numerics.space_window import Bounds, adjusted, fitted_grid, whitened_grid
 
@@ -39,21 +39,18 @@ class Update(NamedTuple):
     truncated: bool
 
 
-def updated(
-    field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, tails: float, band_limited: bool = False
-) -> Update:
+def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, band_limited: bool = False) -> Update:
     """Return the product of a density and a factor that is given by its logarithm at the points of a grid (J,).
 
     A factor that is narrower than the grid's spacing is found on a sequence of finer grids, with a power of it below one as long
-    as neighbours differ by many nats.  `tails` are those of the spectrum of the density.  With `band_limited` interpolation is
-    exact for a density that its grid resolves.
+    as neighbours differ by many nats.  With `band_limited` interpolation is exact for a density that its grid resolves.
     """
     grid, values = field.grid, field.values
     coefficients: Array | None = None
     inverse_previous = grid
     logs = log_factor(grid).reshape(grid.sizes)
-    found, before = None, np.ones(grid.n)
-    best: Any = None  # the smallest grid with the smallest edges and tails so far: a later one may be worse
+    found, before = None, np.full(grid.n, np.inf)
+    best: Any = None  # the grid with the smallest edges and tails so far: a later one may be worse
     for attempt in range(_TRIES):
         real = np.where(values.real > 0, values.real, 0.0)
         with np.errstate(divide="ignore"):
@@ -65,12 +62,11 @@ def updated(
         if power == 1.0:
             found = survey(_exp(product - top), grid, bounds.edge)
             worst = float(max(found.tails.max(), found.edges.max()))
+            if best is None or worst < best[0]:
+                best = worst, grid, values, logs, product, top, found
             span = (found.used[:, 1] - found.used[:, 0] + 4) / np.array(grid.sizes)
             wide = found.edges > 3 * bounds.edge
-            coarse = refinable(found.tails, before, tails, bounds)
-            good = not wide.any() and found.tails.max() <= 3 * bounds.tail
-            if best is None or good or better(worst, best[0]):
-                best = worst, grid, values, logs, product, top, found
+            coarse = refinable(found.tails, before, bounds)
             before = np.where(coarse & (attempt > 0), found.tails, before)
             sparse = np.array([attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1])
             if not (wide.any() or coarse.any() or sparse.any()):
@@ -89,12 +85,11 @@ def updated(
             zero = np.zeros((grid.n, grid.n))
             coefficients = filtered(field.values, gaussian_response(zero, field.grid.sizes, spline=True))
         at = relative_index(new.offsets, new.centre, inverse_previous, bounds.periodic)
-        values = gather(coefficients, at, inverse_previous).reshape(new.sizes)
-        grid, values = new, positive(Field(values, new, 0.0)).values
+        grid, values = new, gather(coefficients, at, inverse_previous).reshape(new.sizes)
         logs, found = log_factor(grid).reshape(grid.sizes), None
     if found is None:
         found = survey(_exp(product - top), grid, bounds.edge)
-    if best is not None:
+    if best is not None and best[0] < 0.1 * max(found.tails.max(), found.edges.max()):
         _, grid, values, logs, product, top, found = best
     peak = int(np.argmax(product))
     ratio = float(values.real.flat[peak] / max(field.values.real.max(), values.real.max()))

@@ -12,7 +12,6 @@ from zakai.numerics.space_grid import Grid, rounded_size
 Array = NDArray[Any]
 LEAST = {1: 32, 2: 20, 3: 16, 4: 12}
 MOST = {1: 1024, 2: 512, 3: 128, 4: 40}
-MARGIN = 0.01  # of the bound on tails of the spectrum, for which a grid is chosen
 _CORRELATED = 0.6  # correlation above which the axes follow the covariance
 _OPEN, _CLOSED = 0.6, 0.85  # shares of a circle below which an axis is cut open, and above which it is closed
 
@@ -37,7 +36,7 @@ class Bounds(NamedTuple):
     @property
     def spacings(self) -> float:
         """Spacings in a standard deviation that leave `tail` with a margin."""
-        return float(np.sqrt(-2 * np.log(MARGIN * self.tail)) / np.pi)
+        return float(np.sqrt(-2 * np.log(self.tail / 30)) / np.pi)
 
 
 def fitted_grid(
