@@ -408,6 +408,17 @@ def test_a_long_gap_of_a_double_well_and_a_wide_prior_with_weak_noise():
     assert np.abs(found[1:] - expected[1:])[:, :2].max() < 1e-3 and abs(found[0, 2] - expected[0, 2]) < 1e-3
 
 
+def test_densities_much_sharper_than_the_noise_of_an_interval():
+    model = model_of("0.9*sin(2*x) - 0.3*x", "tanh(2*x)", gaussian(0.5, 0.3), "samples", 0.01, diffusion=[["0.6"]])
+    times, values = np.array([0.3, 0.9, 1.0, 2.1, 2.6]), np.array([0.3, -0.2, 0.1, 0.5, 0.95])
+    found, healths, _ = steps(model, times, values)
+    assert not any(warned(YAU, health) for health in healths)
+    prior = lambda x: np.exp(-0.5 * (x - 0.5) ** 2 / 0.3)  # noqa: E731
+    drift, h = (lambda x: 0.9 * np.sin(2 * x) - 0.3 * x), (lambda x: np.tanh(2 * x))
+    expected = brute_force(drift, 0.36, (h,), (0.01,), prior, times, values[:, None], "samples", 5.0, 400)
+    assert distance(found, expected) < 1e-8
+
+
 def test_the_large_grid_of_a_wide_prior_is_left_again():
     model = model_of("1.2*(x - x**3)", "x", gaussian(0.0, 1.0), "samples", 0.2, diffusion=[["0.7"]])
     record = Record(0.1 * np.arange(1, 11), np.linspace(0.9, 1.1, 10)[:, None], "samples")
