@@ -21,7 +21,7 @@ def total(values):
     return result
 """
 USE = "import numpy, one; print(one.total(numpy.arange(4.0)))"
-HITS = "import one; print(sum(one.total.stats.cache_hits.values()))"
+HITS = f"{USE}; print(sum(one.total.stats.cache_hits.values()))"
 
 
 def started(folder, code, **environment):
@@ -46,14 +46,27 @@ def folder(tmp_path):
 def test_without_a_cache_folder_a_kernel_is_compiled_and_nothing_is_printed(folder):
     (folder / "__pycache__").write_text("a file in the way")
     assert answered(started(folder, USE)) == ("6.0\n", "")
-    assert answered(started(folder, HITS))[0] == "0\n"
+    assert answered(started(folder, HITS))[0] == "6.0\n0\n"
+
+
+def test_a_kernel_is_compiled_for_the_declared_types_when_it_first_receives_them(folder):
+    (folder / "one.py").write_text(KERNEL.replace('[::1])"', '[::1])", "complex128(complex128[::1])"'))
+    calls = ["", "one.total(x)", "one.total(1j * x)", "one.total(x)"]
+    code = "; ".join(f"{call}; print(len(one.total.signatures), end=' ')".lstrip("; ") for call in calls)
+    assert answered(started(folder, f"import numpy, one; x = numpy.arange(4.0); {code}")) == ("0 1 2 2 ", "")
+
+
+@pytest.mark.parametrize("values", ["numpy.arange(4)", "numpy.arange(8.0)[::2]", "numpy.eye(2)"])
+def test_a_kernel_refuses_arrays_of_other_types(folder, values):
+    code = f"import numpy, one\ntry: print(one.total({values}))\nexcept TypeError: print('refused')"
+    assert answered(started(folder, code)) == ("refused\n", "")
 
 
 def test_two_processes_that_compile_at_once_leave_a_whole_cache(folder):
     for process in [started(folder, USE) for _ in range(2)]:
         assert answered(process) == ("6.0\n", "")
     assert list(folder.glob("__pycache__/*.nbi"))
-    assert answered(started(folder, HITS))[0] == "1\n"
+    assert answered(started(folder, HITS))[0] == "6.0\n1\n"
 
 
 def test_a_full_disk_behind_the_cache_costs_compilation_only(folder):

@@ -9,7 +9,7 @@ It begins as e^phi at the last time.  The smoothed density is v times this messa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +29,7 @@ from zakai.methods._gaussian_families import (
 )
 from zakai.methods._gaussian_paths import draw
 from zakai.methods._protocol import Backward, Info, Infos
+from zakai.numerics import gaussian_backward
 from zakai.numerics.families import Family, solve, weigh
 from zakai.numerics.transition import Array, at, symmetric
 
@@ -148,15 +149,11 @@ def segment(
     """Take a message from the end of a slice of intervals to its start by the compiled loop, where there is one Gaussian."""
     if not is_single(prepared, states[0]) or len(later.logs) > 1:
         return None
-    from zakai.numerics import gaussian_backward  # a filter does not wait for its compilation
-
     assert prepared.loop is not None
-    compiled: Callable[..., None] = gaussian_backward.segment
-    _, arguments = prepared.loop
     means, covs = np.array([state.mean[0] for state in states[1:]]), np.array([state.cov[0] for state in states[1:]])
     moved, masses = Message(*(np.array(field, order="C") for field in later)), np.empty(len(values))
-    compiled(
-        rows.start, moved.centre, moved.information, moved.slopes[0], moved.logs, *arguments, np.ascontiguousarray(values),
+    gaussian_backward.segment(
+        rows.start, moved.centre, moved.information, moved.slopes[0], moved.logs, *prepared.loop, np.ascontiguousarray(values),
         means, covs, masses,
     )  # fmt: skip
     return moved, Infos(masses, means + prepared.setup.origin, covs, health_of_gaussians(covs))

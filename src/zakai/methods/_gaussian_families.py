@@ -6,7 +6,7 @@ Kalman-Bucy, Benes and Hu-Yau are this filter for phi = 0, phi = log cosh and an
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
@@ -27,7 +27,7 @@ from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior, MixturePrior
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.families import Family, exponents, move, observe, weigh
-from zakai.numerics.gaussian_step import segment, segment_with_derivatives
+from zakai.numerics.gaussian_step import segment
 from zakai.numerics.transition import Array, Transition, at
 from zakai.records.schedule import Schedule
 
@@ -72,7 +72,7 @@ class State(NamedTuple):
 class Prepared:
     """What is known without data: for every interval the transition, its `ends`, and the gauge there.
 
-    `loop`: the compiled segment of a single Gaussian with what it receives of this; None where there is a gauge.
+    `loop`: what the compiled loop of a single Gaussian receives of this; None where there is a gauge.
     """
 
     model: Model
@@ -82,7 +82,7 @@ class Prepared:
     stops: Array
     frequencies: Array
     transitions: Transition
-    loop: tuple[Callable[..., None], tuple[Any, ...]] | None
+    loop: tuple[Any, ...] | None
     ends: Ends
     notes: tuple[str, ...]
 
@@ -130,8 +130,7 @@ def prepare(model: Model, schedule: Schedule, theta: Array, kind: type[AffineSys
         dtype = complex if is_complex(setup.theta) else float
         parts = [np.ascontiguousarray(part, dtype) for part in (*transitions, ends.whiten, ends.slope, ends.intercept)]
         level = np.ascontiguousarray(ends.constant, dtype)
-        compiled = segment if dtype is float else segment_with_derivatives()
-        loop = compiled, (lengths, frequencies, *parts, ends.observed, level, ends.relative)
+        loop = (lengths, frequencies, *parts, ends.observed, level, ends.relative)
     return Prepared(model, setup, gauge, lengths, schedule.stops, frequencies, transitions, loop, ends, notes)
 
 
@@ -221,12 +220,11 @@ def is_single(prepared: Prepared, state: State) -> bool:
 def segment_of_gaussian(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[list[State], Infos]:
     """Return the states after the intervals of a slice, and their reports, for one Gaussian."""
     assert prepared.loop is not None
-    (loop, arguments), origin = prepared.loop, prepared.setup.origin
-    dtype = arguments[2].dtype
+    origin, dtype = prepared.setup.origin, prepared.loop[2].dtype
     mean, cov = state.mean[0].astype(dtype), state.cov[0].astype(dtype)
     (count, _), n = values.shape, len(mean)
     means, covs, gains = np.empty((count, 1, n), dtype), np.empty((count, 1, n, n), dtype), np.empty(count, dtype)
-    loop(rows.start, mean, cov, *arguments, np.ascontiguousarray(values), means[:, 0], covs[:, 0], gains)
+    segment(rows.start, mean, cov, *prepared.loop, np.ascontiguousarray(values), means[:, 0], covs[:, 0], gains)
     gains[0] += state.log_mass[0]
     times, none = prepared.stops[rows].tolist(), np.zeros(1)
     head, middle, errors = state[:3], state[5:8], state[9:11]

@@ -3,25 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar, cast
 
-from numba import njit
+from numba import njit, types
+from numba.core.sigutils import normalize_signature
 
 F = TypeVar("F", bound=Callable[..., Any])
+R = TypeVar("R")
+
+# Without Python's lock, with IEEE division, and without the entry for C, which nothing calls.
+_compiler: Any = partial(njit, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 
 
-def kernel(signature: Any) -> Callable[[F], F]:
-    """Return a decorator that compiles a function for one signature, without Python's lock and with IEEE division.
+def kernel(signature: Any, derivative: Any = None) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """Return a decorator that compiles a function for one signature when it is first called, by Python or by another kernel.
 
     The compiled code is kept beside the source, or in the user's cache folder.  Where neither can be written, the function is
     compiled in every process.
+
+    Args:
+        signature: the types of the arguments and of the result.
+        derivative: those of complex arguments, for which the function is compiled when it first receives one.
     """
 
-    def decorate(function: F) -> F:
+    def decorate(function: Callable[..., R]) -> Callable[..., R]:
         try:
-            compiled = njit(signature, cache=True, nogil=True, error_model="numpy")(function)
-        except (RuntimeError, OSError):  # no folder for the cache, or it cannot be written
-            compiled = njit(signature, nogil=True, error_model="numpy")(function)
-        return cast(F, compiled)
+            dispatcher = _compiler(cache=True)(function)
+        except RuntimeError:  # no folder for the cache
+            dispatcher = _compiler()(function)
+        compiled = dispatcher.compile
+
+        def compile_declared(arguments: Any) -> Any:
+            """Compile for the declared types, to which these arguments are converted."""
+            complex_ = derivative is not None and any(getattr(t, "dtype", t) == types.complex128 for t in arguments)
+            declared = derivative if complex_ else signature
+            expected, _ = normalize_signature(declared)
+            pairs = zip(arguments, expected, strict=True)
+            if any(dispatcher.typingctx.can_convert(given, wanted) is None for given, wanted in pairs):
+                raise TypeError(f"{function.__name__}{arguments}: the kernel takes {expected}")
+            try:
+                return compiled(declared)
+            except OSError:  # the cache cannot be written
+                return compiled(declared)
+
+        dispatcher.compile = compile_declared
+        return cast("Callable[..., R]", dispatcher)
 
     return decorate
+
+
+def helper(function: F) -> F:
+    """Compile a function that only kernels call, as a part of each of them."""
+    return cast(F, _compiler(no_cpython_wrapper=True)(function))

@@ -21,7 +21,7 @@ KEPT = 12  # short kernels of other lengths
 Array = NDArray[Any]
 
 
-@kernel([float64[::1](float64[:, ::1], float64[::1], int64), complex128[::1](complex128[:, ::1], complex128[::1], int64)])
+@kernel(float64[::1](float64[:, ::1], float64[::1], int64), complex128[::1](complex128[:, ::1], complex128[::1], int64))
 def repeated_band(bands: Any, values: Any, count: int) -> Any:
     """Return the vector after `count` products with a banded matrix.
 

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
-
 import numpy as np
-from numba import njit
 
-from zakai.numerics.compiled import kernel
+from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.transition import Array
 
 MOST_TERMS = 32  # of the power series of a panel, after all of its entries have appeared
@@ -17,7 +13,7 @@ _NEGLIGIBLE = 2e-15  # share of a Legendre polynomial in a coefficient
 _NEGLIGIBLE_TERM = 1e-14  # of the series, of two in a row, relative to the sum of the sizes of those before
 
 
-@njit(nogil=True, error_model="numpy")
+@helper
 def _powers(values: Array, half: float, to_legendre: Array, to_powers: Array) -> Array:  # pragma: no cover
     """Return the coefficients (D, R) of 1, tau, ... of functions from their values (S, R) at the nodes, times `half`.
 
@@ -46,7 +42,7 @@ def _powers(values: Array, half: float, to_legendre: Array, to_powers: Array) ->
     return powers
 
 
-@njit(nogil=True, error_model="numpy")
+@helper
 def _ends(powers: Array, twice: int, depth: int, ahead: Array, back: Array) -> bool:  # pragma: no cover
     """Set the solutions at the ends of a panel from the powers (D, rows^2) of its generator; return whether the terms suffice.
 
@@ -98,7 +94,13 @@ def _ends(powers: Array, twice: int, depth: int, ahead: Array, back: Array) -> b
     return settled >= 2
 
 
-def _panels(
+def _signature(number: str) -> str:
+    stack = f"{number}[:, :, ::1]"
+    return f"void({stack}, f8[::1], f8[:, ::1], f8[:, ::1], i8, i8[::1], {stack}, {stack}, b1[::1])"
+
+
+@kernel(_signature("f8"), _signature("c16"))
+def panels(
     values: Array, lengths: Array, to_legendre: Array, to_powers: Array, twice: int, depths: Array,
     ahead: Array, back: Array, coarse: Array,
 ) -> None:  # fmt: skip  # pragma: no cover
@@ -118,17 +120,3 @@ def _panels(
     for j in range(len(values)):
         powers = _powers(values[j], 0.5 * lengths[j], to_legendre, to_powers)
         coarse[j] = not _ends(powers, twice, depths[j], ahead[j], back[j])
-
-
-def _signature(number: str) -> str:
-    stack = f"{number}[:, :, ::1]"
-    return f"void({stack}, f8[::1], f8[:, ::1], f8[:, ::1], i8, i8[::1], {stack}, {stack}, b1[::1])"
-
-
-panels = kernel(_signature("f8"))(_panels)
-
-
-@cache
-def panels_with_derivatives() -> Callable[..., None]:
-    """Return `panels` for complex arrays, which is compiled when a derivative is first wanted."""
-    return kernel(_signature("c16"))(_panels)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai.numerics.complex_step import log_determinant
-from zakai.numerics.flow_kernel import panels, panels_with_derivatives
+from zakai.numerics.flow_kernel import panels
 from zakai.numerics.transition import Array, Transition, symmetric, transposed
 
 STAGES = 8  # Gauss nodes of a panel: the coefficients are polynomials of degree 7 on it
@@ -70,8 +70,7 @@ def solve(c: Coefficients, lengths: Array) -> tuple[Transition, Array]:
     depths = np.array([_depth(pattern.tobytes(), twice) for pattern in patterns], int)
     ahead, back, coarse = np.empty((count, rows, rows), kind), np.empty((count, rows, rows), kind), np.empty(count, bool)
     to_legendre, to_powers = (_TO_LEGENDRE, _TO_POWERS) if size > 1 else (_ONE, _ONE)
-    compiled = panels_with_derivatives() if kind.kind == "c" else panels
-    compiled(values, np.ascontiguousarray(lengths), to_legendre, to_powers, twice, depths, ahead, back, coarse)
+    panels(values, np.ascontiguousarray(lengths), to_legendre, to_powers, twice, depths, ahead, back, coarse)
     half, weights = 0.5 * lengths, WEIGHTS if size > 1 else np.full(1, 2.0)
     growth = half[:, None] * (weights @ c.constant.reshape(count, size, k))
     trace = 0.5 * half * (np.trace(c.matrix, axis1=1, axis2=2).reshape(count, size) * weights).sum(axis=1)

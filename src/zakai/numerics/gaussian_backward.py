@@ -6,13 +6,12 @@ The message is exp(-(x - a)'Lambda (x - a) / 2 + q.(x - a) + c).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from zakai.numerics.compiled import kernel
+from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.transition import Array
 
 
-@njit(nogil=True, error_model="numpy")
+@helper
 def _eliminate(left: Array, right: Array) -> float:  # pragma: no cover
     """Set `right` (n, c) to left^-1 right, and return log |det left|; `left` (n, n) is overwritten."""
     n, width = right.shape
@@ -40,7 +39,7 @@ def _eliminate(left: Array, right: Array) -> float:  # pragma: no cover
     return total
 
 
-@njit(nogil=True, error_model="numpy")
+@helper
 def _weigh(
     centre: Array, information: Array, slope: Array, log: Array, means: Array, covs: Array, row: int, moved: Array, mass: Array
 ) -> None:  # pragma: no cover
@@ -83,7 +82,7 @@ def _weigh(
     log[0] -= total
 
 
-@njit(nogil=True, error_model="numpy")
+@helper
 def _retreat(
     k: int, centre: Array, information: Array, slope: Array, log: Array, lengths: Array, frequencies: Array,
     flow: Array, offset: Array, noise: Array, own: Array, vector: Array, constant: Array,

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
-
 import numpy as np
-from numba import njit
 
-from zakai.numerics.compiled import kernel
+from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.transition import Array
 
 
-@njit(nogil=True, error_model="numpy")
+@helper
 def _congruence(out: Array, matrix: Array, cov: Array, product: Array) -> None:  # pragma: no cover
     """Set `out`, which may be `cov`, to matrix cov matrix'; `product` (n, n) is overwritten."""
     n = len(cov)
@@ -33,7 +29,16 @@ def _congruence(out: Array, matrix: Array, cov: Array, product: Array) -> None: 
             out[j, i] = out[i, j]
 
 
-def _segment(
+def _signature(number: str) -> str:
+    vector, rows, stack = (f"{number}[{axes}::1]" for axes in ("", ":, ", ":, :, "))
+    real = "f8[:, ::1]"
+    stacks = ", ".join([stack] * 6)
+    ends = f"{stack}, {stack}, {rows}, b1[:, ::1], {vector}, b1"
+    return f"void(i8, {vector}, {rows}, f8[::1], {real}, {stacks}, {ends}, {real}, {rows}, {stack}, {vector})"
+
+
+@kernel(_signature("f8"), _signature("c16"))
+def segment(
     first: int, mean: Array, cov: Array, lengths: Array, frequencies: Array,
     flow: Array, offset: Array, noise: Array, information: Array, vector: Array, constant: Array,
     whiten: Array, slope: Array, intercept: Array, observed: Array, level: Array, relative: bool,
@@ -158,20 +163,3 @@ def _segment(
             means[row, i] = mean[i]
             for j in range(n):
                 covs[row, i, j] = cov[i, j]
-
-
-def _signature(number: str) -> str:
-    vector, rows, stack = (f"{number}[{axes}::1]" for axes in ("", ":, ", ":, :, "))
-    real = "f8[:, ::1]"
-    stacks = ", ".join([stack] * 6)
-    ends = f"{stack}, {stack}, {rows}, b1[:, ::1], {vector}, b1"
-    return f"void(i8, {vector}, {rows}, f8[::1], {real}, {stacks}, {ends}, {real}, {rows}, {stack}, {vector})"
-
-
-segment = kernel(_signature("f8"))(_segment)
-
-
-@cache
-def segment_with_derivatives() -> Callable[..., None]:
-    """Return `segment` for complex arrays, which is compiled when a derivative is first wanted."""
-    return kernel(_signature("c16"))(_segment)

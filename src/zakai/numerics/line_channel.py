@@ -308,7 +308,7 @@ def _steps(c: Coefficients, length: Array) -> Channels:
     inputs = c.offset.shape[-1]
     arrays = [np.ascontiguousarray(part, kind) for part in c]
     found = np.empty((len(length), 3 + 2 * inputs + inputs * inputs), kind)
-    _collocated(*arrays, np.ascontiguousarray(length, float), _MATRIX, _WEIGHTS, found)  # type: ignore[call-arg]
+    _collocated(*arrays, np.ascontiguousarray(length, float), _MATRIX, _WEIGHTS, found)
     shift, slope = found[:, 3 : 3 + inputs], found[:, 3 + inputs : 3 + 2 * inputs]
     constant = found[:, 3 + 2 * inputs :].reshape(-1, inputs, inputs)
     return Channels(found[:, 0], shift, found[:, 1], constant, slope, found[:, 2])
@@ -317,8 +317,13 @@ def _steps(c: Coefficients, length: Array) -> Channels:
 _F, _C = float64, complex128
 
 
-@kernel([void(t[:, ::1], t[:, :, ::1], t[:, ::1], t[:, ::1], t[:, :, ::1], t[:, :, ::1], _F[::1],
-              _F[:, ::1], _F[::1], t[:, ::1]) for t in (_F, _C)])  # fmt: skip
+_COLLOCATED = [
+    void(t[:, ::1], t[:, :, ::1], t[:, ::1], t[:, ::1], t[:, :, ::1], t[:, :, ::1], _F[::1], _F[:, ::1], _F[::1], t[:, ::1])
+    for t in (_F, _C)
+]
+
+
+@kernel(*_COLLOCATED)
 def _collocated(
     L: Array, l: Array, G: Array, Q: Array, p: Array, r: Array, lengths: Array, matrix: Array, weights: Array, found: Array
 ) -> None:
@@ -387,7 +392,7 @@ def _collocated(
                 row[3 + 2 * inputs + inputs * e + o] = total
 
 
-@kernel([_F[::1](_F[::1], _F, _F, int64, _F[::1], _F, _F, _F), _C[::1](_F[::1], _F, _F, int64, _C[::1], _C, _C, _C)])
+@kernel(_F[::1](_F[::1], _F, _F, int64, _F[::1], _F, _F, _F), _C[::1](_F[::1], _F, _F, int64, _C[::1], _C, _C, _C))
 def applied(
     sources: Array, first: float, spacing: float, size: int, weights: Array, scale: Any, shift: Any, variance: Any
 ) -> Array:

@@ -63,13 +63,10 @@ def generator(closed: bool, spacing: float, covariance: Any, drift: Array, poten
     return np.asarray(matrix)
 
 
-_SIGNATURES = [
+@kernel(
     float64[::1](float64[:, ::1], float64[::1], float64, float64),
     complex128[::1](complex128[:, ::1], complex128[::1], float64, float64),
-]
-
-
-@kernel(_SIGNATURES)
+)
 def _taylor(matrix: Array, vector: Array, shift: float, norm: float) -> Array:
     """exp(matrix + shift) vector, by Taylor series in equal parts; `norm` bounds that of the matrix."""
     parts = max(1, int(np.ceil(norm / _PART)))

@@ -182,10 +182,8 @@ _R, _C = types.float64, types.complex128
 
 
 @kernel(
-    [
-        types.Tuple((_R[::1], _R, _R, _R))(_R[::1], _R[::1], _R),  # type: ignore[no-untyped-call]
-        types.Tuple((_C[::1], _C, _R, _R))(_C[::1], _C[::1], _R),  # type: ignore[no-untyped-call]
-    ]
+    types.Tuple((_R[::1], _R, _R, _R))(_R[::1], _R[::1], _R),  # type: ignore[no-untyped-call]
+    types.Tuple((_C[::1], _C, _R, _R))(_C[::1], _C[::1], _R),  # type: ignore[no-untyped-call]
 )
 def _normalized(values: Array, logs: Array, largest: float) -> tuple[Array, Any, float, float]:
     """values exp(logs) normalised, the logarithm of its sum, how deep below `largest` its mass is, and the growth of errors."""
