@@ -147,6 +147,10 @@ def spread(values: Array, grid: Grid, cov: Array, spline: bool = False) -> Array
     return filtered(values, gaussian_response(inverse @ cov @ inverse.T, grid.sizes, spline))
 
 
+@kernel(
+    "void(float64[::1], int64[::1], boolean[::1], float64[:, ::1], float64[::1])",
+    "void(complex128[::1], int64[::1], boolean[::1], complex128[:, ::1], complex128[::1])",
+)
 def _gather(values: Any, sizes: Any, closed: Any, z: Any, out: Any) -> None:
     """out_j = sum over the taps of coefficients times quintic B-splines at indices z (n, J); outside it is zero."""
     n, count = z.shape
@@ -231,22 +235,12 @@ def _gather(values: Any, sizes: Any, closed: Any, z: Any, out: Any) -> None:
         out[j] = total * scaling
 
 
-_gather_real = kernel("void(float64[::1], int64[::1], boolean[::1], float64[:, ::1], float64[::1])")(_gather)
-
-
-@lru_cache(maxsize=1)
-def _gather_complex() -> Any:
-    """Return the kernel for derivatives, compiled when it is needed first."""
-    return kernel("void(complex128[::1], int64[::1], boolean[::1], complex128[:, ::1], complex128[::1])")(_gather)
-
-
 def gather(coefficients: Array, z: Array, grid: Grid) -> Array:
     """Return the spline with the coefficients (*sizes) at the indices z (J, n), counted from the first point of the grid."""
     dtype = complex if is_complex(coefficients, z) else float
     out = np.empty(len(z), dtype)
-    function = _gather_complex() if dtype is complex else _gather_real
     c, at = np.ascontiguousarray(coefficients, dtype).reshape(-1), np.ascontiguousarray(z.T, dtype)
-    function(c, np.array(grid.sizes, np.int64), np.array(grid.closed), at, out)
+    _gather(c, np.array(grid.sizes, np.int64), np.array(grid.closed), at, out)
     return out
 
 

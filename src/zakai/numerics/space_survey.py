@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import kernel
+from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.space_grid import Grid
 
 Array = NDArray[Any]
@@ -37,7 +37,7 @@ class Survey(NamedTuple):
     negative: float
 
 
-@kernel("float64(float64[::1], int64, int64, int64, int64, float64[:, ::1])")
+@helper
 def _wave(u: Any, outer: int, size: int, inner: int, k: int, work: Any) -> float:
     """Return the sum over lines of the absolute value of the Fourier transform at a frequency."""
     total = 0.0
