@@ -54,5 +54,5 @@ def kernel(signature: Any, derivative: Any = None) -> Callable[[Callable[..., R]
 
 
 def helper(function: F) -> F:
-    """Compile a function that only kernels call, as a part of each of them."""
-    return cast(F, _compiler(no_cpython_wrapper=True)(function))
+    """Compile a function that only kernels call, as a part of each of them; for Python it would be compiled in every process."""
+    return cast(F, _compiler()(function))
