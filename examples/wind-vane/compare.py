@@ -29,11 +29,12 @@ WEEK = 168  # hours; sums over weeks are nearly independent, which gives their s
 
 
 class Year:
-    """The record, and what every filter is asked of it: the direction's log density one hour ahead."""
+    """The record, or its first hours, and what every filter is asked of it: the direction's log density one hour ahead."""
 
-    def __init__(self) -> None:
+    def __init__(self, hours: int | None = None) -> None:
         self.model = zakai.load_model(HERE / "wind-vane.toml")
         self.record = zakai.read_record(HERE / "observations.csv", self.model)
+        self.record = zakai.Record(self.record.times[:hours], self.record.values[:hours], self.record.kind)
         self.times, self.observations = self.record.times, self.record.values
         self.seen = ~np.isnan(self.observations).any(axis=1)
         self.angles = np.arctan2(self.observations[:, 1], self.observations[:, 0])
