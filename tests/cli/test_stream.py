@@ -16,7 +16,9 @@ import zakai as package
 from zakai.records.checkpoint import read_checkpoint, write_checkpoint
 from zakai.records.stream import LONGEST, lines_of
 
-COMMAND = [sys.executable, "-c", "import sys; from zakai.cli import main; sys.exit(main())", "stream", "model.toml"]
+# A test run in the background of a shell ignores SIGINT, and so would its children.
+HEAR = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+COMMAND = [sys.executable, "-c", f"{HEAR}; from zakai.cli import main; raise SystemExit(main())", "stream", "model.toml"]
 LINES = [json.dumps({"time": k / 10, "y": [round(np.sin(k), 3)]}) for k in range(1, 13)]
 
 

@@ -47,14 +47,14 @@ def test_wrong_priors_are_refused(priors, message):
 @pytest.mark.filterwarnings("ignore:sample. R-hat")
 def test_the_posterior_is_that_of_a_quadrature():
     pytest.importorskip("blackjax")
-    found = zakai.sample(_model(), RECORD, {"a": "lognormal(0, 0.5)"}, draws=150, warmup=60)
-    grid = np.linspace(0.02, 6, 100)
+    found = zakai.sample(_model(), RECORD, {"a": "lognormal(0, 0.5)"}, draws=100, warmup=50)
+    grid = np.linspace(0.02, 6, 60)
     likelihood = zakai.log_likelihood(_model(), RECORD)
     logs = np.array([likelihood([a]) for a in grid]) + stats.lognorm(0.5).logpdf(grid)
     weights = np.exp(logs - logs.max())
     mean = weights @ grid / weights.sum()
     deviation = np.sqrt(weights @ (grid - mean) ** 2 / weights.sum())
-    assert found["a"].shape == (2, 150)
+    assert found["a"].shape == (2, 100)
     assert abs(float(found["a"].mean()) - mean) < 5 * deviation / np.sqrt(found.attrs["ess"])
     assert 0.6 < float(found["a"].std()) / deviation < 1.5
     assert {"divergences", "r_hat", "ess"} <= set(found.attrs)

@@ -123,16 +123,19 @@ def test_a_model_without_parameters_has_nothing_to_fit():
 
 
 @pytest.mark.parametrize(
-    ("keys", "truth", "method"),
+    ("keys", "truth", "method", "count"),
     [
-        (dict(drift=["a*tanh(a*x)"], observation=["c*x"], parameters={"a": 0.8, "c": 1.0}), {"a": 0.8, "c": 1.0}, "benes"),
-        (dict(drift=["t/40*x"], observation=["c*x*sin(x)", "c*x*cos(x)"], parameters={"c": 1.0}), {"c": 1.0}, "limited-direct"),
+        (dict(drift=["a*tanh(a*x)"], observation=["c*x"], parameters={"a": 0.8, "c": 1.0}), {"a": 0.8, "c": 1.0}, "benes", 300),
+        (
+            dict(drift=["t/40*x"], observation=["c*x*sin(x)", "c*x*cos(x)"], parameters={"c": 1.0}),
+            {"c": 1.0}, "limited-direct", 150,
+        ),
     ],
-)
-def test_nonlinear_systems_are_fitted(keys, truth, method):
+)  # fmt: skip
+def test_nonlinear_systems_are_fitted(keys, truth, method, count):
     prior = {"kind": "gaussian", "mean": [0.5], "cov": [[0.5]]}
     model = zakai.Model(state=["x"], prior=prior, **keys)
-    _, record = zakai.simulate(model, 0.02 * np.arange(1, 301), seed=4)
+    _, record = zakai.simulate(model, 0.02 * np.arange(1, count + 1), seed=4)
     fitted = zakai.fit(model, record, method=method, start={name: 1.3 * value for name, value in truth.items()})
     assert fitted.converged and fitted.warnings == []
     for name, value in truth.items():
