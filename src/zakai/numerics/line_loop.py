@@ -18,7 +18,7 @@ import numpy as np
 from numba import boolean, float64, int64, types
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import kernel
+from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line_splitting import exponent_of, residual
 from zakai.numerics.line_transition import (
     BAND,
@@ -127,11 +127,7 @@ def narrow(points: float, spacing: float, variance: float) -> bool:
     return within
 
 
-@kernel(
-    int64(
-        _V, _M, _M, _V, _M, _M, int64, float64, _V, _M, float64, _M, float64, float64, float64, boolean, _V, float64, _V, _V
-    )
-)  # fmt: skip
+@helper
 def _attempt(
     now: Array, table: Array, modes: Array, rates: Array, cosines: Array, sines: Array, kind: int, tau: float,
     observed: Array, precision: Array, constant: float, channels: Array, offset: float, covariance: float, spacing: float,
@@ -150,8 +146,12 @@ def _attempt(
     b, first, second, inner = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     early, late, scale = np.empty(size), np.empty(size), np.empty(size)
     outer, between = np.empty(size), np.empty(size)
-    at = int(np.argmax(now))
-    begin = now.copy()
+    at = 0
+    begin = np.empty(size)
+    for j in range(size):
+        begin[j] = now[j]
+        if now[j] > now[at]:
+            at = j
     low, high = support(now, cut)
     width_before = moments(now)[2]
     if kind == FACTOR and not gaussian and not closed and narrow(high - low, spacing, covariance * tau):
@@ -174,7 +174,9 @@ def _attempt(
     clipped = 0.0  # largest value beside values that became zero
     while True:
         parts = 2 * substeps if inside else 1
-        rounding, clipped, positive, now[:] = 0.0, 0.0, gaussian, begin
+        rounding, clipped, positive = 0.0, 0.0, gaussian
+        for j in range(size):
+            now[j] = begin[j]
         if gaussian:
             if 2 * parts - 1 > channels.shape[0] or np.isnan(channels[parts - 1, 0]):
                 answer[0] = parts
@@ -396,7 +398,8 @@ def _advance(
                 answer[0], answer[1] = answer[0] + spacing * (start + half - home), answer[1] + spacing * (start + half - home)
             return k, status
         error, log_floor, resolving = row[10], row[11], answer[2]
-        densities[k, :size] = now
+        for j in range(size):
+            densities[k, j] = now[j]
         starts[k] = start
         home = start + half
         # Whether the same grid serves for the next step: as in `line_window.fitted`.

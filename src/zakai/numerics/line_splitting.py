@@ -16,17 +16,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import float64, int64
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import kernel
+from zakai.numerics.compiled import helper
 from zakai.numerics.line_transition import moments
 
 Array = NDArray[Any]
-_V, _M = float64[::1], float64[:, ::1]
 
 
-@kernel(float64(_V, _V, _V, _V, _V, _V, float64, float64, float64, float64))
+@helper
 def residual(
     values: Array, b: Array, first: Array, second: Array, drift: Array, change: Array, covariance: float, acceleration: float,
     spacing: float, tau: float,
@@ -39,7 +37,10 @@ def residual(
     twice_mean = twice_square = four_mean = four_square = 0.0
     # b, L b, ..., L^4 b, L the backward operator by differences.
     powers = np.zeros((5, size))
-    powers[0], powers[1, 1 : size - 1] = b, drift[1 : size - 1] * first[1 : size - 1] + 0.5 * G * second[1 : size - 1]
+    for j in range(size):
+        powers[0, j] = b[j]
+    for j in range(1, size - 1):
+        powers[1, j] = drift[j] * first[j] + 0.5 * G * second[j]
     for i in range(1, 4):
         for j in range(i + 1, size - i - 1):
             rise = (powers[i, j + 1] - powers[i, j - 1]) / (2.0 * spacing)
@@ -75,7 +76,7 @@ def residual(
     return total
 
 
-@kernel(float64(_M, _M, _M, _M, _V, int64, float64, _V, _V, _V))
+@helper
 def exponent_of(
     h: Array, slope: Array, curvature: Array, precision: Array, observed: Array, at: int, share: float, b: Array, first: Array,
     second: Array,
@@ -85,7 +86,8 @@ def exponent_of(
     Large numbers cancel in this way before they are squared.
     """
     m, size, largest = h.shape[0], h.shape[1], 0.0
-    b[:], first[:], second[:] = 0.0, 0.0, 0.0
+    for j in range(size):
+        b[j], first[j], second[j] = 0.0, 0.0, 0.0
     for i in range(m):
         weighted, centre = 0.0, h[i, at]
         for l in range(m):

@@ -12,11 +12,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import boolean, float64, int64, types, void
+from numba import boolean, float64, int64, types
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from zakai.numerics.compiled import kernel
+from zakai.numerics.compiled import helper, kernel
 
 Array = NDArray[Any]
 
@@ -24,7 +24,6 @@ WIDE = 1.96  # variance of a kernel, in squares of the spacing, from which its s
 BAND = 0.625  # part of the frequencies of a grid for which the filters of narrow kernels are exact
 _SUPPORT = 1e-13  # values relative to the maximum beyond which a density counts as ended
 _SPREAD = 0.01  # of the value at an abrupt end that the interpolant spreads to the middle of the grid
-_V, _M = float64[::1], float64[:, ::1]
 _NODES = 128  # of the periodic transfer function of a narrow kernel
 _TAPS = 50
 _COSINES = np.cos(2.0 * np.pi / _NODES * np.arange(_NODES))
@@ -32,7 +31,7 @@ _FREQUENCIES = 2.0 * np.pi / _NODES * np.arange(_NODES // 2 + 1)
 _PASSED = 0.5 * erfc((_FREQUENCIES - np.pi) * 5.2 / ((1.0 - BAND) * np.pi))  # one up to the band, and one half at the end
 
 
-@kernel(types.UniTuple(float64, 3)(_V))  # type: ignore[no-untyped-call]
+@helper
 def moments(values: Array) -> tuple[float, float, float]:
     """The sum of values, and their mean and variance as an index from the middle."""
     mass, mean, square = 0.0, 0.0, 0.0
@@ -46,7 +45,7 @@ def moments(values: Array) -> tuple[float, float, float]:
     return mass, mean, square / mass
 
 
-@kernel(types.UniTuple(float64, 3)(_V, _M, _M))  # type: ignore[no-untyped-call]
+@helper
 def circular_moments(values: Array, cosines: Array, sines: Array) -> tuple[float, float, float]:
     """The sum of values on the circle, the argument of E exp(i x) as an index from the middle, the variance in squared spacings.
 
@@ -54,7 +53,9 @@ def circular_moments(values: Array, cosines: Array, sines: Array) -> tuple[float
     """
     size = values.size
     spacing = 2.0 * np.pi / size
-    mass = np.sum(values)
+    mass = 0.0
+    for j in range(size):
+        mass += values[j]
     # The grid begins at -pi: cos(k x_j) = (-1)^k cos(2 pi k j / size).
     real, imag = -np.dot(cosines[1], values) / mass, -np.dot(sines[1], values) / mass
     mean = np.arctan2(imag, real) if real * real + imag * imag > 1e-18 else 0.0
@@ -65,10 +66,19 @@ def circular_moments(values: Array, cosines: Array, sines: Array) -> tuple[float
     return mass, mean / spacing, variance / spacing**2
 
 
-@kernel(types.UniTuple(int64, 2)(_V, float64))  # type: ignore[no-untyped-call]
+@helper
+def largest(values: Array) -> float:
+    """The largest of values, which are not all negative."""
+    top = 0.0
+    for j in range(values.size):
+        top = max(top, values[j])
+    return top
+
+
+@kernel(types.UniTuple(int64, 2)(float64[::1], float64))  # type: ignore[no-untyped-call]
 def support(values: Array, cut: float) -> tuple[int, int]:
     """The first and last index of values above `cut` times their maximum."""
-    bound = cut * np.max(values)
+    bound = cut * largest(values)
     first, last = 0, values.size - 1
     while first < last and not values[first] > bound:
         first += 1
@@ -77,10 +87,10 @@ def support(values: Array, cut: float) -> tuple[int, int]:
     return first, last
 
 
-@kernel(boolean(_V))
+@kernel(boolean(float64[::1]))
 def separated(values: Array) -> bool:
     """Whether a density has modes apart from each other, whose weights keep their errors."""
-    peak, valley, least = 0.0, np.inf, 1e-4 * np.max(values)
+    peak, valley, least = 0.0, np.inf, 1e-4 * largest(values)
     for j in range(values.size):
         valley = min(valley, values[j])
         if peak > least and values[j] > least and min(peak, values[j]) > 3.0 * valley:
@@ -90,7 +100,7 @@ def separated(values: Array) -> bool:
     return False
 
 
-@kernel(_V(_V, int64, int64))
+@helper
 def shifted(values: Array, by: int, size: int) -> Array:
     """The values on a grid that begins `by` points later and has another size."""
     found = np.zeros(size)
@@ -99,7 +109,7 @@ def shifted(values: Array, by: int, size: int) -> Array:
     return found
 
 
-@kernel(void(_V, float64, float64, _V, boolean))
+@helper
 def quadratic(found: Array, slope: float, curvature: float, scale: Array, divided: bool) -> None:
     """Write exp(slope n + curvature n^2), n the index from the middle, times or divided by a scale, by recurrence."""
     half = found.size // 2
@@ -116,7 +126,7 @@ def quadratic(found: Array, slope: float, curvature: float, scale: Array, divide
         found[j] = value / scale[j] if divided else value * scale[j]
 
 
-@kernel(_V(float64, float64, int64))
+@helper
 def taps_of(variance: float, depth: float, most: int) -> Array:
     """The filter (T,) of a Gaussian kernel, at distances 0 .. T - 1.
 
@@ -142,7 +152,7 @@ def taps_of(variance: float, depth: float, most: int) -> Array:
     return found
 
 
-@kernel(types.UniTuple(float64, 2)(_V, _V, _V, float64, float64))  # type: ignore[no-untyped-call]
+@helper
 def filtered(now: Array, before: Array, after: Array, variance: float, depth: float) -> tuple[float, float]:
     """Replace values by after times the convolution of before values with a Gaussian.
 
@@ -153,11 +163,14 @@ def filtered(now: Array, before: Array, after: Array, variance: float, depth: fl
     taps, size = taps_of(variance, depth, now.size), now.size
     count = 1 + min(size, taps.size) // 2 * 2
     padded, weights = np.zeros(size + 2 * count), np.zeros(count)
-    weights[: min(count, taps.size)] = taps[:count]
+    for n in range(min(count, taps.size)):
+        weights[n] = taps[n]
     for j in range(size):
         padded[count + j] = now[j] * before[j]
         now[j] = weights[0] * padded[count + j]
-    moduli = np.abs(now)
+    moduli = np.empty(size)
+    for j in range(size):
+        moduli[j] = abs(now[j])
     for n in range(1, count, 2):
         below, above = padded[count - n : count - n + size], padded[count + n : count + n + size]
         lower, higher = padded[count - n - 1 : count - n - 1 + size], padded[count + n + 1 : count + n + 1 + size]
@@ -182,12 +195,16 @@ def filtered(now: Array, before: Array, after: Array, variance: float, depth: fl
     return 2e-15 + noise / total, lost / top
 
 
-@kernel(float64(_V, _V, float64, float64, float64))
+@kernel(float64(float64[::1], float64[::1], float64, float64, float64))
 def wrapped(now: Array, inner: Array, shift: float, variance: float, depth: float) -> float:
     """Replace values on the circle by their convolution with a Gaussian of this mean, in spacings."""
     size, half = now.size, 0.5 / variance
     if 2.0 * (np.pi / size) ** 2 * variance > 40.0:  # nothing is left of any wave
-        now[:] = now.sum() / size
+        total = 0.0
+        for j in range(size):
+            total += now[j]
+        for j in range(size):
+            now[j] = total / size
         return 2e-15
     top, near = 1.0 / np.sqrt(2.0 * np.pi * variance), int(np.floor(shift + 0.5))
     reach = int(np.ceil(np.sqrt(2.0 * depth * variance)))
@@ -203,7 +220,7 @@ def wrapped(now: Array, inner: Array, shift: float, variance: float, depth: floa
     return 2e-15
 
 
-@kernel(float64(_V, _M, _V, _V, _V, _V, float64, float64, boolean))
+@helper
 def decomposed(
     now: Array, modes: Array, rates: Array, before: Array, after: Array, inner: Array, time: float, most: float, closed: bool
 ) -> float:
@@ -213,7 +230,7 @@ def decomposed(
     grid; infinite where beyond the support it might exceed `most`.
     """
     reach, top, highest, end = 0.0, 0.0, 0.0, 0.0
-    limit = _SUPPORT * now.max()
+    limit = _SUPPORT * largest(now)
     for j in range(now.size):
         inner[j] = now[j] * before[j]
         reach += inner[j] * inner[j]
