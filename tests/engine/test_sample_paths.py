@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -190,3 +192,19 @@ def test_what_cannot_be_drawn_is_refused_in_one_line():
             result.sample_paths(count)
     with pytest.raises(zakai.InputError, match="GiB; draw at most"):
         result.sample_paths(10**9)
+
+
+def test_the_memory_of_a_smoothed_record_does_not_grow_with_the_densities():
+    model = zakai.Model(
+        state=["x"], drift=["-x"], observation=["x"], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [0], "cov": [[0.5]]},
+    )  # fmt: skip
+    values = np.random.default_rng(0).normal(size=(1500, 1))
+    record = zakai.Record(np.arange(1, 1501) * 0.05, values, "samples")
+    zakai.smooth(model, record, "yau-yau")  # fills what is kept for a model
+    tracemalloc.start()
+    result = zakai.smooth(model, record, "yau-yau")
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert np.isfinite(result.mean).all()
+    assert kept < 600 * len(record)  # a density takes more than 256 bytes, the moments and figures of health 370

@@ -133,7 +133,7 @@ class SmoothingRun(Run):
         self.start: tuple[np.ndarray, np.ndarray] | None = None
 
     def _take(self, states: list[Any], infos: Infos) -> None:
-        self.segments.append((self.done, self.state))
+        self.segments.append((self.done, _alone(self.state)))
         super()._take(states, infos)
 
     def _segment(self, number: int) -> tuple[range, Any, int, list[Any]]:
@@ -206,3 +206,10 @@ class SmoothingRun(Run):
         result.bounds = {**result.bounds, "evidence_error": _BOUND}
         result.warnings = [*self.notes, *warnings_of_run(result)]
         return result
+
+
+def _alone(state: Any) -> Any:
+    """Return a state with arrays of its own: a view would keep those of all states of its segment."""
+    if isinstance(state, np.ndarray):
+        return state.copy()
+    return type(state)(*map(_alone, state)) if isinstance(state, tuple) and hasattr(state, "_fields") else state
