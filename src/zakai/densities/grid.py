@@ -113,7 +113,7 @@ class GridDensity(WeightedPoints):
         The sum is wrong there where the density ends at the edge of the grid.
         """
         shape = np.array(logs.shape)
-        local, change = level.copy(), np.full(len(level), 0.02)
+        local, change, top = level.copy(), np.full(len(level), 0.02), np.zeros(len(level))
         for axis, size in enumerate(shape):
             distance = index[:, axis] + size // 2 - nearest[:, axis]
             if self._closed[axis]:
@@ -124,10 +124,12 @@ class GridDensity(WeightedPoints):
                 beside[:, axis] += step
                 beside[:, axis] = np.mod(beside[:, axis], size) if self._closed[axis] else np.clip(beside[:, axis], 0, size - 1)
                 sides.append(logs[tuple(beside.T)] - level)
+            top = np.maximum(top, np.maximum(sides[0], sides[1]))
             slope, curvature = 0.5 * (sides[1] - sides[0]), sides[0] + sides[1]
             local += distance * slope + 0.5 * distance**2 * curvature
             change += 0.1 * (np.abs(slope) + np.abs(curvature))
-        return np.where(np.abs(result - local) <= change, result, local)
+        # A neighbour where the density is zero says nothing of the slope.
+        return np.minimum(np.where(np.abs(result - local) <= change, result, local), level + top + 1.0)
 
     def _interpolate_three(self, index: np.ndarray) -> np.ndarray:
         """The sinc interpolant for three axes, one after the other; below 1e-10 of the maximum, linear in the logarithm."""
