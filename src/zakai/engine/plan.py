@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,8 +73,17 @@ def _with_origin(result: FilterResult, plan: Plan, runs: Sequence[Run]) -> Filte
     return result
 
 
-def plan_of(model: Model, prior: Any, method: str, options: Mapping[str, Any], by_value: bool = True) -> Plan:
+def plan_of(
+    model: Model,
+    prior: Any,
+    method: str,
+    options: Mapping[str, Any],
+    by_value: bool = True,
+    unfit: Callable[[Setting], str] | None = None,
+) -> Plan:
     """Return how a system with this prior is filtered; parameters that are equal make equal blocks only `by_value`.
+
+    `unfit` says why "auto" may not take a method, or nothing.
 
     Raises:
         InputError: unknown method or option.
@@ -83,7 +93,11 @@ def plan_of(model: Model, prior: Any, method: str, options: Mapping[str, Any], b
         _registry.load(method)  # an unknown name is refused before anything is computed
     division = divided(model, prior, method, by_value)
     if division is None:
-        return _whole(model, prior, method, options)
+        return _whole(model, prior, method, options, unfit)
+    if unfit is not None and method == "auto":
+        wholes = {block.model: _whole(block.model, block.prior, method, {}, unfit) for block in division.blocks}
+        own_methods = {part: whole.setting.method.name for part, whole in wholes.items()}
+        division = replace(division, methods=own_methods, conditions={part: one.considered for part, one in wholes.items()})
     names = dict.fromkeys(division.methods.values())
     methods = [_registry.load(name) for name in names]
     own = dict(zip(names, zip(methods, _own_options(methods, options), strict=True), strict=True))
@@ -91,8 +105,13 @@ def plan_of(model: Model, prior: Any, method: str, options: Mapping[str, Any], b
     return ByBlocks(model, division, tuple(settings))
 
 
-def _whole(model: Model, prior: Any, method: str, options: Mapping[str, Any]) -> Whole:
-    """Return the plan of one method; "auto" goes on to the next one that holds where a method loses the density at the prior."""
+def _whole(
+    model: Model, prior: Any, method: str, options: Mapping[str, Any], unfit: Callable[[Setting], str] | None = None
+) -> Whole:
+    """Return the plan of one method.
+
+    "auto" goes on to the next one that holds where a method is unfit, or loses the density at the prior.
+    """
     name, why, considered = chosen(model, method)
     lost: list[str] = []
     while True:
@@ -102,10 +121,10 @@ def _whole(model: Model, prior: Any, method: str, options: Mapping[str, Any]) ->
         order = in_order(model)
         later = order[order.index(name) + 1 :] if method == "auto" and not exact else ()
         others = [one for one in later if all_hold(conditions_of(one, model)) is True]
-        fault = _fault_at_prior(setting) if others else ""
+        fault = ((unfit(setting) if unfit else "") or _fault_at_prior(setting)) if others else ""
         if not fault:
             return Whole(setting, "; ".join([why, *lost]), considered)
-        lost.append(f"{name} holds too, but loses the density at the prior: {fault}")
+        lost.append(f"{name} holds too, but {fault}")
         name, considered = others[0], {**considered, others[0]: conditions_of(others[0], model)}
 
 
@@ -118,16 +137,16 @@ def _fault_at_prior(setting: Setting) -> str:
             density = setting.method.density(prepared, state)
             mean, cov = density.mean(), density.cov()
     except InputError as wrong:
-        return str(wrong)
+        return f"loses the density at the prior: {wrong}"
     if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
-        return "it is not finite"
+        return "loses the density at the prior: it is not finite"
     if not isinstance(prior, GaussianPrior | MixturePrior) or model.periodic:
         return ""
     expected, spread = np.asarray(prior.mean), np.diag(prior.cov)
     wide = spread > 0
     apart = np.abs(mean - expected)[wide] / np.sqrt(spread[wide])
     off = max(apart.max(initial=0.0), np.abs(np.diag(cov)[wide] / spread[wide] - 1.0).max(initial=0.0))
-    return f"its moments are off by {off:.1g} deviations" if off > _KEPT_PRIOR else ""
+    return f"loses the density at the prior: its moments are off by {off:.1g} deviations" if off > _KEPT_PRIOR else ""
 
 
 def _own_options(methods: Sequence[Method[Any, Any]], options: Mapping[str, Any]) -> list[dict[str, Any]]:

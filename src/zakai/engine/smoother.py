@@ -1,7 +1,7 @@
 """Smoothing: p(x(t_k) | all observations), by the filter forward and a message backward.
 
-The forward pass keeps the state at the start of every segment only.  The backward pass filters a segment again, and takes the
-message p(later observations | x) through it, so that a record needs the memory of its checkpoints and of one segment.
+The forward pass keeps the state at the start of every segment, and those within while there is memory.  The backward pass takes
+the message p(later observations | x) through a segment, whose states it filters again where they were not kept.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import numpy as np
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.batch import Progress, filter_all
-from zakai.engine.driver import check_noise, check_records, planned
+from zakai.engine.driver import check_noise, check_records
 from zakai.engine.health_warnings import warnings_of_run
-from zakai.engine.loop import CHUNK, Run, advance, joined
+from zakai.engine.loop import CHUNK, KEPT_BYTES, Run, advance, joined, size_of
+from zakai.engine.plan import plan_of
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
@@ -25,7 +26,7 @@ from zakai.methods._protocol import Infos, stacked
 from zakai.models.model import Model
 from zakai.records import Record
 
-_BOUND = 1e-6, "the evidence of the backward pass differs from the filter's, in nats"
+_EVIDENCE = "the evidence of the backward pass differs from the filter's, in nats"
 
 
 @dataclass(eq=False, repr=False)
@@ -85,7 +86,7 @@ def smooth(
     Args:
         model: the system, with a prior.
         record: K observations of the model's kind.
-        method: a method's name, or "auto", as for `zakai.filter`.
+        method: a method's name, or "auto": the first method that holds and has a backward pass for this system.
         progress: called with the number of observations filtered and K.
         **options: options of the method.
 
@@ -100,7 +101,7 @@ def smooth(
         smoothed.mean[0], smoothed.density(0).quantile([0.025, 0.975])
     """
     check_records(model, record)
-    plan = planned(model, None, method, options)
+    plan = plan_of(model, model.prior, method, options, unfit=_unfit)
     check_noise([plan], [record])
     runs = [SmoothingRun(run.setting, run.record) for run in plan.runs(record, "moments")]
     filter_all(runs, progress, len(runs))
@@ -115,6 +116,17 @@ def smooth(
     return SmoothingResult(**shared, filtered=filtered, _runs=tuple(runs))
 
 
+def _unfit(setting: Setting) -> str:
+    """Return why a method cannot smooth a system, or nothing."""
+    if setting.method.backward is None:
+        return "has no backward pass"
+    try:
+        setting.method.backward.message(*setting.begin())
+    except InputError as refused:
+        return str(refused)
+    return ""
+
+
 class SmoothingRun(Run):
     """One record on its way through one method, and back."""
 
@@ -123,17 +135,21 @@ class SmoothingRun(Run):
         backward = setting.method.backward
         if backward is None:
             raise InputError(
-                f"smooth: the method {setting.method.name} has no backward pass; take yau-yau for one state, or "
+                f"smooth: the method {setting.method.name} has no backward pass; take yau-yau for up to four states, or "
                 "kalman-bucy, benes or hu-yau, where one holds"
             )
         self.backward = backward
         backward.message(self.empty, self.state)  # a model without a smoother is refused before it is filtered
         self.segments: list[tuple[int, Any]] = []  # the first interval of each, and the state at its start
+        self.after: list[list[Any] | None] = []  # the states after each interval of a segment, while there is memory
         self.messages: list[Any] = []  # at the end of each segment
+        self.held = 0
         self.start: tuple[np.ndarray, np.ndarray] | None = None
 
     def _take(self, states: list[Any], infos: Infos) -> None:
         self.segments.append((self.done, _alone(self.state)))
+        self.held += sum(map(size_of, states))
+        self.after.append(states if self.held < KEPT_BYTES / 4 else None)
         super()._take(states, infos)
 
     def _segment(self, number: int) -> tuple[range, Any, int, list[Any]]:
@@ -142,8 +158,10 @@ class SmoothingRun(Run):
         last = self.segments[number + 1][0] if number + 1 < len(self.segments) else len(self.schedule)
         begin = first // CHUNK * CHUNK
         prepared = self.setting.prepared(self.schedule.part(slice(begin, min(begin + CHUNK, len(self.schedule)))))
-        with np.errstate(all="ignore"):
-            states, _ = advance(self.setting, prepared, slice(first - begin, last - begin), state, self.values[first:last])
+        states = self.after[number]
+        if states is None:
+            with np.errstate(all="ignore"):
+                states, _ = advance(self.setting, prepared, slice(first - begin, last - begin), state, self.values[first:last])
         return range(first, last), prepared, begin, [state, *states]
 
     def smooth(self) -> None:
@@ -203,7 +221,7 @@ class SmoothingRun(Run):
             return super().result(why, considered, prior_moments)
         result = super().result(why, considered, self.start)
         result._density = self.density
-        result.bounds = {**result.bounds, "evidence_error": _BOUND}
+        result.bounds = {**result.bounds, "evidence_error": (self.backward.accuracy(self.empty), _EVIDENCE)}
         result.warnings = [*self.notes, *warnings_of_run(result)]
         return result
 
