@@ -82,10 +82,3 @@ def test_a_grid_and_a_gaussian_smoother_agree():
     grid, exact = (zakai.smooth(model, record, method) for method in ("yau-yau", "kalman-bucy"))
     np.testing.assert_allclose(grid.mean, exact.mean, atol=1e-6)
     np.testing.assert_allclose(grid.variance, exact.variance, atol=1e-6)
-
-
-def test_two_states_on_a_grid_are_refused_before_they_are_filtered():
-    prior = {"kind": "gaussian", "mean": [0, 0], "cov": [[1, 0], [0, 1]]}
-    model = zakai.Model(state=["x", "y"], drift=["-x + y", "-y**3 - x"], observation=["x"], prior=prior)
-    with pytest.raises(zakai.InputError, match="one state only"):
-        zakai.smooth(model, zakai.Record([0.1], [[0.1]], "increments"), "yau-yau")

@@ -119,13 +119,8 @@ def message(prepared: Prepared, state: State) -> Message:
     """Return the message one at the last time.
 
     Raises:
-        InputError: the model has more than one state, reflecting ends, or cross_noise.
+        InputError: the model has reflecting ends, or cross_noise.
     """
-    if prepared.model.n > 1:
-        raise InputError(
-            f"{prepared.model.source}: smooth: density grids have a backward pass for one state only; take kalman-bucy, benes or "
-            "hu-yau, where one holds"
-        )
     if prepared.system.reflecting:
         raise InputError(f"{prepared.model.source}: smooth: there is no backward pass for a state with reflecting ends yet")
     if prepared.system.cross is not None:

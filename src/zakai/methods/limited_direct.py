@@ -13,7 +13,7 @@ import numpy as np
 from zakai.algebra.theorems import limited_direct
 from zakai.errors import InputError
 from zakai.methods import _line
-from zakai.methods._line_backward import BACKWARD
+from zakai.methods._grid_backward import BACKWARD
 from zakai.methods._line_system import State
 from zakai.methods._line_yau import power_series_of, yau_line_of
 from zakai.methods._protocol import Method

