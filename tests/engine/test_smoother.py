@@ -102,6 +102,47 @@ def test_increments_agree_with_the_limit_of_fine_intervals():
         np.testing.assert_allclose(own, (4 * second - first) / 3, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["samples", "increments"])
+def test_the_extended_smoother_of_a_linear_system_is_the_exact_one(kind):
+    rng = np.random.default_rng(3)
+    times, values = np.cumsum(rng.uniform(0.001, 0.01, 60)), 0.05 * rng.normal(size=(60, 2))
+    values[rng.random((60, 2)) < 0.3] = np.nan
+    record = zakai.Record(times, values, kind)
+    exact, result = (zakai.smooth(pair(kind), record, method) for method in ("kalman-bucy", "extended-kalman-bucy"))
+    bound = 1e-9 if kind == "samples" else 1e-3
+    np.testing.assert_allclose(result.mean, exact.mean, atol=bound)
+    np.testing.assert_allclose(result.cov, exact.cov, atol=bound)
+    np.testing.assert_allclose(result.density(7).mean(), result.mean[7], atol=1e-14)
+    assert result.warnings == []
+
+
+def test_the_extended_smoother_goes_the_short_way_around_a_circle():
+    model = zakai.Model(
+        state=["x"], periodic=["x"], drift=["0*x"], observation=["sin(x)", "cos(x)"], observation_kind="samples",
+        observation_noise=[[0.01, 0], [0, 0.01]], process_noise=[[0.5]],
+        prior={"kind": "gaussian", "mean": [3.0], "cov": [[0.1]]},
+    )  # fmt: skip
+    angles = np.array([3.0, -3.1, -2.9, 3.1])
+    record = zakai.Record([0.1, 0.2, 0.3, 0.4], np.column_stack([np.sin(angles), np.cos(angles)]), "samples")
+    result, grid = (zakai.smooth(model, record, method) for method in ("extended-kalman-bucy", "yau-yau"))
+    apart = result.mean - grid.mean
+    np.testing.assert_allclose(apart - 2 * np.pi * np.round(apart / (2 * np.pi)), 0, atol=0.02)
+    np.testing.assert_allclose(result.variance, grid.variance, rtol=0.1)
+
+
+def test_auto_takes_a_method_that_smooths():
+    # f = F' with e^F = (1 + 2 x^2) e^(x^2 / 2): hu-yau filters it, and smooths sums of exponentials only.
+    prior = {"kind": "gaussian", "mean": [0.2], "cov": [[0.3]]}
+    model = zakai.Model(
+        state=["x"], drift=["x + 4*x/(1 + 2*x**2)"], observation=["x"], observation_kind="samples", prior=prior
+    )
+    record = zakai.Record([0.3, 0.5], [[0.4], [0.7]], "samples")
+    filtered, smoothed = zakai.filter(model, record), zakai.smooth(model, record)
+    assert filtered.method == "hu-yau" and smoothed.method == "limited-direct"
+    assert "hu-yau holds too, but" in smoothed.why and "is not a sum of exponentials" in smoothed.why
+    np.testing.assert_allclose(smoothed.mean[-1], filtered.mean[-1], atol=1e-6)
+
+
 TIMES, SAMPLES = np.array([0.4, 0.5, 1.5, 3.0, 3.2]), np.array([0.5, np.nan, -0.6, 1.4, np.nan])
 PRIORS = {
     "gaussian": ({"kind": "gaussian", "mean": [0.2], "cov": [[0.8]]}, lambda x: -((x - 0.2) ** 2) / 1.6),
@@ -187,8 +228,10 @@ def test_a_state_far_from_the_prior_and_units_of_any_size_keep_their_digits():
 def test_a_method_or_a_form_without_a_backward_pass_is_refused():
     record = zakai.Record([0.1], [[0.1]], "increments")
     line = zakai.load_model("gallery:benes")
-    with pytest.raises(zakai.InputError, match="extended-kalman-bucy has no backward pass"):
-        zakai.smooth(line, record, "extended-kalman-bucy")
+    with pytest.raises(zakai.InputError, match="gaussian-sum has no backward pass; take yau-yau"):
+        zakai.smooth(line, record, "gaussian-sum")
+    with pytest.raises(zakai.InputError, match='riccati="euler" has no backward pass'):
+        zakai.smooth(line, record, "extended-kalman-bucy", riccati="euler")
     with pytest.raises(zakai.InputError, match='take form="stepwise"'):
         zakai.smooth(line, record, "hu-yau", form="one-shot")
 
