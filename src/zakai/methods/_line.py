@@ -22,7 +22,7 @@ from zakai.methods import _line_loop as loop
 from zakai.methods._line_cross import OMITTED
 from zakai.methods._line_domain import on_the_line, variable_of
 from zakai.methods._line_model import System
-from zakai.methods._line_moves import Report, propagated
+from zakai.methods._line_moves import Report, by_kernel, by_substeps
 from zakai.methods._line_system import (
     NOISE,
     Prepared,
@@ -33,6 +33,7 @@ from zakai.methods._line_system import (
     state_moments,
 )
 from zakai.methods._line_update import exponential_factor, factor_at_end
+from zakai.methods._line_volumes import contracted
 from zakai.methods._protocol import Info, Infos
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
@@ -192,7 +193,12 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
         start = float(schedule.starts[k])
         kernel = _kernel(prepared, k, window, rates, report)
         contraction = 1.0 if kernel is None else float(kernel.scale.real)
-        values, window, gained, look = propagated(prepared, values, window, start, length, inside, rates, kernel, report)
+        found = None if kernel is None else by_kernel(prepared, values, window, start, length, kernel, report)
+        if found is None:
+            report.positive = False
+            interval = start, length, inside, rates, report
+            found = contracted(prepared, values, window, *interval) or by_substeps(prepared, values, window, *interval)
+        values, window, gained, look = found
     predicted, log_floor = lw.moments(values, window), float(state.log_floor)
     if report.positive:
         # A positive kernel fills the tails again.
@@ -201,7 +207,7 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
         floor = float(np.exp(log_floor)) + report.edge
     else:
         log_floor = float(np.log(NOISE))
-        floor = NOISE + report.aliasing + report.edge
+        floor = NOISE + report.aliasing + report.edge + report.noise
     at_end = schedule.seen[k] & ~inside
     if at_end.any() or (prepared.lie and inside.any()):
         if at_end.any():

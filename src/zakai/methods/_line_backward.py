@@ -21,7 +21,9 @@ from scipy.special import erfc, erfcx
 
 from zakai.densities import Density
 from zakai.errors import InputError
-from zakai.methods import _line, _line_moves
+from zakai.methods import _line
+from zakai.methods._line_coefficients import coefficients, offset_of, resolved_parts
+from zakai.methods._line_moves import MAGNUS
 from zakai.methods._line_paths import draw
 from zakai.methods._line_system import Prepared, State, covariance_at, covariance_between, drift_at, finite, state_moments
 from zakai.methods._line_update import exponential_factor, factor_at_end
@@ -255,13 +257,10 @@ class _Way:
 
     def back(self, later: Message) -> Message:
         """Return the message at the start of the interval."""
-        report = _line_moves.Report()
         stack, count = [(0.0, self.length)], 0
         if self.prepared.system.varying:
-            stack = _line_moves._panels(
-                self.prepared, later.values, later.window, self.start, self.length, self.inside, report
-            )
-        self.error += report.time
+            stack, error = resolved_parts(self.prepared, later.values, later.window, self.start, self.length, self.inside)
+            self.error += error
         longest = max(last - first for first, last in stack)
         while stack:
             first, last = stack.pop()
@@ -331,11 +330,11 @@ class _Way:
             noise = 4e-16 * float(np.sqrt(np.sum(values * values))) * max(1.0, float(decay.max()))
             return moved, 0.0, noise / float(np.max(moved))
         times = self.start + first + length * (np.full(1, 0.5) if steady else GAUSS_NODES)
-        drift, covariance, potential, constant = _line_moves._coefficients(prepared, window, times, inside, self.rates, values)
+        drift, covariance, potential, constant = coefficients(prepared, window, times, inside, self.rates, values)
         generators = self._generators(window, gauge, drift, covariance)
         zeroth, moment = length * GAUSS_WEIGHTS, 2.0 * length * GAUSS_WEIGHTS * (GAUSS_NODES - 0.5)
         weights = [np.full(1, length)] if steady else [0.5 * zeroth - moment, 0.5 * zeroth + moment]
-        offset, split = _line_moves._offset(sum(weights) @ potential, values)
+        offset, split = offset_of(sum(weights) @ potential, values)
         if split or any(np.any(w @ covariance < 0) for w in weights):
             return None
         parts = [generators(w) + np.diag(w @ potential - offset / len(weights)) for w in weights]
@@ -344,7 +343,7 @@ class _Way:
             total, difference = parts[0] + parts[1], parts[1] - parts[0]
             commutator = 0.25 * (total @ (difference @ values) - difference @ (total @ values))
             error = 5.0 * float(np.sum(np.abs(commutator)) / np.sum(values)) ** (5.0 / 3.0)
-            if error > _line_moves.MAGNUS * prepared.tolerance:
+            if error > MAGNUS * prepared.tolerance:
                 return None
         moved = values
         for part in reversed(parts):

@@ -10,19 +10,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.methods._line_coarse import EDGE, coarsened
-from zakai.methods._line_cross import with_cross_noise
-from zakai.methods._line_model import within
-from zakai.methods._line_system import Prepared, covariance_at, drift_at, finite, spectral, tables
+from zakai.methods._line_coefficients import coefficients, offset_of, potential_of, precision_of, resolved_parts
+from zakai.methods._line_system import Prepared, spectral, tables
 from zakai.methods._line_yau import moved
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel
 from zakai.numerics.line_operator import Exponential, exponential_action
-from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS, panels
+from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line_transition import WIDE, wrapped
 
 Array = Any
 
-GROWTH = 12.0  # largest growth by the potential in one substep where there is no mass, as a logarithm
 GROSS = 1e-4  # spectrum at the highest frequencies from which a shorter substep is taken at once
 MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
 MOST_SUBSTEPS = 4000
@@ -32,7 +30,7 @@ class Report:
     """The worst health figures within one step."""
 
     def __init__(self) -> None:
-        self.aliasing = self.edge = self.time = self.depth = self.growth = self.negative = self.lawless = 0.0
+        self.aliasing = self.edge = self.time = self.noise = self.depth = self.growth = self.negative = self.lawless = 0.0
         self.positive = True  # small values are accurate
         self.decomposed = True  # the operator has a decomposition on the grid that serves every interval
 
@@ -43,7 +41,39 @@ class Report:
         self.edge = max(self.edge, look.left, look.right)
 
 
-def propagated(
+class Moved(NamedTuple):
+    """The density after an interval, its grid, the logarithm of its mass, and its figures."""
+
+    values: Array
+    window: lw.Window
+    gained: Any
+    look: lw.Figures | None
+
+
+def by_kernel(
+    prepared: Prepared, values: Array, window: lw.Window, start: float, length: float, kernel: Channel, report: Report
+) -> Moved | None:
+    """Return the density after an interval with a Gaussian kernel; None where it is too narrow for the grid."""
+    negligible, rough = prepared.negligible, max(1e-10, 1e-3 * prepared.tolerance)
+    if window.closed:
+        around = _around(prepared, values, window, kernel)
+        if around is None:
+            return None
+        look, mass = lw.figures(around, True, negligible), np.sum(around)
+        report.density(look)
+        return Moved(around / mass, window, np.log(mass) + kernel.constant, look)
+    if prepared.yau is None:
+        return None
+    ends = start, start + length
+    direct = moved(prepared.yau, kernel, values, window, *ends, prepared.theta, negligible, rough, prepared.cut)
+    if direct is None:
+        return None
+    report.density(direct.look)
+    mass = np.sum(direct.values)
+    return Moved(direct.values / mass, direct.window, np.log(mass) + direct.offset, direct.look)
+
+
+def by_substeps(
     prepared: Prepared,
     values: Array,
     window: lw.Window,
@@ -51,26 +81,12 @@ def propagated(
     length: float,
     inside: np.ndarray,
     rates: np.ndarray,
-    kernel: Channel | None,
     report: Report,
-) -> tuple[Array, lw.Window, Any, lw.Figures | None]:
-    """Return the density after an interval, its grid, the logarithm of its mass, and its figures."""
+) -> Moved:
+    """Return the density after an interval, by exponentials of its operator."""
     system, negligible, look = prepared.system, prepared.negligible, None
     gained: Any = 0.0
     rough, resolved = max(1e-10, 1e-3 * prepared.tolerance), 30.0 * negligible
-    if kernel is not None and window.closed:
-        around = _around(prepared, values, window, kernel)
-        if around is not None:
-            look, mass = lw.figures(around, True, negligible), np.sum(around)
-            report.density(look)
-            return around / mass, window, np.log(mass) + kernel.constant, look
-    elif kernel is not None and prepared.yau is not None:
-        ends = start, start + length
-        direct = moved(prepared.yau, kernel, values, window, *ends, prepared.theta, negligible, rough, prepared.cut)
-        if direct is not None:
-            report.density(direct.look)
-            mass = np.sum(direct.values)
-            return direct.values / mass, direct.window, np.log(mass) + direct.offset, direct.look
     report.positive = False
     if not system.varying and not inside.any():
         carried = coarsened(prepared, values, window, length)
@@ -79,14 +95,15 @@ def propagated(
             return _normalised(*carried, report, negligible)
     bounds = [(0.0, length)]
     if system.varying:
-        bounds = _panels(prepared, values, window, start, length, inside, report)
+        parts = resolved_parts(prepared, values, window, start, length, inside)
+        bounds, report.time = parts.bounds, report.time + parts.error
     stack = bounds[::-1]
     substeps = 0
     while stack:
         first, last = stack.pop()
         substeps += 1
         if not np.isfinite(values.real).all():
-            return values, window, np.float64(np.nan), look
+            return Moved(values, window, np.float64(np.nan), look)
         begin = window
         known = lw.figures(values, window.closed, negligible).aliasing
         while True:
@@ -146,18 +163,18 @@ def propagated(
             values, window = lw.resampled(values, window, new), new
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
-    return values, window, gained, look
+    return Moved(values, window, gained, look)
 
 
 def _normalised(
     found: Array, window: lw.Window, error: float, report: Report, negligible: float
-) -> tuple[Array, lw.Window, Any, lw.Figures]:
+) -> Moved:
     look = lw.figures(found, window.closed, negligible)
     report.density(look)
     report.time += error
     found = np.where(found.real > 0, found, 0.0)
     mass = np.sum(found)
-    return found / mass, window, np.log(mass), look
+    return Moved(found / mass, window, np.log(mass), look)
 
 
 def _around(prepared: Prepared, values: Array, window: lw.Window, kernel: Channel) -> Array | None:
@@ -215,9 +232,9 @@ def _attempt(
             transition = prepared.once(key, lambda: Exponential(length * window.generator(known.covariance, known.drift)))
             found, error = transition(values)
             return _Attempt(found, 0.0, error, False)
-        potential, constant = _potential(known.observation, _precision(prepared, start, inside), rates, values)
+        potential, constant = potential_of(known.observation, precision_of(prepared, start, inside), rates, values)
         potential, constant = length * potential, length * constant
-        offset, split = _offset(potential, values)
+        offset, split = offset_of(potential, values)
         if split:
             return _Attempt(values, 0.0, 0.0, True)
         matrix = window.generator(length * known.covariance, length * known.drift, potential - offset)
@@ -242,10 +259,10 @@ def _magnus(
     """
     length = last - first
     times = start + first + length * GAUSS_NODES
-    drift, covariance, potential, constant = _coefficients(prepared, window, times, inside, rates, values)
+    drift, covariance, potential, constant = coefficients(prepared, window, times, inside, rates, values)
     zeroth, moment = length * GAUSS_WEIGHTS, 2.0 * length * GAUSS_WEIGHTS * (GAUSS_NODES - 0.5)
     early, late = 0.5 * zeroth - moment, 0.5 * zeroth + moment
-    offset, split = _offset(zeroth @ potential, values)
+    offset, split = offset_of(zeroth @ potential, values)
     if split or np.any((early @ covariance).real < 0) or np.any((late @ covariance).real < 0):
         return _Attempt(values, 0.0, 0.0, True)
     if prepared.system.steady:
@@ -266,101 +283,3 @@ def _magnus(
     middle, one = exponential_action(first_half, values)
     found, two = exponential_action(second_half, middle)
     return _Attempt(found, offset + zeroth @ constant, error + one + two, False)
-
-
-def _coefficients(
-    prepared: Prepared, window: lw.Window, times: np.ndarray, inside: np.ndarray, rates: np.ndarray, values: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return f (T, N), G (T,) or (T, N), V less a constant (T, N) and the constant (T,)."""
-    system, theta = prepared.system, prepared.theta
-    points = window.points[:, None]
-    if system.moving:
-        drift = drift_at(system, window, times, theta)
-        covariance = covariance_at(system, window.points, times, theta)
-    else:
-        known = tables(prepared, window)
-        drift = np.broadcast_to(known.drift, (len(times), window.size))
-        covariance = np.broadcast_to(known.covariance, (len(times), *np.shape(known.covariance)))
-    if not inside.any():
-        return drift, covariance, np.zeros((len(times), window.size)), np.zeros(len(times))
-    if system.steady_observation and system.steady_noise and system.cross is None:
-        h = tables(prepared, window).observation
-        value, constant = _potential(h, _precision(prepared, times, inside), rates, values)
-        return drift, covariance, np.broadcast_to(value, (len(times), len(value))), np.full(len(times), constant)
-    if system.steady_observation:
-        h = np.broadcast_to(tables(prepared, window).observation, (len(times), system.m, window.size))
-    else:
-        h = np.moveaxis(system.observation(points, times[:, None], theta), -1, 1)
-    precision = np.broadcast_to(_precision(prepared, times, inside), (len(times), system.m, system.m))
-    potentials, constants = zip(*[_potential(*pair, rates, values) for pair in zip(h, precision, strict=True)], strict=True)
-    found = drift, covariance, np.stack(potentials), np.array(constants)
-    return found if system.cross is None else with_cross_noise(prepared, window, times, rates, h, precision, found)
-
-
-def _precision(prepared: Prepared, times: Any, inside: np.ndarray) -> Array:
-    """Return the inverse of the block of S of the coordinates that act inside, zero elsewhere, (..., m, m)."""
-    system = prepared.system
-    both = inside[:, None] & inside
-
-    def make(times: Any) -> Array:
-        noise = system.noise(np.zeros((*np.shape(times), 1)), times, prepared.theta)
-        return np.where(both, np.linalg.inv(np.where(both, noise, 0.0) + np.diag(1.0 * ~inside)), 0.0)
-
-    if system.steady_noise:
-        return prepared.once(("inside", inside.tobytes()), lambda: make(prepared.model.start))
-    return make(times)
-
-
-def _potential(h: Array, precision: Array, rates: np.ndarray, values: Array) -> tuple[Array, Any]:
-    """Return h'S^-1 (dy/dt - h / 2) less its value at the maximum of the density (N,), and that value.
-
-    Large numbers cancel before they are squared.  Where h has no value the potential is a large negative number.
-    """
-    centre = finite(h[:, int(np.argmax(values.real))])
-    rest, weighted = h - centre[:, None], precision @ (rates - centre)
-    with np.errstate(all="ignore"):
-        value = np.sum(finite(rest) * (weighted[:, None] - 0.5 * (precision @ finite(rest))), axis=0)
-    value = np.where(np.isfinite(h.real).all(axis=0) & (value.real > -1e8), value, -1e8)
-    return value, centre @ (precision @ (rates - 0.5 * centre))
-
-
-def _offset(potential: Array, values: Array) -> tuple[float, bool]:
-    """Return the largest integral of V where there is mass, and whether it grows too much where there is none."""
-    mass = values.real > 1e-6 * values.real.max()
-    if not mass.any() or not np.isfinite(potential.real).all():
-        return 0.0, False
-    top = float(np.max(potential.real[mass]))
-    return top, bool(np.max(potential.real) > top + GROWTH)
-
-
-def _panels(
-    prepared: Prepared, values: Array, window: lw.Window, start: float, length: float, inside: np.ndarray, report: Report
-) -> list[tuple[float, float]]:
-    """Return parts of the interval in each of which the coefficients are polynomials of time, nearly."""
-    system, theta = prepared.system, prepared.theta.real
-    look = lw.figures(values, window.closed)
-    first, last = look.first, look.last
-    x = window.points[np.unique(np.linspace(first, last, 7).astype(int))]
-
-    bounds = []
-    for low, high in system.pieces(start, start + length):
-
-        def coefficients(times: Array, low: float = low, high: float = high) -> Array:
-            t = within(start + times, low, high)
-            columns = []
-            if system.moving:
-                columns.append(system.drift(x[:, None], t[:, None], theta)[..., 0])
-                columns.append(covariance_at(system, x, t, theta).reshape(len(t), -1))
-            if inside.any() and not system.steady_observation:
-                columns.append(system.observation(x[:, None], t[:, None], theta)[..., inside].reshape(len(t), -1))
-            if inside.any() and not system.steady_noise:
-                noise = system.noise(np.zeros((len(t), 1)), t, theta)[:, inside][..., inside]
-                columns.append(np.linalg.inv(noise).reshape(len(t), -1))
-            if inside.any() and system.cross is not None and not system.steady_cross:
-                columns.append(system.cross(x[:, None], t[:, None], theta).reshape(len(t), -1))
-            return finite(np.concatenate(columns, axis=1)) if columns else np.zeros((len(t), 1))
-
-        found = panels(coefficients, low - start, length if high == start + length else high - start)
-        report.time += found.error
-        bounds += found.bounds
-    return bounds

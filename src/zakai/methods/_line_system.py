@@ -276,7 +276,7 @@ def drift_at(system: System, window: lw.Window, t: Array, theta: Array) -> Array
     Of an f with jumps it is the mean over the spacing around a point, less the second difference that a smooth f adds to it.
     """
     times = np.asarray(t)[..., None]
-    if system.slope is not None:
+    if system.slope is not None or not isinstance(window, lw.Window):
         return finite(system.drift(window.points[:, None], times, theta)[..., 0])
     around = window.origin + window.centre + window.spacing * (np.arange(-1, window.size + 1) - window.size // 2)
     nodes = (around[:, None] + window.spacing * _MIDPOINTS).reshape(-1, 1)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from zakai.errors import InputError
-from zakai.methods import _line_moves
+from zakai.methods import _line_coefficients, _line_moves
 from zakai.methods._line_moves import Report
 from zakai.methods._line_system import Prepared, covariance_at
 from zakai.models.domain import Interval
@@ -27,6 +27,7 @@ RESOLVED = 1e-2  # of the tolerance that more points may change
 MOST_SUBSTEPS = 2000
 
 _MOVES: Any = _line_moves  # which serves grids and elements alike
+_COEFFICIENTS: Any = _line_coefficients
 
 
 def domain_of(prepared: Prepared) -> Interval:
@@ -99,7 +100,8 @@ def propagated(
     start, length, domain = float(prepared.schedule.starts[k]), float(prepared.lengths[k]), domain_of(prepared)
     stack, gained, substeps, negligible = [(0.0, length)], 0.0, 0, negligible_of(prepared)
     if not prepared.system.steady:
-        stack = _MOVES._panels(prepared, values, element, start, length, inside, report)[::-1]
+        parts = _COEFFICIENTS.resolved_parts(prepared, values, element, start, length, inside)
+        stack, report.time = parts.bounds[::-1], report.time + parts.error
     while stack:
         first, last = stack.pop()
         substeps += 1
@@ -190,11 +192,11 @@ def _two_exponentials(
 ) -> Any:
     """Return the density after a substep by the integrator of `_line_moves._magnus`, without its error."""
     length = last - first
-    drift, covariance, potential, constant = _MOVES._coefficients(
+    drift, covariance, potential, constant = _COEFFICIENTS.coefficients(
         prepared, element, start + first + length * GAUSS_NODES, inside, rates, values
     )
     zeroth, moment = length * GAUSS_WEIGHTS, 2.0 * length * GAUSS_WEIGHTS * (GAUSS_NODES - 0.5)
-    offset, split = _MOVES._offset(zeroth @ potential, values)
+    offset, split = _COEFFICIENTS.offset_of(zeroth @ potential, values)
     error = 0.0
     for w in (0.5 * zeroth - moment, 0.5 * zeroth + moment):
         matrix = element.generator(w @ covariance, w @ drift, w @ potential - 0.5 * offset)

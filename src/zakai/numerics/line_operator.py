@@ -56,7 +56,7 @@ def generator(closed: bool, spacing: float, covariance: Any, drift: Array, poten
     """Return L (N, N) for G, one number or (N,), f (N,) and V (N,), or integrals over time of these."""
     size = len(drift)
     first, second = derivatives(size, closed)
-    scale = 1.0 if closed else spacing
+    scale = np.float64(1.0 if closed else spacing)  # whose powers may overflow
     matrix = (0.5 * covariance / scale**2) * second - first * (drift / scale)
     if potential is not None:
         matrix[np.arange(size), np.arange(size)] += potential

@@ -286,13 +286,20 @@ def resampled(values: Array, window: Window, new: Window) -> Array:
         shift = (new.centre - window.centre) / window.spacing + window.size // 2 - new.size // 2
         if abs(shift - round(shift)) < 1e-6:
             return _shifted(values, round(shift), new.size)
-    found = interpolated(values, window, new.offsets)
+    return density_at(values, window, new.offsets) * (new.spacing / window.spacing)
+
+
+def density_at(values: Array, window: Window, offsets: Array) -> Array:
+    """Return the density at offsets (J,) from the origin, times the spacing of the grid."""
+    found = interpolated(values, window, offsets)
     found = np.where(found.real > 0, found, 0.0)
-    small = np.flatnonzero(found.real < _SMALL * values.real.max())
+    bound = _SMALL * values.real.max()
+    small = np.flatnonzero(found.real < bound)
     if len(small):
         # There the interpolant is the rounding of large values; small values are interpolated by their logarithms.
-        found[small] = _interpolated_logs(values, window, new.offsets[small])
-    return found * (new.spacing / window.spacing)
+        logs = interpolated_logs(values, window, offsets[small])
+        found[small] = np.where(logs.real < 2.0 * bound, logs, 0.0)
+    return found
 
 
 _SMALL = 1e-8
@@ -313,7 +320,7 @@ def local_polynomial(values: Array, window: Window, offsets: Array) -> Array:
     return np.asarray(np.sum(weights * own, axis=1) / np.sum(weights, axis=1))
 
 
-def _interpolated_logs(values: Array, window: Window, offsets: Array) -> Array:
+def interpolated_logs(values: Array, window: Window, offsets: Array) -> Array:
     """Return the exponential of the polynomial through eight logarithms, zero where a value is zero or beyond the grid."""
     at = (offsets - window.centre) / window.spacing + window.size // 2
     near = np.floor(at)
@@ -325,7 +332,7 @@ def _interpolated_logs(values: Array, window: Window, offsets: Array) -> Array:
     weights = np.where(exact.any(axis=1, keepdims=True), exact, _WEIGHTS / np.where(exact, 1.0, distance))
     with np.errstate(all="ignore"):
         found = np.exp(np.sum(weights * np.log(own), axis=1) / np.sum(weights, axis=1))
-    inside = (own.real > 0).all(axis=1) & (found.real < 2.0 * _SMALL * values.real.max())
+    inside = (own.real > 0).all(axis=1) & np.isfinite(found.real)
     if not window.closed:
         inside &= (at > -0.5) & (at < window.size - 0.5)
     return np.where(inside, found, 0.0)
