@@ -24,6 +24,14 @@ RATE = {
     "observation": ["x"], "observation_kind": "samples", "observation_noise": [[0.2]],
     "prior": {"kind": "density", "log_density": "3*log(x) - 4*x"},
 }  # fmt: skip
+NEAR_ZERO = {**RATE, "drift": ["0.3 - x"], "prior": {"kind": "density", "log_density": "-0.7*log(x) - 2*x"}}
+LEVEL = {
+    "state": ["x"], "drift": ["-0.5"], "diffusion": [[0.6]],
+    "domain": {"x": {"lower": 0.0, "upper": 1.0, "boundary": "reflecting"}},
+    "observation": ["x"], "observation_kind": "samples", "observation_noise": [[0.2]],
+    "prior": {"kind": "density", "log_density": "0"},
+}  # fmt: skip
+WALL = {**LEVEL, "domain": {"x": {"lower": 0.0, "boundary": "reflecting"}}, "prior": {"kind": "density", "log_density": "-x"}}
 NARROW = {
     **WELL, "drift": ["-(x - 1000)"], "observation_noise": [["1e-6"]], "process_noise": [["1e-6"]],
     "prior": {"kind": "gaussian", "mean": [1000], "cov": [[1e-6]]},
@@ -37,11 +45,15 @@ def models():
     yield "double well", zakai.Model(**WELL), "auto"
     yield "angle", zakai.Model(**ANGLE), "auto"
     yield "half line", zakai.Model(**RATE), "auto"
+    yield "close to a natural end", zakai.Model(**NEAR_ZERO), "auto"
+    yield "reflecting ends", zakai.Model(**LEVEL), "auto"
+    yield "one reflecting end", zakai.Model(**WALL), "auto"
     yield "far and narrow", zakai.Model(**NARROW), "yau-yau"
 
 
 @pytest.mark.parametrize(("name", "model", "method"), list(models()), ids=[name for name, _, _ in models()])
 def test_a_filter_continues_from_a_saved_density(tmp_path, name, model, method):
+    allowed = 1e-6 if name == "close to a natural end" else 1e-8  # of the tolerance of 1e-5, for another grid
     step = 0.25 if model.observation_kind == "samples" else 0.02
     times = step * np.arange(1, 17)
     _, record = zakai.simulate(model, times, seed=3)
@@ -53,10 +65,10 @@ def test_a_filter_continues_from_a_saved_density(tmp_path, name, model, method):
     second = zakai.filter(later, zakai.Record(times[8:], record.values[8:], record.kind), method)
     deviations = np.sqrt(whole.variance[8:])
     assert second.method == whole.method and not second.warnings
-    assert np.abs((second.mean - whole.mean[8:]) / deviations).max() < 1e-8
-    np.testing.assert_allclose(second.variance[1:], whole.variance[9:], rtol=1e-7)
+    assert np.abs((second.mean - whole.mean[8:]) / deviations).max() < allowed
+    np.testing.assert_allclose(second.variance[1:], whole.variance[9:], rtol=10 * allowed)
     np.testing.assert_allclose(second.variance[0], whole.variance[8], rtol=1e-4)  # wrapped deviations have a kink
-    assert second.log_likelihood == pytest.approx(whole.log_likelihood_increments[9:].sum(), abs=1e-8)
+    assert second.log_likelihood == pytest.approx(whole.log_likelihood_increments[9:].sum(), abs=10 * allowed)
 
 
 def densities():

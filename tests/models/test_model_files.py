@@ -83,7 +83,7 @@ FAULTS = [
     ("parameters", "3", "a table of names"),
     ("name", "3", "expected a text"),
     ("prior", "3", "expected a table"),
-    ("prior", "{}", "kind: expected one of gaussian, mixture, density, grid; it is missing"),
+    ("prior", "{}", "kind: expected one of gaussian, mixture, density, grid, interval; it is missing"),
     ("prior", '{kind = "gausian"}', "did you mean 'gaussian'"),
     ("prior", '{kind = "gaussian", mean = [0, 0]}', "cov: missing"),
     ("prior", '{kind = "gaussian", mean = [0, 0], cov = [1, 1], weights = [1]}', "unknown key 'weights'"),

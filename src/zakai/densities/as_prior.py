@@ -1,4 +1,4 @@
-"""A density as the numbers of a prior: a Gaussian mixture, or the logarithm on a grid."""
+"""A density as the numbers of a prior: a Gaussian mixture, or its values on a grid or between ends."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 from zakai.densities._density import Density
 from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
+from zakai.densities.interval import IntervalDensity
+from zakai.densities.mapped import MappedDensity
 from zakai.densities.points import PointMasses
 from zakai.densities.product import ProductDensity
 from zakai.errors import InputError
@@ -33,11 +35,16 @@ def prior_table(density: Density) -> dict[str, Any]:
         if len(found.weights) == 1:
             return {"kind": "gaussian", "mean": found.means[0], "cov": found.covs[0]}
         return {"kind": "mixture", "weights": found.weights, "means": found.means, "covs": found.covs}
-    return {"kind": "grid", "centre": found.centre, "basis": found.basis, "log_values": found.log_values}
+    if isinstance(found, IntervalDensity):
+        return {"kind": "interval", "values": found.values, "nodes": found.nodes, "rule": found.rule}
+    grid, ends = (found.grid, found.map.ends) if isinstance(found, MappedDensity) else (found, {})
+    return {"kind": "grid", "centre": grid.centre, "basis": grid.basis, "log_values": grid.log_values, **ends}
 
 
-def plain(density: Density) -> GaussianMixture | GridDensity:
-    """Return the same density as a mixture with positive weights or on a grid."""
+def plain(density: Density) -> GaussianMixture | GridDensity | IntervalDensity | MappedDensity:
+    """Return the same density as a mixture with positive weights, on a grid, or between the ends of a domain."""
+    if isinstance(density, IntervalDensity | MappedDensity):
+        return density
     if isinstance(density, PointMasses):
         return density.smoothed
     if isinstance(density, GaussianMixture) and np.all(density.weights > 0):

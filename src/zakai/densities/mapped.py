@@ -1,10 +1,13 @@
-"""The density of x = x(w), increasing, from that of w on a grid."""
+"""The density of a state between natural ends, from that of a variable w on the line.
+
+    x = lower + e^w,    x = upper - e^-w,    x = lower + (upper - lower) / (1 + e^-w)
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,14 +15,51 @@ from zakai.densities._density import WeightedPoints, as_states, coordinate_numbe
 from zakai.densities.grid import GridDensity
 
 
-class Map(Protocol):
-    """An increasing map of the line on an interval."""
+class IntervalMap(NamedTuple):
+    """The map between x in an interval and w on the line, by a logarithm at every finite end."""
 
-    def x(self, w: np.ndarray) -> np.ndarray: ...
+    lower: float
+    upper: float
 
-    def w(self, x: np.ndarray) -> np.ndarray: ...
+    @property
+    def ends(self) -> dict[str, float]:
+        """The finite ends by name."""
+        return {name: end for name, end in zip(self._fields, self, strict=True) if np.isfinite(end)}
 
-    def log_slope(self, w: np.ndarray) -> np.ndarray: ...
+    @property
+    def end(self) -> float:
+        """The end from which `offset` counts."""
+        return self.upper if np.isinf(self.lower) else self.lower
+
+    def offset(self, w: np.ndarray) -> np.ndarray:
+        """Return x less one of the ends, without cancellation."""
+        with np.errstate(over="ignore"):
+            if np.isinf(self.upper):
+                return np.exp(w)
+            if np.isinf(self.lower):
+                return -np.exp(-w)
+            return (self.upper - self.lower) / (1.0 + np.exp(-w))
+
+    def x(self, w: np.ndarray) -> np.ndarray:
+        """Return x."""
+        return self.end + self.offset(w)
+
+    def w(self, x: np.ndarray) -> np.ndarray:
+        """Return w, infinite at an end, NaN outside."""
+        with np.errstate(all="ignore"):
+            if np.isinf(self.upper):
+                return np.log(x - self.lower)
+            if np.isinf(self.lower):
+                return -np.log(self.upper - x)
+            return np.log(x - self.lower) - np.log(self.upper - x)
+
+    def log_slope(self, w: np.ndarray) -> np.ndarray:
+        """Return log dx/dw."""
+        if np.isinf(self.upper):
+            return w
+        if np.isinf(self.lower):
+            return -w
+        return np.log(self.upper - self.lower) - np.logaddexp(0.0, w) - np.logaddexp(0.0, -w)
 
 
 @dataclass(frozen=True, repr=False)
@@ -27,7 +67,7 @@ class MappedDensity(WeightedPoints):
     """The density of one state x in an interval: `grid` is that of w on the line, `map` gives x; outside it is zero."""
 
     grid: GridDensity
-    map: Map
+    map: IntervalMap
 
     @property
     def names(self) -> tuple[str, ...]:

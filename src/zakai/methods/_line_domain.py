@@ -9,11 +9,12 @@ density of w is negligible far out.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import sympy as sp
 
+from zakai.densities.mapped import IntervalMap
 from zakai.models.model import Model
 
 Array = Any
@@ -21,46 +22,8 @@ Array = Any
 _DERIVED = ("text", "observation_law", "covariance", "features", "depends_on_time")
 
 
-class Variable(NamedTuple):
-    """The map between x in an interval and w."""
-
-    lower: float
-    upper: float
-
-    @property
-    def end(self) -> float:
-        """The end from which `offset` counts."""
-        return self.upper if np.isinf(self.lower) else self.lower
-
-    def offset(self, w: Array) -> Array:
-        """Return x less one of the ends, without cancellation."""
-        with np.errstate(over="ignore"):
-            if np.isinf(self.upper):
-                return np.exp(w)
-            if np.isinf(self.lower):
-                return -np.exp(-w)
-            return (self.upper - self.lower) / (1.0 + np.exp(-w))
-
-    def x(self, w: Array) -> Array:
-        """Return x."""
-        return self.end + self.offset(w)
-
-    def w(self, x: Array) -> Array:
-        """Return w, infinite at an end, NaN outside."""
-        with np.errstate(all="ignore"):
-            if np.isinf(self.upper):
-                return np.log(x - self.lower)
-            if np.isinf(self.lower):
-                return -np.log(self.upper - x)
-            return np.log(x - self.lower) - np.log(self.upper - x)
-
-    def log_slope(self, w: Array) -> Array:
-        """Return log dx/dw."""
-        if np.isinf(self.upper):
-            return w
-        if np.isinf(self.lower):
-            return -w
-        return np.log(self.upper - self.lower) - np.logaddexp(0.0, w) - np.logaddexp(0.0, -w)
+class Variable(IntervalMap):
+    """The map, with its formula."""
 
     def formula(self, w: sp.Symbol) -> sp.Expr:
         """Return x as a formula."""

@@ -1,4 +1,4 @@
-"""A prior by the logarithm of its density on a grid, as a function that formulas can hold."""
+"""A prior by its density on a grid or between the ends of a domain, as a function that formulas can hold."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from zakai.densities import GridDensity
+from zakai.densities import Density, GridDensity, IntervalDensity, MappedDensity
 from zakai.densities.as_prior import MOST_NUMBERS
+from zakai.densities.mapped import IntervalMap
 from zakai.errors import InputError
-from zakai.models._entries import array, kind_of
+from zakai.models._entries import array, items, kind_of, number
 from zakai.models._errors import named
 from zakai.models.functions import table_function
 
@@ -20,12 +21,12 @@ _OUTSIDE = -600.0  # the logarithm of the density outside of the grid, which fal
 
 
 class GridFunction:
-    """The logarithm of a density on a grid, as a function of the n states; outside of the grid it is negligible."""
+    """The logarithm of a density, as a function of the n states; outside of its grid or its ends it is negligible."""
 
     name = "prior_density"
     degree = 1
 
-    def __init__(self, density: GridDensity):
+    def __init__(self, density: Density):
         self.density = density
         self.axes = (None,) * len(density.names)  # of these a function class takes only the number
         self.functions: dict[tuple[int, ...], Any] = {}
@@ -70,6 +71,41 @@ def read_grid(
             raise InputError(f"expected at most {MOST_NUMBERS:,} numbers on a full grid of {n} axes; its shape is {values.shape}")
         if np.isnan(values).any() or not np.isfinite(values.max()):
             raise InputError("expected logarithms of a density: finite, or -inf where it is zero")
-    density = GridDensity(values, centre, basis, tuple(map(str, states)), periodic)
+    density: Density = GridDensity(values, centre, basis, tuple(map(str, states)), periodic)
     table = {"kind": "grid", "centre": centre.tolist(), "basis": basis.tolist(), "log_values": values.tolist()}
+    ends = {key: _number_of(keys, key) for key in ("lower", "upper") if keys.get(key) is not None}
+    if ends:
+        lower, upper = ends.get("lower", -np.inf), ends.get("upper", np.inf)
+        if n > 1 or not lower < upper:
+            raise InputError("lower, upper: expected the natural ends of the domain of the only state, lower < upper")
+        density = MappedDensity(GridDensity(values, centre, basis, density.names, periodic), IntervalMap(lower, upper))
+    return table_function(GridFunction(density))(*states), {**table, **ends}  # type: ignore[arg-type]
+
+
+def _number_of(keys: Mapping[str, Any], key: str) -> float:
+    with named(key):
+        return float(number(keys[key]))
+
+
+def read_interval(keys: Mapping[str, Any], states: Sequence[sympy.Symbol]) -> tuple[sympy.Expr, dict[str, Any]]:
+    """Return the logarithm of the density of a prior between reflecting ends as an expression, and the keys in plain numbers.
+
+    Raises:
+        InputError: a key has the wrong shape, or there is no density.
+    """
+    if len(states) > 1:
+        raise InputError(f"kind: an interval prior is for one state, and there are {len(states)}")
+    with named("nodes"):
+        count = len(items(keys["nodes"], None, "a list of numbers"))
+    parts = {}
+    for key in ("values", "nodes", "rule"):
+        with named(key):
+            parts[key] = array(keys[key], (count,), f"a list of {count} numbers")
+    values, nodes, rule = parts.values()
+    if not 2 <= len(nodes) <= MOST_NUMBERS or not (np.diff(nodes) > 0).all() or not (rule > 0).all():
+        raise InputError("nodes, rule: expected increasing nodes and their positive weights, as model.with_prior writes them")
+    if not np.sum(values * rule) > 0:
+        raise InputError("values: expected a density with a positive integral")
+    density = IntervalDensity(values, nodes, rule, (str(states[0]),))
+    table = {"kind": "interval", **{key: part.tolist() for key, part in parts.items()}}
     return table_function(GridFunction(density))(*states), table  # type: ignore[arg-type]

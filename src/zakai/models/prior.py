@@ -15,7 +15,7 @@ from zakai.errors import InputError
 from zakai.models._definite import ROUNDING, is_symmetric, smallest_eigenvalue, square_root
 from zakai.models._entries import array, formula, items, kind_of, known_keys
 from zakai.models._errors import did_you_mean, listing, named
-from zakai.models.grid_prior import read_grid
+from zakai.models.grid_prior import read_grid, read_interval
 
 
 def _gaussian_log_density(x: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> np.ndarray:
@@ -104,7 +104,9 @@ _KEYS = {
     "mixture": ("weights", "means", "covs"),
     "density": ("log_density",),
     "grid": ("log_values", "centre", "basis"),
+    "interval": ("values", "nodes", "rule"),
 }
+_OPTIONAL = {"grid": ("lower", "upper")}
 
 
 def read_prior(
@@ -135,7 +137,7 @@ def read_prior(
         hint = did_you_mean(kind, _KEYS) if isinstance(kind, str) else ""
         got = f"got {kind_of(kind)}" if "kind" in keys else "it is missing"
         raise InputError(f"kind: expected one of {listing(_KEYS)}; {got}{hint}")
-    known_keys(keys, ("kind", *_KEYS[kind]))
+    known_keys(keys, ("kind", *_KEYS[kind], *_OPTIONAL.get(kind, ())))
     for key in _KEYS[kind]:
         if key not in keys:
             raise InputError(f"{key}: missing; a {kind} prior needs {listing(_KEYS[kind])}")
@@ -146,6 +148,9 @@ def read_prior(
     elif kind == "grid":
         log_density, grid = read_grid(keys, states, periodic)
         return DensityPrior(log_density), grid
+    elif kind == "interval":
+        log_density, interval = read_interval(keys, states)
+        return DensityPrior(log_density), interval
     else:
         with named("log_density"):
             text = formula(keys["log_density"])

@@ -1,4 +1,4 @@
-"""Files of densities: a mixture, or the logarithm on a grid, in numbers that are equal to the last bit."""
+"""Files of densities: a mixture, or values on a grid or between two ends, in numbers that are equal to the last bit."""
 
 from __future__ import annotations
 
@@ -6,21 +6,29 @@ import os
 
 import numpy as np
 
-from zakai.densities import Density, GaussianMixture, GridDensity
+from zakai.densities import Density, GaussianMixture, GridDensity, IntervalDensity, MappedDensity
 from zakai.densities.as_prior import plain
+from zakai.densities.mapped import IntervalMap
 from zakai.errors import InputError
 from zakai.records.checkpoint import read_checkpoint, write_checkpoint
 from zakai.records.writing import shown
 
 KIND = "density"
-_PARTS = {"mixture": ("weights", "means", "covs"), "grid": ("log_values", "centre", "basis")}
+_PARTS = {
+    "mixture": ("weights", "means", "covs"),
+    "grid": ("log_values", "centre", "basis"),
+    "interval": ("values", "nodes", "rule"),
+}
 
 
 def save_density(density: Density, path: str | os.PathLike[str]) -> None:
     """Write a density to a file, atomically; see `Density.save`."""
     found = plain(density)
-    kind = "mixture" if isinstance(found, GaussianMixture) else "grid"
-    about = {"kind": kind, "names": list(found.names), "periodic": [bool(angle) for angle in found.periodic]}
+    ends: dict[str, float] = {}
+    if isinstance(found, MappedDensity):
+        ends, found = found.map.ends, found.grid
+    kind = "interval" if isinstance(found, IntervalDensity) else "grid" if isinstance(found, GridDensity) else "mixture"
+    about = {"kind": kind, "names": list(found.names), "periodic": [bool(angle) for angle in found.periodic], **ends}
     write_checkpoint(path, about, {name: getattr(found, name) for name in _PARTS[kind]}, KIND)
 
 
@@ -31,7 +39,7 @@ def load_density(path: str | os.PathLike[str]) -> Density:
         path: the file.
 
     Returns:
-        The density: a Gaussian mixture, or one on a grid.
+        The density: a Gaussian mixture, or one on a grid or between the ends of a domain.
 
     Raises:
         InputError: the file is damaged, or holds something else.
@@ -51,16 +59,25 @@ def load_density(path: str | os.PathLike[str]) -> Density:
     try:
         names, periodic = tuple(about["names"]), tuple(about["periodic"])
         parts = {name: arrays[name] for name in _PARTS[about["kind"]]}
-        n, whole = len(names), about["kind"] == "grid"
+        n, kind = len(names), about["kind"]
+        ends = {name: about[name] for name in ("lower", "upper") if name in about}
         fits = all(array.dtype == float for array in parts.values())
         fits &= all(isinstance(name, str) and name.isidentifier() for name in names)
         fits &= len(periodic) == n > 0 and all(isinstance(angle, bool) for angle in periodic)
+        fits &= all(isinstance(end, float) and np.isfinite(end) for end in ends.values())
         if not fits:
             raise damaged
-        if whole:
+        if kind == "grid":
             fits = parts["log_values"].ndim == n and parts["centre"].shape == (n,) and parts["basis"].shape == (n, n)
             fits &= bool(np.isfinite(parts["centre"]).all() and np.linalg.matrix_rank(parts["basis"]) == n)
             fits &= not np.isnan(parts["log_values"]).any() and bool(np.isfinite(parts["log_values"].max()))
+            fits &= not ends or (n == 1 and ends.get("lower", -np.inf) < ends.get("upper", np.inf))
+        elif kind == "interval":
+            count = len(parts["nodes"])
+            fits = n == 1 and count > 1 and not periodic[0] and all(array.shape == (count,) for array in parts.values())
+            fits &= all(np.isfinite(array).all() for array in parts.values())
+            fits &= bool((np.diff(parts["nodes"]) > 0).all() and (parts["rule"] > 0).all())
+            fits &= bool(np.sum(parts["values"] * parts["rule"]) > 0)
         else:
             k = len(parts["weights"])
             fits = k > 0 and parts["weights"].shape == (k,)
@@ -71,4 +88,9 @@ def load_density(path: str | os.PathLike[str]) -> Density:
         raise damaged from None
     if not fits:
         raise damaged
-    return (GridDensity if whole else GaussianMixture)(**parts, names=names, periodic=periodic)
+    if kind == "interval":
+        return IntervalDensity(**parts, names=names)
+    if kind == "mixture":
+        return GaussianMixture(**parts, names=names, periodic=periodic)
+    grid = GridDensity(**parts, names=names, periodic=periodic)
+    return MappedDensity(grid, IntervalMap(ends.get("lower", -np.inf), ends.get("upper", np.inf))) if ends else grid
