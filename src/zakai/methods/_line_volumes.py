@@ -23,6 +23,8 @@ FAST = 5.0  # ranges of a density that the drift crosses in an interval, below w
 MOST_TRAVEL = 20.0  # ranges of a density, as it is at the time, that it moves on uniform grids
 MOST_DEVIATIONS = 100.0  # range of a density on a uniform grid, in the smallest deviations of its parts
 LEVELS = ((1024, 48), (2048, 68), (4096, 96), (8192, 136), (16384, 192))  # cells and steps
+SETTLED = 1e-2  # error above which volumes do not serve
+NARROWEST = 40.0  # range of a density in cells
 SHARE = 0.1  # of the tolerance that volumes may leave
 FIRST = 0.1  # of the time in which the drift would cross the range of the density: the first step
 FASTEST = 100.0  # ranges of the density in the interval, divided by the tolerance: a faster drift counts as this
@@ -41,7 +43,7 @@ def contracted(
     rates: np.ndarray,
     report: Report,
 ) -> Moved | None:
-    """Return the density after an interval, None where it does not contract much."""
+    """Return the density after an interval, None where it does not contract much or volumes do not serve."""
     if window.closed:
         return None
     look = lw.figures(values, False)
@@ -58,6 +60,9 @@ def contracted(
     centre = 0.5 * (low + high)
     scale = 0.5 * (high - low)
     cells = volumes(window.origin, centre, scale, min(ends[0], centre - scale), max(ends[1], centre + scale), LEVELS[0][0])
+    finest = (cells.last - cells.first) / LEVELS[-1][0] * np.hypot(scale, max(abs(ends[0] - centre), abs(ends[1] - centre)))
+    if width < NARROWEST * finest:  # sharper than the cells where it begins
+        return None
     before = best = None
     error = np.inf
     for size, count in LEVELS:
@@ -78,7 +83,8 @@ def contracted(
             if error < SHARE * prepared.tolerance:
                 break
         before = masses, gained
-    assert best is not None
+    if best is None or not error < SETTLED:
+        return None
     report.time, report.noise = report.time + error, max(report.noise, min(error, 1.0))
     found = _resampled(prepared, cells._replace(size=len(best[0])), best[0], window, error)
     assert found.look is not None
