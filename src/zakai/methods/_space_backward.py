@@ -138,12 +138,12 @@ def smoothed(prepared: base.Prepared, state: State, later: Message) -> tuple[Mes
     if later.lost:
         nothing = np.full((prepared.model.n,) * 2, np.nan)
         return later, Info(np.nan, nothing[0], nothing, dict.fromkeys(FIGURES, np.inf))
-    update = _product(prepared, state, later, SUMMED)
-    found = positive(update.field)
+    update, bounds = _product(prepared, state, later, SUMMED), _general(prepared).bounds
+    found = positive(update.field, bounds)
     mean, cov = moments_of(found.values, found.grid, prepared.angles)
     log_mass = float(np.log(found.values.sum() * found.grid.cell) + found.log_scale + later.field.log_scale)
     edge, tails = max(update.edges, later.report.edges), max(update.tails**4, later.report.tails)
-    bounds, tolerance = _general(prepared).bounds, _general(prepared).tolerance
+    tolerance = _general(prepared).tolerance
     error = 1.0 if update.truncated or not np.isfinite(log_mass) else later.error
     spacings = np.sqrt(np.maximum(np.diagonal(found.grid.inverse @ cov @ found.grid.inverse.T), 0.0))
     figures = (
@@ -170,7 +170,7 @@ def step(prepared: base.Prepared, k: int, later: Message, values: np.ndarray, st
     update, tails = Update(later.field, 0.0, 0.0, 0.0, False), later.report.tails
     if factor is not None:
         update = updated(later.field, factor, bounds, tails)
-    now = positive(update.field)
+    now = positive(update.field, bounds)
     now = now._replace(log_scale=now.log_scale + float(np.real(constant)))
     gauge, control, report = later.gauge, later.control, NOTHING
     if observations.lengths[k] > 0:
@@ -239,7 +239,7 @@ def _moved(
         if least >= MOST_PANELS:
             more = more._replace(splitting=max(more.splitting, 1.0))
         report = report.worst(more)
-    return positive(now), report, control
+    return positive(now, general.bounds), report, control
 
 
 def _stayed(
@@ -251,16 +251,16 @@ def _stayed(
         return None
     quick = view._fixed(now, control, allowed, length, potential)
     if quick is None:  # a grid with a margin may do
-        quick = view._fixed(positive(refitted(now, bounds)), control, allowed, length, potential)
+        quick = view._fixed(positive(refitted(now, bounds), bounds), control, allowed, length, potential)
     if quick is None:
         return None
     result, report, control, found = quick
-    return result if fits(found, result.grid, bounds) else positive(refitted(result, bounds)), report, control
+    return result if fits(found, result.grid, bounds) else positive(refitted(result, bounds), bounds), report, control
 
 
 def density(prepared: base.Prepared, state: State, later: Message) -> GridDensity:
     """Return the smoothed density."""
-    found = positive(_product(prepared, state, later, 0.0).field)
+    found = positive(_product(prepared, state, later, 0.0).field, _general(prepared).bounds)
     with np.errstate(divide="ignore"):
         logs = np.log(found.values)
     return GridDensity(logs, found.grid.centre, found.grid.basis, prepared.model.state, prepared.angles)

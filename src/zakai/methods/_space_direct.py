@@ -340,7 +340,7 @@ class Prepared(base.Prepared):
         values = np.exp(found.log_values - np.max(found.log_values.real))
         values, grid = opened(values, Grid(found.centre, found.basis, values.shape, found.closed))
         error = found.error if found.error > 1e-6 else 0.0
-        return self._started(positive(self._folded(Field(values, grid, 0.0))), error)
+        return self._started(positive(self._folded(Field(values, grid, 0.0)), self.bounds), error)
 
     def density(self, state: State) -> Field:
         """Return the posterior on a grid, folded onto the circle where it is wide."""
@@ -388,7 +388,7 @@ class Prepared(base.Prepared):
         factors = [one for one in (factor, extra) if one is not None]
         update = Update(predicted, report.edges, report.tails, 0.0, False)
         if factors:
-            update = updated(predicted, lambda grid: sum(one(grid) for one in factors), bounds, band_limited=True)
+            update = updated(predicted, lambda grid: sum(one(grid) for one in factors), bounds, report.tails)
         update = update._replace(field=regridded(self._folded(update.field), bounds))
         if potential is None:
             after = Control(state.rate, state.measured, state.age)
@@ -442,7 +442,7 @@ def prepare(
 ) -> base.Prepared:
     """Return what is known without data."""
     tolerance = tolerance_of(tolerance, DEFAULT_TOLERANCE)
-    bounds = Bounds(EDGE, TAIL, MOST[model.n], (False,) * model.n)
+    bounds = Bounds(EDGE, TAIL, MOST[model.n], (False,) * model.n, band_limited=True)
     theta = np.asarray(theta)
     yau = yau_of(model)
     series = power_series_of(model, order) if kernel == "power-series" else None

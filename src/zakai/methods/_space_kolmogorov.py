@@ -76,7 +76,7 @@ class Prepared:
         values = np.exp(found.log_values - np.max(found.log_values.real))
         error = found.error if found.error > 1e-6 else 0.0
         grid = Grid(found.centre, found.basis, values.shape, found.closed)
-        return self._started(positive(Field(values, grid, 0.0)), error)
+        return self._started(positive(Field(values, grid, 0.0), self.bounds), error)
 
     def _started(self, field: Field, error: float) -> State:
         """Return the state of a prior."""
@@ -122,7 +122,7 @@ class Prepared:
                 predicted, report, after = self._predicted(begin, parts, inside, rates, control, allowed, bounds)
             update = Update(predicted, report.edges, report.tails, 0.0, False)
             if factor is not None:
-                update = updated(predicted, factor, bounds)
+                update = updated(predicted, factor, bounds, report.tails)
             if not update.truncated or length == 0 or bounds.edge <= OUTLIER_EDGE:
                 break
             # The observation is where the prediction was cut off; so wide a grid leaves rounding, which no substep makes smaller.
@@ -236,7 +236,7 @@ class Prepared:
         report = grid_report(found)
         if not (report.edges <= 3 * self.bounds.edge and report.tails <= self.bounds.tail):
             return None
-        return positive(result), report._replace(splitting=splitting), control, found
+        return positive(result, self.bounds), report._replace(splitting=splitting), control, found
 
     def _motion(self, grid: Grid, length: float) -> Motion:
         """Return the motion of a grid, which is kept where it depends on the grid alone."""
@@ -254,12 +254,12 @@ class Prepared:
     def _reported(
         self, state: State, update: Update, report: Report, control: Control, constant: Any, kept: float, found: Survey | None
     ) -> tuple[State, Info]:
-        result = positive(update.field) if found is None else update.field
+        result = positive(update.field, self.bounds) if found is None else update.field
         mean, cov = moments_of(result.values.real, result.grid, self.angles, found)
         mass = result.values.sum() * result.grid.cell
         gained = np.log(mass) + (result.log_scale + constant)
         if found is not None and not fits(found, result.grid, self.bounds):
-            result = positive(refitted(result, self.bounds))
+            result = positive(refitted(result, self.bounds), self.bounds)
             mass = result.values.sum() * result.grid.cell
         edge, tails = max(report.edges, update.edges), max(report.tails, update.tails)
         made = (report.splitting + report.interpolation) * (1 + update.depth) + 1e-15 * np.exp(min(update.depth, 40.0))
@@ -313,8 +313,7 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: f
     if n > 4:
         raise InputError(f"{model.source}: a density grid is for at most four states, and there are {n}")
     periodic = tuple(name in model.periodic for name in model.state)
-    # With more at the highest frequencies the substeps of skew densities do not converge.
-    tail = min(tolerance**2, 1e-5 * tolerance)
+    tail = min(tolerance**2, 1e-3 * tolerance)
     bounds = Bounds(1e-3 * tolerance, tail, MOST[n], periodic)
     system, theta = system_of(model), np.asarray(theta)
     tables, motions = ({}, {}) if is_complex(theta) else system.caches(theta)

@@ -125,7 +125,7 @@ def fits(found: Survey, grid: Grid, bounds: Bounds) -> bool:
 def refitted(field: Field, bounds: Bounds) -> Field:
     """Return a density on a grid that fits it, with a margin for many short substeps."""
     grid, real = field.grid, field.values.real
-    narrow, _ = narrowest(survey(real, grid, bounds.edge, bounds.tail), grid, bounds.tail)
+    narrow, _ = narrowest(survey(real, grid, bounds.edge, bounds.tail), grid, bounds.tail, bounds.spacings)
     used = np.flatnonzero(real > 0.3 * bounds.edge * real.max())
     logs = np.log(real.reshape(-1)[used] / real.max())
     new = fitted_grid(grid.offsets[used], logs, grid.centre, np.zeros((grid.n, grid.n)), narrow, bounds, grid, MARGIN)

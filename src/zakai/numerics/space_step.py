@@ -34,11 +34,13 @@ Potential = Callable[[Grid, float, float, bool], Factor]  # at the start (False)
 SUPPORT = 200  # points that are moved to see where a density goes
 TRIES = 7
 MARGIN = 0.03  # of the bounds, for a grid of short steps
-INTERPOLATED = 3e-6  # tails of the spectrum below which they may be made by interpolation
+ACCEPTED = 3.0  # times the bound on tails, from a density that had such tails before
+REFINED = 1.15  # growth of the logarithm of tails that a finer grid must bring
 MOST_PARTS = 512
 MOST_ENLARGED = 4.0  # times its own width that a grid may need for the noise of a substep
 NEGLIGIBLE = 1e-40  # of the maximum
 CHECKED = 64  # intervals after which the error of single substeps is measured again
+WORTH, SMALL = 1.5, 0.05  # least order in its length of a small error of a substep for which shorter ones are tried
 _EXTRAPOLATED = 1.0  # the error that extrapolation leaves, as a multiple of difference^(5/3)
 
 
@@ -175,7 +177,7 @@ class Stepper:
         """Choose the target grids of substeps that follow each other by moving points of the density."""
         grid, real, bounds = field.grid, field.values.real, self.bounds
         found, linears = self._survey(field), self._linear(field, times)
-        narrow, widths = narrowest(found, grid, bounds.tail)
+        narrow, widths = narrowest(found, grid, bounds.tail, bounds.spacings)
         holds = bool(np.all(found.edges <= 0.5 * bounds.edge) and np.all(found.tails <= 0.5 * bounds.tail))
         holds = holds and self._fits(found.used, widths, grid)
         support = self._support(real)
@@ -256,57 +258,79 @@ class Stepper:
             t1 = t0 + 0.5 * (t1 - t0)
         return t1
 
-    def _moved(self, field: Field, t0: float, t1: float, move: _Move, potential: Potential | None) -> tuple[Field, Array, Report]:
-        """Return the density after one substep on a grid that fits it, as `_apply`, and the errors of the grid."""
-        before = np.full(field.grid.n, np.inf)
+    def _moved(
+        self, field: Field, t0: float, t1: float, move: _Move, potential: Potential | None, tails: Array
+    ) -> tuple[Field, Array, Report]:
+        """Return the density after one substep on a grid that fits it, as `_apply`, and the errors of the grid.
+
+        `tails` (n,) are those of the density at the start of the interval, which no finer grid has made smaller.
+        """
+        before, last, coarse = np.ones(field.grid.n), None, np.zeros(field.grid.n, bool)
         for attempt in range(TRIES):
             result, moved = self._apply(field, t0, t1, move, potential)
             found = survey(result.values, result.grid, self.bounds.edge)
             wide = found.edges > 3 * self.bounds.edge
-            coarse = refinable(found.tails, before, self.bounds)
+            if last is not None and coarse.any() and not better(found.tails, before)[coarse].any():
+                return last  # the finer grid has the same tails
+            coarse = refinable(found.tails, before, tails, self.bounds)
             if attempt == TRIES - 1 or not (wide.any() or coarse.any()) or not np.isfinite(found.tails).all():
                 break
             ends = 0.2 * np.where(wide, 1.0, 0.0)
             finer = np.where(coarse, np.clip(self.bounds.spacings / deviations_in_spacings(found.tails), 1.1, 2.0), 1.0)
-            better = adjusted(result.grid, ends, ends, finer, self.bounds)
-            if better is None:
+            changed = adjusted(result.grid, ends, ends, finer, self.bounds)
+            if changed is None:
                 break
             before = np.where(coarse, found.tails, before)
-            move = move._replace(target=better)
+            last = None if wide.any() else (result, moved, grid_report(found))
+            move = move._replace(target=changed)
         return result, moved, grid_report(found)
 
     def single(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report]:
         """Return the density after one substep, on a grid that fits it."""
-        result, _, report = self._moved(field, t0, t1, self._moves(field, (t0, t1))[0], potential)
+        result, _, report = self._moved(field, t0, t1, self._moves(field, (t0, t1))[0], potential, self._survey(field).tails)
         return result, report
 
     def double(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report, float]:
         """Return the extrapolated density after two halves of a substep, and the difference from the whole substep."""
         middle = 0.5 * (t0 + t1)
         one, two = self._moves(field, (t0, middle, t1))
-        half, _, first = self._moved(field, t0, middle, one, potential)
-        fine, moved, second = self._moved(positive(half), middle, t1, two, potential)
+        tails = self._survey(field).tails
+        half, _, first = self._moved(field, t0, middle, one, potential, tails)
+        fine, moved, second = self._moved(positive(half, self.bounds), middle, t1, two, potential, tails)
         whole = _Move(one.linear.then(two.linear), one.steps, fine.grid)
         coarse, _ = self._apply(field, t0, t1, whole, potential, (middle, moved))
+        fine = positive(fine, self.bounds)
         values, difference = extrapolated(fine.values, coarse.values, coarse.log_scale - fine.log_scale)
         # Moments differ by a few times as much as densities; by more only where rounding far away counts.
         difference = max(difference, min(moments_difference(fine.values, coarse.values, fine.grid), 5 * difference))
         return Field(values, fine.grid, fine.log_scale), first.worst(second), difference
 
 
-def refinable(tails: Array, before: Array, bounds: Bounds) -> Array:
+def refinable(tails: Array, before: Array, start: Any, bounds: Bounds) -> Array:
     """Return along which axes (n,) a finer grid leaves smaller tails of the spectrum; `before` are those of the last grid.
 
-    What interpolation adds to the spectrum does not decrease with the spacing, and what a kink adds decreases slowly.
+    Small tails that the density had at the `start` need none.
+
+    What interpolation adds to the spectrum does not decrease with the spacing, and what a kink adds decreases slowly: the last
+    grid must have been the reason for a good part of the decrease.
     """
-    enough = max(INTERPOLATED, 100 * bounds.tail)
-    return np.asarray((tails > 3 * bounds.tail) & ((tails < 0.1 * before) | (tails > enough)))
+    return np.asarray((tails > 3 * np.clip(start, bounds.tail, ACCEPTED * bounds.tail)) & better(tails, before))
 
 
-def positive(field: Field) -> Field:
-    """Return the density without its negative values, and without values so small that arithmetic with them is slow."""
+def better(tails: Any, before: Any) -> Array:
+    """Return along which axes a finer grid has smaller tails of the spectrum than the last."""
+    logs, last = (np.log(np.clip(t, 1e-300, 0.99)) for t in (tails, before))
+    return np.asarray(logs < REFINED * last)
+
+
+def positive(field: Field, bounds: Bounds) -> Field:
+    """Return the density without negative values, those of denormal size, and the noise of interpolation.
+
+    The noise is what is not larger than the most negative value.
+    """
     real = field.values.real
-    return field._replace(values=np.where(real > NEGLIGIBLE * real.max(), field.values, 0.0))
+    noise = 0.0 if bounds.band_limited else -real.min()
+    return field._replace(values=np.where(real > max(NEGLIGIBLE * real.max(), noise), field.values, 0.0))
 
 
 def extrapolated(fine: Array, coarse: Array, log_ratio: Any) -> tuple[Array, float]:
@@ -352,7 +376,7 @@ def advance(
         parts, report = int(singles), NOTHING
         for i in range(parts):
             field, more = stepper.single(field, t0 + tau * i / parts, t0 + tau * (i + 1) / parts, potential)
-            field, report = positive(field), report.worst(more)
+            field, report = positive(field, stepper.bounds), report.worst(more)
         return field, report._replace(splitting=error / parts**2), control._replace(age=control.age + 1)
     if not control.fixed and control.measured > 0 and tau > 2 * control.measured:
         doubles = max(doubles, np.ceil(min(tau / (1.5 * control.measured), MOST_PARTS)))
@@ -362,14 +386,19 @@ def advance(
 def _adaptively(
     stepper: Stepper, field: Field, t0: float, tau: float, potential: Potential | None, parts: int, allowed: float, longest: float
 ) -> tuple[Field, Report, Control]:
-    """Return the density after an interval in extrapolated substeps whose lengths follow from the error of each."""
-    done, length, report, rate, count = 0.0, 1.0 / parts, NOTHING, 0.0, 0
+    """Return the density after an interval in extrapolated substeps whose lengths follow from the error of each.
+
+    Shorter substeps are tried as long as the error decreases with an order of at least `WORTH`: at a kink, or where interpolation
+    makes it, it does not.  No interval has more than about `MOST_PARTS` substeps; its report says what error they make.
+    """
+    done, length, report, rate = 0.0, 1.0 / parts, NOTHING, 0.0
+    left, before, stalled = MOST_PARTS + 2 * parts, (np.inf, 1.0), False
     while done < 1 - 1e-12:
-        length = min(length, longest, 1 - done)
+        length = min(max(length, (1 - done) / left), longest, 1 - done)
         if 1 - done - length < 0.3 * length:
             length = 1 - done if 1 - done <= 1.3 * length else 0.5 * (1 - done)
         begin, end = t0 + tau * done, t0 + tau * (done + length)
-        limit = stepper.limit(field, begin, end)
+        limit = stepper.limit(field, begin, end) if left > 1 else end
         if limit < end:
             end, length = limit, (limit - begin) / tau
         result, more, difference = stepper.double(field, begin, end, potential)
@@ -377,12 +406,12 @@ def _adaptively(
         error = _EXTRAPOLATED * difference ** (5 / 3)
         wanted = allowed * length
         change = float(np.clip(0.9 * (wanted / max(error, 1e-30)) ** 0.25, 0.2, 3.0))
-        if error > 3 * wanted and count < MOST_PARTS and length > 1e-6:
-            length *= min(change, 0.7)
-            count += 1
+        left = max(left - 1, 1)
+        stalled = stalled or SMALL > difference and error > before[0] * (length / before[1]) ** WORTH
+        if error > 3 * wanted and left > 1 and not stalled:
+            before, length = (error, length), length * min(change, 0.7)
             continue
-        field, report = positive(result), report.worst(more._replace(splitting=error))
+        field, report, before = positive(result, stepper.bounds), report.worst(more._replace(splitting=error)), (np.inf, 1.0)
         rate = max(rate, difference * (4 / 3) / max((tau * length) ** 3, 1e-300))
-        done, count = done + length, count + 1
-        last, length = length, length * change
+        done, last, length = done + length, length, length * (max(change, 1.0) if stalled else change)
     return field, report, Control(rate, tau * last, 0)

@@ -154,10 +154,11 @@ def survey(values: Array, grid: Grid, edge: float = 0.0, tail: float = 1.0) -> S
     return Survey(total, basis @ mean, basis @ cov @ basis.T, edges, tails, used, highest, negative / max(total, 1e-300))
 
 
-def narrowest(found: Survey, grid: Grid, tail: float) -> tuple[Array, Array]:
+def narrowest(found: Survey, grid: Grid, tail: float, least: float = 0.0) -> tuple[Array, Array]:
     """Return the smallest standard deviation along each axis, in conditional deviations (n,), at most 1, and in spacings (n,).
 
-    It follows from the highest frequency at which the spectrum is above `tail` of the mass.
+    It follows from the highest frequency at which the spectrum is above `tail` of the mass; where that is so at all frequencies,
+    as at a kink, it is not less than `least` spacings.
     """
     inverse = grid.inverse
     spread = inverse @ found.cov @ inverse.T
@@ -165,7 +166,7 @@ def narrowest(found: Survey, grid: Grid, tail: float) -> tuple[Array, Array]:
     scaled = spread / np.outer(scale, scale) + 1e-9 * np.eye(grid.n)
     conditional = scale / np.sqrt(np.diagonal(np.linalg.inv(scaled)))
     width = np.sqrt(-2 * np.log(tail)) / (np.pi * found.highest)
-    width = np.where(found.highest >= 1.0, deviations_in_spacings(found.tails), width)
+    width = np.where(found.highest >= 1.0, np.maximum(deviations_in_spacings(found.tails), least), width)
     return np.minimum(width / conditional, 1.0), np.minimum(width, conditional)
 
 

@@ -16,7 +16,7 @@ from zakai.numerics.space_grid import (
     relative_index,
     triangular_resampled,
 )
-from zakai.numerics.space_step import Field, positive, refinable
+from zakai.numerics.space_step import Field, better, positive, refinable
 from zakai.numerics.space_survey import deviations_in_spacings, narrowest, survey
 from zakai.numerics.space_window import Bounds, adjusted, fitted_grid, whitened_grid
 
@@ -39,18 +39,18 @@ class Update(NamedTuple):
     truncated: bool
 
 
-def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, band_limited: bool = False) -> Update:
+def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, tails: float) -> Update:
     """Return the product of a density and a factor that is given by its logarithm at the points of a grid (J,).
 
     A factor that is narrower than the grid's spacing is found on a sequence of finer grids, with a power of it below one as long
-    as neighbours differ by many nats.  With `band_limited` interpolation is exact for a density that its grid resolves.
+    as neighbours differ by many nats.  `tails` are those of the spectrum of the density.
     """
     grid, values = field.grid, field.values
     coefficients: Array | None = None
     inverse_previous = grid
     logs = log_factor(grid).reshape(grid.sizes)
-    found, before = None, np.full(grid.n, np.inf)
-    best: Any = None  # the grid with the smallest edges and tails so far: a later one may be worse
+    found, before = None, np.ones(grid.n)
+    best: Any = None  # the smallest grid with the smallest edges and tails so far: a later one may be worse
     for attempt in range(_TRIES):
         real = np.where(values.real > 0, values.real, 0.0)
         with np.errstate(divide="ignore"):
@@ -62,21 +62,22 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, b
         if power == 1.0:
             found = survey(_exp(product - top), grid, bounds.edge)
             worst = float(max(found.tails.max(), found.edges.max()))
-            if best is None or worst < best[0]:
-                best = worst, grid, values, logs, product, top, found
             span = (found.used[:, 1] - found.used[:, 0] + 4) / np.array(grid.sizes)
             wide = found.edges > 3 * bounds.edge
-            coarse = refinable(found.tails, before, bounds)
+            coarse = refinable(found.tails, before, tails, bounds)
+            good = not wide.any() and found.tails.max() <= 3 * bounds.tail
+            if best is None or good or better(worst, best[0]):
+                best = worst, grid, values, logs, product, top, found
             before = np.where(coarse & (attempt > 0), found.tails, before)
             sparse = np.array([attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1])
             if not (wide.any() or coarse.any() or sparse.any()):
                 break
         if attempt == _TRIES - 1:
             break
-        new = _next(grid, product, logs.real, power, found, bounds, band_limited, attempt > 1)
+        new = _next(grid, product, logs.real, power, found, bounds, attempt > 1)
         if new is None or new.same(grid):
             break
-        if band_limited:
+        if bounds.band_limited:
             grid, values = new, triangular_resampled(field.values, field.grid, new)
             logs, found = log_factor(grid).reshape(grid.sizes), None
             continue
@@ -85,11 +86,12 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, b
             zero = np.zeros((grid.n, grid.n))
             coefficients = filtered(field.values, gaussian_response(zero, field.grid.sizes, spline=True))
         at = relative_index(new.offsets, new.centre, inverse_previous, bounds.periodic)
-        grid, values = new, gather(coefficients, at, inverse_previous).reshape(new.sizes)
+        values = gather(coefficients, at, inverse_previous).reshape(new.sizes)
+        grid, values = new, positive(Field(values, new, 0.0), bounds).values
         logs, found = log_factor(grid).reshape(grid.sizes), None
     if found is None:
         found = survey(_exp(product - top), grid, bounds.edge)
-    if best is not None and best[0] < 0.1 * max(found.tails.max(), found.edges.max()):
+    if best is not None:
         _, grid, values, logs, product, top, found = best
     peak = int(np.argmax(product))
     ratio = float(values.real.flat[peak] / max(field.values.real.max(), values.real.max()))
@@ -98,7 +100,7 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, b
     result = np.where(good, values, 0.0) * np.exp(np.where(good, np.where((logs.real - shift) > 600, 600, logs - shift), 0.0))
     truncated = _at_end(_exp(product - top), grid, field.grid, bounds)
     return Update(
-        positive(Field(result, grid, field.log_scale + shift)),
+        positive(Field(result, grid, field.log_scale + shift), bounds),
         float(found.edges.max()),
         float(found.tails.max()),
         max(-np.log(max(ratio, 1e-300)), 0.0),
@@ -127,7 +129,7 @@ def _power(logs: Array, product: Array, grid: Grid) -> float:
 
 
 def _next(
-    grid: Grid, product: Array, logs: Array, power: float, found: Any, bounds: Bounds, lower: bool, late: bool
+    grid: Grid, product: Array, logs: Array, power: float, found: Any, bounds: Bounds, late: bool
 ) -> Grid | None:
     """Return the next grid: around the product with a power of the factor, or one that mends what the checks found."""
     if power < 1.0:
@@ -147,7 +149,7 @@ def _next(
     flat = np.flatnonzero(used)
     near = grid.offsets[flat]
     levels = tempered.reshape(-1)[flat] - tempered.max()
-    if lower:
+    if bounds.band_limited:
         return whitened_grid(near, levels, noise, narrow, bounds, grid)
     return fitted_grid(near, levels, grid.centre, noise, narrow, bounds, grid)
 

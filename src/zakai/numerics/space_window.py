@@ -20,13 +20,15 @@ class Bounds(NamedTuple):
     """The requirements for a grid.
 
     `edge` is the share of the maximum that counts as zero; `tail` the share of the mass in the spectrum at the highest
-    frequencies with which a grid is used; `most` points along an axis; which coordinates are `periodic`.
+    frequencies with which a grid is used; `most` points along an axis; which coordinates are `periodic`. With `band_limited`
+    interpolation is exact for a density that its grid resolves, and what remains is rounding.
     """
 
     edge: float
     tail: float
     most: int
     periodic: tuple[bool, ...]
+    band_limited: bool = False
 
     @property
     def reach(self) -> float:
@@ -36,7 +38,8 @@ class Bounds(NamedTuple):
     @property
     def spacings(self) -> float:
         """Spacings in a standard deviation that leave `tail` with a margin."""
-        return float(np.sqrt(-2 * np.log(self.tail / 30)) / np.pi)
+        margin = 30 if self.band_limited else 100
+        return float(np.sqrt(-2 * np.log(self.tail / margin)) / np.pi)
 
 
 def fitted_grid(
