@@ -1,0 +1,58 @@
+"""How many points the grids of two states have where a density has a kink or is stretched, against particles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zakai
+
+FRICTION = {
+    "state": ["x", "v"], "drift": ["v", "-x - v*abs(v)/2"], "diffusion": [["0"], ["1/2"]], "observation": ["x"],
+    "observation_kind": "samples", "observation_noise": [["1/25"]],
+    "prior": {"kind": "gaussian", "mean": [1.0, 0.0], "cov": [0.2, 0.2]},
+}  # fmt: skip
+PREDATOR = {
+    "state": ["u", "v"], "drift": ["1 - exp(v)", "exp(u) - 1"], "process_noise": [["1/20", "0"], ["0", "1/20"]],
+    "observation": ["exp(u)"], "observation_kind": "samples", "observation_noise": [["1/25"]],
+    "prior": {"kind": "gaussian", "mean": [0.3, 0.0], "cov": [0.1, 0.1]},
+}  # fmt: skip
+# A kink in f, whose spectrum decreases slowly, and gaps in which a nonlinear drift stretches the density.
+SYSTEMS = {
+    "kink": (
+        FRICTION, lambda x, v: (v, -x - v * np.abs(v) / 2), lambda x, v: x, (0.0, 0.5), np.full(90, 0.1), 0.0, 1, 6000, 20_000,
+    ),
+    "gaps": (
+        PREDATOR, lambda u, v: (1 - np.exp(v), np.exp(u) - 1), lambda u, v: np.exp(u), (0.05**0.5, 0.05**0.5),
+        np.random.default_rng(1).exponential(0.2, 45) + 0.01, 0.5, 3, 20000, 100_000,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_a_density_with_a_slow_spectrum_has_a_small_grid_and_the_moments_of_particles(name):
+    keys, drift, observe, root, gaps, missing, seed, most, count = SYSTEMS[name]
+    model, times, noise = zakai.Model(**keys), np.cumsum(gaps), 0.04
+    _, record = zakai.simulate(model, times, seed=seed)
+    values = np.where(np.random.default_rng(2).random(record.values.shape) < missing, np.nan, record.values)
+    result = zakai.filter(model, zakai.Record(times, values, "samples"), "yau-yau")
+    assert not result.warnings
+    assert max(result.density(k).log_values.size for k in range(len(times) + 1)) < most
+    rng = np.random.default_rng(0)
+    a, b = rng.multivariate_normal(keys["prior"]["mean"], np.diag(keys["prior"]["cov"]), count).T
+    for k, (gap, z) in enumerate(zip(gaps, values[:, 0], strict=True)):
+        steps = int(np.ceil(gap / 0.04))
+        for _ in range(steps):
+            # Heun's formula, of weak order two for noise that does not depend on the state.
+            h, (v, w) = gap / steps, np.sqrt(gap / steps) * rng.standard_normal((2, count))
+            f, g = drift(a, b)
+            p, q = drift(a + h * f + root[0] * v, b + h * g + root[1] * w)
+            a, b = a + h / 2 * (f + p) + root[0] * v, b + h / 2 * (g + q) + root[1] * w
+        if not np.isnan(z):
+            weights = np.exp(-0.5 * (z - observe(a, b)) ** 2 / noise)
+            index = (np.arange(count) + rng.uniform()) / count
+            chosen = np.searchsorted(np.cumsum(weights) / weights.sum(), index).clip(0, count - 1)
+            a, b = a[chosen], b[chosen]
+        deviations = np.sqrt(result.variance[k + 1])
+        assert np.abs((np.array([a.mean(), b.mean()]) - result.mean[k + 1]) / deviations).max() < 0.1
+        assert np.abs(np.array([a.std(), b.std()]) / deviations - 1).max() < 0.1
