@@ -20,8 +20,9 @@ help:
 	$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("zakai needs Python 3.11 or newer: make PYTHON=python3.12 ...")'
 	$(PYTHON) -m venv .venv
 
+# A module is compiled when it is first imported: to compile all of them takes longer than the rest of the installation.
 .venv/.plots: pyproject.toml | .venv/pyvenv.cfg
-	$(BIN)/python -m pip install --quiet --editable '.[plots]'
+	$(BIN)/python -m pip install --quiet --no-compile --editable '.[plots]'
 	@touch $@
 
 .venv/.dev: pyproject.toml | .venv/pyvenv.cfg
