@@ -85,7 +85,7 @@ class GridDensity(WeightedPoints):
             distance = np.arange(size) - size // 2 - index[:, axis][:, None]
             view = [-1] + [size if a == axis else 1 for a in range(len(shape))]
             if self._closed[axis]:
-                kernels.append(dirichlet(distance, size).reshape(view))
+                kernels.append(dirichlet(index[:, axis], size).reshape(view))
                 continue
             kernels.append(np.sinc(distance).reshape(view))
             if size > 1:
@@ -139,7 +139,7 @@ class GridDensity(WeightedPoints):
         kernels = []
         for axis, size in enumerate(shape):
             distance = np.arange(size) - size // 2 - index[:, axis][:, None]
-            kernels.append(dirichlet(distance, size) if self._closed[axis] else np.sinc(distance))
+            kernels.append(dirichlet(index[:, axis], size) if self._closed[axis] else np.sinc(distance))
         top = np.max(self.log_values)
         values = np.exp(self.log_values - top).reshape(shape[0], -1)
         plane = (kernels[0] @ values).reshape(-1, *shape[1:])
@@ -275,12 +275,15 @@ class GridDensity(WeightedPoints):
         return np.where(self.periodic, wrap(x), x)
 
 
-def dirichlet(distance: np.ndarray, size: int) -> np.ndarray:
-    """The trigonometric interpolation kernel of `size` points on a circle, at a distance in cells."""
-    angle = np.pi * distance / size
+def dirichlet(index: np.ndarray, size: int) -> np.ndarray:
+    """Return the trigonometric interpolation kernel at places (P,) of a circle of points -(size // 2), ..., as (P, size)."""
+    nearest = np.rint(index)
+    rest = (index - nearest)[:, None]
+    # Distances around the circle are whole cells less the rest; the sine of pi times them is that of the rest but for its sign.
+    cells = np.mod(np.arange(size) + size // 2, size) - size // 2
+    signs = np.where(cells % 2, 1.0, -1.0)
+    to_point = np.arange(size) - np.mod(nearest.astype(int) + size // 2, size)[:, None]  # negative ones count from the end
+    angle = np.pi / size * (cells[to_point] - rest)
     with np.errstate(divide="ignore", invalid="ignore"):
-        if size % 2:
-            value = np.sin(np.pi * distance) / (size * np.sin(angle))
-        else:
-            value = np.sin(np.pi * distance) / (size * np.tan(angle))
-    return np.where(np.abs(np.sin(angle)) < 1e-14, 1.0, value)
+        value = signs[to_point] * np.sin(np.pi * rest) / (size * (np.sin(angle) if size % 2 else np.tan(angle)))
+    return np.where(angle == 0.0, 1.0, value)
