@@ -201,6 +201,8 @@ def fitted(look: Figures, window: Window, most: int = LARGEST, generous: int = 6
         margin: range of a new grid beyond that of the density, relative to it.
     """
     needed = look.resolving * window.spacing
+    if not 0.0 < needed < np.inf:  # the values are no numbers
+        return window
     if window.closed:
         size = min(size_for(2 * np.pi / needed), most)
         if window.size >= size and (window.size <= 2 * size or window.size <= generous):
@@ -259,7 +261,7 @@ def interpolated(values: Array, window: Window, offsets: Array) -> Array:
     if window.closed:
         return np.asarray(np.where(exact, values[nearest.astype(int) % window.size], found))
     inside = (at > -0.5) & (at < window.size - 0.5)
-    own = values[np.clip(nearest, 0, window.size - 1).astype(int)]
+    own = values[np.where(inside, nearest, 0.0).astype(int)]
     return np.asarray(np.where(inside, np.where(exact, own, found), 0.0))
 
 
