@@ -208,6 +208,6 @@ def path_of(observations: Observations, k: int, mean: Array, cov: Array, periodi
         noise += 0.5 * length * np.reshape(system.covariance(x, t, theta), cov.shape)
     begin = end
     if len(end.straight) and not end.covers(mean, cov + 0.25 * noise):
-        bent = (slopes[0] - slopes[1]) * length / 8  # what the cubic path differs from a straight line
-        begin = gauge_of(mean, cov, periodic, noise + 0.5 * np.outer(bent, bent))
+        curved = (slopes[0] - slopes[1]) * length / 8  # what the cubic path differs from a straight line
+        begin = gauge_of(mean, cov, periodic, noise + 0.5 * np.outer(curved, curved))
     return Path(begin, end, parts[0][0], length, slopes)
