@@ -27,6 +27,7 @@ from zakai.methods._line_moves import MAGNUS
 from zakai.methods._line_paths import draw
 from zakai.methods._line_system import Prepared, State, covariance_at, covariance_between, drift_at, finite, state_moments
 from zakai.methods._line_update import exponential_factor, factor_at_end
+from zakai.methods._line_volumes import pulled_back
 from zakai.methods._protocol import Backward, Info
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_operator import Spectral, derivatives, exponential_action
@@ -38,9 +39,12 @@ FALL = 3.3  # spacings over which F falls
 HALF = 14.0  # spacings from where F is one to where it is one half
 PAD = 28  # spacings over which F falls to zero
 MOST_SUBSTEPS = 2000
+FEW = 4  # substeps of an interval beyond which finite volumes are tried
 BOUND = 12.0  # range of a bounded gauge
 NOISE = 1e-11  # of the maximum: what is rounding in psi
 SMALLEST = 1e-13  # value of a smoothed density relative to its maximum that is not rounding
+SURE = 10.0  # errors of a density from which its small values count
+LOWEST = -30.0  # logarithm of the largest error of small values, relative to the largest value
 REACH = 8.0  # standard deviations of the noise of a substep that a grid must hold
 
 
@@ -96,6 +100,17 @@ class Message(NamedTuple):
         top = float(np.max(logs[beyond < HALF]))
         values = np.exp(np.minimum(logs - top, 5.0)) * 0.5 * erfc((beyond - HALF) / FALL)
         return self.changed(values, self.window, np.zeros(len(values)), top)
+
+    def logs(self, offsets: Array) -> Array:
+        """Return log(b) - log_scale at offsets from the origin (J,), constant where b does not matter or psi is rounding."""
+        own = self.window.offsets
+        counts = self.values > NOISE * np.max(self.values)
+        if not self.closed:
+            counts &= (own >= self.low) & (own <= self.high)
+        first, last = np.flatnonzero(counts)[[0, -1]]
+        logs = np.log(np.maximum(self.values, 1e-300) / self.spacing) - self.gauge
+        inner = self.window._replace(centre=float(own[first + (last - first + 1) // 2]), size=int(last - first + 1))
+        return lw.local_polynomial(logs[first : last + 1], inner, offsets)
 
     def changed(self, values: Array, window: lw.Window, gauge: Array, gained: float) -> Message:
         """Return the message with other values of any sum, multiplied by exp(gained)."""
@@ -156,10 +171,17 @@ class _Product(NamedTuple):
     log_mass: float
 
 
+def _reliable(state: State, window: lw.Window) -> Array:
+    """Return the density on another grid, zero where its error is as large."""
+    values = np.asarray(state.values).real
+    floor = SURE * float(np.exp(min(state.log_floor, LOWEST))) * float(np.max(values))
+    return lw.resampled(np.where(values > floor, values, 0.0), state.window, window)
+
+
 def _product(state: State, later: Message) -> _Product:
     own, other = state.window, later.window
     finer = own if own.spacing <= 1.0001 * other.spacing else other
-    density = lw.resampled(np.asarray(state.values).real, own, finer)
+    density = _reliable(state, finer)
     psi, gauge = lw.resampled(later.values, other, finer), lw.local_polynomial(later.gauge, other, finer.offsets)
     logs = np.where((density > 0) & (psi > 0), np.log(density) + np.log(psi) - gauge, -np.inf)
     top = float(np.max(logs))
@@ -257,14 +279,20 @@ class _Way:
 
     def back(self, later: Message) -> Message:
         """Return the message at the start of the interval."""
-        stack, count = [(0.0, self.length)], 0
+        stack, count, tried = [(0.0, self.length)], 0, False
         if self.prepared.system.varying:
             stack, error = resolved_parts(self.prepared, later.values, later.window, self.start, self.length, self.inside)
             self.error += error
         longest = max(last - first for first, last in stack)
+        whole = later
         while stack:
             first, last = stack.pop()
             count += 1
+            if count + len(stack) > FEW and not tried and not later.closed:
+                tried = True
+                found = self._by_volumes(whole)
+                if found is not None:
+                    return found
             forced = count + len(stack) >= MOST_SUBSTEPS or last - first <= 2e-3 * min(self.length, longest)
             found = self._substep(later, first, last, forced)
             if found is None:
@@ -308,6 +336,20 @@ class _Way:
         needed = window.spacing * float(np.clip(look.resolving, 1.0, 2.0))
         moved = np.where(moved > 0.0, moved, 0.0)
         return moving.changed(moved, window, gauge.values, offset)._replace(low=low, high=high, needed=needed)
+
+    def _by_volumes(self, later: Message) -> Message | None:
+        """Return the message at the start of the interval from finite volumes, None where they do not serve."""
+        state, window = self.state, self.state.window
+        interval = self.start, self.length, self.inside, self.rates
+        found = pulled_back(self.prepared, later.logs, np.asarray(state.values).real, window, *interval)
+        if found is None:
+            return None
+        low, high = self.ends
+        new = _covering(later.window, low, high, min(later.needed, window.spacing))
+        values = found.at(new.offsets) * _fall(new.size, new.closed)[0] * new.spacing
+        self.error = found.error
+        moved = later.changed(np.where(values > 0.0, values, 0.0), new, np.zeros(new.size), found.log_scale)
+        return moved._replace(low=low, high=high)
 
     def _spread(self, later: Message, first: float, last: float) -> tuple[float, float]:
         """Return about the range to which a message that matters on its own range spreads."""
@@ -373,7 +415,7 @@ class _Way:
 
     def _exact(self, psi: Array, gauge: _Gauge, window: lw.Window, error: float) -> bool:
         """Return whether the error of psi, relative to its maximum, is small in the product with the density at the start."""
-        density = lw.resampled(np.asarray(self.state.values).real, self.state.window, window)
+        density = _reliable(self.state, window)
         weights = np.where(density > 0.0, np.exp(np.log(density) - gauge.values), 0.0)
         top = float(np.max(psi))
         return bool(max(error, 1e-15) * top * np.sum(weights) < max(1e-9, 1e-2 * self.prepared.tolerance) * (weights @ psi))

@@ -6,6 +6,7 @@ more and more cells and steps until the result settles.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -20,6 +21,7 @@ from zakai.numerics.line_volumes import Bands, Volumes, advanced, ends_of_steps,
 Array = Any
 
 FAST = 5.0  # ranges of a density that the drift crosses in an interval, below which it is not followed
+STIFF = 100.0  # the same, above which no uniform grid is tried
 MOST_TRAVEL = 20.0  # ranges of a density, as it is at the time, that it moves on uniform grids
 MOST_DEVIATIONS = 100.0  # range of a density on a uniform grid, in the smallest deviations of its parts
 LEVELS = ((1024, 48), (2048, 68), (4096, 96), (8192, 136), (16384, 192))  # cells and steps
@@ -51,45 +53,145 @@ def contracted(
     width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(_drift(prepared, window, ends, start))))
     if not speed * length > FAST * width:
         return None
-    fastest = FASTEST * width / (length * prepared.tolerance)
-    quick = min(FIRST * width / min(speed, fastest), 0.1 * length)
-    way = _way(prepared, window, ends, start, ends_of_steps(length, quick, _FLOW_STEPS))
-    if not (way.travel > MOST_TRAVEL or way.deviations > MOST_DEVIATIONS):
+    course = _course(prepared, window, ends, start, length)
+    if course is None:
         return None
-    low, high = way.low, way.high
-    centre = 0.5 * (low + high)
-    scale = 0.5 * (high - low)
+    stiff = speed * length > STIFF * width
+    if not (stiff or course.way.travel > MOST_TRAVEL or course.way.deviations > MOST_DEVIATIONS):
+        return None
+    if width < NARROWEST * course.finest:  # sharper than the cells where it begins
+        return None
+
+    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
+        masses = lw.density_at(values, window, cells.offsets) * cells.widths
+        interval = prepared, values, window, cells, start, inside, rates, steps, course.fastest
+        return _advanced(masses / np.sum(masses), *interval)
+
+    def summed(masses: Array) -> Array:
+        return masses.reshape(-1, 2).sum(axis=1)
+
+    found = _settled(prepared, course, length, at_level, summed)
+    if found is None:
+        return None
+    masses, cells, gained, error = found
+    report.time, report.noise = report.time + error, max(report.noise, min(error, 1.0))
+    resampled = _resampled(prepared, cells, masses, window, error)
+    assert resampled.look is not None
+    report.density(resampled.look)
+    return resampled._replace(gained=gained)
+
+
+class Worth(NamedTuple):
+    """A function of the state at the start of an interval: its values (N,) at the middles of cells, the logarithm of their scale."""
+
+    cells: Volumes
+    values: Array
+    log_scale: float
+    error: float
+
+    def at(self, offsets: Array) -> Array:
+        """Return the values at offsets from the origin (J,)."""
+        s = np.arcsinh((offsets - self.cells.centre) / self.cells.scale)
+        return lw.local_polynomial(self.values, self.cells.logarithmic, s)
+
+
+def pulled_back(
+    prepared: Prepared,
+    log_worth: Callable[[Array], Array],
+    values: Array,
+    window: lw.Window,
+    start: float,
+    length: float,
+    inside: np.ndarray,
+    rates: np.ndarray,
+) -> Worth | None:
+    """Return the expectation of a function of the state after an interval, given the state before; None where it does not settle.
+
+    Args:
+        log_worth: the logarithm of the function at offsets from the origin of the window (J,).
+        values: the density before the interval.
+    """
+    look = lw.figures(values, False)
+    ends = window.offsets[[max(look.first - 1, 0), min(look.last + 1, window.size - 1)]]
+    course = _course(prepared, window, ends, start, length)
+    if course is None:
+        return None
+
+    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
+        logs = log_worth(cells.offsets)
+        top = float(np.max(logs))
+        interval = prepared, values, window, cells, start, inside, rates, steps, course.fastest
+        found, gained = _advanced(np.exp(logs - top), *interval, backward=True)
+        return found, gained + top
+
+    def between(found: Array) -> Array:
+        padded = np.concatenate([found[:1], found, found[-1:]])
+        return (9.0 * (found[::2] + found[1::2]) - padded[:-2:2] - padded[3::2]) / 16.0
+
+    found = _settled(prepared, course, length, at_level, between)
+    return None if found is None else Worth(found[1], found[0], float(found[2]), found[3])
+
+
+class _Course(NamedTuple):
+    """How an interval moves a density, the cells that hold it all the way, the first step, and the fastest drift that counts."""
+
+    way: _Way
+    cells: Volumes
+    finest: float
+    quick: float
+    fastest: float
+
+
+def _course(prepared: Prepared, window: lw.Window, ends: Array, start: float, length: float) -> _Course | None:
+    """Return the course of a density between two offsets, None where the drift leads beyond all numbers."""
+    width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(_drift(prepared, window, ends, start))))
+    fastest = FASTEST * width / (length * prepared.tolerance)
+    quick = min(FIRST * width / max(min(speed, fastest), 1e-300), 0.1 * length)
+    way = _way(prepared, window, ends, start, ends_of_steps(length, quick, _FLOW_STEPS))
+    if not np.isfinite([way.low, way.high]).all() or not way.high > way.low:
+        return None
+    centre, scale = 0.5 * (way.low + way.high), 0.5 * (way.high - way.low)
     cells = volumes(window.origin, centre, scale, min(ends[0], centre - scale), max(ends[1], centre + scale), LEVELS[0][0])
     finest = (cells.last - cells.first) / LEVELS[-1][0] * np.hypot(scale, max(abs(ends[0] - centre), abs(ends[1] - centre)))
-    if width < NARROWEST * finest:  # sharper than the cells where it begins
-        return None
+    return _Course(way, cells, float(finest), quick, fastest)
+
+
+def _settled(
+    prepared: Prepared,
+    course: _Course,
+    length: float,
+    at_level: Callable[[Volumes, Array], tuple[Array, Any]],
+    paired: Callable[[Array], Array],
+) -> tuple[Array, Volumes, Any, float] | None:
+    """Return the values of cells, the cells, the logarithm of the scale and the error, with more cells until they settle.
+
+    Args:
+        at_level: values of the sum one on cells and the logarithm of their scale, for the ends of steps.
+        paired: values on half as many cells.
+    """
     before = best = None
     error = np.inf
     for size, count in LEVELS:
-        cells = cells._replace(size=size)
-        steps = ends_of_steps(length, quick, count)
-        masses, gained = _advanced(prepared, values, window, cells, start, inside, rates, steps, fastest)
+        cells = course.cells._replace(size=size)
+        values, gained = at_level(cells, ends_of_steps(length, course.quick, count))
         if before is not None:
-            paired = masses.reshape(-1, 2).sum(axis=1)
+            coarse = paired(values)
             # The error of second order falls to a quarter where the size of the cells is halved.
-            finer = paired + (paired - before[0] * np.exp(before[1] - gained)) / 3.0
+            finer = coarse + (coarse - before[0] * np.exp(before[1] - gained)) / 3.0
             total = np.sum(finer)
-            finer, mass = finer / total, gained + np.log(total)
+            finer, scale = finer / total, gained + np.log(total)
             if best is not None:
-                # What is left falls by more than a factor of four from one level to the next.
-                change = finer.reshape(-1, 2).sum(axis=1) - best[0]
-                error = 0.25 * float(np.sum(np.abs(change.real)) + abs(mass.real - best[1].real))
-            best = finer, mass
+                # The rest falls by more than a factor of four from one level to the next.
+                half = paired(finer)
+                change = half * np.exp(scale - best[1]) - best[0]
+                error = 0.25 * float(np.sum(np.abs(change.real)))
+            best = finer, scale, cells._replace(size=len(finer))
             if error < SHARE * prepared.tolerance:
                 break
-        before = masses, gained
+        before = values, gained
     if best is None or not error < SETTLED:
         return None
-    report.time, report.noise = report.time + error, max(report.noise, min(error, 1.0))
-    found = _resampled(prepared, cells._replace(size=len(best[0])), best[0], window, error)
-    assert found.look is not None
-    report.density(found.look)
-    return found._replace(gained=best[1])
+    return best[0], best[2], best[1], error
 
 
 def _drift(prepared: Prepared, window: lw.Window, offsets: Array, t: float) -> Array:
@@ -134,6 +236,7 @@ def _relative(x: Array) -> Array:
 
 
 def _advanced(
+    masses: Array,
     prepared: Prepared,
     values: Array,
     window: lw.Window,
@@ -143,10 +246,10 @@ def _advanced(
     rates: np.ndarray,
     ends: Array,
     fastest: float,
+    backward: bool = False,
 ) -> tuple[Array, Any]:
     """Return the masses of cells after steps, and the logarithm of their sum."""
     density, at = lw.density_at(values, window, cells.offsets), cast(lw.Window, cells)  # by its points
-    masses = density * cells.widths
     known: list[Bands] = []
 
     def bands(times: Array) -> list[Bands]:
@@ -163,7 +266,7 @@ def _advanced(
         *_, potential, constant = coefficients(prepared, at, np.array([start]), inside, rates, density)
         counts = density.real > 1e-6 * density.real.max()
         offset = float(np.max(potential[0, : cells.size][counts].real) + constant[0].real)
-    masses, gained = advanced(bands, masses / np.sum(masses), ends)
+    masses, gained = advanced(bands, masses, ends, backward)
     return masses, gained + offset * ends[-1]
 
 

@@ -111,29 +111,34 @@ def ends_of_steps(length: float, first: float, count: int) -> Array:
     return np.concatenate([[0.0], first * (length / first) ** np.linspace(0.0, 1.0, count)])
 
 
-def advanced(bands: Callable[[Array], list[Bands]], masses: Array, ends: Array) -> tuple[Array, Any]:
+def advanced(bands: Callable[[Array], list[Bands]], values: Array, ends: Array, backward: bool = False) -> tuple[Array, Any]:
     """Return the masses after steps, with the sum one, and the logarithm of their sum before.
 
     Args:
         bands: the operators at times after the start (T,).
-        masses: (N,).
+        values: the masses (N,); `backward` what a mass in each cell is worth at the end, which the adjoint operator takes to
+            the start.
         ends: the ends of the steps (T + 1,), with the start.
+        backward: whether to take the adjoint.
     """
     gained: Any = 0.0
-    for start, stop in zip(ends[:-1], ends[1:], strict=True):
-        masses = _extrapolated(bands(start + (stop - start) * _TIMES), masses, stop - start)
-        total = np.sum(masses)
-        masses, gained = masses / total, gained + np.log(total)
-    return masses, gained
+    steps = list(zip(ends[:-1], ends[1:], strict=True))
+    for start, stop in steps[::-1] if backward else steps:
+        values = _extrapolated(bands(start + (stop - start) * _TIMES), values, stop - start, backward)
+        total = np.sum(values)
+        values, gained = values / total, gained + np.log(total)
+    return values, gained
 
 
-def _extrapolated(bands: list[Bands], masses: Array, step: float) -> Array:
+def _extrapolated(bands: list[Bands], values: Array, step: float, backward: bool) -> Array:
     """Return the masses after a step, from the operators at parts `_TIMES` of it."""
     row = []
     for count in _COUNTS:
-        h, now = step / count, masses
-        for part in _PLACES[count]:
+        h, now = step / count, values
+        for part in _PLACES[count][::-1] if backward else _PLACES[count]:
             below, diagonal, above = bands[part]
+            if backward:
+                below, above = above, below
             (solve,) = get_lapack_funcs(("gtsv",), (diagonal, now))
             now = solve(-h * below, 1.0 - h * diagonal, -h * above, now)[3]
         row.append(now)
