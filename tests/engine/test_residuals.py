@@ -56,20 +56,24 @@ def test_the_true_model_is_accepted_and_a_halved_noise_detected(seed):
 
 
 @pytest.mark.parametrize(
-    "method, step, tolerance", [("kalman-bucy", 0.05, 1e-5), ("yau-yau", 0.05, 1e-5), ("kalman-bucy", 0.3, 1e-3)]
-)
-def test_residuals_of_increments_equal_the_exact_law(method, step, tolerance):
+    "method, noise, step, tolerance",
+    [
+        ("kalman-bucy", 0.5, 0.05, 1e-5), ("yau-yau", 0.5, 0.05, 1e-5), ("kalman-bucy", 0.5, 0.3, 1e-3),
+        ("kalman-bucy", 0.05, 0.2, 5e-3), ("yau-yau", 0.05, 0.2, 5e-3),
+    ],
+)  # fmt: skip
+def test_residuals_of_increments_equal_the_exact_law(method, noise, step, tolerance):
     """The exact law is that of the state and its integral, two states whose transition is a matrix exponential."""
-    model = _model(0.5, observation_kind="increments")
+    model = _model(noise, observation_kind="increments")
     _, record = zakai.simulate(model, np.arange(1, 9) * step, seed=2)
     found = zakai.filter(model, record, method).residuals()[:, 0]
     A, Q = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.diag([1.0, 0.0])
     blocks = expm(np.block([[-A, Q], [np.zeros((2, 2)), A.T]]) * step)
     transition = blocks[2:, 2:].T
-    noise = transition @ blocks[:2, 2:] + np.diag([0.0, 0.5 * step])
+    spread = transition @ blocks[:2, 2:] + np.diag([0.0, noise * step])
     mean, variance, expected = 0.0, 1.0, []
     for value in record.values[:, 0]:
-        (state, integral), cov = transition @ [mean, 0.0], transition @ np.diag([variance, 0.0]) @ transition.T + noise
+        (state, integral), cov = transition @ [mean, 0.0], transition @ np.diag([variance, 0.0]) @ transition.T + spread
         expected.append(norm.cdf((value - integral) / np.sqrt(cov[1, 1])))
         gain = cov[0, 1] / cov[1, 1]
         mean, variance = state + gain * (value - integral), cov[0, 0] - gain * cov[0, 1]
@@ -109,3 +113,10 @@ def test_residuals_of_increments_are_uniform():
     model = _model(0.5, observation_kind="increments")
     _, record = zakai.simulate(model, np.arange(1, 201) / 100, seed=2)
     assert kstest(zakai.filter(model, record).residuals()[:, 0], "uniform").pvalue > 0.01
+
+
+def test_increments_over_intervals_in_which_the_state_adds_more_than_the_noise_warn():
+    model = _model(0.01, observation_kind="increments")
+    _, record = zakai.simulate(model, np.arange(1, 9) * 0.2, seed=2)
+    with pytest.warns(UserWarning, match="the steps are too long for increments"):
+        zakai.filter(model, record).residuals()

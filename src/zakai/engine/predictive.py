@@ -1,9 +1,10 @@
 """The law of the observations of a row by sums over densities of the state: points of a grid, or Gaussians.
 
 Samples: P(Z <= z) = E F(z | x) over the predicted density.  An increment over an interval of length tau is the integral I of h
-plus noise.  I has the law of tau h(x) with x drawn from the densities at the two ends with equal weights, but for the variance,
-which is less by tau^3 E(H G H') / 6, H = dh/dx, with an error of higher order in tau.  So an increment has the law of this
-mixture of N(tau h, S tau - tau^3 H G H' / 6).  Coordinates of a row are taken in order, each given those before it.
+plus noise.  With x the state in the middle of the interval, I has the mean of tau h(x) to second order in tau, and its variance
+less E C, C = tau^3 H G H' / 6, H = dh/dx.  So an increment has the law of a mixture of N(tau h(x), R (R + C)^-1 R), R = S tau,
+where the noise is reduced by C to first order and stays positive.  An increment over several intervals has the law that the
+filter gives it, from the state at its end.  Coordinates of a row are taken in order, each given those before it.
 """
 
 from __future__ import annotations
@@ -28,7 +29,6 @@ Array = NDArray[Any]
 Pair = tuple[Array, Array]
 ROUGH = 0.05  # difference of the sums over even and odd points above which a grid is too coarse; the error is about its 4th power
 NEGLIGIBLE = 1e-15  # weight of a point, relative to the largest
-CORRECTION = 0.02  # share of the noise that the correction of an increment's variance may have
 
 
 class Mixture(NamedTuple):
@@ -53,13 +53,6 @@ class Mixture(NamedTuple):
         used = weights > NEGLIGIBLE * weights.max()
         signs = [np.where(np.indices(weights.shape)[axis] % 2, -1.0, 1.0)[used] for axis in range(weights.ndim)]
         return cls(weights[used], density.points[used], None, signs)
-
-    def joined(self, other: Mixture) -> Mixture:
-        """Return the mean of two mixtures of one kind."""
-        covs = None if self.covs is None or other.covs is None else np.concatenate([self.covs, other.covs])
-        signs = [np.concatenate(pair) for pair in zip(self.signs, other.signs, strict=True)]
-        weights = 0.5 * np.concatenate([self.weights, other.weights])
-        return Mixture(weights, np.concatenate([self.points, other.points]), covs, signs)
 
     def probabilities(self, seen: Array, terms: Array, below: Array, upto: Array) -> Pair | None:
         """Return P(Z_j < z_j) and P(Z_j <= z_j) (m,) given the coordinates before; None where the grid is too coarse.
@@ -87,11 +80,15 @@ class Mixture(NamedTuple):
 
 
 class PredictiveSums:
-    """The laws of the rows of one run by sums; `row` returns None where another way is needed."""
+    """The laws of the rows of one run by sums; `row` returns None where another way is needed.
+
+    `length_share`: the largest tr(tau H G H' / (6 S)) of a row, the correction of an increment's variance.
+    """
 
     def __init__(self, setting: Setting, schedule: Schedule):
         self.setting, self.model, self.theta = setting, setting.model, setting.theta
         self.schedule, self.inside, self.lengths = schedule, schedule.inside, schedule.lengths
+        self.length_share = 0.0
         model, symbols = self.model, self.model.observation.free_symbols
         self.samples = model.observation_kind == "samples"
         fixed = not symbols & {model.t, *model.u} and not model.cross_noise.todok()
@@ -130,67 +127,64 @@ class PredictiveSums:
         values = self.noise(origin, times, self.theta)[row, column, :, row, column]
         return np.asarray(common * (values @ _WEIGHTS))
 
-    def row(self, k: int, densities: Sequence[Density], values: Array) -> Pair | None:
-        """Return P(Z_j < z_j) and P(Z_j <= z_j) (m,) of the observations at the end of interval k.
+    @cached_property
+    def unobserved(self) -> Schedule:
+        """The schedule of predictions from the start of each interval to the time of its law, with nothing observed."""
+        starts, stops, seen, elapsed, inputs = self.schedule
+        times = stops if self.samples else np.where(self.inside.any(axis=1), 0.5 * (starts + stops), stops)
+        return Schedule(starts, times, np.zeros_like(seen), np.zeros_like(elapsed), inputs)
 
-        Args:
-            k: the interval.
-            densities: the density of the state there before the observations; for increments also that at the start.
-            values: the observations (m,).
-        """
-        seen, mixtures = self.schedule.seen[k], [Mixture.of(density) for density in densities]
-        known = [mixture for mixture in mixtures if mixture is not None]
-        if not self.possible or len(known) < len(densities):
+    def row(self, k: int, state: Any, values: Array) -> Pair | None:
+        """Return P(Z_j < z_j) and P(Z_j <= z_j) (m,) of the observations at the end of interval k, from the state before it."""
+        which, inside = np.flatnonzero(self.schedule.seen[k]), self.inside[k].any()
+        if not self.possible or (inside and np.any(self.inside[k] != self.schedule.seen[k])):
             return None
-        mixture = known[0]
-        if self.samples:
-            found = self._samples(k, mixture, values)
-        elif np.any(self.inside[k] != seen):
+        prepared = self.setting.prepared(self.unobserved)
+        predicted, _ = self.setting.method.step(prepared, k, state, np.zeros(len(values)))
+        mixture = Mixture.of(self.setting.method.density(prepared, predicted))
+        if mixture is None or (mixture.covs is not None and not (self.gaussian and self.affine)):
             return None
-        else:
-            mixture = mixture.joined(known[1])
-            found = self._increments(k, mixture, values)
-        return None if found is None else mixture.probabilities(seen, *found)
+        found = (self._samples if self.samples else self._increments)(k, which, mixture, values)
+        return None if found is None else mixture.probabilities(self.schedule.seen[k], *found)
 
-    def _samples(self, k: int, mixture: Mixture, values: Array) -> tuple[Array, Array, Array] | None:
-        model, t, seen = self.model, float(self.schedule.stops[k]), self.schedule.seen[k]
-        inputs, points = self.inputs(t), mixture.points
+    def _samples(self, k: int, which: Array, mixture: Mixture, values: Array) -> tuple[Array, Array, Array] | None:
+        model, t, points = self.model, float(self.schedule.stops[k]), mixture.points
+        inputs = self.inputs(t)
         if mixture.covs is None:
-            given = np.where(seen, values, np.nan)
+            given = np.full(len(values), np.nan)
+            given[which] = values[which]
             law = model.observation_law
             return law.terms(given, points, t, self.theta, inputs), *law.cdf(given, points, t, self.theta, inputs)
-        if not (self.gaussian and self.affine):
-            return None
         slopes = self.slopes(points, t)
         covs = self.noise(np.zeros(model.n), t, self.theta, inputs) + slopes @ mixture.covs @ np.swapaxes(slopes, 1, 2)
-        return _gaussian(seen, values - self.h(points, t, self.theta, inputs), covs)
+        return _gaussian(which, values - self.h(points, t, self.theta, inputs), covs)
 
-    def _increments(self, k: int, mixture: Mixture, values: Array) -> tuple[Array, Array, Array] | None:
-        t, seen, length = float(self.schedule.stops[k]), self.schedule.seen[k], float(self.lengths[k])
-        points, inputs, noise = mixture.points, self.inputs(t), self.noise_of_increments(k)
-        slopes = self.slopes(points, t)
+    def _increments(self, k: int, which: Array, mixture: Mixture, values: Array) -> tuple[Array, Array, Array] | None:
+        t, span = float(self.unobserved.stops[k]), self.schedule.elapsed[k]
+        points, inputs = mixture.points, self.inputs(t)
+        slopes = span[:, None] * self.slopes(points, t)
         back = np.swapaxes(slopes, 1, 2)
-        excess = length**3 / 6.0 * (slopes @ self.spread(points, t, self.theta, inputs) @ back)
-        share = np.diagonal(excess, axis1=1, axis2=2)[:, seen] / np.diagonal(noise)[seen]
-        if not np.all(mixture.weights @ share <= CORRECTION):
-            return None
-        covs = noise - excess
+        covs = np.broadcast_to(self.noise_of_increments(k), (len(points), len(span), len(span))).copy()
+        if self.inside[k].any():
+            excess = self.lengths[k] / 6.0 * (slopes @ self.spread(points, t, self.theta, inputs) @ back)
+            block = np.ix_(np.arange(len(points)), which, which)
+            noise, total = covs[block], covs[block] + excess[block]
+            share = mixture.weights @ np.trace(np.linalg.solve(noise, excess[block]), axis1=1, axis2=2)
+            self.length_share = max(self.length_share, float(share))
+            covs[block] = noise @ np.linalg.solve(total, noise)
         if mixture.covs is not None:
-            if not self.affine:
-                return None
-            covs = covs + length**2 * slopes @ mixture.covs @ back
-        return _gaussian(seen, values - length * self.h(points, t, self.theta, inputs), covs)
+            covs = covs + slopes @ mixture.covs @ back
+        return _gaussian(which, values - span * self.h(points, t, self.theta, inputs), covs)
 
 
 _NODES, _WEIGHTS = (0.5 * part for part in np.polynomial.legendre.leggauss(4))
 _NODES = _NODES + 0.5
 
 
-def _gaussian(seen: Array, apart: Array, covs: Array) -> tuple[Array, Array, Array] | None:
+def _gaussian(which: Array, apart: Array, covs: Array) -> tuple[Array, Array, Array] | None:
     """Return the log densities and (twice) the distribution functions (N, m) of z - mean = `apart`, each given those before."""
     from scipy.special import ndtr
 
-    which = np.flatnonzero(seen)
     try:
         factors = np.linalg.cholesky(covs[:, which[:, None], which])
     except np.linalg.LinAlgError:

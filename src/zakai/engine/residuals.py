@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from zakai.engine.results import FilterResult
 
 Array = NDArray[Any]
+LONGEST = 0.2  # variance that the state adds to an increment within its interval, in units of that of its noise
 
 
 def residuals(result: FilterResult, seed: int = 0, first: int = 0) -> Array:
@@ -36,25 +37,31 @@ def residuals(result: FilterResult, seed: int = 0, first: int = 0) -> Array:
     found: Array = np.full(draws.shape, np.nan)
     runs = plan.runs(record, "moments")
     blocks: Sequence[Any] = plan.division.blocks if isinstance(plan, ByBlocks) else [None]
-    error = 0.0
+    error, share = 0.0, 0.0
     for run, block in zip(runs, blocks, strict=True):
         columns = list(range(record.values.shape[1])) if block is None else list(block.observations)
         if not columns:
             continue
-        for k, (below, upto), mass_error in _laws(run, first):
+        for k, (below, upto), *errors in _laws(run, first):
             found[k, columns] = below + draws[k, columns] * (upto - below)
-            error = max(error, mass_error)
+            error, share = max(error, errors[0]), max(share, errors[1])
     if error > MASS_ERROR:
         warnings.warn(
             f"residuals: the mass of a predictive law differs from 1 by {error:.2g} nats: the steps are too long for increments, "
             "the law of the samples is not normalised, or the filter is not accurate there",
             stacklevel=3,
         )
+    if share > LONGEST:
+        warnings.warn(
+            f"residuals: within an interval the state adds {share:.2g} times the noise of an increment: the steps are too long "
+            "for increments, and residuals have errors of about 0.01 or more",
+            stacklevel=3,
+        )
     return found
 
 
-def _laws(run: Run, first: int) -> Iterator[tuple[int, Pair, float]]:
-    """Yield k, (P(Z < z), P(Z <= z)), both (m,), and the error of the mass of a law, for the rows from `first` on."""
+def _laws(run: Run, first: int) -> Iterator[tuple[int, Pair, float, float]]:
+    """Yield k, (P(Z < z), P(Z <= z)), both (m,), the error of the mass of a law and the `length_share`, from row `first` on."""
     setting, model, state = run.setting, run.setting.model, run.state
     if model.observation_kind == "samples" and model.log_density is not None and model.m > 1:
         raise InputError(f"{model.source}: residuals: observation_log_density of several coordinates gives no law of one of them")
@@ -71,19 +78,9 @@ def _laws(run: Run, first: int) -> Iterator[tuple[int, Pair, float]]:
                 if start + k < first:
                     continue
                 with np.errstate(all="ignore"):
-                    law = _by_sums(sums, evidence, k, before, values[k]) or evidence.row(k, before, values[k])
-                yield start + k, law, evidence.mass_error
+                    law = sums.row(k, before, values[k]) or evidence.row(k, before, values[k])
+                yield start + k, law, evidence.mass_error, sums.length_share
             state = states[-1]
-
-
-def _by_sums(sums: PredictiveSums, evidence: PredictiveEvidence, k: int, state: Any, values: Array) -> Pair | None:
-    """Return the law of a row by sums, None where it needs quadrature."""
-    if not sums.possible:
-        return None
-    method, (_, prepared) = sums.setting.method, evidence.prefix(0)
-    advanced, _ = method.step(prepared, k, state, np.zeros(len(values)))
-    states = [advanced] if sums.samples else [advanced, state]
-    return sums.row(k, [method.density(prepared, one) for one in states], values)
 
 
 def _spread(values: Array) -> tuple[float, float]:
