@@ -1,4 +1,9 @@
-"""The section on calibration: residuals of a result as pictures, with bounds that hold if the model is true."""
+"""The section on calibration: residuals of a result as pictures and tests, with bounds that hold if the model is true.
+
+References:
+    Diebold, Gunther and Tay 1998, Evaluating density forecasts.
+    Ljung and Box 1978, On a measure of lack of fit in time series models.
+"""
 
 from __future__ import annotations
 
@@ -15,33 +20,73 @@ from zakai.report._extra import plotting
 
 _ROWS = 200  # of the end of a record, of which the residuals are computed
 _BINS, _LAGS, _MOST_COORDINATES = 10, 20, 4
+_TESTED_LAGS = 10  # of the test of autocorrelation, or a fifth of the residuals
 _CLIP = 1e-9  # a residual nearer to 0 or 1 is drawn as this
+_SMALL = 0.01  # p-values below this are said to disagree
 
 
 class Calibration(NamedTuple):
-    """Residuals u of one observed coordinate, with their times, normal scores and autocorrelations.
+    """Residuals u of one observed coordinate, with their times, normal scores z, autocorrelations r of z, and p-values.
 
-    `p_value` is that of the Kolmogorov-Smirnov test of uniformity.
+    `uniformity`: of the Kolmogorov-Smirnov test of u; `variance`: of the sum of z^2, which is chi-squared; `independence`: of
+    the Ljung-Box test of r.
     """
 
     times: np.ndarray
     u: np.ndarray
     scores: np.ndarray
     autocorrelation: np.ndarray
-    p_value: float
+    uniformity: float
+    variance: float
+    independence: float
+
+    def table(self) -> str:
+        """Return the tests as a table, with what a small p-value says."""
+        power = float(np.mean(self.scores**2))
+        rows = [
+            ("Uniform (Kolmogorov-Smirnov)", self.uniformity, "the model has a bias or a noise of the wrong size or law"),
+            (
+                f"Mean square of the normal scores is 1 (chi-squared): {power:.3g}",
+                self.variance,
+                "the model's noise is too small, or it has a bias" if power > 1 else "the model's noise is too large",
+            ),
+            ("No autocorrelation (Ljung-Box)", self.independence, "the model's dynamics are wrong"),
+        ]
+        cells = "".join(
+            f'<tr><td>{name}</td><td class="number">{_p_value(p)}</td><td class="{"fails" if p < _SMALL else "open"}">'
+            f"{said if p < _SMALL else 'consistent with the model'}</td></tr>"
+            for name, p, said in rows
+        )
+        return f"<table><thead><tr><th>Test</th><th>p-value</th><th>Reading</th></tr></thead><tbody>{cells}</tbody></table>"
+
+
+def _p_value(p: float) -> str:
+    return "below 0.0001" if p < 1e-4 else f"{p:.2g}"
 
 
 def calibration_of(times: np.ndarray, u: np.ndarray) -> Calibration:
     """Return the figures of the residuals (K,) of one coordinate; NaN where nothing was observed."""
-    from scipy.special import ndtri
+    from scipy.special import chdtr, chdtrc, ndtri
 
     rows = np.flatnonzero(np.isfinite(u))
+    count = len(rows)
     scores = ndtri(np.clip(u, _CLIP, 1 - _CLIP))
     centred = np.where(np.isfinite(scores), scores - np.nanmean(scores), 0.0)
     variance = float(centred @ centred)
-    lags = range(1, min(_LAGS, len(rows) - 1) + 1)
+    lags = range(1, min(_LAGS, count - 1) + 1)
     found = np.array([float(centred[lag:] @ centred[:-lag]) / variance if variance > 0 else 0.0 for lag in lags])
-    return Calibration(times[rows], u[rows], scores[rows], found, _uniformity(u[rows]))
+    tested = min(_TESTED_LAGS, max(1, count // 5))
+    portmanteau = count * (count + 2) * float(np.sum(found[:tested] ** 2 / (count - np.arange(1, tested + 1))))
+    power = float(scores[rows] @ scores[rows])
+    return Calibration(
+        times[rows],
+        u[rows],
+        scores[rows],
+        found,
+        _uniformity(u[rows]),
+        float(min(1.0, 2.0 * min(chdtr(count, power), chdtrc(count, power)))),
+        float(chdtrc(tested, portmanteau)),
+    )
 
 
 def _uniformity(u: np.ndarray) -> float:
@@ -80,8 +125,7 @@ def section(result: Any) -> str:
         "model. A U-shaped histogram shows that the noise of the model is too small, a hump that it is too large, a slope a "
         "bias; autocorrelation shows that the dynamics are wrong.</p>"
     ]
-    if count > _ROWS:
-        parts.append(f"<p>The last {_ROWS:,} of {count:,} observations are used.</p>")
+    used = f" of the last {_ROWS:,} of {count:,} observations" if count > _ROWS else ""
     parts += [f"<p><strong>{escape(str(one.message))}.</strong></p>" for one in caught]
     columns = [j for j in range(u.shape[1]) if np.isfinite(u[:, j]).sum() >= 3]
     if not columns:
@@ -92,9 +136,8 @@ def section(result: Any) -> str:
     for j in columns[:_MOST_COORDINATES]:
         found = calibration_of(times, u[:, j])
         title = f"<h3>Observation {j + 1}</h3>" if u.shape[1] > 1 else ""
-        said = "" if found.p_value >= 0.01 else " The residuals are not uniform: model and data disagree."
-        note = f"{len(found.u):,} residuals; Kolmogorov-Smirnov test of uniformity: p = {found.p_value:.3g}.{said}"
-        parts.append(title + plots.framed(calibration_figure(found, getattr(result, "clock", None)), f"calibration-{j}", note))
+        figure = plots.framed(calibration_figure(found, getattr(result, "clock", None)), f"calibration-{j}", "")
+        parts.append(f"{title}<p>{len(found.u):,} residuals{used}.</p>{found.table()}{figure}")
     return "".join(parts)
 
 
@@ -116,16 +159,18 @@ def calibration_figure(found: Calibration, clock: Any = None) -> Any:
         go.Bar(x=middles, y=heights, width=0.92 / _BINS, marker=bars, showlegend=False, name="density"), row=1, col=1
     )
     low, high = np.searchsorted(bdtr(np.arange(count), count, 1.0 / _BINS), [0.025, 0.975]) * _BINS / count
+    middle, edge = {"color": style.INK, "width": 1}, {"color": style.BAND_COLOUR, "width": 1, "dash": "3px,3px"}
     band = {"fillcolor": style.BAND_COLOUR, "opacity": 0.16, "line_width": 0, "layer": "below"}
     figure.add_hrect(y0=float(low), y1=float(high), row=1, col=1, **band)
-    figure.add_hline(y=1.0, line={"color": style.INK, "width": 1}, row=1, col=1)
+    for level, line in ((float(low), edge), (1.0, middle), (float(high), edge)):  # the bars hide the band
+        figure.add_hline(y=level, line=line, row=1, col=1)
     lags = np.arange(1, len(found.autocorrelation) + 1)
     figure.add_trace(
         go.Bar(x=lags, y=found.autocorrelation, width=0.3, marker=bars, showlegend=False, name="autocorrelation"), row=1, col=2
     )
     bound = 1.96 / np.sqrt(count)
     figure.add_hrect(y0=-bound, y1=bound, row=1, col=2, **band)
-    figure.add_hline(y=0.0, line={"color": style.INK, "width": 1}, row=1, col=2)
+    figure.add_hline(y=0.0, line=middle, row=1, col=2)
     dots = {"color": style.SERIES_COLOUR, "size": 4, "opacity": 0.75}
     figure.add_trace(
         go.Scatter(
@@ -137,11 +182,13 @@ def calibration_figure(found: Calibration, clock: Any = None) -> Any:
     plots.layout(figure, 560)
     figure.update_annotations(font={"size": 13, "color": style.INK})
     figure.update_layout(margin={"t": 62}, bargap=0.05)
+    figure.update_xaxes(title_standoff=8)
     size = max(0.3, 1.2 * bound, 1.1 * float(np.abs(found.autocorrelation).max(initial=0.0)))
     figure.update_xaxes(title_text="probability", range=[0, 1], row=1, col=1)
-    figure.update_yaxes(title_text="density", rangemode="tozero", row=1, col=1)
-    figure.update_xaxes(title_text="lag (observations)", row=1, col=2)
+    figure.update_yaxes(title_text="density", range=[0, 1.1 * max(float(high), float(heights.max()))], row=1, col=1)
+    figure.update_xaxes(title_text="lag (observations)", range=[0, len(lags) + 1], row=1, col=2)
     figure.update_yaxes(range=[-size, size], row=1, col=2)
     plots.time_axis(figure, clock, row=2, col=1)
-    figure.update_yaxes(title_text="standard deviations", row=2, col=1)
+    size = max(3.5, 1.1 * float(np.abs(found.scores).max()))
+    figure.update_yaxes(title_text="standard deviations", range=[-size, size], row=2, col=1)
     return figure
