@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 import os
-import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from zakai.engine.batch import Progress
+from zakai._progress import bar
+from zakai.engine.batch import LONG, Progress
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
 from zakai.engine.priors import Prior
 from zakai.errors import InputError
@@ -26,6 +29,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 LARGEST_R_HAT = 1.01
+EVALUATIONS = 4  # of the posterior for a draw, about, after whitening
+_LOG = logging.getLogger("zakai")
 
 
 def sample(
@@ -59,7 +64,7 @@ def sample(
         seed: the same seed gives the same draws.
         warmup: number of draws of each chain for adaptation, which are not kept.
         method: as for `zakai.filter`.
-        progress: called with the number of draws done and their total; by default a line on a terminal.
+        progress: called with the number of draws done and their total; without it long work has a bar on a terminal.
         **options: options of the method.
 
     Returns:
@@ -89,22 +94,35 @@ def sample(
         import blackjax
     except ImportError:
         raise InputError("sample: blackjax is not installed; install the extra bayes: pip install 'zakai[bayes]'") from None
-    report = _line if progress is None and sys.stderr.isatty() else progress
     posterior.whiten(np.array([posterior.priors[i].place(model.parameters[name]) for i, name in enumerate(names)]))
     rng = np.random.default_rng(seed)
     starts = [(posterior.start(rng), int(rng.integers(2**31))) for _ in range(chains)]
-    counts = np.zeros(chains, int)
+    counts, lock = np.zeros(chains, int), Lock()
+    _announce(posterior, chains * (warmup + draws))
+    threads = min(os.cpu_count() or 1, chains)
+    shown = bar("sampling parameters") if progress is None else nullcontext(progress)
+    with shown as report, _double_precision(), ThreadPoolExecutor(threads) as pool:
 
-    def done(chain: int, count: int) -> None:
-        counts[chain] = count
-        if report is not None:
-            report(int(counts.sum()), chains * draws)
+        def done(chain: int, count: int) -> None:
+            with lock:
+                counts[chain] = count
+                if report is not None:
+                    report(int(counts.sum()), chains * draws)
 
-    with _double_precision(), ThreadPoolExecutor(min(os.cpu_count() or 1, chains)) as pool:
         run = _chain(blackjax, posterior, warmup, draws)
         found = list(pool.map(lambda chain: run(*starts[chain], lambda count: done(chain, count)), range(chains)))
     values = np.array([[posterior.values(w) for w in one] for one, _ in found])
     return _dataset(blackjax, values, names, sum(diverged for _, diverged in found), posterior.method)
+
+
+def _announce(posterior: _Posterior, draws: int) -> None:
+    """Say what the draws will take where that is long."""
+    began = time.monotonic()
+    for _ in range(3):
+        posterior(np.zeros(len(posterior.mode)))
+    seconds = (time.monotonic() - began) / 3 * EVALUATIONS * draws
+    if seconds > LONG:
+        _LOG.warning("sample: %d draws, warm-up included, take about %.0f s; to shorten it, give fewer draws", draws, seconds)
 
 
 class _Posterior:
@@ -127,7 +145,7 @@ class _Posterior:
         with np.errstate(all="ignore"):
             u = self.mode + self.factor @ w
             values = self.values(w)
-            value, gradient = self.likelihood.value_and_gradient(values)
+            value, gradient = self.likelihood.consistent_pair(values)
             value += sum(prior.log_density(place) for prior, place in zip(self.priors, u, strict=True))
             slopes = np.array([prior.slopes(place) for prior, place in zip(self.priors, u, strict=True)])
             force = self.factor.T @ (gradient * slopes[:, 0] + slopes[:, 1])
@@ -257,10 +275,3 @@ def _dataset(blackjax: Any, values: Array, names: tuple[str, ...], divergences: 
     coordinates = {"chain": np.arange(chains), "draw": np.arange(draws)}
     about = {"divergences": divergences, "r_hat": worst, "ess": least, "method": method}
     return xarray.Dataset(variables, coords=coordinates, attrs=about)
-
-
-def _line(done: int, total: int) -> None:
-    """Write the progress on a terminal, in place."""
-    if done % 20 == 0 or done == total:
-        sys.stderr.write(f"\rsampling: {done} of {total} draws" + ("\n" if done == total else ""))
-        sys.stderr.flush()

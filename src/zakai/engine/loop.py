@@ -25,7 +25,7 @@ GROWTH = 8  # the first report comes after one interval
 KEPT_BYTES = 512 * 2**20  # of densities that are kept by default
 
 
-def advance(setting: Setting, prepared: Any, rows: slice, state: Any, values: np.ndarray) -> tuple[list[Any], Infos]:
+def advance(setting: Setting, prepared: Any, rows: slice, state: Any, values: np.ndarray) -> tuple[Sequence[Any], Infos]:
     """Advance a state over the intervals `rows` of what is prepared; `values` (rows, m) are their observations.
 
     Returns the state after each interval and what the steps report.
@@ -93,7 +93,7 @@ class Run:
         for first in range(0, min(len(self.schedule), KEPT * CHUNK), CHUNK):
             self.setting.prepared(self.schedule.part(slice(first, min(first + CHUNK, len(self.schedule)))))
 
-    def _take(self, states: list[Any], infos: Infos) -> None:
+    def _take(self, states: Sequence[Any], infos: Infos) -> None:
         self.state = states[-1]
         self.parts.append(infos)
         self.done += len(states)

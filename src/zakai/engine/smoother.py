@@ -6,7 +6,7 @@ the message p(later observations | x) through a segment, whose states it filters
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -141,12 +141,12 @@ class SmoothingRun(Run):
         self.backward = backward
         backward.message(self.empty, self.state)  # a model without a smoother is refused before it is filtered
         self.segments: list[tuple[int, Any]] = []  # the first interval of each, and the state at its start
-        self.after: list[list[Any] | None] = []  # the states after each interval of a segment, while there is memory
+        self.after: list[Sequence[Any] | None] = []  # the states after each interval of a segment, while there is memory
         self.messages: list[Any] = []  # at the end of each segment
         self.held = 0
         self.start: tuple[np.ndarray, np.ndarray] | None = None
 
-    def _take(self, states: list[Any], infos: Infos) -> None:
+    def _take(self, states: Sequence[Any], infos: Infos) -> None:
         self.segments.append((self.done, _alone(self.state)))
         self.held += sum(map(size_of, states))
         self.after.append(states if self.held < KEPT_BYTES / 4 else None)

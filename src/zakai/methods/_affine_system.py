@@ -245,8 +245,9 @@ class Setup:
     def _repeated(self, pieces: Pieces, inside: Array) -> Transition:
         """Return the transitions of pieces that do not depend on time: one for each length, inputs and coordinates."""
         lengths = pieces.lengths
-        names = [row.tobytes() for row in np.column_stack([lengths, inside, pieces.first])]
-        first = {name: row for row, name in reversed(list(enumerate(names)))}
+        table = np.column_stack([lengths, inside, pieces.first])
+        _, rows_of, numbers = np.unique(table, axis=0, return_index=True, return_inverse=True)
+        first = {table[row].tobytes(): row for row in rows_of}
         with self.lock:
             known = {name: self.kept[name] for name in first if name in self.kept}
         missing = [name for name in first if name not in known]
@@ -261,7 +262,7 @@ class Setup:
                     self.kept.clear()
                 self.kept.update({name: at(found.transition, i) for i, name in enumerate(missing[:_KEPT])})
         place = {name: i for i, name in enumerate([*known, *missing])}
-        places = np.array([place[name] for name in names])
+        places = np.array([place[name] for name in first])[numbers.ravel()]
         return Transition(*(np.concatenate(fields)[places] for fields in zip(*tables, strict=True)))
 
     def _check_finite(self, found: FlowResult, starts: Array, stops: Array) -> None:

@@ -6,7 +6,7 @@ Kalman-Bucy, Benes and Hu-Yau are this filter for phi = 0, phi = log cosh and an
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
@@ -22,7 +22,7 @@ from zakai.methods._family_prior import prior_families
 from zakai.methods._gauge import Gauge, Posterior, Tilts, posterior, tilts_at
 from zakai.methods._gauged_density import density_of
 from zakai.methods._gaussian_ends import Ends, ends_of
-from zakai.methods._protocol import Info, Infos, stacked
+from zakai.methods._protocol import Info, Infos, LazyStates, stacked
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior, MixturePrior
 from zakai.numerics.complex_step import is_complex
@@ -217,7 +217,7 @@ def is_single(prepared: Prepared, state: State) -> bool:
     return prepared.loop is not None and state.nodes.shape == (1, 1, 0)
 
 
-def segment_of_gaussian(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[list[State], Infos]:
+def segment_of_gaussian(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[Sequence[State], Infos]:
     """Return the states after the intervals of a slice, and their reports, for one Gaussian."""
     assert prepared.loop is not None
     origin, dtype = prepared.setup.origin, prepared.loop[2].dtype
@@ -226,13 +226,15 @@ def segment_of_gaussian(prepared: Prepared, rows: slice, state: State, values: A
     means, covs, gains = np.empty((count, 1, n), dtype), np.empty((count, 1, n, n), dtype), np.empty(count, dtype)
     segment(rows.start, mean, cov, *prepared.loop, np.ascontiguousarray(values), means[:, 0], covs[:, 0], gains)
     gains[0] += state.log_mass[0]
-    times, none = prepared.stops[rows].tolist(), np.zeros(1)
-    head, middle, errors = state[:3], state[5:8], state[9:11]
-    states = [State(*head, mean, cov, *middle, none, *errors, time) for mean, cov, time in zip(means, covs, times, strict=True)]
-    return states, Infos(gains, means[:, 0] + origin, covs[:, 0], health_of_gaussians(covs[:, 0]))
+    none, stops = np.zeros(1), prepared.stops[rows]
+
+    def after(i: int) -> State:
+        return state._replace(mean=means[i], cov=covs[i], log_mass=none, time=float(stops[i]))
+
+    return LazyStates(count, after), Infos(gains, means[:, 0] + origin, covs[:, 0], health_of_gaussians(covs[:, 0]))
 
 
-def segment_of_families(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[list[State], Infos]:
+def segment_of_families(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[Sequence[State], Infos]:
     """Return the states after the intervals of a slice, and their reports."""
     if is_single(prepared, state):
         return segment_of_gaussian(prepared, rows, state, values)
