@@ -310,8 +310,13 @@ def test_what_is_prepared_for_an_interval_depends_on_that_interval_alone_to_the_
             whole = general_direct.prepare(model, schedule, model.theta(), splitting=splitting)
             for k in range(len(schedule)):
                 alone = general_direct.prepare(model, schedule.part(slice(k, k + 1)), model.theta(), splitting=splitting)
-                pairs = [*zip(whole.factors[k], alone.factors[0], strict=True), (whole.precision[k], alone.precision[0])]
-                pairs += [(a[k], b[0]) for a, b in zip(whole.transitions, alone.transitions, strict=True)]
+                pairs = [(whole.precision[k], alone.precision[0])]
+                rows = [(whole.whole, alone.whole, k, 0)]
+                if whole.halved[k] >= 0:
+                    rows += [(whole.halves, alone.halves, 2 * whole.halved[k] + half, half) for half in (0, 1)]
+                for many, one, i, j in rows:
+                    pairs += [*zip(many.factors[i], one.factors[j], strict=True)]
+                    pairs += [(a[i], b[j]) for a, b in zip(many.transitions, one.transitions, strict=True)]
                 assert all(a is b or np.array_equal(a, b) for a, b in pairs)
 
 

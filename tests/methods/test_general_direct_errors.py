@@ -10,6 +10,8 @@ import pytest
 from scipy.linalg import expm
 
 import zakai
+from references.dmz import dmz
+from references.kolmogorov import Box
 
 SENSORS = {
     "mirror": ("x**2", 0.05, [0.5]),
@@ -78,8 +80,7 @@ def said(result):
 
 @pytest.mark.parametrize(
     ("name", "seed"),
-    [(name, 3) for name in ("cubic", "mirror")]
-    + [(name, 4) for name in SENSORS],
+    [(name, 3) for name in ("cubic", "mirror")] + [(name, 4) for name in SENSORS],
 )
 def test_a_sum_is_near_the_density_or_says_that_it_is_not(name, seed):
     model = sensor(name)
@@ -97,6 +98,73 @@ def test_a_sum_of_too_few_components_says_so(name, components):
     result = zakai.filter(model, record_of(name, 3), "general-direct", components=components)
     mean, evidence = distance(result, *on_a_line(name, 3))
     assert (mean <= 0.05 and evidence <= 0.1) or said(result)
+
+
+def within_ten_times(result, mean, deviation, evidence):
+    """Whether the reported errors are at least a tenth of the true ones, or something warns."""
+    away = np.abs(result.mean[1:, 0] - mean) / deviation
+    width = np.abs(np.sqrt(result.variance[1:, 0]) / deviation - 1)
+    evidence = np.abs(np.cumsum(result.log_likelihood_increments[1:]) - evidence)
+    names = ("mean_error", "deviation_error", "evidence_error")
+    reported = [max(np.nanmax(result.health[name]), 1e-4) for name in names]
+    return bool(result.warnings) or all(np.max(e) <= 10 * r for e, r in zip((away, width, evidence), reported, strict=True))
+
+
+WIDE = {
+    # drift, observation, S, prior, median step
+    "saturating": (-0.5, "atan(3*x)", np.arctan, 3.0, 0.02, 1.0),
+    "atan near": (-0.6, "atan(5*x/2)", np.arctan, 2.5, 0.275, 0.04),
+    "tanh": (-0.45, "tanh(13*x/10)", np.tanh, 1.3, 0.18, 0.1),
+    "exponential": (-0.77, "exp(-x)", np.exp, -1.0, 0.02, 0.9),
+}
+
+
+@pytest.mark.parametrize("name", WIDE)
+def test_wide_samples_report_an_error_of_the_right_size(name):
+    slope, formula, h, factor, noise, step = WIDE[name]
+    model = zakai.Model(
+        state=["x"], drift=[f"{slope}*x"], observation=[formula], observation_kind="samples",
+        observation_noise=[[str(noise)]], prior={"kind": "gaussian", "mean": [0.3], "cov": [[0.8]]},
+    )  # fmt: skip
+    gaps = step * np.random.default_rng(1).choice([0.5, 1.0, 3.0], 16)
+    _, record = zakai.simulate(model, np.cumsum(gaps), seed=2)
+    density, rows, total = np.exp(-0.5 * (LINE - 0.3) ** 2 / 0.8), [], 0.0
+    density /= density.sum()
+    for gap, value in zip(gaps, record.values[:, 0], strict=True):
+        decay = np.exp(slope * gap)
+        variance = np.expm1(2 * slope * gap) / (2 * slope)
+        move = np.exp(-0.5 * (LINE[:, None] - decay * LINE) ** 2 / variance)
+        density = move @ density / (np.sqrt(2 * np.pi * variance) / (LINE[1] - LINE[0]))
+        density *= np.exp(-0.5 * (value - h(factor * LINE)) ** 2 / noise) / np.sqrt(2 * np.pi * noise)
+        total += np.log(density.sum())
+        density /= density.sum()
+        mean = density @ LINE
+        rows.append((mean, np.sqrt(density @ (LINE - mean) ** 2), total))
+    assert within_ten_times(zakai.filter(model, record, "general-direct"), *np.array(rows).T)
+
+
+TURNING = [(-0.49, 2.7, 0.098, 0.038), (-0.06, 1.9, 0.013, 0.015), (0.21, 2.0, 1.684, 0.101)]
+
+
+@pytest.mark.parametrize(("slope", "size", "noise", "step"), TURNING)
+def test_increments_report_the_error_of_the_interval(slope, size, noise, step):
+    model = zakai.Model(
+        state=["x"], drift=[f"{slope}*x"], observation=[f"{size}*sin(x)", f"{size}*cos(x)"],
+        observation_noise=[[str(noise), "0"], ["0", str(noise)]], prior={"kind": "gaussian", "mean": [0.3], "cov": [[0.5]]},
+    )  # fmt: skip
+    gaps = step * np.random.default_rng(1).choice([0.5, 1.0, 3.0], 16)
+    _, record = zakai.simulate(model, np.cumsum(gaps), seed=2)
+    box, S = Box(9.0, 240), noise * np.eye(2)
+    x, start = box.x[..., 0], np.exp(-0.5 * (box.x[..., 0] - 0.3) ** 2 / 0.5)
+    densities = dmz(
+        box, start / start.sum(), record.times, record.values, lambda x, t: slope * x, lambda x, t: slope, lambda t: np.eye(1),
+        lambda x, t: size * np.concatenate([np.sin(x), np.cos(x)], axis=-1), S, tolerance=1e-9,
+    )  # fmt: skip
+    mass = np.array([density.sum() for density in densities])
+    mean = np.array([density.ravel() @ x.ravel() for density in densities]) / mass
+    second = np.array([density.ravel() @ x.ravel() ** 2 for density in densities]) / mass
+    result = zakai.filter(model, record, "general-direct")
+    assert within_ten_times(result, mean, np.sqrt(second - mean**2), np.log(mass))
 
 
 def paths(record, count=20000, turns=(-1, 0, 1)):

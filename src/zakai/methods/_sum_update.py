@@ -48,7 +48,10 @@ MOST_DIRECTIONS = 5
 # Up to so many directions the start of an affine h, which is exact from there on, is not reduced.
 MOST_WHOLE = 2
 # How often components are split before a sample, and how many times more of them there may be while it is used.
-ROUNDS, SPLIT_FACTOR = 5, 3
+ROUNDS, SPLIT_FACTOR = 5, 6
+# The share of the components that the companion has.  The error falls about like the inverse of their number, so that the
+# distance of the two is about the error of the longer one, or more.
+_COMPANION = 0.35
 # The loss that a component is meant to have at most; a transition that widens it beyond needs more rounds of exchanges.
 _FINE, _MOST_ROUNDS = 0.1, 12
 # The share of the reach of its nodes beyond which a component that an observation moves is not known.
@@ -79,6 +82,8 @@ class Sum:
         self.split_merge = reduction == "split-merge"
         # The last factor of an interval corrects for what both halves lose; other reductions may have negative parts.
         self.corrections = 1 + self.system.halves if self.split_merge else 0
+        # Whether an interval is split in time: its error is that of the companion, which takes two steps of half the length.
+        self.split_time = not self.system.rates and not self.system.sampled
         # Whether components are split before each observation rather than after it.
         self.split_before = self.system.sampled and bool(self.directions.shape[1]) and self.split_merge
 
@@ -89,7 +94,7 @@ class Sum:
             used = count if self.affine else self.components
             return used, used
         used = min(self.components, count) if self.affine else self.components
-        return used, round(0.7 * used) if used >= 8 else used + 4
+        return used, round(_COMPANION * used) if used >= 6 else used + 4
 
 
 @lru_cache(maxsize=32)

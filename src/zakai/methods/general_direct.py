@@ -8,7 +8,7 @@ Components are split where h is curved over them and merged where that costs lea
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,11 +18,10 @@ from zakai.densities import GaussianMixture
 from zakai.errors import InputError
 from zakai.methods import _sum_start as start
 from zakai.methods._protocol import Info, Method
-from zakai.methods._sum_system import Factor
-from zakai.methods._sum_update import SPLIT_FACTOR, Moment, Sum, average, move, sum_of
+from zakai.methods._sum_intervals import Prepared, advance, prepared_of
+from zakai.methods._sum_update import SPLIT_FACTOR, Sum, sum_of
 from zakai.models.features import OBSERVATION_FAMILY, SINC, STATE_DEPENDENT_OBSERVATION_NOISE
 from zakai.models.model import Model
-from zakai.numerics.flow import Transition, at
 from zakai.numerics.gaussian_sum import Array, Components, selected, shares, wrapped
 from zakai.numerics.sum_reduction import PRUNED, gathered, groups
 from zakai.records.schedule import Schedule
@@ -38,7 +37,8 @@ class State(NamedTuple):
     """Two sums in gauge, each with u = e^phi v of mass one, in z = x - origin.
 
     The first (`log_weights` (K,), `means`, `covs`, `signs`) is the result; the second (`other_...`) has another number of
-    components, none where it would be the same, and their distance estimates the error.  `most` (2,) are the numbers that they
+    components and takes increments in halves, and has none where it would be the same; their distance estimates the error.
+    `most` (2,) are the numbers that they
     may have, `edge` (K,) marks the outermost of the start where nothing is merged, `start_error` is the distance of the first
     from the prior, `difference` that of the two log-likelihoods.
     """
@@ -66,23 +66,6 @@ class State(NamedTuple):
     def second(self) -> Components:
         """The companion."""
         return Components(*self[4:8])
-
-
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """What is known without data: the transitions (K, ...) and the factors of K intervals."""
-
-    static: Sum
-    schedule: Schedule
-    theta: Array
-    transitions: Transition
-    factors: list[Factor]
-    precision: Array
-    notes: tuple[str, ...]
-
-    def moment(self, k: int, time: float) -> Moment:
-        """Return what acts on sums at a time of interval k."""
-        return Moment(self.static, time, self.theta, self.precision[k])
 
 
 def prepare(
@@ -113,12 +96,8 @@ def prepare(
     """
     _check(model, components, splitting, reduction, tolerance, alpha)
     static = sum_of(model, splitting, components, reduction, float(tolerance), float(alpha))
-    system = static.system
-    flow = system.transitions(schedule, theta)
-    factors, error = system.factors(schedule, theta)
-    precision = system.precision(schedule.stops if len(schedule) else np.array([model.start]), theta.real)
-    errors = float(flow.error.max(initial=0.0)), error
-    return Prepared(static, schedule, theta, flow.transition, factors, precision, _notes(static, schedule, errors))
+    prepared, errors = prepared_of(static, schedule, theta)
+    return replace(prepared, notes=_notes(static, schedule, errors))
 
 
 def _check(model: Model, components: Any, splitting: Any, reduction: Any, tolerance: Any, alpha: Any) -> None:
@@ -171,7 +150,8 @@ def init(prepared: Prepared, prior: Any) -> State:
         loss, most = now.losses(narrow, share), static.limits(len(share))
         # Before a sample there are as many as while it is used.
         factor = SPLIT_FACTOR if static.split_before else 1
-        sums = [_merged(narrow, share, loss, factor * count, static.angles) for count in dict.fromkeys(most)]
+        counts = most if static.split_time else dict.fromkeys(most)
+        sums = [_merged(narrow, share, loss, factor * count, static.angles) for count in counts]
         error = start.difference(gauge.lift(sums[0], t, theta), start.given(model, prior, origin), static.angles)
         if doubt is not None:
             error = max(error, float(np.max(doubt(u))))
@@ -204,37 +184,22 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
 
 
 def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
-    static, factor, schedule = prepared.static, prepared.factors[k], prepared.schedule
-    t0, t1 = float(schedule.starts[k]), float(schedule.stops[k])
-    before, after = prepared.moment(k, t0), prepared.moment(k, t1)
-    inputs = np.ones(1)
-    if static.system.rates:
-        inputs = np.append(inputs, np.where(schedule.inside[k], values, 0.0) / (schedule.lengths[k] if t1 > t0 else 1.0))
-    transition = at(prepared.transitions, k) if t1 > t0 else None
-
-    def one(v: Components, most: int) -> tuple[Components, Info]:
-        moved = 0.0
-        if factor.before is not None:
-            product = before.multiply(v, factor, values, start=True)
-            v, moved = product.sum, average(shares(product.sum)[0], product.moved)
-        if transition is not None:
-            v = move(transition, v, inputs, static.angles)
-        return after.update(v, factor, values, most, state.edge, moved)
-
     most = [int(count) for count in state.most]
-    first, info = one(state.first, most[0])
-    second, other = one(state.second, most[1]) if most[0] != most[1] else (state.second, info)
+    first, info = advance(prepared, k, state.first, values, most[0], state.edge)
+    second, other = state.second, info
+    if len(second.signs):
+        second, other = advance(prepared, k, second, values, most[1], state.edge, halves=True)
     difference = state.difference + float((info.log_likelihood_increment - other.log_likelihood_increment).real)
     deviation, companion = (np.sqrt(np.maximum(np.diagonal(result.cov).real, 1e-300)) for result in (info, other))
-    distance = np.abs(wrapped((info.mean - other.mean).real, static.angles)) / deviation
-    known = 1.0 if static.split_merge else np.nan
+    distance = np.abs(wrapped((info.mean - other.mean).real, prepared.static.angles)) / deviation
+    known = 1.0 if prepared.static.split_merge else np.nan
     errors = {
         "mean_error": float(distance.max()) * known,
         "deviation_error": float(np.abs(companion / deviation - 1.0).max()) * known,
         "evidence_error": abs(difference) * known,
         "start_error": state.start_error,
     }
-    state = State(*first, *second, state.most, state.edge, state.start_error, difference, t1)
+    state = State(*first, *second, state.most, state.edge, state.start_error, difference, float(prepared.whole.schedule.stops[k]))
     return state, info._replace(health={**info.health, **errors})
 
 
@@ -262,7 +227,7 @@ def valid(prepared: Prepared, state: State) -> bool:
 
 
 BOUNDS = {
-    "mean_error": (0.04, "distance of the mean from that of a second sum of other length, in standard deviations"),
+    "mean_error": (0.04, "distance of the mean from that of a shorter sum, which halves increments, in standard deviations"),
     "deviation_error": (0.1, "relative distance of a standard deviation from that of the second sum"),
     "evidence_error": (0.04, "distance of the log-likelihood so far from that of the second sum"),
     "start_error": (0.01, "distance of the first sum, or of a part of it, from the prior in mass, mean or variance"),

@@ -55,6 +55,14 @@ class Schedule(NamedTuple):
         """Return the schedule with every interval moved to begin at zero, for models that do not depend on t."""
         return Schedule(np.zeros(len(self)), self.lengths, self.seen, self.elapsed)
 
+    def halved(self, rows: np.ndarray) -> Schedule:
+        """Return the 2 R halves of some of the intervals (R,), each with half of the time of an increment."""
+        starts, stops = self.starts[rows], self.stops[rows]
+        middle = starts + 0.5 * (stops - starts)
+        ends = np.stack([starts, middle, stops], axis=1)
+        seen, elapsed = (np.repeat(part[rows], 2, axis=0) for part in (self.seen, self.elapsed))
+        return Schedule(ends[:, :2].ravel(), ends[:, 1:].ravel(), seen, 0.5 * elapsed, self.inputs)
+
     @property
     def inside(self) -> np.ndarray:
         """Whether a coordinate (K, m) is an increment over just its interval, so that it may act inside of it."""
