@@ -82,7 +82,7 @@ def contracted(
 
 
 class Worth(NamedTuple):
-    """A function of the state at the start of an interval: its values (N,) at the middles of cells, the logarithm of their scale."""
+    """A function of the state at the start of an interval: values (N,) at the middles of cells, the logarithm of their scale."""
 
     cells: Volumes
     values: Array
