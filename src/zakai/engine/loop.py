@@ -100,7 +100,7 @@ class Run:
         if not self.keep:
             return
         self.states.extend(states)
-        self.bytes += sum(map(size_of, states))
+        self.bytes += size_of(states[-1]) * len(states)
         # Densities that will not fit are not kept to begin with.
         if self.bytes / self.done * len(self.schedule) > self.most and not self.must_keep:
             self.keep, self.states = False, self.states[:1]

@@ -103,14 +103,14 @@ def init(prepared: Prepared, prior: Any) -> State:
             with np.errstate(all="ignore"):
                 return of_state(points) + variable.log_slope(points)[..., 0]
 
-    cut = prepared.cut if variable is None else CUT_OF_DOMAIN
+    cut = lw.CUT if variable is None else CUT_OF_DOMAIN
     if log_density is None:
         tolerance = 1e-12 if variable is None else cut
         grid = prior_grid(lambda points: evaluate(points).real, 1, [closed], tolerance=tolerance)
         low, high = (float(grid.points[i, 0]) for i in (0, -1))
         spacing = float(grid.basis[0, 0])
     else:
-        depth = float(np.sqrt(-2.0 * np.log(prepared.cut))) + 0.1
+        depth = float(np.sqrt(-2.0 * np.log(cut))) + 0.1
         low, high = float(np.min(means[:, 0] - depth * deviations)), float(np.max(means[:, 0] + depth * deviations))
         spacing = float(deviations.min()) / 3.0
     if closed:
@@ -195,6 +195,9 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
         contraction = 1.0 if kernel is None else float(kernel.scale.real)
         found = None if kernel is None else by_kernel(prepared, values, window, start, length, kernel, report)
         if found is None:
+            if prepared.gaussian:  # the grids of kernels are finer
+                new = lw.fitted(lw.figures(values, window.closed, prepared.negligible), window, lw.LARGEST, prepared.generous)
+                values, window = lw.resampled(values, window, new), new
             report.positive = False
             interval = start, length, inside, rates, report
             found = contracted(prepared, values, window, *interval) or by_substeps(prepared, values, window, *interval)

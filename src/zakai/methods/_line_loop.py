@@ -10,8 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from zakai.methods._line_system import Prepared, State, edge_of_moments, outside_tables, spectral, state_moments, tables
-from zakai.methods._line_yau import Kernels
+from zakai.methods._line_system import (
+    FINEST,
+    Coefficients,
+    Prepared,
+    State,
+    edge_of_moments,
+    outside_tables,
+    spectral,
+    state_moments,
+    tables,
+)
 from zakai.methods._protocol import Info, Infos
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channels
@@ -19,25 +28,29 @@ from zakai.numerics.line_loop import (
     AFTER,
     COLUMNS,
     FACTOR,
+    FAILED,
     KERNEL,
+    MARGIN,
     RANGE,
-    SPLIT,
-    SUBSTEPS,
     Grid,
     Limits,
     Steps,
     advance,
     narrow,
 )
+from zakai.numerics.line_panels import GAUSS_NODES, interpolation
+from zakai.numerics.line_splitting import CELL, DRIFT, OBSERVED, PHI, SLOPE
 from zakai.numerics.line_transition import BAND, support
 
-MARGIN = 0.2  # of a new grid, relative to the range of the density
-KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one increment with Gaussian kernels may leave
-SHARE = 5e-3  # of the tolerance that the splitting of one increment may leave
+ROOM = 0.2  # margin of a new grid, relative to the range of the density
+KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
+SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
 BLOCK = 2048  # points by which the tables of a spacing are apart; a table has twice as many
-TOGETHER = 4  # parts of which the kernels of all intervals are computed where one interval needs them
-FINEST = 1024  # points of the largest grid
+TOGETHER = 32  # intervals whose tables of coefficients in time are computed together
 SHARED = 128  # points of the largest grid on which many steps share a decomposition
+RESOLVED = 1e-8  # relative error of the interpolants of coefficients in time
+PROBES = np.linspace(0.0, 1.0, 129)  # parts of an interval at which coefficients are compared with their interpolants
+LOBATTO = np.array([0.0, 0.5 - 0.5 / np.sqrt(5.0), 0.5 + 0.5 / np.sqrt(5.0)])  # nodes within a spacing
 HEALTH = {
     "edge_mass": "edge",
     "negative_mass": "negative",
@@ -49,32 +62,32 @@ HEALTH = {
 _AT = {name: i for i, name in enumerate(COLUMNS)}
 
 
-def grid_of(prepared: Prepared, window: lw.Window) -> Grid | None:
+def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
     """Return what the loop knows of a grid, None where the operator has no decomposition or a formula no value."""
-    if not prepared.gaussian or prepared.yau is None:
+    if not prepared.gaussian:
         found: tuple[Grid | None] = prepared.once(("grid", window), lambda: (_decomposed_grid(prepared, window),))
         return found[0]
-    offset = window.origin - prepared.origin
+    index, size = round(window.centre / window.spacing), window.size
     if window.closed:
-        table = prepared.once(("table", window), lambda: _table(prepared, window.points, True))
-        start, first = 0, float(window.offsets[0])
+        begin, length = 0, size
+    elif prepared.mixed:
+        begin, length = index - size // 2 - MARGIN, size + 2 * MARGIN
     else:
-        index = round(window.centre / window.spacing)
-        block = BLOCK * round(index / BLOCK)
-        begin = block - BLOCK
-        points = window.origin + window.spacing * (begin + np.arange(2.0 * BLOCK))
-        key = ("table", window.origin, window.spacing, block)
-        table = prepared.once(key, lambda: _table(prepared, points, True))
-        start, first = index - window.size // 2 - begin, window.spacing * begin
-    if not np.isfinite(table[:, start : start + window.size]).all():
+        begin, length = BLOCK * round(index / BLOCK) - BLOCK, 2 * BLOCK
+    start = 0 if window.closed else index - size // 2 - begin
+    offsets = window.offsets if window.closed else window.spacing * (begin + np.arange(float(length)))
+    if prepared.mixed:
+        table = _mixed(prepared, window, window.origin + offsets, rows)
+    else:
+        key = ("table", window.origin, window.spacing, begin, length)
+        table = prepared.once(key, lambda: _separated(prepared, window, window.origin + offsets))
+    if not np.isfinite(table[:, :, OBSERVED:, start : start + size]).all():
         return None
-    covariance = float(tables_covariance(prepared))
-    return Grid(np.zeros((0, 0)), np.zeros(0), table, start, offset + first, covariance, window.spacing, window.closed)
+    offset = window.origin - prepared.origin + float(offsets[0])
+    return Grid(_NONE[None], _NONE, table, 0.0, start, offset, window.spacing, window.closed)
 
 
-def tables_covariance(prepared: Prepared) -> Any:
-    """Return G at the model's start."""
-    return prepared.once("G", lambda: prepared.system.covariance(np.zeros(1), prepared.model.start, prepared.theta)[0, 0])
+_NONE = np.zeros(0)
 
 
 def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
@@ -83,70 +96,128 @@ def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
     decomposed = spectral(prepared, window)
     if decomposed is None or not (decomposed.scale > 0).all():
         return None
-    table = _table(prepared, window.points, False)
-    table[0], table[1] = np.log(decomposed.scale), tables(prepared, window).drift
-    if not np.isfinite(table).all():
+    table = _separated(prepared, window, window.points)
+    table[0, 0, PHI] = np.log(decomposed.scale)
+    if not np.isfinite(table[0, 0, [PHI, *range(OBSERVED, table.shape[2])]]).all():
         return None
-    modes = np.ascontiguousarray(decomposed.modes)
-    # Only the splitting of increments asks for G, which is constant there.
-    covariance = float(np.max(tables(prepared, window).covariance))
-    return Grid(modes, decomposed.rates, table, 0, 0.0, covariance, window.spacing, window.closed)
+    modes, covariance = np.ascontiguousarray(decomposed.modes), float(np.max(tables(prepared, window).covariance))
+    return Grid(modes, decomposed.rates, table, covariance, 0, 0.0, window.spacing, window.closed)
 
 
-def _table(prepared: Prepared, x: np.ndarray, gauge: bool) -> np.ndarray:
-    """Return phi, phi', h, h' and h'' at points (T,) as rows (2 + 3 m, T)."""
-    system, theta, start, m = prepared.system, prepared.theta, prepared.model.start, prepared.system.m
-    points, table = x[:, None], np.zeros((2 + 3 * prepared.system.m, len(x)))
-    table[2 : 2 + m] = system.observation(points, start, theta).T
-    if gauge and prepared.yau is not None:
-        table[0] = prepared.yau.potential(x, start, theta)
-        table[1] = prepared.yau.gauge_slope(points, start, theta)[:, 0]
-    if not system.samples and system.observation_slope is not None and system.curvature is not None:
-        table[2 + m : 2 + 2 * m] = system.observation_slope(points, start, theta).T
-        table[2 + 2 * m :] = system.curvature(points, start, theta).T
+def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:
+    """Return the terms (1, R, 4 + m, T) of f and h at points (T,)."""
+    system, start, theta = prepared.system, prepared.model.start, prepared.theta
+    assert system.separated is not None
+    parts = np.moveaxis(system.separated[1](_nodes(window, x), start, theta), 0, -1)
+    table = np.zeros((1, len(parts), OBSERVED + system.m, len(x)))
+    table[0, :, CELL] = _cells(window, parts[:, 0])
+    table[0, :, DRIFT:] = parts[..., :-1:3]
+    if prepared.yau is not None:
+        table[0, 0, PHI] = prepared.yau.potential(x, start, theta)
     return table
 
 
-def precisions_of(prepared: Prepared) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inverses of the observed blocks of S (K, m, m), and the constants of the log-likelihoods (K,)."""
-    schedule, system = prepared.schedule, prepared.system
-    seen = schedule.seen
-    if system.general:  # the loop takes only intervals without observations
-        return np.zeros((len(seen), system.m, system.m)), np.zeros(len(seen))
-    if system.steady_noise:
-        noise = np.broadcast_to(system.noise(np.zeros(1), prepared.model.start, prepared.theta), (len(seen), system.m, system.m))
-    else:
-        noise = system.noise(np.zeros((len(seen), 1)), schedule.stops, prepared.theta)
-    both = seen[:, :, None] & seen[:, None]
-    block = np.where(both, noise, 0.0) + np.eye(system.m) * ~seen[:, None]
-    constants = np.zeros(len(seen))
-    if system.samples:
-        constants = -0.5 * (np.linalg.slogdet(block)[1] + np.log(2 * np.pi) * seen.sum(axis=1))
-    precisions = np.where(both, np.linalg.inv(block), 0.0)
-    if prepared.gaussian:
-        precisions = np.where((prepared.kinds == KERNEL)[:, None, None], 0.0, precisions)
-    return precisions, constants
+def _nodes(window: lw.Window, x: np.ndarray) -> np.ndarray:
+    """Return Lobatto's nodes (3 T + 1, 1) of the spacings above points (T,)."""
+    return np.append((x[:, None] + window.spacing * LOBATTO).reshape(-1), x[-1] + window.spacing)[:, None]
 
 
-def channels_of(prepared: Prepared) -> np.ndarray:
-    """Return the kernels (K, P, 6) of intervals and of their halves without rates of observations, NaN where there are none."""
-    kinds = prepared.kinds
-    split = bool((kinds == SPLIT).any())
-    found = np.full((len(kinds), 3 if split else 1, 6), np.nan)
-    _write(found, prepared.kernels, slice(0, len(kinds)), 1)
-    if split:
-        _write(found, prepared.parts(2), slice(0, len(kinds)), 2)
-    return found
+def _cells(window: lw.Window, f: np.ndarray) -> np.ndarray:
+    """Return the integrals (..., T) of f over spacings from values at Lobatto's nodes (..., 3 T + 1)."""
+    ends, inner = f[..., ::3], f[..., 1::3] + f[..., 2::3]
+    return np.asarray(window.spacing / 12.0 * (ends[..., :-1] + 5.0 * inner + ends[..., 1:]))
 
 
-def _write(found: np.ndarray, kernels: Kernels | None, rows: slice, count: int) -> None:
-    """Write the kernels of `count` parts of some intervals."""
-    if kernels is not None:
-        place = kernels.place[rows]
-        here = np.flatnonzero(place >= 0)
-        which = (place[here, None] * count + np.arange(count)).reshape(-1)
-        numbers = _numbers(Channels(*(part[which] for part in kernels.channels)), np.zeros((len(which), 0)))
-        found[here, count - 1 : 2 * count - 1] = numbers.reshape(len(here), count, 6)
+def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) -> np.ndarray:
+    """Return terms (K, 7, 4 + m, T) at points (T,): f and h at the Gauss nodes of intervals and, for samples, at their ends.
+
+    Those of intervals in which the nodes do not resolve the coefficients are NaN.
+    """
+    system, theta, count = prepared.system, prepared.theta, len(GAUSS_NODES)
+    starts, lengths = prepared.schedule.starts[rows, None], prepared.lengths[rows, None]
+    times = np.concatenate([starts + lengths * GAUSS_NODES, starts + lengths], axis=1)
+    table = np.zeros((*times.shape, OBSERVED + system.m, len(x)))
+    f = system.drift(_nodes(window, x), times[..., None], theta)[..., 0]
+    table[..., CELL, :], table[..., DRIFT, :] = _cells(window, f), f[..., :-1:3]
+    assert system.slope is not None
+    table[..., SLOPE, :] = system.slope(x[:, None], times[..., None], theta)[..., 0]
+    table[..., OBSERVED:, :] = np.moveaxis(system.observation(x[:, None], times[..., None], theta), -1, 2)
+    at = window.points[:: max(1, window.size // 8), None]
+
+    def coefficients(t: np.ndarray) -> np.ndarray:
+        f: np.ndarray = system.drift(at, t[..., None], theta)[..., 0]
+        if system.samples:
+            return f
+        return np.concatenate([f, system.observation(at, t[..., None], theta).reshape(*t.shape, -1)], axis=-1)
+
+    known = coefficients(times[:, :count])
+    table[~resolved(coefficients(probed(starts, lengths)), known), :, :OBSERVED] = np.nan
+    return table
+
+
+def coefficients_of(prepared: Prepared) -> Coefficients:
+    """Return what the loop needs of the coefficients in time of all intervals."""
+    schedule, system, theta = prepared.schedule, prepared.system, prepared.theta
+    count, seen, m = len(schedule), schedule.seen, system.m
+    starts, lengths, stops = schedule.starts[:, None], prepared.lengths[:, None], schedule.stops[:, None]
+    nodes = starts + lengths * GAUSS_NODES if prepared.timed else np.full((count, 1), prepared.model.start)
+    nodes = np.clip(nodes, starts, np.nextafter(stops, starts)) if prepared.timed else nodes
+    ends = stops if system.samples else nodes
+    if not system.samples and prepared.timed and system.steady_observation and system.steady_noise:
+        ends = nodes[:, :1]
+
+    def covariance(t: np.ndarray) -> np.ndarray:
+        G = system.covariance(np.zeros((1, 1, 1)), t, theta)[..., 0, 0] if prepared.divides else np.zeros(1)
+        return np.array(np.broadcast_to(G, t.shape))
+
+    def factors(t: np.ndarray) -> np.ndarray:
+        if prepared.mixed:  # the terms of the table are those at the nodes and at the end
+            rows = [len(GAUSS_NODES)] if system.samples and t.shape[1] == 1 else range(t.shape[1])
+            return np.broadcast_to(np.eye(len(GAUSS_NODES) + 1)[rows], (count, t.shape[1], len(GAUSS_NODES) + 1)).copy()
+        assert system.separated is not None
+        found: np.ndarray = system.separated[0](_X, t, theta)
+        return np.array(np.broadcast_to(found, (*t.shape, found.shape[-1])))
+
+    def precision(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if system.general:  # the loop takes only intervals without observations
+            return np.zeros((*t.shape, m, m)), np.zeros(count)
+        noise = np.broadcast_to(system.noise(_X, t, theta), (*t.shape, m, m))
+        both = (seen[:, :, None] & seen[:, None])[:, None]
+        block = np.where(both, noise, 0.0) + np.eye(m) * ~seen[:, None, :, None]
+        constant = np.zeros(count)
+        if system.samples:
+            constant = -0.5 * (np.linalg.slogdet(block[:, 0])[1] + np.log(2 * np.pi) * seen.sum(axis=1))
+        return np.where(both, np.linalg.inv(block), 0.0), constant
+
+    drifts, outputs, covariances, (precisions, constants) = factors(nodes), factors(ends), covariance(nodes), precision(ends)
+    good = np.ones(count, bool)
+    if prepared.timed and count:
+        t = probed(starts, lengths)
+        good &= resolved(covariance(t)[..., None], covariances[..., None])
+        if not prepared.mixed:
+            good &= resolved(factors(t), factors(nodes))
+        if not system.samples and not system.steady_noise:
+            good &= resolved(precision(t)[0], precisions)
+    return Coefficients(drifts, outputs, covariances, precisions, constants, good)
+
+
+_X = np.zeros((1, 1, 1))
+
+
+def probed(starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Return times (K, P) at which coefficients are compared with their interpolants, of which the last are before the ends."""
+    return np.clip(starts + lengths * PROBES, starts, np.nextafter(starts + lengths, starts))
+
+
+def resolved(exact: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Return whether the interpolants of values at the nodes (K, Q, ...) agree with those at the probes (K, P, ...)."""
+    exact, nodes = exact.reshape(*exact.shape[:2], -1), nodes.reshape(*nodes.shape[:2], -1)
+    scale = np.maximum(np.abs(exact).max(axis=1), 1e-300)
+    rest = np.abs(_TO_PROBES @ nodes - exact).max(axis=1) / scale
+    return np.asarray(rest.max(axis=1) <= RESOLVED)
+
+
+_TO_PROBES = interpolation(PROBES)
 
 
 def _numbers(c: Channels, rates: np.ndarray) -> np.ndarray:
@@ -162,69 +233,60 @@ def _numbers(c: Channels, rates: np.ndarray) -> np.ndarray:
 
 def steps_of(prepared: Prepared, rows: slice, observed: np.ndarray) -> Steps:
     """Return the steps of some intervals."""
-    kinds, lengths = prepared.kinds[rows], prepared.lengths[rows]
-    precisions, constants = prepared.precisions
-    channels = np.zeros((len(kinds), 0, 6))
-    if prepared.gaussian:
-        channels = prepared.channels[rows]
-        here = np.flatnonzero(kinds == KERNEL)
-        if len(here) and prepared.kernels is not None:
-            which = prepared.kernels.place[rows][here]
-            rates = observed[here] / lengths[here, None]
-            channels = channels.copy()
-            channels[here, 0] = _numbers(Channels(*(part[which] for part in prepared.kernels.channels)), rates)
+    kinds, lengths, kernels = prepared.kinds[rows], prepared.lengths[rows], prepared.kernels
+    channels = np.full((len(kinds), 6 * prepared.gaussian), np.nan)
+    here = np.flatnonzero((kinds == KERNEL) | (kinds == FACTOR))
+    if prepared.gaussian and kernels is not None and len(here):
+        which = kernels.place[rows][here]
+        rates = np.where((kinds == KERNEL)[:, None], observed / lengths[:, None], 0.0)[here]
+        channels[here] = _numbers(Channels(*(part[which] for part in kernels.channels)), rates)
     observed = np.ascontiguousarray(observed, float)
-    return Steps(kinds, np.ascontiguousarray(lengths), observed, precisions[rows], constants[rows], channels)
-
-
-def _with_parts(prepared: Prepared, rows: slice, channels: np.ndarray, count: int) -> np.ndarray:
-    """Return the kernels (K, P, 6) of some intervals with those of `count` parts, at least of the first interval."""
-    found = np.full((len(channels), max(channels.shape[1], 2 * count - 1), 6), np.nan)
-    found[:, : channels.shape[1]] = channels
-    if count <= TOGETHER:
-        _write(found, prepared.parts(count), rows, count)
-    else:
-        kernels = prepared.parts_of(rows.start, count)
-        _write(found[:1], kernels, slice(0, 1), count)
-    return found
+    c = Coefficients(*(part[rows] for part in prepared.coefficients))
+    precisions = np.where((kinds == KERNEL)[:, None, None, None], 0.0, c.precisions)
+    lengths = np.ascontiguousarray(lengths)
+    return Steps(kinds, lengths, observed, precisions, c.constants, channels, c.drifts, c.outputs, c.covariances)
 
 
 def run(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[list[State], Infos] | None:
     """Return the states after the first intervals of `rows`, as many as the loop takes, and their reports; None for none."""
-    splitting = KERNEL_SHARE * prepared.promised if prepared.gaussian else SHARE * prepared.tolerance
-    limits = Limits(prepared.negligible, prepared.promised, splitting, prepared.cut, prepared.generous, prepared.finest)
-    steps = steps_of(prepared, rows, observed)
+    splitting = SHARE * prepared.tolerance if prepared.yau is None else KERNEL_SHARE * prepared.promised
+    generous = FINEST if prepared.timed and prepared.model.periodic else prepared.generous
+    limits = Limits(prepared.negligible, prepared.promised, splitting, prepared.cut, generous, prepared.finest)
     states: list[State] = []
     parts: list[Infos] = []
-    attempts = 0
-    while len(states) < rows.stop - rows.start and attempts < 8:
-        if not prepared.gaussian and _narrow(prepared, rows.start + len(states), state, limits.cut):
+    attempts, first = 0, rows.start
+    steps = steps_of(prepared, rows, observed)
+    while first < rows.stop and attempts < 8:
+        if not prepared.gaussian and _narrow(prepared, first, state, limits.cut):
             break
-        grid = grid_of(prepared, state.window)
+        here = slice(first, min(rows.stop, first + TOGETHER) if prepared.mixed else rows.stop)
+        grid = grid_of(prepared, state.window, here)
         if grid is None:
             break
-        found = advance(np.asarray(state.values), grid, steps, float(state.error), float(state.log_floor), limits)
-        centres = state.centre + state.spacing * (found.starts - grid.start)
-        for values, centre, row in zip(found.densities, centres.tolist(), found.reports, strict=True):
-            states.append(state._replace(values=values, centre=centre, error=float(row[10]), log_floor=float(row[11])))
-        if len(found.reports):
-            done = states[-len(centres) :]
-            stops = prepared.schedule.stops[rows.start + len(states) - len(centres) :].tolist()
-            parts.append(_infos(prepared, state.window, np.array(centres), found.reports, done, stops))
-            state, steps, attempts = states[-1], steps.after(len(found.reports)), 0
+        some = Steps(*(part[: here.stop - first] for part in steps))
+        found = advance(np.asarray(state.values), grid, some, float(state.error), float(state.log_floor), limits)
+        taken = len(found.reports)
+        if taken:
+            centres = state.centre + state.spacing * (found.starts - grid.start)
+            done = [
+                State(values, state.origin, centre, state.spacing, state.unit, state.closed, error, log_floor)
+                for values, centre, error, log_floor in zip(
+                    found.densities, centres.tolist(), found.reports[:, 10].tolist(), found.reports[:, 11].tolist(), strict=True
+                )
+            ]
+            stops = prepared.schedule.stops[first : first + taken].tolist()
+            parts.append(_infos(prepared, state.window, centres, found.reports, done, stops))
+            states += done
+            state, steps, attempts, first = done[-1], steps.after(taken), 0, first + taken
         attempts += 1
         if found.why == AFTER:
             states[-1] = state = regridded(prepared, state)
-        elif found.why == SUBSTEPS:
-            rest = slice(rows.start + len(states), rows.stop)
-            channels = _with_parts(prepared, rest, steps.channels, int(found.answer[0]))
-            steps = steps._replace(channels=channels)
         elif found.why == RANGE:
             larger = _covering(state, *found.answer[:3])
             if larger is None:
                 break
             state = larger
-        else:
+        elif found.why == FAILED:
             break
     if not states:
         return None
@@ -254,7 +316,7 @@ def _covering(state: State, low: float, high: float, spacing: float) -> State | 
         size = lw.size_for(2 * np.pi / spacing)
         new = window._replace(size=size, spacing=2 * np.pi / size)
     else:
-        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, MARGIN, FINEST)
+        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, ROOM, FINEST)
         if new.spacing * new.size < high - low:
             return None
     return None if new == window else moved_to(state, new)
@@ -273,7 +335,7 @@ def regridded(prepared: Prepared, state: State) -> State:
     look = lw.figures(values, window.closed, prepared.negligible, prepared.cut)
     if prepared.gaussian:
         look = look._replace(resolving=look.resolving * BAND / 0.92)
-    new = lw.fitted(look, window, FINEST if prepared.gaussian else prepared.largest, prepared.generous, MARGIN)
+    new = lw.fitted(look, window, prepared.largest, prepared.generous, ROOM)
     return state if new == window else moved_to(state, new)
 
 

@@ -26,8 +26,8 @@ _KINKS = (sp.Abs, Minimum, Maximum)
 class Formulas(NamedTuple):
     """Functions of x (..., 1), t (...), theta (p,) and the inputs; None where a derivative is not that of a smooth function.
 
-    `slope` is f', `spread` G' and G'', `observation_slope` h' and `curvature` h''; `cross` is g C with its
-    derivative and h' (3, m), None for independent noises.
+    `slope` is f', `spread` G' and G''; `cross` is g C with its derivative and h' (3, m), None for independent noises.
+    `separated` are the functions a (R,) of t and g (R, 2 + m) of x with (f, f', h) = sum a_r g_r.
     """
 
     drift: Function
@@ -36,10 +36,9 @@ class Formulas(NamedTuple):
     spread: Function | None
     observation: Function
     noise: Function
-    observation_slope: Function | None
-    curvature: Function | None
     cross: Function | None
     arguments: tuple[Function, ...]
+    separated: tuple[Function, Function] | None
 
 
 @lru_cache(maxsize=32)
@@ -47,10 +46,8 @@ def _formulas(model: Model) -> Formulas:
     """Return the functions of a model, made once."""
     x, m = model.x[0], model.m
     f, G, h = model.drift[0], model.covariance[0], list(model.observation)
-    smooth = all(_continuous(entry, x) and not _rough(entry, x) for entry in h)
-    first, second = [sp.diff(entry, x) for entry in h], [sp.diff(entry, x, 2) for entry in h]
     joint = list(model.diffusion * model.cross_noise) if CROSS_NOISE in model.features else []
-    cross = [*joint, *[sp.diff(entry, x) for entry in joint], *first]
+    cross = [*joint, *[sp.diff(entry, x) for entry in [*joint, *h]]]
     return Formulas(
         numpy_function(model.drift, model, (1,)),
         numpy_function([sp.diff(f, x)], model, (1,)) if _continuous(f, x) else None,
@@ -58,11 +55,34 @@ def _formulas(model: Model) -> Formulas:
         numpy_function([sp.diff(G, x), sp.diff(G, x, 2)], model, (2,)) if _continuous(G, x) and not _rough(G, x) else None,
         numpy_function(model.observation, model, (m,)),
         numpy_function(model.observation_noise, model, (m, m)),
-        numpy_function(first, model, (m,)) if smooth else None,
-        numpy_function(second, model, (m,)) if smooth else None,
         numpy_function(cross, model, (3, m)) if joint else None,
         tuple(numpy_function(list(call.args), model, (len(call.args),)) for call in _tables(model)),
+        _separated(model),
     )
+
+
+def _separated(model: Model) -> tuple[Function, Function] | None:
+    """Return f, f' and h as sums of products of functions of t and of x, None where they are not shown to be such."""
+    x, given = model.x[0], {model.t, *model.u}
+    terms: dict[sp.Expr, list[sp.Expr]] = {}
+    for row, formula in enumerate([model.drift[0], *model.observation]):
+        for form in (formula, sp.expand(formula, power_exp=False, power_base=False, log=False, trig=True)):
+            pairs = [term.as_independent(x, as_Add=False) for term in sp.Add.make_args(form)]
+            separable = not any(part.free_symbols & given for _, part in pairs)
+            if separable:
+                break
+        if not separable:
+            return None
+        for factor, part in pairs:
+            factor, part = (factor, part) if factor.free_symbols & given else (sp.Integer(1), factor * part)
+            terms.setdefault(factor, [sp.Integer(0)] * (1 + model.m))[row] += part
+    if len(terms) > _MOST_TERMS:
+        return None
+    parts = [[row[0], sp.diff(row[0], x) if _continuous(row[0], x) else sp.nan, *row[1:]] for row in terms.values()]
+    return numpy_function(list(terms), model, (len(terms),)), numpy_function(sp.Matrix(parts), model, (len(parts), 2 + model.m))
+
+
+_MOST_TERMS = 8
 
 
 def _continuous(formula: sp.Expr, x: sp.Symbol) -> bool:
@@ -94,8 +114,8 @@ class System:
         self.drift, self.covariance = self._bound(formulas.drift), self._bound(formulas.covariance)
         self.observation, self.noise = self._bound(formulas.observation), self._bound(formulas.noise)
         self.slope, self.spread = self._optional(formulas.slope), self._optional(formulas.spread)
-        self.observation_slope, self.curvature = self._optional(formulas.observation_slope), self._optional(formulas.curvature)
         self.cross = self._optional(formulas.cross)
+        self.separated = None if formulas.separated is None else (self._bound(formulas.separated[0]), formulas.separated[1])
         self._tables: list[tuple[Table, Function]] = [
             (call.table, self._bound(arguments)) for call, arguments in zip(_tables(model), formulas.arguments, strict=True)
         ]
@@ -103,6 +123,8 @@ class System:
         self.state_dependent = STATE_DEPENDENT_DIFFUSION in model.features
         self.reflecting = any(interval.reflecting for interval in model.domain.values())
         self.general = bool(OF_OBSERVATION & model.features.keys())
+        # Whether h has no jump and no kink.
+        self.smooth_observation = not any(not _continuous(part, x) or _rough(part, x) for part in model.observation)
         self.rough = any(not _continuous(part, x) or _rough(part, x) for part in (model.drift[0], model.covariance[0]))
         self.moving = bool((model.drift.free_symbols | model.covariance.free_symbols) & given)
         self.steady_observation = not model.observation.free_symbols & given

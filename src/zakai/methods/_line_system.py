@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from zakai.methods._line_yau import Kernels, YauLine
 from zakai.methods._series_kernel import PowerSeries
 from zakai.models.model import Model
 from zakai.numerics import line_window as lw
-from zakai.numerics.line_loop import FACTOR, KERNEL, SPLIT
+from zakai.numerics.line_loop import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR
 from zakai.numerics.line_operator import Spectral
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.records.schedule import Schedule
@@ -23,6 +23,7 @@ from zakai.records.schedule import Schedule
 Array = Any
 
 NOISE = 3e-15  # error of a density relative to its maximum, which matters in its tails
+FINEST = 1024  # points of the largest grid for Gaussian kernels and splitting
 KEPT = 120  # tables and decompositions of grids that are kept for a model
 
 
@@ -54,6 +55,20 @@ class State(NamedTuple):
         )
 
 
+class Coefficients(NamedTuple):
+    """What the compiled loop knows of the coefficients in time of K intervals: see `line_loop.Steps`.
+
+    `resolved` (K,) marks intervals in which the Gauss nodes resolve them.
+    """
+
+    drifts: Array
+    outputs: Array
+    covariances: Array
+    precisions: Array
+    constants: Array
+    resolved: Array
+
+
 @dataclass(eq=False)
 class Prepared:
     """What is known without data.
@@ -79,7 +94,6 @@ class Prepared:
     origin: float = 0.0
     series: PowerSeries | None = None
     notes: tuple[str, ...] = ()
-    divided: dict[int, Kernels | None] = field(default_factory=dict)
 
     @cached_property
     def kept(self) -> dict[Any, Any]:
@@ -87,17 +101,37 @@ class Prepared:
         return _kept(self.model, self.theta.tobytes(), self.theta.dtype.str)
 
     @cached_property
+    def divides(self) -> bool:
+        """Whether the compiled loop can split the transition into diffusion and a potential."""
+        system = self.system
+        smooth = not (system.state_dependent or system.reflecting or system.general or system.rough) and system.slope is not None
+        return smooth and system.cross is None and not (self.model.periodic and not system.samples)
+
+    @cached_property
     def gaussian(self) -> bool:
-        """Whether the compiled loop takes Gaussian kernels, else the decomposition of the operator."""
-        if self.model.periodic:
-            return self.yau is not None and self.yau.flat and self.system.samples
-        steady = not self.system.varying
-        return self.yau is not None and not (steady and not self.yau.affine)
+        """Whether the compiled loop takes Gaussian kernels and splits, else the decomposition of the operator."""
+        if self.yau is not None:
+            return not self.model.periodic or (self.yau.flat and self.system.samples)
+        return self.divides and (self.system.moving or not self.system.samples)
+
+    @cached_property
+    def timed(self) -> bool:
+        """Whether coefficients vary within an interval that the compiled loop splits."""
+        system = self.system
+        affine = self.yau is not None and self.yau.affine and self.yau.unobserved and not system.samples
+        steady = not system.moving and system.steady_observation and (system.samples or system.steady_noise)
+        return self.gaussian and self.divides and not steady and not affine
+
+    @cached_property
+    def mixed(self) -> bool:
+        """Whether f or h are not known as sums of products of functions of t and of x."""
+        return self.timed and self.system.separated is None
 
     @cached_property
     def cut(self) -> float:
         """The density relative to its maximum that a grid must hold."""
-        if not self.gaussian or (self.kinds < 0).all():
+        kernels = self.yau is not None and self.yau.unobserved and self.yau.steady_gauge
+        if not self.gaussian or not (self.divides or kernels) or self.lie or np.iscomplexobj(self.theta):
             return lw.CUT
         if self.model.periodic:
             return 1e-280  # a grid around the circle holds every value
@@ -109,23 +143,16 @@ class Prepared:
         return 512.0 if self.system.samples else 256.0
 
     @cached_property
-    def precisions(self) -> tuple[np.ndarray, np.ndarray]:
-        """The inverses of the observed blocks of S (K, m, m), and the constants of the log-likelihoods (K,)."""
-        from zakai.methods._line_loop import precisions_of
+    def coefficients(self) -> Coefficients:
+        """The coefficients in time of all intervals."""
+        from zakai.methods._line_loop import coefficients_of
 
-        return precisions_of(self)
-
-    @cached_property
-    def channels(self) -> np.ndarray:
-        """The kernels (K, P, 6) of intervals and of their halves."""
-        from zakai.methods._line_loop import channels_of
-
-        return channels_of(self)
+        return coefficients_of(self)
 
     @property
     def largest(self) -> int:
         """The largest size of a grid."""
-        return lw.LARGEST
+        return FINEST if self.gaussian else lw.LARGEST
 
     @cached_property
     def kinds(self) -> np.ndarray:
@@ -137,28 +164,6 @@ class Prepared:
         """Which intervals (K,) the compiled loop may take."""
         found: list[bool] = (self.kinds >= 0).tolist()
         return found
-
-    def parts(self, count: int) -> Kernels | None:
-        """Return the kernels of `count` equal parts of the intervals that are split, for those without observations inside."""
-        if count not in self.divided:
-            assert self.yau is not None
-            first = self.divided.get(2)
-            lengths, nodes = np.where(self.kinds == SPLIT, self.lengths, 0.0), None if first is None else first.nodes
-            starts, nothing = self.schedule.starts, np.zeros_like(self.inside)
-            self.divided[count] = self.yau.kernels(
-                starts, lengths, nothing, self.theta, False, self.origin, self.series, count, nodes
-            )
-        return self.divided[count]
-
-    def parts_of(self, k: int, count: int) -> Kernels | None:
-        """Return the same of interval k alone."""
-        together, row = self.parts(2), slice(k, k + 1)
-        if self.yau is None or together is None or together.place[k] < 0:
-            return None
-        place = int(together.place[k])
-        nodes = None if together.nodes is None else together.nodes.part(slice(place, place + 1))
-        starts, nothing = self.schedule.starts[row], np.zeros_like(self.inside[row])
-        return self.yau.kernels(starts, self.lengths[row], nothing, self.theta, False, self.origin, self.series, count, nodes)
 
     def deepest(self, floor: float) -> float:
         """Return the depth of the tails, as a logarithm below the maximum, to which a density with this floor is accurate."""
@@ -183,29 +188,22 @@ def kinds_of(prepared: Prepared) -> np.ndarray:
     system, schedule, yau, kernels = prepared.system, prepared.schedule, prepared.yau, prepared.kernels
     positive = prepared.lengths > 0
     none = np.full(len(schedule), -1)
-    if np.iscomplexobj(prepared.theta) or prepared.lie or (prepared.model.periodic and not system.samples):
+    if not len(schedule) or np.iscomplexobj(prepared.theta) or prepared.lie or (prepared.model.periodic and not system.samples):
         return none
-    splits = system.steady_observation and system.steady_noise and system.curvature is not None
-    splits = splits and not system.state_dependent and system.cross is None
     silent = ~schedule.seen.any(axis=1)
     regular = positive & np.all(schedule.seen == prepared.inside, axis=1)
-    if not prepared.gaussian or yau is None:
-        if system.moving or not system.steady_observation:
-            return none
-        if system.samples:
-            return np.where(positive & (silent | (not system.general)), FACTOR, -1)
-        return np.where(regular, SPLIT, -1) if splits else none
-    if not yau.unobserved or not yau.steady_gauge:
-        return none
-    if kernels is None:
-        whole = np.zeros(len(schedule), bool)
-    else:
+    if not prepared.gaussian:
+        usable = system.samples and not system.moving and system.separated is not None
+        return np.where(positive & (silent | (not system.general)), FACTOR, -1) if usable else none
+    whole = np.zeros(len(schedule), bool)
+    if kernels is not None and yau is not None and yau.unobserved and yau.steady_gauge:
         whole = positive & (kernels.place >= 0) & (kernels.errors[kernels.place] == 0)
+    split = positive & prepared.divides & prepared.coefficients.resolved
     if system.samples:
-        return np.where(whole & (silent | (not system.general)), FACTOR, -1) if system.steady_observation else none
-    split = SPLIT if splits else -1
-    inside = np.where(whole, KERNEL, -1) if yau.affine else np.full(len(schedule), split)
-    return np.where(silent, np.where(whole, FACTOR, -1), np.where(regular, inside, -1))
+        whole = whole & (silent | (not system.general))
+        return np.where(whole, FACTOR, np.where(split, SPLIT_FACTOR, -1))
+    inside = np.where(whole, KERNEL, -1) if yau is not None and yau.affine else np.where(split, SPLIT, -1)
+    return np.where(silent, np.where(whole, FACTOR, inside), np.where(regular, inside, -1))
 
 
 class Tables(NamedTuple):

@@ -21,8 +21,8 @@ _PROBES_OF_PART = 21
 _MOST = 600
 
 
-def _interpolation(points: Array) -> Array:
-    """The matrix from values at the Gauss nodes to values at points in [0, 1]."""
+def interpolation(points: Array) -> Array:
+    """Return the matrix from values at the Gauss nodes to values at points in [0, 1]."""
     basis = np.polynomial.legendre.legvander(2 * GAUSS_NODES - 1, NODES - 1)
     return np.asarray(np.polynomial.legendre.legvander(2 * points - 1, NODES - 1) @ np.linalg.inv(basis))
 
@@ -30,7 +30,7 @@ def _interpolation(points: Array) -> Array:
 @lru_cache(maxsize=16)
 def _probes(count: int) -> tuple[Array, Array]:
     points = np.linspace(0.0, 1.0, count)
-    return points, _interpolation(points)
+    return points, interpolation(points)
 
 
 class Panels(NamedTuple):

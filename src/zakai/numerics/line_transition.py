@@ -75,6 +75,16 @@ def largest(values: Array) -> float:
     return top
 
 
+@helper
+def highest_of(values: Array) -> int:
+    """The first index of the largest of values."""
+    at = 0
+    for j in range(values.size):
+        if values[j] > values[at]:
+            at = j
+    return at
+
+
 @kernel(types.UniTuple(int64, 2)(float64[::1], float64))  # type: ignore[no-untyped-call]
 def support(values: Array, cut: float) -> tuple[int, int]:
     """The first and last index of values above `cut` times their maximum."""
@@ -127,13 +137,13 @@ def quadratic(found: Array, slope: float, curvature: float, scale: Array, divide
 
 
 @helper
-def taps_of(variance: float, depth: float, most: int) -> Array:
+def taps_of(variance: float, depth: float, most: int, narrow: bool) -> Array:
     """The filter (T,) of a Gaussian kernel, at distances 0 .. T - 1.
 
-    It is up to `most` of its samples, down to exp(-depth), or where the kernel is narrow the coefficients of a periodic transfer
+    It is up to `most` of its samples, down to exp(-depth), or for a narrow kernel the coefficients of a periodic transfer
     function that agrees with exp(-variance w^2 / 2) in the band.
     """
-    if variance >= WIDE:
+    if not narrow:
         found = np.empty(int(min(np.ceil(np.sqrt(2.0 * depth * variance)) + 1, float(most))))
         top = 1.0 / np.sqrt(2.0 * np.pi * variance)
         for n in range(found.size):
@@ -153,21 +163,21 @@ def taps_of(variance: float, depth: float, most: int) -> Array:
 
 
 @helper
-def filtered(now: Array, before: Array, after: Array, variance: float, depth: float) -> tuple[float, float]:
-    """Replace values by after times the convolution of before values with a Gaussian.
+def filtered(now: Array, taps: Array, after: Array, scale: Array, narrow: bool) -> tuple[float, float]:
+    """Replace values by after times their convolution with a Gaussian, whose filter is given.
 
     The filter is short, so that the rounding of a value is relative to values nearby.  A narrow kernel has negative parts: values
     that are rounding become zero, each by itself, because a mode may lie beyond them.  Returns the rounding error relative to the
-    sum, and the largest value that may have become zero relative to the maximum.
+    sum, and the largest value that may have become zero relative to the maximum, both of values times a scale.
     """
-    taps, size = taps_of(variance, depth, now.size), now.size
+    size = now.size
     count = 1 + min(size, taps.size) // 2 * 2
     padded, weights = np.zeros(size + 2 * count), np.zeros(count)
     for n in range(min(count, taps.size)):
         weights[n] = taps[n]
     for j in range(size):
-        padded[count + j] = now[j] * before[j]
-        now[j] = weights[0] * padded[count + j]
+        padded[count + j] = now[j]
+        now[j] *= weights[0]
     moduli = np.empty(size)
     for j in range(size):
         moduli[j] = abs(now[j])
@@ -177,19 +187,21 @@ def filtered(now: Array, before: Array, after: Array, variance: float, depth: fl
         near, far = weights[n], weights[n + 1]
         for j in range(size):
             now[j] += near * (below[j] + above[j]) + far * (lower[j] + higher[j])
-        if variance < WIDE:
+        if narrow:
             near, far = abs(near), abs(far)
             for j in range(size):
                 moduli[j] += near * (below[j] + above[j]) + far * (lower[j] + higher[j])
     total, top, noise, lost = 0.0, 0.0, 0.0, 0.0
     for j in range(size):
-        if variance < WIDE and not now[j] > 1e-12 * moduli[j]:
-            now[j] = 0.0
-            lost = max(lost, 1e-12 * moduli[j] * after[j])
+        weight = after[j] * scale[j]
+        if narrow:
+            noise += 4e-16 * moduli[j] * weight
+            if not now[j] > 1e-12 * moduli[j]:
+                now[j] = 0.0
+                lost = max(lost, 1e-12 * moduli[j] * weight)
+        total += now[j] * weight
+        top = max(top, now[j] * weight)
         now[j] *= after[j]
-        noise += 4e-16 * moduli[j] * after[j]
-        total += now[j]
-        top = max(top, now[j])
     if not (0.0 < total < np.inf):
         return np.inf, 1.0
     return 2e-15 + noise / total, lost / top
