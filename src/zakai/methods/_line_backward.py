@@ -43,6 +43,8 @@ FEW = 4  # substeps of an interval beyond which finite volumes are tried
 BOUND = 12.0  # range of a bounded gauge
 NOISE = 1e-11  # of the maximum: what is rounding in psi
 SMALLEST = 1e-13  # value of a smoothed density relative to its maximum that is not rounding
+EXCURSION = 3.9  # standard deviations of the noise that a path between two points goes beyond them, but for exp(-30)
+RESOLVED = 0.4  # spacing in standard deviations of the noise: the shortest wave decays by exp(-30)
 SURE = 10.0  # errors of a density from which its small values count
 LOWEST = -30.0  # logarithm of the largest error of small values, relative to the largest value
 REACH = 8.0  # standard deviations of the noise of a substep that a grid must hold
@@ -81,6 +83,11 @@ class Message(NamedTuple):
         return self._moved(window, gauge, own)
 
     def _moved(self, window: lw.Window, gauge: Array, own: Array) -> Message:
+        if not self.closed and window.spacing > 1.5 * self.spacing:  # integrals with what the coarse grid resolves
+            own = lw.local_polynomial(gauge, window, self.window.offsets) - self.gauge
+            logs = np.where(self.values > 0.0, own + np.log(np.where(self.values > 0.0, self.values, 1.0)), -np.inf)
+            top = float(np.max(logs))
+            return self.changed(lw.gathered(np.exp(logs - top), self.window.offsets, window), window, gauge, top)
         values = lw.resampled(self.values, self.window, window)
         logs = np.where(values > 0.0, gauge - own + np.log(np.where(values > 0.0, values, 1.0)), -np.inf)
         top = float(np.max(logs))
@@ -309,7 +316,9 @@ class _Way:
     def _substep(self, later: Message, first: float, last: float, forced: bool) -> Message | None:
         """Return the message at the start of a substep; None where a shorter one is needed."""
         low, high = min(later.low, self.ends[0]), max(later.high, self.ends[1])
-        spacing = later.needed
+        least, most = self._noise(low, high, last - first)
+        low, high = low - EXCURSION * most, high + EXCURSION * most  # paths from one support to the other leave both
+        spacing = later.needed if self.inside.any() else max(later.needed, RESOLVED * least)
         for attempt in range(7):
             window = _covering(later.window, low, high, spacing)
             if window.size > lw.LARGEST and not forced:
@@ -350,6 +359,13 @@ class _Way:
         self.error = found.error
         moved = later.changed(np.where(values > 0.0, values, 0.0), new, np.zeros(new.size), found.log_scale)
         return moved._replace(low=low, high=high)
+
+    def _noise(self, low: float, high: float, length: float) -> tuple[float, float]:
+        """Return the smallest and the largest standard deviation of the noise of a substep between two offsets."""
+        points = self.state.origin + np.linspace(low, high, 9)
+        middle = self.start + 0.5 * self.length
+        covariance = covariance_at(self.prepared.system, points, middle, self.prepared.theta.real) * np.ones(9)
+        return float(np.sqrt(max(np.min(covariance), 0.0) * length)), float(np.sqrt(np.max(covariance) * length))
 
     def _spread(self, later: Message, first: float, last: float) -> tuple[float, float]:
         """Return about the range to which a message that matters on its own range spreads."""
