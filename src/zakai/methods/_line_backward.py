@@ -44,88 +44,68 @@ BOUND = 12.0  # range of a bounded gauge
 NOISE = 1e-11  # of the maximum: what is rounding in psi
 SMALLEST = 1e-13  # value of a smoothed density relative to its maximum that is not rounding
 EXCURSION = 3.9  # standard deviations of the noise that a path between two points goes beyond them, but for exp(-30)
-RESOLVED = 0.4  # spacing in standard deviations of the noise: the shortest wave decays by exp(-30)
+RESOLVED = 0.25  # spacing in standard deviations of the noise
 SURE = 10.0  # errors of a density from which its small values count
 LOWEST = -30.0  # logarithm of the largest error of small values, relative to the largest value
-REACH = 8.0  # standard deviations of the noise of a substep that a grid must hold
+FEWEST = 12  # points of a message
 
 
 class Message(NamedTuple):
-    """The function b(x_i) = exp(log_scale - gauge_i) values_i / spacing on a grid.
+    """The logarithm of the function b at the points of a grid (N,), constant beyond them.
 
-    The values (N,) have the sum one; `gauge` (N,) is s.  `low` and `high`, relative to the origin, are the ends of where b
-    matters; `needed` is the spacing that its product with the density needs; `error` is the estimate of its relative error.
+    The grid covers where b matters.  `needed` is the spacing that its product with the density needs; `error` is the estimate of
+    its relative error.
     """
 
-    values: np.ndarray
-    gauge: np.ndarray
+    logs: np.ndarray
     origin: float
     centre: float
     spacing: float
     unit: float
     closed: bool
-    low: float
-    high: float
     needed: float
-    log_scale: float
     error: float
 
     @property
     def window(self) -> lw.Window:
         """The grid."""
-        return lw.Window(self.origin, self.centre, self.spacing, len(self.values), self.closed, self.unit)
+        return lw.Window(self.origin, self.centre, self.spacing, len(self.logs), self.closed, self.unit)
 
-    def on(self, window: lw.Window, gauge: Array) -> Message:
-        """Return the same function on another grid, in another gauge."""
-        own = lw.local_polynomial(self.gauge, self.window, window.offsets)
-        if not self.closed and np.ptp(gauge - own) > 0.5 * BOUND:
-            return self._plain().on(window, gauge) if np.any(self.gauge) else self._moved(window, gauge, own)
-        return self._moved(window, gauge, own)
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The first and the last point, as offsets from the origin."""
+        half = len(self.logs) // 2
+        return self.centre - half * self.spacing, self.centre + (len(self.logs) - 1 - half) * self.spacing
 
-    def _moved(self, window: lw.Window, gauge: Array, own: Array) -> Message:
-        if not self.closed and window.spacing > 1.5 * self.spacing:  # integrals with what the coarse grid resolves
-            own = lw.local_polynomial(gauge, window, self.window.offsets) - self.gauge
-            logs = np.where(self.values > 0.0, own + np.log(np.where(self.values > 0.0, self.values, 1.0)), -np.inf)
-            top = float(np.max(logs))
-            return self.changed(lw.gathered(np.exp(logs - top), self.window.offsets, window), window, gauge, top)
-        values = lw.resampled(self.values, self.window, window)
-        logs = np.where(values > 0.0, gauge - own + np.log(np.where(values > 0.0, values, 1.0)), -np.inf)
-        top = float(np.max(logs))
-        return self.changed(np.exp(logs - top), window, gauge, top)
+    def at(self, offsets: Array) -> Array:
+        """Return log b at offsets from the origin (J,)."""
+        return lw.local_polynomial(self.logs, self.window, offsets)
 
-    def _plain(self) -> Message:
-        """Return b itself, continued by straight lines of its logarithm where psi is rounding."""
-        counts = np.flatnonzero(self.values > NOISE * np.max(self.values))
-        first, last = int(counts[0]), int(counts[-1])
-        logs = np.log(np.maximum(self.values, 1e-300)) - self.gauge
-        i = np.arange(len(logs))
-        for end, inner in ((first, first + 1), (last, last - 1)):
-            slope = float(np.clip((logs[end] - logs[inner]) * (end - inner), -0.1, 0.1))
-            logs = np.where((i - end) * (end - inner) > 0, logs[end] + slope * (i - end), logs)
-        offsets = self.window.offsets
-        beyond = np.maximum(self.low - offsets, offsets - self.high) / self.spacing
-        top = float(np.max(logs[beyond < HALF]))
-        values = np.exp(np.minimum(logs - top, 5.0)) * 0.5 * erfc((beyond - HALF) / FALL)
-        return self.changed(values, self.window, np.zeros(len(values)), top)
+    def between(self, low: float, high: float) -> Message:
+        """Return the message on its points between two offsets, and on those that hold them."""
+        if self.closed:
+            return self
+        size, first = len(self.logs), self.ends[0]
+        i = int(np.clip(np.floor((low - first) / self.spacing + 1e-9), 0, size - FEWEST))
+        j = int(np.clip(np.ceil((high - first) / self.spacing - 1e-9), i + FEWEST - 1, size - 1))
+        return self._replace(logs=self.logs[i : j + 1], centre=first + self.spacing * (i + (j - i + 1) // 2))
 
-    def logs(self, offsets: Array) -> Array:
-        """Return log(b) - log_scale at offsets from the origin (J,), constant where b does not matter or psi is rounding."""
-        own = self.window.offsets
-        counts = self.values > NOISE * np.max(self.values)
-        if not self.closed:
-            counts &= (own >= self.low) & (own <= self.high)
-        first, last = np.flatnonzero(counts)[[0, -1]]
-        logs = np.log(np.maximum(self.values, 1e-300) / self.spacing) - self.gauge
-        inner = self.window._replace(centre=float(own[first + (last - first + 1) // 2]), size=int(last - first + 1))
-        return lw.local_polynomial(logs[first : last + 1], inner, offsets)
-
-    def changed(self, values: Array, window: lw.Window, gauge: Array, gained: float) -> Message:
-        """Return the message with other values of any sum, multiplied by exp(gained)."""
-        total = float(np.sum(values))
+    def on(self, window: lw.Window) -> Message:
+        """Return the message on another grid."""
         origin, centre, spacing, _, closed, unit = window
-        log_scale = self.log_scale + gained + float(np.log(total))
-        own = values / total, gauge, origin, centre, spacing, unit, closed
-        return Message(*own, self.low, self.high, self.needed, log_scale, self.error)
+        return Message(self.at(window.offsets), origin, centre, spacing, unit, closed, self.needed, self.error)
+
+    @property
+    def variance(self) -> float:
+        """The variance of b as a density."""
+        values = np.exp(self.logs - np.max(self.logs))
+        return float(lw.moments(values / np.sum(values), self.window)[1])
+
+
+def _taper(offsets: Array, ends: tuple[float, float], spacing: float) -> Array:
+    """Return F of a grid that ends `PAD` spacings beyond two offsets."""
+    beyond = np.maximum(ends[0] - offsets, offsets - ends[1]) / spacing
+    return 0.5 * erfc((beyond - HALF) / FALL)
 
 
 def _covering(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:
@@ -139,6 +119,16 @@ def _covering(window: lw.Window, low: float, high: float, spacing: float) -> lw.
     return window._replace(centre=float(centre), spacing=spacing, size=size)
 
 
+def _points(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:
+    """Return the grid of at most this spacing between two offsets, without the fall of F."""
+    if window.closed:
+        return _covering(window, low, high, spacing)
+    spacing = lw.quantized(window, low, high, spacing).spacing
+    first, last = np.floor(low / spacing + 1e-9), np.ceil(high / spacing - 1e-9)
+    size = max(int(last - first) + 1, FEWEST)
+    return window._replace(centre=float((first + size // 2) * spacing), spacing=spacing, size=size)
+
+
 def message(prepared: Prepared, state: State) -> Message:
     """Return the message one at the last time.
 
@@ -149,12 +139,8 @@ def message(prepared: Prepared, state: State) -> Message:
         raise InputError(f"{prepared.model.source}: smooth: there is no backward pass for a state with reflecting ends yet")
     if prepared.system.cross is not None:
         raise InputError(f"{prepared.model.source}: smooth: grids have no backward pass with cross_noise yet; take kalman-bucy")
-    window = state.window
-    low, high = float(window.offsets[0]), float(window.offsets[-1])
-    new = _covering(window, low, high, window.spacing)
-    values = _fall(new.size, new.closed)[0]
-    blank = Message(values, values, *new[:3], new.unit, new.closed, low, high, new.spacing, float(np.log(new.spacing)), 0.0)
-    return blank.changed(values, new, np.zeros(new.size), 0.0)
+    origin, centre, spacing, size, closed, unit = state.window
+    return Message(np.zeros(size), origin, centre, spacing, unit, closed, spacing, 0.0)
 
 
 @lru_cache(maxsize=64)
@@ -186,17 +172,17 @@ def _reliable(state: State, window: lw.Window) -> Array:
 
 
 def _product(state: State, later: Message) -> _Product:
-    own, other = state.window, later.window
-    finer = own if own.spacing <= 1.0001 * other.spacing else other
+    finer = state.window
+    if later.spacing < 0.9999 * finer.spacing:
+        finer = _points(finer, float(finer.offsets[0]), float(finer.offsets[-1]), later.spacing)
     density = _reliable(state, finer)
-    psi, gauge = lw.resampled(later.values, other, finer), lw.local_polynomial(later.gauge, other, finer.offsets)
-    logs = np.where((density > 0) & (psi > 0), np.log(density) + np.log(psi) - gauge, -np.inf)
+    logs = np.where(density > 0, np.log(density) + later.at(finer.offsets), -np.inf)
     top = float(np.max(logs))
     values = np.exp(logs - top)
     first, last = _support(values, SMALLEST)
     values[:first], values[last + 1 :] = 0.0, 0.0
     total = float(np.sum(values))
-    return _Product(values / total, finer, float(np.log(total)) + top + later.log_scale - float(np.log(finer.spacing)))
+    return _Product(values / total, finer, float(np.log(total)) + top)
 
 
 @np.errstate(all="ignore")
@@ -218,16 +204,10 @@ def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message,
         "aliasing": look.aliasing,
         "std_in_spacings": spacings,
     }
-    ends = float(window.offsets[0]), float(window.offsets[-1])
-    values = later.values
-    if not window.closed:
-        first, last = _support(found.values, negligible(prepared))
-        ends = float(window.offsets[first]), float(window.offsets[last])
-        offsets, spacing = later.window.offsets, later.spacing
-        beyond = np.maximum(ends[0] - offsets, offsets - ends[1]) / spacing
-        values = values * (0.5 * erfc((beyond - HALF) / FALL))
+    first, last = _support(found.values, negligible(prepared))
     needed = min(later.needed, window.spacing * max(look.resolving, 1.0), float(state.spacing))
-    kept = later.changed(values, later.window, later.gauge, -found.log_mass)._replace(low=ends[0], high=ends[1], needed=needed)
+    kept = later.between(float(window.offsets[first]), float(window.offsets[last]))
+    kept = kept._replace(logs=kept.logs - found.log_mass, needed=needed)
     return kept, Info(found.log_mass, np.array([mean]), np.array([[variance]]), health)
 
 
@@ -245,29 +225,23 @@ def _support(values: Array, cut: float) -> tuple[int, int]:
 def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state: State) -> Message:
     """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
     length = float(prepared.lengths[k])
-    finer = _covering(later.window, later.low, later.high, later.needed)
-    if finer.spacing < 0.999 * later.spacing:
-        later = later.on(finer, lw.local_polynomial(later.gauge, later.window, finer.offsets))
-    window, values = later.window, later.values
+    later = later.on(_points(later.window, *later.ends, later.needed))
+    before = later.variance
     inside = prepared.inside[k]
     if prepared.lie and not inside.all():
         inside = np.zeros_like(inside)
     at_end = prepared.schedule.seen[k] & ~inside
-    _, before = lw.moments(values, window)
     if at_end.any() or (prepared.lie and inside.any()):
-        exact = bool(at_end.any())
+        exact, window = bool(at_end.any()), later.window
         likelihood = factor_at_end(prepared, k, at_end, observed, window) if exact else exponential_factor(prepared, k, observed)
-        logs = likelihood.logs(window.points).real
-        top = float(np.max(logs[values > 0.0], initial=-np.inf))
-        later = later.changed(values * np.exp(np.minimum(logs - top, 0.0)), window, later.gauge, top)
+        later = later._replace(logs=later.logs + likelihood.logs(window.points).real)
     if length == 0:
         return later
-    _, between = lw.moments(later.values, window)
+    between = later.variance
     rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
     way = _Way(prepared, k, inside, rates, state)
     later = way.back(later)
-    _, after = lw.moments(later.values, later.window)
-    kept = float(np.clip(between / np.sqrt(max(before * after, 1e-300)), 0.3, 1.0))
+    kept = float(np.clip(between / np.sqrt(max(before * later.variance, 1e-300)), 0.3, 1.0))
     return later._replace(error=way.error + kept * later.error)
 
 
@@ -288,14 +262,15 @@ class _Way:
         """Return the message at the start of the interval."""
         stack, count, tried = [(0.0, self.length)], 0, False
         if self.prepared.system.varying:
-            stack, error = resolved_parts(self.prepared, later.values, later.window, self.start, self.length, self.inside)
+            values = np.exp(later.logs - np.max(later.logs))
+            stack, error = resolved_parts(self.prepared, values, later.window, self.start, self.length, self.inside)
             self.error += error
         longest = max(last - first for first, last in stack)
         whole = later
         while stack:
             first, last = stack.pop()
             count += 1
-            if count + len(stack) > FEW and not tried and not later.closed:
+            if (self.bounded > self.prepared.system.varying or count + len(stack) > FEW) and not (tried or later.closed):
                 tried = True
                 found = self._by_volumes(whole)
                 if found is not None:
@@ -303,39 +278,39 @@ class _Way:
             forced = count + len(stack) >= MOST_SUBSTEPS or last - first <= 2e-3 * min(self.length, longest)
             found = self._substep(later, first, last, forced)
             if found is None:
-                middle = 0.5 * (first + last)
-                stack += [(first, middle), (middle, last)]
+                if not (self.bounded > self.prepared.system.varying and not tried):
+                    middle = 0.5 * (first + last)
+                    stack += [(first, middle), (middle, last)]
+                else:
+                    stack.append((first, last))
                 continue
             later = found
-            if not np.isfinite(later.log_scale):
+            if not np.isfinite(later.logs).all():
                 break
         if count >= MOST_SUBSTEPS:
             self.error = np.inf
         return later
 
     def _substep(self, later: Message, first: float, last: float, forced: bool) -> Message | None:
-        """Return the message at the start of a substep; None where a shorter one is needed."""
-        low, high = min(later.low, self.ends[0]), max(later.high, self.ends[1])
+        """Return the message at the start of a substep; None where a shorter one, or another way, is needed."""
+        (low, high), begins = later.ends, self.ends
+        low, high = min(low, begins[0]), max(high, begins[1])
         least, most = self._noise(low, high, last - first)
         low, high = low - EXCURSION * most, high + EXCURSION * most  # paths from one support to the other leave both
-        spacing = later.needed if self.inside.any() else max(later.needed, RESOLVED * least)
+        spacing = later.needed if self.inside.any() or later.closed else max(later.needed, RESOLVED * least)
         for attempt in range(7):
             window = _covering(later.window, low, high, spacing)
             if window.size > lw.LARGEST and not forced:
-                # A narrow message becomes wide in short substeps first.
-                low, high = self._spread(later, first, last)
-                window = _covering(later.window, low, high, spacing)
-                if window.size > 256:
-                    return None
+                return None
             gauge = self._gauge(window, self.bounded or last - first < self.length)
-            moving = later.on(window, gauge.values)
-            found = self._attempt(moving.values, window, gauge, first, last)
+            psi, top = self._psi(later, window, gauge.values)
+            found = self._attempt(psi, window, gauge, first, last)
             if found is None or not np.isfinite(found[0]).all() or not found[0].any():
-                return later._replace(log_scale=np.nan) if forced else None
+                return later._replace(logs=np.full(len(later.logs), np.nan)) if forced else None
             moved, offset, error = found
             if gauge.modes is not None and not self._exact(moved, gauge, window, error):
                 self.bounded = True
-                continue
+                return None
             look = lw.figures(moved, window.closed, self.accepted)
             coarse = look.aliasing > self.accepted and not (look.rough and look.aliasing < 1e-3 * self.prepared.tolerance)
             if not coarse or window.size >= lw.LARGEST or (look.rough and attempt > 1):
@@ -343,22 +318,43 @@ class _Way:
             spacing = window.spacing / 1.5
         self.error += error + 2.0 * look.aliasing + 10.0 * max(look.left, look.right)
         needed = window.spacing * float(np.clip(look.resolving, 1.0, 2.0))
-        moved = np.where(moved > 0.0, moved, 0.0)
-        return moving.changed(moved, window, gauge.values, offset)._replace(low=low, high=high, needed=needed)
+        moved = np.maximum(moved, 1e-300 * np.max(moved))
+        origin, centre, spacing, _, closed, unit = window
+        logs = np.log(moved / spacing) - gauge.values + (top + offset)
+        kept = Message(logs, origin, centre, spacing, unit, closed, needed, later.error)
+        if first == 0.0:
+            return kept.between(*begins)
+        counts = np.flatnonzero(moved > NOISE * np.max(moved))[[0, -1]]
+        ends = window.offsets[counts]
+        return kept.between(max(low, float(ends[0])), min(high, float(ends[1])))
+
+    def _psi(self, later: Message, window: lw.Window, gauge: Array) -> tuple[Array, float]:
+        """Return the values of psi on a grid times its spacing, divided by the exponential of the second number."""
+        if window.closed or window.spacing <= 1.01 * later.spacing:
+            logs = later.at(window.offsets) + gauge
+            top = float(np.max(logs))
+            values = window.spacing * np.exp(logs - top)
+            return values if window.closed else values * _taper(window.offsets, later.ends, window.spacing), top
+        # Integrals of psi with what the coarse grid resolves.
+        fine = _covering(later.window, *later.ends, later.spacing)
+        logs = later.at(fine.offsets) + lw.local_polynomial(gauge, window, fine.offsets)
+        top = float(np.max(logs))
+        values = fine.spacing * np.exp(logs - top) * _taper(fine.offsets, later.ends, fine.spacing)
+        return lw.gathered(values, fine.offsets, window), top
 
     def _by_volumes(self, later: Message) -> Message | None:
         """Return the message at the start of the interval from finite volumes, None where they do not serve."""
         state, window = self.state, self.state.window
         interval = self.start, self.length, self.inside, self.rates
-        found = pulled_back(self.prepared, later.logs, np.asarray(state.values).real, window, *interval)
+        found = pulled_back(self.prepared, later.at, np.asarray(state.values).real, window, *interval)
         if found is None:
             return None
-        low, high = self.ends
-        new = _covering(later.window, low, high, min(later.needed, window.spacing))
-        values = found.at(new.offsets) * _fall(new.size, new.closed)[0] * new.spacing
+        new = _points(later.window, *self.ends, min(later.needed, window.spacing))
+        values = found.at(new.offsets)
         self.error = found.error
-        moved = later.changed(np.where(values > 0.0, values, 0.0), new, np.zeros(new.size), found.log_scale)
-        return moved._replace(low=low, high=high)
+        logs = np.log(np.maximum(values, 1e-300 * np.max(values))) + found.log_scale
+        origin, centre, spacing, _, closed, unit = new
+        return Message(logs, origin, centre, spacing, unit, closed, later.needed, later.error)
 
     def _noise(self, low: float, high: float, length: float) -> tuple[float, float]:
         """Return the smallest and the largest standard deviation of the noise of a substep between two offsets."""
@@ -366,15 +362,6 @@ class _Way:
         middle = self.start + 0.5 * self.length
         covariance = covariance_at(self.prepared.system, points, middle, self.prepared.theta.real) * np.ones(9)
         return float(np.sqrt(max(np.min(covariance), 0.0) * length)), float(np.sqrt(np.max(covariance) * length))
-
-    def _spread(self, later: Message, first: float, last: float) -> tuple[float, float]:
-        """Return about the range to which a message that matters on its own range spreads."""
-        points = later.origin + np.linspace(later.low, later.high, 9)
-        system, theta, t = self.prepared.system, self.prepared.theta.real, self.start + last
-        speed = float(np.max(np.abs(system.drift(points[:, None], t, theta))))
-        covariance = float(np.max(system.covariance(points[:, None], t, theta)))
-        more = REACH * np.sqrt(covariance * (last - first)) + 1.5 * speed * (last - first)
-        return later.low - more, later.high + more
 
     def _attempt(
         self, values: Array, window: lw.Window, gauge: _Gauge, first: float, last: float
