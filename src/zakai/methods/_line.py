@@ -191,7 +191,7 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
     if length > 0:
         rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
         start = float(schedule.starts[k])
-        kernel = _kernel(prepared, k, window, rates, report)
+        kernel = kernel_of(prepared, k, window, rates, report)
         contraction = 1.0 if kernel is None else float(kernel.scale.real)
         found = None if kernel is None else by_kernel(prepared, values, window, start, length, kernel, report)
         if found is None:
@@ -262,7 +262,7 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
     return _state(moved, new, float(error), log_floor), Info(gained, np.array([mean]), np.array([[variance]]), health)
 
 
-def _kernel(prepared: Prepared, k: int, window: lw.Window, rates: np.ndarray, report: Report) -> Channel | None:
+def kernel_of(prepared: Prepared, k: int, window: lw.Window, rates: np.ndarray, report: Report) -> Channel | None:
     """Return the Gaussian kernel of interval k, for x relative to the origin of the window, if there is one."""
     kernels = prepared.kernels
     if kernels is None or kernels.place[k] < 0:

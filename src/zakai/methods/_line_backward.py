@@ -23,7 +23,7 @@ from zakai.densities import Density
 from zakai.errors import InputError
 from zakai.methods import _line
 from zakai.methods._line_coefficients import coefficients, offset_of, resolved_parts
-from zakai.methods._line_moves import MAGNUS
+from zakai.methods._line_moves import MAGNUS, Report
 from zakai.methods._line_paths import draw
 from zakai.methods._line_system import Prepared, State, covariance_at, covariance_between, drift_at, finite, state_moments
 from zakai.methods._line_update import exponential_factor, factor_at_end
@@ -48,6 +48,8 @@ RESOLVED = 0.25  # spacing in standard deviations of the noise
 SURE = 10.0  # errors of a density from which its small values count
 LOWEST = -30.0  # logarithm of the largest error of small values, relative to the largest value
 FEWEST = 12  # points of a message
+WIDTH = 0.8  # spacing in standard deviations of a Gaussian kernel at which sums are integrals
+MOST_POINTS = 4000  # of such sums
 
 
 class Message(NamedTuple):
@@ -240,7 +242,7 @@ def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state
     between = later.variance
     rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
     way = _Way(prepared, k, inside, rates, state)
-    later = way.back(later)
+    later = way.by_kernel(later, k) or way.back(later)
     kept = float(np.clip(between / np.sqrt(max(before * later.variance, 1e-300)), 0.3, 1.0))
     return later._replace(error=way.error + kept * later.error)
 
@@ -342,6 +344,30 @@ class _Way:
         values = fine.spacing * np.exp(logs - top) * _taper(fine.offsets, later.ends, fine.spacing)
         return lw.gathered(values, fine.offsets, window), top
 
+    def by_kernel(self, later: Message, k: int) -> Message | None:
+        """Return the message at the start of an interval whose kernel is Gaussian, None where it is not or needs many points."""
+        prepared, report = self.prepared, Report()
+        kernel = None if prepared.yau is None or later.closed else _line.kernel_of(prepared, k, later.window, self.rates, report)
+        if kernel is None or not kernel.variance > 0:
+            return None
+        assert prepared.yau is not None
+        deviation, (low, high), begins = float(np.sqrt(kernel.variance)), later.ends, self.ends
+        if (high - low) > MOST_POINTS * WIDTH * deviation:
+            return None
+        spacing = min(max(later.needed, RESOLVED * deviation) / max(abs(kernel.scale), 1e-3), (begins[1] - begins[0]) / FEWEST)
+        fine = _points(later.window, low, high, min(later.needed, WIDTH * deviation))
+        new = _points(later.window, *begins, spacing)
+        x, y, theta = fine.offsets, new.offsets, prepared.theta.real
+        after = later.at(x) + prepared.yau.potential(fine.points, self.start + self.length, theta)
+        logs = after - 0.5 * ((x - kernel.scale * y[:, None] - kernel.shift) / deviation) ** 2
+        top = np.max(logs, axis=1)
+        found = np.log(np.sum(np.exp(logs - top[:, None]), axis=1) * fine.spacing / (deviation * np.sqrt(2 * np.pi))) + top
+        found += kernel.constant + y * (kernel.slope + kernel.curvature * y)
+        found -= prepared.yau.potential(new.points, self.start, theta)
+        self.error = report.time
+        origin, centre, spacing, _, closed, unit = new
+        return Message(found, origin, centre, spacing, unit, closed, new.spacing, later.error)
+
     def _by_volumes(self, later: Message) -> Message | None:
         """Return the message at the start of the interval from finite volumes, None where they do not serve."""
         state, window = self.state, self.state.window
@@ -387,7 +413,8 @@ class _Way:
         if not steady:  # what the commutator-free integrator of order four omits, as in the filter
             total, difference = parts[0] + parts[1], parts[1] - parts[0]
             commutator = 0.25 * (total @ (difference @ values) - difference @ (total @ values))
-            error = 5.0 * float(np.sum(np.abs(commutator)) / np.sum(values)) ** (5.0 / 3.0)
+            inner = slice(None) if window.closed else slice(PAD, -PAD)
+            error = 5.0 * float(np.sum(np.abs(commutator[inner])) / np.sum(values)) ** (5.0 / 3.0)
             if error > MAGNUS * prepared.tolerance:
                 return None
         moved = values

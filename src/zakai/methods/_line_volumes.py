@@ -24,10 +24,11 @@ FAST = 5.0  # ranges of a density that the drift crosses in an interval, below w
 STIFF = 100.0  # the same, above which no uniform grid is tried
 MOST_TRAVEL = 20.0  # ranges of a density, as it is at the time, that it moves on uniform grids
 MOST_DEVIATIONS = 100.0  # range of a density on a uniform grid, in the smallest deviations of its parts
-LEVELS = ((1024, 48), (2048, 68), (4096, 96), (8192, 136), (16384, 192))  # cells and steps
+LEVELS = ((256, 24), (512, 34), (1024, 48), (2048, 68), (4096, 96), (8192, 136), (16384, 192))  # cells and steps
 SETTLED = 1e-2  # error above which volumes do not serve
 NARROWEST = 40.0  # range of a density in cells
 SHARE = 0.1  # of the tolerance that volumes may leave
+SMOOTH = 1e-6  # tolerance of a smoother for which more cells are taken, at least
 FIRST = 0.1  # of the time in which the drift would cross the range of the density: the first step
 FASTEST = 100.0  # ranges of the density in the interval, divided by the tolerance: a faster drift counts as this
 REACH = 8.0  # standard deviations to the end of a density
@@ -70,7 +71,7 @@ def contracted(
     def summed(masses: Array) -> Array:
         return masses.reshape(-1, 2).sum(axis=1)
 
-    found = _settled(prepared, course, length, at_level, summed)
+    found = _settled(SHARE * prepared.tolerance, course, length, at_level, summed)
     if found is None:
         return None
     masses, cells, gained, error = found
@@ -128,7 +129,7 @@ def pulled_back(
         padded = np.concatenate([found[:1], found, found[-1:]])
         return (9.0 * (found[::2] + found[1::2]) - padded[:-2:2] - padded[3::2]) / 16.0
 
-    found = _settled(prepared, course, length, at_level, between)
+    found = _settled(SHARE * max(prepared.tolerance, SMOOTH), course, length, at_level, between)
     return None if found is None else Worth(found[1], found[0], float(found[2]), found[3])
 
 
@@ -157,7 +158,7 @@ def _course(prepared: Prepared, window: lw.Window, ends: Array, start: float, le
 
 
 def _settled(
-    prepared: Prepared,
+    allowed: float,
     course: _Course,
     length: float,
     at_level: Callable[[Volumes, Array], tuple[Array, Any]],
@@ -166,6 +167,7 @@ def _settled(
     """Return the values of cells, the cells, the logarithm of the scale and the error, with more cells until they settle.
 
     Args:
+        allowed: the error at which more cells are not taken.
         at_level: values of the sum one on cells and the logarithm of their scale, for the ends of steps.
         paired: values on half as many cells.
     """
@@ -186,7 +188,7 @@ def _settled(
                 change = half * np.exp(scale - best[1]) - best[0]
                 error = 0.25 * float(np.sum(np.abs(change.real)))
             best = finer, scale, cells._replace(size=len(finer))
-            if error < SHARE * prepared.tolerance:
+            if error < allowed:
                 break
         before = values, gained
     if best is None or not error < SETTLED:
