@@ -194,7 +194,8 @@ def test_what_cannot_be_drawn_is_refused_in_one_line():
         result.sample_paths(10**9)
 
 
-def test_the_memory_of_a_smoothed_record_does_not_grow_with_the_densities():
+def test_beyond_a_bound_the_memory_of_a_smoothed_record_does_not_grow_with_the_densities(monkeypatch):
+    monkeypatch.setattr("zakai.engine.smoother.KEPT_BYTES", 0)
     model = zakai.Model(
         state=["x"], drift=["-x"], observation=["x"], observation_kind="samples",
         prior={"kind": "gaussian", "mean": [0], "cov": [[0.5]]},
