@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from zakai.algebra.conditions import Condition
+from zakai import _registry
+from zakai.algebra.conditions import Condition, all_hold
+from zakai.algebra.theorems import conditions_of
 from zakai.densities import Density
 from zakai.engine.batch import Progress, filter_all
 from zakai.engine.driver import check_noise, check_records
@@ -127,6 +129,19 @@ def _unfit(setting: Setting) -> str:
     return ""
 
 
+def _refusal(setting: Setting) -> str:
+    """Return that a method has no backward pass, and the first method that holds for its system and smooths it."""
+    model, prior = setting.model, setting.prior
+    said = f"{model.source}: smooth: the method {setting.method.name} has no backward pass"
+    for name in _registry.METHODS:  # the most exact first
+        other = _registry.load(name)
+        if other.backward is None or all_hold(conditions_of(name, model)) is not True:
+            continue
+        if not _unfit(Setting.of(model, prior, other, other.options)):
+            return f"{said}; take {name}, which holds for this system and smooths it"
+    return f"{said}, and no method that has one holds for this system"
+
+
 class SmoothingRun(Run):
     """One record on its way through one method, and back."""
 
@@ -134,10 +149,7 @@ class SmoothingRun(Run):
         super().__init__(setting, record, "moments")
         backward = setting.method.backward
         if backward is None:
-            raise InputError(
-                f"smooth: the method {setting.method.name} has no backward pass; take yau-yau for up to four states, or "
-                "kalman-bucy, benes or hu-yau, where one holds"
-            )
+            raise InputError(_refusal(setting))
         self.backward = backward
         backward.message(self.empty, self.state)  # a model without a smoother is refused before it is filtered
         self.segments: list[tuple[int, Any]] = []  # the first interval of each, and the state at its start
