@@ -153,3 +153,46 @@ def test_windows_line_ends_and_a_byte_order_mark_are_accepted_in_a_model_file(za
 @pytest.mark.parametrize("source", ["nowhere.toml", "gallery:nowhere", ".", "", "gallery:../model", "a\nb.toml"])
 def test_a_model_that_is_not_there_is_one_line(refused, source):
     refused("nowhere" if "nowhere" in source else "", model=source)
+
+
+PLANE = """
+state = ["x", "y"]
+drift = ["1 - x", "-y"]
+diffusion = [["x/2", "0"], ["0", "1"]]
+observation = ["x"]
+observation_kind = "samples"
+
+[domain]
+x = { lower = 0.0 }
+
+[prior]
+kind = "density"
+"""
+
+
+@pytest.mark.parametrize(
+    ("density", "words"),
+    [("-x - y**2/2", ["decay", "vanish before the ends of the domain"]), ("-4*(x - 0.5)**2 - y**2/2", ["mass outside", "'x'"])],
+)
+def test_a_prior_of_two_states_that_reaches_the_end_of_its_domain_is_refused(refused, tmp_path, density, words):
+    (tmp_path / "model.toml").write_text(PLANE + f'log_density = "{density}"\n')
+    refused("model.toml", "prior", *words)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("observation", '["log(x)"]', "observation[0] = log(x): log of a negative number"),
+        ("drift", '["-a*sqrt(x)"]', "drift[0]"),
+        ("diffusion", '[["sqrt(x)"]]', "diffusion"),
+    ],
+)
+def test_a_formula_without_a_value_where_the_density_is_is_named(zakai, tmp_path, key, value, words):
+    (tmp_path / "model.toml").write_text(with_key(key, value))
+    answer = zakai("filter", "model.toml", "record.csv", "-o", "result.nc")
+    assert answer.code == 0 and words in answer.err and "[domain]" in answer.err
+
+
+def test_a_formula_without_a_value_elsewhere_does_not_warn(zakai, tmp_path):
+    (tmp_path / "model.toml").write_text(with_key("observation", '["sin(x)/x"]').replace("mean = [0.0]", "mean = [9.0]"))
+    assert "[domain]" not in zakai("filter", "model.toml", "record.csv", "-o", "result.nc").err

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from .conftest import RECORD
+from .conftest import MODEL, RECORD
 
 BAD = {
     "empty": (b"", "empty"),
@@ -61,3 +61,20 @@ def test_windows_line_ends_a_byte_order_mark_and_gaps_are_accepted(zakai, tmp_pa
     answer = zakai("filter", "model.toml", "record.csv", "-o", "result.nc")
     assert answer.code == 0, answer
     assert (tmp_path / "result.nc").exists()
+
+
+@pytest.mark.parametrize(("family", "value"), [("poisson", "-1"), ("poisson", "1.5"), ("bernoulli", "2")])
+def test_a_value_that_the_family_cannot_have_is_named_with_its_row(refused, tmp_path, family, value):
+    keys = f'observation_kind = "samples"\nobservation_family = "{family}"\n'
+    (tmp_path / "model.toml").write_text(keys + MODEL.replace('observation_kind = "increments"\n', ""))
+    (tmp_path / "record.csv").write_text(f"time,y\n0.1,1\n0.2,{value}\n")
+    refused("record.csv", "row 3", family)
+
+
+def test_angles_in_degrees_warn(zakai, tmp_path):
+    keys = 'observation_kind = "samples"\nobservation_family = "von-mises"\nconcentration = "4"\n'
+    (tmp_path / "model.toml").write_text(keys + MODEL.replace('observation_kind = "increments"\n', ""))
+    (tmp_path / "record.csv").write_text("time,y\n0.1,175\n0.2,-179\n")
+    assert "radians" in zakai("filter", "model.toml", "record.csv", "-o", "result.nc").err
+    (tmp_path / "record.csv").write_text("time,y\n0.1,3.1\n0.2,-3.1\n")
+    assert "radians" not in zakai("filter", "model.toml", "record.csv", "-o", "result.nc").err

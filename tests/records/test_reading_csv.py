@@ -12,7 +12,7 @@ from zakai.records import Record, read_record
 
 
 def model(m=2, kind="samples", start=0.0):
-    return SimpleNamespace(m=m, observation_kind=kind, start=start, inputs=())
+    return SimpleNamespace(m=m, observation_kind=kind, start=start, inputs=(), observation_law=SimpleNamespace(is_gaussian=True))
 
 
 @pytest.fixture

@@ -11,7 +11,8 @@ import re, sys
 from pathlib import Path
 from types import SimpleNamespace
 from zakai.records import read_record
-record = read_record(sys.argv[1], SimpleNamespace(m=2, observation_kind="samples", inputs=(), start=0.0))
+law = SimpleNamespace(is_gaussian=True)
+record = read_record(sys.argv[1], SimpleNamespace(m=2, observation_kind="samples", inputs=(), start=0.0, observation_law=law))
 status = Path("/proc/self/status")
 peak = re.search(r"VmHWM:\\s*(\\d+) kB", status.read_text()) if status.exists() else None
 if peak:

@@ -25,7 +25,9 @@ def test_a_record_comes_back_bit_for_bit(tmp_path_factory, values, first):
     path = tmp_path_factory.mktemp("record") / "record.csv"
     record = Record(first + np.arange(len(values)) / 3, values, "samples")
     record.to_csv(path)
-    again = read_record(path, SimpleNamespace(m=2, observation_kind="samples", inputs=(), start=float(record.times[0])))
+    law, start = SimpleNamespace(is_gaussian=True), float(record.times[0])
+    model = SimpleNamespace(m=2, observation_kind="samples", inputs=(), start=start, observation_law=law)
+    again = read_record(path, model)
     assert again.times.tobytes() == record.times.tobytes()
     np.testing.assert_array_equal(again.values, record.values)
     np.testing.assert_array_equal(

@@ -10,6 +10,7 @@ import numpy as np
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.health_warnings import warnings_of_run
+from zakai.engine.notes import notes_on_angles, notes_on_formulas
 from zakai.engine.results import FilterResult, versions
 from zakai.engine.setting import KEPT, Setting
 from zakai.errors import InputError
@@ -65,7 +66,12 @@ class Run:
         self.states: list[Any] = [self.state]
         self.parts: list[Infos] = []
         self.notes: dict[str, None] = dict.fromkeys(
-            [*_after_gaps(self.schedule), *notes_on_noise(setting.model, self.schedule), *self.empty.notes]
+            [
+                *_after_gaps(self.schedule),
+                *notes_on_noise(setting.model, self.schedule),
+                *notes_on_angles(setting.model, record),
+                *self.empty.notes,
+            ]
         )
         self.bytes = 0
         self.done = 0
@@ -168,7 +174,8 @@ class Run:
             _density=self.density if kept else None,
             _no_density=self._no_density(),
         )
-        result.warnings.extend([*self.notes, *warnings_of_run(result)])
+        undefined = notes_on_formulas(model, self.setting.theta.real, self.record, result.mean, result.variance)
+        result.warnings.extend([*undefined, *self.notes, *warnings_of_run(result)])
         return result
 
     def _no_density(self) -> str:

@@ -10,10 +10,15 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from zakai.densities import Density
+from zakai.errors import InputError
 from zakai.methods._protocol import Method
+from zakai.models.domain import NEGLIGIBLE
 from zakai.models.model import Model
+from zakai.models.prior import DensityPrior
 from zakai.records.schedule import Schedule
 
+_ENDS = "in two or more states the density must vanish before the ends of the domain, and have a value beyond them"
 KEPT = 8  # schedules whose preparation is kept for each model
 
 _PREPARED: WeakKeyDictionary[Model, OrderedDict[Any, Any]] = WeakKeyDictionary()
@@ -70,4 +75,21 @@ class Setting(NamedTuple):
     def begin(self) -> tuple[Any, Any]:
         """Return what is prepared for no interval, and the state at the model's start."""
         prepared = self.prepared(Schedule.empty(self.model.m))
-        return prepared, self.method.init(prepared, self.prior)
+        inside = self.model.n > 1 and bool(self.model.domain) and isinstance(self.prior, DensityPrior)
+        try:
+            state = self.method.init(prepared, self.prior)
+        except InputError as error:
+            words = str(error)
+            words = f"{self.model.source}: {words}" if words.startswith("prior") else words
+            error.args = (f"{words}; {_ENDS}" if inside else words,)
+            raise
+        if inside:
+            self._check_domain(self.method.density(prepared, state))
+        return prepared, state
+
+    def _check_domain(self, density: Density) -> None:
+        """Raise InputError where the prior of several states has mass outside of the domain."""
+        for name, interval in self.model.domain.items():
+            low, high = density.marginal(name).quantile([NEGLIGIBLE, 1 - NEGLIGIBLE]).ravel()
+            if low < interval.lower or high > interval.upper:
+                raise InputError(f"{self.model.source}: prior: has mass outside of the domain of {name!r}, {interval}; {_ENDS}")

@@ -182,22 +182,18 @@ class ObservationLaw:
             draws[k, 0] = np.interp(rng.uniform() * total[-1], total, grid)
         return draws
 
-    def check(self, values: Array) -> None:
-        """Raise InputError at the first observation (K, m) that the law cannot have made."""
+    def fault(self, values: Array) -> tuple[int, str] | None:
+        """Return the row of the first observation (K, m) that the law cannot have made, and why, or None."""
         for j, name in enumerate(self.families):
             family = FAMILIES[name]
             wrong = ~(np.isnan(values[:, j]) | family.inside(values[:, j]))
             if wrong.any():
                 row = int(np.argmax(wrong))
-                raise InputError(
-                    f"record: row {row}, counted from 0: observation {j + 1} is {float(values[row, j])!r}; "
-                    f"the family {name} has {family.support}"
-                )
+                return row, f"observation {j + 1} is {float(values[row, j])!r}; the family {name} has {family.support}"
         if self._model.log_density is not None:
             seen = ~np.isnan(values)
             partial = seen.any(axis=1) & ~seen.all(axis=1)
             if partial.any():
-                raise InputError(
-                    f"record: row {int(np.argmax(partial))}, counted from 0: only some coordinates are observed; "
-                    "with observation_log_density give all of a row or none"
-                )
+                given = "only some coordinates are observed; with observation_log_density give all of a row or none"
+                return int(np.argmax(partial)), given
+        return None

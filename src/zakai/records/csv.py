@@ -41,7 +41,7 @@ def read_record(path: str | os.PathLike[str], model: Any, unit: str | None = Non
 
     Arguments:
         path: the file.
-        model: a `zakai.Model`; its `m`, `start` and `observation_kind` say what the file must hold.
+        model: a `zakai.Model`; its `m`, `start`, `observation_kind` and `observation_law` say what the file must hold.
         unit: the model's unit of time, for a file whose first column has ISO dates; see `Record`.
         origin: the date at which t = 0, by default the first date.
 
@@ -67,6 +67,9 @@ def read_record(path: str | os.PathLike[str], model: Any, unit: str | None = Non
     if fault is not None:
         hint = "" if dates is None else "; give the date at which t = 0 as origin"
         raise InputError(f"{shown(path)}: row {row}: {fault}{hint}")
+    wrong = record.fault_of_law(model)
+    if wrong is not None:
+        raise InputError(f"{shown(path)}: row {row + wrong[0]}: {wrong[1]}")
     return record
 
 

@@ -129,8 +129,14 @@ class Record:
         """Refuse a record without the model's inputs, or with values that its observation family cannot have."""
         if self.inputs is not None or model.inputs:
             check_inputs(model, self.inputs, float(self.times[-1]))
-        if self.kind == "samples" and not model.observation_law.is_gaussian:
-            model.observation_law.check(self.values)
+        fault = self.fault_of_law(model)
+        if fault is not None:
+            raise InputError(f"record: row {fault[0]}, counted from 0: {fault[1]}")
+
+    def fault_of_law(self, model: Any) -> tuple[int, str] | None:
+        """Return the first row with a value that the model's observation family cannot have, and why, or None."""
+        lawless = self.kind != "samples" or model.observation_law.is_gaussian
+        return None if lawless else model.observation_law.fault(self.values)
 
     @classmethod
     def from_pandas(cls, frame: Any, kind: str, unit: str | None = None, origin: Any = None) -> Record:

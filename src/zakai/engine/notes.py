@@ -1,0 +1,79 @@
+"""What a result warns of beside its health figures: formulas without a value where the density is, and angles in degrees."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from zakai.models.model import Model
+from zakai.models.numeric import explain_nonfinite, numpy_function
+from zakai.records import Record
+
+_KEYS = ("drift", "diffusion", "observation")
+_REACH, _TIMES = 3.0, 32  # deviations from the mean, and number of times, that are checked
+
+
+def notes_on_formulas(model: Model, theta: np.ndarray, record: Record, mean: np.ndarray, variance: np.ndarray) -> list[str]:
+    """Return a sentence for every formula that is not finite within three deviations of the mean, at some of the times.
+
+    Args:
+        model: The model.
+        theta: The parameters (p,).
+        record: The record, with K times.
+        mean: (K+1, n), that of the prior first.
+        variance: (K+1, n).
+    """
+    keys = [key for key in _KEYS if _is_partial(getattr(model, key), model)]
+    if not keys:
+        return []
+    times = np.concatenate([[model.start], record.times])
+    # Not symmetric, so that a removable singularity at the mean, as in sin(x)/x, is not hit.
+    steps = np.linspace(-_REACH, _REACH, 12)[:, None, None] * np.eye(model.n)
+    checked = np.unique(np.linspace(0, len(times) - 1, _TIMES).astype(int))
+    notes = []
+    for key in keys:
+        formulas = getattr(model, key)
+        evaluate = numpy_function(list(formulas), model)
+        for k in checked:
+            points = (mean[k] + steps * np.sqrt(np.maximum(variance[k], 0.0))).reshape(-1, model.n)
+            points = points[_inside(model, points) & np.isfinite(points).all(axis=1)]
+            t = float(times[k])
+            u = None if record.inputs is None else record.inputs.at(t, model.input_hold)
+            with np.errstate(all="ignore"):
+                wrong = ~np.isfinite(evaluate(points, t, theta, u)).all(axis=-1)
+            if wrong.any():
+                reason = explain_nonfinite(model, key, formulas, points[wrong][0], t, u)
+                notes.append(f"{reason}, within {_REACH:g} deviations of the mean; give a [domain], or change the formula")
+                break
+    return notes
+
+
+def notes_on_angles(model: Model, record: Record) -> list[str]:
+    """Return a sentence where samples of an angle exceed a turn, as they do in degrees."""
+    if "von-mises" not in model.observation_family:
+        return []
+    angles = np.array([family == "von-mises" for family in model.observation_family])
+    largest = float(np.nanmax(np.abs(np.asarray(record.values, float)[:, angles]), initial=0.0))
+    if largest <= 2 * np.pi + 1e-6:
+        return []
+    return [f"observed angles of up to {largest:g} are taken modulo 2 pi; give them in radians"]
+
+
+def _is_partial(formulas: Any, model: Model) -> bool:
+    """Return whether a formula has a part that may have no value at a real state."""
+    state = set(model.x)
+    return any(
+        part.free_symbols & state
+        for formula in formulas
+        for part in formula.atoms(sp.log, sp.asin, sp.acos, sp.Pow)
+        if not (isinstance(part, sp.Pow) and part.exp.is_integer and part.exp.is_nonnegative)
+    )
+
+
+def _inside(model: Model, points: np.ndarray) -> np.ndarray:
+    inside = np.ones(len(points), bool)
+    for name, interval in model.domain.items():
+        inside &= interval.contains(points[:, model.state.index(name)])
+    return inside
