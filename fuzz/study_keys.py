@@ -8,7 +8,7 @@ from fuzz.oracle import value_or_one_line
 from zakai.errors import InputError
 from zakai.models._errors import named
 from zakai.models.files import load_model, read_keys
-from zakai.studies import specification
+from zakai.studies import _study_models, study_files
 
 KEYS = (
     *("name", "models", "parameters", "methods", "seeds", "times", "records", "reference", "metrics", "densities", "lost_above"),
@@ -27,7 +27,7 @@ GOOD = (
     *('reference = "a"', 'metrics = ["nees", "crps"]', "batch = 2", 'records = ["a.csv"]', "densities = 3", "lost_above = 1.5"),
     'models = [{model = "gallery:kalman-bucy-1d", parameters = {a = [1, "1/2"]}}]',
 )
-specification.load_model = lru_cache(load_model)  # type: ignore[attr-defined]  # the same few over and over
+_study_models.load_model = lru_cache(load_model)  # type: ignore[attr-defined]  # the same few over and over
 
 
 def text_of(data: bytes) -> str:
@@ -58,12 +58,12 @@ def one_input(data: bytes) -> None:
 
     def read():
         with named("s.toml"):
-            return specification.study_of(read_keys(text, "study"), "s", Path("nowhere"))
+            return study_files.study_of(read_keys(text, "study"), "s", Path("nowhere"))
 
     found = value_or_one_line(read)
     if isinstance(found, InputError):
         assert str(found).startswith("s.toml: ")
         return
     study, models = found
-    assert len(study.points) == len(models) <= specification.MOST_POINTS and study.methods
-    assert len(study.batches) <= specification.MOST_BATCHES and len(study.key()) == 64
+    assert len(study.points) == len(models) <= _study_models.MOST_POINTS and study.methods
+    assert len(study.batches) <= study_files.MOST_BATCHES and len(study.key()) == 64

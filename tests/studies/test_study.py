@@ -20,8 +20,8 @@ from scipy import stats
 import zakai
 from zakai.errors import ConditionError, InputError
 from zakai.studies import _batch, _workers
-from zakai.studies.specification import read_study
 from zakai.studies.study import run_study
+from zakai.studies.study_files import read_study
 
 STUDY = """
 name = "two filters"

@@ -27,8 +27,8 @@ def reproduce(name: str, folder: Path | None, settings: list[str]) -> None:
 
 def study(file: Path, folder: Path, scheduler: str | None, processes: int | None, inputs: Path | None = None) -> None:
     """Run a study, or continue it, and print its table."""
-    from zakai.studies.specification import read_study
     from zakai.studies.study import run_study
+    from zakai.studies.study_files import read_study
 
     read = read_study(file, inputs)
     with progress(read.name) as advance:

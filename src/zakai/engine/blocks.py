@@ -13,7 +13,8 @@ from zakai.algebra.independent import IndependentBlock
 from zakai.densities import Density, ProductDensity
 from zakai.densities.product import renamed
 from zakai.engine.loop import KEPT_BYTES, Run
-from zakai.engine.results import FilterResult, versions
+from zakai.engine.results import FilterResult
+from zakai.engine.versions import versions
 from zakai.models.model import Model
 from zakai.records import Record
 

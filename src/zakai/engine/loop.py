@@ -11,8 +11,9 @@ from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.health_warnings import warnings_of_run
 from zakai.engine.notes import notes_on_angles, notes_on_formulas
-from zakai.engine.results import FilterResult, versions
+from zakai.engine.results import FilterResult
 from zakai.engine.setting import KEPT, Setting
+from zakai.engine.versions import versions
 from zakai.errors import InputError
 from zakai.methods._protocol import Infos, stacked
 from zakai.models.numeric import explain_nonfinite, numpy_function

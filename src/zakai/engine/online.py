@@ -14,7 +14,7 @@ from zakai.engine.driver import check_model, planned
 from zakai.engine.estimate import Estimate
 from zakai.engine.feed import Feed
 from zakai.engine.plan import ByBlocks
-from zakai.engine.results import other_versions, versions
+from zakai.engine.versions import other_versions, versions
 from zakai.errors import InputError
 from zakai.models._errors import named
 from zakai.models.checks import check_noise_at

@@ -12,7 +12,8 @@ from zakai import _display
 from zakai.engine.batch import Progress
 from zakai.engine.driver import check_model, check_noise, check_records, filter_planned
 from zakai.engine.plan import ByBlocks, plan_of
-from zakai.engine.results import FilterResult, other_versions, versions
+from zakai.engine.results import FilterResult
+from zakai.engine.versions import other_versions, versions
 from zakai.errors import InputError
 from zakai.models.files import read_model
 from zakai.models.model import Model

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -319,15 +317,3 @@ class FilterResult:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as NetCDF, atomically."""
         save_variables(self._variables(), self._attributes(), path)
-
-
-@lru_cache(maxsize=1)
-def versions() -> dict[str, str]:
-    """Return the versions of what computed a result."""
-    return {f"version_{name}": version(name) for name in ("zakai", "numba", "numpy", "scipy", "sympy")}
-
-
-def other_versions(stored: Any) -> str:
-    """Return the names of the packages of which a file has not the versions in use, joined by commas."""
-    stored = stored if isinstance(stored, dict) else {}
-    return ", ".join(name.removeprefix("version_") for name, own in versions().items() if stored.get(name) != own)

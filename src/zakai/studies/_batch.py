@@ -15,7 +15,8 @@ import xarray
 
 from zakai import _registry
 from zakai.engine.driver import filter as run_filter
-from zakai.engine.results import FilterResult, versions
+from zakai.engine.results import FilterResult
+from zakai.engine.versions import versions
 from zakai.errors import InputError
 from zakai.models.files import read_model
 from zakai.models.model import Model

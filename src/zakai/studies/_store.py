@@ -16,7 +16,7 @@ from typing import Any
 
 import xarray
 
-from zakai.engine.results import versions
+from zakai.engine.versions import versions
 from zakai.errors import InputError
 from zakai.records.writing import atomic_write, shown
 from zakai.studies.specification import Study

@@ -18,7 +18,8 @@ from zakai.studies import _workers
 from zakai.studies._batch import COSTS
 from zakai.studies._store import FORMAT, Store
 from zakai.studies._summary import summary, timing
-from zakai.studies.specification import Study, read_study
+from zakai.studies.specification import Study
+from zakai.studies.study_files import read_study
 
 
 @dataclass(frozen=True, eq=False)
