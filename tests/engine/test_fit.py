@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import zakai
-from zakai.engine import fit as fitting
+from zakai.engine import maximum
 
 LINE = dict(
     state=["x"],
@@ -89,8 +89,8 @@ def test_parameters_that_the_record_does_not_tell_apart_have_no_standard_errors(
 
 
 def test_a_fit_that_does_not_converge_says_so(line, monkeypatch):
-    monkeypatch.setattr(fitting, "ITERATIONS", 1)
-    monkeypatch.setattr(fitting, "NEAR", 0.0)
+    monkeypatch.setattr(maximum, "ITERATIONS", 1)
+    monkeypatch.setattr(maximum, "NEAR", 0.0)
     fitted = zakai.fit(*line, parameters=["a"], method="kalman-bucy", start={"a": 2.0})
     assert not fitted.converged and "did not converge" in fitted.warnings[0] and "not converged" in str(fitted)
 

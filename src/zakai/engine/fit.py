@@ -7,21 +7,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
 
 from zakai import _display
-from zakai._progress import Advance, bar
+from zakai._progress import bar
 from zakai.densities import GaussianMixture
 from zakai.engine.driver import filter as run_filter
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
+from zakai.engine.maximum import Counted, maximum
 from zakai.errors import InputError
 from zakai.models._errors import listing
 from zakai.models.model import Model
 from zakai.records import Record
-
-ITERATIONS = 200
-NEAR = 1e-3  # the distance to the maximum, in standard errors, that counts as none
-SINGULAR = 1e-6  # the smallest eigenvalue of the information scaled to a unit diagonal; differences leave 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +131,7 @@ def fit(
     box = _box(model, names, values, bounds)
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
     with bar("fitting") as advance:
-        found = _maximum(_Counted(LogLikelihood(now, record, method, names, options), advance), values, box, names, model)
+        found = maximum(Counted(LogLikelihood(now, record, method, names, options), advance), values, box, names, model)
     values = found.values
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
     result = run_filter(now, record, method, keep="moments", **options)
@@ -158,19 +154,6 @@ def fit(
         observations=len(record.times),
         warnings=warnings,
     )
-
-
-class _Counted:
-    """The log-likelihood and its gradient; every evaluation is reported."""
-
-    def __init__(self, function: LogLikelihood, advance: Advance | None):
-        self._function, self._advance, self._count = function, advance, 0
-
-    def value_and_gradient(self, values: np.ndarray) -> tuple[float, np.ndarray]:
-        self._count += 1
-        if self._advance is not None:
-            self._advance(self._count, None)
-        return self._function.value_and_gradient(values)
 
 
 def _number(value: Any, where: str) -> float:
@@ -210,131 +193,3 @@ def _box(model: Model, names: tuple[str, ...], values: np.ndarray, bounds: Any) 
         if not low <= value <= high:
             raise InputError(f"start: {name}: {value:g} is outside its bounds {low:g} and {high:g}; give another start")
     return box
-
-
-@dataclass
-class _Found:
-    values: np.ndarray
-    log_likelihood: float
-    covariance: np.ndarray
-    converged: bool
-    message: str
-    problem: str
-    iterations: int
-
-
-class _Objective:
-    """The negative log-likelihood of the parameters in units of `scale`, and its gradient; finite everywhere."""
-
-    def __init__(self, function: _Counted, origin: np.ndarray, scale: np.ndarray):
-        self._both = function.value_and_gradient
-        self.origin, self.scale = origin, scale
-        self.best: tuple[float, np.ndarray, np.ndarray] | None = None
-        self.refused = 0
-
-    def exact(self, u: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = self._both(self.origin + self.scale * u)
-        return -float(value), -self.scale * np.asarray(gradient, float)
-
-    def __call__(self, u: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = self.exact(u)
-        if np.isfinite(value) and np.isfinite(gradient).all():
-            if self.best is None or value < self.best[0]:
-                self.best = value, np.array(u), gradient
-            return value, gradient
-        # A wall behind the best point, which rises ten times as fast as the function fell there: the search turns back.
-        assert self.best is not None
-        self.refused += 1
-        best, at, slope = self.best
-        rise = -10.0 * slope
-        return best + abs(rise @ (u - at)) + 1e-3, rise
-
-    def hessian(self, u: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """Central differences of the gradient."""
-        columns = []
-        for shift in np.diag(steps):
-            above, below = self.exact(u + shift)[1], self.exact(u - shift)[1]
-            columns.append((above - below) / (2 * shift.sum()))
-        matrix = np.array(columns)
-        return np.asarray(0.5 * (matrix + matrix.T))
-
-
-def _maximum(function: _Counted, values: np.ndarray, box: np.ndarray, names: tuple[str, ...], model: Model) -> _Found:
-    """The maximum of the replayed likelihood from `values`: L-BFGS-B, and then Newton's steps in the free parameters."""
-    scale = np.where(values != 0, np.abs(values), 1.0)
-    objective = _Objective(function, values, scale)
-    value, gradient = objective.exact(np.zeros(len(values)))
-    if not (np.isfinite(value) and np.isfinite(gradient).all()):
-        at = ", ".join(f"{name} = {float(number):g}" for name, number in zip(names, values, strict=True))
-        raise InputError(f"{model.source}: start: the log-likelihood does not exist at {at}; give another start")
-    limits = (box - values[:, None]) / scale[:, None]
-    settings = {"maxiter": ITERATIONS, "ftol": 1e-13, "gtol": 1e-7 * max(1.0, np.abs(gradient).max() * 1e-3)}
-    search = minimize(objective, np.zeros(len(values)), jac=True, method="L-BFGS-B", bounds=limits, options=settings)
-    assert objective.best is not None
-    # From here on the unit is where the search came to: it may have come a long way.
-    values = np.clip(values + scale * objective.best[1], box[:, 0], box[:, 1])
-    scale = np.where(values != 0, np.abs(values), scale)
-    limits = (box - values[:, None]) / scale[:, None]
-    objective, u = _Objective(function, values, scale), np.zeros(len(values))
-    value, gradient = objective.exact(u)
-    iterations = int(search.nit)
-    for _ in range(8):
-        held = ((u <= limits[:, 0]) & (gradient > 0)) | ((u >= limits[:, 1]) & (gradient < 0))
-        free = ~held
-        information = _information(objective, u, free)
-        cov, distance, problem = _inverse(information, gradient, free, names)
-        if not np.isfinite(distance) or distance < 1e-2 * NEAR:
-            break
-        # Newton's step, in the box; where it gains nothing, rounding has been reached.
-        trial = np.clip(u - np.nan_to_num(cov) @ np.where(free, gradient, 0.0), limits[:, 0], limits[:, 1])
-        new, slope = objective.exact(trial)
-        if not (new <= value + 1e-13 * abs(value)) or not np.isfinite(slope).all():
-            break
-        value, u, gradient, iterations = new, trial, slope, iterations + 1
-    converged = bool(distance < NEAR) if np.isfinite(distance) else bool(search.success and not problem.startswith("the log"))
-    if held.any():
-        at = ", ".join(f"{name} = {values[i] + scale[i] * u[i]:g}" for i, name in enumerate(names) if held[i])
-        problem = "; ".join(filter(None, [f"at a bound ({at}), where there is no standard error", problem]))
-    covariance = np.where(np.outer(free, free), cov * np.outer(scale, scale), np.nan)
-    message = f"converged after {iterations} iterations" if converged else f"not converged after {iterations} iterations"
-    if not converged:
-        said = search.message if isinstance(search.message, str) else search.message.decode()
-        message += f" ({said.strip().lower()})"
-    values = np.clip(values + scale * u, box[:, 0], box[:, 1])
-    return _Found(values, -value, covariance, converged, message, problem, iterations)
-
-
-def _information(objective: _Objective, u: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """The Hessian of the negative log-likelihood, by steps of a thousandth of a standard error, once that is known."""
-    for size in (1e-4, 1e-6, 1e-8):
-        steps = np.full(len(u), size)
-        first = np.diag(objective.hessian(u, steps))
-        if np.isfinite(first[free]).all():
-            break
-    with np.errstate(invalid="ignore", divide="ignore"):
-        better = np.where(free & (first > 0), 1e-3 / np.sqrt(first), steps)
-    return objective.hessian(u, np.clip(np.where(np.isfinite(better), better, steps), 1e-7, 1e-1))
-
-
-def _inverse(
-    information: np.ndarray, gradient: np.ndarray, free: np.ndarray, names: tuple[str, ...]
-) -> tuple[np.ndarray, float, str]:
-    """The inverse information of the free parameters, the distance to the maximum in standard errors, and what is wrong."""
-    count = len(names)
-    cov, index = np.full((count, count), np.nan), np.flatnonzero(free)
-    if not len(index):
-        return cov, 0.0, ""
-    block = information[np.ix_(index, index)]
-    if not np.isfinite(block).all():
-        return cov, np.nan, "the information does not exist at the estimates, which are at the edge of what is possible"
-    size = np.sqrt(np.abs(np.diag(block)))
-    values, vectors = np.linalg.eigh(block / np.outer(np.where(size > 0, size, 1.0), np.where(size > 0, size, 1.0)))
-    if values[0] <= SINGULAR:
-        which = listing(names[i] for i, share in zip(index, vectors[:, 0], strict=True) if abs(share) > 0.1)
-        if values[0] < -1e-6:
-            return cov, np.nan, f"the log-likelihood curves upwards in {which}: this is no maximum"
-        return cov, np.nan, f"the information is singular: the record does not determine {which}; no standard errors"
-    inverse = (vectors / values) @ vectors.T / np.outer(size, size)
-    cov[np.ix_(index, index)] = inverse
-    distance = float(np.sqrt(gradient[index] @ inverse @ gradient[index]))
-    return cov, distance, ""
