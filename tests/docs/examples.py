@@ -38,7 +38,8 @@ def examples() -> Iterator[Example]:
     """Yield the examples of all public docstrings of the source."""
     for path in sorted((ROOT / "src/zakai").rglob("*.py")):
         module = ".".join(path.relative_to(ROOT / "src").with_suffix("").parts).removesuffix(".__init__")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        text = path.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(text)) if "Example:" in text else ():
             if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
                 _, found, code = (ast.get_docstring(node) or "").partition("\nExample:\n")
                 if found:

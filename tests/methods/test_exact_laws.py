@@ -59,7 +59,7 @@ def test_two_states_are_kalman_and_bucy():
 
 def test_an_observation_far_beyond_the_prediction_is_said():
     model = zakai.load_model("gallery:kalman-bucy-1d")
-    result = zakai.filter(model, zakai.Record([0.01, 0.02], [[1e6], [0.0]], "increments"), "limited-direct")
+    result = zakai.filter(model, zakai.Record([0.01, 0.02], [[1e4], [0.0]], "increments"), "limited-direct")
     assert any("tolerance_ratio" in warning and "t = 0.01" in warning for warning in result.warnings)
 
 

@@ -53,7 +53,7 @@ def test_blocks_give_the_posterior_of_the_bimodal_problem(tmp_path):
 
 
 def test_every_filter_and_theorem_that_is_left(tmp_path):
-    short = studies.reproduce("cubic-sensor", paths=2, steps=100)
+    short = studies.reproduce("cubic-sensor", paths=2, steps=30)
     assert [row[0] for row in short.tables[0].rows] == [*cubic_sensor.FILTERS, cubic_sensor.REFERENCE]
     assert all(row[5] == "0" for row in short.tables[0].rows)
     assert set(verdicts(studies.reproduce("hu-yau-2002", forms=1, observations=3))[:-2]) == {"agrees"}
