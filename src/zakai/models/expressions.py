@@ -15,13 +15,10 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from zakai.errors import InputError
 from zakai.models._errors import echo
-
-if TYPE_CHECKING:
-    pass
 
 MAX_LENGTH = 10_000
 MAX_DEPTH = 100
