@@ -42,7 +42,7 @@ from zakai.numerics.line_panels import GAUSS_NODES, interpolation
 from zakai.numerics.line_splitting import CELL, DRIFT, OBSERVED, PHI, SLOPE
 from zakai.numerics.line_transition import BAND, support
 
-ROOM = 0.2  # margin of a new grid, relative to the range of the density
+LARGER = 0.2  # margin of a new grid, relative to the range of the density
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
 BLOCK = 2048  # points by which the tables of a spacing are apart; a table has twice as many
@@ -316,7 +316,7 @@ def _covering(state: State, low: float, high: float, spacing: float) -> State | 
         size = lw.size_for(2 * np.pi / spacing)
         new = window._replace(size=size, spacing=2 * np.pi / size)
     else:
-        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, ROOM, FINEST)
+        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, LARGER, FINEST)
         if new.spacing * new.size < high - low:
             return None
     return None if new == window else moved_to(state, new)
@@ -335,7 +335,7 @@ def regridded(prepared: Prepared, state: State) -> State:
     look = lw.figures(values, window.closed, prepared.negligible, prepared.cut)
     if prepared.gaussian:
         look = look._replace(resolving=look.resolving * BAND / 0.92)
-    new = lw.fitted(look, window, prepared.largest, prepared.generous, ROOM)
+    new = lw.fitted(look, window, prepared.largest, prepared.generous, LARGER)
     return state if new == window else moved_to(state, new)
 
 

@@ -201,7 +201,7 @@ def fitted(look: Figures, window: Window, most: int = LARGEST, generous: int = 6
         margin: range of a new grid beyond that of the density, relative to it.
     """
     needed = look.resolving * window.spacing
-    if not 0.0 < needed < np.inf:  # the values are no numbers
+    if not 0.0 < needed < np.inf:  # the values are not finite
         return window
     if window.closed:
         size = min(size_for(2 * np.pi / needed), most)
