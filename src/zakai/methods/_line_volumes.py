@@ -28,7 +28,7 @@ LEVELS = ((256, 24), (512, 34), (1024, 48), (2048, 68), (4096, 96), (8192, 136),
 SETTLED = 1e-2  # error above which volumes do not serve
 NARROWEST = 40.0  # range of a density in cells
 SHARE = 0.1  # of the tolerance that volumes may leave
-SMOOTH = 1e-6  # tolerance of a smoother for which more cells are taken, at least
+SMOOTH = 3e-7  # error of a backward interval at which more cells are not taken
 FIRST = 0.1  # of the time in which the drift would cross the range of the density: the first step
 FASTEST = 100.0  # ranges of the density in the interval, divided by the tolerance: a faster drift counts as this
 REACH = 8.0  # standard deviations to the end of a density
@@ -129,7 +129,7 @@ def pulled_back(
         padded = np.concatenate([found[:1], found, found[-1:]])
         return (9.0 * (found[::2] + found[1::2]) - padded[:-2:2] - padded[3::2]) / 16.0
 
-    found = _settled(SHARE * max(prepared.tolerance, SMOOTH), course, length, at_level, between)
+    found = _settled(SMOOTH, course, length, at_level, between)
     return None if found is None else Worth(found[1], found[0], float(found[2]), found[3])
 
 
