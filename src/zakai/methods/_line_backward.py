@@ -123,4 +123,9 @@ def density(prepared: Prepared, state: State, later: Message) -> Density:
     return _line.density(prepared, State(found.values, origin, centre, spacing, unit, closed, state.error, state.log_floor))
 
 
-BACKWARD: Backward[Prepared, State, Message] = Backward(message, step, smoothed, density, draw=draw)
+def accuracy(prepared: Prepared) -> float:
+    """Return the error of the evidence that a step of the filter may leave."""
+    return max(1e-6, prepared.promised)
+
+
+BACKWARD: Backward[Prepared, State, Message] = Backward(message, step, smoothed, density, draw=draw, accuracy=accuracy)
