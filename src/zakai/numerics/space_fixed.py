@@ -22,6 +22,7 @@ from zakai.numerics.space_window import LEAST, Bounds, fitted_grid
 
 Array = NDArray[Any]
 STEEPEST = 0.3  # largest tau |L|
+STEEP_AT = 0.25  # share of the width of a grid from its centre at which L is taken too
 MARGIN = 0.07  # share of its width by which a grid that is to stay is wider at each end
 LARGEST_NOISE = 0.2  # of the variance of a density that fills its grid
 LARGEST_RANGE = 300.0  # nats between the largest and the smallest factor of a potential
@@ -48,9 +49,12 @@ def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
     """Return the motion of a grid for lengths up to the power of two that is not below tau."""
     unit = math.ldexp(1.0, math.ceil(math.log2(tau)))
     n, points, inverse = grid.n, np.asfortranarray(grid.points), grid.inverse
-    rate = float(np.abs(inverse @ dynamics.jacobian(grid.centre, 0.0).real @ grid.basis).sum(axis=1).max())
+    away = STEEP_AT * grid.basis * np.array(grid.sizes)
+    inside = grid.centre + np.concatenate([np.zeros((1, n)), away.T, -away.T])
     slopes: list[Array] = []
     with np.errstate(all="ignore"):
+        matrices = np.stack([inverse @ dynamics.jacobian(x, 0.0).real @ grid.basis for x in inside])
+        rate = float(np.abs(matrices).sum(axis=2).max())
         for share in (0.0, 0.5, 0.5, 1.0):
             at = points - (unit * share) * slopes[-1][:, :n] if slopes else points
             slopes.append(dynamics.drift(at, 0.0))
