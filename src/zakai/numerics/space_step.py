@@ -35,10 +35,11 @@ SUPPORT = 200  # points that are moved to see where a density goes
 TRIES = 7
 MARGIN = 0.03  # of the bounds, for a grid of short steps
 ACCEPTED = 3.0  # times the bound on tails, from a density that had such tails before
-REFINED = 1.15  # growth of the logarithm of tails that a finer grid must bring
+HARMFUL = 100.0  # times the bound on tails
 MOST_PARTS = 512
 MOST_ENLARGED = 4.0  # times its own width that a grid may need for the noise of a substep
 NEGLIGIBLE = 1e-40  # of the maximum
+NOISE = 2.0  # the largest noise, as a multiple of the most negative value
 CHECKED = 64  # intervals after which the error of single substeps is measured again
 WORTH, SMALL = 1.5, 0.05  # least order in its length of a small error of a substep for which shorter ones are tried
 _EXTRAPOLATED = 1.0  # the error that extrapolation leaves, as a multiple of difference^(5/3)
@@ -265,22 +266,22 @@ class Stepper:
 
         `tails` (n,) are those of the density at the start of the interval, which no finer grid has made smaller.
         """
-        before, last, coarse = np.ones(field.grid.n), None, np.zeros(field.grid.n, bool)
+        before, last, coarse, ratio = np.ones(field.grid.n), None, np.zeros(field.grid.n, bool), np.ones(field.grid.n)
         for attempt in range(TRIES):
             result, moved = self._apply(field, t0, t1, move, potential)
             found = survey(result.values, result.grid, self.bounds.edge)
             wide = found.edges > 3 * self.bounds.edge
-            if last is not None and coarse.any() and not better(found.tails, before)[coarse].any():
+            if last is not None and coarse.any() and not better(found.tails, before, ratio, self.bounds)[coarse].any():
                 return last  # the finer grid has the same tails
-            coarse = refinable(found.tails, before, tails, self.bounds)
-            if attempt == TRIES - 1 or not (wide.any() or coarse.any()) or not np.isfinite(found.tails).all():
+            coarse = refinable(found.tails, before, ratio, tails, self.bounds)
+            if attempt == TRIES - 1 or not (wide.any() or coarse.any()) or found.tails.max() >= 1.0:
                 break
             ends = 0.2 * np.where(wide, 1.0, 0.0)
             finer = np.where(coarse, np.clip(self.bounds.spacings / deviations_in_spacings(found.tails), 1.1, 2.0), 1.0)
             changed = adjusted(result.grid, ends, ends, finer, self.bounds)
             if changed is None:
                 break
-            before = np.where(coarse, found.tails, before)
+            before, ratio = np.where(coarse, found.tails, before), finer_by(changed, result.grid)
             last = None if wide.any() else (result, moved, grid_report(found))
             move = move._replace(target=changed)
         return result, moved, grid_report(found)
@@ -306,30 +307,36 @@ class Stepper:
         return Field(values, fine.grid, fine.log_scale), first.worst(second), difference
 
 
-def refinable(tails: Array, before: Array, start: Any, bounds: Bounds) -> Array:
+def refinable(tails: Array, before: Array, ratio: Array, start: Any, bounds: Bounds) -> Array:
     """Return along which axes (n,) a finer grid leaves smaller tails of the spectrum; `before` are those of the last grid.
 
-    Small tails that the density had at the `start` need none.
-
-    What interpolation adds to the spectrum does not decrease with the spacing, and what a kink adds decreases slowly: the last
-    grid must have been the reason for a good part of the decrease.
+    Small tails that the density had at the `start` need none.  `ratio` is that of the spacings of the last grid to those of this.
     """
-    return np.asarray((tails > 3 * np.clip(start, bounds.tail, ACCEPTED * bounds.tail)) & better(tails, before))
+    return np.asarray((tails > 3 * np.clip(start, bounds.tail, ACCEPTED * bounds.tail)) & better(tails, before, ratio, bounds))
 
 
-def better(tails: Any, before: Any) -> Array:
-    """Return along which axes a finer grid has smaller tails of the spectrum than the last."""
+def better(tails: Any, before: Any, ratio: Any, bounds: Bounds) -> Array:
+    """Return along which axes spacings that are smaller by a ratio make the tails of the spectrum as small as they should.
+
+    The logarithm of those of a Gaussian grows as the square of the ratio, of an analytic density as the ratio.  What a kink adds
+    to the spectrum decreases as a power of the spacing, which is enough while it is `HARMFUL`; what interpolation adds does not.
+    """
     logs, last = (np.log(np.clip(t, 1e-300, 0.99)) for t in (tails, before))
-    return np.asarray(logs < REFINED * last)
+    return np.asarray(logs < np.maximum(ratio, 1.0) ** np.where(tails > HARMFUL * bounds.tail, 0.2, 0.5) * last)
+
+
+def finer_by(grid: Grid, last: Grid) -> Array:
+    """Return the ratio of the spacings of the last grid to those of a grid along each axis (n,)."""
+    return np.asarray(np.linalg.norm(last.basis, axis=0) / np.linalg.norm(grid.basis, axis=0))
 
 
 def positive(field: Field, bounds: Bounds) -> Field:
     """Return the density without negative values, those of denormal size, and the noise of interpolation.
 
-    The noise is what is not larger than the most negative value.
+    The noise is what is not larger than a few times the most negative value.
     """
     real = field.values.real
-    noise = 0.0 if bounds.band_limited else -real.min()
+    noise = 0.0 if bounds.band_limited else -NOISE * real.min()
     return field._replace(values=np.where(real > max(NEGLIGIBLE * real.max(), noise), field.values, 0.0))
 
 
@@ -392,7 +399,7 @@ def _adaptively(
     makes it, it does not.  No interval has more than about `MOST_PARTS` substeps; its report says what error they make.
     """
     done, length, report, rate = 0.0, 1.0 / parts, NOTHING, 0.0
-    left, before, stalled = MOST_PARTS + 2 * parts, (np.inf, 1.0), False
+    left, before, stalled, growth = MOST_PARTS + 2 * parts, (np.inf, 1.0), False, 3.0
     while done < 1 - 1e-12:
         length = min(max(length, (1 - done) / left), longest, 1 - done)
         if 1 - done - length < 0.3 * length:
@@ -405,13 +412,13 @@ def _adaptively(
         difference = min(difference, 10.0) if np.isfinite(difference) else 10.0
         error = _EXTRAPOLATED * difference ** (5 / 3)
         wanted = allowed * length
-        change = float(np.clip(0.9 * (wanted / max(error, 1e-30)) ** 0.25, 0.2, 3.0))
+        change = float(np.clip(0.9 * (wanted / max(error, 1e-30)) ** 0.25, 0.2, growth))
         left = max(left - 1, 1)
         stalled = stalled or SMALL > difference and error > before[0] * (length / before[1]) ** WORTH
-        if error > 3 * wanted and left > 1 and not stalled:
-            before, length = (error, length), length * min(change, 0.7)
+        if error > 3 * wanted and left > 1 and not (stalled and difference < SMALL):
+            before, length, growth = (error, length), length * min(change, 0.7), 1.0
             continue
         field, report, before = positive(result, stepper.bounds), report.worst(more._replace(splitting=error)), (np.inf, 1.0)
-        rate = max(rate, difference * (4 / 3) / max((tau * length) ** 3, 1e-300))
+        growth, rate = 3.0, max(rate, difference * (4 / 3) / max((tau * length) ** 3, 1e-300))
         done, last, length = done + length, length, length * (max(change, 1.0) if stalled else change)
     return field, report, Control(rate, tau * last, 0)

@@ -16,7 +16,7 @@ from zakai.numerics.space_grid import (
     relative_index,
     triangular_resampled,
 )
-from zakai.numerics.space_step import Field, better, positive, refinable
+from zakai.numerics.space_step import Field, better, finer_by, positive, refinable
 from zakai.numerics.space_survey import deviations_in_spacings, narrowest, survey
 from zakai.numerics.space_window import Bounds, adjusted, fitted_grid, whitened_grid
 
@@ -47,7 +47,7 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
     """
     grid, values = field.grid, field.values
     coefficients: Array | None = None
-    inverse_previous = grid
+    inverse_previous = last = grid
     logs = log_factor(grid).reshape(grid.sizes)
     found, before = None, np.ones(grid.n)
     best: Any = None  # the smallest grid with the smallest edges and tails so far: a later one may be worse
@@ -64,11 +64,15 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
             worst = float(max(found.tails.max(), found.edges.max()))
             span = (found.used[:, 1] - found.used[:, 0] + 4) / np.array(grid.sizes)
             wide = found.edges > 3 * bounds.edge
-            coarse = refinable(found.tails, before, tails, bounds)
+            coarse = refinable(found.tails, before, finer_by(grid, last), tails, bounds)
             good = not wide.any() and found.tails.max() <= 3 * bounds.tail
-            if best is None or good or better(worst, best[0]):
+            if best is not None and not good and not (best[-1].edges > 3 * bounds.edge).any():
+                good = bool(better(worst, best[0], float((best[1].cell / grid.cell) ** (1 / grid.n)), bounds))
+            elif best is not None and not good:
+                good = worst < best[0]
+            if best is None or good:
                 best = worst, grid, values, logs, product, top, found
-            before = np.where(coarse & (attempt > 0), found.tails, before)
+            before, last = np.where(coarse & (attempt > 0), found.tails, before), grid
             sparse = np.array([attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1])
             if not (wide.any() or coarse.any() or sparse.any()):
                 break
