@@ -51,8 +51,8 @@ def joined(parts: Sequence[Infos]) -> Infos:
 
 
 def size_of(state: Any) -> int:
-    """Return the bytes of the arrays of a state."""
-    return sum(size_of(part) if isinstance(part, tuple) else getattr(part, "nbytes", 8) for part in state)
+    """Return the bytes of the arrays of a state, or of several."""
+    return sum(map(size_of, state)) if isinstance(state, tuple | list) else getattr(state, "nbytes", 8)
 
 
 class Run:

@@ -25,6 +25,7 @@ from zakai.engine.results import FilterResult
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
 from zakai.methods._protocol import Infos, stacked
+from zakai.methods._states import Preceded
 from zakai.models.model import Model
 from zakai.records import Record
 
@@ -160,11 +161,11 @@ class SmoothingRun(Run):
 
     def _take(self, states: Sequence[Any], infos: Infos) -> None:
         self.segments.append((self.done, _alone(self.state)))
-        self.held += sum(map(size_of, states))
+        self.held += size_of(states)
         self.after.append(states if self.held < KEPT_BYTES / 4 else None)
         super()._take(states, infos)
 
-    def _segment(self, number: int) -> tuple[range, Any, int, list[Any]]:
+    def _segment(self, number: int) -> tuple[range, Any, int, Sequence[Any]]:
         """Return the intervals of a segment, what is prepared for them and from which interval on, and the states around them."""
         first, state = self.segments[number]
         last = self.segments[number + 1][0] if number + 1 < len(self.segments) else len(self.schedule)
@@ -174,7 +175,7 @@ class SmoothingRun(Run):
         if states is None:
             with np.errstate(all="ignore"):
                 states, _ = advance(self.setting, prepared, slice(first - begin, last - begin), state, self.values[first:last])
-        return range(first, last), prepared, begin, [state, *states]
+        return range(first, last), prepared, begin, Preceded(state, states)
 
     def smooth(self) -> None:
         """Replace the filter's moments by the smoothed ones."""
@@ -196,7 +197,7 @@ class SmoothingRun(Run):
         self.start = info.mean, info.cov
 
     def _backward(
-        self, prepared: Any, rows: slice, states: list[Any], message: Any, observed: range
+        self, prepared: Any, rows: slice, states: Sequence[Any], message: Any, observed: range
     ) -> tuple[Any, Infos]:
         """Return the message at the start of the intervals `rows` of what is prepared, and the smoothed moments after each."""
         values = self.values[observed.start : observed.stop]

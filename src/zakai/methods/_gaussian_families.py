@@ -22,7 +22,8 @@ from zakai.methods._family_prior import prior_families
 from zakai.methods._gauge import Gauge, Posterior, Tilts, posterior, tilts_at
 from zakai.methods._gauged_density import density_of
 from zakai.methods._gaussian_ends import Ends, ends_of
-from zakai.methods._protocol import Info, Infos, LazyStates, stacked
+from zakai.methods._protocol import Info, Infos, stacked
+from zakai.methods._states import StackedStates
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior, MixturePrior
 from zakai.numerics.complex_step import is_complex
@@ -226,12 +227,9 @@ def segment_of_gaussian(prepared: Prepared, rows: slice, state: State, values: A
     means, covs, gains = np.empty((count, 1, n), dtype), np.empty((count, 1, n, n), dtype), np.empty(count, dtype)
     segment(rows.start, mean, cov, *prepared.loop, np.ascontiguousarray(values), means[:, 0], covs[:, 0], gains)
     gains[0] += state.log_mass[0]
-    none, stops = np.zeros(1), prepared.stops[rows]
-
-    def after(i: int) -> State:
-        return state._replace(mean=means[i], cov=covs[i], log_mass=none, time=float(stops[i]))
-
-    return LazyStates(count, after), Infos(gains, means[:, 0] + origin, covs[:, 0], health_of_gaussians(covs[:, 0]))
+    fields = {"mean": means, "cov": covs, "log_mass": np.zeros((count, 1)), "time": prepared.stops[rows].tolist()}
+    infos = Infos(gains, means[:, 0] + origin, covs[:, 0], health_of_gaussians(covs[:, 0]))
+    return StackedStates(state, fields), infos
 
 
 def segment_of_families(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[Sequence[State], Infos]:

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar, overload
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -74,24 +74,6 @@ class Prepared(Protocol):
 P = TypeVar("P", bound=Prepared)
 S = TypeVar("S")
 M = TypeVar("M")
-
-
-class LazyStates(Sequence[S]):
-    """The states of a segment, each made by `make(index)` when it is taken: most calls take the last one only."""
-
-    def __init__(self, count: int, make: Callable[[int], S]):
-        self._count, self._make = count, make
-
-    def __len__(self) -> int:
-        return self._count
-
-    @overload
-    def __getitem__(self, index: int) -> S: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[S]: ...
-    def __getitem__(self, index: int | slice) -> S | list[S]:
-        rows = range(self._count)[index]
-        return self._make(rows) if isinstance(rows, int) else [self._make(row) for row in rows]
 
 
 @dataclass(frozen=True)
