@@ -302,3 +302,37 @@ def test_a_splitting_system_is_fitted_as_the_whole_is():
     assert blocks.converged and blocks.method == "blocks: 3 x kalman-bucy"
     assert np.isclose(blocks.estimates["a"], one.estimates["a"], rtol=0, atol=1e-5)
     assert np.isclose(blocks.standard_errors["a"], one.standard_errors["a"], rtol=1e-3)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_features_of_models_are_those_of_their_blocks(smooth):
+    """Noise that depends on the state, counts and a reflecting end, each in a block of its own."""
+    parts = [
+        {"state": "x", "drift": "1 - x", "diffusion": "0.3*sqrt(1 + x**2)", "observation": "x", "noise": "0.1 + x**2/20"},
+        {"state": "y", "drift": "-y", "diffusion": "1", "observation": "2*exp(y)", "family": "poisson"},
+        {"state": "z", "drift": "-z", "diffusion": "0.5", "observation": "z", "noise": "0.1", "domain": {"lower": 0.0}},
+    ]
+
+    def model(parts):
+        n = len(parts)
+        return zakai.Model(
+            state=[part["state"] for part in parts], drift=[part["drift"] for part in parts],
+            diffusion=[[part["diffusion"] if i == j else "0" for j in range(n)] for i, part in enumerate(parts)],
+            observation=[part["observation"] for part in parts], observation_kind="samples",
+            observation_noise=[[part.get("noise", "1") if i == j else "0" for j in range(n)] for i, part in enumerate(parts)],
+            observation_family=[part.get("family", "gaussian") for part in parts],
+            domain={p["state"]: {**p["domain"], "boundary": "reflecting"} for p in parts if "domain" in p},
+            prior={"kind": "gaussian", "mean": [1.0] * n, "cov": (0.01 * np.eye(n)).tolist()},
+        )  # fmt: skip
+
+    parts = parts[:2] if smooth else parts  # reflecting ends have no smoother
+    whole, run = model(parts), zakai.smooth if smooth else zakai.filter
+    _, record = zakai.simulate(whole, np.arange(1, 11) / 5, seed=2)
+    values = record.values.copy()
+    values[3, 0] = values[5:7, 1] = np.nan
+    result = run(whole, zakai.Record(record.times, values, "samples"))
+    assert [block.state for block in result.blocks] == [(part["state"],) for part in parts]
+    for i, part in enumerate(parts):
+        alone = run(model([part]), zakai.Record(record.times, values[:, [i]], "samples"))
+        assert np.array_equal(result.mean[:, i], alone.mean[:, 0])
+        assert np.array_equal(result.variance[:, i], alone.variance[:, 0])

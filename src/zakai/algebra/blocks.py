@@ -10,7 +10,22 @@ from typing import Any
 import sympy as sp
 
 from zakai.algebra.identities import tidy
+from zakai.models.features import (
+    DOMAIN,
+    JUMPS,
+    KINKS,
+    OBSERVATION_FAMILY,
+    SINC,
+    STATE_DEPENDENT_DIFFUSION,
+    STATE_DEPENDENT_OBSERVATION_NOISE,
+    TABLES,
+)
 from zakai.models.model import Model
+
+# The features with which a model is divided.
+DIVIDED = frozenset(
+    {STATE_DEPENDENT_DIFFUSION, STATE_DEPENDENT_OBSERVATION_NOISE, OBSERVATION_FAMILY, DOMAIN, TABLES, KINKS, JUMPS, SINC}
+)
 
 
 @dataclass(frozen=True)
@@ -72,20 +87,50 @@ class Groups:
 
 def connected(model: Model, join: Callable[[Groups], None] | None = None) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
     """The places of the states and of the observations of each connected part; `more` may join some."""
-    if model.features:
+    if not model.features.keys() <= DIVIDED:
         return [(tuple(range(model.n)), tuple(range(model.m)))]
     groups, place = Groups(model), {symbol: i for i, symbol in enumerate(model.x)}
-    for i, formula in enumerate([*model.drift, *model.observation]):
+
+    def join_used(node: int, formula: sp.Expr) -> None:
         used = [place[symbol] for symbol in formula.free_symbols if symbol in place]
         if used:
-            groups.join([i, *used])
+            groups.join([node, *used])
+
+    for i, formula in enumerate([*model.drift, *model.observation]):
+        join_used(i, formula)
+    for (_, row), formula in model.family_parameters.items():
+        join_used(model.n + row, formula)
     for matrix, first in ((model.covariance, 0), (model.observation_noise, model.n)):
         for (i, j), entry in matrix.todok().items():
+            join_used(first + i, entry)
             if i < j and tidy(entry) != 0:
                 groups.join((first + i, first + j))
     if join is not None:
         join(groups)
     return groups.parts()
+
+
+def _noise(model: Model, states: tuple[int, ...]) -> dict[str, Any]:
+    """Return the noise of some states: their block of G, or their rows of g and the noises in them where g has states."""
+    if STATE_DEPENDENT_DIFFUSION not in model.features:
+        return {"process_noise": model.covariance.extract(states, states).tolist()}
+    rows = model.diffusion.extract(states, range(model.diffusion.cols))
+    used = [j for j in range(rows.cols) if any(entry != 0 for entry in rows[:, j])] or [0]
+    noise = model.process_noise.extract(used, used)
+    return {"diffusion": rows.extract(range(len(states)), used).tolist(), "process_noise": noise.tolist()}
+
+
+def _families(model: Model, rows: tuple[int, ...]) -> dict[str, Any]:
+    """Return the families of some observations, with their parameters."""
+    families = [model.observation_family[row] for row in rows]
+    if set(families) <= {"gaussian"}:
+        return {}
+    keys: dict[str, Any] = {"observation_family": families}
+    for name in dict.fromkeys(name for name, _ in model.family_parameters):
+        given = [model.family_parameters[name, row] for row in rows if (name, row) in model.family_parameters]
+        if given:
+            keys[name] = given
+    return keys
 
 
 def part_of(model: Model, states: tuple[int, ...], rows: tuple[int, ...], prior: Any = None) -> Model:
@@ -98,7 +143,7 @@ def part_of(model: Model, states: tuple[int, ...], rows: tuple[int, ...], prior:
         "name": f"{model.name}: {', '.join(names)}",
         "state": names,
         "drift": [model.drift[i] for i in states],
-        "process_noise": model.covariance.extract(states, states).tolist(),
+        **_noise(model, states),
         "observation": observed,
         "observation_noise": model.observation_noise.extract(rows, rows).tolist() if rows else None,
         "observation_kind": model.observation_kind,
@@ -107,5 +152,8 @@ def part_of(model: Model, states: tuple[int, ...], rows: tuple[int, ...], prior:
         "parameters": model.parameters,
         "functions": model.functions,
         "prior": prior,
+        "domain": {name: interval.keys() for name, interval in model.domain.items() if name in names},
+        "tables": {name: table.keys() for name, table in model.tables.items()},
+        **_families(model, rows),
     }
     return Model._from_file(keys, f"{model.source}: block {', '.join(names)}", None)

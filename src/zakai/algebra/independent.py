@@ -176,11 +176,14 @@ def _formulas(model: Model, states: tuple[int, ...], rows: tuple[int, ...], prio
     # No name of a user's begins like this.
     renamed = {**values, **{model.x[i]: sp.Symbol(f"_{k}", real=True) for k, i in enumerate(states)}}
     matrices = [model.covariance.extract(states, states), model.observation_noise.extract(rows, rows)]
+    families = tuple(model.observation_family[i] for i in rows)
+    kinds = families, tuple(model.domain.get(model.state[i]) for i in states)
     formulas = [
         *(model.drift[i] for i in states),
         *(model.observation[i] for i in rows),
         *(entry for matrix in matrices for entry in matrix),
+        *(formula for (_, i), formula in model.family_parameters.items() if i in rows),
         *([prior.log_density] if isinstance(prior, DensityPrior) else []),
     ]
     angles = tuple(model.state[i] in model.periodic for i in states)
-    return len(states), len(rows), type(prior), angles, tuple(formula.xreplace(renamed) for formula in formulas)
+    return len(states), len(rows), type(prior), angles, kinds, tuple(formula.xreplace(renamed) for formula in formulas)
