@@ -159,7 +159,7 @@ PLANE = """
 state = ["x", "y"]
 drift = ["1 - x", "-y"]
 diffusion = [["x/2", "0"], ["0", "1"]]
-observation = ["x"]
+observation = ["x + y"]
 observation_kind = "samples"
 
 [domain]
