@@ -23,6 +23,7 @@ from zakai.methods._line_cross import OMITTED
 from zakai.methods._line_domain import on_the_line, variable_of
 from zakai.methods._line_model import System
 from zakai.methods._line_moves import Report, by_kernel, by_substeps
+from zakai.methods._line_prior import averaged
 from zakai.methods._line_system import (
     NOISE,
     Prepared,
@@ -51,6 +52,7 @@ Array = Any
 # exceeds the mass, since the coefficients of the variable w grow exponentially.
 CUT_OF_DOMAIN = 1e-8
 
+SMOOTH = 1e-6  # spectrum at the end of that of a prior beyond which it is averaged around the grid points
 GENEROUS = 96  # points of a grid that is kept though fewer would do
 
 
@@ -108,7 +110,8 @@ def init(prepared: Prepared, prior: Any) -> State:
         tolerance = 1e-12 if variable is None else cut
         grid = prior_grid(lambda points: evaluate(points).real, 1, [closed], tolerance=tolerance)
         low, high = (float(grid.points[i, 0]) for i in (0, -1))
-        spacing = float(grid.basis[0, 0])
+        # Rather too coarse than without a part of the mass.
+        spacing = max(float(grid.basis[0, 0]), (high - low) / (lw.SIZES[-1] - 2 * lw.ALIGNMENT))
     else:
         depth = float(np.sqrt(-2.0 * np.log(cut))) + 0.1
         low, high = float(np.min(means[:, 0] - depth * deviations)), float(np.max(means[:, 0] + depth * deviations))
@@ -134,6 +137,8 @@ def init(prepared: Prepared, prior: Any) -> State:
         if new == window or attempt == 7:  # the values belong to this window
             break
         window = new
+    if log_density is None and not closed and look.aliasing > SMOOTH:
+        values = averaged(evaluate, window)
     return _state(values, window, max(0.0, look.aliasing - 1e-12), -700.0)
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from zakai.errors import InputError
 
 Array = np.ndarray
-_SEARCH_STEPS = 150
+# Widenings of a step by one half: at a jump the search ends with steps as small as 1e-50.
+_SEARCH_STEPS, _WIDENINGS = 150, 400
 _FARTHEST = 1e13
 
 
@@ -65,7 +66,7 @@ def box_of_peaks(
     for i in np.flatnonzero(~np.array(angles)):
         for sign in (-1.0, 1.0):
             reach = steps[:, i].copy()
-            for _ in range(120):
+            for _ in range(_WIDENINGS):
                 end = x.copy()
                 end[:, i] += sign * reach
                 grows = value(end) >= best.max() - depth
