@@ -46,3 +46,22 @@ def test_auto_goes_on_where_a_method_loses_the_prior():
     near = certain.with_prior({"kind": "gaussian", "mean": [0.3], "cov": [[1e-8]]})
     other = zakai.filter(near, record, "limited-direct")
     np.testing.assert_allclose(result.mean, other.mean, atol=1e-3 * np.sqrt(other.variance[-1, 0]))
+
+
+def test_auto_leaves_a_method_that_loses_a_formula_s_density():
+    model = zakai.Model(
+        state=["x", "y"], drift=["y - x", "-y"], observation=["x"],
+        prior={"kind": "density", "log_density": "-x**2/2 - y**2/2 + log(heaviside(x))"},
+    )  # fmt: skip
+    start = zakai.online(model)
+    assert start.last.mean[0] == pytest.approx(np.sqrt(2 / np.pi), abs=0.02)
+    assert start.last.cov[0, 0] == pytest.approx(1 - 2 / np.pi, abs=0.02)
+
+
+@pytest.mark.parametrize("variance", [0.3, 30.0])
+def test_auto_keeps_the_first_method_for_an_angle_of_any_width(variance):
+    model = zakai.Model(
+        state=["x"], drift=["1"], observation=["sin(x)", "cos(x)"], periodic=["x"],
+        prior={"kind": "gaussian", "mean": [3], "cov": [[variance]]},
+    )  # fmt: skip
+    assert zakai.online(model).method == "limited-direct"

@@ -17,9 +17,11 @@ from zakai.engine.loop import KEPT_BYTES, Run
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
+from zakai.methods._moments import prior_moments
 from zakai.methods._protocol import Method
 from zakai.models.model import Model
-from zakai.models.prior import GaussianPrior, MixturePrior
+from zakai.models.prior import DensityPrior, GaussianPrior
+from zakai.numerics.gaussian_sum import wrapped
 from zakai.records import Record
 
 
@@ -64,7 +66,10 @@ class ByBlocks(NamedTuple):
 
 
 Plan = Whole | ByBlocks
-_KEPT_PRIOR = 1e-3  # difference of moments, in deviations and relative, beyond which "auto" takes another method
+# Differences of moments, in deviations and relative, beyond which "auto" takes another method: of a prior whose moments are
+# known, and of a formula, whose own are sums over a grid.
+_KEPT_PRIOR, _KEPT_FORMULA = 1e-3, 2e-2
+_NARROW = 0.3  # variance of an angle up to which its moments hardly depend on whether they are wrapped
 
 
 def _with_origin(result: FilterResult, plan: Plan, runs: Sequence[Run]) -> FilterResult:
@@ -129,7 +134,7 @@ def _whole(
 
 
 def _fault_at_prior(setting: Setting) -> str:
-    """Return how a method's density at the start differs from the prior, or nothing; a formula's moments are not compared."""
+    """Return how a method's density at the start differs from the prior, or nothing."""
     prior, model = setting.prior, setting.model
     try:
         with np.errstate(all="ignore"):
@@ -140,13 +145,15 @@ def _fault_at_prior(setting: Setting) -> str:
         return f"loses the density at the prior: {wrong}"
     if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
         return "loses the density at the prior: it is not finite"
-    if not isinstance(prior, GaussianPrior | MixturePrior) or model.periodic:
+    if isinstance(prior, DensityPrior) and model.n > 2:
         return ""
-    expected, spread = np.asarray(prior.mean), np.diag(prior.cov)
-    wide = spread > 0
-    apart = np.abs(mean - expected)[wide] / np.sqrt(spread[wide])
+    expected, cov_of_prior = prior_moments(model, prior, setting.theta.real)
+    spread, angle = np.diag(cov_of_prior), np.array([name in model.periodic for name in model.state])
+    wide = (spread > 0) & ~(angle & (spread > _NARROW))
+    apart = np.abs(wrapped(mean - expected, tuple(np.flatnonzero(angle).tolist())))[wide] / np.sqrt(spread[wide])
     off = max(apart.max(initial=0.0), np.abs(np.diag(cov)[wide] / spread[wide] - 1.0).max(initial=0.0))
-    return f"loses the density at the prior: its moments are off by {off:.1g} deviations" if off > _KEPT_PRIOR else ""
+    kept = _KEPT_FORMULA if isinstance(prior, DensityPrior) else _KEPT_PRIOR
+    return f"loses the density at the prior: its moments are off by {off:.1g} deviations" if off > kept else ""
 
 
 def _own_options(methods: Sequence[Method[Any, Any]], options: Mapping[str, Any]) -> list[dict[str, Any]]:
