@@ -52,7 +52,11 @@ def test_sine_and_cosine_samples_of_two_states_agree_with_the_exact_density():
 
 def test_a_mirrored_mode_is_kept_and_the_sum_stays_symmetric():
     model = zakai.Model(
-        state=["x"], drift=["-x/5"], observation=["x**2"], observation_noise=[["0.05"]], observation_kind="samples",
+        state=["x"],
+        drift=["-x/5"],
+        observation=["x**2"],
+        observation_noise=[["0.05"]],
+        observation_kind="samples",
         prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
     )
     _, record = zakai.simulate(model, np.arange(1, 41) * 0.1, seed=3)
@@ -82,7 +86,10 @@ def test_an_affine_observation_of_the_benes_system_is_exact_once_the_start_is_cu
 @pytest.mark.parametrize(("variance", "step"), [(1e-8, 1e-6), (1e8, 0.1), (1.0, 10.0)])
 def test_extreme_variances_and_steps_give_numbers_and_positive_variances(variance, step):
     model = zakai.Model(
-        state=["x"], drift=["t/40 * x"], observation=["x*sin(x)", "x*cos(x)"], observation_kind="increments",
+        state=["x"],
+        drift=["t/40 * x"],
+        observation=["x*sin(x)", "x*cos(x)"],
+        observation_kind="increments",
         prior={"kind": "gaussian", "mean": [0.1], "cov": [[variance]]},
     )
     values = np.array([[0.3, -0.2], [0.1, 0.4], [-0.2, 0.1]]) * np.sqrt(min(step, 1.0))
@@ -171,8 +178,7 @@ VARIANCES = [1e-8, 1e-4, 1e-2, 1.0, 10.0, 1e2, 1e4, 1e6, 1e8]
 
 @pytest.mark.parametrize(
     ("variance", "step"),
-    [(v, 0.01) for v in VARIANCES]
-    + [(v, h) for v in VARIANCES for h in (1e-6, 10.0)],
+    [(v, 0.01) for v in VARIANCES] + [(v, h) for v in VARIANCES for h in (1e-6, 10.0)],
 )
 def test_a_prior_of_any_width_over_the_bend_of_the_gauge_is_right_or_warned_of(variance, step):
     model, record = benes(variance), record_of(step)
@@ -202,3 +208,25 @@ def test_points_of_no_variance_are_put_together_without_a_division_by_zero():
     assert np.isfinite(result.mean).all() and result.mean[0, 0] == pytest.approx(0.83, abs=0.01)
 
 
+@pytest.mark.parametrize("kind", ["samples", "increments"])
+def test_long_gaps_of_an_unstable_state_keep_the_digits(kind):
+    model = zakai.Model(
+        state=["x"], drift=["x"], observation=["x"], observation_kind=kind, observation_noise=[["0.5"]],
+        prior={"kind": "gaussian", "mean": [1.0], "cov": [[1.3]]},
+    )  # fmt: skip
+    times, values = [1.0, 2.0, 15.0, 15.5], [2.0, 4.0, 7.0, 12.0]
+    result = zakai.filter(model, zakai.Record(times, np.array(values)[:, None], kind), "general-direct")
+    if kind == "increments":
+        other = zakai.filter(model, zakai.Record(times, np.array(values)[:, None], kind), "kalman-bucy")
+        assert np.allclose(result.mean, other.mean, rtol=1e-6) and np.allclose(result.variance, other.variance, rtol=1e-6)
+        assert result.log_likelihood == pytest.approx(other.log_likelihood, rel=1e-6)
+        return
+    mean, variance, before, total = 1.0, 1.3, 0.0, 0.0
+    for k, (time, value) in enumerate(zip(times, values, strict=True)):
+        growth = np.exp(time - before)
+        mean, variance, before = growth * mean, growth**2 * variance + (growth**2 - 1) / 2, time
+        total -= 0.5 * ((value - mean) ** 2 / (variance + 0.5) + np.log(2 * np.pi * (variance + 0.5)))
+        mean, variance = (0.5 * mean + variance * value) / (variance + 0.5), 0.5 * variance / (variance + 0.5)
+        assert result.mean[k + 1, 0] == pytest.approx(mean, rel=1e-6)
+        assert result.variance[k + 1, 0] == pytest.approx(variance, rel=1e-6)
+    assert result.log_likelihood == pytest.approx(total, rel=1e-6)

@@ -86,7 +86,7 @@ def test_an_affine_likelihood_is_bayes_rule():
     root = rng.normal(size=(2, 3, 3))
     prior = components(np.zeros(2), rng.normal(size=(2, 3)), root @ np.swapaxes(root, 1, 2))
     C, c, z, S = rng.normal(size=(2, 3)), rng.normal(size=2), rng.normal(size=2), np.array([[0.5, 0.1], [0.1, 0.3]])
-    found = refit_affine(prior, np.zeros(3), 0.0, C, c - z, np.linalg.inv(S))
+    found = refit_affine(prior, C, c - z, np.linalg.inv(S))
     for k in range(2):
         m, P = prior.means[k], prior.covs[k]
         gain = P @ C.T @ np.linalg.inv(C @ P @ C.T + S)

@@ -37,6 +37,7 @@ from zakai.numerics.sum_quadrature import (
     refit,
     refit_affine,
     rows_of,
+    tilted,
     together,
     without_loss,
 )
@@ -193,9 +194,9 @@ class Moment(NamedTuple):
         for j, t in enumerate(factor.times):
             C, c = static.system.slope(t, theta)
             if linear is not None:
-                v = refit_affine(v, linear[j] @ C, linear[j] @ c, C, c, None)
+                v = tilted(v, linear[j] @ C, linear[j] @ c)
             if energy is not None:
-                v = refit_affine(v, np.zeros(C.shape[1]), 0.0, C, c - target, energy[j])
+                v = refit_affine(v, C, c - target, energy[j])
         return without_loss(v._replace(log_weights=v.log_weights + constant))
 
     def update(

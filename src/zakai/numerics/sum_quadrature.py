@@ -220,25 +220,25 @@ def _rebalanced(old: Components, new: Components, x: Array, values: Array, rule:
     return new._replace(log_weights=new.log_weights + np.log1p(change) - np.log1p(np.sum(share * change)))
 
 
-def refit_affine(sum_: Components, slope: Array, constant: Any, C: Array, c: Array, energy: Array | None) -> Components:
-    """Return the sum times exp(slope.x + constant - h'(energy) h / 2), exactly, for h = C x + c."""
-    K, n = sum_.means.shape
-    if energy is None:
-        across = product(sum_.covs, slope[:, None])[..., 0]
-        logs = sum_.means @ slope + 0.5 * across @ slope + constant
-        return sum_._replace(log_weights=sum_.log_weights + logs, means=sum_.means + across)
+def tilted(sum_: Components, slope: Array, constant: Any) -> Components:
+    """Return the sum times exp(slope.x + constant), exactly."""
+    across = product(sum_.covs, slope[:, None])[..., 0]
+    logs = sum_.means @ slope + 0.5 * across @ slope + constant
+    return sum_._replace(log_weights=sum_.log_weights + logs, means=sum_.means + across)
+
+
+def refit_affine(sum_: Components, C: Array, c: Array, energy: Array) -> Components:
+    """Return the sum times exp(-h'(energy) h / 2), exactly, for h = C x + c."""
     centre = sum_.means @ C.T + c
-    pull = centre @ energy
-    gradient = slope - pull @ C
     spread = product(sum_.covs, C.T)
-    # P (1 + C'E C P)^-1, by the smaller system in the observations.
+    # (E^-1 + C P C')^-1: no difference of large numbers where a component is far wider than what the observation leaves.
     inner = np.eye(len(c)) + (energy @ C) @ spread
-    gain = spread @ solve(inner, np.broadcast_to(energy, (K, *energy.shape)))
-    covs = symmetric(sum_.covs - gain @ np.swapaxes(spread, 1, 2))
-    shift = dot(covs, gradient[:, None, :])
-    logs = sum_.means @ slope + constant - 0.5 * dot(centre, pull) + 0.5 * dot(gradient, shift)
-    logs = logs - 0.5 * log_determinant(inner)
-    return Components(sum_.log_weights + logs, sum_.means + shift, covs, sum_.signs)
+    precision = solve(inner, np.broadcast_to(energy, (len(centre), *energy.shape)))
+    pull = dot(precision, centre[:, None, :])
+    logs = -0.5 * (dot(centre, pull) + log_determinant(inner))
+    across = product(sum_.covs, C.T @ energy @ C)
+    covs = symmetric(solve(np.eye(C.shape[1]) + across, sum_.covs))
+    return Components(sum_.log_weights + logs, sum_.means - dot(spread, pull[:, None, :]), covs, sum_.signs)
 
 
 def _divergence(logs: Array, values: Array, z: Array, log_mass: Array, cov: Array) -> Array:
