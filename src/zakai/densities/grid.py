@@ -74,36 +74,45 @@ class GridDensity(WeightedPoints):
         nearest = np.rint(index).astype(int) + shape // 2
         inside = np.all((nearest >= 0) & (nearest < shape) | np.array(self._closed), axis=1)
         nearest = np.where(self._closed, np.mod(nearest, shape), np.clip(nearest, 0, shape - 1))
-        at = tuple(nearest.T)
-        floor = np.max(self.log_values) - 700.0
+        top = np.max(self.log_values)
+        floor = top - 700.0
         logs = np.maximum(self.log_values, floor)
-        level = logs[at]
-        plain = np.broadcast_to(logs, (len(index), *shape)) - level.reshape(-1, *([1] * len(shape)))
-        tilted = plain
-        kernels = []
-        for axis, size in enumerate(shape):
-            distance = np.arange(size) - size // 2 - index[:, axis][:, None]
-            view = [-1] + [size if a == axis else 1 for a in range(len(shape))]
-            if self._closed[axis]:
-                kernels.append(dirichlet(index[:, axis], size).reshape(view))
-                continue
-            kernels.append(np.sinc(distance).reshape(view))
-            if size > 1:
-                slope = np.gradient(logs, axis=axis)[at]
-                tilted = tilted - (slope[:, None] * distance).reshape(view)
+        level = logs[tuple(nearest.T)]
+        kernels = [interpolation(column, size, closed) for column, size, closed in zip(index.T, shape, self._closed, strict=True)]
         # Rounding of the largest term matters only where the density is below 1e-11 of it; there the slope is taken out.
+        deep = top - level > 25.0
+        total = kernels[0] @ np.exp(logs - top)
+        if len(kernels) == 2:
+            total = np.einsum("pj,pj->p", total, kernels[1])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            result = top + np.log(np.where(total > 0, total, np.nan))
+        if deep.any():
+            tail = [kernel[deep] for kernel in kernels]
+            result[deep] = self._in_tails(logs, nearest[deep], index[deep], level[deep], tail)
+        return np.where(inside & (level > floor), np.where(np.isfinite(result), result, level), -np.inf)
+
+    def _in_tails(
+        self, logs: np.ndarray, nearest: np.ndarray, index: np.ndarray, level: np.ndarray, kernels: list[np.ndarray]
+    ) -> np.ndarray:
+        """The interpolant relative to the nearest value, after the slope there was taken out if that lowers the largest term."""
+        shape, at = logs.shape, tuple(nearest.T)
+        plain = np.broadcast_to(logs, (len(index), *shape)) - level.reshape(-1, *([1] * len(shape)))
+        tilted, views = plain, []
+        for axis, size in enumerate(shape):
+            views.append([-1] + [size if a == axis else 1 for a in range(len(shape))])
+            if size > 1 and not self._closed[axis]:
+                slope = np.gradient(logs, axis=axis)[at]
+                distance = np.arange(size) - size // 2 - index[:, axis][:, None]
+                tilted = tilted - (slope[:, None] * distance).reshape(views[axis])
         axes = tuple(range(1, plain.ndim))
-        deep = plain.max(axis=axes) > 25.0
-        better = (deep & (tilted.max(axis=axes) < plain.max(axis=axes))).reshape(-1, *([1] * len(shape)))
+        better = (tilted.max(axis=axes) < plain.max(axis=axes)).reshape(-1, *([1] * len(shape)))
         values = np.exp(np.minimum(np.where(better, tilted, plain), 600.0))
-        for kernel in kernels:
-            values = values * kernel
+        for kernel, view in zip(kernels, views, strict=True):
+            values = values * kernel.reshape(view)
         total = values.reshape(len(index), -1).sum(axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             result = level + np.log(np.where(total > 0, total, np.nan))
-        result = np.where(np.isfinite(result), result, level)
-        result = np.where(deep, self._bounded(logs, nearest, index, level, result), result)
-        return np.where(inside & (level > floor), result, -np.inf)
+        return self._bounded(logs, nearest, index, level, np.where(np.isfinite(result), result, level))
 
     def _bounded(
         self, logs: np.ndarray, nearest: np.ndarray, index: np.ndarray, level: np.ndarray, result: np.ndarray
@@ -136,10 +145,7 @@ class GridDensity(WeightedPoints):
         shape = np.array(self.log_values.shape)
         inside = np.all((index > -0.5 - shape // 2) & (index < shape - shape // 2 - 0.5) | np.array(self._closed), axis=1)
         index = np.where(inside[:, None], index, 0.0)
-        kernels = []
-        for axis, size in enumerate(shape):
-            distance = np.arange(size) - size // 2 - index[:, axis][:, None]
-            kernels.append(dirichlet(index[:, axis], size) if self._closed[axis] else np.sinc(distance))
+        kernels = [interpolation(column, size, closed) for column, size, closed in zip(index.T, shape, self._closed, strict=True)]
         top = np.max(self.log_values)
         values = np.exp(self.log_values - top).reshape(shape[0], -1)
         plane = (kernels[0] @ values).reshape(-1, *shape[1:])
@@ -275,15 +281,21 @@ class GridDensity(WeightedPoints):
         return np.where(self.periodic, wrap(x), x)
 
 
-def dirichlet(index: np.ndarray, size: int) -> np.ndarray:
-    """Return the trigonometric interpolation kernel at places (P,) of a circle of points -(size // 2), ..., as (P, size)."""
+def interpolation(index: np.ndarray, size: int, closed: bool) -> np.ndarray:
+    """Return the interpolation kernel at places (P,) of the points -(size // 2), ..., as (P, size).
+
+    It is that of trigonometric polynomials on a circle, and sin(pi d) / (pi d) on a line.
+    """
     nearest = np.rint(index)
     rest = (index - nearest)[:, None]
-    # Distances around the circle are whole cells less the rest; the sine of pi times them is that of the rest but for its sign.
-    cells = np.mod(np.arange(size) + size // 2, size) - size // 2
-    signs = np.where(cells % 2, 1.0, -1.0)
-    to_point = np.arange(size) - np.mod(nearest.astype(int) + size // 2, size)[:, None]  # negative ones count from the end
-    angle = np.pi / size * (cells[to_point] - rest)
+    # The sine of pi times a distance, of whole cells and a rest, is that of the rest but for its sign.
+    if closed:
+        cells = np.mod(np.arange(size) + size // 2, size) - size // 2
+        to_point = np.arange(size) - np.mod(nearest.astype(int) + size // 2, size)[:, None]  # negative ones count from the end
+        angle = np.pi / size * (cells[to_point] - rest)
+        signs, length = np.where(cells % 2, 1.0, -1.0)[to_point], size * (np.sin(angle) if size % 2 else np.tan(angle))
+    else:
+        signs = np.where((np.arange(size) - size // 2) % 2, 1.0, -1.0) * np.where(nearest % 2, -1.0, 1.0)[:, None]
+        length = np.pi * (np.arange(size) - size // 2 - index[:, None])
     with np.errstate(divide="ignore", invalid="ignore"):
-        value = signs[to_point] * np.sin(np.pi * rest) / (size * (np.sin(angle) if size % 2 else np.tan(angle)))
-    return np.where(angle == 0.0, 1.0, value)
+        return np.where(length == 0.0, 1.0, signs * np.sin(np.pi * rest) / length)
