@@ -3,7 +3,7 @@
     python benchmarks/figures.py [--only WORD ...] [--repeats 3] [--write]
 
 Each system filters a record with the default settings, and the same record again: the first call compiles and prepares, the
-later ones are measured (processor time, the smallest of `--repeats`; the first where it takes ten seconds). The bootstrap
+later ones are measured (processor time, the smallest of `--repeats`, of one where it takes ten seconds). The bootstrap
 particle filter of `first_answer.py` (10,000 particles, plain NumPy) filters the same record once. `distance` is the largest
 distance of the last means of the two filters in posterior standard deviations; the error of the particle filter alone is some
 hundredths. `error` is the largest `error_estimate` of the result. With `--write` the table replaces that of the page.
@@ -49,10 +49,8 @@ def row_of(name: str, system: System, repeats: int) -> tuple[str, ...]:
     _, record = zakai.simulate(model, times, seed=2)
     missing = np.random.default_rng(2).random(record.values.shape) < system.missing
     record = zakai.Record(times, np.where(missing, np.nan, record.values), record.kind)
-    begin = time.process_time()
-    result = zakai.filter(model, record)
-    first, seconds = time.process_time() - begin, []
-    while len(seconds) < repeats and sum(seconds) + first < LONG:
+    result, seconds = zakai.filter(model, record), []
+    while not seconds or (len(seconds) < repeats and sum(seconds) < LONG):
         begin = time.process_time()
         zakai.filter(model, record)
         seconds.append(time.process_time() - begin)
@@ -64,7 +62,7 @@ def row_of(name: str, system: System, repeats: int) -> tuple[str, ...]:
     errors = result.health.get("error_estimate")
     error = "exact" if errors is None else f"{np.nanmax(errors):.0e}"
     what = f"{name} (gallery)" if isinstance(system.model, str) else name
-    ours, theirs = per * min(seconds, default=first), per * particles
+    ours, theirs = per * min(seconds), per * particles
     apart = f"{distance(system, last):.3f}"
     return what, result.method, str(model.n), str(len(record)), f"{ours:,.0f}", f"{theirs:,.0f}", apart, error
 
