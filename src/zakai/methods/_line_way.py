@@ -13,13 +13,13 @@ import numpy as np
 
 from zakai.methods import _line
 from zakai.methods._line_coefficients import coefficients, offset_of, resolved_parts
-from zakai.methods._line_gauge import Gauge, gauge_of, generator
+from zakai.methods._line_gauge import Gauge, derivative, gauge_of, generator
 from zakai.methods._line_message import FEWEST, PAD, Message, covering, points_of, reliable, support, taper
 from zakai.methods._line_moves import MAGNUS, Report
 from zakai.methods._line_system import Prepared, State, covariance_at
 from zakai.methods._line_volumes import pulled_back
 from zakai.numerics import line_window as lw
-from zakai.numerics.line_operator import exponential_action
+from zakai.numerics.line_operator import Spectral, exponential_action
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 
 Array = Any
@@ -28,6 +28,8 @@ MOST_SUBSTEPS = 500
 NOISE = 1e-11  # of the maximum: what is rounding in psi
 EXCURSION = 3.9  # standard deviations of the noise that a path between two points goes beyond them, but for exp(-30)
 RESOLVED = 0.25  # spacing in standard deviations of the noise
+DIVISIONS = (1, 2, 4, 8, 16, 32)  # parts of an interval in which an increment acts
+DIVIDED = 1e-2  # of the tolerance that they may leave
 WIDTH = 0.8  # spacing in standard deviations of a Gaussian kernel at which sums are integrals
 MOST_POINTS = 4000  # of such sums
 
@@ -35,6 +37,13 @@ MOST_POINTS = 4000  # of such sums
 def negligible(prepared: Prepared) -> float:
     """Return the values relative to the maximum that do not count."""
     return float(np.clip(1e-5 * prepared.tolerance, 1e-13, 1e-10))
+
+
+def _decayed(values: Array, modes: Spectral, length: float) -> tuple[Array, float]:
+    """Return exp(tau A) of values by a decomposition, and its rounding."""
+    decay = np.exp(-length * modes.rates)
+    noise = 4e-16 * float(np.sqrt(np.sum(values * values))) * max(1.0, float(decay.max()))
+    return modes.modes @ (decay * (modes.modes.T @ values)), noise
 
 
 class Way:
@@ -183,10 +192,8 @@ class Way:
         """Return psi at the start of a substep, the logarithm of its scale, and its error; None asks for a shorter substep."""
         prepared, inside, length = self.prepared, self.inside, last - first
         steady = not prepared.system.varying
-        if steady and gauge.modes is not None and not inside.any():
-            decay = np.exp(-length * gauge.modes.rates)
-            moved = gauge.modes.modes @ (decay * (gauge.modes.modes.T @ values))
-            noise = 4e-16 * float(np.sqrt(np.sum(values * values))) * max(1.0, float(decay.max()))
+        if gauge.modes is not None and not inside.any():
+            moved, noise = _decayed(values, gauge.modes, length)
             return moved, 0.0, noise / float(np.max(moved))
         times = self.start + first + length * (np.full(1, 0.5) if steady else GAUSS_NODES)
         drift, covariance, potential, constant = coefficients(prepared, window, times, inside, self.rates, values)
@@ -195,6 +202,10 @@ class Way:
         offset, split = offset_of(sum(weights) @ potential, values)
         if split or any(np.any(w @ covariance < 0) for w in weights):
             return None
+        if gauge.modes is not None:
+            divided = self._divided(values, window, gauge, length, length * potential[0] - offset, covariance[0])
+            if divided is not None:
+                return divided[0], offset + length * float(constant[0]), divided[1]
         parts = [generator(window, gauge, drift, covariance, w) + np.diag(w @ potential - offset / len(weights)) for w in weights]
         error = 0.0
         if not steady:  # what the commutator-free integrator of order four omits, as in the filter
@@ -210,11 +221,46 @@ class Way:
             error += more
         return moved, offset + float(sum(weights) @ constant), error
 
+    def _divided(
+        self, values: Array, window: lw.Window, gauge: Gauge, length: float, weight: Array, covariance: Array
+    ) -> tuple[Array, float] | None:
+        """Return psi at the start and its rounding; the logarithm b of the weight of the increment acts in parts.
+
+            e^(b / 6) D e^(2 b / 3 - tau G b'^2 / 72) D e^(b / 6),    D = exp(tau A / 2)
+
+        in each of s parts, of fourth order in tau (Chin 1997, scheme A), with more parts until they agree.
+        """
+        modes, at_start = gauge.modes, self._weights(window, gauge)
+        assert modes is not None
+        curved = covariance * derivative(weight, window.spacing, window.closed) ** 2
+        before, noise = None, 0.0
+        for count in DIVISIONS:
+            part = length / count
+            edge = np.exp(weight / (6.0 * count))
+            middle = np.exp(2.0 * weight / (3.0 * count) - part * curved / (72.0 * count**2))
+            now = values
+            for _ in range(count):
+                half, one = _decayed(edge * now, modes, 0.5 * part)
+                now, two = _decayed(middle * half, modes, 0.5 * part)
+                now = edge * now
+                noise = max(noise, one, two)
+            if before is not None:
+                error = float(at_start @ np.abs(now - before)) / (15.0 * float(at_start @ now))
+                if error < DIVIDED * self.prepared.tolerance:
+                    self.error += error
+                    now = now + (now - before) / 15.0
+                    return now, count * noise / float(np.max(now))
+            before = now
+        return None
+
+    def _weights(self, window: lw.Window, gauge: Gauge) -> Array:
+        """Return what psi is multiplied by in the product with the density at the start (N,)."""
+        density = reliable(self.state, window)
+        return np.where(density > 0.0, np.exp(np.log(density) - gauge.values), 0.0)
+
     def _exact(self, psi: Array, gauge: Gauge, window: lw.Window, error: float) -> bool:
         """Return whether the error of psi, relative to its maximum, is small in the product with the density at the start."""
-        density = reliable(self.state, window)
-        weights = np.where(density > 0.0, np.exp(np.log(density) - gauge.values), 0.0)
-        top = float(np.max(psi))
+        weights, top = self._weights(window, gauge), float(np.max(psi))
         return bool(max(error, 1e-15) * top * np.sum(weights) < max(1e-9, 1e-2 * self.prepared.tolerance) * (weights @ psi))
 
     def _gauge(self, window: lw.Window) -> Gauge:
