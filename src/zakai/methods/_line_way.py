@@ -25,6 +25,7 @@ from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 Array = Any
 
 MOST_SUBSTEPS = 500
+ROUNDING = 1e-15  # of the maximum: smaller values of psi are not kept
 NOISE = 1e-11  # of the maximum: what is rounding in psi
 EXCURSION = 3.9  # standard deviations of the noise that a path between two points goes beyond them, but for exp(-30)
 RESOLVED = 0.25  # spacing in standard deviations of the noise
@@ -117,7 +118,7 @@ class Way:
                 break
             spacing = window.spacing / 1.5
         self.error += error + 2.0 * look.aliasing + 10.0 * max(look.left, look.right)
-        moved = np.maximum(moved, 1e-300 * np.max(moved))
+        moved = np.maximum(moved, ROUNDING * np.max(moved))
         origin, centre, spacing, _, closed, unit = window
         logs = np.log(moved / spacing) - gauge.values + (top + offset)
         needed = spacing * float(np.clip(look.resolving, 1.0, 2.0))
@@ -175,7 +176,7 @@ class Way:
         new = points_of(later.window, *self.ends, min(later.needed, window.spacing))
         values = found.at(new.offsets)
         self.error = found.error
-        logs = np.log(np.maximum(values, 1e-300 * np.max(values))) + found.log_scale
+        logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + found.log_scale
         origin, centre, spacing, _, closed, unit = new
         return Message(logs, origin, centre, spacing, unit, closed, later.needed, later.error)
 
