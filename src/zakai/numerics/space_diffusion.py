@@ -48,7 +48,7 @@ def diffused(values: Array, grid: Grid, noise: Array, tau: float) -> Array:
     inverse = grid.inverse
     noise = inverse @ noise @ inverse.T
     # Where the density is negligible the noise may be so too, which bounds the spectrum of the operator.
-    size, real = np.trace(noise.real, axis1=1, axis2=2), values.real.reshape(-1)
+    size, real = np.abs(noise.real).sum(axis=(1, 2)), values.real.reshape(-1)
     largest = SPARE * float(np.max(size, where=real > NEGLIGIBLE * real.max(), initial=0.0))
     noise = noise * np.minimum(1.0, largest / np.maximum(size, 1e-300))[:, None, None]
     axes, parts = tuple(range(grid.n)), []
@@ -58,7 +58,7 @@ def diffused(values: Array, grid: Grid, noise: Array, tau: float) -> Array:
             parts.append((entry, multiplier))
     if not parts:
         return values
-    # A bound on the spectrum, whose eigenvalues are in [-radius, 0].
+    # A bound on the spectrum, whose eigenvalues are in [-radius, 0]: k'Gk for waves of at most pi a spacing along each axis.
     radius = 0.5 * tau * np.pi**2 * min(largest, float(size.max()))
 
     def transformed(fields: list[Array]) -> Array:
