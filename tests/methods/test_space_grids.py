@@ -56,3 +56,29 @@ def test_a_density_with_a_slow_spectrum_has_a_small_grid_and_the_moments_of_part
         deviations = np.sqrt(result.variance[k + 1])
         assert np.abs((np.array([a.mean(), b.mean()]) - result.mean[k + 1]) / deviations).max() < 0.1
         assert np.abs(np.array([a.std(), b.std()]) / deviations - 1).max() < 0.1
+
+
+def test_an_epidemic_near_extinction_agrees_with_particles():
+    # Infections move a person from s to i: the noise of both is correlated, depends on them, and vanishes with a kink at i = 0.
+    model = zakai.Model(
+        state=["s", "i"], drift=["-2*s*i", "2*s*i - i"], observation=["i"], observation_kind="samples",
+        diffusion=[["-sqrt(abs(s*i)/50)", "0"], ["sqrt(abs(s*i)/50)", "sqrt(abs(i)/100)"]], observation_noise=[["1/2500"]],
+        prior={"kind": "gaussian", "mean": [0.9, 0.05], "cov": [4e-4, 1e-4]},
+    )  # fmt: skip
+    times, count, steps, rng = 0.2 * np.arange(1, 10), 100_000, 10, np.random.default_rng(0)
+    _, record = zakai.simulate(model, times, seed=1)
+    result = zakai.filter(model, record, "yau-yau")
+    assert max(result.density(k).log_values.size for k in range(len(times) + 1)) < 20_000
+    s, i = rng.normal(0.9, 0.02, count), rng.normal(0.05, 0.01, count)
+    for k, z in enumerate(np.asarray(record.values)[:, 0]):
+        h = 0.2 / steps
+        for _ in range(steps):
+            v, w = np.sqrt(h) * rng.standard_normal((2, count))
+            infected, recovered = np.sqrt(np.abs(s * i) / 50) * v, np.sqrt(np.abs(i) / 100) * w
+            s, i = s - 2 * s * i * h - infected, i + (2 * s * i - i) * h + infected + recovered
+        weights = np.exp(-0.5 * (z - i) ** 2 * 2500)
+        chosen = np.searchsorted(np.cumsum(weights) / weights.sum(), (np.arange(count) + rng.uniform()) / count)
+        s, i = s[chosen.clip(0, count - 1)], i[chosen.clip(0, count - 1)]
+        deviations = np.sqrt(result.variance[k + 1])
+        assert np.abs((np.array([s.mean(), i.mean()]) - result.mean[k + 1]) / deviations).max() < 0.03
+        assert np.abs(np.array([s.std(), i.std()]) / deviations - 1).max() < 0.015

@@ -333,10 +333,10 @@ def finer_by(grid: Grid, last: Grid) -> Array:
 def positive(field: Field, bounds: Bounds) -> Field:
     """Return the density without negative values, those of denormal size, and the noise of interpolation.
 
-    The noise is what is not larger than a few times the most negative value.
+    The noise is what is not larger than a few times the most negative value, and not larger than the bound on edges.
     """
     real = field.values.real
-    noise = 0.0 if bounds.band_limited else -NOISE * real.min()
+    noise = 0.0 if bounds.band_limited else min(-NOISE * real.min(), bounds.edge * real.max())
     return field._replace(values=np.where(real > max(NEGLIGIBLE * real.max(), noise), field.values, 0.0))
 
 
