@@ -133,8 +133,8 @@ class Reversed:
             noise = covariance(x, -s) if fixed is None else fixed
             push = _times(precision, away)
             noisy = _times(noise, push)
-            rate = -0.5 * np.einsum("...ij,...ij->...", noise, precision) - 0.5 * (away * _times(change, away)).sum(axis=-1)
-            found[..., n] = rate - ((found[..., :n] + 0.5 * noisy - speed) * push).sum(axis=-1)
+            pulled = (found[..., :n] + 0.5 * noisy - speed) * push + 0.5 * away * _times(change, away)
+            found[..., n] = -0.5 * np.einsum("...ij,...ij->...", noise, precision) - pulled @ np.ones(n)
             found[..., :n] = -found[..., :n] - noisy
             if system.spreading is not None:
                 slopes = system.spreading(x, -s, theta)
@@ -164,6 +164,12 @@ def _times(matrix: Array, points: Array) -> Array:
     return points @ matrix.T if matrix.ndim == 2 else (matrix @ points[..., None])[..., 0]
 
 
+def _eighth_power(values: Array) -> Array:
+    """Return values^8, at most 1e240; products are much faster than a power."""
+    squares = np.square(np.minimum(values, 1e30))
+    return np.square(np.square(squares))
+
+
 class ReversedStepper(Stepper):
     """Substeps of psi.  Points that move beyond the reach of g stop there: what is there comes from the inside."""
 
@@ -174,15 +180,16 @@ class ReversedStepper(Stepper):
     def _far(self, x: Array, s: Any) -> Array:
         """Return -log g relative to the depth at which psi is cut off."""
         mean, precision, _, _ = self.path.at(-s)
-        return np.asarray((_times(precision, x - mean) * (x - mean)).sum(axis=-1) / self.bounds.reach**2)
+        away = x - mean
+        return np.asarray((_times(precision, away) * away) @ np.ones(away.shape[-1]) / self.bounds.reach**2)
 
     def _drift(self, x: Array, t: Any) -> Array:
-        return super()._drift(x, t) / (1.0 + np.minimum(self._far(x, t), 1e30) ** 8)[..., None]
+        return super()._drift(x, t) / (1.0 + _eighth_power(self._far(x, t)))[..., None]
 
     def _within(self, moved: Array, goal: Grid, t0: float) -> Array:
         """Return displacements with a rate that lets b fall to zero where psi is cut off: exp of the rate may be large there."""
         far = self._far(goal.points + moved[:, : goal.n], t0)
-        fall = np.minimum(np.where(np.isfinite(far), far / CUT, 0.0), 1e30) ** 8
+        fall = _eighth_power(np.where(np.isfinite(far), far / CUT, 0.0))
         moved = moved.copy()
         moved[:, -1] = np.maximum(moved[:, -1] - fall, LOWEST)
         return moved
@@ -202,12 +209,14 @@ def path_of(observations: Observations, k: int, mean: Array, cov: Array, periodi
     """
     parts, length, theta = observations.parts(k), float(observations.lengths[k]), observations.theta.real
     slopes, noise = np.zeros((2, len(mean))), np.zeros_like(cov)
-    for i, (x, (start, span), t) in enumerate(((mean, parts[0], parts[0][0]), (end.mean, parts[-1], sum(parts[-1])))):
-        system = observations.over(start, span).system
-        slopes[i, end.straight] = np.nan_to_num(system.drift(x[None], t, theta)[0, end.straight])
+    ends = (mean, parts[0], parts[0][0]), (end.mean, parts[-1], sum(parts[-1]))
+    systems = [observations.over(*part).system for _, part, _ in ends]
+    for system, (x, _, t) in zip(systems, ends, strict=True):
         noise += 0.5 * length * np.reshape(system.covariance(x, t, theta), cov.shape)
-    begin = end
-    if len(end.straight) and not end.covers(mean, cov + 0.25 * noise):
-        curved = (slopes[0] - slopes[1]) * length / 8  # what the cubic path differs from a straight line
-        begin = gauge_of(mean, cov, periodic, noise + 0.5 * np.outer(curved, curved))
+    if not len(end.straight) or end.covers(mean, cov + 0.25 * noise):
+        return Path(end, end, parts[0][0], length, slopes)
+    for i, (system, (x, _, t)) in enumerate(zip(systems, ends, strict=True)):
+        slopes[i, end.straight] = np.nan_to_num(system.drift(x[None], t, theta)[0, end.straight])
+    curved = (slopes[0] - slopes[1]) * length / 8  # what the cubic path differs from a straight line
+    begin = gauge_of(mean, cov, periodic, noise + 0.5 * np.outer(curved, curved))
     return Path(begin, end, parts[0][0], length, slopes)
