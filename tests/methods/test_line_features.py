@@ -329,3 +329,14 @@ def test_a_log_density_that_depends_on_time_is_that_of_its_time():
     likelihoods = [lambda x, z=z, t=t: np.exp(-((z - x) ** 2) / 2 - t * x) for z, t in zip(values, TIMES, strict=True)]
     expected = dense(X, -X, np.ones(len(X)), likelihoods, np.diff(np.concatenate([[0.0], TIMES])), normal(0.2, 0.5))
     assert error(result, expected) < 1e-6
+
+
+@pytest.mark.parametrize("observation", ["x", "x**3", "atan(x)"])
+@pytest.mark.parametrize("value", [1e8, 1e20, 9.969209968386869e36, -1e150])
+def test_a_fill_value_that_is_no_observation_warns(observation, value):
+    model = zakai.Model(
+        state=["x"], drift=["-x"], observation=[observation], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [0], "cov": [[1]]},
+    )  # fmt: skip
+    record = zakai.Record([0.1, 0.2, 0.9], [[0.1], [value], [0.2]], "samples")
+    assert any("tail_depth" in warning for warning in zakai.filter(model, record, "limited-direct").warnings)

@@ -227,7 +227,9 @@ def _placed(values: Array, window: lw.Window, likelihood: Likelihood) -> lw.Wind
     for _ in range(_LEVELS):
         product, bound, change = likelihood.cells(cells, prior, window.origin)
         best = float(product.max())
-        keep = bound > best - _DEPTH
+        if not np.isfinite(best):  # no number compares the cells; the depth reports it
+            return window
+        keep = bound >= best - _DEPTH  # equal, where the logarithms are so large that nothing can be subtracted
         cells, change, product = cells[keep], change[keep], product[keep]
         widths = cells[:, 1] - cells[:, 0]
         divide = (change > 0.7) & (widths > 1e-14 * np.max(np.abs(offsets)) + 1e-300)
@@ -237,7 +239,7 @@ def _placed(values: Array, window: lw.Window, likelihood: Likelihood) -> lw.Wind
         parts = np.stack([quarters[:, :-1], quarters[:, 1:]], axis=2).reshape(-1, 2)
         cells = np.concatenate([cells[~divide], parts])
     product, _, _ = likelihood.cells(cells, prior, window.origin)
-    good = (product > product.max() - 32.0).any(axis=1)
+    good = (product >= product.max() - 32.0).any(axis=1)
     low, high = float(cells[good, 0].min()), float(cells[good, 1].max())
     spacing = min(window.spacing, max(float((cells[good, 1] - cells[good, 0]).min()), (high - low) / 370.0))
     if window.closed:

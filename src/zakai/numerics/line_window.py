@@ -357,7 +357,7 @@ def moments(values: Array, window: Window) -> tuple[Any, Any]:
         i = index(window.size)
         first = i @ values
         apart = i - first
-        return window.centre + window.spacing * first, window.spacing**2 * ((apart * apart) @ values)
+        return window.centre + window.spacing * first, (window.spacing * window.spacing) * ((apart * apart) @ values)
     x = window.points
     cosine, sine = np.cos(x) @ values, np.sin(x) @ values
     length = np.sqrt(cosine**2 + sine**2)
