@@ -266,3 +266,12 @@ def test_noise_that_depends_on_another_coordinate_agrees_with_particles():
         apart = x - mean
         assert np.abs((apart * weights[:, None]).T @ apart - result.cov[k + 1]).max() < 0.02
         x = x[np.searchsorted(np.cumsum(weights), (np.arange(count) + rng.uniform()) / count).clip(0, count - 1)]
+
+
+def test_a_fill_value_that_is_no_observation_warns():
+    model = zakai.Model(
+        state=["x", "y"], drift=["-x + y", "-y"], observation=["atan(x)"], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [0, 0], "cov": [1, 1]},
+    )  # fmt: skip
+    record = zakai.Record([0.1, 0.2, 0.9], [[1.0], [1e20], [2.0]], "samples")
+    assert any("tail_depth" in warning for warning in zakai.filter(model, record).warnings)

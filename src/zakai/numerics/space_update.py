@@ -149,7 +149,7 @@ def _next(
             ratio = np.clip(bounds.spacings / deviations_in_spacings(found.tails), 1.1, 2)
             finer = np.where(found.tails > bounds.tail, ratio, 1.0)
             return adjusted(grid, np.zeros(grid.n), np.zeros(grid.n), finer, bounds)
-    used = tempered > tempered.max() + np.log(bounds.edge)
+    used = tempered >= tempered.max() + np.log(bounds.edge)  # equal, where logarithms are too large to subtract
     flat = np.flatnonzero(used)
     near = grid.offsets[flat]
     levels = tempered.reshape(-1)[flat] - tempered.max()
