@@ -335,7 +335,7 @@ def regridded(prepared: Prepared, state: State) -> State:
     look = lw.figures(values, window.closed, prepared.negligible, prepared.cut)
     if prepared.gaussian:
         look = look._replace(resolving=look.resolving * BAND / 0.92)
-    new = lw.fitted(look, window, prepared.largest, prepared.generous, LARGER)
+    new = lw.fitted(look, window, FINEST if prepared.gaussian else prepared.largest, prepared.generous, LARGER)
     return state if new == window else moved_to(state, new)
 
 

@@ -151,8 +151,8 @@ class Prepared:
 
     @property
     def largest(self) -> int:
-        """The largest size of a grid."""
-        return FINEST if self.gaussian else lw.LARGEST
+        """The largest size of a grid on which a step may begin that the compiled loop does not take."""
+        return FINEST if self.gaussian and self.yau is not None else lw.LARGEST
 
     @cached_property
     def kinds(self) -> np.ndarray:
