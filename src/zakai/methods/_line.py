@@ -30,10 +30,12 @@ from zakai.methods._line_system import (
     State,
     covariance_at,
     edge_of_moments,
+    figures,
     outside_tables,
+    resampled,
     state_moments,
 )
-from zakai.methods._line_update import exponential_factor, factor_at_end
+from zakai.methods._line_update import exponential_factor, factor_at_end, sampled_weakly
 from zakai.methods._line_volumes import contracted
 from zakai.methods._protocol import Info, Infos
 from zakai.models.model import Model
@@ -53,6 +55,8 @@ Array = Any
 CUT_OF_DOMAIN = 1e-8
 
 SMOOTH = 1e-6  # spectrum at the end of that of a prior beyond which it is averaged around the grid points
+SLOW = 1e-2  # of the tolerance: the spectrum that need not be resolved where f has kinks
+SLOW_GENEROUS = 256  # points of a grid that is kept though fewer would do
 GENEROUS = 96  # points of a grid that is kept though fewer would do
 
 
@@ -67,9 +71,13 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
     system = System(on_the_line(model), schedule.inputs)
     # A sample may lead deep into the tails, where a small error counts; increments do not.
     negligible = 1e-13 if system.samples else float(np.clip(1e-6 * tolerance, 1e-13, 1e-10))
+    if system.kinked_drift:  # the spectrum of a density falls slowly
+        negligible = max(negligible, SLOW * float(tolerance))
     generous = loop.SHARED if system.samples and not system.moving else GENEROUS
     lengths, inside = schedule.lengths, schedule.inside
     found = Prepared(model, schedule, theta, system, float(tolerance), lengths, inside, negligible, generous, float(tolerance))
+    if found.kinked:  # a grid is finer, and another one takes long to prepare
+        found.generous = SLOW_GENEROUS
     found.notes = (OMITTED,) if system.cross is not None and (schedule.seen & ~inside).any() else ()
     return found
 
@@ -224,17 +232,21 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
             likelihood = exponential_factor(prepared, k, observed)
         if isinstance(likelihood, General):
             report.lawless = float(np.sum(values.real[np.isnan(likelihood.log_density(window.points).real)]))
-        result = multiplied(values, window, likelihood, max(1e-10, 1e-3 * prepared.tolerance))
+        if prepared.weak and not np.iscomplexobj(values):
+            result, look = sampled_weakly(prepared, k, values, window, observed)
+        else:
+            result = multiplied(values, window, likelihood, max(1e-10, 1e-3 * prepared.tolerance))
+            look = figures(prepared, result.values, result.window)
         values, window, gained = result.values, result.window, gained + result.log_mass
         report.depth, report.growth = result.depth, result.growth
-        look = lw.figures(values, window.closed, prepared.negligible, prepared.cut)
         report.density(look)
-    look = lw.figures(values, window.closed, prepared.negligible, prepared.cut) if look is None else look
+    elif look is None or prepared.kinked:
+        look = figures(prepared, values, window)
     # A large grid is kept only where its decomposition serves the next intervals too.
     generous = prepared.generous if report.decomposed else min(prepared.generous, GENEROUS)
     new = lw.fitted(look, window, prepared.largest, generous)
-    moved = lw.resampled(values, window, new)
-    if new != window:  # the largest grid may be too coarse for all that the density has
+    moved = resampled(prepared, values, window, new)
+    if new != window and not prepared.weak:  # the largest grid may be too coarse for all that the density has
         moved = moved / np.sum(moved)
         coarse = lw.figures(moved, new.closed, prepared.negligible, prepared.cut).aliasing
         report.aliasing = max(report.aliasing, coarse)

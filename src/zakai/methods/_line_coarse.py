@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from zakai.methods._line_system import Prepared, covariance_at, spectral
+from zakai.methods._line_system import Prepared, covariance_at, figures, spectral
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 
@@ -38,7 +38,7 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
         window: the fine grid on the line.
         length: tau.
     """
-    look = lw.figures(values, window.closed, prepared.negligible)
+    look = figures(prepared, values, window) if prepared.kinked else lw.figures(values, window.closed, prepared.negligible)
     inner = slice(look.first, look.last + 1)
     points, kept = window.points[inner], values[inner]
     covariance = covariance_at(prepared.system, points, prepared.model.start, prepared.theta)

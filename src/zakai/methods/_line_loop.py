@@ -16,7 +16,9 @@ from zakai.methods._line_system import (
     Prepared,
     State,
     edge_of_moments,
+    figures,
     outside_tables,
+    resampled,
     spectral,
     state_moments,
     tables,
@@ -41,6 +43,7 @@ from zakai.numerics.line_loop import (
 from zakai.numerics.line_panels import GAUSS_NODES, interpolation
 from zakai.numerics.line_splitting import CELL, DRIFT, OBSERVED, PHI, SLOPE
 from zakai.numerics.line_transition import BAND, support
+from zakai.numerics.line_weak import at_nodes, nodes
 
 LARGER = 0.2  # margin of a new grid, relative to the range of the density
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
@@ -84,14 +87,16 @@ def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
     if not np.isfinite(table[:, :, OBSERVED:, start : start + size]).all():
         return None
     offset = window.origin - prepared.origin + float(offsets[0])
-    return Grid(_NONE[None], _NONE, table, 0.0, start, offset, window.spacing, window.closed)
+    fine = _fine(prepared, window, window.origin + offsets)
+    return Grid(_NONE[None], _NONE, table, 0.0, start, offset, window.spacing, window.closed, fine)
 
 
 _NONE = np.zeros(0)
 
 
 def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
-    if window.size > SHARED and not window.closed:  # the decomposition takes longer than steps on a coarser grid
+    # The decomposition of a large grid takes longer than steps on a coarser one.
+    if window.size > SHARED and not window.closed and not prepared.kinked:
         return None
     decomposed = spectral(prepared, window)
     if decomposed is None or not (decomposed.scale > 0).all():
@@ -101,7 +106,8 @@ def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
     if not np.isfinite(table[0, 0, [PHI, *range(OBSERVED, table.shape[2])]]).all():
         return None
     modes, covariance = np.ascontiguousarray(decomposed.modes), float(np.max(tables(prepared, window).covariance))
-    return Grid(modes, decomposed.rates, table, covariance, 0, 0.0, window.spacing, window.closed)
+    fine = _fine(prepared, window, window.points)
+    return Grid(modes, decomposed.rates, table, covariance, 0, 0.0, window.spacing, window.closed, fine)
 
 
 def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:
@@ -115,6 +121,20 @@ def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarr
     if prepared.yau is not None:
         table[0, 0, PHI] = prepared.yau.potential(x, start, theta)
     return table
+
+
+def _fine(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:
+    """Return an h with kinks, of samples, at the nodes of points (m, F), else nothing."""
+    system = prepared.system
+    if not prepared.weak:
+        return _NONE[None]
+
+    def make() -> np.ndarray:
+        points = nodes(x, window.spacing)[:, None]
+        return at_nodes(system.observation(points, prepared.model.start, prepared.theta).T)
+
+    found: np.ndarray = prepared.once(("fine", window.origin, window.spacing, float(x[0]), len(x)), make)
+    return found
 
 
 def _nodes(window: lw.Window, x: np.ndarray) -> np.ndarray:
@@ -282,7 +302,7 @@ def run(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> 
         if found.why == AFTER:
             states[-1] = state = regridded(prepared, state)
         elif found.why == RANGE:
-            larger = _covering(state, *found.answer[:3])
+            larger = _covering(prepared, state, *found.answer[:3])
             if larger is None:
                 break
             state = larger
@@ -309,34 +329,39 @@ def joined(parts: list[Infos]) -> Infos:
     return Infos(increments, means, covs, health)
 
 
-def _covering(state: State, low: float, high: float, spacing: float) -> State | None:
+def _covering(prepared: Prepared, state: State, low: float, high: float, spacing: float) -> State | None:
     """Return a state on a grid for a range relative to the centre of its grid, None if that needs too many points."""
     window = state.window
     if window.closed:
         size = lw.size_for(2 * np.pi / spacing)
         new = window._replace(size=size, spacing=2 * np.pi / size)
     else:
-        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, LARGER, FINEST)
+        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, LARGER, _most(prepared))
         if new.spacing * new.size < high - low:
             return None
-    return None if new == window else moved_to(state, new)
+    return None if new == window else moved_to(prepared, state, new)
 
 
-def moved_to(state: State, new: lw.Window) -> State:
+def _most(prepared: Prepared) -> int:
+    """Return the points of the largest grid of the loop."""
+    return FINEST if prepared.gaussian else lw.LARGEST
+
+
+def moved_to(prepared: Prepared, state: State, new: lw.Window) -> State:
     """Return a state on another grid."""
     window = state.window
-    moved, floor = lw.resampled(np.asarray(state.values), window, new), float(state.log_floor)
+    moved, floor = resampled(prepared, np.asarray(state.values), window, new), float(state.log_floor)
     return state._replace(values=moved / np.sum(moved), centre=new.centre, spacing=new.spacing, log_floor=floor)
 
 
 def regridded(prepared: Prepared, state: State) -> State:
     """Return a state on a grid that fits it, with a margin for the next steps."""
     window, values = state.window, state.values
-    look = lw.figures(values, window.closed, prepared.negligible, prepared.cut)
+    look = figures(prepared, values, window)
     if prepared.gaussian:
         look = look._replace(resolving=look.resolving * BAND / 0.92)
-    new = lw.fitted(look, window, FINEST if prepared.gaussian else prepared.largest, prepared.generous, LARGER)
-    return state if new == window else moved_to(state, new)
+    new = lw.fitted(look, window, _most(prepared), prepared.generous, LARGER)
+    return state if new == window else moved_to(prepared, state, new)
 
 
 def _infos(

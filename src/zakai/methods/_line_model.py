@@ -125,6 +125,9 @@ class System:
         self.general = bool(OF_OBSERVATION & model.features.keys())
         # Whether h has no jump and no kink.
         self.smooth_observation = not any(not _continuous(part, x) or _rough(part, x) for part in model.observation)
+        # Whether h has kinks, but no jump.
+        self.kinked_observation = not self.smooth_observation and all(_continuous(part, x) for part in model.observation)
+        self.kinked_drift = self.slope is not None and _rough(model.drift[0], x)
         self.rough = any(not _continuous(part, x) or _rough(part, x) for part in (model.drift[0], model.covariance[0]))
         self.moving = bool((model.drift.free_symbols | model.covariance.free_symbols) & given)
         self.steady_observation = not model.observation.free_symbols & given

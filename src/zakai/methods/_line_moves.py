@@ -116,6 +116,7 @@ def by_substeps(
                 break
             look = lw.figures(attempt.values, window.closed, negligible)
             coarse = look.aliasing > resolved and (look.aliasing > rough or not look.rough)
+            coarse = coarse and (not prepared.weak or known <= resolved)  # a finer grid has no more of the spectrum of a kink
             bound = max(EDGE, 4.0 * look.aliasing)
             left, right = look.left > bound, look.right > bound
             if not (left or right or coarse):

@@ -18,6 +18,8 @@ from zakai.numerics import line_window as lw
 from zakai.numerics.line_loop import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR
 from zakai.numerics.line_operator import Spectral
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
+from zakai.numerics.line_transition import support
+from zakai.numerics.line_weak import PARTS, at_nodes, nodes, weak
 from zakai.records.schedule import Schedule
 
 Array = Any
@@ -123,6 +125,18 @@ class Prepared:
         return self.gaussian and self.divides and not steady and not affine
 
     @cached_property
+    def weak(self) -> bool:
+        """Whether the likelihoods of samples have kinks and act in the weak sense."""
+        system = self.system
+        kinked = system.samples and system.kinked_observation and system.steady_observation and not system.general
+        return kinked and not self.model.periodic and not np.iscomplexobj(self.theta)
+
+    @property
+    def kinked(self) -> bool:
+        """Whether densities have kinks."""
+        return self.weak or self.system.kinked_drift
+
+    @cached_property
     def mixed(self) -> bool:
         """Whether f or h are not known as sums of products of functions of t and of x."""
         return self.timed and self.system.separated is None
@@ -204,6 +218,29 @@ def kinds_of(prepared: Prepared) -> np.ndarray:
         return np.where(whole, FACTOR, np.where(split, SPLIT_FACTOR, -1))
     inside = np.where(whole, KERNEL, -1) if yau is not None and yau.affine else np.where(split, SPLIT, -1)
     return np.where(silent, np.where(whole, FACTOR, inside), np.where(regular, inside, -1))
+
+
+def resampled(prepared: Prepared, values: Array, window: lw.Window, new: lw.Window) -> Array:
+    """Return probabilities on another grid, in the weak sense on a coarser one where densities have kinks."""
+    if not prepared.weak or new.spacing <= window.spacing:
+        return lw.resampled(values, window, new)
+    density = at_nodes(lw.density_at(values, window, nodes(new.offsets, new.spacing)))
+    found = weak(density, new.spacing)[0] * (new.spacing / window.spacing)
+    return np.where(found > 0, found, 0.0)
+
+
+def figures(prepared: Prepared, values: Array, window: lw.Window) -> lw.Figures:
+    """Return the figures of a density.
+
+    The spectrum of kinks does not tell where a density ends.  Of those of likelihoods a coarser grid would fold it, and a finer
+    one has no more of it.
+    """
+    look = lw.figures(values, window.closed, prepared.negligible, prepared.cut)
+    if prepared.kinked:
+        noise = 0.0 if prepared.weak else 1e-2 * look.aliasing  # of waves that the transition leaves everywhere
+        first, last = support(np.ascontiguousarray(values.real), max(prepared.cut, noise))
+        look = look._replace(first=first, last=last)
+    return look._replace(resolving=1.0) if prepared.weak else look
 
 
 class Tables(NamedTuple):
@@ -303,17 +340,25 @@ def _decomposed(prepared: Prepared, window: lw.Window) -> Spectral | None:
         return None
     if not (covariance.real > 0).all():
         return None
-    points = window.points[:, None]
-    nodes = (points + window.spacing * GAUSS_NODES).reshape(-1, 1)
-    slope, spread, curvature = system.slope(points, start, theta)[:, 0], 0.0, 0.0
-    inner = system.drift(nodes, start, theta)[:, 0] / covariance_at(system, nodes[:, 0], start, theta)
-    scale = 1.0
+    points, parts, spread, curvature, scale = window.points[:, None], PARTS if system.rough else 1, 0.0, 0.0, 1.0
+    within = (points + window.spacing / parts * (np.arange(parts)[:, None] + GAUSS_NODES).reshape(-1)).reshape(-1, 1)
+    inner = system.drift(within, start, theta)[:, 0] / covariance_at(system, within[:, 0], start, theta)
+    steps = window.spacing / parts * (inner.reshape(window.size, parts, -1) @ GAUSS_WEIGHTS).sum(axis=1)
+    if system.rough and not window.closed:
+        x = nodes(window.points, window.spacing)
+        drift, covariance = system.drift(x[:, None], start, theta)[:, 0], covariance_at(system, x, start, theta)
+        drift = drift - (0.5 * system.spread(x[:, None], start, theta)[:, 0] if system.state_dependent else 0.0)
+        drift, covariance = at_nodes(drift), at_nodes(np.broadcast_to(covariance, x.shape))
+        potential = 0.5 * (weak(drift**2 / covariance, window.spacing)[0] + weak(drift, window.spacing)[1])
+    else:
+        slope = system.slope(points, start, theta)[:, 0]
+        if system.state_dependent:
+            spread, curvature = np.moveaxis(system.spread(points, start, theta), -1, 0)
+        potential = 0.5 * ((drift - 0.5 * spread) ** 2 / covariance + slope - 0.5 * curvature)
+    covariance = known.covariance
     if system.state_dependent:
-        spread, curvature = np.moveaxis(system.spread(points, start, theta), -1, 0)
         scale = 1.0 / np.sqrt(covariance)
         covariance = covariance_between(system, window, start, theta)
-    steps = window.spacing * (inner.reshape(window.size, -1) @ GAUSS_WEIGHTS)
-    potential = 0.5 * ((drift - 0.5 * spread) ** 2 / known.covariance + slope - 0.5 * curvature)
     if not np.isfinite(potential.real).all() or not np.isfinite(steps.real).all():
         return None
     if window.closed and abs(np.sum(steps).real) > 1e-12 * max(1.0, float(np.sum(np.abs(steps.real)))):

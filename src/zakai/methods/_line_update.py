@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from zakai.methods._line_model import System
-from zakai.methods._line_system import Prepared, tables
+from zakai.methods._line_system import Prepared, figures, tables
 from zakai.methods._observation import log_likelihood
 from zakai.numerics import line_window as lw
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS, panels
-from zakai.numerics.line_posterior import Gaussian, General, Likelihood
+from zakai.numerics.line_posterior import Gaussian, General, Likelihood, Product
+from zakai.numerics.line_weak import WEAK_SHARE, at_nodes, nodes, weak_error, weaken
 
 Array = Any
 
@@ -44,6 +45,42 @@ def factor_at_end(prepared: Prepared, k: int, at_end: np.ndarray, observed: np.n
         h = tables(prepared, window).observation
         known = window, (h if len(rows) == len(h) and system.samples else h[rows] * spans[:, None])
     return Gaussian(evaluate, observed[rows], precision, constant, known=known)
+
+
+def sampled_weakly(
+    prepared: Prepared, k: int, values: Array, window: lw.Window, observed: np.ndarray
+) -> tuple[Product, lw.Figures]:
+    """Return the product of a density and the likelihood of a sample of an h with kinks, on a grid that resolves it weakly.
+
+    The figures of the product report the error in the weak sense in place of the spectrum at the highest frequencies.
+    """
+    system, start, theta = prepared.system, prepared.model.start, prepared.theta
+    precision, constant = np.ascontiguousarray(prepared.coefficients.precisions[k, 0]), prepared.coefficients.constants[k]
+    observed = np.ascontiguousarray(observed, float)
+    while True:
+        at = int(np.argmax(values))
+        centre = system.observation(window.points[at : at + 1, None], start, theta)[0]
+        fine = at_nodes(system.observation(nodes(window.points, window.spacing)[:, None], start, theta).T)
+        logs, change = np.full(window.size, -np.inf), np.ones(window.size)
+        weaken(fine, 0, precision, observed, np.ascontiguousarray(centre), logs, change)
+        known = np.where(values > 0, np.log(np.where(values > 0, values, 1.0)), -np.inf)
+        best = float(np.max(known + logs))
+        product = np.exp(known + logs - best)
+        total = float(np.sum(product))
+        product = product / total
+        error = 0.5 * weak_error(product, change)
+        new = lw.refined(window)
+        if error <= WEAK_SHARE * prepared.tolerance or new.size > prepared.largest:
+            break
+        values, window = lw.resampled(values, window, new), new
+        values = values / np.sum(values)
+    rest = observed - centre
+    gained = np.log(total) + best + constant - 0.5 * rest @ precision @ rest
+    reference = float(np.log(values.max()))
+    growth = float(np.sum(np.exp(np.minimum(logs + reference - best - np.log(total), 200.0))))
+    depth = float(product @ np.where(product > 0, reference - known, 0.0))
+    look = figures(prepared, product, window)._replace(aliasing=error)
+    return Product(product, gained, depth, growth, window), look
 
 
 def _sample_noise(prepared: Prepared, stop: float, at_end: np.ndarray) -> tuple[Array, Any]:

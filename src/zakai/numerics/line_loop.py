@@ -49,6 +49,7 @@ from zakai.numerics.line_transition import (
     taps_of,
     wrapped,
 )
+from zakai.numerics.line_weak import WEAK_SHARE, weak_error, weaken
 from zakai.numerics.line_window import ALIGNMENT, CUT, figures_of, waves
 
 Array = NDArray[Any]
@@ -72,7 +73,8 @@ class Grid(NamedTuple):
     The rows of a term are phi of Gaussian kernels or of the decomposition, the integral of f over the spacing above a point, f,
     f' and h.  K = 1 where the terms do not depend on the interval.  With a decomposition the table is that of the grid.  Else it
     is longer than the grid, which begins at `start`; the first point of the table is `offset` away from the origin of the
-    kernels.  `covariance` is the largest G, where there is a decomposition.
+    kernels.  `covariance` is the largest G, where there is a decomposition.  `fine` (m, F) are the values of an h with kinks at
+    the nodes of `line_weak`, else empty.
     """
 
     modes: Array
@@ -83,6 +85,7 @@ class Grid(NamedTuple):
     offset: float
     spacing: float
     closed: bool
+    fine: Array
 
 
 class Steps(NamedTuple):
@@ -270,6 +273,7 @@ def _attempt(
     now: Array, table: Array, modes: Array, rates: Array, averages: Array, cosines: Array, sines: Array, kind: int, tau: float,
     observed: Array, precisions: Array, constant: float, channel: Array, drifts: Array, outputs: Array, covariances: Array,
     covariance: float, middle: float, spacing: float, closed: bool, limits: Array, log_floor: float, row: Array, answer: Array,
+    fine: Array, start: int,
 ) -> int:  # fmt: skip
     """Advance a density by one interval on one grid; write the report; return OK or what is needed instead.
 
@@ -317,6 +321,7 @@ def _attempt(
             late[j] = np.exp(phi[j] - phi[at]) if phi[j] != phi[at] else 1.0
             early[j] = 1.0 / late[j]
         rounding = decomposed(now, modes, rates, early, late, b, tau, 0.1 * most, closed)
+    weakly, change = fine.shape[1] > 0, np.zeros(size)
     if not (rounding < max(1e-11, 1e-3 * most)):
         return FAILED
     left, right, begins, ends, negative, aliasing, upper, highest, nyquist = figures_of(now, cut, negligible, cosines, sines)
@@ -326,9 +331,9 @@ def _attempt(
         aliasing = max(aliasing, upper)
     if not (aliasing <= 30.0 * negligible):
         answer[0], answer[1], answer[2] = (low - half) * spacing, (high - half) * spacing, 0.7 * spacing
-        return RANGE if gaussian and aliasing < np.inf else FAILED
+        return RANGE if gaussian and not weakly and aliasing < np.inf else FAILED
     if not (edge <= bound):
-        if not gaussian or np.isnan(edge):
+        if not (gaussian or weakly) or np.isnan(edge):
             return FAILED
         answer[0] = (min(low, (0 if left > bound else low) - size // 3 * (left > bound)) - half) * spacing
         answer[1] = (max(high, (size if right > bound else high) + size // 3 * (right > bound)) - half) * spacing
@@ -355,6 +360,8 @@ def _attempt(
         b = np.zeros(size)
         h = observation_of(table, outputs[0])
         exponent_added(h, precision, observed, 1.0, 1.0, at, b)
+        if weakly and np.any(precision != 0.0):
+            weaken(fine, start, precision, observed, h[:, at].copy(), b, change)
         for j in range(size):
             if not (b[j] > -1e8):
                 b[j] = -1e8
@@ -382,10 +389,13 @@ def _attempt(
             now[j] = outer[j] / total
             if now[j] > 0:
                 depth += now[j] * (reference - first[j])
+        before = highest
         left, right, begins, ends, lost, aliasing, upper, highest, nyquist = figures_of(now, cut, negligible, cosines, sines)
-        if not (aliasing <= 30.0 * negligible):
+        if weakly:  # of a kink the spectrum falls slowly
+            aliasing, highest = 0.5 * weak_error(now, change), before
+        if not (aliasing <= (WEAK_SHARE * most if weakly else 30.0 * negligible)):
             answer[0], answer[1], answer[2] = (low - half) * spacing, (high - half) * spacing, 0.6 * spacing
-            return RANGE if positive and aliasing < np.inf else FAILED
+            return RANGE if positive and not weakly and aliasing < np.inf else FAILED
         if not closed:
             if not (max(left, right) < 1e-10):
                 return FAILED
@@ -412,7 +422,7 @@ def _attempt(
     # No estimate is reliable far below the tolerance.
     row[10] = max(made + row[10] * ratio, RELIABLE * most)
     row[11] = min(log_floor + max(depth - 1.0, 0.0), 0.0)
-    if gaussian:
+    if gaussian or weakly:
         first_one, last_one = support(now, cut)
         begins, ends = float(first_one), float(last_one)
     answer[0], answer[1], answer[2] = begins, ends, (BAND if gaussian else 0.92) * nyquist / (max(highest, 0.0) + 1.0)
@@ -440,14 +450,14 @@ def _flow(factors: Array, table: Array, at: int) -> float:
 @kernel(
     types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]
         _V, int64, _Q, float64, _M, _V, _T, _M, _M, float64, float64, boolean, int64[::1], _V, _M, _Q, _V, _M, _T, _T, _M,
-        float64, float64, _V, _V, _M, int64[::1], _M
+        float64, float64, _V, _V, _M, int64[::1], _M, _M
     )
 )  # fmt: skip
 def _advance(
     values: Array, start: int, table: Array, covariance: float, modes: Array, rates: Array, averages: Array, cosines: Array,
     sines: Array, offset: float, spacing: float, closed: bool, kinds: Array, lengths: Array, observed: Array, precisions: Array,
     constants: Array, channels: Array, drifts: Array, outputs: Array, covariances: Array, error: float, log_floor: float,
-    limits: Array, answer: Array, densities: Array, starts: Array, out: Array,
+    limits: Array, answer: Array, densities: Array, starts: Array, out: Array, fine: Array,
 ) -> tuple[int, int]:  # fmt: skip
     """The number of steps that were taken, and why the loop ended."""
     size, generous = values.size, limits[4]
@@ -497,7 +507,7 @@ def _advance(
         status = _attempt(
             now, local, modes, rates, averages, cosines, sines, kinds[k], lengths[k], observed[k], precisions[k], constants[k],
             channels[k], drifts[k], outputs[k], covariances[k], covariance, offset + spacing * (start + half), spacing, closed,
-            limits, log_floor, row, answer,
+            limits, log_floor, row, answer, fine, start,
         )  # fmt: skip
         if status != OK:
             # The step is tried again on another grid, from the grid of the last state.
@@ -549,5 +559,6 @@ def advance(values: Array, grid: Grid, steps: Steps, error: float, log_floor: fl
     taken, why = _advance(
         np.ascontiguousarray(values), grid.start, grid.table, grid.covariance, grid.modes, grid.rates, averages, *waves(size),
         grid.offset, grid.spacing, grid.closed, *steps, error, log_floor, np.array(limits), answer, densities, starts, out,
+        grid.fine,
     )  # fmt: skip
     return Taken(densities[:taken], starts[:taken], out[:taken], why, answer)

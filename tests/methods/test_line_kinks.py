@@ -1,0 +1,49 @@
+"""Kinks in f and h of one state, against conservative differences on fine grids with a face at each kink."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tests.references.graded import posterior
+
+import zakai
+
+TIMES = np.cumsum([0.053, 0.11, 0.324, 0.241, 0.056, 0.185])
+
+
+def model_of(drift, observation, noise):
+    return zakai.Model(
+        state=["x"], drift=[drift], observation=[observation], observation_noise=[[noise]], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [0.1], "cov": [[0.25]]},
+    )  # fmt: skip
+
+
+def exact(f, h, noise, values):
+    """Return means, deviations and the log-likelihood, extrapolated from two spacings."""
+    logs = [lambda x, z=z: -0.5 * (z - h(x)) ** 2 / noise - 0.5 * np.log(2 * np.pi * noise) for z in values]
+    grids = [np.linspace(-4.0, 4.0, count + 1) for count in (800, 1600)]
+    parts = [posterior(f, lambda x: -0.5 * (x - 0.1) ** 2 / 0.25, TIMES, logs, faces, 1e-3, 24) for faces in grids]
+    coarse, fine = (np.concatenate([np.ravel(part) for part in found]) for found in parts)
+    found, k = fine + (fine - coarse) / 3.0, len(TIMES)
+    return found[:k], np.sqrt(found[k : 2 * k]), found[-1]
+
+
+@pytest.mark.parametrize(
+    ("drift", "f", "observation", "h", "noise"),
+    [
+        ("-x", lambda x: -x, "abs(x)", np.abs, 0.1),
+        ("-x", lambda x: -x, "max(x, 1/10)", lambda x: np.maximum(x, 0.1), 0.05),
+        ("sin(x)", np.sin, "abs(x - 3/10)", lambda x: np.abs(x - 0.3), 0.05),
+        ("-abs(x)*x", lambda x: -np.abs(x) * x, "x", lambda x: x, 0.2),
+        ("1/2 - x - abs(x)", lambda x: 0.5 - x - np.abs(x), "abs(x)", np.abs, 0.1),
+    ],
+)
+def test_kinks_are_as_accurate_as_smooth_functions(drift, f, observation, h, noise):
+    model = model_of(drift, observation, str(noise))
+    _, record = zakai.simulate(model, TIMES, seed=2)
+    result = zakai.filter(model, record, "yau-yau")
+    mean, deviation, log_likelihood = exact(f, h, noise, record.values[:, 0])
+    errors = np.abs(result.mean[1:, 0] - mean) / deviation, np.abs(np.sqrt(result.variance[1:, 0]) / deviation - 1.0)
+    assert np.max(errors) < 2e-5
+    assert result.log_likelihood == pytest.approx(log_likelihood, abs=4e-5)
+    assert np.max(errors) < 10.0 * np.nanmax(result.health["error_estimate"]) + 1e-5
