@@ -19,6 +19,10 @@ def total(values):
     for value in values:
         result += value
     return result
+
+@kernel("float64(float64)")
+def half(value):
+    return 0.5 * value
 """
 USE = "import numpy, one; print(one.total(numpy.arange(4.0)))"
 HITS = f"{USE}; print(sum(one.total.stats.cache_hits.values()))"
@@ -53,7 +57,9 @@ def test_a_kernel_is_compiled_for_the_declared_types_when_it_first_receives_them
     (folder / "one.py").write_text(KERNEL.replace('[::1])"', '[::1])", "complex128(complex128[::1])"'))
     calls = ["", "one.total(x)", "one.total(1j * x)", "one.total(x)"]
     code = "; ".join(f"{call}; print(len(one.total.signatures), end=' ')".lstrip("; ") for call in calls)
-    assert answered(started(folder, f"import numpy, one; x = numpy.arange(4.0); {code}")) == ("0 1 2 2 ", "")
+    # A whole number in the place of a float64 is converted, and Numba is asked once only.
+    code += "; one.half(3); one.half.compile = None; print(one.half(3))"
+    assert answered(started(folder, f"import numpy, one; x = numpy.arange(4.0); {code}")) == ("0 1 2 2 1.5\n", "")
 
 
 @pytest.mark.parametrize("values", ["numpy.arange(4)", "numpy.arange(8.0)[::2]", "numpy.eye(2)"])

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, TypeVar, cast
 
 from numba import njit, types
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.sigutils import normalize_signature
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -42,10 +43,18 @@ def kernel(signature: Any, derivative: Any = None) -> Callable[[Callable[..., R]
             pairs = zip(arguments, expected, strict=True)
             if any(dispatcher.typingctx.can_convert(given, wanted) is None for given, wanted in pairs):
                 raise TypeError(f"{function.__name__}{arguments}: the kernel takes {expected}")
-            try:
-                return compiled(declared)
-            except OSError:  # the cache cannot be written
-                return compiled(declared)
+            with global_compiler_lock:  # threads of a batch come here together
+                known = dispatcher.overloads.get(tuple(expected))
+                if known is not None:
+                    return known.entry_point
+                try:
+                    entry = compiled(declared)
+                except OSError:  # the cache cannot be written
+                    entry = compiled(declared)
+                if len(dispatcher.overloads) == (1 if derivative is None else 2):
+                    # From now on arguments of other types, such as int for float64, are converted without asking here first.
+                    dispatcher.disable_compile()
+                return entry
 
         dispatcher.compile = compile_declared
         return cast("Callable[..., R]", dispatcher)
