@@ -22,7 +22,7 @@ from zakai.methods import _line_loop as loop
 from zakai.methods._line_cross import OMITTED
 from zakai.methods._line_domain import on_the_line, variable_of
 from zakai.methods._line_model import System
-from zakai.methods._line_moves import Report, by_kernel, by_substeps
+from zakai.methods._line_moves import Report, by_decomposition, by_kernel, by_substeps
 from zakai.methods._line_prior import averaged
 from zakai.methods._line_system import (
     NOISE,
@@ -213,7 +213,10 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
                 values, window = lw.resampled(values, window, new), new
             report.positive = False
             interval = start, length, inside, rates, report
-            found = contracted(prepared, values, window, *interval) or by_substeps(prepared, values, window, *interval)
+            if not prepared.system.varying and not inside.any():
+                found = by_decomposition(prepared, values, window, length, report)
+            if found is None:
+                found = contracted(prepared, values, window, *interval) or by_substeps(prepared, values, window, *interval)
         values, window, gained, look = found
     predicted, log_floor = lw.moments(values, window), float(state.log_floor)
     if report.positive:

@@ -73,6 +73,48 @@ def by_kernel(
     return Moved(direct.values / mass, direct.window, np.log(mass) + direct.offset, direct.look)
 
 
+def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, length: float, report: Report) -> Moved | None:
+    """Return the density after an interval without observations inside by modes of its operator, None where they do not serve."""
+    negligible, rough = prepared.negligible, max(1e-10, 1e-3 * prepared.tolerance)
+    carried = coarsened(prepared, values, window, length)
+    if carried is not None:
+        return _normalised(*carried, report, negligible)
+    known, begin = lw.figures(values, window.closed, negligible).aliasing, window
+    while window.size <= lw.LARGEST:
+        found = _by_modes(prepared, values, window, length)
+        if found is None or not abs(float(np.sum(found[0].real)) - 1.0) < 1e-3:
+            return None
+        look = lw.figures(found[0], window.closed, negligible)
+        if look.aliasing > 30.0 * negligible and (look.aliasing > rough or not look.rough):
+            return None
+        bound = max(EDGE, 4.0 * look.aliasing)
+        left, right = look.left > bound, look.right > bound
+        if not (left or right):
+            if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
+                report.aliasing = max(report.aliasing, lw.figures(values, window.closed, negligible).aliasing - known)
+            return _normalised(found[0], window, found[1], report, negligible)
+        new = lw.enlarged(window, left, right)
+        if new == window:
+            return None
+        values, window = lw.resampled(values, window, new), new
+    return None
+
+
+def _by_modes(prepared: Prepared, values: Array, window: lw.Window, length: float) -> tuple[Array, float] | None:
+    """Return the density after a time and its error by the decomposition on a grid, None where it does not serve."""
+    decomposed = spectral(prepared, window)
+    if decomposed is None:
+        return None
+    found, error = decomposed(values, length)
+    # Tails that were cut off are jumps in the gauge of the decomposition, which show at the highest frequencies, as does a
+    # density that reaches the ends of the grid: that one needs another grid, not another transition.
+    allowed = 1e-5 * prepared.tolerance
+    look = lw.figures(found, window.closed, prepared.negligible)
+    aliased = look.aliasing > max(allowed, 30.0 * prepared.negligible)
+    ended = max(look.left, look.right) > max(EDGE, 4.0 * look.aliasing)
+    return (found, error) if error < max(1e-11, allowed) and (ended or not aliased) else None
+
+
 def by_substeps(
     prepared: Prepared,
     values: Array,
@@ -88,11 +130,6 @@ def by_substeps(
     gained: Any = 0.0
     rough, resolved = max(1e-10, 1e-3 * prepared.tolerance), 30.0 * negligible
     report.positive = False
-    if not system.varying and not inside.any():
-        carried = coarsened(prepared, values, window, length)
-        if carried is not None:
-            report.decomposed = True
-            return _normalised(*carried, report, negligible)
     bounds = [(0.0, length)]
     if system.varying:
         parts = resolved_parts(prepared, values, window, start, length, inside)
@@ -172,7 +209,7 @@ def _normalised(
 ) -> Moved:
     look = lw.figures(found, window.closed, negligible)
     report.density(look)
-    report.time += error
+    report.time, report.decomposed = report.time + error, True
     found = np.where(found.real > 0, found, 0.0)
     mass = np.sum(found)
     return Moved(found / mass, window, np.log(mass), look)
@@ -218,17 +255,9 @@ def _attempt(
     if not system.varying:
         known = tables(prepared, window)
         if not inside.any():
-            decomposed = spectral(prepared, window)
-            if decomposed is not None:
-                found, error = decomposed(values, length)
-                # Tails that were cut off are jumps in the gauge of the decomposition, which show at the highest frequencies, as
-                # does a density that reaches the ends of the grid: that one needs another grid, not another transition.
-                allowed = 1e-5 * prepared.tolerance
-                look = lw.figures(found, window.closed, prepared.negligible)
-                aliased = look.aliasing > max(allowed, 30.0 * prepared.negligible)
-                ended = max(look.left, look.right) > max(EDGE, 4.0 * look.aliasing)
-                if error < max(1e-11, allowed) and (ended or not aliased):
-                    return _Attempt(found, 0.0, error, False, True)
+            modes = _by_modes(prepared, values, window, length)
+            if modes is not None:
+                return _Attempt(modes[0], 0.0, modes[1], False, True)
             key = ("exponential", window, length)
             transition = prepared.once(key, lambda: Exponential(length * window.generator(known.covariance, known.drift)))
             found, error = transition(values)
