@@ -33,7 +33,7 @@ FIRST = 0.1  # of the time in which the drift would cross the range of the densi
 FASTEST = 100.0  # ranges of the density in the interval, divided by the tolerance: a faster drift counts as this
 REACH = 8.0  # standard deviations to the end of a density
 _FLOW_POINTS = 17
-_FLOW_STEPS = 80
+_FLOW_STEPS = 32
 
 
 def contracted(
