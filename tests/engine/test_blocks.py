@@ -87,9 +87,10 @@ def check_whole_and_parts(kind, times=TIMES):
     for name in {name for one in alone for name in one.health}:
         values = np.array([one.health[name] for one in alone if name in one.health])
         worst = values.min(axis=0) if name == "std_in_spacings" else values.max(axis=0)
-        # The depth to which tails are accurate is the logarithm of a rounding error, which differs with the increments of a path.
+        # The depth to which tails are accurate is the logarithm of a rounding error, which differs with the increments of a path;
+        # so do figures that are rounding, some 1e-9 of the tolerance.
         relative = 1e-3 if name == "tail_depth" else 1e-6
-        assert np.allclose(result.health[name], worst, rtol=relative, atol=1e-9, equal_nan=True), name
+        assert np.allclose(result.health[name], worst, rtol=relative, atol=1e-8, equal_nan=True), name
     return model, record, result
 
 
