@@ -7,6 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 import zakai
+from references import graded
 
 TIMES, VALUES = np.array([0.05, 0.1, 0.9, 1.0, 2.5]), np.array([0.6, np.nan, -0.3, 0.8, 0.2])
 
@@ -48,6 +49,49 @@ def forward_backward(x, drift, covariance, h, noise, prior, kind, closed):
     return found[::-1]
 
 
+def test_sharp_samples_hold_the_paths_between_them():
+    # The deviation of the sensor is a tenth of that of the noise between two samples.
+    x, noise = np.linspace(-2.4, 2.6, 501), 0.0009
+    model = zakai.Model(
+        state=["x"], drift=["sin(x)"], observation=["x"], observation_kind="samples", observation_noise=[[noise]],
+        process_noise=[[0.4]], prior={"kind": "gaussian", "mean": [0.4], "cov": [[0.04]]},
+    )  # fmt: skip
+    result = zakai.smooth(model, zakai.Record(TIMES, VALUES[:, None], "samples"), "yau-yau")
+    expected = forward_backward(x, np.sin(x), 0.4, x, noise, np.exp(-((x - 0.4) ** 2) / 0.08), "samples", False)
+    for k, density in enumerate(expected):
+        with np.errstate(divide="ignore"):
+            own = np.exp(result.density(k).log_density(x[:, None]))
+        np.testing.assert_allclose(own, density, atol=1e-6 * density.max())
+    assert result.warnings == []
+
+
+@pytest.mark.parametrize("kind", ["samples", "increments"])
+def test_a_broad_prior_is_smoothed_as_its_evidence_says(kind):
+    # The derivative of the evidence for the mean of a prior N(mean, 1) is the smoothed mean less the prior's.
+    times, values, noise = np.array([0.33, 0.5, 0.9]), np.array([0.6, -0.3, 0.8]), 0.2
+
+    def evidence(mean):
+        lengths = np.diff(np.concatenate([[0.0], times]))
+        samples = [lambda x, z=z: -0.5 * (z - x) ** 2 / noise for z in values]
+        nothing = [lambda x: 0.0 * x] * 3
+        inside = [lambda x, r=z / tau: (r - 0.5 * x) * x / noise for z, tau in zip(values, lengths, strict=True)]
+        likelihoods, potentials = (samples, None) if kind == "samples" else (nothing, inside)
+        faces = graded.sinh_faces(-9.0, 9.0, 0.6, 1600)
+        return graded.posterior(
+            lambda x: x - x**3, lambda x: -0.5 * (x - mean) ** 2, times, likelihoods, faces, 1e-4, potentials=potentials
+        )[2]
+
+    model = zakai.Model(
+        state=["x"], drift=["x - x**3"], observation=["x"], observation_kind=kind, observation_noise=[[noise]],
+        prior={"kind": "gaussian", "mean": [0], "cov": [[1]]},
+    )  # fmt: skip
+    result = zakai.smooth(model, zakai.Record(times, values[:, None], kind), "yau-yau")
+    low, middle, high = (evidence(mean) for mean in (-0.02, 0.0, 0.02))
+    assert result.mean[0, 0] == pytest.approx((high - low) / 0.04, abs=2e-4)
+    assert result.variance[0, 0] == pytest.approx(1 + (high - 2 * middle + low) / 0.0004, abs=2e-3)
+    assert result.warnings == []
+
+
 LINE, CIRCLE = np.linspace(-3.4, 3.4, 321), np.linspace(-np.pi, np.pi, 128, endpoint=False)
 CASES = {
     "double well": (LINE, "x - x**3", LINE - LINE**3, 0.5, "x", LINE, False),
@@ -72,6 +116,20 @@ def test_a_smoothed_density_agrees_with_sums_over_a_fine_grid(case, kind):
         np.testing.assert_allclose(own, density, atol=1e-6 * density.max())
     assert result.warnings == [] and result.log_likelihood == result.filtered.log_likelihood
     np.testing.assert_allclose(result.mean[-1], result.filtered.mean[-1], atol=1e-9)
+
+
+def test_a_drift_in_time_is_smoothed_as_by_the_gaussian_smoother():
+    model = zakai.Model(
+        state=["x"], drift=["-x + cos(t)*x/2 + sin(t)"], observation=["x"], observation_kind="samples",
+        observation_noise=[[0.3]], prior={"kind": "gaussian", "mean": [0.5], "cov": [[0.2]]},
+    )  # fmt: skip
+    record = zakai.Record(TIMES, VALUES[:, None], "samples")
+    exact = zakai.smooth(model, record, "kalman-bucy")
+    for method in ("yau-yau", "limited-direct"):
+        grid = zakai.smooth(model, record, method)
+        np.testing.assert_allclose(grid.mean, exact.mean, atol=1e-6)
+        np.testing.assert_allclose(grid.variance, exact.variance, atol=1e-6)
+        assert grid.warnings == []
 
 
 def test_a_grid_and_a_gaussian_smoother_agree():
