@@ -84,9 +84,11 @@ def covering(window: lw.Window, low: float, high: float, spacing: float) -> lw.W
         size = lw.size_for(2 * np.pi / spacing * 0.999)
         return window._replace(size=size, spacing=2 * np.pi / size)
     spacing = lw.quantized(window, low, high, spacing).spacing
-    centre = 8.0 * spacing * np.round((low + high) / (16.0 * spacing))
-    size = int(np.ceil(((high - low) / spacing + 2 * PAD + 8) / 16.0)) * 16
-    return window._replace(centre=float(centre), spacing=spacing, size=size)
+    # Few different grids: their ends are multiples of an eighth of their size, and decompositions serve many times.
+    apart = spacing * 2.0 ** np.floor(np.log2(max((high - low) / spacing + 2 * PAD, 32.0) / 8.0))
+    first, last = apart * np.floor(low / apart), apart * np.ceil(high / apart)
+    size = int(round((last - first) / spacing)) + 2 * PAD
+    return window._replace(centre=float(0.5 * (first + last)), spacing=spacing, size=size)
 
 
 def points_of(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:

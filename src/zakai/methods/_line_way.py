@@ -100,7 +100,7 @@ class Way:
         spacing = later.needed if self.inside.any() or later.closed else max(later.needed, RESOLVED * least)
         for attempt in range(7):
             window = covering(later.window, low, high, spacing)
-            if window.size > lw.LARGEST and not forced:
+            if window.size > lw.SIZES[-1] and not forced:
                 return None
             gauge = self._gauge(window)
             psi, top = self._psi(later, window, gauge.values)
