@@ -127,10 +127,17 @@ def fits(found: Survey, grid: Grid, bounds: Bounds) -> bool:
 
 
 def refitted(field: Field, bounds: Bounds) -> Field:
-    """Return a density on a grid that fits it, with a margin for many short substeps."""
+    """Return a density on a grid that fits it, with a margin for many short substeps.
+
+    Along other axes a density may need smaller spacings than along its own; where it does, it stays on its grid.
+    """
     grid, real = field.grid, field.values.real
-    narrow, _ = narrowest(survey(real, grid, bounds.edge, bounds.tail), grid, bounds.tail, bounds.spacings)
+    found = survey(real, grid, bounds.edge, bounds.tail)
+    narrow, _ = narrowest(found, grid, bounds.tail, bounds.spacings)
     used = np.flatnonzero(real > 0.3 * bounds.edge * real.max())
     logs = np.log(real.reshape(-1)[used] / real.max())
     new = fitted_grid(grid.offsets[used], logs, grid.centre, np.zeros((grid.n, grid.n)), narrow, bounds, grid, MARGIN)
-    return Field(resampled(field.values, grid, new, bounds.periodic), new, field.log_scale)
+    values = resampled(field.values, grid, new, bounds.periodic)
+    if survey(values, new).tails.max() > max(3 * bounds.tail, found.tails.max()):
+        return field
+    return Field(values, new, field.log_scale)
