@@ -34,6 +34,7 @@ Array = NDArray[Any]
 _TERMS = 18
 _LARGEST = 4.0  # of tau L
 _MOST_STEPS = 256
+_TOGETHER = 2**15  # points that are moved together: many more take memory, and time to fetch it
 _LARGEST_VOLUME = 300.0  # nats; points beyond come from outside of the grid
 
 
@@ -200,10 +201,12 @@ def characteristics(
         return np.asarray(np.any(~(z < sizes) & open_axes, axis=1))
 
     points, end = target.points, None if any(periodic) else beyond
+    if begun is not None:
+        points, t1 = points + begun[1][:, : source.n], begun[0]
+    parts = np.array_split(points, -(-len(points) // _TOGETHER))
     with np.errstate(all="ignore"):
-        if begun is None:
-            return runge_kutta(dynamics.drift, points, t1, t0, steps, end)
-        return begun[1] + runge_kutta(dynamics.drift, points + begun[1][:, : source.n], begun[0], t0, steps, end)
+        moved = np.concatenate([runge_kutta(dynamics.drift, part, t1, t0, steps, end) for part in parts])
+    return moved if begun is None else begun[1] + moved
 
 
 class Factor(NamedTuple):
