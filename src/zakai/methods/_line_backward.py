@@ -20,7 +20,7 @@ from zakai.methods._line_message import Message, points_of, reliable, support
 from zakai.methods._line_paths import draw
 from zakai.methods._line_system import Prepared, State, state_moments
 from zakai.methods._line_update import exponential_factor, factor_at_end
-from zakai.methods._line_way import Way, negligible
+from zakai.methods._line_way import Way, negligible, smoothing_tolerance
 from zakai.methods._protocol import Backward, Info
 from zakai.numerics import line_window as lw
 
@@ -78,7 +78,7 @@ def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message,
         mean = mean - 2 * np.pi * np.ceil((mean - np.pi) / (2 * np.pi))
     health = {
         "error_estimate": float(state.error) + later.error,
-        "tolerance_ratio": later.error / max(prepared.tolerance, 1e-8),
+        "tolerance_ratio": later.error / smoothing_tolerance(prepared),
         "edge_mass": max(look.left, look.right),
         "negative_mass": look.negative,
         "aliasing": look.aliasing,

@@ -40,6 +40,11 @@ def negligible(prepared: Prepared) -> float:
     return float(np.clip(1e-5 * prepared.tolerance, 1e-13, 1e-10))
 
 
+def smoothing_tolerance(prepared: Prepared) -> float:
+    """Return the error of an interval above which a smoother warns."""
+    return max(prepared.tolerance, 1e-6)
+
+
 def _decayed(values: Array, modes: Spectral, length: float) -> tuple[Array, float]:
     """Return exp(tau A) of values by a decomposition, and its rounding."""
     decay = np.exp(-length * modes.rates)
@@ -54,7 +59,7 @@ class Way:
         self.prepared, self.k, self.inside, self.rates, self.state = prepared, k, inside, rates, state
         self.start, self.length = float(prepared.schedule.starts[k]), float(prepared.lengths[k])
         self.accepted = max(negligible(prepared), 30.0 * prepared.negligible)
-        self.error = 0.0
+        self.error, self.tolerance = 0.0, smoothing_tolerance(prepared)
         own = state.window
         first, last = support(np.asarray(state.values).real, 1e-13)
         self.ends = float(own.offsets[first]), float(own.offsets[last])
@@ -113,11 +118,14 @@ class Way:
                     return None
                 error = np.inf
             look = lw.figures(moved, window.closed, self.accepted)
-            coarse = look.aliasing > self.accepted and not (look.rough and look.aliasing < 1e-3 * self.prepared.tolerance)
+            coarse = look.aliasing > self.accepted and not (look.rough and look.aliasing < 1e-3 * self.tolerance)
             if not coarse or window.size >= lw.LARGEST or (look.rough and attempt > 1):
                 break
             spacing = window.spacing / 1.5
-        self.error += error + 2.0 * look.aliasing + 10.0 * max(look.left, look.right)
+        made = error + 2.0 * look.aliasing + 10.0 * max(look.left, look.right)
+        if made > self.tolerance and not (later.closed or forced):
+            return None
+        self.error += made
         moved = np.maximum(moved, ROUNDING * np.max(moved))
         origin, centre, spacing, _, closed, unit = window
         logs = np.log(moved / spacing) - gauge.values + (top + offset)
@@ -214,7 +222,7 @@ class Way:
             commutator = 0.25 * (total @ (difference @ values) - difference @ (total @ values))
             inner = slice(None) if window.closed else slice(PAD, -PAD)
             error = 5.0 * float(np.sum(np.abs(commutator[inner])) / np.sum(values)) ** (5.0 / 3.0)
-            if error > MAGNUS * prepared.tolerance:
+            if error > MAGNUS * self.tolerance:
                 return None
         moved = values
         for part in reversed(parts):
@@ -247,7 +255,7 @@ class Way:
                 noise = max(noise, one, two)
             if before is not None:
                 error = float(at_start @ np.abs(now - before)) / (15.0 * float(at_start @ now))
-                if error < DIVIDED * self.prepared.tolerance:
+                if error < DIVIDED * self.tolerance:
                     self.error += error
                     now = now + (now - before) / 15.0
                     return now, count * noise / float(np.max(now))
@@ -262,7 +270,7 @@ class Way:
     def _exact(self, psi: Array, gauge: Gauge, window: lw.Window, error: float) -> bool:
         """Return whether the error of psi, relative to its maximum, is small in the product with the density at the start."""
         weights, top = self._weights(window, gauge), float(np.max(psi))
-        return bool(max(error, 1e-15) * top * np.sum(weights) < max(1e-9, 1e-2 * self.prepared.tolerance) * (weights @ psi))
+        return bool(max(error, 1e-15) * top * np.sum(weights) < 1e-2 * self.tolerance * (weights @ psi))
 
     def _gauge(self, window: lw.Window) -> Gauge:
         """Return the gauge of the interval on a grid."""
