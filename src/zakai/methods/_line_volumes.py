@@ -49,8 +49,7 @@ def contracted(
     """Return the density after an interval, None where it does not contract much or volumes do not serve."""
     if window.closed:
         return None
-    look = lw.figures(values, False)
-    ends = window.offsets[[max(look.first - 1, 0), min(look.last + 1, window.size - 1)]]
+    ends = _ends(values, window)
     width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(_drift(prepared, window, ends, start))))
     if not speed * length > FAST * width:
         return None
@@ -112,8 +111,7 @@ def pulled_back(
         log_worth: the logarithm of the function at offsets from the origin of the window (J,).
         values: the density before the interval.
     """
-    look = lw.figures(values, False)
-    ends = window.offsets[[max(look.first - 1, 0), min(look.last + 1, window.size - 1)]]
+    ends = _ends(values, window)
     course = _course(prepared, window, ends, start, length)
     if course is None:
         return None
@@ -194,6 +192,12 @@ def _settled(
     if best is None or not error < SETTLED:
         return None
     return best[0], best[2], best[1], error
+
+
+def _ends(values: Array, window: lw.Window) -> Array:
+    """Return the ends of the support of a density as offsets from the origin (2,)."""
+    look = lw.figures(values, False)
+    return window.offsets[[max(look.first - 1, 0), min(look.last + 1, window.size - 1)]]
 
 
 def _drift(prepared: Prepared, window: lw.Window, offsets: Array, t: float) -> Array:

@@ -94,7 +94,7 @@ def message(prepared: base.Prepared, state: State) -> Message:
             f"{prepared.model.source}: smooth: several states have no backward pass with cross_noise and a diffusion that "
             "depends on the state; take one of them out"
         )
-    if getattr(prepared, "lie", False):
+    if prepared.lie:
         source = prepared.model.source
         raise InputError(f'{source}: smooth: splitting="lie" has no backward pass for several states; take "strang"')
     general, own, n = _general(prepared), prepared.density(state), prepared.model.n

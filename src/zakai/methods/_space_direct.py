@@ -328,7 +328,6 @@ def regridded(field: Field, bounds: Bounds) -> Field:
 class Prepared(base.Prepared):
     """A model, a schedule and parameters, with the equation of its gauge."""
 
-    lie: bool = False
     yau: YauSystem = field(default=None)  # type: ignore[assignment]
     series: PowerSeries | None = None
 

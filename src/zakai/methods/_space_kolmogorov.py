@@ -57,7 +57,10 @@ MOST_FIXED = 8  # substeps of an interval on a grid that stays
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A model, a schedule and parameters, with the bounds that follow from the tolerance."""
+    """A model, a schedule and parameters, with the bounds that follow from the tolerance.
+
+    `lie` tells whether the filter splits an interval at its end only, which has no backward pass.
+    """
 
     model: Model
     schedule: Schedule
@@ -68,6 +71,7 @@ class Prepared:
     observations: Observations
     notes: tuple[str, ...] = ()
     motions: dict[Any, Any] = field(default_factory=dict)
+    lie: bool = False
 
     def init(self, prior: Any) -> State:
         """Return the prior on a grid."""
