@@ -176,9 +176,12 @@ def _nested(expression: sp.Expr, symbol: sp.Symbol) -> int:
 
 
 def _known_antiderivative(function: sp.Expr, symbol: sp.Symbol) -> sp.Expr | None:
-    """Antiderivatives of F(a x + b) in the forms that stay smooth on the whole line, such as log cosh for tanh."""
+    """Antiderivatives of powers, and of F(a x + b) in the forms that stay smooth on the whole line, such as log cosh for tanh."""
     if not function.has(symbol):
         return function * symbol
+    base, exponent = function.as_independent(symbol, as_Add=False)[1].as_base_exp()
+    if base == symbol and exponent.is_Integer and exponent > 0:
+        return function * symbol / (exponent + 1)
     rules = {
         sp.tanh: lambda u: sp.log(sp.cosh(u)),
         sp.coth: lambda u: sp.log(sp.sinh(u)),

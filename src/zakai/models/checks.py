@@ -142,6 +142,8 @@ def check_periodic(model: Model) -> None:
 
     Raises InputError naming the entry. Undetermined functions are taken as periodic.
     """
+    if not model.periodic:
+        return
     rng = np.random.default_rng(0)
     entries = [(f"drift[{i}]", expr) for i, expr in enumerate(model.drift)]
     for i, (expr, family) in enumerate(zip(model.observation, model.observation_family, strict=True)):
