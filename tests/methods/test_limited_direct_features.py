@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import factorial
+
 import numpy as np
 import pytest
 
@@ -32,6 +34,18 @@ def test_inputs_of_the_observation():
     plain = zakai.filter(model_of("-x", "x**3", **keys), samples(TIMES, values), "limited-direct")
     assert moved.mean == pytest.approx(plain.mean, abs=1e-9)
     assert moved.log_likelihood == pytest.approx(plain.log_likelihood, abs=1e-8)
+
+
+@pytest.mark.parametrize("method", ["limited-direct", "yau-yau"])
+def test_counts_whose_mean_is_no_product_of_input_and_state(method):
+    u, counts = np.array([1.0, -2.0, 3.0, 0.0, 2.0, -1.0, 0.5]), [0, 1, 0, 2, 1, 3, 0]
+    model = model_of("-x", "exp(tanh(x) + u*x/4)", observation_family="poisson", inputs=["u"])
+    result = zakai.filter(model, samples(TIMES, counts, zakai.Inputs([0.0, *TIMES], [0.0, *u])), method)
+    x = np.linspace(-5, 5, 401)
+    logs = [np.tanh(x) + v * x / 4 for v in u]
+    likelihoods = [lambda _, n=n, a=a: np.exp(n * a - np.exp(a)) / factorial(n) for n, a in zip(counts, logs, strict=True)]
+    lengths = np.diff(np.concatenate([[0.0], TIMES]))
+    assert error(result, dense(x, -x, np.ones(len(x)), likelihoods, lengths, normal(0.2, 0.5))) < 1e-6
 
 
 def test_tables_and_kinks_of_the_observation():

@@ -209,6 +209,8 @@ def kinds_of(prepared: Prepared) -> np.ndarray:
     if not prepared.gaussian:
         usable = system.samples and not system.moving and system.separated is not None
         return np.where(positive & (silent | (not system.general)), FACTOR, -1) if usable else none
+    if system.separated is None and not prepared.mixed:
+        return none
     whole = np.zeros(len(schedule), bool)
     if kernels is not None and yau is not None and yau.unobserved and yau.steady_gauge:
         whole = positive & (kernels.place >= 0) & (kernels.errors[kernels.place] == 0)
