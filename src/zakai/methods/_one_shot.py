@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import expm
 
 from zakai.densities import Density
 from zakai.errors import InputError
@@ -36,10 +37,7 @@ _NODES, _WEIGHTS = 0.5 * (_LINE + 1.0), 0.5 * _MASSES
 
 
 class State(NamedTuple):
-    """The state `own` of u~; the statistics b, a~ (n,), y (m,) and c; the `log_scale` of sigma, and the number of `steps`.
-
-    All but `own` stay zero in the stepwise form.
-    """
+    """The state `own` of u~; the statistics b, a~ (n,), y (m,) and c; the `log_scale` of sigma, and the number of `steps`."""
 
     own: families.State
     b: Array
@@ -125,27 +123,16 @@ def _maps(found: Constants, lengths: Array) -> Array:
     generator = np.zeros((twice + m, twice + m), found.hamiltonian.dtype)
     generator[:twice, :twice] = found.hamiltonian
     generator[twice // 2 : twice, twice:] = -found.slope.T
-    maps = np.zeros((len(lengths), len(_NODES) + 1, twice, twice + m), generator.dtype)
-    size = np.abs(generator.real).sum(axis=1).max()
-    for k, length in enumerate(lengths):
-        for j, share in enumerate([*_NODES, 1.0]):
-            halvings = max(0, int(np.ceil(np.log2(max(length * size, 1e-300)))) + 1)
-            matrix = generator * np.ldexp(length * share, -halvings)
-            value = np.eye(twice + m) + matrix / 18
-            for order in range(17, 0, -1):
-                value = np.eye(twice + m) + matrix @ value / order
-            for _ in range(halvings):
-                value = value @ value
-            maps[k, j] = value[:twice]
-    return maps
+    times = lengths[:, None] * [*_NODES, 1.0]
+    return np.asarray(expm(times[:, :, None, None] * generator)[:, :, :twice])
 
 
-def init(prepared: Prepared | families.Prepared, prior: Any) -> State:
+def init(prepared: Prepared, prior: Any) -> State:
     """Return the state of the prior, with statistics that are zero."""
-    base = prepared.base if isinstance(prepared, Prepared) else prepared
-    zero, kind = np.zeros(base.model.n), (complex if is_complex(base.setup.theta) else float)
-    none = zero.astype(kind)
-    return State(families.init(base, prior), none, none, np.zeros(base.model.m, kind), none[0], none[0], 0.0)
+    base = prepared.base
+    kind = complex if is_complex(base.setup.theta) else float
+    none, zero = np.zeros(base.model.n, kind), np.zeros((), kind)
+    return State(families.init(base, prior), none, none, np.zeros(base.model.m, kind), zero, zero, 0.0)
 
 
 def c_rate(k: Constants, b: Array, a: Array, b_rate: Array) -> Any:

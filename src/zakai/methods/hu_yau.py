@@ -13,6 +13,7 @@ stable over any time; Theorems 4 and 5 then are one method, for e^F cancels.  `f
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -27,7 +28,7 @@ from zakai.methods import _gaussian_families as families
 from zakai.methods import _one_shot as one_shot
 from zakai.methods._affine_system import AffineSystem
 from zakai.methods._gaussian_backward import BACKWARD, Message
-from zakai.methods._protocol import Backward, Info, Method
+from zakai.methods._protocol import Info, Method
 from zakai.models.features import INPUTS
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
@@ -37,7 +38,6 @@ from zakai.records.schedule import Schedule
 
 THEOREMS = ("theorem-4", "theorem-5", "theorem-6", "survey-1")
 Prepared = families.Prepared | one_shot.Prepared
-State = one_shot.State
 
 
 class WithoutDrift(AffineSystem):
@@ -127,59 +127,43 @@ def _check_theorem(model: Model, theorem: str, theta: Array) -> None:
             )
 
 
-def init(prepared: Prepared, prior: Any) -> State:
+def init(prepared: Prepared, prior: Any) -> Any:
     """Return the state at the model's start."""
-    return one_shot.init(prepared, prior)
+    return one_shot.init(prepared, prior) if isinstance(prepared, one_shot.Prepared) else families.init(prepared, prior)
 
 
-def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
+def step(prepared: Prepared, k: int, state: Any, values: Array) -> tuple[Any, Info]:
     """Advance one interval; nothing cancels in the stepwise form."""
     if isinstance(prepared, one_shot.Prepared):
         return one_shot.step(prepared, k, state, values)
-    moved, info = families.step(prepared, k, state.own, values)
-    return state._replace(own=moved), info._replace(health={"lost_digits": 0.0, **info.health})
+    state, info = families.step(prepared, k, state, values)
+    return state, _without_loss(info)
 
 
-def density(prepared: Prepared, state: State) -> Density:
+def density(prepared: Prepared, state: Any) -> Density:
     """Return the posterior."""
     if isinstance(prepared, one_shot.Prepared):
         return one_shot.density(prepared, state)
-    return families.density(prepared, state.own)
+    return families.density(prepared, state)
 
 
-def message(prepared: Prepared, state: State) -> Message:
+def message(prepared: Prepared, state: Any) -> Message:
     """Return the message of the backward pass at the last time."""
     if isinstance(prepared, one_shot.Prepared):
         raise InputError(
             f'{prepared.base.model.source}: option form: "one-shot" has no smoother; take form="stepwise"'
         )
-    return BACKWARD.message(prepared, state.own)
+    return BACKWARD.message(prepared, state)
 
 
-def smoothed(prepared: Any, state: State, later: Message) -> tuple[Message, Info]:
+def smoothed(prepared: Any, state: Any, later: Message) -> tuple[Message, Info]:
     """Return the message normalised, and the smoothed moments."""
-    own, info = BACKWARD.smoothed(prepared, state.own, later)
-    return own, info._replace(health={"lost_digits": 0.0, **info.health})
+    own, info = BACKWARD.smoothed(prepared, state, later)
+    return own, _without_loss(info)
 
 
-def smoothed_density(prepared: Any, state: State, later: Message) -> Density:
-    """Return the smoothed density."""
-    return BACKWARD.density(prepared, state.own, later)
-
-
-def draw(
-    prepared: Any, k: int, later: Array, values: Array, state: State, rng: np.random.Generator
-) -> tuple[Array, float]:
-    """Return draws of the state at the start of interval k given those at its end."""
-    assert BACKWARD.draw is not None
-    return BACKWARD.draw(prepared, k, later, values, state.own, rng)
-
-
-def valid(prepared: Prepared, state: State) -> bool:
-    """Return whether the arrays of a state fit together."""
-    base = prepared.base if isinstance(prepared, one_shot.Prepared) else prepared
-    n, m = base.model.n, base.model.m
-    return families.valid(base, state.own) and [np.shape(part) for part in state[1:4]] == [(n,), (n,), (m,)]
+def _without_loss(info: Info) -> Info:
+    return info._replace(health={"lost_digits": 0.0, **info.health})
 
 
 BOUNDS: Mapping[str, tuple[float, str]] = {
@@ -187,7 +171,8 @@ BOUNDS: Mapping[str, tuple[float, str]] = {
     "lost_digits": (1e-6, 'rounding of the evidence in nats, as the statistics of one shot cancel; take form="stepwise"'),
 }
 
-METHOD: Method[Prepared, State] = Method(
+# An online filter and a smoother need the stepwise form, whose state is that of the families.
+METHOD: Method[Prepared, Any] = Method(
     name="hu-yau",
     source="Hu and Yau 2002, Theorems 3 to 6, corrected; any prior: Makowski 1986",
     exactness="exact for y that is linear between observations, and for samples; the prior to 1e-12",
@@ -197,10 +182,10 @@ METHOD: Method[Prepared, State] = Method(
     init=init,
     step=step,
     density=density,
-    state=State,
+    state=families.State,
     bounds=BOUNDS,
     absolute=lambda options: bool(options["form"] == "one-shot"),
-    valid=valid,
+    valid=cast(Any, families.valid),
     handles=frozenset({INPUTS}),
-    backward=Backward(message, cast(Any, BACKWARD.step), smoothed, smoothed_density, draw=draw),
+    backward=replace(cast(Any, BACKWARD), message=message, smoothed=smoothed, segment=None),
 )
