@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 
@@ -89,3 +92,18 @@ def test_times_that_are_none_are_refused():
     for times, words in [(times, words) for words, every in wrong.items() for times in every]:
         with pytest.raises(zakai.InputError, match=words):
             zakai.prepare(model, times)
+
+
+def test_what_is_kept_of_a_model_ends_with_it():
+    alive = []
+    for i in range(1, 91):
+        model = zakai.Model(
+            state=["x"],
+            drift=[f"-{i}*x"],
+            observation=["x"],
+            prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
+        )
+        zakai.filter(model, zakai.Record([0.1], [[0.0]], "increments"), "kalman-bucy")
+        alive.append(weakref.ref(model))
+    gc.collect()
+    assert sum(one() is not None for one in alive) <= 70  # what is known of the formulas of the last 64

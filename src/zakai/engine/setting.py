@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping
-from threading import Lock
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -14,15 +11,13 @@ from zakai.densities import Density
 from zakai.errors import InputError
 from zakai.methods._protocol import Method
 from zakai.models.domain import NEGLIGIBLE
+from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
 from zakai.records.schedule import Schedule
 
 _ENDS = "in two or more states the density must vanish before the ends of the domain, and have a value beyond them"
 KEPT = 8  # schedules whose preparation is kept for each model
-
-_PREPARED: WeakKeyDictionary[Model, OrderedDict[Any, Any]] = WeakKeyDictionary()
-_LOCK = Lock()
 
 
 class Setting(NamedTuple):
@@ -54,23 +49,13 @@ class Setting(NamedTuple):
         Of a model that does not depend on t every interval begins at zero, so that equal lengths are prepared equally.
         """
         schedule = schedule.from_zero() if self.autonomous else schedule
-        key = (
-            self.method.name,
-            tuple(sorted(self.options.items())),
-            self.theta.tobytes(),
-            *schedule.key(),
+        return kept(
+            self.model,
+            "schedules",
+            lambda: self.method.prepare(self.model, schedule, self.theta, **self.options),
+            (self.method.name, tuple(sorted(self.options.items())), self.theta.tobytes(), *schedule.key()),
+            KEPT,
         )
-        with _LOCK:
-            kept = _PREPARED.setdefault(self.model, OrderedDict())
-            if key in kept:
-                kept.move_to_end(key)
-                return kept[key]
-        prepared = self.method.prepare(self.model, schedule, self.theta, **self.options)
-        with _LOCK:
-            kept[key] = prepared
-            while len(kept) > KEPT:
-                kept.popitem(last=False)
-        return prepared
 
     def begin(self) -> tuple[Any, Any]:
         """Return what is prepared for no interval, and the state at the model's start."""

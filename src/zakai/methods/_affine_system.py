@@ -23,7 +23,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from threading import Lock
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import sympy as sp
@@ -32,6 +31,7 @@ from zakai.algebra.gauges import affine_system
 from zakai.algebra.systems import affine_observation
 from zakai.errors import InputError
 from zakai.methods._input_pieces import Pieces, pieces_of
+from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.flow import Coefficients, FlowResult, Transition, composed, integrate
@@ -274,12 +274,6 @@ class Setup:
             )
 
 
-_SYSTEMS: WeakKeyDictionary[Model, dict[type[AffineSystem], AffineSystem]] = WeakKeyDictionary()
-
-
 def affine_system_of(model: Model, kind: type[AffineSystem] = AffineSystem) -> AffineSystem:
     """Return the system of a model, one for all values of its parameters."""
-    kept = _SYSTEMS.setdefault(model, {})
-    if kind not in kept:
-        kept[kind] = kind(model)
-    return kept[kind]
+    return kept(model, kind, lambda: kind(model))

@@ -10,12 +10,12 @@ Else phi depends on one or two directions z = D x, and the integrals over z are 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from zakai.algebra.gauges import gauge
 from zakai.methods._affine_system import Matrices
+from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.complex_step import cholesky
@@ -50,9 +50,6 @@ class _Formulas:
         self.matrices = Matrices(blocks, model)
 
 
-_FORMULAS: WeakKeyDictionary[Model, _Formulas] = WeakKeyDictionary()
-
-
 class Gauge:
     """phi for the parameters `theta`, at coordinates relative to an origin.
 
@@ -60,9 +57,7 @@ class Gauge:
     """
 
     def __init__(self, model: Model, theta: Array, origin: Array):
-        if model not in _FORMULAS:
-            _FORMULAS[model] = _Formulas(model)
-        self._formulas = _FORMULAS[model]
+        self._formulas = kept(model, _Formulas, lambda: _Formulas(model))
         self.trivial, self.exact, self.count = self._formulas.trivial, self._formulas.exact, self._formulas.count
         self.theta, self.origin = theta, origin
         self._constant: list[Array] | None = None  # the matrices, where they do not depend on time

@@ -5,13 +5,10 @@ Kalman-Bucy, Benes and Hu-Yau are this filter for phi = 0, phi = log cosh and an
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from threading import Lock
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -24,6 +21,7 @@ from zakai.methods._gauged_density import density_of
 from zakai.methods._gaussian_ends import Ends, ends_of
 from zakai.methods._protocol import Info, Infos, stacked
 from zakai.methods._states import StackedStates
+from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior, MixturePrior
 from zakai.numerics.complex_step import is_complex
@@ -93,24 +91,16 @@ class Prepared:
         return self.gauge.at(self.stops)
 
 
-_SETUPS: WeakKeyDictionary[Model, OrderedDict[Any, tuple[Setup, Gauge]]] = WeakKeyDictionary()
-_LOCK = Lock()
-
-
 def setup_of(model: Model, theta: Array, kind: type[AffineSystem]) -> tuple[Setup, Gauge]:
     """Return what does not depend on the schedule, kept for the last values of the parameters."""
-    key = (kind, theta.dtype, theta.tobytes())
-    with _LOCK:
-        kept = _SETUPS.setdefault(model, OrderedDict())
-        if key not in kept:
-            prior = model.prior
-            # The coordinates are relative to where the state begins.
-            origin = np.array(prior.mean) if isinstance(prior, GaussianPrior | MixturePrior) else np.zeros(model.n)
-            system = affine_system_of(model, kind)
-            kept[key] = Setup(system, theta, origin), Gauge(model, theta, origin)
-            while len(kept) > _KEPT:
-                kept.popitem(last=False)
-        return kept[key]
+
+    def made() -> tuple[Setup, Gauge]:
+        prior = model.prior
+        # The coordinates are relative to where the state begins.
+        origin = np.array(prior.mean) if isinstance(prior, GaussianPrior | MixturePrior) else np.zeros(model.n)
+        return Setup(affine_system_of(model, kind), theta, origin), Gauge(model, theta, origin)
+
+    return kept(model, (Setup, kind), made, (theta.dtype, theta.tobytes()), _KEPT)
 
 
 def prepare(model: Model, schedule: Schedule, theta: Array, kind: type[AffineSystem] = AffineSystem) -> Prepared:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import sympy as sp
 
 from zakai.methods._affine_system import RESOLVED, precision_of
 from zakai.methods._input_pieces import Pieces
+from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import NumericFunction, numpy_function
 from zakai.numerics.flow import Coefficients, integrate
@@ -60,14 +60,9 @@ class Formulas:
         return values[:m], values[m:].reshape(m, n)
 
 
-_FORMULAS: WeakKeyDictionary[Model, Formulas] = WeakKeyDictionary()
-
-
 def formulas_of(model: Model) -> Formulas:
     """Return the functions of a model, made once."""
-    if model not in _FORMULAS:
-        _FORMULAS[model] = Formulas(model)
-    return _FORMULAS[model]
+    return kept(model, Formulas, lambda: Formulas(model))
 
 
 class Part(NamedTuple):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import sympy
@@ -12,6 +11,7 @@ from sympy.core.function import AppliedUndef
 
 from zakai.errors import InputError
 from zakai.models._definite import ROUNDING, is_symmetric, smallest_eigenvalue
+from zakai.models.kept import kept
 from zakai.models.numeric import NumericFunction, numpy_function
 from zakai.models.prior import DensityPrior
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 COEFFICIENTS = ("diffusion", "process_noise", "observation_noise", "cross_noise")
 NoiseCheck = Callable[[np.ndarray, np.ndarray], tuple[int, tuple[str, str]] | None]
 WITHIN = 1024  # times inside of intervals at which noise is checked
-
-_GOOD: WeakKeyDictionary[Model, set[str]] = WeakKeyDictionary()  # the noises of a model that are noise at all times
 
 
 def check_noise_at(model: Model, times: Any, keys: Sequence[str] = COEFFICIENTS) -> None:
@@ -37,8 +35,9 @@ def check_noise_at(model: Model, times: Any, keys: Sequence[str] = COEFFICIENTS)
         >>> from zakai.models import load_model
         >>> check_noise_at(load_model("gallery:spiral-sensor"), [0.0, 10.0])
     """
+    good: set[str] = kept(model, check_noise_at, set)  # the noises that are noise at all times
     for key in keys:
-        if key in _GOOD.get(model, ()) or depends_on_state(getattr(model, key), model):
+        if key in good or depends_on_state(getattr(model, key), model):
             continue
         problem, varies = _problem(model, key, np.atleast_1d(np.asarray(times, dtype=float))), getattr(model, key).has(model.t)
         if problem:
@@ -46,7 +45,7 @@ def check_noise_at(model: Model, times: Any, keys: Sequence[str] = COEFFICIENTS)
             when = f" at t = {np.atleast_1d(times)[index]:.12g}" if varies else ""
             raise InputError(f"{model.source}: {key}: {words[0]}{when}{words[1]}")
         if not varies:
-            _GOOD.setdefault(model, set()).add(key)
+            good.add(key)
 
 
 def check_noise_within(model: Model, times: np.ndarray) -> None:

@@ -30,6 +30,7 @@ KEYS = (
 )  # fmt: skip
 Formulas = Sequence[str | float | sympy.Expr]
 FormulaRows = Sequence[Formulas]
+_OWN = ("text", "observation_law", "_kept")  # what depends on the values of the parameters, or on the prior
 
 
 class Model:
@@ -229,8 +230,8 @@ class Model:
                     raise InputError(f"unknown parameter {name!r}{did_you_mean(name, self.parameters)} {known}")
             parameters = {**self.parameters, **read_parameters(values)}
         other = object.__new__(Model)
-        kept = {key: value for key, value in vars(self).items() if key not in ("text", "observation_law")}
-        vars(other).update({**kept, "parameters": parameters, "_keys": {**self._keys, "parameters": parameters}})
+        same = {key: value for key, value in vars(self).items() if key not in _OWN}
+        vars(other).update({**same, "parameters": parameters, "_keys": {**self._keys, "parameters": parameters}})
         with named(self.source):
             checks.check_constant_noise(other)
         return other
@@ -253,7 +254,7 @@ class Model:
             (2.0, [0.3])
         """
         other = object.__new__(Model)
-        vars(other).update({key: value for key, value in vars(self).items() if key not in ("text", "observation_law")})
+        vars(other).update({key: value for key, value in vars(self).items() if key not in _OWN})
         changed: dict[str, Any] = {}
         with named(self.source):
             if start is not None:
