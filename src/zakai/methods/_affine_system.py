@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from threading import Lock
 from typing import Any
 
@@ -104,7 +105,6 @@ class AffineSystem:
         self.autonomous = not any(part.timed for part in parts) and (model.input_hold == "zero" or not self.matrices.driven)
         self.inputs = len(model.u)
         self.kind, self.hold, self.source = model.observation_kind, model.input_hold, model.source
-        self.kept_quadratics: dict[Any, tuple[Array, Array]] = {}
 
     @property
     def correlated(self) -> bool:
@@ -156,7 +156,7 @@ class AffineSystem:
         return slope, (intercept + slope @ origin[:, None])[:, :, 0], noise
 
     def quadratic(self, theta: Array, origin: Array) -> tuple[Array, Array] | None:
-        """Return K (n, n) and k (n,) of S = -x'K x / 2 - k.x where the equation is that of e^S v; None: it is that of v."""
+        """Return `Setup.quadratic`."""
         return None
 
 
@@ -185,8 +185,17 @@ class Setup:
     theta: Array
     origin: Array
     kept: dict[bytes, Transition] = field(default_factory=dict)
-    still: list[tuple[Array, Array, Array]] = field(default_factory=list)
     lock: Any = field(default_factory=Lock)
+
+    @cached_property
+    def quadratic(self) -> tuple[Array, Array] | None:
+        """K (n, n) and k (n,) of S = -x'K x / 2 - k.x where the equation is that of e^S v; None: it is that of v."""
+        return self.system.quadratic(self.theta, self.origin)
+
+    @cached_property
+    def constant_observation(self) -> tuple[Array, Array, Array]:
+        """C, c and S, each with a leading axis of one, where they do not vary."""
+        return self.system.observation(np.zeros(1), self.theta, self.origin, None)
 
     def integrated(self, pieces: Pieces, lengths: Array, inside: Array) -> FlowResult:
         """Return the transitions of pieces in which the coordinates `inside` (J, m) act."""
@@ -210,9 +219,7 @@ class Setup:
             if inputs is not None:
                 u = inputs.at(stops, self.system.hold, before=self.system.kind != "samples")
             return self.system.observation(stops, self.theta, self.origin, u)
-        if not self.still:
-            self.still.append(self.system.observation(np.zeros(1), self.theta, self.origin, None))
-        slope, intercept, noise = (np.broadcast_to(array, (len(stops), *array.shape[1:])) for array in self.still[0])
+        slope, intercept, noise = (np.broadcast_to(array, (len(stops), *array.shape[1:])) for array in self.constant_observation)
         return slope, intercept, noise
 
     def transitions(self, schedule: Schedule, inside: Array) -> tuple[Transition, tuple[str, ...]]:

@@ -69,8 +69,7 @@ def message(prepared: Prepared, state: State) -> Message:
         tilts = gauge.at_one(state.time)
         assert tilts.slopes is not None and tilts.logs is not None
         slopes, logs = tilts.slopes, tilts.logs
-    quadratic = setup.system.quadratic(setup.theta, setup.origin)
-    matrix, slope = (np.zeros((n, n)), np.zeros(n)) if quadratic is None else quadratic
+    matrix, slope = (np.zeros((n, n)), np.zeros(n)) if setup.quadratic is None else setup.quadratic
     return Message(np.zeros(n), -matrix, slopes + slope, logs)
 
 

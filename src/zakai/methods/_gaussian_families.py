@@ -133,16 +133,17 @@ def init(prepared: Prepared, prior: Any) -> State:
     families = found.families
     log_mass = posterior(gauge, gauge.at_one(model.start), model.start, families).log_mass
     families = families._replace(log_mass=families.log_mass - log_mass)
-    quadratic = setup.system.quadratic(setup.theta, setup.origin)
-    if quadratic is not None:
-        families = times_gauge(families, quadratic, 1.0)
+    if setup.quadratic is not None:
+        families = times_gauge(families, setup, 1.0)
         _check_normalisable(model, families.cov)
     return State(*families, found.log_error, found.edge, float(model.start))
 
 
-def times_gauge(families: Family, quadratic: tuple[Array, Array], sign: float) -> Family:
-    """Return the families times e^{sign S}, S = -x'K x / 2 - k.x."""
-    matrix, slope = quadratic
+def times_gauge(families: Family, setup: Setup, sign: float) -> Family:
+    """Return the families times e^{sign S}, where the equation is that of e^S v."""
+    if setup.quadratic is None:
+        return families
+    matrix, slope = setup.quadratic
     return weigh(families, sign * matrix, -sign * slope, 0.0)
 
 
@@ -196,8 +197,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     gauge, setup, inputs = prepared.gauge, prepared.setup, inputs_of(prepared, k, values)
     families = observe_end(prepared.ends, k, move_families(prepared, k, state.families, inputs), values)
     moved = State(*families, state.log_error, state.edge, float(prepared.stops[k]))
-    quadratic = setup.system.quadratic(setup.theta, setup.origin)
-    own = families if quadratic is None else times_gauge(families, quadratic, -1.0)
+    own = times_gauge(families, setup, -1.0)
     found = posterior(gauge, tilts_at(prepared.tilts, k), prepared.stops[k], own)
     info = Info(found.log_mass, found.mean + setup.origin, found.cov, health_of(moved, own, found))
     return moved._replace(log_mass=families.log_mass - found.log_mass), info
@@ -268,10 +268,7 @@ def health_of(state: State, families: Family, found: Posterior) -> dict[str, flo
 
 def density(prepared: Prepared, state: State) -> Density:
     """Return the posterior: a mixture of Gaussians where e^phi is a sum of exponentials, else by its formula."""
-    setup = prepared.setup
-    quadratic = setup.system.quadratic(setup.theta.real, setup.origin)
-    families = Family(*(array.real for array in state.families))
-    families = families if quadratic is None else times_gauge(families, quadratic, -1.0)
+    families = Family(*(array.real for array in times_gauge(state.families, prepared.setup, -1.0)))
     return density_of(prepared.model, prepared.gauge.real(), state.time, families)
 
 

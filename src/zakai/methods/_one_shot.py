@@ -178,9 +178,7 @@ def _rounding(k: Constants, state: State) -> float:
 def _sigma(prepared: Prepared, state: State) -> Family:
     """Return e^-F sigma as families."""
     setup, k = prepared.base.setup, prepared.constants
-    found = state.own.families
-    quadratic = setup.system.quadratic(setup.theta, setup.origin)
-    found = found if quadratic is None else families.times_gauge(found, quadratic, -1.0)
+    found = families.times_gauge(state.own.families, setup, -1.0)
     constant = k.intercept @ state.y - state.c + (state.a + k.slope.T @ state.y) @ state.b
     return weigh(found._replace(mean=found.mean + state.b), np.zeros((len(state.b),) * 2), -state.a, constant)
 

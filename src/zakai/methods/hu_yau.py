@@ -33,7 +33,7 @@ from zakai.models.features import INPUTS
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.flow import Coefficients
-from zakai.numerics.transition import Array, transposed
+from zakai.numerics.transition import Array, symmetric, transposed
 from zakai.records.schedule import Schedule
 
 THEOREMS = ("theorem-4", "theorem-5", "theorem-6", "survey-1")
@@ -64,14 +64,9 @@ class WithoutDrift(AffineSystem):
 
     def quadratic(self, theta: Array, origin: Array) -> tuple[Array, Array] | None:
         """Return K (n, n) and k (n,) of S = -x'K x / 2 - k.x; the coefficients are constant."""
-        key = (theta.tobytes(), origin.tobytes())
-        if key not in self.kept_quadratics:
-            L, l, G, *_ = self.letters(np.zeros(1), theta, origin)
-            slope = np.linalg.solve(G[0], np.concatenate([L[0], l[0]], axis=1))
-            n = len(slope)
-            self.kept_quadratics.clear()
-            self.kept_quadratics[key] = 0.5 * (slope[:, :n] + slope[:, :n].T), slope[:, n]
-        return self.kept_quadratics[key]
+        L, l, G, *_ = self.letters(np.zeros(1), theta, origin)
+        slope = np.linalg.solve(G[0], np.concatenate([L[0], l[0]], axis=1))
+        return symmetric(slope[:, :-1]), slope[:, -1]
 
 
 def prepare(
