@@ -31,6 +31,7 @@ from zakai.methods._input_pieces import Pieces, pieces_of
 from zakai.methods._line_cross import OMITTED
 from zakai.methods._linearised_system import Formulas, Part, formulas_of, part_of, rate_noise_of, subdivided
 from zakai.methods._moments import prior_moments
+from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info
 from zakai.models.model import Model
 from zakai.numerics.complex_step import cholesky, is_complex
@@ -100,10 +101,8 @@ def prepare(model: Model, schedule: Schedule, theta: Array, *, riccati: str = "s
     Raises:
         InputError: an option has another value.
     """
-    if riccati not in ("stable", "euler"):
-        raise InputError(f'option riccati: "{riccati}" is neither "stable" nor "euler"')
-    if isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1:
-        raise InputError(f"option substeps: {substeps!r} is not a whole number from 1")
+    one_of("riccati", riccati, ("stable", "euler"))
+    whole_number("substeps", substeps, 1)
     formulas = formulas_of(model)
     if riccati == "euler" and formulas.cross is not None:
         raise InputError('option riccati: "euler" is for independent noises, and there is cross_noise; use "stable"')

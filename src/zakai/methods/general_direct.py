@@ -17,6 +17,7 @@ from zakai.algebra.theorems import general_direct as theorem
 from zakai.densities import GaussianMixture
 from zakai.errors import InputError
 from zakai.methods import _sum_start as start
+from zakai.methods._options import one_of, real_number, whole_number
 from zakai.methods._protocol import Info, Method
 from zakai.methods._sum_intervals import Prepared, advance, prepared_of
 from zakai.methods._sum_update import SPLIT_FACTOR, Sum, sum_of
@@ -101,22 +102,17 @@ def prepare(
 
 
 def _check(model: Model, components: Any, splitting: Any, reduction: Any, tolerance: Any, alpha: Any) -> None:
-    if reduction not in _REDUCTIONS:
-        listed = ", ".join(f'"{name}"' for name in _REDUCTIONS)
-        raise InputError(f'option reduction: "{reduction}" is none of {listed}')
+    one_of("reduction", reduction, _REDUCTIONS)
     if model.n > _REDUCTIONS[reduction]:
         most = _REDUCTIONS[reduction]
         raise InputError(f'option reduction: "{reduction}" is for n <= {most}, here n = {model.n}; use "split-merge"')
     if reduction != "split-merge" and model.periodic:
         raise InputError(f'option reduction: "{reduction}" does not support angles; use "split-merge"')
-    if isinstance(alpha, bool) or not isinstance(alpha, int | float) or not 0 < alpha < 1:
-        raise InputError(f"option alpha: {alpha!r} must lie between 0 and 1")
-    if splitting not in ("strang", "lie"):
-        raise InputError(f'option splitting: "{splitting}" is neither "strang" nor "lie"')
-    if components is not None and (isinstance(components, bool) or not isinstance(components, int) or components < 1):
-        raise InputError(f"option components: {components!r} must be a whole number from 1")
-    if not isinstance(tolerance, int | float) or not 0 < tolerance < 1:
-        raise InputError(f"option tolerance: {tolerance!r} must lie between 0 and 1")
+    one_of("splitting", splitting, ("strang", "lie"))
+    if components is not None:
+        whole_number("components", components, 1)
+    for name, value in (("alpha", alpha), ("tolerance", tolerance)):
+        real_number(name, value, "a number between 0 and 1", lambda number: 0 < number < 1)
 
 
 def _notes(static: Sum, schedule: Schedule, errors: tuple[float, float]) -> tuple[str, ...]:

@@ -28,6 +28,7 @@ from zakai.methods import _gaussian_families as families
 from zakai.methods import _one_shot as one_shot
 from zakai.methods._affine_system import AffineSystem
 from zakai.methods._gaussian_backward import BACKWARD, Message
+from zakai.methods._options import one_of, real_number
 from zakai.methods._protocol import Info, Method
 from zakai.models.features import INPUTS
 from zakai.models.model import Model
@@ -87,12 +88,9 @@ def prepare(
     Raises:
         InputError: an option does not fit.
     """
-    if form not in ("stepwise", "one-shot"):
-        raise InputError(f'option form: "{form}" is neither "stepwise" nor "one-shot"')
-    if theorem not in THEOREMS:
-        raise InputError(f'option theorem: "{theorem}" is none of {", ".join(THEOREMS)}')
-    if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not tolerance > 0:
-        raise InputError(f"option tolerance: {tolerance!r} is not a positive number")
+    one_of("form", form, ("stepwise", "one-shot"))
+    one_of("theorem", theorem, THEOREMS)
+    real_number("tolerance", tolerance, "a positive number", lambda value: value > 0)
     _check_theorem(model, theorem, np.asarray(theta).real)
     kind = WithoutDrift if theorem == "theorem-6" else AffineSystem
     if form == "stepwise":

@@ -34,6 +34,7 @@ from zakai.methods._kolmogorov_transition import (
     times_factor,
     transition,
 )
+from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info, Method
 from zakai.methods._residuals import Factor
 from zakai.methods._space_system import prior_on_grid
@@ -88,13 +89,11 @@ def prepare(
     Raises:
         InputError: an option has another value.
     """
-    for name, value, most in (("order", order, 6), ("substeps", 1 if substeps is None else substeps, MOST_SUBSTEPS)):
-        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
-            raise InputError(f"option {name}: {value!r} is not a whole number from 1 to {most}")
-    if form not in FORMS:
-        raise InputError(f'option form: "{form}" is neither "log" nor "sum"')
-    if splitting not in ("strang", "lie"):
-        raise InputError(f'option splitting: "{splitting}" is neither "strang" nor "lie"')
+    whole_number("order", order, 1, 6)
+    if substeps is not None:
+        whole_number("substeps", substeps, 1, MOST_SUBSTEPS)
+    one_of("form", form, FORMS)
+    one_of("splitting", splitting, ("strang", "lie"))
     theta = np.asarray(theta)
     system = system_of(model, theta.tobytes(), theta.dtype.str, order, form)
     return Prepared(system, schedule, schedule.lengths, substeps, splitting == "lie")

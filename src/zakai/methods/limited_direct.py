@@ -16,6 +16,7 @@ from zakai.methods import _line
 from zakai.methods._grid_backward import BACKWARD
 from zakai.methods._line_system import State
 from zakai.methods._line_yau import power_series_of, yau_line_of
+from zakai.methods._options import one_of
 from zakai.methods._protocol import Method
 from zakai.methods.yau_yau import BOUNDS, density, init, segment, step, valid
 from zakai.models import features
@@ -55,10 +56,8 @@ def prepare(
         InputError: another word, a tolerance that is out of range, or an order that is no whole number from 1.
         ConditionError: with the series, a singular G, or a coefficient that is not analytic in time.
     """
-    if kernel not in ("flow", "power-series"):
-        raise InputError(f'option kernel: "{kernel}" is neither "flow" nor "power-series"')
-    if splitting not in ("strang", "lie"):
-        raise InputError(f'option splitting: "{splitting}" is neither "strang" nor "lie"')
+    one_of("kernel", kernel, ("flow", "power-series"))
+    one_of("splitting", splitting, ("strang", "lie"))
     series = kernel == "power-series"
     if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1 or not series):
         raise InputError(f'option order: {order!r} must be a whole number from 1, and needs kernel="power-series"')

@@ -20,7 +20,7 @@ import numpy as np
 
 from zakai.algebra.exponentials import wei_norman_filter as theorem
 from zakai.densities import GridDensity
-from zakai.errors import InputError
+from zakai.methods._options import whole_number
 from zakai.methods._protocol import Info, Method
 from zakai.methods._residuals import Factor
 from zakai.methods._space_system import prior_on_grid
@@ -94,8 +94,8 @@ def prepare(model: Model, schedule: Schedule, theta: Array, *, points: int | Non
     Raises:
         InputError: `points` is not a whole number from 16.
     """
-    if points is not None and (isinstance(points, bool) or not isinstance(points, int) or not 16 <= points <= 4096):
-        raise InputError(f"option points: {points!r} must be a whole number from 16 to 4096")
+    if points is not None:
+        whole_number("points", points, 16, 4096)
     theta = np.asarray(theta)
     system = system_of(model, theta.tobytes(), theta.dtype.str)
     return Prepared(system, schedule, schedule.lengths, points)

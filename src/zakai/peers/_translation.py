@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities._density import wrap
-from zakai.errors import InputError
+from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info, Infos
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
@@ -94,33 +94,10 @@ def system_of(model: Model, scheme: str, substeps: int, rule: Any) -> System:
     Raises:
         InputError: an unknown scheme or number of substeps.
     """
-    if scheme not in SCHEMES:
-        raise InputError(f'option scheme: "{scheme}" is neither "midpoint" nor "euler"')
+    one_of("scheme", scheme, SCHEMES)
     matrices = (model.drift, model.diffusion, model.process_noise, model.observation, model.observation_noise)
     names = (model.state, model.parameter_symbols, model.periodic, model.functions, model.observation_kind)
     return _system(_Formulas((names, matrices), model), scheme, whole_number("substeps", substeps, 1), rule)
-
-
-def whole_number(option: str, value: Any, least: int, most: int = 10**9) -> int:
-    """Return the value of an option that counts something.
-
-    Raises:
-        InputError: it is not a whole number from `least` to `most`.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
-        raise InputError(f"option {option}: {value!r} is not a whole number from {least} to {most}")
-    return int(value)
-
-
-def real_number(option: str, value: Any, what: str, fits: Callable[[Any], Any]) -> float:
-    """Return the value of an option that measures something.
-
-    Raises:
-        InputError: it is not a number, or does not satisfy `fits`, which `what` describes.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not fits(value):
-        raise InputError(f"option {option}: {value!r} is not {what}")
-    return float(value)
 
 
 class Interval(NamedTuple):

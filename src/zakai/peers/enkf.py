@@ -16,6 +16,7 @@ import numpy as np
 
 from zakai.algebra.theorems import smooth_system as theorem
 from zakai.densities import PointMasses
+from zakai.methods._options import real_number, whole_number
 from zakai.methods._protocol import Info, Method
 from zakai.models.model import Model
 from zakai.peers import _float64  # noqa: F401
@@ -31,8 +32,6 @@ from zakai.peers._translation import (
     compiled,
     in_deviations,
     innovations,
-    real_number,
-    whole_number,
 )
 from zakai.records.schedule import Schedule
 

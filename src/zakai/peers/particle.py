@@ -17,7 +17,7 @@ import numpy as np
 
 from zakai.algebra.theorems import smooth_system as theorem
 from zakai.densities import PointMasses
-from zakai.errors import InputError
+from zakai.methods._options import one_of, real_number, whole_number
 from zakai.methods._protocol import Info, Method
 from zakai.models.model import Model
 from zakai.peers import _float64  # noqa: F401
@@ -33,8 +33,6 @@ from zakai.peers._translation import (
     compiled,
     in_deviations,
     innovations,
-    real_number,
-    whole_number,
 )
 from zakai.records.schedule import Schedule
 
@@ -97,8 +95,7 @@ def prepare(
     Raises:
         InputError: another value of an option.
     """
-    if resampling not in RESAMPLING:
-        raise InputError(f'option resampling: "{resampling}" is none of {", ".join(RESAMPLING)}')
+    one_of("resampling", resampling, RESAMPLING)
     share = real_number("ess_threshold", ess_threshold, "a share between 0 and 1", lambda value: 0 <= value <= 1)
     rule = Rule(whole_number("particles", particles, 2), resampling, share)
     notes: tuple[str, ...] = ()

@@ -18,12 +18,13 @@ import numpy as np
 
 from zakai.algebra.theorems import smooth_system as theorem
 from zakai.errors import InputError
+from zakai.methods._options import real_number
 from zakai.methods._protocol import Method
 from zakai.models.model import Model
 from zakai.peers import _gaussian
 from zakai.peers._dynamax import inference_ukf as dynamax
 from zakai.peers._gaussian import Rule, State
-from zakai.peers._translation import Prepared, real_number
+from zakai.peers._translation import Prepared
 from zakai.records.schedule import Schedule
 
 import jax.numpy as jnp  # isort: skip
