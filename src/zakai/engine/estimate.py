@@ -57,23 +57,17 @@ class Estimate:
     @property
     def mean(self) -> np.ndarray:
         """The mean of the state (n,)."""
-        means = [self._part(i).mean() if one.info is None else one.info.mean for i, one in enumerate(self._moments)]
-        if self._online.blocks is None:
-            return means[0]
         mean = np.empty(self._online.model.n)
-        for block, part in zip(self._online.blocks, means, strict=True):
-            mean[list(block.states)] = part
+        for i, (block, moment) in enumerate(zip(self._online.blocks, self._moments, strict=True)):
+            mean[list(block.states)] = self._part(i).mean() if moment.info is None else moment.info.mean
         return mean
 
     @property
     def cov(self) -> np.ndarray:
         """The covariance of the state (n, n)."""
-        covs = [self._part(i).cov() if one.info is None else one.info.cov for i, one in enumerate(self._moments)]
-        if self._online.blocks is None:
-            return covs[0]
         cov = np.zeros((self._online.model.n,) * 2)
-        for block, part in zip(self._online.blocks, covs, strict=True):
-            cov[np.ix_(block.states, block.states)] = part
+        for i, (block, moment) in enumerate(zip(self._online.blocks, self._moments, strict=True)):
+            cov[np.ix_(block.states, block.states)] = self._part(i).cov() if moment.info is None else moment.info.cov
         return cov
 
     @property
@@ -105,14 +99,12 @@ class Estimate:
     def density(self) -> Density:
         """The conditional density of the state."""
         if self._density is None:
-            online, parts = self._online, [self._part(i) for i in range(len(self._moments))]
-            if online.blocks is None:
-                self._density = parts[0]
-            else:
-                model, blocks = online.model, online.blocks
-                named = [renamed(part, block.names) for part, block in zip(parts, blocks, strict=True)]
-                angles = tuple(name in model.periodic for name in model.state)
-                self._density = ProductDensity(named, tuple(block.states for block in blocks), model.state, angles)
+            model, blocks = self._online.model, self._online.blocks
+            parts = [renamed(self._part(i), block.names) for i, block in enumerate(blocks)]
+            angles = tuple(name in model.periodic for name in model.state)
+            self._density = parts[0]
+            if len(parts) > 1:
+                self._density = ProductDensity(parts, tuple(block.states for block in blocks), model.state, angles)
         return self._density
 
     def interval(self, probability: float = 0.95) -> np.ndarray:
@@ -128,7 +120,7 @@ class Estimate:
                 part = np.array([info.mean - half, info.mean + half]).T
             else:
                 part = self._part(i).quantile([tail, 1 - tail]).T
-            found[slice(None) if online.blocks is None else list(online.blocks[i].states)] = part
+            found[list(online.blocks[i].states)] = part
         return found
 
     def _part(self, index: int) -> Density:

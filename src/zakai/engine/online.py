@@ -13,7 +13,6 @@ from zakai.engine.checkpoint import restored, stored
 from zakai.engine.driver import check_model, planned
 from zakai.engine.estimate import Estimate
 from zakai.engine.feed import Feed
-from zakai.engine.plan import ByBlocks
 from zakai.engine.versions import other_versions, versions
 from zakai.errors import InputError
 from zakai.models._errors import named
@@ -64,13 +63,10 @@ class Online:
             raise InputError('option form: "one-shot" needs all times from the start on; an online filter takes "stepwise"')
         plan = planned(model, None, method, options)
         self.model, self.options, self.clock = model, options, clock
-        self.blocks: Any = plan.division.blocks if isinstance(plan, ByBlocks) else None
-        self.method = plan.division.method if isinstance(plan, ByBlocks) else plan.setting.method.name
-        self.why = plan.division.why if isinstance(plan, ByBlocks) else plan.why
+        self.blocks, self.method, self.why = plan.blocks, plan.method, plan.why
         check_noise_at(model, [model.start])
         self.feeds = tuple(Feed(setting) for setting in plan.settings)
         self.lock = RLock()
-        self._columns = [list(block.observations) for block in self.blocks] if self.blocks else None
 
     def __repr__(self) -> str:
         return f"Online({self.method} of {self.model.source}, at t = {self.time:g})"
@@ -184,9 +180,7 @@ class Online:
 
     def _divided(self, values: list[float]) -> list[list[float]]:
         """Return the observations of each block; a block without sensors has one that is never observed."""
-        if self._columns is None:
-            return [values]
-        return [[values[i] for i in columns] or [np.nan] for columns in self._columns]
+        return [[values[i] for i in block.observations] or [np.nan] for block in self.blocks]
 
     def _known(self, call: str, time: float, inputs: Any) -> Inputs | None:
         """Return the known inputs from the time of the filter on, None for a model without inputs."""

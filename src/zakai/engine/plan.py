@@ -11,6 +11,7 @@ import numpy as np
 from zakai import _registry
 from zakai.algebra.choice import Conditions, Division, chosen, divided
 from zakai.algebra.conditions import all_hold
+from zakai.algebra.independent import IndependentBlock
 from zakai.algebra.theorems import conditions_of, in_order
 from zakai.engine.blocks import joined_blocks, record_of_block
 from zakai.engine.loop import KEPT_BYTES, Run
@@ -25,57 +26,48 @@ from zakai.numerics.gaussian_sum import wrapped
 from zakai.records import Record
 
 
-class Whole(NamedTuple):
-    """One method for the whole system, why, and the conditions of every method that was considered."""
+class Plan(NamedTuple):
+    """One method for the whole system, or one for each of its independent blocks.
 
-    setting: Setting
-    why: str
-    considered: Mapping[str, Conditions]
-
-    @property
-    def settings(self) -> tuple[Setting, ...]:
-        """The setting of each run."""
-        return (self.setting,)
-
-    def runs(self, record: Record, keep: str | None, most: float = KEPT_BYTES, theta: Any = None) -> list[Run]:
-        """Return what is to be run for a record; `theta` (p,) are other values of the parameters, complex for a derivative."""
-        return [Run(self.setting.at(theta), record, keep, most)]
-
-    def result(self, runs: Sequence[Run]) -> FilterResult:
-        """Return the result of the runs."""
-        return _with_origin(runs[0].result(self.why, self.considered), self, runs)
-
-
-class ByBlocks(NamedTuple):
-    """A method for each of the independent blocks of a system."""
+    `settings` are those of the `blocks`; a system that is filtered as a whole is one block. `why` says on what grounds the
+    methods were chosen, and `considered` has the conditions of every method that was checked for the whole.
+    """
 
     model: Model
-    division: Division
+    blocks: tuple[IndependentBlock, ...]
     settings: tuple[Setting, ...]
+    why: str
+    considered: Mapping[str, Conditions]
+    division: Division | None = None
+
+    @property
+    def method(self) -> str:
+        """The name of the method, or of those of the blocks."""
+        return self.settings[0].method.name if self.division is None else self.division.method
 
     def runs(self, record: Record, keep: str | None, most: float = KEPT_BYTES, theta: Any = None) -> list[Run]:
-        """Return what is to be run for a record: one run for each block."""
+        """Return a run for each block; `theta` (p,) are other values of the parameters, complex for a derivative."""
+        if self.division is None:
+            return [Run(self.settings[0].at(theta), record, keep, most)]
         return [
             Run(setting.at(theta), record_of_block(record, block), keep, most / len(self.settings))
-            for setting, block in zip(self.settings, self.division.blocks, strict=True)
+            for setting, block in zip(self.settings, self.blocks, strict=True)
         ]
 
     def result(self, runs: Sequence[Run]) -> FilterResult:
-        """Return the result of the runs, assembled."""
-        return _with_origin(joined_blocks(self.model, self.division, runs), self, runs)
+        """Return the result of the runs, with what continues it: the plan, and the last state of each run."""
+        if self.division is None:
+            result = runs[0].result(self.why, self.considered)
+        else:
+            result = joined_blocks(self.model, self.division, runs)
+        result.origin = self, tuple(run.state for run in runs)
+        return result
 
 
-Plan = Whole | ByBlocks
 # Differences of moments, in deviations and relative, beyond which "auto" takes another method: of a prior whose moments are
 # known, and of a formula, whose own are sums over a grid.
 _KEPT_PRIOR, _KEPT_FORMULA = 1e-3, 2e-2
 _NARROW = 0.3  # variance of an angle up to which its moments hardly depend on whether they are wrapped
-
-
-def _with_origin(result: FilterResult, plan: Plan, runs: Sequence[Run]) -> FilterResult:
-    """Return a result that holds what continues it: the plan, and the last state of each run."""
-    result.origin = plan, tuple(run.state for run in runs)
-    return result
 
 
 def plan_of(
@@ -98,22 +90,22 @@ def plan_of(
         _registry.load(method)  # an unknown name is refused before anything is computed
     division = divided(model, prior, method, by_value)
     if division is None:
-        return _whole(model, prior, method, options, unfit)
+        return _plan_of_whole(model, prior, method, options, unfit)
     if unfit is not None and method == "auto":
-        wholes = {block.model: _whole(block.model, block.prior, method, {}, unfit) for block in division.blocks}
-        own_methods = {part: whole.setting.method.name for part, whole in wholes.items()}
-        division = replace(division, methods=own_methods, conditions={part: one.considered for part, one in wholes.items()})
+        plans = {block.model: _plan_of_whole(block.model, block.prior, method, {}, unfit) for block in division.blocks}
+        own_methods = {part: plan.method for part, plan in plans.items()}
+        division = replace(division, methods=own_methods, conditions={part: plan.considered for part, plan in plans.items()})
     names = dict.fromkeys(division.methods.values())
     methods = [_registry.load(name) for name in names]
     own = dict(zip(names, zip(methods, _own_options(methods, options), strict=True), strict=True))
-    settings = (Setting.of(b.model, b.prior, *own[division.methods[b.model]]) for b in division.blocks)
-    return ByBlocks(model, division, tuple(settings))
+    settings = tuple(Setting.of(b.model, b.prior, *own[division.methods[b.model]]) for b in division.blocks)
+    return Plan(model, division.blocks, settings, division.why, {}, division)
 
 
-def _whole(
+def _plan_of_whole(
     model: Model, prior: Any, method: str, options: Mapping[str, Any], unfit: Callable[[Setting], str] | None = None
-) -> Whole:
-    """Return the plan of one method.
+) -> Plan:
+    """Return the plan of one method for the whole system.
 
     "auto" goes on to the next one that holds where a method is unfit, or loses the density at the prior.
     """
@@ -128,7 +120,8 @@ def _whole(
         others = [one for one in later if all_hold(conditions_of(one, model)) is True]
         fault = ((unfit(setting) if unfit else "") or _fault_at_prior(setting)) if others else ""
         if not fault:
-            return Whole(setting, "; ".join([why, *lost]), considered)
+            whole = IndependentBlock(tuple(range(model.n)), tuple(range(model.m)), model.state, model, prior)
+            return Plan(model, (whole,), (setting,), "; ".join([why, *lost]), considered)
         lost.append(f"{name} holds too, but {fault}")
         name, considered = others[0], {**considered, others[0]: conditions_of(others[0], model)}
 

@@ -11,7 +11,7 @@ import numpy as np
 from zakai import _display
 from zakai.engine.batch import Progress
 from zakai.engine.driver import check_model, check_noise, check_records, filter_planned
-from zakai.engine.plan import ByBlocks, plan_of
+from zakai.engine.plan import plan_of
 from zakai.engine.results import FilterResult
 from zakai.engine.versions import other_versions, versions
 from zakai.errors import InputError
@@ -76,8 +76,7 @@ class Prepared:
             run.prepare()
 
     def __repr__(self) -> str:
-        method = self._plan.division.method if isinstance(self._plan, ByBlocks) else self._plan.setting.method.name
-        return f"Prepared({method} of {self.model.source}: {_display.counted(len(self.record), 'time')})"
+        return f"Prepared({self._plan.method} of {self.model.source}: {_display.counted(len(self.record), 'time')})"
 
     def _repr_html_(self) -> str:
         first, last = map(_display.number, self.record.times[[0, -1]])

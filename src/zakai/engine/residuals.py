@@ -9,7 +9,7 @@ observation is served, with the accuracy of the method.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from zakai.engine.forecast import origin_of
 from zakai.engine.loop import CHUNK, PIECE, Run, advance
-from zakai.engine.plan import ByBlocks
 from zakai.engine.predictive import Pair, PredictiveSums
 from zakai.engine.predictive_evidence import PredictiveEvidence
 from zakai.errors import InputError
@@ -35,11 +34,9 @@ def residuals(result: FilterResult, seed: int = 0, first: int = 0) -> Array:
     plan, _, record = origin_of(result, "residuals")
     draws = np.random.default_rng(seed).uniform(size=record.values.shape)
     found: Array = np.full(draws.shape, np.nan)
-    runs = plan.runs(record, "moments")
-    blocks: Sequence[Any] = plan.division.blocks if isinstance(plan, ByBlocks) else [None]
     error, share = 0.0, 0.0
-    for run, block in zip(runs, blocks, strict=True):
-        columns = list(range(record.values.shape[1])) if block is None else list(block.observations)
+    for run, block in zip(plan.runs(record, "moments"), plan.blocks, strict=True):
+        columns = list(block.observations)
         if not columns:
             continue
         for k, (below, upto), *errors in _laws(run, first):
