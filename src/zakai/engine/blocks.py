@@ -37,12 +37,8 @@ def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> Filt
     increments = np.zeros(len(mean))
     health: dict[str, np.ndarray] = {}
     bounds: dict[str, tuple[float, str]] = {}
-    why, known = division.why, {}
     for run, block in zip(runs, blocks, strict=True):
-        same = id(block.model), id(block.prior)
-        if same not in known:
-            known[same] = run.prior_moments()
-        part = run.result(why, division.conditions[block.model], known[same])
+        part = run.result(division.why, division.conditions[block.model])
         _rename(part, block)
         parts.append(part)
         mean[:, block.states], variance[:, block.states] = part.mean, part.variance
@@ -61,7 +57,7 @@ def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> Filt
         health=health,
         warnings=_warnings(blocks, parts),
         method=division.method,
-        why=why,
+        why=division.why,
         model=model,
         conditions=_conditions(division),
         bounds=bounds,

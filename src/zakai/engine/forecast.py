@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zakai.algebra.conditions import Condition
 from zakai.engine.batch import filter_all
 from zakai.engine.loop import Run
 from zakai.errors import InputError
@@ -58,12 +56,3 @@ class ForecastRun(Run):
         self.state = self.first = state
         self.states = [state]
         self.schedule.starts[0] = last
-
-    def result(
-        self,
-        why: str,
-        considered: Mapping[str, tuple[Condition, ...]],
-        prior_moments: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> FilterResult:
-        """Return the result; blocks that share a prior differ at the end of the record."""
-        return super().result(why, considered, self.prior_moments())

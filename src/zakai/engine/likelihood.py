@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.engine.driver import check_noise, check_records, planned
-from zakai.engine.loop import CHUNK, PIECE, Run, advance
+from zakai.engine.loop import Run, segments
 from zakai.engine.setting import Setting
 from zakai.errors import ConditionError, InputError
 from zakai.models._errors import did_you_mean, listing
@@ -180,19 +180,8 @@ class _Part(NamedTuple):
 
     def evidence(self, theta: np.ndarray) -> Any:
         """Return the log-likelihood at the parameters, complex where they are."""
-        setting, state, increments = self.setting.at(theta), None, []
-        for first in range(0, len(self.schedule), CHUNK):
-            prepared = setting.prepared(self.schedule.part(slice(first, first + CHUNK)))
-            values = self.values[first : first + CHUNK]
-            if state is None:
-                state = setting.method.init(prepared, setting.prior)
-            for begin in range(0, len(values), PIECE):
-                rows = slice(begin, min(begin + PIECE, len(values)))
-                with np.errstate(all="ignore"):  # of this thread
-                    states, infos = advance(setting, prepared, rows, state, values[rows])
-                state = states[-1]
-                increments.append(infos.log_likelihood_increment)
-        return np.sum(np.concatenate(increments))
+        found = segments(self.setting.at(theta), self.schedule, None, self.values)
+        return np.sum(np.concatenate([segment.infos.log_likelihood_increment for segment in found]))
 
 
 def _each(function: Callable[[Any], Any], arguments: Sequence[Any]) -> list[Any]:

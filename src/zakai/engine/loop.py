@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,6 +43,43 @@ def advance(setting: Setting, prepared: Any, rows: slice, state: Any, values: np
     return states, stacked(infos)
 
 
+class Segment(NamedTuple):
+    """Consecutive intervals of a record, after which the states are `states`.
+
+    `first` is the number of the first interval, `rows` are their places in what is `prepared`, and `before` is the state at
+    their start.
+    """
+
+    first: int
+    prepared: Any
+    rows: slice
+    before: Any
+    states: Sequence[Any]
+    infos: Infos
+
+
+def segments(setting: Setting, schedule: Schedule, state: Any, values: np.ndarray, size: int = PIECE) -> Iterator[Segment]:
+    """Advance a state over a schedule; None stands for the state at the model's start.
+
+    Args:
+        setting: the model and the method.
+        schedule: K intervals.
+        state: the state at the start of the first.
+        values: (K, m).
+        size: the number of intervals of the first segment.
+    """
+    for start in range(0, len(schedule), CHUNK):
+        chunk = schedule.part(slice(start, start + CHUNK))
+        prepared, begin = setting.prepared(chunk), 0
+        state = setting.method.init(prepared, setting.prior) if state is None else state
+        while begin < len(chunk):
+            rows = slice(begin, min(begin + size, len(chunk)))
+            with np.errstate(all="ignore"):  # what is not finite is reported by who receives it
+                states, infos = advance(setting, prepared, rows, state, values[start + rows.start : start + rows.stop])
+            yield Segment(start + begin, prepared, rows, state, states, infos)
+            state, begin, size = states[-1], rows.stop, min(GROWTH * size, PIECE)
+
+
 def joined(parts: Sequence[Infos]) -> Infos:
     """Return the reports of consecutive segments as one."""
     health = {name: np.concatenate([part.health[name] for part in parts]) for name in parts[0].health}
@@ -78,22 +115,13 @@ class Run:
         self.done = 0
 
     def all(self, report: Callable[[Run, int], None] | None = None) -> None:
-        """Filter the rest of the record; `report` receives the run and how many intervals have been added."""
-        count, size = len(self.schedule), 1
-        while self.done < count:
-            chunk = slice(self.done, min(self.done + CHUNK, count))
-            prepared = self.setting.prepared(self.schedule.part(chunk))
-            self.notes.update(dict.fromkeys(prepared.notes))
-            while self.done < chunk.stop:
-                first, last = self.done, min(self.done + size, chunk.stop)
-                rows = slice(first - chunk.start, last - chunk.start)
-                with np.errstate(all="ignore"):  # what is not finite is reported below
-                    states, infos = advance(self.setting, prepared, rows, self.state, self.values[first:last])
-                self._explain(infos)
-                self._take(states, infos)
-                size = min(GROWTH * size, PIECE)
-                if report is not None:
-                    report(self, last - first)
+        """Filter the record; `report` receives the run and how many intervals have been added."""
+        for segment in segments(self.setting, self.schedule, self.state, self.values, 1):
+            self.notes.update(dict.fromkeys(segment.prepared.notes))
+            self._explain(segment.infos)
+            self._take(segment.states, segment.infos)
+            if report is not None:
+                report(self, len(segment.states))
 
     def prepare(self) -> None:
         """Prepare the chunks of the record that are remembered."""
@@ -135,7 +163,7 @@ class Run:
                 reason = explain_nonfinite(model, key, getattr(model, key), points[wrong][0], stop, u)
                 raise InputError(f"{model.source}: {reason}, which the density reaches")
 
-    def prior_moments(self) -> tuple[np.ndarray, np.ndarray]:
+    def start_moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean (n,) and the covariance (n, n) at the start."""
         first = self.setting.method.density(self.empty, self.first)
         return first.mean(), first.cov()
@@ -144,15 +172,10 @@ class Run:
         """Return the density at an index of the result."""
         return self.setting.method.density(self.empty, self.states[index])
 
-    def result(
-        self,
-        why: str,
-        considered: Mapping[str, tuple[Condition, ...]],
-        prior_moments: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> FilterResult:
-        """Return the result; the moments of a prior that many runs share are computed once."""
+    def result(self, why: str, considered: Mapping[str, tuple[Condition, ...]]) -> FilterResult:
+        """Return the result."""
         model, method = self.setting.model, self.setting.method
-        first_mean, first_cov = self.prior_moments() if prior_moments is None else prior_moments
+        first_mean, first_cov = self.start_moments()
         infos = joined(self.parts)
         cov = np.concatenate([first_cov[None], infos.cov])
         kept = len(self.states) == len(self.schedule) + 1

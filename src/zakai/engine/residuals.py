@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.engine.forecast import origin_of
-from zakai.engine.loop import CHUNK, PIECE, Run, advance
+from zakai.engine.loop import CHUNK, Run, segments
 from zakai.engine.predictive import Pair, PredictiveSums
 from zakai.engine.predictive_evidence import PredictiveEvidence
 from zakai.errors import InputError
@@ -59,25 +59,22 @@ def residuals(result: FilterResult, seed: int = 0, first: int = 0) -> Array:
 
 def _laws(run: Run, first: int) -> Iterator[tuple[int, Pair, float, float]]:
     """Yield k, (P(Z < z), P(Z <= z)), both (m,), the error of the mass of a law and the `length_share`, from row `first` on."""
-    setting, model, state = run.setting, run.setting.model, run.state
+    setting, model = run.setting, run.setting.model
     if model.observation_kind == "samples" and model.log_density is not None and model.m > 1:
         raise InputError(f"{model.source}: residuals: observation_log_density of several coordinates gives no law of one of them")
     spread = [_spread(run.values[run.schedule.seen[:, j], j]) for j in range(model.m)]
-    for start in range(0, len(run.schedule), CHUNK):
-        chunk, values = run.schedule.part(slice(start, start + CHUNK)), run.values[start : start + CHUNK]
-        prepared, sums = setting.prepared(chunk), PredictiveSums(setting, chunk)
-        evidence = PredictiveEvidence(setting, chunk, sums, spread)
-        for begin in range(0, len(chunk), PIECE):
-            rows = slice(begin, min(begin + PIECE, len(chunk)))
+    for segment in segments(setting, run.schedule, run.state, run.values):
+        if segment.rows.start == 0:
+            chunk = run.schedule.part(slice(segment.first, segment.first + CHUNK))
+            sums = PredictiveSums(setting, chunk)
+            evidence = PredictiveEvidence(setting, chunk, sums, spread)
+        for i, before in enumerate([segment.before, *segment.states[:-1]]):
+            k, place = segment.first + i, segment.rows.start + i
+            if k < first:
+                continue
             with np.errstate(all="ignore"):
-                states, _ = advance(setting, prepared, rows, state, values[rows])
-            for k, before in zip(range(rows.start, rows.stop), [state, *states]):
-                if start + k < first:
-                    continue
-                with np.errstate(all="ignore"):
-                    law = sums.row(k, before, values[k]) or evidence.row(k, before, values[k])
-                yield start + k, law, evidence.mass_error, sums.length_share
-            state = states[-1]
+                law = sums.row(place, before, run.values[k]) or evidence.row(place, before, run.values[k])
+            yield k, law, evidence.mass_error, sums.length_share
 
 
 def _spread(values: Array) -> tuple[float, float]:

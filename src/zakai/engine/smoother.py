@@ -223,16 +223,15 @@ class SmoothingRun(Run):
             message = self.backward.step(prepared, k - begin, message, self.values[k], states[k - rows.start])
         return self.backward.density(self.empty, states[index - rows.start], message)
 
-    def result(
-        self,
-        why: str,
-        considered: Mapping[str, tuple[Condition, ...]],
-        prior_moments: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> FilterResult:
-        """Return the result, of the filter until the record is smoothed; blocks that share a prior differ at the start then."""
+    def start_moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean and the covariance at the start, smoothed once the record is."""
+        return super().start_moments() if self.start is None else self.start
+
+    def result(self, why: str, considered: Mapping[str, tuple[Condition, ...]]) -> FilterResult:
+        """Return the result, of the filter until the record is smoothed."""
+        result = super().result(why, considered)
         if self.start is None:
-            return super().result(why, considered, prior_moments)
-        result = super().result(why, considered, self.start)
+            return result
         result._density = self.density
         result.bounds = {**result.bounds, "evidence_error": (self.backward.accuracy(self.empty), _EVIDENCE)}
         result.warnings = [*self.notes, *warnings_of_run(result)]
