@@ -57,17 +57,23 @@ class Estimate:
     @property
     def mean(self) -> np.ndarray:
         """The mean of the state (n,)."""
+        means = [self._part(i).mean() if one.info is None else one.info.mean for i, one in enumerate(self._moments)]
+        if len(means) == 1:
+            return means[0]
         mean = np.empty(self._online.model.n)
-        for i, (block, moment) in enumerate(zip(self._online.blocks, self._moments, strict=True)):
-            mean[list(block.states)] = self._part(i).mean() if moment.info is None else moment.info.mean
+        for block, part in zip(self._online.blocks, means, strict=True):
+            mean[list(block.states)] = part
         return mean
 
     @property
     def cov(self) -> np.ndarray:
         """The covariance of the state (n, n)."""
+        covs = [self._part(i).cov() if one.info is None else one.info.cov for i, one in enumerate(self._moments)]
+        if len(covs) == 1:
+            return covs[0]
         cov = np.zeros((self._online.model.n,) * 2)
-        for i, (block, moment) in enumerate(zip(self._online.blocks, self._moments, strict=True)):
-            cov[np.ix_(block.states, block.states)] = self._part(i).cov() if moment.info is None else moment.info.cov
+        for block, part in zip(self._online.blocks, covs, strict=True):
+            cov[np.ix_(block.states, block.states)] = part
         return cov
 
     @property
