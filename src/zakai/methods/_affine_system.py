@@ -20,10 +20,8 @@ The transition of an interval is composed of those of its pieces, in which the k
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from threading import Lock
-from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -40,7 +38,6 @@ from zakai.numerics.transition import Array, at, transposed
 from zakai.records.schedule import Schedule
 
 RESOLVED = 1e-9  # relative error of a transition above which a result warns
-_KEPT = 256  # transitions of a system without time that are kept
 _MOST_PIECES = 2**16  # that are prepared together, for memory
 
 
@@ -179,13 +176,11 @@ def _padded(whole: Transition, m: int) -> Transition:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What does not depend on the schedule: the system, the parameters, the origin; transitions without time are kept."""
+    """What does not depend on the schedule: the system, the parameters and the origin."""
 
     system: AffineSystem
     theta: Array
     origin: Array
-    kept: dict[bytes, Transition] = field(default_factory=dict)
-    lock: Any = field(default_factory=Lock)
 
     @cached_property
     def quadratic(self) -> tuple[Array, Array] | None:
@@ -253,24 +248,10 @@ class Setup:
         """Return the transitions of pieces that do not depend on time: one for each length, inputs and coordinates."""
         lengths = pieces.lengths
         table = np.column_stack([lengths, inside, pieces.first])
-        _, rows_of, numbers = np.unique(table, axis=0, return_index=True, return_inverse=True)
-        first = {table[row].tobytes(): row for row in rows_of}
-        with self.lock:
-            known = {name: self.kept[name] for name in first if name in self.kept}
-        missing = [name for name in first if name not in known]
-        tables = [Transition(*(array[None] for array in one)) for one in known.values()]
-        if missing:
-            rows = np.array([first[name] for name in missing])
-            found = self.integrated(pieces.part(rows), lengths[rows], inside[rows])
-            self._check_finite(found, pieces.starts[rows], pieces.stops[rows])
-            tables.append(found.transition)
-            with self.lock:
-                if len(self.kept) > _KEPT:
-                    self.kept.clear()
-                self.kept.update({name: at(found.transition, i) for i, name in enumerate(missing[:_KEPT])})
-        place = {name: i for i, name in enumerate([*known, *missing])}
-        places = np.array([place[name] for name in first])[numbers.ravel()]
-        return Transition(*(np.concatenate(fields)[places] for fields in zip(*tables, strict=True)))
+        _, rows, places = np.unique(table, axis=0, return_index=True, return_inverse=True)
+        found = self.integrated(pieces.part(rows), lengths[rows], inside[rows])
+        self._check_finite(found, pieces.starts[rows], pieces.stops[rows])
+        return at(found.transition, places.ravel())
 
     def _check_finite(self, found: FlowResult, starts: Array, stops: Array) -> None:
         wrong = np.isinf(found.error)
