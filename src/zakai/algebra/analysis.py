@@ -20,7 +20,8 @@ from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
 from zakai.algebra.explosion import Explosion, explosion
 from zakai.algebra.observed_block import ObservedBlock, observed_block
-from zakai.algebra.theorems import THEOREMS, cached_yau_form, conditions_of
+from zakai.algebra.systems import cached_yau_form
+from zakai.algebra.theorems import THEOREMS, conditions_of
 from zakai.algebra.yau import (
     NoYauForm,
     YauForm,

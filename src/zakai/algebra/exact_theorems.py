@@ -10,7 +10,7 @@ import sympy as sp
 from zakai.algebra.conditions import Condition
 from zakai.algebra.gauges import affine_system, gauge
 from zakai.algebra.systems import affine_observation, affine_parts, cached_yau_form, definite_covariance, determined
-from zakai.algebra.yau import NoYauForm, short
+from zakai.algebra.yau import NoYauForm, form_text, short
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
 
@@ -95,9 +95,9 @@ def _yau_conditions(model: Model, source: str, covariance: str) -> tuple[Conditi
     system = affine_system(model)
     assert system is not None
     _, _, holds, evidence = system
-    text = f"L = {short(str(form.matrix.tolist()))}, l = {short(str(list(form.offset)))}, phi = {short(str(form.potential))}"
     quadratic = "2 phi_t + G:Hess phi + grad phi'G grad phi + 2 (L x + l).grad phi + 2 tr L is quadratic in x"
-    return first, observed, definite, Condition(statement, True, text, source), Condition(quadratic, holds, evidence, source)
+    found = Condition(statement, True, form_text(form), source)
+    return first, observed, definite, found, Condition(quadratic, holds, evidence, source)
 
 
 def _affine(statement: str, field: sp.MatrixBase, model: Model, source: str) -> Condition:

@@ -5,7 +5,7 @@ Each function takes a Model and gives a tuple of `Condition`.  A theorem says wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 
 import sympy as sp
@@ -15,22 +15,14 @@ from zakai.algebra.conditions import Condition
 from zakai.algebra.exact_theorems import benes, hu_yau, kalman_bucy
 from zakai.algebra.exponentials import wei_norman_filter
 from zakai.algebra.identities import all_zero
-from zakai.algebra.systems import (
-    CLY,
-    YauSystem,
-    affine_observation,
-    cached_yau_form,
-    definite_covariance,
-    determined,
-    q_parts,
-    yau_system,
-)
-from zakai.algebra.yau import YauForm, inverse, short
+from zakai.algebra.systems import CLY, affine_observation, cached_yau_form, definite_covariance, determined, q_parts
+from zakai.algebra.yau import YauForm, form_text, short
 from zakai.models import features
 from zakai.models.features import ASSUMPTIONS
 from zakai.models.model import Model
 
 _SURVEY = "Chen and Dong, survey of direct methods"
+
 
 @lru_cache(maxsize=64)
 def limited_direct(model: Model) -> tuple[Condition, ...]:
@@ -51,22 +43,26 @@ def limited_direct(model: Model) -> tuple[Condition, ...]:
     if any(condition.holds is not True for condition in (conditions[0], *conditions[2:])):
         return tuple(conditions)
     conditions.append(definite_covariance(model))
+    root = Condition(
+        "L = G Omega + F' F^-1 with Omega symmetric for some square root F of G",
+        True,
+        "F = Fc R, Fc the Cholesky factor and R' = W R a rotation, makes it true for every L",
+        f"{CLY}, Assumption 2",
+    )
+    return (*conditions, *_yau_conditions(model, f"{CLY}, (17) corrected", lambda form: root))
+
+
+def _yau_conditions(model: Model, source: str, further: Callable[[YauForm], Condition]) -> Iterator[Condition]:
+    """Yield what the direct methods ask of a time-varying Yau system; `further` is a condition of one method."""
     form = cached_yau_form(model)
     statement = "f = L(t) x + l(t) + G(t) grad phi(t, x)"
     if not isinstance(form, YauForm):
-        return (*conditions, Condition(statement, form.holds, form.evidence, f"{CLY}, (17) corrected"))
-    conditions.append(Condition(statement, True, _form_text(form), f"{CLY}, (17) corrected"))
-    conditions.append(
-        Condition(
-            "L = G Omega + F' F^-1 with Omega symmetric for some square root F of G",
-            True,
-            "F = Fc R, Fc the Cholesky factor and R' = W R a rotation, makes it true for every L",
-            f"{CLY}, Assumption 2",
-        )
-    )
-    conditions.append(_quadratic_condition(model))
-    conditions.extend(_angle_conditions(model, form))
-    return tuple(conditions)
+        yield Condition(statement, form.holds, form.evidence, source)
+        return
+    yield Condition(statement, True, form_text(form), source)
+    yield further(form)
+    yield _quadratic_condition(model)
+    yield from _angle_conditions(model, form)
 
 
 def _features_of_samples(model: Model) -> tuple[Condition, ...]:
@@ -96,7 +92,7 @@ def _quadratic_condition(model: Model) -> Condition:
     return Condition(statement, holds, evidence, f"{CLY}, Assumption 3 with 2 phi_t")
 
 
-def _angle_conditions(model: Model, form: YauForm):
+def _angle_conditions(model: Model, form: YauForm) -> Iterator[Condition]:
     """What an angle needs: an affine part and a potential that do not know how often it has turned."""
     for name in model.periodic:
         i = model.state.index(name)
@@ -130,15 +126,7 @@ def general_direct(model: Model) -> tuple[Condition, ...]:
         conditions.append(Condition("features are in what a sample depends on", sampled and not own, words, source))
     if any(condition.holds is not True for condition in conditions):
         return tuple(conditions)
-    form = cached_yau_form(model)
-    statement = "f = L(t) x + l(t) + G(t) grad phi(t, x)"
-    if not isinstance(form, YauForm):
-        return (*conditions, Condition(statement, form.holds, form.evidence, f"{_SURVEY}, (32) corrected"))
-    conditions.append(Condition(statement, True, _form_text(form), f"{_SURVEY}, (32) corrected"))
-    conditions.append(_quadratic_condition(model))
-    conditions.append(_few_directions(model, form))
-    conditions.extend(_angle_conditions(model, form))
-    return tuple(conditions)
+    return (*conditions, *_yau_conditions(model, f"{_SURVEY}, (32) corrected", lambda form: _few_directions(model, form)))
 
 
 @lru_cache(maxsize=64)
@@ -265,10 +253,6 @@ def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
     )
 
 
-def _form_text(form: YauForm) -> str:
-    return f"L = {short(str(form.matrix.tolist()))}, l = {short(str(list(form.offset)))}, phi = {short(str(form.potential))}"
-
-
 # The theorem that says when a method holds, by the method's name.
 THEOREMS: Mapping[str, Callable[[Model], tuple[Condition, ...]]] = {
     "kalman-bucy": kalman_bucy,
@@ -319,27 +303,3 @@ def conditions_of(name: str, model: Model) -> tuple[Condition, ...]:
         if refused:
             return refused
     return theorem_of(name)(model)
-
-
-__all__ = [
-    "PEERS",
-    "THEOREMS",
-    "YauSystem",
-    "affine_observation",
-    "any_smooth_system",
-    "benes",
-    "cached_yau_form",
-    "conditions_of",
-    "hu_yau",
-    "in_order",
-    "gaussian_sum",
-    "general_direct",
-    "inverse",
-    "kalman_bucy",
-    "kolmogorov_series",
-    "limited_direct",
-    "smooth_system",
-    "theorem_of",
-    "wei_norman_filter",
-    "yau_system",
-]

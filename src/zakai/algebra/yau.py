@@ -304,6 +304,11 @@ def quadratic_expression(quadratic: Quadratic, x: tuple[sp.Symbol, ...]) -> sp.E
     return sp.collect(sp.expand(-2 * value), list(x)) if value.count_ops() < 200 else -2 * value
 
 
+def form_text(form: YauForm) -> str:
+    """A Yau form for a sentence."""
+    return f"L = {short(str(form.matrix.tolist()))}, l = {short(str(list(form.offset)))}, phi = {short(str(form.potential))}"
+
+
 def short(text: str) -> str:
     """A formula for a sentence: cut where it would fill the screen."""
     return text if len(text) <= 240 else f"{text[:240]} ..."

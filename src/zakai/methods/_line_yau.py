@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
-from zakai.algebra.theorems import yau_system
+from zakai.algebra.systems import yau_system
 from zakai.methods._series_kernel import PowerSeries
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function

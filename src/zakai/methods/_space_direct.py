@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from zakai.algebra.theorems import yau_system
+from zakai.algebra.systems import yau_system
 from zakai.methods import _space_kolmogorov as base
 from zakai.methods._affine_system import Matrices, precision_of
 from zakai.methods._options import tolerance_of

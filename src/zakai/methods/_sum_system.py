@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
-from zakai.algebra.theorems import yau_system
+from zakai.algebra.systems import yau_system
 from zakai.methods._affine_system import Matrices, precision_of
 from zakai.methods._residuals import Factor as Residuals
 from zakai.methods._residuals import Sensors
