@@ -4,7 +4,8 @@ import pytest
 import sympy as sp
 
 import zakai
-from zakai.algebra.identities import evaluate, grouped, is_quadratic, is_zero, terms_of
+from zakai.algebra.grouping import grouped, terms_of
+from zakai.algebra.identities import evaluate, is_quadratic, is_zero
 
 X = sp.Symbol("x", real=True)
 

@@ -62,3 +62,8 @@ def times(factor: sp.Expr, noise: str) -> str:
         return ""
     short = factor.is_Symbol or factor.is_Integer or factor.is_Function
     return noise if factor == 1 else f"{factor} {noise}" if short else f"({factor}) {noise}"
+
+
+def short(text: str) -> str:
+    """A formula for a sentence: cut where it would fill the screen."""
+    return text if len(text) <= 240 else f"{text[:240]} ..."

@@ -20,18 +20,10 @@ from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
 from zakai.algebra.explosion import Explosion, explosion
 from zakai.algebra.observed_block import ObservedBlock, observed_block
+from zakai.algebra.quadratics import as_quadratic, quadratic_expression
 from zakai.algebra.systems import cached_yau_form
 from zakai.algebra.theorems import THEOREMS, conditions_of
-from zakai.algebra.yau import (
-    NoYauForm,
-    YauForm,
-    as_quadratic,
-    observation_energy,
-    q_without_observation,
-    quadratic_expression,
-    tidy_state,
-    wong_omega,
-)
+from zakai.algebra.yau import NoYauForm, YauForm, observation_energy, q_without_observation, tidy_state, wong_omega
 from zakai.algebra.yau import eta as wong_eta
 from zakai.errors import InputError
 from zakai.models.model import Model

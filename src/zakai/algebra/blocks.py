@@ -9,7 +9,7 @@ from typing import Any
 
 import sympy as sp
 
-from zakai.algebra.identities import tidy
+from zakai.algebra.grouping import tidy
 from zakai.models.features import (
     DOMAIN,
     JUMPS,

@@ -19,7 +19,7 @@ from zakai.algebra.certificates import CLOSED, Certificate, affine_functions, ce
 from zakai.algebra.closure import NO_JETS, Budget, Closure, close
 from zakai.algebra.dmz_operators import DmzOperators
 from zakai.algebra.generators import Unreadable
-from zakai.algebra.identities import tidy
+from zakai.algebra.grouping import tidy
 from zakai.algebra.normal_form import Basis, basis_of
 from zakai.algebra.operators import JetTowerEnds
 from zakai.algebra.ratios import TooLarge

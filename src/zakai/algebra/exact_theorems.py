@@ -7,10 +7,11 @@ from functools import lru_cache
 
 import sympy as sp
 
+from zakai.algebra._readable import short
 from zakai.algebra.conditions import Condition
 from zakai.algebra.gauges import affine_system, gauge
 from zakai.algebra.systems import affine_observation, affine_parts, cached_yau_form, definite_covariance, determined
-from zakai.algebra.yau import NoYauForm, form_text, short
+from zakai.algebra.yau import NoYauForm, form_text
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
 

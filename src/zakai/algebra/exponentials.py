@@ -14,11 +14,12 @@ from functools import lru_cache
 
 import sympy as sp
 
+from zakai.algebra._readable import short
 from zakai.algebra.conditions import Condition
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
 from zakai.algebra.normal_form import operator_symbols
 from zakai.algebra.systems import determined
-from zakai.algebra.yau import inverse, short
+from zakai.algebra.yau import inverse
 from zakai.models.model import Model
 
 _SOURCE = "Wei and Norman 1964"

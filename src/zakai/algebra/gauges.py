@@ -9,9 +9,11 @@ import numpy as np
 import sympy as sp
 from sympy.functions.elementary.hyperbolic import HyperbolicFunction
 
-from zakai.algebra.identities import is_zero, tidy
+from zakai.algebra.grouping import tidy
+from zakai.algebra.identities import is_zero
+from zakai.algebra.quadratics import Quadratic, as_quadratic
 from zakai.algebra.systems import affine_parts, cached_yau_form
-from zakai.algebra.yau import Quadratic, YauForm, as_quadratic, q_without_observation
+from zakai.algebra.yau import YauForm, q_without_observation
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 

@@ -9,7 +9,6 @@ dozen random points is taken to be zero.  Everything else is undecided, and said
 
 from __future__ import annotations
 
-import math
 import random
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -25,12 +24,11 @@ POINTS = 12
 SHORT = 160  # operations up to which the algebraic proof is tried
 UNDERFLOW = 80  # argument of an exponential and its like from which a sum loses it in so many digits
 LARGEST_ARGUMENT = 10**6  # of an exponential and its like
-MANY_TERMS = 5000  # of an expansion: more of them tell nobody anything
 
-_CIRCULAR = (sp.sin, sp.cos, sp.tan, sp.cot, sp.sec, sp.csc)
-_HYPERBOLIC = (sp.sinh, sp.cosh, sp.tanh, sp.coth, sp.sech, sp.csch)
+CIRCULAR = (sp.sin, sp.cos, sp.tan, sp.cot, sp.sec, sp.csc)
+HYPERBOLIC = (sp.sinh, sp.cosh, sp.tanh, sp.coth, sp.sech, sp.csch)
 _FUNCTIONS = {
-    **{f: getattr(mpmath, f.__name__) for f in (*_CIRCULAR, *_HYPERBOLIC)},
+    **{f: getattr(mpmath, f.__name__) for f in (*CIRCULAR, *HYPERBOLIC)},
     sp.exp: mpmath.exp,
     sp.log: mpmath.log,
     sp.asin: mpmath.asin,
@@ -40,7 +38,7 @@ _FUNCTIONS = {
     sp.Abs: abs,
     sp.sign: mpmath.sign,
 }
-_EXPONENTIAL = (sp.exp, sp.erf, *_HYPERBOLIC)
+_EXPONENTIAL = (sp.exp, sp.erf, *HYPERBOLIC)
 _RELATIVE = (sp.exp, sp.cosh, sp.sech, sp.csch)  # whose derivative is not much larger than they are
 _SLOW_GROWING = (sp.log, sp.Abs, sp.sign)
 _ENTIRE = (sp.sin, sp.cos, sp.sinh, sp.cosh, sp.tanh, sp.sech, sp.exp, sp.erf, sp.atan)
@@ -277,103 +275,6 @@ def _as_rational(expression: sp.Expr) -> sp.Expr:
         if not e.args:
             return e
         arguments = [convert(argument) for argument in e.args]
-        if isinstance(e, sp.exp):
-            return exponential(arguments[0])
-        if isinstance(e, _CIRCULAR):
-            forward = exponential(sp.I * arguments[0])
-            return _from_exponential(e.func, forward, sp.I)
-        if isinstance(e, _HYPERBOLIC):
-            return _from_exponential(_CIRCULAR[_HYPERBOLIC.index(e.func)], exponential(arguments[0]), sp.Integer(1))
-        return e.func(*arguments)
+        return exponential(arguments[0]) if isinstance(e, sp.exp) else e.func(*arguments)
 
-    return convert(expression)
-
-
-def _from_exponential(function: type, e: sp.Expr, unit: sp.Expr) -> sp.Expr:
-    """sin, cos and their quotients (unit = I), or sinh, cosh and theirs (unit = 1), of u from e = exp(unit u)."""
-    sine, cosine = (e - 1 / e) / (2 * unit), (e + 1 / e) / 2
-    return {
-        sp.sin: sine,
-        sp.cos: cosine,
-        sp.tan: sine / cosine,
-        sp.cot: cosine / sine,
-        sp.sec: 1 / cosine,
-        sp.csc: 1 / sine,
-    }[function]
-
-
-def normal_form(expression: sp.Expr, variables: Sequence[sp.Symbol]) -> sp.Expr:
-    """Expanded, with tanh and cosh for hyperbolic and sin and cos for circular functions of the variables, sin at most once.
-
-    In this form most identities between them are gone: 1/cosh^2 is 1 - tanh^2, sin^2 is 1 - cos^2.  What would have too many
-    terms stays as it is.
-    """
-    if terms_of(expression) >= MANY_TERMS:
-        return expression
-
-    def of_variables(e: sp.Expr) -> bool:
-        return isinstance(e, (*_CIRCULAR, *_HYPERBOLIC)) and e.has(*variables)
-
-    def basic(e: sp.Expr) -> sp.Expr:
-        u = e.args[0]
-        return {
-            sp.sinh: lambda: sp.tanh(u) * sp.cosh(u),
-            sp.coth: lambda: 1 / sp.tanh(u),
-            sp.sech: lambda: 1 / sp.cosh(u),
-            sp.csch: lambda: 1 / (sp.tanh(u) * sp.cosh(u)),
-            sp.tan: lambda: sp.sin(u) / sp.cos(u),
-            sp.cot: lambda: sp.cos(u) / sp.sin(u),
-            sp.sec: lambda: 1 / sp.cos(u),
-            sp.csc: lambda: 1 / sp.sin(u),
-        }.get(e.func, lambda: e)()
-
-    def power(e: sp.Expr) -> bool:
-        return e.is_Pow and e.exp.is_Integer and of_variables(e.base) and isinstance(e.base, sp.sin | sp.cosh)
-
-    def reduced(e: sp.Expr) -> sp.Expr:
-        u, k = e.base.args[0], int(e.exp)
-        if isinstance(e.base, sp.sin) and k >= 2:
-            return (1 - sp.cos(u) ** 2) ** (k // 2) * sp.sin(u) ** (k % 2)
-        if isinstance(e.base, sp.cosh) and k <= -2:
-            return (1 - sp.tanh(u) ** 2) ** (-k // 2) * sp.cosh(u) ** (-(-k % 2))
-        return e
-
-    basics = expression.replace(of_variables, basic)
-    return sp.expand(sp.expand(basics).replace(power, reduced))
-
-
-def terms_of(expression: sp.Expr) -> int:
-    """Return an upper bound, at most `MANY_TERMS`, of the number of terms of the expanded expression."""
-    if isinstance(expression, sp.Add):
-        return min(MANY_TERMS, sum(terms_of(part) for part in expression.args))
-    if isinstance(expression, sp.Mul):
-        count = 1
-        for part in expression.args:
-            count = min(MANY_TERMS, count * terms_of(part))
-        return count
-    if isinstance(expression, sp.Pow) and expression.exp.is_Integer and expression.exp > 0:
-        terms, power = terms_of(expression.base), int(expression.exp)
-        return MANY_TERMS if terms >= MANY_TERMS else min(MANY_TERMS, math.comb(terms + power - 1, power))
-    return 1
-
-
-def grouped(expression: sp.Expr, variables: Sequence[sp.Symbol]) -> dict[sp.Expr, sp.Expr]:
-    """The expanded expression as {function of the variables: coefficient that is free of them}.
-
-    One that would have too many terms is a single function.
-    """
-    if terms_of(expression) >= MANY_TERMS:
-        return {expression: sp.Integer(1)}
-    groups: dict[sp.Expr, list[sp.Expr]] = {}
-    for term in sp.Add.make_args(sp.expand(expression)):
-        coefficient, function = term.as_independent(*variables, as_Add=False)
-        groups.setdefault(function, []).append(coefficient)
-    sums = {function: sp.Add(*coefficients) for function, coefficients in groups.items()}
-    return {function: tidy(c) for function, c in sums.items() if is_zero(c) is not True}
-
-
-def tidy(expression: sp.Expr) -> sp.Expr:
-    """A shorter form of a coefficient that depends on time and parameters only."""
-    if expression.is_number or expression.is_Symbol or expression.count_ops() > 80:
-        return expression
-    return min((expression, sp.cancel(sp.together(expression))), key=sp.count_ops)
+    return convert(expression.rewrite((*CIRCULAR, *HYPERBOLIC), sp.exp))

@@ -28,8 +28,8 @@ from typing import Any
 import sympy as sp
 from flint import Ordering, fmpq, fmpq_mpoly_ctx
 
+from zakai.algebra._readable import short
 from zakai.algebra.identities import is_zero
-from zakai.algebra.yau import short
 from zakai.errors import ConditionError
 from zakai.models.model import Model
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import sympy as sp
 
-from zakai.algebra._readable import readable
+from zakai.algebra._readable import readable, short
 from zakai.algebra.conditions import Condition
 from zakai.algebra.estimation_algebra import estimation_algebra
 from zakai.algebra.identities import all_zero
 from zakai.algebra.normal_form import operator_symbols
+from zakai.algebra.quadratics import as_quadratic
 from zakai.algebra.systems import affine_parts
-from zakai.algebra.yau import as_quadratic, eta, observation_energy, short, wong_omega
+from zakai.algebra.yau import eta, observation_energy, wong_omega
 from zakai.algebra.yau_theorems import DONG, TheoremCheck
 from zakai.models.model import Model
 

@@ -18,7 +18,7 @@ import sympy as sp
 
 from zakai.algebra.dmz_operators import DmzOperators
 from zakai.algebra.generators import Unreadable
-from zakai.algebra.identities import tidy
+from zakai.algebra.grouping import tidy
 from zakai.algebra.linear_span import Span, Vector
 from zakai.algebra.operators import JetTowerEnds, Symbol
 from zakai.algebra.ratios import TooLarge

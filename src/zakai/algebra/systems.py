@@ -8,18 +8,11 @@ from functools import lru_cache
 import numpy as np
 import sympy as sp
 
+from zakai.algebra._readable import short
 from zakai.algebra.conditions import Condition
 from zakai.algebra.identities import all_zero, is_in_one_piece, is_zero
-from zakai.algebra.yau import (
-    NoYauForm,
-    Quadratic,
-    YauForm,
-    as_quadratic,
-    observation_energy,
-    q_without_observation,
-    short,
-    yau_form,
-)
+from zakai.algebra.quadratics import Quadratic, as_quadratic
+from zakai.algebra.yau import NoYauForm, YauForm, observation_energy, q_without_observation, yau_form
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 

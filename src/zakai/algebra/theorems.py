@@ -11,12 +11,13 @@ from functools import lru_cache
 import sympy as sp
 
 from zakai import _registry
+from zakai.algebra._readable import short
 from zakai.algebra.conditions import Condition
 from zakai.algebra.exact_theorems import benes, hu_yau, kalman_bucy
 from zakai.algebra.exponentials import wei_norman_filter
 from zakai.algebra.identities import all_zero
 from zakai.algebra.systems import CLY, affine_observation, cached_yau_form, definite_covariance, determined, q_parts
-from zakai.algebra.yau import YauForm, form_text, short
+from zakai.algebra.yau import YauForm, form_text
 from zakai.models import features
 from zakai.models.features import ASSUMPTIONS
 from zakai.models.model import Model

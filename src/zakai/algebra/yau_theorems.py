@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import sympy as sp
 
-from zakai.algebra._readable import readable
+from zakai.algebra._readable import readable, short
 from zakai.algebra.arguments import Unreadable
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.dmz_operators import DmzOperators
@@ -21,7 +21,7 @@ from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algeb
 from zakai.algebra.normal_form import operator_symbols
 from zakai.algebra.operators import Symbol
 from zakai.algebra.systems import affine_observation, cached_yau_form, definite_covariance
-from zakai.algebra.yau import YauForm, short
+from zakai.algebra.yau import YauForm
 from zakai.errors import InputError
 from zakai.models.model import Model
 
