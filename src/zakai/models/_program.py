@@ -7,9 +7,10 @@ instruction whose value is not finite is the innermost cause of a value that is 
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,23 +20,9 @@ from sympy.core.function import AppliedUndef
 from zakai.errors import InputError
 from zakai.models.functions import Floor, Maximum, Minimum, Sinc, TableFunction, sinc
 
-_UNARY: dict[type, str] = {
-    sympy.sin: "sin",
-    sympy.cos: "cos",
-    sympy.tan: "tan",
-    sympy.asin: "asin",
-    sympy.acos: "acos",
-    sympy.atan: "atan",
-    sympy.sinh: "sinh",
-    sympy.cosh: "cosh",
-    sympy.tanh: "tanh",
-    sympy.exp: "exp",
-    sympy.log: "log",
-    sympy.erf: "erf",
-    sympy.Abs: "abs",
-    sympy.sign: "sign",
-    Floor: "floor",
-}
+_ELEMENTARY = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log")
+_UNARY: dict[type, str] = {getattr(sympy, name): name for name in (*_ELEMENTARY, "erf", "sign")}
+_UNARY |= {sympy.Abs: "abs", Floor: "floor"}
 _BINARY: dict[type, str] = {sympy.atan2: "atan2", Minimum: "min", Maximum: "max"}
 # SymPy makes these of the grammar's functions: tan(x + pi/2) becomes -cot(x), and derivatives hold others.
 _QUOTIENTS: dict[type, tuple[Callable, Callable]] = {
@@ -160,27 +147,23 @@ class Program:
         self, x: Any, t: Any, theta: Any, functions: Mapping[str, Callable], u: Any = None, z: Any = None
     ) -> list[Any]:
         """The value of every instruction; `functions` holds the operations of the array library."""
+        sources = {"x": x, "theta": theta, "u": u, "z": z}
         values: list[Any] = []
         for instruction in self.instructions:
-            match instruction.operation:
-                case "x":
-                    value = x[..., instruction.constant]
-                case "t":
-                    value = t
-                case "theta":
-                    value = theta[..., instruction.constant]
-                case "u":
-                    value = u[..., instruction.constant]
-                case "z":
-                    value = z[..., instruction.constant]
-                case "constant":
-                    value = instruction.constant
-                case "power" | "sinc" as operation:
-                    value = functions[operation](values[instruction.operands[0]], instruction.constant)
-                case "table":
-                    value = instruction.constant(*(values[slot] for slot in instruction.operands))
-                case operation:
-                    value = functions[operation](*(values[slot] for slot in instruction.operands))
+            operation, constant = instruction.operation, instruction.constant
+            operands = [values[slot] for slot in instruction.operands]
+            if operation in sources:
+                value = sources[operation][..., constant]
+            elif operation == "t":
+                value = t
+            elif operation == "constant":
+                value = constant
+            elif operation == "table":
+                value = constant(*operands)
+            elif constant is None:
+                value = functions[operation](*operands)
+            else:
+                value = functions[operation](*operands, constant)
             values.append(value)
         return values
 
@@ -246,38 +229,17 @@ def _float_table(table: Callable[..., Any]) -> Callable[..., float]:
 def operations(xp: Any, erf: Callable, **special: Callable) -> dict[str, Callable]:
     """The operations of an array library with NumPy's names."""
     names = {"asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2", "min": "minimum", "max": "maximum"}
-    plain = (
-        "sin",
-        "cos",
-        "tan",
-        "asin",
-        "acos",
-        "atan",
-        "sinh",
-        "cosh",
-        "tanh",
-        "exp",
-        "log",
-        "abs",
-        "sign",
-        "sqrt",
-        "atan2",
-        "min",
-        "max",
-        "floor",
-        "log1p",
-        "expm1",
-    )
+    plain = (*_ELEMENTARY, "abs", "sign", "sqrt", "atan2", "min", "max", "floor", "log1p", "expm1")
     return (
         {name: getattr(xp, names.get(name, name)) for name in plain}
         | {
             "erf": erf,
             "sinc": sinc,
-            "add": _add,
-            "multiply": _multiply,
-            "divide": lambda a, b: a / b,
+            "add": lambda *terms: reduce(operator.add, terms),
+            "multiply": lambda *factors: reduce(operator.mul, factors),
+            "divide": operator.truediv,
             "power": _power,
-            "general_power": lambda base, power: base**power,
+            "general_power": operator.pow,
             "logcosh": lambda u: xp.logaddexp(u, -u) - math.log(2),
         }
         | special
@@ -296,20 +258,6 @@ def _power(base: Any, power: Any) -> Any:
         if power:
             base = base * base
     return result
-
-
-def _add(*terms: Any) -> Any:
-    total = terms[0]
-    for term in terms[1:]:
-        total = total + term
-    return total
-
-
-def _multiply(*factors: Any) -> Any:
-    product = factors[0]
-    for factor in factors[1:]:
-        product = product * factor
-    return product
 
 
 def _float_power(base: float, power: float) -> float:
