@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numba import float64, int64, void
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 
 from zakai.numerics.compiled import kernel
 from zakai.numerics.line_splitting import exponent_added
@@ -35,9 +34,9 @@ _POSITIONS = (np.arange(2 * REACH * PARTS) + 0.5) / PARTS - REACH
 
 def _rule(order: int, derivative: int) -> Array:
     """Return the weights of the nodes for K = `order`, of F or its derivative."""
-    spline = BSpline.basis_element(np.arange(-2.0, 3.0), extrapolate=False)
     apart = _POSITIONS[:, None] - np.arange(-order, order + 1)
-    basis = np.where(np.abs(apart) < 2.0, np.nan_to_num(spline(apart, nu=derivative)), 0.0)
+    near, far = (np.maximum(reach - np.abs(apart), 0.0) for reach in (1.0, 2.0))
+    basis = (2.0 * near**2 - 0.5 * far**2) * np.sign(apart) if derivative else (far**3 - 4.0 * near**3) / 6.0
     degrees = np.arange(2 * order + 1) + derivative
     return np.asarray(basis @ np.linalg.solve((_POSITIONS[:, None] ** degrees).T @ basis, 1.0 * (degrees == derivative)))
 
