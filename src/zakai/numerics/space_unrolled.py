@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import resample
 from scipy.special import erf
 
+from zakai.numerics.complex_step import is_complex
 from zakai.numerics.space_grid import Grid, sinc_resampled, triangular_resampled
 
 Array = NDArray[Any]
@@ -86,6 +86,16 @@ def weighed(values: Array, grid: Grid, angles: tuple[bool, ...]) -> Array:
     return values
 
 
+def _on_more_points(values: Array, count: int, axis: int) -> Array:
+    """Return a periodic function at more points along an axis."""
+    if is_complex(values):
+        return _on_more_points(values.real, count, axis) + 1j * _on_more_points(values.imag, count, axis)
+    size, spectrum = values.shape[axis], np.moveaxis(np.fft.rfft(values, axis=axis), axis, -1)
+    if size % 2 == 0:
+        spectrum[..., -1] *= 0.5  # half of the highest frequency belongs to its negative
+    return np.moveaxis(np.fft.irfft(spectrum, count), -1, axis) * (count / size)
+
+
 def opened(values: Array, grid: Grid) -> tuple[Array, Grid]:
     """Return a density on an aligned grid with closed axes as one on the line."""
     for d, closed in enumerate(grid.closed):
@@ -94,7 +104,7 @@ def opened(values: Array, grid: Grid) -> tuple[Array, Grid]:
             finer = int(2 * np.ceil(0.5 * size + HIGHEST))
             wide = int(2 * np.ceil(REACH / (2 * np.pi) * finer))
             # The first point of the grid keeps its place.
-            values = np.roll(resample(values, finer, axis=d), finer // 2 - round(size // 2 * finer / size), axis=d)
+            values = np.roll(_on_more_points(values, finer, d), finer // 2 - round(size // 2 * finer / size), axis=d)
             values = np.take(values, np.arange(finer // 2 - wide // 2, finer // 2 - wide // 2 + wide) % finer, axis=d)
             basis = grid.basis.copy()
             basis[d, d] = 2 * np.pi / finer
