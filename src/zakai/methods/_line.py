@@ -43,9 +43,9 @@ from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior, GaussianPrior
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel, around, chosen
+from zakai.numerics.line_density import separated
 from zakai.numerics.line_loop import RELIABLE
 from zakai.numerics.line_posterior import General, Likelihood, multiplied
-from zakai.numerics.line_transition import separated
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 from zakai.records.schedule import Schedule
 

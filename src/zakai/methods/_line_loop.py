@@ -26,6 +26,8 @@ from zakai.methods._line_system import (
 from zakai.methods._protocol import Info, Infos
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channels
+from zakai.numerics.line_density import support
+from zakai.numerics.line_filters import BAND
 from zakai.numerics.line_loop import (
     AFTER,
     COLUMNS,
@@ -38,11 +40,10 @@ from zakai.numerics.line_loop import (
     Limits,
     Steps,
     advance,
-    narrow,
 )
+from zakai.numerics.line_modes import narrow
 from zakai.numerics.line_panels import GAUSS_NODES, interpolation
-from zakai.numerics.line_splitting import CELL, DRIFT, OBSERVED, PHI, SLOPE
-from zakai.numerics.line_transition import BAND, support
+from zakai.numerics.line_terms import CELL, DRIFT, OBSERVED, PHI, SLOPE
 from zakai.numerics.line_weak import at_nodes, nodes
 
 LARGER = 0.2  # margin of a new grid, relative to the range of the density
@@ -88,7 +89,7 @@ def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
         return None
     offset = window.origin - prepared.origin + float(offsets[0])
     fine = _fine(prepared, window, window.origin + offsets)
-    return Grid(_NONE[None], _NONE, table, 0.0, start, offset, window.spacing, window.closed, fine)
+    return Grid(_NONE[None], _NONE[None], _NONE, table, 0.0, start, offset, window.spacing, window.closed, fine)
 
 
 _NONE = np.zeros(0)
@@ -107,7 +108,9 @@ def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
         return None
     modes, covariance = np.ascontiguousarray(decomposed.modes), float(np.max(tables(prepared, window).covariance))
     fine = _fine(prepared, window, window.points)
-    return Grid(modes, decomposed.rates, table, covariance, 0, 0.0, window.spacing, window.closed, fine)
+    return Grid(
+        modes, np.ascontiguousarray(modes.T), decomposed.rates, table, covariance, 0, 0.0, window.spacing, window.closed, fine
+    )
 
 
 def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:
@@ -254,7 +257,7 @@ def _numbers(c: Channels, rates: np.ndarray) -> np.ndarray:
 def steps_of(prepared: Prepared, rows: slice, observed: np.ndarray) -> Steps:
     """Return the steps of some intervals."""
     kinds, lengths, kernels = prepared.kinds[rows], prepared.lengths[rows], prepared.kernels
-    channels = np.full((len(kinds), 6 * prepared.gaussian), np.nan)
+    channels = np.full((len(kinds), 6), np.nan)
     here = np.flatnonzero((kinds == KERNEL) | (kinds == FACTOR))
     if prepared.gaussian and kernels is not None and len(here):
         which = kernels.place[rows][here]
@@ -284,7 +287,9 @@ def run(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> 
         if grid is None:
             break
         some = Steps(*(part[: here.stop - first] for part in steps))
-        found = advance(np.asarray(state.values), grid, some, float(state.error), float(state.log_floor), limits)
+        found = advance(
+            prepared.mechanisms, np.asarray(state.values), grid, some, float(state.error), float(state.log_floor), limits
+        )
         taken = len(found.reports)
         if taken:
             centres = state.centre + state.spacing * (found.starts - grid.start)

@@ -15,10 +15,10 @@ from zakai.methods._line_yau import Kernels, YauLine
 from zakai.methods._series_kernel import PowerSeries
 from zakai.models.model import Model
 from zakai.numerics import line_window as lw
-from zakai.numerics.line_loop import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR
+from zakai.numerics.line_density import support
+from zakai.numerics.line_loop import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Mechanisms
 from zakai.numerics.line_operator import Spectral
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
-from zakai.numerics.line_transition import support
 from zakai.numerics.line_weak import PARTS, at_nodes, nodes, weak
 from zakai.records.schedule import Schedule
 
@@ -172,6 +172,16 @@ class Prepared:
     def kinds(self) -> np.ndarray:
         """How the compiled loop takes each interval (K,): FACTOR, SPLIT or KERNEL; -1 where it does not."""
         return kinds_of(self)
+
+    @cached_property
+    def mechanisms(self) -> Mechanisms:
+        """What the compiled loop needs for this model."""
+        system, yau = self.system, self.yau
+        if not self.gaussian:
+            return Mechanisms(True, False, False, True, self.weak)
+        whole = yau is not None and yau.unobserved and yau.steady_gauge and self.kernels is not None
+        always = whole and yau is not None and (not system.moving if system.samples else yau.affine)
+        return Mechanisms(False, whole, self.divides and not always, system.samples, self.weak)
 
     @cached_property
     def fast(self) -> list[bool]:

@@ -14,9 +14,6 @@ the third and fifth commutators for a Gaussian density of the variance P,
     + tau^4 max(rate^2 rms([A, [b, A]]), std(L^4 b)) / 2880,
 
 L the backward operator.  With s substeps of an interval, s^-4 of that.
-
-Of coefficients that vary within the interval the mean takes the place of the constants where that is accurate, else two averages
-with weights, one after the other: Magnus' integrator of fourth order without commutators.
 """
 
 from __future__ import annotations
@@ -27,134 +24,98 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper
-from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS, NODES
-from zakai.numerics.line_transition import filtered, largest, moments, taps_of, wrapped
+from zakai.numerics.line_averages import EARLY, IMPOSSIBLE, LATE, MEAN, MOST_MAGNUS, averaged, averaging
+from zakai.numerics.line_density import highest_of, moments
+from zakai.numerics.line_filters import filtered, taps_of, wrapped
+from zakai.numerics.line_terms import Transition, failed
 
 Array = NDArray[Any]
 
-PHI, CELL, DRIFT, SLOPE, OBSERVED = 0, 1, 2, 3, 4  # rows of a term: phi, int f over the spacing above a point, f, f', h
-MOST_MAGNUS = 32  # equal parts of an interval with two averages each
-_IMPOSSIBLE = -1e8  # exponent where a formula has no value
+MOST_SUBSTEPS = 64
 _OVERFLOW = 690.0
 _STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
 
 
-MEAN, EARLY, LATE, DIFFERENCE, SECOND = 0, 1, 2, 3, 4  # weights of a part
+@helper
+def divided(
+    now: Array, table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, averages: Array,
+    observed: Array, inside: bool, tau: float, spacing: float, closed: bool, depth: float, most: float, finest: float,
+) -> Transition:  # fmt: skip
+    """Replace a density by that after a split interval, in as many averages and substeps as its error asks for.
 
+    The samples of a Gaussian of the variance V, in squares of the spacing, are a filter of positive numbers with the relative
+    error 2 exp(-2 pi^2 V).  Narrower kernels are used where these would need a spacing below `finest`.
 
-def _averages() -> Array:
-    """Return the weights (P, 5, 6) of the six Gauss nodes in each of n equal parts of an interval, n = 1 .. MOST_MAGNUS.
-
-    They give the integral over the part, the two averages of the integrator, their difference, and the second Legendre
-    coefficient.
+    Args:
+        now: the density (N,).
+        table, drifts, outputs, precisions, covariances, observed: see `line_loop.Grid` and `line_loop.Steps`.
+        averages: the weights of `line_averages`.
+        inside: whether the observation acts inside the interval.
+        tau: the length of the interval.
+        spacing: the spacing of the grid.
+        closed: whether it goes around the circle.
+        depth: the depth of the tails, as a logarithm below the maximum, to which filters are accurate.
+        most: the largest error.
+        finest: the smallest spacing that may be asked for.
     """
-    y = 2.0 * GAUSS_NODES - 1.0
-    own = GAUSS_WEIGHTS * np.array([np.ones(NODES), 0.5 - y, 0.5 + y, 2.0 * y, 2.5 * (3.0 * y**2 - 1.0)])
-    inverse = np.linalg.inv(np.polynomial.legendre.legvander(y, NODES - 1))
-    parts = [(n, part) for n in range(1, MOST_MAGNUS + 1) for part in range(n)]
-    nodes = [2.0 * (part + GAUSS_NODES) / n - 1.0 for n, part in parts]
-    between = [np.polynomial.legendre.legvander(at, NODES - 1) @ inverse / n for at, (n, _) in zip(nodes, parts, strict=True)]
-    return np.array([own @ matrix for matrix in between])
-
-
-AVERAGES = _averages()  # those of n parts begin at n (n - 1) / 2
-
-
-@helper
-def add(to: Array, weight: float, values: Array) -> None:
-    """Add values with a weight."""
-    for j in range(to.size):
-        to[j] += weight * values[j]
-
-
-@helper
-def exponent_added(h: Array, precision: Array, observed: Array, weight: float, share: float, at: int, b: Array) -> float:
-    """Add h'S^-1 (weight y - share h / 2) less its value at a point, which is returned.
-
-    Large numbers cancel in this way before they are squared.
-    """
-    constant = 0.0
-    for i in range(h.shape[0]):
-        weighted, centre = 0.0, h[i, at]
-        for l in range(h.shape[0]):
-            if precision[i, l] != 0.0:
-                weighted += precision[i, l] * (weight * observed[l] - share * h[l, at])
-                constant += centre * precision[i, l] * (weight * observed[l] - 0.5 * share * h[l, at])
-        for l in range(h.shape[0]):
-            pull, other = 0.5 * share * precision[i, l], h[l, at]
-            if pull != 0.0:
-                for j in range(b.size):
-                    b[j] -= pull * (h[l, j] - other) * (h[i, j] - centre)
-        if weighted != 0.0:
-            for j in range(b.size):
-                b[j] += weighted * (h[i, j] - centre)
-    return constant
-
-
-@helper
-def observation_of(table: Array, outputs: Array) -> Array:
-    """Return h (m, N), the sum of the terms of a table with factors (R,)."""
-    found = np.zeros((table.shape[1] - OBSERVED, table.shape[2]))
-    for r in range(outputs.size):
-        if outputs[r] != 0.0:
-            for i in range(found.shape[0]):
-                add(found[i], outputs[r], table[r, OBSERVED + i])
-    return found
-
-
-@helper
-def averaged(
-    table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, weights: Array, tau: float,
-    observed: Array, inside: bool, at: int, spacing: float, closed: bool, phi: Array, drift: Array, b: Array,
-) -> tuple[float, float, float, float]:  # fmt: skip
-    """Write phi, f and b of an average; return length, int G dt, shift and the constant of b."""
-    size, fraction, spread, mean, constant = b.size, 0.0, 0.0, 0.0, 0.0
-    for j in range(size):
-        phi[j], drift[j], b[j] = 0.0, 0.0, 0.0
-    for q in range(weights.size):
-        fraction += weights[q]
-        spread += weights[q] * covariances[q] * tau
-    for r in range(table.shape[0]):
-        weight = 0.0
-        for q in range(weights.size):
-            weight += weights[q] * drifts[q, r]
-        if weight != 0.0:
-            add(phi, weight, table[r, CELL])
-            add(drift, weight, table[r, DRIFT])
-            add(b, weight, table[r, SLOPE])
-    length = fraction * tau
-    G = spread / length
-    for j in range(size):
-        phi[j] /= fraction * G
-        drift[j] /= fraction
-    if closed:
+    size, at, varying = now.size, highest_of(now), averages.shape[0] > 1
+    begin, phi, drift = now.copy(), np.empty(size), np.empty(size)
+    b, first, second = np.empty(size), np.empty(size), np.empty(size)
+    magnus, substeps = 0.0, 1.0  # pairs of averages, one after the other, or the mean
+    if varying:
+        mean_error, pair_error = averaging(
+            now, table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, spacing
+        )
+        if mean_error > most:
+            magnus = max(np.ceil(1.1 * (pair_error / most) ** 0.25), 1.0)
+    for _ in range(8):
+        if not (magnus <= MOST_MAGNUS and max(magnus, 1.0) * substeps <= MOST_SUBSTEPS):
+            break
+        parts = int(max(magnus, 1.0))
+        splitting, time, pairs, rounding, clipped, spread, constant, needed = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        wide = np.log(1e4 * parts * substeps / most) / (2.0 * np.pi**2)
         for j in range(size):
-            mean += phi[j] * G / (2.0 * np.pi)
-        for j in range(size):
-            phi[j] -= mean * spacing / G
-    own = -0.5 * length * ((drift[at] - mean) * (drift[at] + mean) / G + b[at] / fraction)
-    constant += own
-    for j in range(size):
-        b[j] = -0.5 * length * ((drift[j] - mean) * (drift[j] + mean) / G + b[j] / fraction) - own
-    if inside:
-        for q in range(outputs.shape[0]):
-            w = fraction if outputs.shape[0] == 1 else weights[q]
-            constant += exponent_added(observation_of(table, outputs[q]), precisions[q], observed, w, w * tau, at, b)
-    for j in range(size):
-        if not (b[j] > _IMPOSSIBLE):
-            b[j] = _IMPOSSIBLE
-    # phi, from its derivative, relative to the point `at`.
-    total, step = 0.0, phi[at]
-    phi[at] = 0.0
-    for j in range(at + 1, size):
-        total += step
-        step = phi[j]
-        phi[j] = total
-    total = 0.0
-    for j in range(at - 1, -1, -1):
-        total -= phi[j]
-        phi[j] = total
-    return length, spread, mean * length, constant
+            now[j] = begin[j]
+        for i in range(2 * parts if magnus > 0.0 else 1):
+            weights = averages[parts * (parts - 1) // 2 + i // 2]
+            which = MEAN if magnus == 0.0 else (EARLY if i % 2 == 0 else LATE)
+            length, own_spread, shift, added = averaged(
+                table, drifts, outputs, precisions, covariances, weights[which], tau, observed, inside, at, spacing, closed, phi,
+                drift, b,
+            )  # fmt: skip
+            if not (own_spread > 0.0):
+                return failed(spread, 0.0)
+            variance = 0.5 * own_spread / substeps
+            if variance < wide * spacing * spacing:
+                needed = np.sqrt(variance / (1.05 * wide))
+                if closed or needed > finest:
+                    return failed(spread, needed)
+            differences(b, spacing, closed, first, second)
+            noise, end = split(now, phi, b, first, own_spread, shift, substeps, spacing, depth, closed, needed > 0.0)
+            if needed > 0.0 and not (noise < 1e-2 * most):  # perhaps the exponents vary too much between points
+                return failed(spread, max(needed, 0.6 * spacing))
+            splitting += residual(now, b, first, second, drift, own_spread, spacing, length) / substeps**4
+            rounding, clipped, spread, constant = rounding + noise, max(clipped, end), spread + own_spread, constant + added
+            if varying and (magnus == 0.0 or i % 2 == 1):
+                mean_error, pair_error = averaging(
+                    now, table, drifts, outputs, precisions, covariances, weights, tau, observed, inside, at, spacing
+                )
+                time, pairs = time + (pair_error if magnus > 0.0 else mean_error), pairs + pair_error
+            total = moments(now)[0]
+            if not (1e-200 < total < 1e200):
+                splitting = np.inf
+            if not (splitting < np.inf):
+                break
+        if splitting <= most and time <= most:
+            return Transition(splitting + time, rounding, clipped, spread, 1.0, needed, constant)
+        if not (splitting + time < np.inf):
+            substeps *= 4.0
+        else:
+            if time > most:
+                magnus = max(np.ceil(1.1 * parts * (pairs / most) ** 0.25), 1.0)
+            rest = splitting * (parts / max(magnus, 1.0)) ** 4
+            substeps = np.ceil(substeps * max(1.02 * (rest / most) ** 0.25, 1.0 / substeps))
+    return failed(0.0, 0.0)
 
 
 @helper
@@ -227,77 +188,16 @@ def residual(
 
 
 @helper
-def _generated(u: Array, parts: Array, spread: float, spacing: float, weight: float, to: Array) -> None:
-    """Add the integral of the equation's right-hand side with a weight, by differences of fourth order."""
-    inner, flow = u.size - 4, np.empty(u.size)
-    for j in range(u.size):
-        flow[j] = parts[0, j] * u[j]
-    one, two = weight / (12.0 * spacing), 0.5 * weight * spread / (12.0 * spacing * spacing)
-    a, b, c, d, e = u[:inner], u[1 : inner + 1], u[2 : inner + 2], u[3 : inner + 3], u[4:]
-    first, second, fourth, fifth = flow[:inner], flow[1 : inner + 1], flow[3 : inner + 3], flow[4:]
-    own, found = parts[1, 2 : inner + 2], to[2 : inner + 2]
-    for j in range(inner):
-        curved = 16.0 * (b[j] + d[j]) - a[j] - e[j] - 30.0 * c[j]
-        found[j] += two * curved - one * (8.0 * (fourth[j] - second[j]) - fifth[j] + first[j]) + weight * own[j] * c[j]
-
-
-# Which operator (B, D, E) acts on which density, with which weight, and to which density it is added.  From the density 0 they
-# make 4 = [B, D] and 5 = [B, [B, E]] = B (B E - 2 E B) + E B B.
-_PRODUCTS = np.array(
-    [
-        (0, 0, 1, 1), (1, 0, 1, 2), (0, 2, 1, 4), (1, 1, -1, 4), (2, 0, 1, 3), (0, 3, 1, 6), (2, 1, -2, 6), (0, 6, 1, 5),
-        (0, 1, 1, 7), (2, 7, 1, 5),
-    ]
-)  # fmt: skip
-
-
-@helper
-def averaging(
-    values: Array, table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, averages: Array,
-    tau: float, observed: Array, inside: bool, at: int, spacing: float,
-) -> tuple[float, float]:  # fmt: skip
-    """Return estimates of the errors of the mean and of two averages in a part of an interval.
-
-    With the integral B of the operator, D the difference of the averages and E the second Legendre coefficient they are
-    [B, D] / 4 + [B, [B, E]] / 10, and of fifth order 5 |[B, D] / 4|^(5/3) + [B, [B, E]] / 10.
-    """
-    size = values.size
-    parts, spreads, found = np.zeros((3, 2, size)), np.zeros(3), np.zeros((8, size))
-    for i in range(3):
-        weights, whole = averages[MEAN if i == 0 else (DIFFERENCE if i == 1 else SECOND)], 0.0
-        for q in range(weights.size):
-            spreads[i] += tau * weights[q] * covariances[q]
-            whole += weights[q]
-            for r in range(table.shape[0]):
-                add(parts[i, 0], tau * weights[q] * drifts[q, r], table[r, DRIFT])
-        if inside and (i == 0 or outputs.shape[0] > 1):
-            for q in range(outputs.shape[0]):
-                w = whole if outputs.shape[0] == 1 else weights[q]
-                exponent_added(observation_of(table, outputs[q]), precisions[q], observed, w, w * tau, at, parts[i, 1])
-    add(found[0], 1.0, values)
-    for operator, of, weight, to in _PRODUCTS:
-        _generated(found[of], parts[operator], spreads[operator], spacing, float(weight), found[to])
-    one, two, mass, limit = 0.0, 0.0, 0.0, 1e-12 * largest(values)
-    for j in range(size):
-        mass += values[j]
-        if values[j] > limit:
-            one += abs(found[4, j])
-            two += abs(found[5, j])
-    one, two = 0.25 * one / mass, 0.1 * two / mass
-    return one + two, 5.0 * one ** (5.0 / 3.0) + two
-
-
-@helper
 def split(
-    now: Array, phi: Array, b: Array, first: Array, spread: float, shift: float, substeps: int, spacing: float, depth: float,
+    now: Array, phi: Array, b: Array, first: Array, spread: float, shift: float, substeps: float, spacing: float, depth: float,
     closed: bool, narrow: bool,
 ) -> tuple[float, float]:  # fmt: skip
     """Replace a density by that after an average, in substeps; return the rounding error and what may have become zero.
 
     The filter of a narrow kernel is accurate where v is band-limited, that is where the exponents change little between points.
     """
-    size, weight, part = now.size, 1.0 / (6.0 * substeps), spread / (2.0 * substeps)
-    correction, negligible, clipped = spread / (72.0 * substeps**3), 1e-13 * largest(now), 0.0
+    size, count, weight, part = now.size, 2 * int(substeps), 1.0 / (6.0 * substeps), spread / (2.0 * substeps)
+    correction, negligible, clipped = spread / (72.0 * substeps**3), 1e-13 * now[highest_of(now)], 0.0
     middle, joint, late, work = np.empty(size), np.empty(size), np.empty(size), np.ones(size)
     for j in range(1, size):
         if narrow and not (abs(phi[j] - phi[j - 1]) + 5.0 * weight * abs(b[j] - b[j - 1]) < _STEEPEST):
@@ -308,26 +208,26 @@ def split(
     for j in range(size):
         outer, gauge = weight * b[j], phi[j]
         if not (abs(gauge) < _OVERFLOW and outer - gauge < _OVERFLOW):
-            if now[j] > negligible or not (gauge < 0.0 or b[j] == _IMPOSSIBLE):
+            if now[j] > negligible or not (gauge < 0.0 or b[j] == IMPOSSIBLE):
                 return np.inf, 1.0
             clipped = max(clipped, now[j])
             now[j], outer, gauge = 0.0, -_OVERFLOW, 0.0
         now[j] *= np.exp(outer - gauge)
         middle[j] = np.exp(4.0 * outer - correction * first[j] * first[j])
         late[j] = np.exp(outer + gauge)
-        joint[j] = np.exp(2.0 * outer) if substeps > 1 else 1.0
+        joint[j] = np.exp(2.0 * outer) if substeps > 1.0 else 1.0
         work[j] = np.exp(gauge) if narrow else 1.0
     variance = part / (spacing * spacing)
     taps = taps_of(variance, depth, size, narrow)
     rounding, clipped = 0.0, clipped * 1e-13 / negligible
-    for i in range(2 * substeps):
-        after = middle if i % 2 == 0 else (joint if i < 2 * substeps - 1 else late)
+    for i in range(count):
+        after = middle if i % 2 == 0 else (joint if i < count - 1 else late)
         if closed:
-            rounding += wrapped(now, work, shift / (2.0 * substeps * spacing), variance, depth)
+            rounding += wrapped(now, work, shift / (count * spacing), variance, depth)
             for j in range(size):
                 now[j] *= after[j]
         else:
-            if i == 2 * substeps - 1:
+            if i == count - 1:
                 for j in range(size):
                     work[j] = 1.0
             noise, end = filtered(now, taps, after, work, narrow)

@@ -19,8 +19,8 @@ from numba import float64, int64, void
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
-from zakai.numerics.line_splitting import exponent_added
-from zakai.numerics.line_transition import moments
+from zakai.numerics.line_density import moments
+from zakai.numerics.line_terms import exponent_added
 
 Array = NDArray[Any]
 _V, _M = float64[::1], float64[:, ::1]

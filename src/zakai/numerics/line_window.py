@@ -12,10 +12,9 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import types
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import kernel
+from zakai.numerics.line_density import spectrum, waves
 from zakai.numerics.line_operator import generator
 
 Array = NDArray[Any]
@@ -105,69 +104,6 @@ class Figures(NamedTuple):
     resolving: float
 
 
-_F = types.float64
-
-
-@lru_cache(maxsize=16)
-def waves(size: int) -> tuple[Array, Array]:
-    """Return cos(2 pi k i / size) and the sines (size // 2 + 1, size)."""
-    angle = 2.0 * np.pi / size * (np.outer(np.arange(size // 2 + 1), np.arange(size)) % size)
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return cosine, sine
-
-
-@kernel(types.UniTuple(_F, 9)(_F[::1], _F, _F, _F[:, ::1], _F[:, ::1]))  # type: ignore[no-untyped-call]
-def figures_of(values: Array, cut: float, negligible: float, cosines: Array, sines: Array) -> tuple[float, ...]:
-    """left, right, first, last, negative, aliasing, middle of the spectrum, highest frequency that counts, number of these."""
-    size = values.shape[0]
-    top, total, mass = 0.0, 0.0, 0.0
-    for i in range(size):
-        top = max(top, values[i])
-        total += abs(values[i])
-        mass += values[i]
-    nyquist = size // 2
-    scale = 1.0 / abs(mass) if mass != 0.0 else 0.0
-    aliasing, middle, highest = 0.0, 0.0, -1
-    stride = max(1, nyquist // 32)  # a few frequencies of a large grid
-    k, top_known = nyquist, False
-    while k > 0:
-        in_top = k >= nyquist * 7 // 8
-        in_middle = nyquist * 5 // 8 <= k < nyquist * 3 // 4
-        if in_top or in_middle or highest < 0:
-            if not in_top and not top_known:
-                top_known = True
-                if aliasing > negligible:
-                    # Above, nothing can be resolved: what counts is noise or too much for this grid.
-                    negligible = 4.0 * aliasing
-            real, imag = np.dot(cosines[k], values) * scale, np.dot(sines[k], values) * scale
-            size_here = np.sqrt(real * real + imag * imag)
-            if in_top:
-                aliasing = max(aliasing, size_here)
-            elif in_middle:
-                middle = max(middle, size_here)
-            if highest < 0 and size_here > negligible and not in_top:
-                highest = k + stride - 1
-        elif k < nyquist * 5 // 8:
-            break
-        k -= stride
-    if highest < 0 and aliasing > negligible:
-        highest = nyquist
-    if cut >= 1e-14:  # smaller values are accurate
-        cut = max(cut, min(aliasing, 1e-4))
-    first, last = 0, size - 1
-    while first < size - 1 and not values[first] > cut * top:
-        first += 1
-    while last > first and not values[last] > cut * top:
-        last -= 1
-    inverse = 1.0 / top if top > 0 else 0.0
-    left = max(abs(values[0]), abs(values[1])) * inverse
-    right = max(abs(values[size - 1]), abs(values[size - 2])) * inverse
-    negative = 0.5 * (total - mass) / total if total > 0 else 0.0
-    if not (total < np.inf):
-        aliasing = middle = np.inf
-    return left, right, float(first), float(last), negative, aliasing, middle, float(highest), float(nyquist)
-
-
 def figures(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: float = CUT) -> Figures:
     """Return the figures of a density.
 
@@ -178,7 +114,7 @@ def figures(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: fl
         cut: the smallest value that counts, relative to the largest.
     """
     real = np.ascontiguousarray(values.real)
-    left, right, first, last, negative, aliasing, middle, highest, nyquist = figures_of(real, cut, negligible, *waves(len(real)))
+    left, right, first, last, negative, aliasing, middle, highest, nyquist = spectrum(real, cut, negligible, *waves(len(real)))
     rough = middle < 6.0 * aliasing
     if aliasing <= negligible or (rough and aliasing < 1e-9):
         resolving = 0.92 * nyquist / (max(highest, 0.0) + 1.0)

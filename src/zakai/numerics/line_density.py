@@ -1,0 +1,181 @@
+"""Figures of a density on a uniform grid: moments, support, modes and spectrum, in compiled code."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import boolean, float64, int64, types
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import helper, kernel
+
+Array = NDArray[Any]
+
+
+class Spectrum(NamedTuple):
+    """Figures of the spectrum and of the ends of a density; those of the spectrum are relative to the mass.
+
+    `left` and `right` are the largest moduli of the two outermost points on each side, relative to the maximum; `first` and
+    `last` the support; `negative` the negative share of the mass; `aliasing` the largest spectrum in the highest eighth of the
+    frequencies and `middle` that around eleven sixteenths of the highest; `highest` is the highest of the `nyquist` frequencies
+    that is not negligible.
+    """
+
+    left: float
+    right: float
+    first: float
+    last: float
+    negative: float
+    aliasing: float
+    middle: float
+    highest: float
+    nyquist: float
+
+
+@helper
+def moments(values: Array) -> tuple[float, float, float]:
+    """Return the sum of values, and their mean and variance as an index from the middle."""
+    mass, mean, square = 0.0, 0.0, 0.0
+    half = values.size // 2
+    for j in range(values.size):
+        mass += values[j]
+        mean += (j - half) * values[j]
+    mean /= mass
+    for j in range(values.size):
+        square += (j - half - mean) ** 2 * values[j]
+    return mass, mean, square / mass
+
+
+@helper
+def circular_moments(values: Array, cosines: Array, sines: Array) -> tuple[float, float]:
+    """Return the argument of E exp(i x) as an index from the middle, and the variance in squares of the spacing.
+
+    The square of a wrapped deviation d is pi^2 / 3 + 4 sum (-1)^k cos(k d) / k^2.
+    """
+    size = values.size
+    spacing, mass, mean, variance = 2.0 * np.pi / size, 0.0, 0.0, np.pi**2 / 3.0
+    for j in range(size):
+        mass += values[j]
+    for k in range(1, size // 2):
+        real, imag = 0.0, 0.0
+        for j in range(size):
+            real += cosines[k, j] * values[j]
+            imag += sines[k, j] * values[j]
+        real, imag = real / mass, imag / mass
+        # The grid begins at -pi: cos(k x_j) = (-1)^k cos(2 pi k j / size).
+        if k == 1 and real * real + imag * imag > 1e-18:
+            mean = np.arctan2(-imag, -real)
+        variance += 4.0 / k**2 * (np.cos(k * mean) * real + np.sin(k * mean) * imag)
+    return mean / spacing, variance / spacing**2
+
+
+@helper
+def highest_of(values: Array) -> int:
+    """Return the first index of the largest of values."""
+    at = 0
+    for j in range(values.size):
+        if values[j] > values[at]:
+            at = j
+    return at
+
+
+@kernel(types.UniTuple(int64, 2)(float64[::1], float64))  # type: ignore[no-untyped-call]
+def support(values: Array, cut: float) -> tuple[int, int]:
+    """Return the first and last index of values above `cut` times their maximum."""
+    bound = cut * max(values[highest_of(values)], 0.0)
+    first, last = 0, values.size - 1
+    while first < last and not values[first] > bound:
+        first += 1
+    while last > first and not values[last] > bound:
+        last -= 1
+    return first, last
+
+
+@kernel(boolean(float64[::1]))
+def separated(values: Array) -> bool:
+    """Return whether a density has modes apart from each other, whose weights keep their errors."""
+    peak, valley, least = 0.0, np.inf, 1e-4 * max(values[highest_of(values)], 0.0)
+    for j in range(values.size):
+        valley = min(valley, values[j])
+        if peak > least and values[j] > least and min(peak, values[j]) > 3.0 * valley:
+            return True
+        if values[j] > peak:
+            peak, valley = values[j], values[j]
+    return False
+
+
+@lru_cache(maxsize=16)
+def waves(size: int) -> tuple[Array, Array]:
+    """Return cos(2 pi k i / size) and the sines (size // 2 + 1, size)."""
+    angle = 2.0 * np.pi / size * (np.outer(np.arange(size // 2 + 1), np.arange(size)) % size)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return cosine, sine
+
+
+_F = float64
+
+
+@kernel(types.UniTuple(_F, 9)(_F[::1], _F, _F, _F[:, ::1], _F[:, ::1]))  # type: ignore[no-untyped-call]
+def spectrum(values: Array, cut: float, negligible: float, cosines: Array, sines: Array) -> tuple[float, ...]:
+    """Return the entries of `Spectrum` of values (N,), N > 2; of a large grid few frequencies are computed."""
+    size = values.shape[0]
+    nyquist = size // 2
+    top, total, mass = 0.0, 0.0, 0.0
+    for i in range(size):
+        top = max(top, values[i])
+        total += abs(values[i])
+        mass += values[i]
+    # The even part at 0 .. N / 2, and the odd part, with zeros beyond.
+    even, odd = np.zeros(nyquist + 2), np.zeros(nyquist + 2)
+    even[0] = values[0]
+    for i in range(1, nyquist + 1):
+        mirrored = values[size - i] if 2 * i < size else 0.0
+        even[i], odd[i] = values[i] + mirrored, values[i] - mirrored
+    scale = 1.0 / abs(mass) if mass != 0.0 else 0.0
+    aliasing, middle, highest = 0.0, 0.0, -1
+    stride = max(1, nyquist // 32)
+    k, top_known = nyquist, False
+    while k > 0:
+        in_top = k >= nyquist * 7 // 8
+        in_middle = nyquist * 5 // 8 <= k < nyquist * 3 // 4
+        if in_top or in_middle or highest < 0:
+            if not in_top and not top_known:
+                top_known = True
+                if aliasing > negligible:
+                    # Above, nothing can be resolved: what counts is noise or too much for this grid.
+                    negligible = 4.0 * aliasing
+            real, imag, other_real, other_imag = 0.0, 0.0, 0.0, 0.0
+            for i in range(0, nyquist + 1, 2):
+                real += cosines[k, i] * even[i]
+                imag += sines[k, i] * odd[i]
+                other_real += cosines[k, i + 1] * even[i + 1]
+                other_imag += sines[k, i + 1] * odd[i + 1]
+            real, imag = real + other_real, imag + other_imag
+            size_here = scale * np.sqrt(real * real + imag * imag)
+            if in_top:
+                aliasing = max(aliasing, size_here)
+            elif in_middle:
+                middle = max(middle, size_here)
+            if highest < 0 and size_here > negligible and not in_top:
+                highest = k + stride - 1
+        elif k < nyquist * 5 // 8:
+            break
+        k -= stride
+    if highest < 0 and aliasing > negligible:
+        highest = nyquist
+    if cut >= 1e-14:  # smaller values are accurate
+        cut = max(cut, min(aliasing, 1e-4))
+    first, last = 0, size - 1
+    while first < size - 1 and not values[first] > cut * top:
+        first += 1
+    while last > first and not values[last] > cut * top:
+        last -= 1
+    inverse = 1.0 / top if top > 0 else 0.0
+    left = max(abs(values[0]), abs(values[1])) * inverse
+    right = max(abs(values[size - 1]), abs(values[size - 2])) * inverse
+    negative = 0.5 * (total - mass) / total if total > 0 else 0.0
+    if not (total < np.inf):
+        aliasing = middle = np.inf
+    return left, right, float(first), float(last), negative, aliasing, middle, float(highest), float(nyquist)

@@ -1,0 +1,77 @@
+"""The transition of an interval by the modes of a symmetric operator: v -> after U exp(-time rates) U' v / after."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import boolean, float64
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.line_density import highest_of
+
+Array = NDArray[Any]
+
+LOG_NOISE = -33.4  # logarithm of the error of a decomposition relative to the maximum
+_NARROW = 7.0  # support of a density, in standard deviations of the noise, below which a step is left to another grid
+_SUPPORT = 1e-13  # values relative to the maximum beyond which a density counts as ended
+_SPREAD = 0.01  # of the value at an abrupt end that the interpolant spreads to the middle of the grid
+
+
+@kernel(boolean(float64, float64, float64))
+def narrow(points: float, spacing: float, variance: float) -> bool:
+    """Return whether noise of a variance makes the support of a density far wider: its grid cannot serve after the interval."""
+    within: bool = points * spacing < _NARROW * np.sqrt(variance)
+    return within
+
+
+@helper
+def decomposed(
+    now: Array, phi: Array, modes: Array, transposed: Array, rates: Array, time: float, most: float, closed: bool
+) -> float:
+    """Replace a density by that after an interval, after = exp(phi); return the relative error.
+
+    It is that of rounding, and of values that end abruptly after division by the gauge, which the interpolant spreads over the
+    grid; infinite where beyond the support it might exceed `most`.
+
+    Args:
+        now: the density (N,).
+        phi: the logarithm of the gauge (N,).
+        modes, transposed: U (N, N) and U'.
+        rates: (N,).
+        time: the length of the interval.
+        most: the largest error.
+        closed: whether the grid goes around the circle.
+    """
+    at = highest_of(now)
+    reach, top, highest, end, limit = 0.0, 0.0, 0.0, 0.0, _SUPPORT * now[at]
+    after, inner = np.empty(now.size), np.empty(now.size)
+    for j in range(now.size):
+        after[j] = np.exp(phi[j] - phi[at]) if phi[j] != phi[at] else 1.0
+        inner[j] = now[j] / after[j]
+        reach += inner[j] * inner[j]
+        if not closed and (now[j] <= limit or j < 2 or j >= now.size - 2):
+            end = max(end, inner[j])
+    coefficients = np.dot(transposed, inner)
+    for j in range(now.size):
+        coefficients[j] *= np.exp(-time * rates[j])
+    moved = np.dot(modes, coefficients)
+    # Beyond the support there is only rounding, which must not be amplified.
+    noise = 4e-16 * np.sqrt(reach)
+    left, right = 0, now.size - 1
+    while left < right and not moved[left] > noise:
+        now[left] = 0.0
+        left += 1
+    while right > left and not moved[right] > noise:
+        now[right] = 0.0
+        right -= 1
+    for j in range(left, right + 1):
+        now[j] = after[j] * moved[j]
+        top = max(top, now[j])
+        highest = max(highest, after[j])
+    outside = max(after[0], after[now.size - 1])
+    if not (top > 0.0 and noise * outside < most * top):
+        return np.inf
+    error: float = (noise + _SPREAD * end) * highest / top
+    return error
