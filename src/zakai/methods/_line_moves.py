@@ -15,9 +15,9 @@ from zakai.methods._line_system import Prepared, spectral, tables
 from zakai.methods._line_yau import moved
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel
+from zakai.numerics.line_filters import WIDE, wrapped
 from zakai.numerics.line_operator import Exponential, exponential_action
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
-from zakai.numerics.line_filters import WIDE, wrapped
 
 Array = Any
 
