@@ -98,29 +98,25 @@ class Observations:
         """Return h (J, m) at the points of a grid."""
         return self._kept(grid, None, lambda: (self.system.observe(grid.points, t, self.theta),))[0]
 
-    def energy(self, grid: Grid, t: float, inside: Array, precision: Array) -> Array:
-        """Return S^-1 h and -h'S^-1 h / 2 of the coordinates `inside` (rows), and their derivatives, (m + 1, n + 1, J)."""
+    def fields(self, grid: Grid, t: float) -> tuple[Array, Array]:
+        """Return h and its derivatives (m, n + 1, J) at the points of a grid, zero at those (J,) where h is not finite."""
 
-        def make() -> tuple[Array]:
+        def make() -> tuple[Array, Array]:
             points = grid.points
-            h = self.system.observe(points, t, self.theta).T[inside]
-            slopes = np.moveaxis(self.system.slopes(points, t, self.theta), 0, -1)[inside]
+            h = self.system.observe(points, t, self.theta).T
+            slopes = np.moveaxis(self.system.slopes(points, t, self.theta), 0, -1)
             fields = np.concatenate([h[:, None], slopes], axis=1)
-            gain = np.tensordot(precision, fields, axes=1)
-            half = (h[:, None] * gain).sum(axis=0)
-            half[0] *= 0.5
-            lost = ~np.isfinite(half.real).all(axis=0)  # the density ends where h is not finite
-            energy = np.concatenate([gain, -half[None]])
-            energy[:, :, lost] = 0.0
-            energy[-1, 0, lost] = -1e300
-            return (energy,)
+            lost = ~np.isfinite(fields.real).all(axis=(0, 1))
+            fields[:, :, lost] = 0.0
+            return fields, lost
 
-        return self._kept(grid, inside.tobytes(), make)[0]
+        found: tuple[Array, Array] = self._kept(grid, "fields", make)
+        return found
 
     def potential(self, inside: Array, values: Array, start: float, length: float) -> Any:
         """Return the factor of the increments `inside` over a substep, as a function of a grid."""
         system, theta, n, m = self.system, self.theta, self.model.n, self.model.m
-        coefficients, rows = np.append(values[inside] / length, 1.0), np.ix_(inside, inside)
+        rates, rows = (values[inside] / length)[:, None], np.ix_(inside, inside)
         origin, stop = np.zeros(n), start + length
         dynamics = self.dynamics
 
@@ -141,12 +137,14 @@ class Observations:
 
         def potential(grid: Grid, a: float, b: float, end: bool) -> Factor:
             a, b = max(a, start), min(b, stop)
-            fields: Array = 0.0
+            log: Array = 0.0
+            slope: Array = 0.0
             for weight, t, P in parts(grid, a, b):
-                energy = self.energy(grid, t, inside, P)
-                fields = fields + (weight * coefficients) @ energy.reshape(len(energy), -1)
-            fields = fields.reshape(n + 1, -1)
-            log, slope = fields[0], fields[1:]
+                fields, lost = self.fields(grid, t)
+                h, slopes = fields[inside, 0], fields[inside, 1:]
+                log = log + (h * (P @ (rates - 0.5 * h))).sum(axis=0) * weight
+                log = np.where(lost, -1e300, log)  # the density ends where h is not finite
+                slope = slope + np.einsum("mdj,mj->dj", slopes, (weight * P) @ (rates - h))
             if dynamics.diffusion is None:
                 steep = ((dynamics.noise(a, b)[0] @ slope) * slope).sum(axis=0)
             else:

@@ -20,6 +20,7 @@ from zakai.numerics.complex_step import is_complex
 
 Array = NDArray[Any]
 _MOST_SHEARED = 3.0  # times the points of an axis that a shear may need
+BLOCK = 5  # points of a block along each axis, of which the six taps of a spline reach two at most
 PAD = 3  # zeros, or the other end of a circle, around the coefficients of a spline
 
 
@@ -148,11 +149,14 @@ def spread(values: Array, grid: Grid, cov: Array, spline: bool = False) -> Array
 
 
 @kernel(
-    "void(float64[::1], int64[::1], boolean[::1], float64[:, ::1], float64[::1])",
-    "void(complex128[::1], int64[::1], boolean[::1], complex128[:, ::1], complex128[::1])",
+    "void(float64[::1], int64[::1], boolean[::1], float64, float64[:, ::1], float64[::1])",
+    "void(complex128[::1], int64[::1], boolean[::1], float64, complex128[:, ::1], complex128[::1])",
 )
-def _gather(values: Any, sizes: Any, closed: Any, z: Any, out: Any) -> None:
-    """out_j = sum over the taps of coefficients times quintic B-splines at indices z (n, J); outside it is zero."""
+def _gather(values: Any, sizes: Any, closed: Any, least: Any, z: Any, out: Any) -> None:
+    """out_j = sum over the taps of coefficients times quintic B-splines at indices z (n, J).
+
+    Outside it is zero, and where all coefficients are below `least`.
+    """
     n, count = z.shape
     padded = sizes + 2 * PAD
     strides = np.ones(n, np.int64)
@@ -179,6 +183,21 @@ def _gather(values: Any, sizes: Any, closed: Any, z: Any, out: Any) -> None:
                 for i in range(PAD):
                     c[first - 1 - i] = values[source + last - 1 - i]
                     c[first + last + i] = values[source + i]
+    # The largest coefficient of each block.
+    blocks = (padded + BLOCK - 1) // BLOCK
+    steps = np.ones(n, np.int64)
+    for d in range(n - 2, -1, -1):
+        steps[d] = steps[d + 1] * blocks[d + 1]
+    largest = np.zeros(steps[0] * blocks[0])
+    for line in range(c.size // padded[n - 1]):
+        rest, block = line, 0
+        for d in range(n - 2, -1, -1):
+            block += rest % padded[d] // BLOCK * steps[d]
+            rest //= padded[d]
+        first = line * padded[n - 1]
+        for i in range(padded[n - 1]):
+            at = block + i // BLOCK
+            largest[at] = max(largest[at], abs(c[first + i].real))
     scaling = 120.0**-n
     outer = 1
     for _ in range(n - 1):
@@ -186,19 +205,36 @@ def _gather(values: Any, sizes: Any, closed: Any, z: Any, out: Any) -> None:
     offsets = np.zeros(outer, np.int64)
     weights = np.zeros(outer, z.dtype)
     w = np.zeros((n, 6), z.dtype)
+    blocks_at = np.zeros(2**n, np.int64)
     for j in range(count):
         base = 0
         inside = True
+        used = 1
+        blocks_at[0] = 0
         for d in range(n):
             floor = math.floor(z[d, j].real) if math.isfinite(z[d, j].real) else -1e9
             if not closed[d] and (floor < -1 or floor >= sizes[d]) or abs(floor) > 1e8:
                 inside = False
                 break
-            t = z[d, j] - floor
             cell = int(floor)
             if closed[d]:
                 cell = cell % sizes[d]
-            base += (cell + PAD - 2) * strides[d]
+            first = cell + PAD - 2
+            base += first * strides[d]
+            low, high = first // BLOCK, (first + 5) // BLOCK
+            for i in range(used):
+                blocks_at[used + i] = blocks_at[i] + high * steps[d]
+                blocks_at[i] += low * steps[d]
+            used *= 2
+        if inside:
+            inside = False
+            for i in range(used):
+                inside = inside or largest[blocks_at[i]] >= least
+        if not inside:
+            out[j] = 0.0
+            continue
+        for d in range(n):
+            t = z[d, j] - math.floor(z[d, j].real)
             s = 1.0 - t
             t2 = t * t
             s2 = s * s
@@ -208,9 +244,6 @@ def _gather(values: Any, sizes: Any, closed: Any, z: Any, out: Any) -> None:
             w[d, 2] = 66.0 + t2 * (-60.0 + t2 * (30.0 - 10.0 * t))
             w[d, 3] = 66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s))
             w[d, 4] = 26.0 + s * (-50.0 + s * (20.0 + s * (20.0 + s * (-20.0 + 5.0 * s))))
-        if not inside:
-            out[j] = 0.0
-            continue
         size = 1
         offsets[0] = base
         weights[0] = 1.0
@@ -235,12 +268,15 @@ def _gather(values: Any, sizes: Any, closed: Any, z: Any, out: Any) -> None:
         out[j] = total * scaling
 
 
-def gather(coefficients: Array, z: Array, grid: Grid) -> Array:
-    """Return the spline with the coefficients (*sizes) at the indices z (J, n), counted from the first point of the grid."""
+def gather(coefficients: Array, z: Array, grid: Grid, least: float = 0.0) -> Array:
+    """Return the spline with the coefficients (*sizes) at the indices z (J, n), counted from the first point of the grid.
+
+    It is zero where all coefficients nearby are below `least`.
+    """
     dtype = complex if is_complex(coefficients, z) else float
     out = np.empty(len(z), dtype)
     c, at = np.ascontiguousarray(coefficients, dtype).reshape(-1), np.ascontiguousarray(z.T, dtype)
-    _gather(c, np.array(grid.sizes, np.int64), np.array(grid.closed), at, out)
+    _gather(c, np.array(grid.sizes, np.int64), np.array(grid.closed), least, at, out)
     return out
 
 

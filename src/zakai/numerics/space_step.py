@@ -36,7 +36,8 @@ TRIES = 7
 MARGIN = 0.03  # of the bounds, for a grid of short steps
 ACCEPTED = 3.0  # times the bound on tails, from a density that had such tails before
 HARMFUL = 100.0  # times the bound on tails
-MOST_PARTS = 512
+MOST_PARTS, MOST_WORK = 512, 2**24  # substeps of an interval, and substeps times points
+BALANCED = 0.5  # of the error that the grid makes, below which shorter substeps do not make that in time
 MOST_ENLARGED = 4.0  # times its own width that a grid may need for the noise of a substep
 NEGLIGIBLE = 1e-40  # of the maximum
 NOISE = 2.0  # the largest noise, as a multiple of the most negative value
@@ -88,6 +89,10 @@ class Report(NamedTuple):
     edges: float
     tails: float
     negative: float
+
+    def of_grid(self, reach: float) -> float:
+        """Return the error that the grid makes; a Gaussian has fallen to the bound on edges at `reach` deviations."""
+        return self.interpolation + 0.1 * reach**2 * self.edges + self.tails
 
     def worst(self, other: Report) -> Report:
         """Return the total of the errors of methods, and the largest of those of grids."""
@@ -266,13 +271,17 @@ class Stepper:
 
         `tails` (n,) are those of the density at the start of the interval, which no finer grid has made smaller.
         """
-        before, last, coarse, ratio = np.ones(field.grid.n), None, np.zeros(field.grid.n, bool), np.ones(field.grid.n)
+        n, reach = field.grid.n, self.bounds.reach
+        before, best, coarse, ratio, smallest = np.ones(n), None, np.zeros(n, bool), np.ones(n), np.inf
         for attempt in range(TRIES):
             result, moved = self._apply(field, t0, t1, move, potential)
             found = survey(result.values, result.grid, self.bounds.edge)
-            wide = found.edges > 3 * self.bounds.edge
-            if last is not None and coarse.any() and not better(found.tails, before, ratio, self.bounds)[coarse].any():
-                return last  # the finer grid has the same tails
+            report, wide = grid_report(found), found.edges > 3 * self.bounds.edge
+            # A finer grid may have the same tails, and a wider one that has no more points the noise of its spacings.
+            same = coarse.any() and not better(found.tails, before, ratio, self.bounds)[coarse].any()
+            if best is not None and (same or report.of_grid(reach) >= smallest):
+                break
+            best, smallest = (result, moved, report), report.of_grid(reach)
             coarse = refinable(found.tails, before, ratio, tails, self.bounds)
             if attempt == TRIES - 1 or not (wide.any() or coarse.any()) or found.tails.max() >= 1.0:
                 break
@@ -282,9 +291,9 @@ class Stepper:
             if changed is None:
                 break
             before, ratio = np.where(coarse, found.tails, before), finer_by(changed, result.grid)
-            last = None if wide.any() else (result, moved, grid_report(found))
             move = move._replace(target=changed)
-        return result, moved, grid_report(found)
+        assert best is not None
+        return best
 
     def single(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report]:
         """Return the density after one substep, on a grid that fits it."""
@@ -395,11 +404,12 @@ def _adaptively(
 ) -> tuple[Field, Report, Control]:
     """Return the density after an interval in extrapolated substeps whose lengths follow from the error of each.
 
-    Shorter substeps are tried as long as the error decreases with an order of at least `WORTH`: at a kink, or where interpolation
-    makes it, it does not.  No interval has more than about `MOST_PARTS` substeps; its report says what error they make.
+    Shorter substeps are tried as long as the error is larger than the tolerance and than what the grid makes, and decreases with
+    an order of at least `WORTH`: at a kink it does not.  No interval has more than about `MOST_PARTS` substeps, and fewer on
+    large grids; its report says what error they make.
     """
     done, length, report, rate = 0.0, 1.0 / parts, NOTHING, 0.0
-    left, before, stalled, growth = MOST_PARTS + 2 * parts, (np.inf, 1.0), False, 3.0
+    left, before, stalled, growth, work = MOST_PARTS + 2.0 * parts, (np.inf, 1.0), False, 3.0, 0
     while done < 1 - 1e-12:
         length = min(max(length, (1 - done) / left), longest, 1 - done)
         if 1 - done - length < 0.3 * length:
@@ -409,11 +419,12 @@ def _adaptively(
         if limit < end:
             end, length = limit, (limit - begin) / tau
         result, more, difference = stepper.double(field, begin, end, potential)
+        work += result.values.size
         difference = min(difference, 10.0) if np.isfinite(difference) else 10.0
         error = _EXTRAPOLATED * difference ** (5 / 3)
-        wanted = allowed * length
+        wanted = max(allowed * length, BALANCED / 3 * min(more.of_grid(stepper.bounds.reach), 1.0))
         change = float(np.clip(0.9 * (wanted / max(error, 1e-30)) ** 0.25, 0.2, growth))
-        left = max(left - 1, 1)
+        left = max(min(left - 1, (MOST_WORK - work) / result.values.size), 1)
         stalled = stalled or SMALL > difference and error > before[0] * (length / before[1]) ** WORTH
         if error > 3 * wanted and left > 1 and not (stalled and difference < SMALL):
             before, length, growth = (error, length), length * min(change, 0.7), 1.0

@@ -226,6 +226,12 @@ def weighed(values: Array, logs: Array) -> tuple[Array, Any]:
     return values * np.exp(np.where(shifted.real > 30.0, 30.0, shifted)), top
 
 
+def faintest(values: Array) -> float:
+    """Return a value below the smallest of a density that is not zero: smaller ones are unknown."""
+    real = values.real
+    return 0.5 * float(np.min(real, where=real > 0, initial=np.inf))
+
+
 def transported(
     values: Array,
     source: Grid,
@@ -242,7 +248,7 @@ def transported(
     `noises` are G (J, n, n) at the points of both grids, and half of the substep, where the noise depends on the state.
     """
     top: Any = 0.0
-    inverse = source.inverse
+    inverse, least = source.inverse, faintest(values)
     half = inverse @ linear.before @ inverse.T
     if before is None and noises is None:
         coefficients = filtered(values, gaussian_response(half, source.sizes, spline=True))
@@ -251,13 +257,14 @@ def transported(
         coefficients = filtered(values, gaussian_response(0.0 * half, source.sizes, spline=True))
     elif before is not None:
         values, first = weighed(values, before.log / 6)
+        least = faintest(values)
         values = spread(values, source, linear.before) if noises is None else diffused(values, source, noises[0], noises[2])
         values, second = weighed(values, before.log / 3 + before.correction)
         coefficients = filtered(values, gaussian_response(0.0 * half, source.sizes, spline=True))
         top = first + second
     at = relative_index(target.offsets + moved[:, :-1], target.centre, source, periodic)
     volume = np.exp(np.where(np.abs(moved[:, -1].real) < _LARGEST_VOLUME, moved[:, -1], 0.0))
-    result = (gather(coefficients, at, source) * volume).reshape(target.sizes)
+    result = (gather(coefficients, at, source, least) * volume).reshape(target.sizes)
     if after is not None:
         result, third = weighed(result, after.log / 3 + after.correction)
         top = top + third

@@ -12,6 +12,7 @@ from zakai.numerics.space_grid import Grid, rounded_size
 Array = NDArray[Any]
 LEAST = {1: 32, 2: 20, 3: 16, 4: 12}
 MOST = {1: 1024, 2: 512, 3: 128, 4: 40}
+POINTS = {1: 2**10, 2: 2**18, 3: 2**18, 4: 2**19}  # of a grid; the work of a substep is proportional to them
 _CORRELATED = 0.6  # correlation above which the axes follow the covariance
 _OPEN, _CLOSED = 0.6, 0.85  # shares of a circle below which an axis is cut open, and above which it is closed
 
@@ -110,6 +111,7 @@ def _sized(centre: Array, shape: Array, low: Array, high: Array, spacing: Array,
     n = len(centre)
     sizes, closed, steps = [], [], np.ones(n)
     middle = 0.5 * (low + high)
+    spacing = spacing * _coarser((high - low) / spacing + 4, bounds)
     for d in range(n):
         width = high[d] - low[d] + 4 * spacing[d]
         share = width / (2 * np.pi)
@@ -125,6 +127,12 @@ def _sized(centre: Array, shape: Array, low: Array, high: Array, spacing: Array,
     return Grid(centre + shape @ middle, shape * steps, tuple(sizes), tuple(closed))
 
 
+def _coarser(sizes: Array, bounds: Bounds) -> float:
+    """Return the factor of all spacings by which a grid of so many points (n,) has no more than it may."""
+    n, count = len(sizes), float(np.prod(np.minimum(sizes, bounds.most)))
+    return max(count / POINTS[n], 1.0) ** (1 / n)
+
+
 def adjusted(grid: Grid, below: Array, above: Array, finer: Array, bounds: Bounds) -> Grid | None:
     """Return a wider or finer grid; None where nothing can be changed.
 
@@ -133,9 +141,12 @@ def adjusted(grid: Grid, below: Array, above: Array, finer: Array, bounds: Bound
     n = grid.n
     sizes, basis, centre = [], grid.basis.copy(), grid.centre
     changed = False
+    growth = np.array([(1.0 if grid.closed[d] else 1.0 + below[d] + above[d]) * finer[d] for d in range(n)])
+    margin, wanted = np.log(POINTS[n] / np.prod(grid.sizes)), np.log(growth).sum()
+    growth = growth ** min(max(margin / max(wanted, 1e-300), 0.0), 1.0)
     for d, size in enumerate(grid.sizes):
         wider = 0.0 if grid.closed[d] else below[d] + above[d]
-        new = rounded_size(size * (1 + wider) * finer[d], LEAST[n], bounds.most)
+        new = rounded_size(size * growth[d], min(LEAST[n], size), bounds.most)
         factor = size * (1 + wider) / new
         if grid.closed[d]:
             factor = size / new
@@ -191,6 +202,7 @@ def whitened_grid(offsets: Array, logs: Array, noise: Array, narrowness: Array, 
     extra = np.sqrt(np.maximum(bounds.reach**2 + 2 * np.minimum(logs, 0.0), 0.0))[:, None] * np.sqrt(np.diagonal(spread))
     low, high = (white - extra).min(axis=0), (white + extra).max(axis=0)
     spacing = np.full(n, max(float(np.min(narrowness)), 1e-3) / bounds.spacings)
+    spacing = spacing * _coarser((high - low) / spacing + 3, bounds)
     sizes = tuple(rounded_size((high[d] - low[d]) / spacing[d] + 3, LEAST[n], bounds.most) for d in range(n))
     width = high - low + 3 * spacing
     steps = np.maximum(width / np.array(sizes), np.sqrt(width / np.array(sizes) * spacing))
