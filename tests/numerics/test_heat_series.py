@@ -10,9 +10,10 @@ import sympy as sp
 
 import zakai
 from zakai.algebra.kolmogorov_series import kolmogorov_series
-from zakai.methods._heat_series import heat_series, parametrix, transition
+from zakai.methods._heat_series import heat_series
 from zakai.methods._jets import jets
 from zakai.numerics.series import value
+from zakai.studies._yau_kernels import parametrix, transition
 
 DRIFTS = {
     # f, f' and its primitive as NumPy functions
