@@ -37,36 +37,19 @@ _REDUCTIONS: dict[str, float] = {"split-merge": np.inf, "nnls": 2, "algorithm-1"
 class State(NamedTuple):
     """Two sums in gauge, each with u = e^phi v of mass one, in z = x - origin.
 
-    The first (`log_weights` (K,), `means`, `covs`, `signs`) is the result; the second (`other_...`) has another number of
-    components and takes increments in halves, and has none where it would be the same; their distance estimates the error.
-    `most` (2,) are the numbers that they
-    may have, `edge` (K,) marks the outermost of the start where nothing is merged, `start_error` is the distance of the first
-    from the prior, `difference` that of the two log-likelihoods.
+    The first is the result; the second has another number of components and takes increments in halves, and has none where it
+    would be the same; their distance estimates the error. `most` (2,) are the numbers that they may have, `edge` (K,) marks the
+    outermost of the start where nothing is merged, `start_error` is the distance of the first from the prior, `difference` that
+    of the two log-likelihoods.
     """
 
-    log_weights: Array
-    means: Array
-    covs: Array
-    signs: Array
-    other_log_weights: Array
-    other_means: Array
-    other_covs: Array
-    other_signs: Array
+    first: Components
+    second: Components
     most: Array
     edge: Array
     start_error: float
     difference: float
     time: float
-
-    @property
-    def first(self) -> Components:
-        """The sum that is the result."""
-        return Components(*self[:4])
-
-    @property
-    def second(self) -> Components:
-        """The companion."""
-        return Components(*self[4:8])
 
 
 def prepare(
@@ -155,7 +138,7 @@ def init(prepared: Prepared, prior: Any) -> State:
     # Once components are exchanged or merged, none of them is the outermost for good.
     edge = edge if static.affine and len(edge) <= most[0] else np.zeros(0)
     second = sums[1] if len(sums) > 1 else selected(sums[0], slice(0))
-    return State(*sums[0], *second, np.array(most), edge, error, 0.0, t)
+    return State(sums[0], second, np.array(most), edge, error, 0.0, t)
 
 
 def _merged(sum_: Components, share: Array, loss: Array, most: int, angles: tuple[int, ...]) -> Components:
@@ -195,7 +178,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "evidence_error": abs(difference) * known,
         "start_error": state.start_error,
     }
-    state = State(*first, *second, state.most, state.edge, state.start_error, difference, float(prepared.whole.schedule.stops[k]))
+    state = State(first, second, state.most, state.edge, state.start_error, difference, float(prepared.whole.schedule.stops[k]))
     return state, info._replace(health={**info.health, **errors})
 
 
@@ -214,12 +197,12 @@ def density(prepared: Prepared, state: State) -> GaussianMixture:
 def valid(prepared: Prepared, state: State) -> bool:
     """Return whether the arrays of a state that was read from a file fit together."""
     n = prepared.static.model.n
-    for logs, means, covs, signs in (state[:4], state[4:8]):
+    for logs, means, covs, signs in (state.first, state.second):
         K = len(logs)
         if logs.shape != (K,) or means.shape != (K, n) or covs.shape != (K, n, n) or signs.shape != (K,):
             return False
     most = np.asarray(state.most)
-    return most.shape == (2,) and bool((most >= 1).all()) and state.edge.ndim == 1 and len(state.log_weights) > 0
+    return most.shape == (2,) and bool((most >= 1).all()) and state.edge.ndim == 1 and len(state.first.log_weights) > 0
 
 
 BOUNDS = {
