@@ -91,13 +91,15 @@ class AffineSystem:
         (form, unobserved, _, _), (slope, intercept) = found, observed
         assert unobserved is not None
         constant = sp.Matrix([unobserved.constant])
-        own = [form.matrix, form.offset, model.covariance, unobserved.matrix, unobserved.linear, constant]
-        self.matrices = Matrices([*own, slope, intercept, model.observation_noise], model)
-        self._observation = Matrices([slope, intercept, model.observation_noise], model)
+        equation = [form.matrix, form.offset, model.covariance, unobserved.matrix, unobserved.linear, constant]
+        observation = [slope, intercept, model.observation_noise]
+        # Samples act at the ends of intervals only, increments and paths inside of them too.
+        self.matrices = Matrices(equation if model.observation_kind == "samples" else [*equation, *observation], model)
+        self._observation = Matrices(observation, model)
         self._noise = Matrices([model.observation_noise], model)
         self._cross = None if model.cross_noise.is_zero_matrix else Matrices([model.diffusion * model.cross_noise], model)
         parts = [self.matrices] if self._cross is None else [self.matrices, self._cross]
-        self.varying = any(part.varying for part in parts)
+        self.varying = any(part.varying for part in [*parts, self._observation])
         # Whether a piece has one flow for each length: the inputs are constant in it.
         self.autonomous = not any(part.timed for part in parts) and (model.input_hold == "zero" or not self.matrices.driven)
         self.inputs = len(model.u)
@@ -110,20 +112,29 @@ class AffineSystem:
 
     def letters(self, times: Array, theta: Array, origin: Array, u: Array | None = None) -> list[Array]:
         """Return L, l, G, Q, p, r, C, c, S at times (J,), in coordinates relative to the origin."""
-        L, l, G, Q, p, r, C, c, S = self.matrices(times, theta, u)
+        equation, observed = self._equation(times, theta, origin, u)
+        C, c, S = observed or self._observation(times, theta, u)
+        return [*equation, C, c + C @ origin[:, None], S]
+
+    def _equation(
+        self, times: Array, theta: Array, origin: Array, u: Array | None = None
+    ) -> tuple[list[Array], list[Array]]:
+        """Return L, l, G, Q, p, r relative to the origin, and the other matrices."""
+        L, l, G, Q, p, r, *others = self.matrices(times, theta, u)
         if origin.any():
             pushed = Q @ origin[:, None]
             r = r + transposed(p + pushed) @ origin[:, None]
-            l, p, c = l + L @ origin[:, None], p + 2.0 * pushed, c + C @ origin[:, None]
-        return [L, l, G, Q, p, r, C, c, S]
+            l, p = l + L @ origin[:, None], p + 2.0 * pushed
+        return [L, l, G, Q, p, r], others
 
     def coefficients(
         self, times: Array, theta: Array, origin: Array, inside: Array, u: Array | None = None
     ) -> Coefficients:
         """Return the coefficients at times (J,) with the potential of the coordinates `inside` (J, m); samples have none."""
-        L, l, G, Q, p, r, C, c, S = self.letters(times, theta, origin, u)
         if self.kind == "samples":
+            (L, l, G, Q, p, r), _ = self._equation(times, theta, origin, u)
             return Coefficients(L, l, G, Q, p, r[:, :, 0])
+        L, l, G, Q, p, r, C, c, S = self.letters(times, theta, origin, u)
         precision = precision_of(S, inside)
         gain = transposed(C) @ precision
         driven = precision @ c
@@ -141,7 +152,7 @@ class AffineSystem:
     def features(self, times: Array, theta: Array, u: Array | None = None) -> Array:
         """Return the functions of time that the coefficients are made of, (J, F)."""
         found = [self.matrices.features(times, theta, u)]
-        if self._noise.varying:
+        if self.kind != "samples" and self._noise.varying:
             found.append(np.linalg.inv(self._noise(times, theta, u)[0]).reshape(len(times), -1))
         if self._cross is not None:
             found.append(self._cross.features(times, theta, u))

@@ -103,9 +103,9 @@ class _Problem(NamedTuple):
         return np.asarray(self.starts[panels.row, None] + self.lengths[panels.row, None] * shares)
 
     def values(self, panels: _Panels, times: Array) -> Array:
-        """Return the features (J, P, F) at times (J, P), without derivatives."""
+        """Return the features (J, F, P) at times (J, P), without derivatives."""
         found = np.asarray(self.features(times.ravel(), np.repeat(panels.row, times.shape[1]))).real
-        return np.reshape(found, (*times.shape, -1))
+        return np.ascontiguousarray(np.reshape(found, (*times.shape, -1)).swapaxes(1, 2))
 
     def solve(self, panels: _Panels) -> tuple[Transition, Array]:
         """Return the transitions of panels, and which of them are too long for their series."""
@@ -119,17 +119,17 @@ def _unresolved(problem: _Problem, panels: _Panels, probes: int, scales: Array |
     places, interpolation = _CHECKS[probes]
     times = problem.times(panels, places)
     values = problem.values(panels, times)
-    times, at_nodes, at_probes = times[:, STAGES:], values[:, :STAGES], values[:, STAGES:]
+    times, at_nodes, at_probes = times[:, STAGES:], values[:, :, :STAGES], values[:, :, STAGES:]
     with np.errstate(all="ignore"):
         if scales is None:
-            scales = np.abs(values).max(axis=1)
-        own = np.maximum(scales[panels.row], 1e-290)[:, None]
-        difference = np.abs(at_probes - interpolation @ at_nodes)
+            scales = np.abs(values).max(axis=2)
+        difference = np.abs(at_probes - at_nodes @ interpolation.T)
         # The time is known to its rounding only, and so are the values.
         span = (problem.lengths[panels.row] * panels.width)[:, None, None]
-        steps = np.abs(at_probes[:, 1:] - at_probes[:, :-1]).max(axis=1, keepdims=True) * (probes / span)
-        noise = 8.0 * np.finfo(float).eps * np.abs(times[:, :, None]) * steps
-        mismatch = (np.maximum(difference - noise, 0.0) / own).max(axis=(1, 2), initial=0.0)
+        steps = np.abs(at_probes[:, :, 1:] - at_probes[:, :, :-1]).max(axis=2, keepdims=True) * (probes / span)
+        difference -= 8.0 * np.finfo(float).eps * np.abs(times[:, None]) * steps
+        worst = np.maximum(difference.max(axis=2), 0.0)
+        mismatch = (worst / np.maximum(scales[panels.row], 1e-290)).max(axis=1, initial=0.0)
     mismatch = np.where(np.isfinite(mismatch), mismatch, np.inf)
     return np.where(problem.lengths[panels.row] > 0, mismatch, 0.0), scales
 
