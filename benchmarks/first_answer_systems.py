@@ -37,11 +37,11 @@ class System:
     substep: float = 0.01
     count: int = 200
 
-    def times(self) -> np.ndarray:
-        """Return the times of the observations (K,)."""
+    def times(self, seed: int = 1) -> np.ndarray:
+        """Return the times of the observations (K,); the seed is that of irregular ones."""
         if not self.irregular:
             return self.mean_step * np.arange(1, self.count + 1)
-        gaps = np.random.default_rng(1).exponential(self.mean_step, self.count)
+        gaps = np.random.default_rng(seed).exponential(self.mean_step, self.count)
         return np.cumsum(np.maximum(gaps, self.mean_step / 50))
 
 
