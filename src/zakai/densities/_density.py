@@ -215,8 +215,8 @@ def generator(key: object) -> np.random.Generator:
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:
-    """Return an angle in (-pi, pi]."""
-    return np.pi - np.mod(np.pi - np.asarray(angle, float), 2.0 * np.pi)
+    """Return an angle in (-pi, pi]; complex numbers keep their derivatives."""
+    return np.asarray(angle + 2.0 * np.pi * np.floor((np.pi - np.real(angle)) / (2.0 * np.pi)))
 
 
 def probabilities(q: Sequence[float]) -> np.ndarray:

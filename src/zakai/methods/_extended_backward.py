@@ -15,6 +15,7 @@ import numpy as np
 from zakai.densities import GaussianMixture
 from zakai.errors import InputError
 from zakai.methods import _extended_filter as ahead
+from zakai.methods._moments import wrapped
 from zakai.methods._protocol import Info
 from zakai.numerics.transition import Array
 
@@ -35,14 +36,12 @@ def step(prepared: ahead.Prepared, k: int, later: ahead.State, values: Array, st
     """Return the smoothed moments at the start of interval k from those at its end."""
     moves: list[ahead.Moved] = []
     ahead.step(prepared, k, state, values, moves.append)
-    angles = np.array([name in prepared.model.periodic for name in prepared.model.state])
     for before, after, matrix in reversed(moves):
         scale = np.sqrt(np.maximum(np.diagonal(after.cov), 1e-300))
         inverse = np.linalg.pinv(after.cov / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
-        gain, apart = before.cov @ matrix.T @ inverse, later.mean - after.mean
-        apart = np.where(angles, apart - 2 * np.pi * np.round(apart / (2 * np.pi)), apart)
+        gain, apart = before.cov @ matrix.T @ inverse, wrapped(prepared.model, later.mean - after.mean)
         cov = before.cov + gain @ (later.cov - after.cov) @ gain.T
-        later = ahead.State(ahead.wrapped(prepared.model, before.mean + gain @ apart), 0.5 * (cov + cov.T))
+        later = ahead.State(wrapped(prepared.model, before.mean + gain @ apart), 0.5 * (cov + cov.T))
     return later
 
 

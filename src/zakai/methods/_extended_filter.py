@@ -30,7 +30,7 @@ from zakai.errors import InputError
 from zakai.methods._input_pieces import Pieces, pieces_of
 from zakai.methods._line_cross import OMITTED
 from zakai.methods._linearised_system import Formulas, Part, formulas_of, part_of, rate_noise_of, subdivided
-from zakai.methods._moments import prior_moments
+from zakai.methods._moments import prior_moments, wrapped
 from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info
 from zakai.models.model import Model
@@ -252,14 +252,6 @@ def _log_normal(right: Array, covariance: Array) -> tuple[Array, Any]:
     white = np.linalg.solve(factor, right)
     logs = np.log(np.diagonal(factor)).sum()
     return np.linalg.solve(factor.T, white).T, -0.5 * white[:, 0] @ white[:, 0] - logs
-
-
-def wrapped(model: Model, mean: Array) -> Array:
-    """Return the mean with its angles in (-pi, pi]."""
-    if not model.periodic:
-        return mean
-    angles = np.array([name in model.periodic for name in model.state])
-    return mean + angles * 2.0 * np.pi * np.floor((np.pi - mean.real) / (2.0 * np.pi))
 
 
 def info_of(state: State, log_factor: Any) -> Info:

@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 
 from zakai.densities import GaussianMixture
+from zakai.densities._density import wrap
 from zakai.errors import InputError
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import GaussianPrior, MixturePrior
 from zakai.numerics.prior_grid import prior_grid
 
-_FINER = {1: 32, 2: 4}
+_FINER = {1: 32, 2: 4}  # factor of the points of an angle, by the number of states
+_MOST_STATES = 4  # of a density, whose grid must be small
 NO_DIRECTION = 1e-9  # length of a mean direction below which an angle has none
 
 
@@ -24,26 +26,26 @@ def prior_moments(model: Model, prior: Any, theta: np.ndarray) -> tuple[np.ndarr
     moments of a density are sums over a grid that fits the real part of `theta` (p,).
 
     Raises:
-        InputError: a density in more than two coordinates.
+        InputError: a density in more than four coordinates.
     """
     periodic = np.array([name in model.periodic for name in model.state])
     if isinstance(prior, GaussianPrior):
-        return np.where(periodic, _wrap(prior.mean), prior.mean), np.array(prior.cov)
+        return wrapped(model, prior.mean), np.array(prior.cov)
     if isinstance(prior, MixturePrior):
         mixture = GaussianMixture(prior.weights, prior.means, prior.covs, model.state, tuple(periodic.tolist()))
         return mixture.mean(), mixture.cov()
-    if model.n > 2:
+    if model.n > _MOST_STATES:
         raise InputError(f"{model.source}: prior: a density in {model.n} coordinates has no grid; give a gaussian")
     log_density = numpy_function(prior.log_density, model)
     source = f"{model.source}: prior: log_density"
     grid = prior_grid(lambda x: log_density(x, model.start, theta.real), model.n, periodic.tolist(), source=source)
     if periodic.any():
         # Wrapped deviations jump half a turn away from the mean, and need more points than the density.
-        finer = _FINER[model.n]
+        finer = _FINER.get(model.n, 1)
         sizes = tuple(finer * size for size in grid.log_values.shape)
         grid = grid._replace(basis=grid.basis / finer, log_values=np.zeros(sizes))
     points = grid.points.reshape(-1, model.n)
-    logs = log_density(np.where(periodic, _wrap(points), points), model.start, theta)
+    logs = log_density(wrapped(model, points), model.start, theta)
     with np.errstate(all="ignore"):
         weights = np.exp(logs - np.nanmax(logs.real))
     weights = np.where(np.isfinite(weights), weights, 0.0)
@@ -53,8 +55,7 @@ def prior_moments(model: Model, prior: Any, theta: np.ndarray) -> tuple[np.ndarr
     directed = np.hypot(cosine.real, sine.real) > NO_DIRECTION
     circular = np.where(directed, _angle(sine, np.where(directed, cosine, 1.0)), 0.0)
     mean = np.where(periodic, circular, weights @ points)
-    deviation = points - mean
-    deviation = np.where(periodic, _wrap(deviation), deviation)
+    deviation = wrapped(model, points - mean)
     return mean, (deviation * weights[:, None]).T @ deviation
 
 
@@ -67,6 +68,6 @@ def _angle(sine: np.ndarray, cosine: np.ndarray) -> np.ndarray:
     return np.asarray(angle + 1j * turn / (cosine.real**2 + sine.real**2))
 
 
-def _wrap(angle: np.ndarray) -> np.ndarray:
-    """Return angles in (-pi, pi]."""
-    return np.asarray(angle + 2.0 * np.pi * np.floor((np.pi - np.real(angle)) / (2.0 * np.pi)))
+def wrapped(model: Model, points: np.ndarray) -> np.ndarray:
+    """Return points (..., n) with angles in (-pi, pi]."""
+    return np.where([name in model.periodic for name in model.state], wrap(points), points) if model.periodic else points

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities import GaussianMixture
-from zakai.densities._density import wrap
+from zakai.methods._moments import prior_moments, wrapped
 from zakai.methods._protocol import Info
 from zakai.models.model import Model
-from zakai.models.prior import GaussianPrior, MixturePrior
 from zakai.peers import _float64  # noqa: F401
 from zakai.peers._translation import (
     DIVERGED,
@@ -22,11 +21,9 @@ from zakai.peers._translation import (
     Prepared,
     System,
     compiled,
-    grid_of,
     in_deviations,
     innovations,
     system_of,
-    wrapped,
 )
 from zakai.records.schedule import Schedule
 
@@ -34,7 +31,6 @@ import jax  # isort: skip
 import jax.numpy as jnp  # isort: skip
 from tensorflow_probability.substrates.jax.distributions import MultivariateNormalFullCovariance  # isort: skip
 
-NO_DIRECTION = 1e-9  # length of the mean vector of an angle that has no mean direction
 BOUNDS = {
     "indefinite_cov": (1e-9, "the covariance has a negative eigenvalue (its share of the largest), or is not finite"),
     "innovation_excess": (DOUBTFUL, DIVERGED),
@@ -69,30 +65,6 @@ def prepared_by(rule: Rule, model: Model, schedule: Schedule, theta: np.ndarray,
 def init(prepared: Prepared, prior: Any) -> State:
     """Return the prior's mean and covariance."""
     return State(*prior_moments(prepared.model, prior, prepared.theta), Innovations())
-
-
-def prior_moments(model: Model, prior: Any, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean (n,) and the covariance (n, n) of a prior.
-
-    An angle has its mean direction, 0 where there is none (uniform: variance pi^2 / 3), and wrapped deviations.
-    """
-    periodic = np.array([name in model.periodic for name in model.state])
-    if isinstance(prior, GaussianPrior):
-        return wrapped(model, prior.mean), np.array(prior.cov)
-    if isinstance(prior, MixturePrior):
-        mixture = GaussianMixture(prior.weights, prior.means, prior.covs, model.state, tuple(periodic))
-        return mixture.mean(), mixture.cov()
-    grid = grid_of(model, prior, theta)
-    points = grid.offsets.reshape(-1, model.n)
-    weights = np.exp(grid.log_values.ravel() - grid.log_values.max())
-    weights = weights / weights.sum()
-    turned = np.where(periodic, points, 0.0)
-    cosine, sine = weights @ np.cos(turned), weights @ np.sin(turned)
-    directed = np.hypot(cosine, sine) > NO_DIRECTION
-    mean = np.where(periodic, np.where(directed, np.arctan2(sine, cosine), -grid.centre), weights @ points)
-    deviation = points - mean
-    deviation = np.where(periodic, wrap(deviation), deviation)
-    return wrapped(model, grid.centre + mean), np.einsum("k,ki,kj->ij", weights, deviation, deviation)
 
 
 def _advanced(system: System, interval: Interval, state: State, observation: Observation) -> tuple[State, Info]:

@@ -8,13 +8,14 @@ import numpy as np
 
 from zakai.densities import GridDensity
 from zakai.errors import InputError
+from zakai.methods._moments import wrapped
 from zakai.methods._options import whole_number
 from zakai.models._definite import square_root
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import GaussianPrior, MixturePrior
 from zakai.peers import _float64  # noqa: F401
-from zakai.peers._translation import Interval, Prepared, System, grid_of, system_of, wrapped
+from zakai.peers._translation import Interval, Prepared, System, grid_of, system_of
 from zakai.records.schedule import Schedule
 
 import jax  # isort: skip

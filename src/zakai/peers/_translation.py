@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.densities._density import wrap
 from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info, Infos
 from zakai.models.model import Model
@@ -185,11 +184,6 @@ def grid_of(model: Model, prior: DensityPrior, theta: np.ndarray) -> PriorGrid:
     periodic = [name in model.periodic for name in model.state]
     source = f"{model.source}: prior: log_density"
     return prior_grid(lambda x: log_density(x, model.start, theta), model.n, periodic, tolerance=1e-9, source=source)
-
-
-def wrapped(model: Model, points: np.ndarray) -> np.ndarray:
-    """Return points (..., n) with angles in (-pi, pi]."""
-    return np.where([name in model.periodic for name in model.state], wrap(points), points)
 
 
 Advance = Callable[[System, Interval, Any, Observation], tuple[Any, Info]]

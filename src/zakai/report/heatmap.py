@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from zakai.densities._density import wrap
 from zakai.errors import InputError
 
 BAND = 0.95
@@ -128,7 +129,7 @@ def density_over_time(
 
     centre = np.zeros_like(mean) if about_mean else mean
     if about_mean and truth_here is not None:
-        truth_here = wrapped(truth_here - mean) if periodic else truth_here - mean
+        truth_here = wrap(truth_here - mean) if periodic else truth_here - mean
     if periodic and not about_mean:
         edges = np.linspace(-np.pi, np.pi, _ROWS + 1)
     else:
@@ -149,8 +150,8 @@ def density_over_time(
 
     lower, upper = centre + low, centre + high
     if periodic and not about_mean:
-        lower, upper = wrapped(lower), wrapped(upper)
-        truth_here = None if truth_here is None else wrapped(truth_here)
+        lower, upper = wrap(lower), wrap(upper)
+        truth_here = None if truth_here is None else wrap(truth_here)
     times = np.asarray(result.times, dtype=float)[index]
     shown_on_circle = periodic and not about_mean
     return DensityOverTime(
@@ -182,7 +183,7 @@ def profile(result: Any, k: int, state: int) -> Profile:
     if certain:
         logarithm = -0.5 * (deviation / spread) ** 2
     else:
-        points = wrapped(mean + deviation) if periodic else mean + deviation
+        points = wrap(mean + deviation) if periodic else mean + deviation
         marginal = result.density(k).marginal(state)
         logarithm = np.asarray(marginal.log_density(points[:, None]), dtype=float).reshape(-1)
     logarithm = np.where(np.isfinite(logarithm), logarithm, -np.inf)
@@ -225,13 +226,8 @@ def direct_observations(result: Any, state: int, first: float, last: float) -> t
     values = record.values[rows][:, columns]
     times = np.broadcast_to(record.times[rows][:, None], values.shape)
     seen = np.isfinite(values)
-    shown = wrapped(values) if is_periodic(result, state) else values
+    shown = wrap(values) if is_periodic(result, state) else values
     return (times[seen], shown[seen]) if seen.any() else None
-
-
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """The same angle in (-pi, pi]."""
-    return np.pi - np.mod(np.pi - np.asarray(angle, dtype=float), 2 * np.pi)
 
 
 def circle_line(times: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from zakai.densities._density import wrap
 from zakai.report import _style, calibration, observed, plots, sections, words
-from zakai.report.heatmap import is_periodic, state_names, true_states, wrapped
+from zakai.report.heatmap import is_periodic, state_names, true_states
 from zakai.report.words import signed
 
 # The page may not fetch anything, whatever a file that was put into it says.
@@ -96,7 +97,7 @@ def _errors(result: Any, truth: np.ndarray | None) -> np.ndarray | None:
     error = truth - np.asarray(result.mean)
     for i in range(error.shape[1]):
         if is_periodic(result, i):
-            error[:, i] = wrapped(error[:, i])
+            error[:, i] = wrap(error[:, i])
     return error
 
 

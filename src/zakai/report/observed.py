@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from zakai.densities._density import wrap
 from zakai.models.numeric import numpy_function
 from zakai.records.schedule import schedule_of
 from zakai.report import _style as style
 from zakai.report import plots, words
 from zakai.report._extra import plotting
 from zakai.report.axes import joint_map
-from zakai.report.heatmap import circle_line, state_names, wrapped
+from zakai.report.heatmap import circle_line, state_names
 
 _MOST_PAIRS = 3
 _MOST_COORDINATES = 4
@@ -65,7 +66,7 @@ def observations(result: Any) -> str:
             title += f": h = {_short(model.observation[j])}"
             line = times, expected[rows, j]
             if model.observation_family[j] == "von-mises":
-                seen, line = wrapped(seen), circle_line(times, wrapped(expected[rows, j]))
+                seen, line = wrap(seen), circle_line(times, wrap(expected[rows, j]))
         series.append((title, times, seen, line))
     if not series:
         return "<p>Nothing was observed.</p>"

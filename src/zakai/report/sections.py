@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from zakai.densities._density import wrap
 from zakai.report import plots, words
 from zakai.report.equations import equations
 from zakai.report.heatmap import (
@@ -16,7 +17,6 @@ from zakai.report.heatmap import (
     is_periodic,
     profile,
     state_names,
-    wrapped,
 )
 from zakai.report.words import signed
 
@@ -54,7 +54,7 @@ def posterior(result: Any, truth: np.ndarray | None) -> str:
             note = f"The last {_DETAIL} times, every one drawn."
             drawn = plots.posterior(last, 330, observed=_seen(result, i, last), clock=clock)
             parts.append(plots.framed(drawn, f"detail-{i}", note))
-        spread = np.median(np.abs(wrapped(picture.upper - picture.lower) if picture.periodic else picture.upper - picture.lower))
+        spread = np.median(np.abs(wrap(picture.upper - picture.lower) if picture.periodic else picture.upper - picture.lower))
         if not picture.periodic and spread < 0.05 * (picture.edges[-1] - picture.edges[0]):
             close = density_over_time(
                 result, i, truth, columns=_COLUMNS, extra=moments, about_mean=True, profiles=picture.profiles
