@@ -10,41 +10,14 @@ from __future__ import annotations
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numba import complex128, float64, int64
 from numpy.typing import NDArray
+from scipy.sparse import dia_array
 
-from zakai.numerics.compiled import kernel
 from zakai.numerics.dyadic_grid import Grid
 
 SHORTEST = 1.34  # grid spacings in the standard deviation of the shortest kernel
 KEPT = 12  # short kernels of other lengths
 Array = NDArray[Any]
-
-
-@kernel(float64[::1](float64[:, ::1], float64[::1], int64), complex128[::1](complex128[:, ::1], complex128[::1], int64))
-def repeated_band(bands: Any, values: Any, count: int) -> Any:
-    """Return the vector after `count` products with a banded matrix.
-
-        out_i = sum_e bands_ei values_(i + e - b),        e = 0, ..., 2 b
-
-    Args:
-        bands: (2 b + 1, N).
-        values: (N,).
-        count: the number of products.
-    """
-    width, size = bands.shape
-    reach = width // 2
-    now = np.zeros(size + 2 * reach, values.dtype)
-    now[reach : reach + size] = values
-    after = np.empty(size, values.dtype)
-    for _ in range(count):
-        after[:] = 0.0
-        for e in range(width):
-            band, shifted = bands[e], now[e : e + size]
-            for i in range(size):
-                after[i] += band[i] * shifted[i]
-        now[reach : reach + size] = after
-    return now[reach : reach + size].copy()
 
 
 class Series(Protocol):
@@ -59,9 +32,9 @@ class Series(Protocol):
 
 
 class Kernel(NamedTuple):
-    """A short kernel by `bands` (2 b + 1, N), band e from the sources i + e - b; `defects` (N,) of the columns' masses."""
+    """A short kernel as a banded `matrix` (N, N), and the `defects` (N,) of the columns' masses."""
 
-    bands: Array
+    matrix: Any
     defects: Array
 
 
@@ -92,33 +65,24 @@ class Kernels:
         # The sum changes its sign, so that its columns may have any mass.
         columns = np.where(good, columns, 0.0) / (np.where(good, mass, 1.0) if self.form == "log" else 1.0)
         reach, size = len(columns) // 2, columns.shape[1]
-        padded = np.concatenate([np.zeros((len(columns), reach)), columns, np.zeros((len(columns), reach))], axis=1)
-        bands = np.stack([padded[2 * reach - e, e : e + size] for e in range(2 * reach + 1)])
-        return Kernel(bands, np.where(good, np.abs(np.where(good, mass.real, 1.0) - 1.0), 1.0))
+        matrix = dia_array((columns, np.arange(reach, -reach - 1, -1)), shape=(size, size))
+        return Kernel(matrix, np.where(good, np.abs(np.where(good, mass.real, 1.0) - 1.0), 1.0))
 
     def power(self, t: float, i: int) -> Array:
         """Return the matrix of 2^i kernels of a time t."""
         found = self._powers.get((t, i))
         if found is None:
-            if i:
-                half = self.power(t, i - 1)
-                found = half @ half
-            else:
-                bands, size = self.short(t).bands, self.grid.size
-                reach = len(bands) // 2
-                matrix = np.zeros((size, size + 2 * reach), bands.dtype)
-                rows = np.arange(size)
-                for e, band in enumerate(bands):
-                    matrix[rows, rows + e] = band
-                found = matrix[:, reach : reach + size].copy()
-            self._powers[t, i] = found
+            half = self.power(t, i - 1) if i else None
+            found = self._powers[t, i] = self.short(t).matrix.toarray() if half is None else half @ half
         return found
 
     def repeated(self, values: Array, t: float, count: int) -> Array:
         """Apply `count` kernels of a time t."""
         if 100 * count < self.grid.size**2 * count.bit_length():  # fewer operations than powers of a matrix take
-            bands = self.short(t).bands
-            return np.asarray(repeated_band(bands, values.astype(np.result_type(bands, values)), count))
+            matrix = self.short(t).matrix
+            for _ in range(count):
+                values = matrix @ values
+            return values
         for i in range(count.bit_length()):
             if count >> i & 1:
                 values = self.power(t, i) @ values
