@@ -33,8 +33,9 @@ def advance(setting: Setting, prepared: Any, rows: slice, state: Any, values: np
     Returns the state after each interval and what the steps report.
     """
     method = setting.method
-    if method.segment is not None:
-        return method.segment(prepared, rows, state, values)
+    found = None if method.segment is None else method.segment(prepared, rows, state, values)
+    if found is not None:
+        return found
     states, infos = [], []
     for k, value in zip(range(rows.start, rows.stop), values, strict=True):
         state, info = method.step(prepared, k, state, value)

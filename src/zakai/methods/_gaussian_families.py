@@ -19,7 +19,7 @@ from zakai.methods._family_prior import prior_families
 from zakai.methods._gauge import Gauge, Posterior, Tilts, posterior, tilts_at
 from zakai.methods._gauged_density import density_of
 from zakai.methods._gaussian_ends import Ends, ends_of
-from zakai.methods._protocol import Info, Infos, stacked
+from zakai.methods._protocol import Info, Infos
 from zakai.methods._states import StackedStates
 from zakai.models.kept import kept
 from zakai.models.model import Model
@@ -222,16 +222,11 @@ def segment_of_gaussian(prepared: Prepared, rows: slice, state: State, values: A
     return StackedStates(state, fields), infos
 
 
-def segment_of_families(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[Sequence[State], Infos]:
-    """Return the states after the intervals of a slice, and their reports."""
-    if is_single(prepared, state):
-        return segment_of_gaussian(prepared, rows, state, values)
-    states, infos = [], []
-    for k, value in zip(range(rows.start, rows.stop), values, strict=True):
-        state, info = step(prepared, k, state, value)
-        states.append(state)
-        infos.append(info)
-    return states, stacked(infos)
+def segment_of_families(
+    prepared: Prepared, rows: slice, state: State, values: Array
+) -> tuple[Sequence[State], Infos] | None:
+    """Return the states after the intervals of a slice, and their reports, for one Gaussian."""
+    return segment_of_gaussian(prepared, rows, state, values) if is_single(prepared, state) else None
 
 
 def health_of_gaussians(covs: Array) -> dict[str, Array]:
@@ -243,9 +238,7 @@ def health_of_gaussians(covs: Array) -> dict[str, Array]:
 
 def health_of_gaussian(cov: Array) -> dict[str, float]:
     """Return the health of a posterior without nodes."""
-    variances = cov.diagonal().real.tolist()
-    negative = max(0.0, -min(variances)) / max(max(map(abs, variances)), 1e-300)
-    return {"negative_variance": negative, "representation_error": 0.0, "edge_weight": 0.0, "gauge_error": 0.0}
+    return {name: float(figures[0]) for name, figures in health_of_gaussians(cov[None]).items()}
 
 
 def health_of(state: State, families: Family, found: Posterior) -> dict[str, float]:

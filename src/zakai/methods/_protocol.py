@@ -128,7 +128,7 @@ class Method(Generic[P, S]):
     a file, before any kernel receives it.
 
     Optional: `segment(prepared, rows, state, values)` advances the intervals of a slice in one compiled loop that calls the same
-    kernel as `step`, and returns the states after each step and their Infos.
+    kernel as `step`, and returns the states after each step and their Infos; or None, where the single steps are to be taken.
 
     Optional: `backward` is the backward pass of `zakai.smooth`.
     """
@@ -149,5 +149,5 @@ class Method(Generic[P, S]):
     shorter: str = "give fewer observations"
     absolute: Callable[[Mapping[str, Any]], bool] | None = None
     valid: Callable[[P, S], bool] | None = None
-    segment: Callable[[P, slice, S, np.ndarray], tuple[Sequence[S], Infos]] | None = None
+    segment: Callable[[P, slice, S, np.ndarray], tuple[Sequence[S], Infos] | None] | None = None
     backward: Backward[P, S, Any] | None = None

@@ -78,19 +78,9 @@ def step(prepared: Any, k: int, state: Any, values: np.ndarray) -> tuple[Any, In
     return result
 
 
-def segment(prepared: Any, rows: slice, state: Any, values: np.ndarray) -> tuple[list[Any], Infos]:
-    """Return the states after the intervals of a slice, and their reports."""
-    module = module_of(prepared.model)
-    if module is _line:
-        return _line.segment(prepared, rows, state, values)
-    states, infos = [], []
-    for k, observed in zip(range(rows.start, rows.stop), values, strict=True):
-        state, info = module.step(prepared, k, state, observed)
-        states.append(state)
-        infos.append(info)
-    health = {name: np.array([info.health[name] for info in infos]) for name in infos[0].health}
-    increments, means, covs = (np.array([info[i] for info in infos]) for i in range(3))
-    return states, Infos(increments, means, covs, health)
+def segment(prepared: Any, rows: slice, state: Any, values: np.ndarray) -> tuple[list[Any], Infos] | None:
+    """Return the states after the intervals of a slice, and their reports, for one state without reflecting ends."""
+    return _line.segment(prepared, rows, state, values) if module_of(prepared.model) is _line else None
 
 
 def density(prepared: Any, state: Any) -> Any:
