@@ -19,6 +19,7 @@ from scipy.optimize import minimize
 from zakai._progress import bar
 from zakai.engine.batch import LONG, Progress
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
+from zakai.engine.maximum import hessian
 from zakai.engine.priors import Prior
 from zakai.errors import InputError
 from zakai.models.model import Model
@@ -169,14 +170,13 @@ class _Posterior:
         mode = minimize(objective, origin, jac=True, method="L-BFGS-B", options={"maxiter": 100, "ftol": 1e-9}).x
         size = np.full(len(mode), 1e-2)
         for _ in range(2):  # the second time with steps of half a standard deviation
-            columns = [(self(mode + row)[1] - self(mode - row)[1]) / (2 * row.sum()) for row in np.diag(size)]
-            hessian = 0.5 * (np.array(columns) + np.array(columns).T)
-            curvature = -np.diag(hessian)
+            information = -hessian(lambda w: self(w)[1], mode, size)
+            curvature = np.diag(information)
             size = np.where(curvature > 0, 0.5 / np.sqrt(np.abs(curvature) + 1e-300), size)
             size = np.clip(size, 1e-6, 1.0)
         self.mode = start + mode
         try:
-            self.factor = np.linalg.cholesky(np.linalg.inv(-hessian))
+            self.factor = np.linalg.cholesky(np.linalg.inv(information))
         except np.linalg.LinAlgError:
             self.factor = np.diag(size)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from zakai._progress import bar
 from zakai.densities import GaussianMixture
 from zakai.engine.driver import filter as run_filter
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
-from zakai.engine.maximum import Counted, maximum
+from zakai.engine.maximum import maximum
 from zakai.errors import InputError
 from zakai.models._errors import listing
 from zakai.models.model import Model
@@ -130,8 +131,15 @@ def fit(
     values = _start(model, names, start)
     box = _box(model, names, values, bounds)
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
+    function, evaluations = LogLikelihood(now, record, method, names, options), count(1)
     with bar("fitting") as advance:
-        found = maximum(Counted(LogLikelihood(now, record, method, names, options), advance), values, box, names, model)
+
+        def counted(theta: np.ndarray) -> tuple[float, np.ndarray]:
+            if advance is not None:
+                advance(next(evaluations), None)
+            return function.value_and_gradient(theta)
+
+        found = maximum(counted, values, box, names, model)
     values = found.values
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
     result = run_filter(now, record, method, keep="moments", **options)

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -98,7 +99,6 @@ class LogLikelihood:
         self._times = np.concatenate([[model.start], record.times])
         keys = [key for key in COEFFICIENTS if not depends_on_state(getattr(model, key), model)]
         self._checks = [check for key in keys if (check := noise_check(model, key)) is not None]
-        self._traced: Callable[[Any], Any] | None = None
 
     def __repr__(self) -> str:
         return f"LogLikelihood({', '.join(self.names)}; {len(self.record)} observations of {self.model.source})"
@@ -106,7 +106,7 @@ class LogLikelihood:
     def __call__(self, values: Any) -> Any:
         """Return l at the values (p,)."""
         if "jax" in sys.modules and isinstance(values, sys.modules["jax"].core.Tracer):
-            return self._in_jax()(values)
+            return self._in_jax(values)
         return self._evaluated(values, False)[0]
 
     def value_and_gradient(self, values: Any) -> tuple[float, np.ndarray]:
@@ -159,11 +159,10 @@ class LogLikelihood:
                 gradient[direction] += total.imag / STEP
         return value, gradient
 
+    @cached_property
     def _in_jax(self) -> Callable[[Any], Any]:
-        """Return the function for values that JAX traces."""
-        if self._traced is None:
-            self._traced = _traced(self)
-        return self._traced
+        """The function for values that JAX traces."""
+        return _traced(self)
 
 
 class _Part(NamedTuple):

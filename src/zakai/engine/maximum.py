@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
 
-from zakai._progress import Advance
-from zakai.engine.likelihood import LogLikelihood
 from zakai.errors import InputError
 from zakai.models._errors import listing
 from zakai.models.model import Model
@@ -18,18 +17,7 @@ NEAR = 1e-3  # the distance to the maximum, in standard errors, that counts as n
 SINGULAR = 1e-6  # the smallest eigenvalue of the information scaled to a unit diagonal; differences leave 1e-8
 
 
-class Counted:
-    """The log-likelihood and its gradient; every evaluation is counted and shown on a progress bar."""
-
-    def __init__(self, function: LogLikelihood, advance: Advance | None):
-        self._function, self._advance, self._count = function, advance, 0
-
-    def value_and_gradient(self, values: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return l and its gradient (p,)."""
-        self._count += 1
-        if self._advance is not None:
-            self._advance(self._count, None)
-        return self._function.value_and_gradient(values)
+Function = Callable[[np.ndarray], tuple[float, np.ndarray]]  # a value and its gradient (p,)
 
 
 @dataclass
@@ -48,8 +36,8 @@ class Found:
 class _Objective:
     """The negative log-likelihood of the parameters in units of `scale`, and its gradient; finite everywhere."""
 
-    def __init__(self, function: Counted, origin: np.ndarray, scale: np.ndarray):
-        self._both = function.value_and_gradient
+    def __init__(self, function: Function, origin: np.ndarray, scale: np.ndarray):
+        self._both = function
         self.origin, self.scale = origin, scale
         self.best: tuple[float, np.ndarray, np.ndarray] | None = None
         self.refused = 0
@@ -71,17 +59,14 @@ class _Objective:
         rise = -10.0 * slope
         return best + abs(rise @ (u - at)) + 1e-3, rise
 
-    def hessian(self, u: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """Central differences of the gradient."""
-        columns = []
-        for shift in np.diag(steps):
-            above, below = self.exact(u + shift)[1], self.exact(u - shift)[1]
-            columns.append((above - below) / (2 * shift.sum()))
-        matrix = np.array(columns)
-        return np.asarray(0.5 * (matrix + matrix.T))
+
+def hessian(gradient: Callable[[np.ndarray], np.ndarray], u: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return the central differences (p, p) of a gradient, by steps (p,)."""
+    matrix = np.array([(gradient(u + shift) - gradient(u - shift)) / (2 * shift.sum()) for shift in np.diag(steps)])
+    return np.asarray(0.5 * (matrix + matrix.T))
 
 
-def maximum(function: Counted, values: np.ndarray, box: np.ndarray, names: tuple[str, ...], model: Model) -> Found:
+def maximum(function: Function, values: np.ndarray, box: np.ndarray, names: tuple[str, ...], model: Model) -> Found:
     """Return the maximum of the likelihood from `values`: L-BFGS-B, and then Newton's steps in the free parameters."""
     scale = np.where(values != 0, np.abs(values), 1.0)
     objective = _Objective(function, values, scale)
@@ -130,12 +115,13 @@ def _information(objective: _Objective, u: np.ndarray, free: np.ndarray) -> np.n
     """The Hessian of the negative log-likelihood, by steps of a thousandth of a standard error, once that is known."""
     for size in (1e-4, 1e-6, 1e-8):
         steps = np.full(len(u), size)
-        first = np.diag(objective.hessian(u, steps))
+        first = np.diag(hessian(lambda v: objective.exact(v)[1], u, steps))
         if np.isfinite(first[free]).all():
             break
     with np.errstate(invalid="ignore", divide="ignore"):
         better = np.where(free & (first > 0), 1e-3 / np.sqrt(first), steps)
-    return objective.hessian(u, np.clip(np.where(np.isfinite(better), better, steps), 1e-7, 1e-1))
+    steps = np.clip(np.where(np.isfinite(better), better, steps), 1e-7, 1e-1)
+    return hessian(lambda v: objective.exact(v)[1], u, steps)
 
 
 def _inverse(
