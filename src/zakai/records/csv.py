@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import re
 from array import array
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
@@ -17,11 +15,11 @@ import numpy as np
 from zakai.errors import InputError
 from zakai.models._errors import named
 from zakai.records.dates import Clock, date_of, unit_name
+from zakai.records.header import LONGEST_LINE, cells_of, columns_fault, columns_with_inputs, header_names, header_of, quoted
 from zakai.records.inputs import Inputs
 from zakai.records.record import Record, early, first_fault
-from zakai.records.writing import default_names, shown
+from zakai.records.writing import shown
 
-LONGEST_LINE = 1 << 20  # characters: a thousand numbers with a thousand blanks each
 _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 _AT_ONCE = 1 << 18  # characters
 _NO_TEXT = re.compile("[\ud800-\udfff]")
@@ -92,15 +90,6 @@ def _with_inputs(path: Path, model: Any, names: list[str], dates: Dates | None) 
     return Record(table[:, 0], table[:, observed], model.observation_kind, Inputs(times, values), **clock_of(dates)), row
 
 
-def header_of(path: Path) -> list[str]:
-    """The names of the columns of a CSV file, or nothing where it cannot be read, which `read_table` reports."""
-    try:
-        with path.open(encoding="utf-8-sig", errors="surrogateescape") if path.is_file() else nullcontext() as file:
-            return [] if file is None else header_names(file.readline(LONGEST_LINE).rstrip("\r\n"))
-    except (OSError, ValueError):
-        return []
-
-
 class Dates:
     """ISO dates of a file as times, in a unit from an origin, which is the first date unless it is given."""
 
@@ -116,7 +105,7 @@ class Dates:
         for number, (cell, _, rest) in enumerate(cells, part.number):
             found.append(date_of(cell.strip().strip('"')) if cell.strip() or rest else np.datetime64("NaT", "ns"))
             if found[-1] is None:
-                wrong = number, f"{_quoted(cell)} in column 'time' is not a date; write 2024-01-31T12:30, or omit the unit"
+                wrong = number, f"{quoted(cell)} in column 'time' is not a date; write 2024-01-31T12:30, or omit the unit"
                 found.pop()
                 break
         dates = np.array(found, "datetime64[ns]")
@@ -224,54 +213,11 @@ def _header(source: str, line: str, m: int, what: str, expected: Sequence[str] |
     names = header_names(line)
     if names[0] != "time":
         hint = " (is the header missing?)" if _NUMBER.fullmatch(names[0]) else ""
-        fault = f"the first column is {_quoted(names[0])}; the header must begin with time{hint}"
+        fault = f"the first column is {quoted(names[0])}; the header must begin with time{hint}"
         raise InputError(f"{source}: row 1: {fault}")
     if (fault := columns_fault(names, m, what, expected)) is not None:
         raise InputError(f"{source}: row 1: {fault}")
     return names
-
-
-def header_names(line: str) -> list[str]:
-    """The names of the columns that a header gives."""
-    return [name.strip() for name in _cells(line)]
-
-
-def columns_with_inputs(names: Sequence[str], m: int, inputs: Sequence[str]) -> tuple[list[int], list[int]]:
-    """Return the places of the m observations and of the inputs in a header, the first column of which is the time.
-
-    Raises:
-        InputError: an input has no column or two, or the other columns are not the observations.
-    """
-    missing = [name for name in inputs if name not in names[1:]]
-    if missing:
-        raise InputError(f"no column for the input {', '.join(missing)}; give a column for each input")
-    observed = [i for i, name in enumerate(names) if i > 0 and name not in inputs]
-    fault = columns_fault([names[0], *(names[i] for i in observed)], m, "observations")
-    if fault is None and len(names) != 1 + m + len(inputs):
-        fault = "an input has two columns; give one for each"
-    if fault is not None:
-        raise InputError(fault)
-    return observed, [names.index(name) for name in inputs]
-
-
-def columns_fault(names: Sequence[str], m: int, what: str, expected: Sequence[str] | None = None) -> str | None:
-    """What is wrong with the columns of a header, of which the first is the time, or None."""
-    if len(names) != m + 1:
-        return f"{len(names)} columns; the model needs {m + 1}: time, and one for each of its {what}"
-    if expected is not None:
-        wrong = next((name for name, wanted in zip(names[1:], expected) if name != wanted), None)
-        return None if wrong is None else f"a column is {_quoted(wrong)}; expected time, {', '.join(expected)}"
-    # Columns are taken by their position; names that are all our own say which position was meant.
-    ours = default_names(m)
-    if sorted(names[1:]) != sorted(ours):
-        return None
-    for place, (name, wanted) in enumerate(zip(names[1:], ours), start=2):
-        if name != wanted:
-            return (
-                f"column {place} is {name}, where {wanted} is read: columns are taken by their position; put them in the order "
-                f"time, {', '.join(ours) if m <= 4 else f'{ours[0]} to {ours[-1]}'}, or give them other names"
-            )
-    return None
 
 
 def _fast(lines: list[str], columns: int) -> np.ndarray | None:
@@ -295,7 +241,7 @@ def _careful(part: _Part, names: list[str]) -> tuple[np.ndarray, tuple[int, str]
     for number, line in enumerate(part.lines, start=part.number):
         if not line.strip():
             continue
-        cells = [cell.strip() for cell in _cells(line)]
+        cells = [cell.strip() for cell in cells_of(line)]
         what = _not_text(line) or _not_numbers(cells, names, part.whole)
         if what is not None:
             wrong = number, what
@@ -307,10 +253,10 @@ def _careful(part: _Part, names: list[str]) -> tuple[np.ndarray, tuple[int, str]
 def _not_numbers(cells: list[str], names: list[str], whole: bool) -> str | None:
     if len(cells) != len(names):
         cut = "" if whole else " (the file ends in this row; was it cut off?)"
-        return f"{len(cells)} columns; expected {len(names)}: {_quoted(','.join(names))}{cut}"
+        return f"{len(cells)} columns; expected {len(names)}: {quoted(','.join(names))}{cut}"
     for name, cell in zip(names, cells):
         if cell and not _NUMBER.fullmatch(cell):
-            what = f"{_quoted(cell)} in column {_quoted(name)} is not a number"
+            what = f"{quoted(cell)} in column {quoted(name)} is not a number"
             if name == "time" and date_of(cell) is not None:
                 return f"{what}; for dates give the model's unit of time, as in unit='h' (command: --unit h)"
             return f"{what}; leave the cell empty if nothing was observed"
@@ -323,22 +269,9 @@ def _line(part: _Part, row: int) -> int:
     return next(islice(filled, row, None))
 
 
-def _cells(line: str) -> list[str]:
-    """The cells of one line; one that `csv` refuses is split at its commas."""
-    try:
-        return next(csv.reader([line]), [""]) or [""]
-    except csv.Error:
-        return line.split(",")
-
-
 def _not_text(line: str) -> str | None:
     if _NO_TEXT.search(line):
         return "bytes that are not UTF-8 text; save the file as UTF-8"
     if "\0" in line:
         return "a NUL byte; is this a CSV file?"
     return None
-
-
-def _quoted(text: str) -> str:
-    """Text from the file as it may appear in an error: one short line of printable characters."""
-    return ascii(text if len(text) <= 40 else text[:37] + "...")

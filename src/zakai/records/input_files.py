@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from zakai.errors import InputError
-from zakai.records.csv import Dates, header_of, read_table
+from zakai.records.csv import Dates, read_table
 from zakai.records.dates import Clock
+from zakai.records.header import header_of
 from zakai.records.inputs import Inputs
 from zakai.records.writing import shown
 

@@ -12,8 +12,8 @@ from typing import Any, BinaryIO, NamedTuple
 
 from zakai.errors import InputError
 from zakai.models._errors import named
-from zakai.records.csv import columns_with_inputs, header_names
 from zakai.records.dates import Clock, date_of
+from zakai.records.header import columns_with_inputs, header_names, quoted
 
 LONGEST = 2**20  # bytes of a line
 MOST_DIGITS = 640  # of an integer: what Python always reads, however it is set
@@ -100,11 +100,11 @@ def _json(clock: Clock | None, text: str) -> tuple[Any, list[Any], dict[str, Any
     try:
         found = _DECODER.decode(text)
     except json.JSONDecodeError:
-        raise ValueError(f'{_quoted(text.strip())} is not JSON; expected {{"time": ..., "y": [...]}}') from None
+        raise ValueError(f'{quoted(text.strip())} is not JSON; expected {{"time": ..., "y": [...]}}') from None
     except RecursionError:
-        raise ValueError(f"{_quoted(text.strip())} is nested too deep to be read as JSON") from None
+        raise ValueError(f"{quoted(text.strip())} is nested too deep to be read as JSON") from None
     if not isinstance(found, dict) or "time" not in found or "y" not in found:
-        raise ValueError(f'{_quoted(text.strip())} is not an object with "time" and "y"')
+        raise ValueError(f'{quoted(text.strip())} is not an object with "time" and "y"')
     time, values, inputs = found["time"], found["y"] if isinstance(found["y"], list) else [found["y"]], found.get("inputs")
     if clock is not None:
         time = _date(time, clock)
@@ -166,7 +166,7 @@ def _csv(
         cells[0] = repr(_date(cells[0].strip('"'), clock))
     for cell in cells:
         if cell and not _NUMBER.fullmatch(cell):
-            raise ValueError(f"{_quoted(cell)} is not a number; leave the cell empty if nothing was observed")
+            raise ValueError(f"{quoted(cell)} is not a number; leave the cell empty if nothing was observed")
     if not cells[0]:
         raise ValueError("the time is missing")
     numbers = [float(cell) if cell else None for cell in cells]
@@ -194,7 +194,7 @@ def _columns(text: str, number: int, m: int, inputs: Sequence[str]) -> tuple[lis
             header = (
                 f"whose first line must be a header: first the column time, then {m} for the observations, with commas between"
             )
-            raise InputError(f"{_quoted(text.strip())} looks like CSV, {header}")
+            raise InputError(f"{quoted(text.strip())} looks like CSV, {header}")
     return None
 
 
@@ -202,7 +202,3 @@ def _looks_like_csv(text: str) -> bool:
     """Whether a line is several words or numbers with separators between: no part of a line of JSON ends so, nor does prose."""
     cells = [cell.strip().strip('"') for cell in _SEPARATOR.split(text.strip())]
     return len(cells) > 1 and all(_WORD.fullmatch(cell) or _NUMBER.fullmatch(cell) for cell in cells)
-
-
-def _quoted(text: str) -> str:
-    return ascii(text if len(text) <= 40 else text[:37] + "...")
