@@ -31,16 +31,7 @@ def limited_direct(model: Model) -> tuple[Condition, ...]:
 
     Chen, Luo and Yau (2017), Theorems 1 to 3, in their corrected form.
     """
-    conditions = [
-        determined(model),
-        Condition(
-            "the state has at most three coordinates, so that the density fits on a grid",
-            model.n <= 3,
-            f"n = {model.n}",
-            "the grid of this method",
-        ),
-    ]
-    conditions.extend(_features_of_samples(model))
+    conditions = [determined(model), _fits_on_a_grid(model, 3, "three"), *_features_of_samples(model)]
     if any(condition.holds is not True for condition in (conditions[0], *conditions[2:])):
         return tuple(conditions)
     conditions.append(definite_covariance(model))
@@ -51,6 +42,11 @@ def limited_direct(model: Model) -> tuple[Condition, ...]:
         f"{CLY}, Assumption 2",
     )
     return (*conditions, *_yau_conditions(model, f"{CLY}, (17) corrected", lambda form: root))
+
+
+def _fits_on_a_grid(model: Model, most: int, words: str) -> Condition:
+    statement = f"the state has at most {words} coordinates, so that the density fits on a grid"
+    return Condition(statement, model.n <= most, f"n = {model.n}", "the grid of this method")
 
 
 def _yau_conditions(model: Model, source: str, further: Callable[[YauForm], Condition]) -> Iterator[Condition]:
@@ -168,12 +164,7 @@ def any_smooth_system(model: Model) -> tuple[Condition, ...]:
     """Any smooth system whose density fits on a grid."""
     return (
         determined(model),
-        Condition(
-            "the state has at most four coordinates, so that the density fits on a grid",
-            model.n <= 4,
-            f"n = {model.n}",
-            "the grid of this method",
-        ),
+        _fits_on_a_grid(model, 4, "four"),
         *_in_many_states(model),
         *_correlated(model),
         *_reflecting_ends(model),
