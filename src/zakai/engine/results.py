@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from zakai.engine.plan import Plan
     from zakai.records import Inputs
 
-_LARGEST_COV = 32
 _MOST_ASSEMBLED = 4 * 2**30  # bytes of the covariances of independent blocks, when they are put together
 
 
@@ -256,43 +255,17 @@ class FilterResult:
 
         write_report(self, Path(path), truth)
 
-    def _variables(self) -> dict[str, tuple[list[str], np.ndarray, dict[str, Any]]]:
-        names = np.array(self.state, dtype=object)
-        variables: dict[str, tuple[list[str], np.ndarray, dict[str, Any]]] = {
-            "time": (["time"], self.times, {}),
-            "state": (["state"], names, {}),
-            "state_": (["state_"], names, {}),
-            "mean": (["time", "state"], self.mean, {}),
-            "variance": (["time", "state"], self.variance, {}),
-            "log_likelihood_increment": (["time"], self.log_likelihood_increments, {}),
-        }
-        if len(names) <= _LARGEST_COV:
-            variables["cov"] = (["time", "state", "state_"], self.cov, {})
-        for name, values in self.health.items():
-            variables[name] = (["time"], values, {"description": self.bounds.get(name, (0, name))[1]})
-        return variables
-
-    def _attributes(self) -> dict[str, Any]:
-        clock = {} if self.clock is None else {f"time_{name}": str(value) for name, value in self.clock._asdict().items()}
-        return {
-            **clock,
-            "method": self.method,
-            "why": self.why,
-            "log_likelihood": self.log_likelihood,
-            "warnings": "\n".join(self.warnings),
-            "model": self.model.text if self.model is not None else "",
-            **self.attributes,
-        }
-
     def to_dataset(self) -> xarray.Dataset:
         """Return the result as an xarray Dataset with dimensions `time`, of dates if the record has some, and `state`."""
         import xarray
 
-        variables = self._variables()
+        from zakai.engine.stored import attributes_of, variables_of
+
+        variables = variables_of(self)
         if self.dates is not None:
             variables["time"] = (["time"], self.dates, {})
         coordinates = {name: variables.pop(name) for name in ("time", "state", "state_")}
-        return xarray.Dataset(variables, coords=coordinates, attrs=self._attributes())
+        return xarray.Dataset(variables, coords=coordinates, attrs=attributes_of(self))
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return means and standard deviations as a DataFrame, a row for each time, or date if the record has some.
@@ -316,4 +289,6 @@ class FilterResult:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as NetCDF, atomically."""
-        save_variables(self._variables(), self._attributes(), path)
+        from zakai.engine.stored import attributes_of, variables_of
+
+        save_variables(variables_of(self), attributes_of(self), path)

@@ -1,4 +1,4 @@
-"""Results that were written to files."""
+"""Results as the variables and attributes of files, and back."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from zakai.records.dates import Clock
 from zakai.records.netcdf import load_variables
 from zakai.records.writing import shown
 
+_LARGEST_COV = 32  # number of states up to which covariances are stored
 _LONGEST_NAME = 64  # of a state, or a method
 # All others are over the time.
 _DIMENSIONS = {
@@ -33,6 +34,39 @@ _RENAMED = {
     "resolution": "std_in_spacings",
     "negative": "negative_mass",
 }
+
+
+def variables_of(result: FilterResult) -> dict[str, tuple[list[str], np.ndarray, dict[str, Any]]]:
+    """Return the variables of a file by name: their dimensions, values and attributes."""
+    names = np.array(result.state, dtype=object)
+    found = {
+        "time": result.times,
+        "state": names,
+        "state_": names,
+        "mean": result.mean,
+        "variance": result.variance,
+        "log_likelihood_increment": result.log_likelihood_increments,
+    }
+    if len(names) <= _LARGEST_COV:
+        found["cov"] = result.cov
+    variables: dict[str, Any] = {name: (list(_DIMENSIONS.get(name, ("time",))), array, {}) for name, array in found.items()}
+    for name, values in result.health.items():
+        variables[name] = (["time"], values, {"description": result.bounds.get(name, (0, name))[1]})
+    return variables
+
+
+def attributes_of(result: FilterResult) -> dict[str, Any]:
+    """Return the attributes of a file."""
+    clock = {} if result.clock is None else {f"time_{name}": str(value) for name, value in result.clock._asdict().items()}
+    return {
+        **clock,
+        "method": result.method,
+        "why": result.why,
+        "log_likelihood": result.log_likelihood,
+        "warnings": "\n".join(result.warnings),
+        "model": result.model.text if result.model is not None else "",
+        **result.attributes,
+    }
 
 
 def load_result(path: str | os.PathLike[str]) -> FilterResult:
