@@ -445,4 +445,4 @@ def test_wrong_options_and_systems_outside_the_class_are_refused_in_one_line():
     prepared = general_direct.prepare(model, Schedule.empty(2), model.theta())
     state = general_direct.init(prepared, model.prior)
     assert general_direct.METHOD.valid(prepared, state)
-    assert not general_direct.METHOD.valid(prepared, state._replace(covs=state.covs[1:]))
+    assert not general_direct.METHOD.valid(prepared, state._replace(first=state.first._replace(covs=state.first.covs[1:])))

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from report.fakes import fake_result
+from zakai.densities._density import wrap
 from zakai.errors import InputError
-from zakai.report.heatmap import chosen_times, circle_line, density_over_time, profile, true_states, wrapped
+from zakai.report.heatmap import chosen_times, circle_line, density_over_time, profile, true_states
 
 
 def test_a_column_keeps_its_mass_even_where_the_density_is_narrower_than_a_cell():
@@ -77,7 +78,7 @@ def test_an_angle_is_not_joined_across_times_that_are_left_out():
 
 
 def test_wrapping_gives_pi_and_never_minus_pi():
-    np.testing.assert_allclose(wrapped(np.array([np.pi, -np.pi, 3 * np.pi, 0.0])), [np.pi, np.pi, np.pi, 0.0])
+    np.testing.assert_allclose(wrap(np.array([np.pi, -np.pi, 3 * np.pi, 0.0])), [np.pi, np.pi, np.pi, 0.0])
 
 
 def test_without_densities_the_band_is_gaussian_and_no_density_is_asked_for():
