@@ -58,13 +58,13 @@ class _Watch:
         self.slow = 0  # successive measurements by which the rest takes long
 
     def report_nothing(self, run: Run) -> None:
-        """Say that the first observation takes long, and what would shorten it."""
+        """Log that the first observation takes long, with what shortens it."""
         if self.done == 0:
             name, shorter = run.setting.method.name, run.setting.method.shorter
             _LOG.warning("%s: the first observation takes more than %.0f s; to shorten it, %s", name, FIRST, shorter)
 
     def report(self, run: Run, count: int) -> None:
-        """Add intervals that a run has done; say once that the rest takes long, and what would shorten it."""
+        """Add intervals that a run has done; log once that the rest takes long, with what shortens it."""
         with self.lock:
             self.done += count
             done, total = round(self.done / self.blocks), round(self.total / self.blocks)

@@ -117,7 +117,7 @@ def sample(
 
 
 def _announce(posterior: _Posterior, draws: int) -> None:
-    """Say what the draws will take where that is long."""
+    """Log the time that the draws will take, where it is long."""
     began = time.monotonic()
     for _ in range(3):
         posterior(np.zeros(len(posterior.mode)))

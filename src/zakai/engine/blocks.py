@@ -24,13 +24,13 @@ _NUMBER = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 
 
 def record_of_block(record: Record, block: IndependentBlock) -> Record:
-    """What was observed of one block; of one that is not observed at all, nothing of a sensor that shows nothing."""
+    """Return the observations of one block; a block without sensors has one coordinate that is never observed."""
     values = record.values[:, list(block.observations)] if block.observations else np.full((len(record), 1), np.nan)
     return Record(record.times, values, record.kind, record.inputs)
 
 
 def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> FilterResult:
-    """The result of the whole, from one run for each of its blocks."""
+    """Return the result of the whole system, from one run for each block."""
     blocks, parts = division.blocks, []
     mean = np.empty((len(runs[0].record) + 1, model.n))
     variance = np.empty_like(mean)
@@ -70,7 +70,7 @@ def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> Filt
 
 
 def _rename(part: FilterResult, block: IndependentBlock) -> None:
-    """The states of a block by their own names, not by those of the block that it shares its model with."""
+    """Give the states of a block their own names instead of those of the block with which it shares its model."""
     own = block.names == block.model.state
     part.state = block.names
     part.model = part.model if own else None
@@ -88,13 +88,13 @@ def _conditions(division: Division) -> dict[str, Any]:
 
 
 def _all_of(parts: Sequence[FilterResult], key: str) -> str:
-    """What the methods say of themselves, each with its name where they differ."""
+    """Return an attribute of the methods, with their names where they differ."""
     said = {part.method: part.attributes[key] for part in parts}
     return next(iter(said.values())) if len(said) == 1 else "; ".join(f"{name}: {text}" for name, text in said.items())
 
 
 def _warnings(blocks: Sequence[IndependentBlock], parts: Sequence[FilterResult]) -> list[str]:
-    """The warnings of all blocks; those that differ only in their numbers are said once, with the names of the blocks."""
+    """Return the warnings of all blocks; warnings that differ only in their numbers become one, with the names of the blocks."""
     found: dict[str, list[tuple[IndependentBlock, str]]] = {}
     for block, part in zip(blocks, parts, strict=True):
         for warning in part.warnings:
@@ -115,7 +115,7 @@ def _warnings(blocks: Sequence[IndependentBlock], parts: Sequence[FilterResult])
 
 
 def _no_density(runs: Sequence[Run]) -> str:
-    """Why densities were not kept: of one block too many of them are enough."""
+    """Return why densities were not kept, which one block without densities decides."""
     if any(run.keep is False and run.bytes for run in runs):
         return (
             f"the densities of {len(runs[0].record)} steps of {len(runs)} blocks were not kept: they need more than "

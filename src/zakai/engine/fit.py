@@ -187,7 +187,7 @@ def _start(model: Model, names: tuple[str, ...], start: Any) -> np.ndarray:
 
 
 def _box(model: Model, names: tuple[str, ...], values: np.ndarray, bounds: Any) -> np.ndarray:
-    """The bounds (p, 2), infinite where there is none."""
+    """Return the bounds (p, 2), infinite where there is none."""
     box = np.tile([-np.inf, np.inf], (len(names), 1))
     for name, pair in _known(bounds, names, "bounds").items():
         if not isinstance(pair, tuple | list) or len(pair) != 2:

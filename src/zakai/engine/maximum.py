@@ -52,7 +52,7 @@ class _Objective:
             if self.best is None or value < self.best[0]:
                 self.best = value, np.array(u), gradient
             return value, gradient
-        # A wall behind the best point, which rises ten times as fast as the function fell there: the search turns back.
+        # Beyond the domain the function rises ten times as fast as it fell at the best point, so that the search turns back.
         assert self.best is not None
         self.refused += 1
         best, at, slope = self.best
@@ -78,7 +78,7 @@ def maximum(function: Function, values: np.ndarray, box: np.ndarray, names: tupl
     settings = {"maxiter": ITERATIONS, "ftol": 1e-13, "gtol": 1e-7 * max(1.0, np.abs(gradient).max() * 1e-3)}
     search = minimize(objective, np.zeros(len(values)), jac=True, method="L-BFGS-B", bounds=limits, options=settings)
     assert objective.best is not None
-    # From here on the unit is where the search came to: it may have come a long way.
+    # The search may have moved far: the best point gives the new units.
     values = np.clip(values + scale * objective.best[1], box[:, 0], box[:, 1])
     scale = np.where(values != 0, np.abs(values), scale)
     limits = (box - values[:, None]) / scale[:, None]
@@ -112,7 +112,7 @@ def maximum(function: Function, values: np.ndarray, box: np.ndarray, names: tupl
 
 
 def _information(objective: _Objective, u: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """The Hessian of the negative log-likelihood, by steps of a thousandth of a standard error, once that is known."""
+    """Return the Hessian of the negative log-likelihood, by steps of about a thousandth of a standard error."""
     for size in (1e-4, 1e-6, 1e-8):
         steps = np.full(len(u), size)
         first = np.diag(hessian(lambda v: objective.exact(v)[1], u, steps))
@@ -127,7 +127,7 @@ def _information(objective: _Objective, u: np.ndarray, free: np.ndarray) -> np.n
 def _inverse(
     information: np.ndarray, gradient: np.ndarray, free: np.ndarray, names: tuple[str, ...]
 ) -> tuple[np.ndarray, float, str]:
-    """The inverse information of the free parameters, the distance to the maximum in standard errors, and what is wrong."""
+    """Return the inverse information of the free parameters, the distance to the maximum in standard errors, and the fault."""
     count = len(names)
     cov, index = np.full((count, count), np.nan), np.flatnonzero(free)
     if not len(index):

@@ -84,7 +84,7 @@ class FilterResult:
         return self._cov
 
     def _assembled(self) -> np.ndarray:
-        """The covariances of independent blocks as those of the whole."""
+        """Return the covariances of the whole system from those of its independent blocks."""
         count, n = self.mean.shape
         if not self.blocks:
             raise InputError(f"cov: the covariances of {n} states were not stored, only their variances; see `variance`")
@@ -130,7 +130,7 @@ class FilterResult:
         return self._density is not None
 
     def density(self, k: int) -> Density:
-        """The posterior after observation k (0: the prior; negative numbers count from the end).
+        """Return the posterior after observation k (0: the prior; negative numbers count from the end).
 
         Raises InputError where the densities were not kept.
         """

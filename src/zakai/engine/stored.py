@@ -89,9 +89,9 @@ def load_result(path: str | os.PathLike[str]) -> FilterResult:
 
 
 def result_of(variables: Mapping[str, Any], attributes: Mapping[str, Any], source: str) -> FilterResult:
-    """The result that a file's variables and attributes are; `source` is what errors call it.
+    """Return the result that the variables and attributes of a file describe; `source` is its name in errors.
 
-    Raises InputError where they are none.
+    Raises InputError where they describe none.
     """
     _check_layout(variables, source)
     arrays = {name: values for name, (_, values, _) in variables.items()}

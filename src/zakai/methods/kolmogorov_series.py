@@ -241,7 +241,7 @@ def density(prepared: Prepared, state: State) -> GridDensity:
 
 
 def valid(prepared: Prepared, state: State) -> bool:
-    """Say whether a state that was read from a file is a density on a grid."""
+    """Return whether a state that was read from a file is a density on a grid."""
     numbers = np.array([state.origin, state.unit], float)
     fits = state.logs.ndim == 1 and 8 <= len(state.logs) <= 4 * MOST_POINTS
     return fits and bool(np.isfinite(numbers).all()) and state.unit > 0

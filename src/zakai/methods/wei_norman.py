@@ -266,7 +266,7 @@ def density(prepared: Prepared, state: State) -> GridDensity:
 
 
 def valid(prepared: Prepared, state: State) -> bool:
-    """Say whether the arrays of a state that was read from a file fit together."""
+    """Return whether the arrays of a state that was read from a file fit together."""
     n, d = prepared.system.n, prepared.system.count
     shapes = [np.shape(a) for a in (state.low, state.spacing, state.mean, state.driven)]
     sizes = np.array(np.shape(state.values))
