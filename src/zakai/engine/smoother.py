@@ -217,11 +217,11 @@ class SmoothingRun(Run):
         """Return the smoothed density at an index of the result, made from the nearest checkpoints."""
         number = max(i for i, (first, _) in enumerate(self.segments) if first < max(index, 1))
         rows, prepared, begin, states = self._segment(number)
-        message = self.messages[number]
-        for k in reversed(range(max(index, rows.start), rows.stop)):
-            message, _ = self.backward.smoothed(self.empty, states[k + 1 - rows.start], message)
-            message = self.backward.step(prepared, k - begin, message, self.values[k], states[k - rows.start])
-        return self.backward.density(self.empty, states[index - rows.start], message)
+        message, first = self.messages[number], index - rows.start
+        if index < rows.stop:
+            here = slice(index - begin, rows.stop - begin)
+            message, _ = self._backward(prepared, here, states[first:], message, range(index, rows.stop))
+        return self.backward.density(self.empty, states[first], message)
 
     def start_moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean and the covariance at the start, smoothed once the record is."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from zakai.errors import InputError
 from zakai.methods._line_backward import BACKWARD as LINE
-from zakai.methods._protocol import Backward, Info
+from zakai.methods._protocol import Backward, Info, Infos
 
 
 def _of(prepared: Any) -> Backward[Any, Any, Any]:
@@ -32,6 +33,12 @@ def step(prepared: Any, k: int, later: Any, values: np.ndarray, state: Any) -> A
 def smoothed(prepared: Any, state: Any, later: Any) -> tuple[Any, Info]:
     """Return the message, normalised, and the report of its product with the state."""
     return _of(prepared).smoothed(prepared, state, later)
+
+
+def segment(prepared: Any, rows: slice, states: Sequence[Any], later: Any, values: np.ndarray) -> tuple[Any, Infos] | None:
+    """Return the message at the start of the intervals of a slice and the reports after each, None for several states."""
+    together = _of(prepared).segment
+    return None if together is None else together(prepared, rows, states, later, values)
 
 
 def density(prepared: Any, state: Any, later: Any) -> Any:
@@ -61,4 +68,4 @@ def accuracy(prepared: Any) -> float:
     return _of(prepared).accuracy(prepared)
 
 
-BACKWARD: Backward[Any, Any, Any] = Backward(message, step, smoothed, density, draw=draw, accuracy=accuracy)
+BACKWARD: Backward[Any, Any, Any] = Backward(message, step, smoothed, density, segment, draw, accuracy)

@@ -9,6 +9,7 @@ Only the product of b with the filter's density matters: a message is kept where
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,12 +17,14 @@ import numpy as np
 from zakai.densities import Density
 from zakai.errors import InputError
 from zakai.methods import _line
+from zakai.methods._line_adjoint import back
+from zakai.methods._line_loop import joined
 from zakai.methods._line_message import Message, points_of, reliable, support
 from zakai.methods._line_paths import draw
 from zakai.methods._line_system import Prepared, State, state_moments
 from zakai.methods._line_update import exponential_factor, factor_at_end
 from zakai.methods._line_way import Way, negligible, smoothing_tolerance
-from zakai.methods._protocol import Backward, Info
+from zakai.methods._protocol import Backward, Info, Infos
 from zakai.numerics import line_window as lw
 
 Array = Any
@@ -68,7 +71,32 @@ def _product(state: State, later: Message) -> _Product:
 @np.errstate(all="ignore")
 def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message, Info]:
     """Return the message, normalised and without what is negligible in its product with the state, and the product's report."""
-    found = _product(state, later)
+    return _smoothed(prepared, state, later, _product(state, later))
+
+
+@np.errstate(all="ignore")
+def segment(
+    prepared: Prepared, rows: slice, states: Sequence[State], later: Message, observed: np.ndarray
+) -> tuple[Message, Infos]:
+    """Return the message at the start of the intervals of a slice, and the reports after each."""
+    parts: list[Infos] = []
+    stop = rows.stop
+    while stop > rows.start:
+        place = stop - rows.start
+        found = _product(states[place], later)
+        later, info = _smoothed(prepared, states[place], later, found)
+        parts.append(_line._alone(info))
+        taken = back(prepared, slice(rows.start, stop), states, later, found.values, found.window, observed)
+        if taken is None:
+            stop -= 1
+            later = step(prepared, stop, later, observed[place - 1], states[place - 1])
+        else:
+            later, stop = taken.message, stop - taken.number
+            parts.append(taken.infos)
+    return later, joined(parts[::-1])
+
+
+def _smoothed(prepared: Prepared, state: State, later: Message, found: _Product) -> tuple[Message, Info]:
     window = found.window
     look = lw.figures(found.values, window.closed, prepared.negligible)
     mean, variance = lw.moments(found.values, window)
@@ -128,4 +156,4 @@ def accuracy(prepared: Prepared) -> float:
     return max(1e-6, prepared.promised)
 
 
-BACKWARD: Backward[Prepared, State, Message] = Backward(message, step, smoothed, density, draw=draw, accuracy=accuracy)
+BACKWARD: Backward[Prepared, State, Message] = Backward(message, step, smoothed, density, segment, draw, accuracy)

@@ -18,8 +18,11 @@ from zakai.numerics.line_weak import WEAK_SHARE, at_nodes, nodes, weak_error, we
 Array = Any
 
 
-def factor_at_end(prepared: Prepared, k: int, at_end: np.ndarray, observed: np.ndarray, window: lw.Window) -> Likelihood:
-    """Return the likelihood of the samples, or of the increments that were gathered over more than the interval."""
+def factor_at_end(prepared: Prepared, k: int, at_end: np.ndarray, observed: np.ndarray, window: lw.Window | None) -> Likelihood:
+    """Return the likelihood of the samples, or of the increments that were gathered over more than the interval.
+
+    `window` is a grid at which h is known where it does not depend on t.
+    """
     system, theta, stop = prepared.system, prepared.theta, float(prepared.schedule.stops[k])
     rows = np.flatnonzero(at_end)
     if system.general:
@@ -41,7 +44,7 @@ def factor_at_end(prepared: Prepared, k: int, at_end: np.ndarray, observed: np.n
         return system.observation(points[:, None], stop, theta)[:, rows].T * spans[:, None]
 
     known = None
-    if system.steady_observation:
+    if system.steady_observation and window is not None:
         h = tables(prepared, window).observation
         known = window, (h if len(rows) == len(h) and system.samples else h[rows] * spans[:, None])
     return Gaussian(evaluate, observed[rows], precision, constant, known=known)

@@ -1,0 +1,160 @@
+"""Many intervals backward in time for one state, in a compiled loop: the adjoints of splittings (`line_splitting.py`).
+
+The adjoint of a splitting is the same splitting with phi replaced by -phi and the averages in reverse order.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import boolean, float64, int64, types
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.line_backward import ERROR, LOG_MASS, Filtered, Limits, Message, Taken, kept, multiplied, spread
+from zakai.numerics.line_loop import SPLIT, Grid, Steps
+from zakai.numerics.line_splitting import (
+    AVERAGES,
+    EARLY,
+    LATE,
+    MEAN,
+    MOST_MAGNUS,
+    averaged,
+    averaging,
+    differences,
+    residual,
+    split,
+)
+from zakai.numerics.line_transition import highest_of, shifted
+from zakai.numerics.line_window import waves
+
+Array = NDArray[Any]
+
+MOST_SUBSTEPS = 64
+STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
+_WHOLE = np.ones((1, 5, 1))
+_V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1]
+
+
+@helper
+def _split(
+    now: Array, product: Array, table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array,
+    averages: Array, observed: Array, inside: bool, tau: float, at: int, first: int, last: int, spacing: float, closed: bool,
+    depth: float, most: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Replace b by that before a split interval; return its error, infinite where it is not accurate, and the constant."""
+    size = now.size
+    phi, slope, curvature, drift, b = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    made, constant, magnus = 0.0, 0.0, 0
+    if averages.shape[0] > 1:
+        made, pair = averaging(
+            product, table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, spacing
+        )
+        if not (made <= most):
+            magnus = int(min(max(np.ceil(1.1 * (pair / most) ** 0.25), 1.0), 1e6))
+            made = pair / float(magnus) ** 4
+        if magnus > MOST_MAGNUS or not (made < np.inf):
+            return np.inf, 0.0
+    parts, count = max(magnus, 1), max(2 * magnus, 1)
+    for i in range(count - 1, -1, -1):
+        weights = averages[parts * (parts - 1) // 2 + i // 2]
+        which = MEAN if magnus == 0 else (EARLY if i % 2 == 0 else LATE)
+        length, spread, shift, added = averaged(
+            table, drifts, outputs, precisions, covariances, weights[which], tau, observed, inside, at, spacing, closed, phi,
+            drift, b,
+        )  # fmt: skip
+        if not spread > 0.0:
+            return np.inf, 0.0
+        differences(b, spacing, closed, slope, curvature)
+        error = residual(product, b, slope, curvature, drift, spread, spacing, length)
+        substeps = max((count * error / most) ** 0.25, 1.0)
+        if not (count * substeps < MOST_SUBSTEPS):
+            return np.inf, 0.0
+        whole = int(np.ceil(substeps))
+        narrow = 0.5 * spread / whole < np.log(1e4 * parts * whole / most) / (2.0 * np.pi**2) * spacing * spacing
+        if narrow:
+            for j in range(first + 1, last + 1):
+                if closed or not (abs(phi[j] - phi[j - 1]) + abs(b[j] - b[j - 1]) < STEEPEST):
+                    return np.inf, 0.0
+        for j in range(size):
+            phi[j] = -phi[j]
+        noise, _ = split(now, phi, b, slope, spread, -shift, whole, spacing, depth, closed, narrow)
+        made, constant = made + error / float(whole) ** 4 + noise, constant + added
+        if not (made < most * 2.0 + 1e-2 * most):
+            return np.inf, 0.0
+    return made, constant
+
+
+@kernel(
+    types.Tuple((int64, int64, int64, int64, float64))(  # type: ignore[no-untyped-call]
+        _V, int64, int64, int64, float64, _V, _M, int64[::1], _V, _Q, float64, boolean, _M, boolean[::1], _V, _M, _Q, _T, _T, _M,
+        _T, float64, float64, float64, _M, _M, _M, _M,
+    )
+)  # fmt: skip
+def _adjoint(
+    b: Array, first: int, last: int, start: int, error: float, product: Array, densities: Array, starts: Array, floors: Array,
+    table: Array, spacing: float, closed: bool, logs: Array, inside: Array, lengths: Array, observed: Array,
+    precisions: Array, drifts: Array, outputs: Array, covariances: Array, averages: Array, most: float,
+    negligible: float, cut: float, cosines: Array, sines: Array, products: Array, out: Array,
+) -> tuple[int, int, int, int, float]:  # fmt: skip
+    """How many intervals were taken, and the support, the start and the error of the message b, which is replaced."""
+    size, timed, depth = b.size, table.shape[0] > 1, 8.0 - np.log(cut)
+    local, found = np.empty((table.shape[1], table.shape[2], b.size)), np.empty(b.size)
+    for i in range(lengths.size - 1, -1, -1):
+        row, taken = out[i], lengths.size - 1 - i
+        if start < 0 or start + size > table.shape[3]:
+            return taken, first, last, start, error
+        for r in range(local.shape[0]):
+            for l in range(local.shape[1]):
+                for j in range(size):
+                    local[r, l, j] = table[i if timed else 0, r, l, start + j]
+        at, before = highest_of(product), spread(b, first, last)
+        row[LOG_MASS] = logs[i, at]
+        for j in range(size):
+            found[j] = b[j] * np.exp(logs[i, j] - logs[i, at]) if b[j] > 0.0 else 0.0
+        between = spread(found, first, last)
+        made, constant = _split(
+            found, product, local, drifts[i], outputs[i], precisions[i], covariances[i], averages, observed[i], inside[i],
+            lengths[i], at, first, last, spacing, closed, depth, most,
+        )  # fmt: skip
+        row[LOG_MASS] += constant
+        if not (made < np.inf):
+            return taken, first, last, start, error
+        if starts[i] != start:
+            found = shifted(found, starts[i] - start, size)
+        begins, ends = multiplied(found, densities[i], floors[i], negligible, closed, cosines, sines, products[i], row)
+        if ends < 0:
+            return taken, first, last, start, error
+        first, last, start = begins, ends, starts[i]
+        error = made + error * kept(before, between, spread(found, first, last))
+        row[ERROR] = error
+        for j in range(size):
+            b[j] = found[j] if first <= j <= last else 0.0
+            product[j] = products[i, j]
+    return lengths.size, first, last, start, error
+
+
+def by_adjoints(message: Message, before: Filtered, grid: Grid, logs: Array, steps: Steps, limits: Limits) -> Taken:
+    """Return the message before the last intervals, as many as the adjoints of splittings take.
+
+    Args:
+        message: b on the grid.
+        before: the filter's densities.
+        grid: the table of the grids.
+        logs: the log-likelihoods of what is observed at the end of each interval (K, N), on the grid of the density there.
+        steps: the intervals.
+        limits: what an interval must keep.
+    """
+    count, size = len(steps.lengths), len(message.values)
+    b, product, products, out = message.values.copy(), message.product.copy(), np.empty((count, size)), np.zeros((count, 6))
+    kinds, lengths, observed, precisions, _, _, *rest = steps
+    averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
+    taken, first, last, start, error = _adjoint(
+        b, message.first, message.last, message.start, message.error, product, *before, grid.table, grid.spacing, grid.closed,
+        logs, kinds == SPLIT, lengths, observed, precisions, *rest, averages, limits.splitting, limits.negligible, limits.cut,
+        *waves(size), products, out,
+    )  # fmt: skip
+    if taken:
+        out[-1, LOG_MASS] += message.scale
+    return Taken(Message(b, 0.0, first, last, start, error, product), taken, products[count - taken :], out[count - taken :])
