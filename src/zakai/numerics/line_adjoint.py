@@ -12,22 +12,11 @@ from numba import boolean, float64, int64, types
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.line_averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, averaged, averaging
 from zakai.numerics.line_backward import ERROR, LOG_MASS, Filtered, Limits, Message, Taken, kept, multiplied, spread
+from zakai.numerics.line_density import highest_of, waves
 from zakai.numerics.line_loop import SPLIT, Grid, Steps
-from zakai.numerics.line_splitting import (
-    AVERAGES,
-    EARLY,
-    LATE,
-    MEAN,
-    MOST_MAGNUS,
-    averaged,
-    averaging,
-    differences,
-    residual,
-    split,
-)
-from zakai.numerics.line_transition import highest_of, shifted
-from zakai.numerics.line_window import waves
+from zakai.numerics.line_splitting import differences, residual, split
 
 Array = NDArray[Any]
 
@@ -35,6 +24,15 @@ MOST_SUBSTEPS = 64
 STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
 _WHOLE = np.ones((1, 5, 1))
 _V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1]
+
+
+@helper
+def _shifted(values: Array, by: int) -> Array:
+    """Return the values on a grid of the same size that begins `by` points later."""
+    found = np.zeros(values.size)
+    for j in range(max(0, by), min(values.size, by + values.size)):
+        found[j - by] = values[j]
+    return found
 
 
 @helper
@@ -122,7 +120,7 @@ def _adjoint(
         if not (made < np.inf):
             return taken, first, last, start, error
         if starts[i] != start:
-            found = shifted(found, starts[i] - start, size)
+            found = _shifted(found, starts[i] - start)
         begins, ends = multiplied(found, densities[i], floors[i], negligible, closed, cosines, sines, products[i], row)
         if ends < 0:
             return taken, first, last, start, error

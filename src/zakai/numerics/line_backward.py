@@ -16,8 +16,8 @@ from numba import boolean, float64, int64, types
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
-from zakai.numerics.line_transition import circular_moments, highest_of, largest, moments, support
-from zakai.numerics.line_window import CUT, figures_of, waves
+from zakai.numerics.line_density import circular_moments, highest_of, moments, spectrum, support, waves
+from zakai.numerics.line_window import CUT
 
 Array = NDArray[Any]
 
@@ -101,10 +101,10 @@ def multiplied(
     row: Array,
 ) -> tuple[int, int]:  # fmt: skip
     """Write the product with a density, of sum one, and its report; divide b by the sum; return the support, or (0, -1)."""
-    size, total, least = b.size, 0.0, floor * largest(density)
+    size, total, least = b.size, 0.0, floor * density[highest_of(density)]
     for j in range(size):
         product[j] = density[j] * b[j] if density[j] > least else 0.0
-    least = SMALLEST * largest(product)
+    least = SMALLEST * product[highest_of(product)]
     for j in range(size):
         product[j] = product[j] if product[j] > least else 0.0
         total += product[j]
@@ -113,10 +113,13 @@ def multiplied(
     for j in range(size):
         product[j] /= total
         b[j] /= total
-    left, right, _, _, _, aliasing, _, _, _ = figures_of(product, CUT, SMALLEST, cosines, sines)
+    left, right, _, _, _, aliasing, _, _, _ = spectrum(product, CUT, SMALLEST, cosines, sines)
     row[LOG_MASS] += np.log(total)
     row[ALIASING], row[EDGE] = aliasing, 0.0 if closed else max(left, right)
-    _, row[MEAN_AT], row[VARIANCE] = circular_moments(product, cosines, sines) if closed else moments(product)
+    if closed:
+        row[MEAN_AT], row[VARIANCE] = circular_moments(product, cosines, sines)
+    else:
+        _, row[MEAN_AT], row[VARIANCE] = moments(product)
     if not (aliasing <= UNRESOLVED):
         return 0, -1
     begins, ends = (0, size - 1) if closed else support(product, negligible)
@@ -176,12 +179,12 @@ def _decomposed(
         for n in range(count):
             coefficients[n] *= np.exp(-tau * (rates[n] - rates[0]))
         now = np.dot(coefficients, modes[:count])
-        highest = largest(now)
+        highest = now[highest_of(now)]
         noise = NOISE * np.sqrt(norm) * max(1.0, np.exp(min(tau * rates[0], 600.0)))
-        left, right, _, _, _, aliasing, _, _, _ = figures_of(now, CUT, SMALLEST, long_cosines, long_sines)
+        left, right, _, _, _, aliasing, _, _, _ = spectrum(now, CUT, SMALLEST, long_cosines, long_sines)
         level = max(noise, (ROUNDING + 2.0 * aliasing) * highest)
         # b relative to where its product with the density is largest.
-        density, least = densities[i], floors[i] * largest(densities[i])
+        density, least = densities[i], floors[i] * densities[i, highest_of(densities[i])]
         reference, weight, total = -np.inf, 0.0, 0.0
         for j in range(size):
             if density[j] > least:
