@@ -63,5 +63,10 @@ def kernel(signature: Any, derivative: Any = None) -> Callable[[Callable[..., R]
 
 
 def helper(function: F) -> F:
-    """Compile a function that only kernels call, as a part of each of them; for Python it would be compiled in every process."""
-    return cast(F, _compiler()(function))
+    """Compile a function that only kernels call, as a part of each of them; it has no entry for Python."""
+    return cast(F, _compiler(no_cpython_wrapper=True)(function))
+
+
+def inlined(function: F) -> F:
+    """Copy a function into the one kernel that calls it before that is compiled, so that it is not optimised twice."""
+    return cast(F, _compiler(inline="always")(function))

@@ -75,7 +75,8 @@ def averaged(
     if inside:
         for q in range(outputs.shape[0]):
             w = fraction if outputs.shape[0] == 1 else weights[q]
-            constant += exponent_added(observation_of(table, outputs[q]), precisions[q], observed, w, w * tau, at, b)
+            h, centre = observation_of(table, outputs[q], at)
+            constant += exponent_added(h, centre, precisions[q], observed, w, w * tau, b)
     for j in range(size):
         if not (b[j] > IMPOSSIBLE):
             b[j] = IMPOSSIBLE
@@ -140,7 +141,8 @@ def averaging(
         if inside and (i == 0 or outputs.shape[0] > 1):
             for q in range(outputs.shape[0]):
                 w = whole if outputs.shape[0] == 1 else weights[q]
-                exponent_added(observation_of(table, outputs[q]), precisions[q], observed, w, w * tau, at, parts[i, 1])
+                h, centre = observation_of(table, outputs[q], at)
+                exponent_added(h, centre, precisions[q], observed, w, w * tau, parts[i, 1])
     add(found[0], 1.0, values)
     for operator, of, weight, to in _PRODUCTS:
         _generated(found[of], parts[operator], spreads[operator], spacing, float(weight), found[to])

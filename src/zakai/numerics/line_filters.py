@@ -15,7 +15,7 @@ from numba import float64
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.compiled import helper, inlined, kernel
 from zakai.numerics.line_density import highest_of
 from zakai.numerics.line_terms import Transition, failed
 
@@ -136,7 +136,7 @@ def _quadratic(values: Array, slope: float, curvature: float) -> None:
             ratio *= step
 
 
-@helper
+@inlined
 def convolved(
     now: Array, phi: Array, channel: Array, middle: float, spacing: float, finest: float, depth: float, closed: bool
 ) -> Transition:

@@ -22,10 +22,10 @@ from zakai.numerics.line_averages import AVERAGES
 from zakai.numerics.line_density import circular_moments, highest_of, moments, separated, spectrum, support, waves
 from zakai.numerics.line_filters import BAND, convolved
 from zakai.numerics.line_modes import LOG_NOISE, decomposed, narrow
-from zakai.numerics.line_sample import likelihood, product, weakened
+from zakai.numerics.line_sample import likelihood, product
 from zakai.numerics.line_splitting import divided
-from zakai.numerics.line_terms import DRIFT, PHI, Transition, failed
-from zakai.numerics.line_weak import WEAK_SHARE, weak_error
+from zakai.numerics.line_terms import DRIFT, PHI, Transition, failed, observation_of
+from zakai.numerics.line_weak import WEAK_SHARE, weak_error, weaken
 from zakai.numerics.line_window import ALIGNMENT, CUT
 
 Array = NDArray[Any]
@@ -282,9 +282,14 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool) -
             # The sample, on a finer grid where the product is not resolved.
             worst, growth, below, seen = aliasing, 0.0, 0.0, False
             if samples:
-                gained += likelihood(local, outputs[k, 0], precisions[k, 0], observed[k], at, b)
+                h, centre = observation_of(local, outputs[k, 0], at)
+                gained += likelihood(h, centre, precisions[k, 0], observed[k], b)
                 if weak:
-                    weakened(local, outputs[k, 0], precisions[k, 0], observed[k], at, fine, start, b, change)
+                    for i in range(centre.size):
+                        seen |= precisions[k, 0, i, i] != 0.0
+                    if seen:
+                        weaken(fine, start, precisions[k, 0], observed[k], centre, b, change)
+                        seen = False
                 for j in range(size):
                     seen |= b[j] != 0.0
                 if seen:

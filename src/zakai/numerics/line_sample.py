@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper
-from zakai.numerics.line_terms import OBSERVED, exponent_added, observation_of
-from zakai.numerics.line_weak import weaken
+from zakai.numerics.line_terms import exponent_added
 
 Array = NDArray[Any]
 
@@ -17,35 +16,17 @@ _IMPOSSIBLE = -1e8  # logarithm of a likelihood where a formula has no value
 
 
 @helper
-def likelihood(table: Array, outputs: Array, precision: Array, observed: Array, at: int, b: Array) -> float:
-    """Write the logarithm b of the likelihood relative to its value at a point, which is returned without its constant."""
-    h, gained = observation_of(table, outputs), 0.0
+def likelihood(h: Array, centre: Array, precision: Array, observed: Array, b: Array) -> float:
+    """Write the logarithm b of the likelihood relative to where h is `centre` (m,); return it there, without its constant."""
+    gained = 0.0
     for j in range(b.size):
         b[j] = 0.0
-    exponent_added(h, precision, observed, 1.0, 1.0, at, b)
+    exponent_added(h, centre, precision, observed, 1.0, 1.0, b)
     for i in range(observed.size):
         for l in range(observed.size):
             if precision[i, l] != 0.0:
-                gained -= 0.5 * (observed[i] - h[i, at]) * precision[i, l] * (observed[l] - h[l, at])
+                gained -= 0.5 * (observed[i] - centre[i]) * precision[i, l] * (observed[l] - centre[l])
     return gained
-
-
-@helper
-def weakened(
-    table: Array, outputs: Array, precision: Array, observed: Array, at: int, fine: Array, start: int, b: Array, change: Array
-) -> None:
-    """Replace b by its values in the weak sense; write the relative difference of another rule (`line_weak.weaken`)."""
-    centre, seen = np.empty(observed.size), False
-    for i in range(observed.size):
-        centre[i] = 0.0
-        for r in range(outputs.size):
-            centre[i] += outputs[r] * table[r, OBSERVED + i, at]
-        for l in range(observed.size):
-            seen |= precision[i, l] != 0.0
-    for j in range(b.size):
-        change[j] = 0.0
-    if seen:
-        weaken(fine, start, precision, observed, centre, b, change)
 
 
 @helper

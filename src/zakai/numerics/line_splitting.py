@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import helper
+from zakai.numerics.compiled import helper, inlined
 from zakai.numerics.line_averages import EARLY, IMPOSSIBLE, LATE, MEAN, MOST_MAGNUS, averaged, averaging
 from zakai.numerics.line_density import highest_of, moments
 from zakai.numerics.line_filters import filtered, taps_of, wrapped
@@ -36,7 +36,7 @@ _OVERFLOW = 690.0
 _STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
 
 
-@helper
+@inlined
 def divided(
     now: Array, table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, averages: Array,
     observed: Array, inside: bool, tau: float, spacing: float, closed: bool, depth: float, most: float, finest: float,

@@ -50,33 +50,34 @@ def add(to: Array, weight: float, values: Array) -> None:
 
 
 @helper
-def observation_of(table: Array, outputs: Array) -> Array:
-    """Return h (m, N), the sum of terms (R, 4 + m, N) with factors (R,)."""
-    h = np.zeros((table.shape[1] - OBSERVED, table.shape[2]))
+def observation_of(table: Array, outputs: Array, at: int) -> tuple[Array, Array]:
+    """Return h (m, N), the sum of terms (R, 4 + m, N) with factors (R,), and its values (m,) at a point."""
+    h, centre = np.zeros((table.shape[1] - OBSERVED, table.shape[2])), np.empty(table.shape[1] - OBSERVED)
     for r in range(outputs.size):
         if outputs[r] != 0.0:
-            for i in range(h.shape[0]):
+            for i in range(centre.size):
                 add(h[i], outputs[r], table[r, OBSERVED + i])
-    return h
+    for i in range(centre.size):
+        centre[i] = h[i, at]
+    return h, centre
 
 
 @helper
-def exponent_added(h: Array, precision: Array, observed: Array, weight: float, share: float, at: int, b: Array) -> float:
-    """Add h'S^-1 (weight y - share h / 2) less its value at a point, which is returned.
+def exponent_added(h: Array, centre: Array, precision: Array, observed: Array, weight: float, share: float, b: Array) -> float:
+    """Add h'S^-1 (weight y - share h / 2) less its value where h is `centre` (m,); return that value.
 
     Large numbers cancel in this way before they are squared.
     """
     constant = 0.0
-    for i in range(h.shape[0]):
-        weighted, centre = 0.0, h[i, at]
-        for l in range(h.shape[0]):
+    for i in range(centre.size):
+        weighted, own = 0.0, h[i]
+        for l in range(centre.size):
             if precision[i, l] != 0.0:
-                weighted += precision[i, l] * (weight * observed[l] - share * h[l, at])
-                constant += centre * precision[i, l] * (weight * observed[l] - 0.5 * share * h[l, at])
-                pull, other = 0.5 * share * precision[i, l], h[l, at]
+                weighted += precision[i, l] * (weight * observed[l] - share * centre[l])
+                constant += centre[i] * precision[i, l] * (weight * observed[l] - 0.5 * share * centre[l])
+                pull, other = 0.5 * share * precision[i, l], h[l]
                 for j in range(b.size):
-                    b[j] -= pull * (h[l, j] - other) * (h[i, j] - centre)
-        if weighted != 0.0:
-            for j in range(b.size):
-                b[j] += weighted * (h[i, j] - centre)
+                    b[j] -= pull * (other[j] - centre[l]) * (own[j] - centre[i])
+        for j in range(b.size):
+            b[j] += weighted * (own[j] - centre[i])
     return constant

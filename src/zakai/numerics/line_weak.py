@@ -77,12 +77,11 @@ def weaken(fine: Array, start: int, precision: Array, observed: Array, centre: A
         change: receives the relative difference of another rule.
     """
     m, size, length = fine.shape[0], b.size, (b.size + 2 * REACH - 1) * PARTS
-    h, logs = np.empty((m, length + 1)), np.zeros(length + 1)
+    h, logs = np.empty((m, length)), np.zeros(length)
     for i in range(m):
         for f in range(length):
             h[i, f] = fine[i, start * PARTS + f]
-        h[i, length] = centre[i]
-    exponent_added(h, precision, observed, 1.0, 1.0, length, logs)
+    exponent_added(h, centre, precision, observed, 1.0, 1.0, logs)
     tops = np.empty(length // PARTS)
     for cell in range(tops.size):
         tops[cell] = -np.inf
