@@ -77,7 +77,7 @@ CALLED = {
     "engine/results.py": {"zakai.report", "zakai.report.axes", "zakai.engine.forecast", "zakai.engine.residuals"},
     # The parts of one method.
     "methods/_space.py": {"zakai.methods._space_direct", "zakai.methods._space_kolmogorov"},
-    "methods/_line_system.py": {"zakai.methods._line_loop"},
+    "methods/_line_system.py": {"zakai.methods._line_steps"},
 }
 
 

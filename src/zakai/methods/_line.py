@@ -21,6 +21,7 @@ from zakai.errors import InputError
 from zakai.methods import _line_loop as loop
 from zakai.methods._line_cross import OMITTED
 from zakai.methods._line_domain import on_the_line, variable_of
+from zakai.methods._line_grids import SHARED
 from zakai.methods._line_model import System
 from zakai.methods._line_moves import Report, by_decomposition, by_kernel, by_substeps
 from zakai.methods._line_prior import averaged
@@ -44,8 +45,8 @@ from zakai.models.prior import DensityPrior, GaussianPrior
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel, around, chosen
 from zakai.numerics.line_density import separated
-from zakai.numerics.line_loop import RELIABLE
 from zakai.numerics.line_posterior import General, Likelihood, multiplied
+from zakai.numerics.line_segment import RELIABLE
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 from zakai.records.schedule import Schedule
 
@@ -73,7 +74,7 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
     negligible = 1e-13 if system.samples else float(np.clip(1e-6 * tolerance, 1e-13, 1e-10))
     if system.kinked_drift:  # the spectrum of a density falls slowly
         negligible = max(negligible, SLOW * float(tolerance))
-    generous = loop.SHARED if system.samples and not system.moving else GENEROUS
+    generous = SHARED if system.samples and not system.moving else GENEROUS
     lengths, inside = schedule.lengths, schedule.inside
     found = Prepared(model, schedule, theta, system, float(tolerance), lengths, inside, negligible, generous, float(tolerance))
     if found.kinked:  # a grid is finer, and another one takes long to prepare

@@ -10,51 +10,31 @@ from typing import Any
 
 import numpy as np
 
+from zakai.methods._line_grids import grid_of
+from zakai.methods._line_steps import steps_of
 from zakai.methods._line_system import (
     FINEST,
-    Coefficients,
     Prepared,
     State,
     edge_of_moments,
     figures,
     outside_tables,
     resampled,
-    spectral,
     state_moments,
     tables,
 )
 from zakai.methods._protocol import Info, Infos
 from zakai.numerics import line_window as lw
-from zakai.numerics.line_channel import Channels
 from zakai.numerics.line_density import support
 from zakai.numerics.line_filters import BAND
-from zakai.numerics.line_loop import (
-    AFTER,
-    COLUMNS,
-    FACTOR,
-    FAILED,
-    KERNEL,
-    MARGIN,
-    RANGE,
-    Grid,
-    Limits,
-    Steps,
-    advance,
-)
+from zakai.numerics.line_loop import advance
 from zakai.numerics.line_modes import narrow
-from zakai.numerics.line_panels import GAUSS_NODES, interpolation
-from zakai.numerics.line_terms import CELL, DRIFT, OBSERVED, PHI, SLOPE
-from zakai.numerics.line_weak import at_nodes, nodes
+from zakai.numerics.line_segment import AFTER, COLUMNS, FACTOR, FAILED, RANGE, Limits, Steps
 
 LARGER = 0.2  # margin of a new grid, relative to the range of the density
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
-BLOCK = 2048  # points by which the tables of a spacing are apart; a table has twice as many
 TOGETHER = 32  # intervals whose tables of coefficients in time are computed together
-SHARED = 128  # points of the largest grid on which many steps share a decomposition
-RESOLVED = 1e-8  # relative error of the interpolants of coefficients in time
-PROBES = np.linspace(0.0, 1.0, 129)  # parts of an interval at which coefficients are compared with their interpolants
-LOBATTO = np.array([0.0, 0.5 - 0.5 / np.sqrt(5.0), 0.5 + 0.5 / np.sqrt(5.0)])  # nodes within a spacing
 HEALTH = {
     "edge_mass": "edge",
     "negative_mass": "negative",
@@ -64,210 +44,6 @@ HEALTH = {
     "error_estimate": "error",
 }
 _AT = {name: i for i, name in enumerate(COLUMNS)}
-
-
-def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
-    """Return what the loop knows of a grid, None where the operator has no decomposition or a formula no value."""
-    if not prepared.gaussian:
-        found: tuple[Grid | None] = prepared.once(("grid", window), lambda: (_decomposed_grid(prepared, window),))
-        return found[0]
-    index, size = round(window.centre / window.spacing), window.size
-    if window.closed:
-        begin, length = 0, size
-    elif prepared.mixed:
-        begin, length = index - size // 2 - MARGIN, size + 2 * MARGIN
-    else:
-        begin, length = BLOCK * round(index / BLOCK) - BLOCK, 2 * BLOCK
-    start = 0 if window.closed else index - size // 2 - begin
-    offsets = window.offsets if window.closed else window.spacing * (begin + np.arange(float(length)))
-    if prepared.mixed:
-        table = _mixed(prepared, window, window.origin + offsets, rows)
-    else:
-        key = ("table", window.origin, window.spacing, begin, length)
-        table = prepared.once(key, lambda: _separated(prepared, window, window.origin + offsets))
-    if not np.isfinite(table[:, :, OBSERVED:, start : start + size]).all():
-        return None
-    offset = window.origin - prepared.origin + float(offsets[0])
-    fine = _fine(prepared, window, window.origin + offsets)
-    return Grid(_NONE[None], _NONE[None], _NONE, table, 0.0, start, offset, window.spacing, window.closed, fine)
-
-
-_NONE = np.zeros(0)
-
-
-def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
-    # The decomposition of a large grid takes longer than steps on a coarser one.
-    if window.size > SHARED and not window.closed and not prepared.kinked:
-        return None
-    decomposed = spectral(prepared, window)
-    if decomposed is None or not (decomposed.scale > 0).all():
-        return None
-    table = _separated(prepared, window, window.points)
-    table[0, 0, PHI] = np.log(decomposed.scale)
-    if not np.isfinite(table[0, 0, [PHI, *range(OBSERVED, table.shape[2])]]).all():
-        return None
-    modes, covariance = np.ascontiguousarray(decomposed.modes), float(np.max(tables(prepared, window).covariance))
-    fine = _fine(prepared, window, window.points)
-    return Grid(
-        modes, np.ascontiguousarray(modes.T), decomposed.rates, table, covariance, 0, 0.0, window.spacing, window.closed, fine
-    )
-
-
-def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:
-    """Return the terms (1, R, 4 + m, T) of f and h at points (T,)."""
-    system, start, theta = prepared.system, prepared.model.start, prepared.theta
-    assert system.separated is not None
-    parts = np.moveaxis(system.separated[1](_nodes(window, x), start, theta), 0, -1)
-    table = np.zeros((1, len(parts), OBSERVED + system.m, len(x)))
-    table[0, :, CELL] = _cells(window, parts[:, 0])
-    table[0, :, DRIFT:] = parts[..., :-1:3]
-    if prepared.yau is not None:
-        table[0, 0, PHI] = prepared.yau.potential(x, start, theta)
-    return table
-
-
-def _fine(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:
-    """Return an h with kinks, of samples, at the nodes of points (m, F), else nothing."""
-    system = prepared.system
-    if not prepared.weak:
-        return _NONE[None]
-
-    def make() -> np.ndarray:
-        points = nodes(x, window.spacing)[:, None]
-        return at_nodes(system.observation(points, prepared.model.start, prepared.theta).T)
-
-    found: np.ndarray = prepared.once(("fine", window.origin, window.spacing, float(x[0]), len(x)), make)
-    return found
-
-
-def _nodes(window: lw.Window, x: np.ndarray) -> np.ndarray:
-    """Return Lobatto's nodes (3 T + 1, 1) of the spacings above points (T,)."""
-    return np.append((x[:, None] + window.spacing * LOBATTO).reshape(-1), x[-1] + window.spacing)[:, None]
-
-
-def _cells(window: lw.Window, f: np.ndarray) -> np.ndarray:
-    """Return the integrals (..., T) of f over spacings from values at Lobatto's nodes (..., 3 T + 1)."""
-    ends, inner = f[..., ::3], f[..., 1::3] + f[..., 2::3]
-    return np.asarray(window.spacing / 12.0 * (ends[..., :-1] + 5.0 * inner + ends[..., 1:]))
-
-
-def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) -> np.ndarray:
-    """Return terms (K, 7, 4 + m, T) at points (T,): f and h at the Gauss nodes of intervals and, for samples, at their ends.
-
-    Those of intervals in which the nodes do not resolve the coefficients are NaN.
-    """
-    system, theta, count = prepared.system, prepared.theta, len(GAUSS_NODES)
-    starts, lengths = prepared.schedule.starts[rows, None], prepared.lengths[rows, None]
-    times = np.concatenate([starts + lengths * GAUSS_NODES, starts + lengths], axis=1)
-    table = np.zeros((*times.shape, OBSERVED + system.m, len(x)))
-    f = system.drift(_nodes(window, x), times[..., None], theta)[..., 0]
-    table[..., CELL, :], table[..., DRIFT, :] = _cells(window, f), f[..., :-1:3]
-    assert system.slope is not None
-    table[..., SLOPE, :] = system.slope(x[:, None], times[..., None], theta)[..., 0]
-    table[..., OBSERVED:, :] = np.moveaxis(system.observation(x[:, None], times[..., None], theta), -1, 2)
-    at = window.points[:: max(1, window.size // 8), None]
-
-    def coefficients(t: np.ndarray) -> np.ndarray:
-        f: np.ndarray = system.drift(at, t[..., None], theta)[..., 0]
-        if system.samples:
-            return f
-        return np.concatenate([f, system.observation(at, t[..., None], theta).reshape(*t.shape, -1)], axis=-1)
-
-    known = coefficients(times[:, :count])
-    table[~resolved(coefficients(probed(starts, lengths)), known), :, :OBSERVED] = np.nan
-    return table
-
-
-def coefficients_of(prepared: Prepared) -> Coefficients:
-    """Return what the loop needs of the coefficients in time of all intervals."""
-    schedule, system, theta = prepared.schedule, prepared.system, prepared.theta
-    count, seen, m = len(schedule), schedule.seen, system.m
-    starts, lengths, stops = schedule.starts[:, None], prepared.lengths[:, None], schedule.stops[:, None]
-    nodes = starts + lengths * GAUSS_NODES if prepared.timed else np.full((count, 1), prepared.model.start)
-    nodes = np.clip(nodes, starts, np.nextafter(stops, starts)) if prepared.timed else nodes
-    ends = stops if system.samples else nodes
-    if not system.samples and prepared.timed and system.steady_observation and system.steady_noise:
-        ends = nodes[:, :1]
-
-    def covariance(t: np.ndarray) -> np.ndarray:
-        G = system.covariance(np.zeros((1, 1, 1)), t, theta)[..., 0, 0] if prepared.divides else np.zeros(1)
-        return np.array(np.broadcast_to(G, t.shape))
-
-    def factors(t: np.ndarray) -> np.ndarray:
-        if prepared.mixed:  # the terms of the table are those at the nodes and at the end
-            rows = [len(GAUSS_NODES)] if system.samples and t.shape[1] == 1 else range(t.shape[1])
-            return np.broadcast_to(np.eye(len(GAUSS_NODES) + 1)[rows], (count, t.shape[1], len(GAUSS_NODES) + 1)).copy()
-        assert system.separated is not None
-        found: np.ndarray = system.separated[0](_X, t, theta)
-        return np.array(np.broadcast_to(found, (*t.shape, found.shape[-1])))
-
-    def precision(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if system.general:  # the loop takes only intervals without observations
-            return np.zeros((*t.shape, m, m)), np.zeros(count)
-        noise = np.broadcast_to(system.noise(_X, t, theta), (*t.shape, m, m))
-        both = (seen[:, :, None] & seen[:, None])[:, None]
-        block = np.where(both, noise, 0.0) + np.eye(m) * ~seen[:, None, :, None]
-        constant = np.zeros(count)
-        if system.samples:
-            constant = -0.5 * (np.linalg.slogdet(block[:, 0])[1] + np.log(2 * np.pi) * seen.sum(axis=1))
-        return np.where(both, np.linalg.inv(block), 0.0), constant
-
-    drifts, outputs, covariances, (precisions, constants) = factors(nodes), factors(ends), covariance(nodes), precision(ends)
-    good = np.ones(count, bool)
-    if prepared.timed and count:
-        t = probed(starts, lengths)
-        good &= resolved(covariance(t)[..., None], covariances[..., None])
-        if not prepared.mixed:
-            good &= resolved(factors(t), factors(nodes))
-        if not system.samples and not system.steady_noise:
-            good &= resolved(precision(t)[0], precisions)
-    return Coefficients(drifts, outputs, covariances, precisions, constants, good)
-
-
-_X = np.zeros((1, 1, 1))
-
-
-def probed(starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Return times (K, P) at which coefficients are compared with their interpolants, of which the last are before the ends."""
-    return np.clip(starts + lengths * PROBES, starts, np.nextafter(starts + lengths, starts))
-
-
-def resolved(exact: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Return whether the interpolants of values at the nodes (K, Q, ...) agree with those at the probes (K, P, ...)."""
-    exact, nodes = exact.reshape(*exact.shape[:2], -1), nodes.reshape(*nodes.shape[:2], -1)
-    scale = np.maximum(np.abs(exact).max(axis=1), 1e-300)
-    rest = np.abs(_TO_PROBES @ nodes - exact).max(axis=1) / scale
-    return np.asarray(rest.max(axis=1) <= RESOLVED)
-
-
-_TO_PROBES = interpolation(PROBES)
-
-
-def _numbers(c: Channels, rates: np.ndarray) -> np.ndarray:
-    """Return a, b, V, k0, k1, k2 (K, 6) of kernels for rates of observations (K, m)."""
-    inputs = [np.ones(len(c.scale)), *rates.T]
-    shift, slope, constant = np.zeros(len(c.scale)), np.zeros(len(c.scale)), np.zeros(len(c.scale))
-    for i, one in enumerate(inputs):
-        shift, slope = shift + c.shift[:, i] * one, slope + c.slope[:, i] * one
-        for j, other in enumerate(inputs):
-            constant = constant + c.constant[:, i, j] * one * other
-    return np.stack([c.scale, shift, c.variance, constant, slope, c.curvature], axis=1)
-
-
-def steps_of(prepared: Prepared, rows: slice, observed: np.ndarray) -> Steps:
-    """Return the steps of some intervals."""
-    kinds, lengths, kernels = prepared.kinds[rows], prepared.lengths[rows], prepared.kernels
-    channels = np.full((len(kinds), 6), np.nan)
-    here = np.flatnonzero((kinds == KERNEL) | (kinds == FACTOR))
-    if prepared.gaussian and kernels is not None and len(here):
-        which = kernels.place[rows][here]
-        rates = np.where((kinds == KERNEL)[:, None], observed / lengths[:, None], 0.0)[here]
-        channels[here] = _numbers(Channels(*(part[which] for part in kernels.channels)), rates)
-    observed = np.ascontiguousarray(observed, float)
-    c = Coefficients(*(part[rows] for part in prepared.coefficients))
-    precisions = np.where((kinds == KERNEL)[:, None, None, None], 0.0, c.precisions)
-    lengths = np.ascontiguousarray(lengths)
-    return Steps(kinds, lengths, observed, precisions, c.constants, channels, c.drifts, c.outputs, c.covariances)
 
 
 def run(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[list[State], Infos] | None:

@@ -9,6 +9,7 @@ from scipy.special import erfc
 
 from zakai.methods._line_system import State
 from zakai.numerics import line_window as lw
+from zakai.numerics.line_polynomial import local_polynomial
 
 Array = Any
 
@@ -49,7 +50,7 @@ class Message(NamedTuple):
 
     def at(self, offsets: Array) -> Array:
         """Return log b at offsets from the origin (J,)."""
-        return lw.local_polynomial(self.logs, self.window, offsets)
+        return local_polynomial(self.logs, self.window, offsets)
 
     def between(self, low: float, high: float) -> Message:
         """Return the message on its points between two offsets, and on those that hold them."""

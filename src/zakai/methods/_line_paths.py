@@ -25,6 +25,7 @@ from zakai.methods._line_domain import variable_of
 from zakai.methods._line_system import Prepared, State
 from zakai.numerics import line_window as lw
 from zakai.numerics.complex_step import STEP
+from zakai.numerics.line_polynomial import local_polynomial
 from zakai.numerics.transition import Array
 
 RELIABLE = 1e-10  # of the maximum: a density whose derivative is not rounding
@@ -54,7 +55,7 @@ def draw(prepared: Prepared, k: int, later: Array, values: Array, state: State, 
     law, window, ends = _law(prepared, k, values, state)
     offsets = z - window.origin
     offsets = window.centre + wrap(offsets - window.centre) if window.closed else np.clip(offsets, *ends)
-    shift, deviation, skewness, kurtosis = (lw.local_polynomial(part, window, offsets) for part in law)
+    shift, deviation, skewness, kurtosis = (local_polynomial(part, window, offsets) for part in law)
     departure = float(np.sqrt(np.mean(skewness**2 + kurtosis**2)))
     if not np.isfinite(departure) or (window.closed and np.max(deviation) > WIDE):
         departure = np.inf

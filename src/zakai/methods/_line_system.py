@@ -16,9 +16,9 @@ from zakai.methods._series_kernel import PowerSeries
 from zakai.models.model import Model
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_density import support
-from zakai.numerics.line_loop import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Mechanisms
 from zakai.numerics.line_operator import Spectral
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
+from zakai.numerics.line_segment import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Mechanisms
 from zakai.numerics.line_weak import PARTS, at_nodes, nodes, weak
 from zakai.records.schedule import Schedule
 
@@ -159,7 +159,7 @@ class Prepared:
     @cached_property
     def coefficients(self) -> Coefficients:
         """The coefficients in time of all intervals."""
-        from zakai.methods._line_loop import coefficients_of
+        from zakai.methods._line_steps import coefficients_of
 
         return coefficients_of(self)
 

@@ -16,6 +16,7 @@ from zakai.methods._line_model import within
 from zakai.methods._line_moves import Moved, Report
 from zakai.methods._line_system import Prepared, covariance_at, finite
 from zakai.numerics import line_window as lw
+from zakai.numerics.line_polynomial import local_polynomial
 from zakai.numerics.line_volumes import Bands, Volumes, advanced, ends_of_steps, volumes
 
 Array = Any
@@ -92,7 +93,7 @@ class Worth(NamedTuple):
     def at(self, offsets: Array) -> Array:
         """Return the values at offsets from the origin (J,)."""
         s = np.arcsinh((offsets - self.cells.centre) / self.cells.scale)
-        return lw.local_polynomial(self.values, self.cells.logarithmic, s)
+        return local_polynomial(self.values, self.cells.logarithmic, s)
 
 
 def pulled_back(

@@ -21,6 +21,7 @@ from zakai.methods._line_volumes import pulled_back
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_operator import Spectral, exponential_action
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
+from zakai.numerics.line_polynomial import local_polynomial
 
 Array = Any
 
@@ -146,7 +147,7 @@ class Way:
             return values if window.closed else values * taper(window.offsets, later.ends, window.spacing), top
         # Integrals of psi with what the coarse grid resolves.
         fine = covering(later.window, *later.ends, later.spacing)
-        logs = later.at(fine.offsets) + lw.local_polynomial(gauge, window, fine.offsets)
+        logs = later.at(fine.offsets) + local_polynomial(gauge, window, fine.offsets)
         top = float(np.max(logs))
         values = fine.spacing * np.exp(logs - top) * taper(fine.offsets, later.ends, fine.spacing)
         return lw.gathered(values, fine.offsets, window), top

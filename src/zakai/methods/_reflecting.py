@@ -35,8 +35,8 @@ from zakai.methods._reflecting_moves import (
 )
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior, GaussianPrior
-from zakai.numerics.line_loop import RELIABLE
 from zakai.numerics.line_posterior import General, Likelihood
+from zakai.numerics.line_segment import RELIABLE
 from zakai.numerics.lobatto import Element
 from zakai.numerics.prior_grid import mixture_log_density
 

@@ -21,7 +21,7 @@ from zakai.methods._power_series import Schroedinger, Series, power_series, schr
 from zakai.models.model import Model
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.flow import FlowResult
-from zakai.numerics.line_channel import Channels
+from zakai.numerics.line_collocation import Channels
 from zakai.numerics.series import apply, dot, value
 from zakai.numerics.transition import Array, Transition, at, compose, identity, symmetric, transposed
 

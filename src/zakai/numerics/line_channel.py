@@ -21,41 +21,19 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import complex128, float64, int64, void
+from numba import float64
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
+from zakai.numerics.line_collocation import NODES, STAGES, Channels, Coefficients, collocated
 
 Array = NDArray[Any]
 
-_STAGES = 8
 _LONGEST = 0.5  # norm of the Hamiltonian times the length of a step
 _MOST = 1024  # steps of one interval that are computed together
 _MOST_POWER = 20  # of two: steps of one interval
 _PROBES = 65  # times of an interval at which coefficients are compared with their interpolants, at least
 _RESOLVED = 1e-11
-
-
-class Coefficients(NamedTuple):
-    """L, G and Q at times (...); l, p and r (..., k), an entry for each input."""
-
-    matrix: Array
-    offset: Array
-    covariance: Array
-    quadratic: Array
-    linear: Array
-    constant: Array
-
-
-class Channels(NamedTuple):
-    """The kernels exp(e'k0 e + k1.e y + k2 y^2) N(x; a y + b.e, V) of K intervals: a, V, k2 (K,), b, k1 (K, k), k0 (K, k, k)."""
-
-    scale: Array
-    shift: Array
-    variance: Array
-    constant: Array
-    slope: Array
-    curvature: Array
 
 
 class Channel(NamedTuple):
@@ -115,18 +93,6 @@ def _symmetric(a: Array, b: Array) -> Array:
     return np.asarray(0.5 * (outer + np.swapaxes(outer, 1, 2)))
 
 
-def _collocation() -> tuple[Array, Array, Array]:
-    nodes, weights = np.polynomial.legendre.leggauss(_STAGES)
-    nodes, weights = (nodes + 1.0) / 2.0, weights / 2.0
-    powers = np.arange(_STAGES)
-    integrals = nodes[:, None] ** (powers + 1) / (powers + 1)
-    matrix = integrals @ np.linalg.inv(nodes[:, None] ** powers)
-    return nodes, matrix, weights
-
-
-_NODES, _MATRIX, _WEIGHTS = (np.ascontiguousarray(part) for part in _collocation())
-
-
 def channels(
     coefficients: Callable[[Array, Array], Coefficients], starts: Array, lengths: Array, steady: bool
 ) -> tuple[Channels, Array]:
@@ -152,8 +118,8 @@ def channels(
         level = int(power[waiting].min())
         rows = waiting[power[waiting] == level]
         if steady:
-            c = coefficients(np.broadcast_to(starts[rows, None], (len(rows), _STAGES)), rows[:, None])
-            found = _steps(c, lengths[rows] * 0.5**level)
+            c = coefficients(np.broadcast_to(starts[rows, None], (len(rows), STAGES)), rows[:, None])
+            found = collocated(c, lengths[rows] * 0.5**level)
             for _ in range(level):
                 found = then(found, found)
             good = np.ones(len(rows), bool)
@@ -193,7 +159,7 @@ def nodes_of(coefficients: Callable[[Array, Array], Coefficients], starts: Array
     resolved = np.ones(len(rows), bool)
     for part in c:
         resolved &= _missed(np.ascontiguousarray(part.real, float).reshape(*times.shape, -1), _TO_PROBES) < _RESOLVED
-    return Nodes(Coefficients(*(part[:, :_STAGES] for part in c)), rate, resolved)
+    return Nodes(Coefficients(*(part[:, :STAGES] for part in c)), rate, resolved)
 
 
 def parts(
@@ -206,12 +172,12 @@ def parts(
     known = nodes_of(coefficients, starts, lengths) if known is None else known
     nodes, good = known.values, known.resolved & (known.rate * lengths <= _LONGEST * count)
     if count > 1:
-        ends = (np.arange(count)[:, None] + _NODES).reshape(-1) / count
-        matrix = np.polynomial.legendre.legvander(2 * ends - 1, _STAGES - 1) @ _FROM_NODES
+        ends = (np.arange(count)[:, None] + NODES).reshape(-1) / count
+        matrix = np.polynomial.legendre.legvander(2 * ends - 1, STAGES - 1) @ _FROMNODES
         nodes = Coefficients(
-            *(_interpolated(matrix, part).reshape(len(starts) * count, _STAGES, *part.shape[2:]) for part in nodes)
+            *(_interpolated(matrix, part).reshape(len(starts) * count, STAGES, *part.shape[2:]) for part in nodes)
         )
-    found, errors = _steps(nodes, np.repeat(lengths / count, count)), np.zeros(len(starts))
+    found, errors = collocated(nodes, np.repeat(lengths / count, count)), np.zeros(len(starts))
     if not good.all():
         bad = np.flatnonzero(~good)
         length = lengths[bad] / count
@@ -225,10 +191,10 @@ def parts(
     return found, errors
 
 
-_FROM_NODES = np.linalg.inv(np.polynomial.legendre.legvander(2 * _NODES - 1, _STAGES - 1))
+_FROMNODES = np.linalg.inv(np.polynomial.legendre.legvander(2 * NODES - 1, STAGES - 1))
 _AT = np.linspace(0.0, 1.0, _PROBES)
-_CHECKED = np.concatenate([_NODES, _AT])
-_TO_PROBES = np.polynomial.legendre.legvander(2 * _AT - 1, _STAGES - 1) @ _FROM_NODES
+_CHECKED = np.concatenate([NODES, _AT])
+_TO_PROBES = np.polynomial.legendre.legvander(2 * _AT - 1, STAGES - 1) @ _FROMNODES
 
 
 @kernel(float64[::1](float64[:, :, ::1], float64[:, ::1]))
@@ -285,10 +251,10 @@ def _divided(
     length = lengths / count
     begins = (starts[:, None] + lengths[:, None] * (np.arange(count) / count)).reshape(-1)
     each, own = np.repeat(length, count), np.repeat(rows, count)
-    c = coefficients(begins[:, None] + each[:, None] * _NODES, own[:, None])
+    c = coefficients(begins[:, None] + each[:, None] * NODES, own[:, None])
     probes = np.linspace(0.0, 1.0, max(_PROBES // count, 9))
-    basis = np.polynomial.legendre.legvander(2 * _NODES - 1, _STAGES - 1)
-    to_probes = np.polynomial.legendre.legvander(2 * probes - 1, _STAGES - 1) @ np.linalg.inv(basis)
+    basis = np.polynomial.legendre.legvander(2 * NODES - 1, STAGES - 1)
+    to_probes = np.polynomial.legendre.legvander(2 * probes - 1, STAGES - 1) @ np.linalg.inv(basis)
     true = coefficients(begins[:, None] + each[:, None] * probes, own[:, None])
     rest = np.zeros(len(rows))
     for values, known in zip(true, c, strict=True):
@@ -296,134 +262,7 @@ def _divided(
         apart = np.abs(to_probes @ known - values).max(axis=1).reshape(len(rows), count, -1).mean(axis=1)
         scale = np.abs(values).max(axis=1).reshape(len(rows), count, -1).max(axis=1)
         rest = np.maximum(rest, (apart / np.maximum(scale, 1e-300)).max(axis=1))
-    found = _steps(c, each)
+    found = collocated(c, each)
     while len(found.scale) > len(rows):
         found = then(Channels(*(part[0::2] for part in found)), Channels(*(part[1::2] for part in found)))
     return found, rest
-
-
-def _steps(c: Coefficients, length: Array) -> Channels:
-    """One step each of Gauss' collocation method (order 16); coefficients (K, stages)."""
-    kind = np.result_type(*c)
-    inputs = c.offset.shape[-1]
-    arrays = [np.ascontiguousarray(part, kind) for part in c]
-    found = np.empty((len(length), 3 + 2 * inputs + inputs * inputs), kind)
-    _collocated(*arrays, np.ascontiguousarray(length, float), _MATRIX, _WEIGHTS, found)
-    shift, slope = found[:, 3 : 3 + inputs], found[:, 3 + inputs : 3 + 2 * inputs]
-    constant = found[:, 3 + 2 * inputs :].reshape(-1, inputs, inputs)
-    return Channels(found[:, 0], shift, found[:, 1], constant, slope, found[:, 2])
-
-
-_F, _C = float64, complex128
-
-
-_COLLOCATED = [
-    void(t[:, ::1], t[:, :, ::1], t[:, ::1], t[:, ::1], t[:, :, ::1], t[:, :, ::1], _F[::1], _F[:, ::1], _F[::1], t[:, ::1])
-    for t in (_F, _C)
-]
-
-
-@kernel(*_COLLOCATED)
-def _collocated(
-    L: Array, l: Array, G: Array, Q: Array, p: Array, r: Array, lengths: Array, matrix: Array, weights: Array, found: Array
-) -> None:
-    """Write a, V, k2, b, k1, k0 of each interval, by quadrature.
-
-    V' = G + 2 (L + Q V) V,   a' = F a,   b' = F b + l + V p,   F = L + 2 Q V,
-    k2' = Q a^2,   k1' = (2 Q b + p) a,   k0' = Q b^2 + p b + r + Q V + L.
-    """
-    stages, inputs = l.shape[1], l.shape[2]
-    V, rate, a, b = np.zeros(stages, L.dtype), np.zeros(stages, L.dtype), np.zeros(stages, L.dtype), np.zeros(stages, L.dtype)
-    before = np.zeros((inputs, stages), L.dtype)
-    for k in range(lengths.size):
-        tau, row = lengths[k], found[k]
-        for i in range(stages):
-            V[i] = 0.0 * L[k, 0]
-        for _ in range(60):
-            for i in range(stages):
-                rate[i] = G[k, i] + 2.0 * (L[k, i] + Q[k, i] * V[i]) * V[i]
-            change, largest = 0.0, 0.0
-            for i in range(stages):
-                total = 0.0 * rate[0]
-                for j in range(stages):
-                    total += matrix[i, j] * rate[j]
-                change, largest = max(change, abs((tau * total - V[i]).real)), max(largest, abs(total.real) * tau)
-                V[i] = tau * total
-            if not (change > 1e-17 * largest):
-                break
-        log_a, variance = 0.0 * rate[0], 0.0 * rate[0]
-        for i in range(stages):
-            variance += tau * weights[i] * (G[k, i] + 2.0 * (L[k, i] + Q[k, i] * V[i]) * V[i])
-            rate[i] = L[k, i] + 2.0 * Q[k, i] * V[i]
-            log_a += tau * weights[i] * rate[i]
-        for i in range(stages):
-            total = 0.0 * rate[0]
-            for j in range(stages):
-                total += matrix[i, j] * rate[j]
-            a[i] = np.exp(tau * total)
-        row[0], row[1], row[2] = np.exp(log_a), variance, 0.0
-        for i in range(stages):
-            row[2] += tau * weights[i] * Q[k, i] * a[i] * a[i]
-        for e in range(inputs):
-            shift, slope = 0.0 * rate[0], 0.0 * rate[0]
-            for i in range(stages):
-                b[i] = (l[k, i, e] + V[i] * p[k, i, e]) / a[i]
-                shift += tau * weights[i] * b[i]
-            for i in range(stages):
-                total = 0.0 * rate[0]
-                for j in range(stages):
-                    total += matrix[i, j] * b[j]
-                before[e, i] = tau * total * a[i]
-                slope += tau * weights[i] * (2.0 * Q[k, i] * before[e, i] + p[k, i, e]) * a[i]
-            row[3 + e], row[3 + inputs + e] = row[0] * shift, slope
-        for e in range(inputs):
-            for o in range(inputs):
-                total = 0.0 * rate[0]
-                for i in range(stages):
-                    own = Q[k, i] * before[e, i] * before[o, i]
-                    own += 0.5 * (p[k, i, e] * before[o, i] + p[k, i, o] * before[e, i])
-                    if e == 0:
-                        own += 0.5 * r[k, i, o]
-                    if o == 0:
-                        own += 0.5 * r[k, i, e]
-                    if e == 0 and o == 0:
-                        own += Q[k, i] * V[i] + L[k, i]
-                    total += tau * weights[i] * own
-                row[3 + 2 * inputs + inputs * e + o] = total
-
-
-@kernel(_F[::1](_F[::1], _F, _F, int64, _F[::1], _F, _F, _F), _C[::1](_F[::1], _F, _F, int64, _C[::1], _C, _C, _C))
-def applied(
-    sources: Array, first: float, spacing: float, size: int, weights: Array, scale: Any, shift: Any, variance: Any
-) -> Array:
-    """Return sum_j N(x_i; scale y_j + shift, variance) weights_j at x_i = first + spacing i, i = 0 .. size - 1, by recurrence."""
-    found = np.zeros(size, weights.dtype)
-    half = 0.5 / variance
-    top = 1.0 / np.sqrt(2.0 * np.pi * variance)
-    falloff = np.exp(-2.0 * half * spacing * spacing)
-    for j in range(sources.size):
-        w = weights[j] * top
-        if w == 0:
-            continue
-        mean = scale * sources[j] + shift
-        near = int(np.floor((mean.real - first) / spacing + 0.5))
-        near = min(max(near, 0), size - 1)
-        rest = first + spacing * near - mean
-        peak = w * np.exp(-half * rest * rest)
-        value = peak
-        ratio = np.exp(-half * (2.0 * rest * spacing + spacing * spacing))
-        for i in range(near, size):
-            found[i] += value
-            value *= ratio
-            ratio *= falloff
-            if abs(value.real) < 1e-300:
-                break
-        value = peak
-        ratio = np.exp(-half * (-2.0 * rest * spacing + spacing * spacing))
-        for i in range(near - 1, -1, -1):
-            value *= ratio
-            ratio *= falloff
-            if abs(value.real) < 1e-300:
-                break
-            found[i] += value
-    return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import boolean, float64, int64, types
@@ -12,26 +12,6 @@ from numpy.typing import NDArray
 from zakai.numerics.compiled import helper, kernel
 
 Array = NDArray[Any]
-
-
-class Spectrum(NamedTuple):
-    """Figures of the spectrum and of the ends of a density; those of the spectrum are relative to the mass.
-
-    `left` and `right` are the largest moduli of the two outermost points on each side, relative to the maximum; `first` and
-    `last` the support; `negative` the negative share of the mass; `aliasing` the largest spectrum in the highest eighth of the
-    frequencies and `middle` that around eleven sixteenths of the highest; `highest` is the highest of the `nyquist` frequencies
-    that is not negligible.
-    """
-
-    left: float
-    right: float
-    first: float
-    last: float
-    negative: float
-    aliasing: float
-    middle: float
-    highest: float
-    nyquist: float
 
 
 @helper
@@ -119,7 +99,14 @@ _F = float64
 
 @kernel(types.UniTuple(_F, 9)(_F[::1], _F, _F, _F[:, ::1], _F[:, ::1]))  # type: ignore[no-untyped-call]
 def spectrum(values: Array, cut: float, negligible: float, cosines: Array, sines: Array) -> tuple[float, ...]:
-    """Return the entries of `Spectrum` of values (N,), N > 2; of a large grid few frequencies are computed."""
+    """Return figures of the ends and of the spectrum of values (N,), N > 2; of a large grid few frequencies are computed.
+
+    Returns:
+        The largest moduli of the two outermost points on the left and on the right, relative to the maximum; the first and last
+        point above `cut` times the maximum; the negative share of the mass; relative to the mass, the largest spectrum in the
+        highest eighth of the frequencies, and around eleven sixteenths of the highest; the highest frequency that is not
+        negligible, and the number of frequencies.
+    """
     size = values.shape[0]
     nyquist = size // 2
     top, total, mass = 0.0, 0.0, 0.0

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import float64
+from numba import complex128, float64, int64
 from numpy.typing import NDArray
 from scipy.special import erfc
 
@@ -187,3 +187,46 @@ def convolved(
             late[j], early[j] = late[j] * gauge[j], 1.0
         rounding, clipped = filtered(now, taps_of(width, depth, size, narrow), late, early, narrow)
     return Transition(0.0, rounding, clipped, variance, a, needed, exponent)
+
+
+_APPLIED = [
+    t[::1](float64[::1], float64, float64, int64, t[::1], t, t, t)  # type: ignore[call-overload]
+    for t in (float64, complex128)
+]
+
+
+@kernel(*_APPLIED)
+def applied(
+    sources: Array, first: float, spacing: float, size: int, weights: Array, scale: Any, shift: Any, variance: Any
+) -> Array:
+    """Return sum_j N(x_i; scale y_j + shift, variance) weights_j at x_i = first + spacing i, i = 0 .. size - 1, by recurrence."""
+    found = np.zeros(size, weights.dtype)
+    half = 0.5 / variance
+    top = 1.0 / np.sqrt(2.0 * np.pi * variance)
+    falloff = np.exp(-2.0 * half * spacing * spacing)
+    for j in range(sources.size):
+        w = weights[j] * top
+        if w == 0:
+            continue
+        mean = scale * sources[j] + shift
+        near = int(np.floor((mean.real - first) / spacing + 0.5))
+        near = min(max(near, 0), size - 1)
+        rest = first + spacing * near - mean
+        peak = w * np.exp(-half * rest * rest)
+        value = peak
+        ratio = np.exp(-half * (2.0 * rest * spacing + spacing * spacing))
+        for i in range(near, size):
+            found[i] += value
+            value *= ratio
+            ratio *= falloff
+            if abs(value.real) < 1e-300:
+                break
+        value = peak
+        ratio = np.exp(-half * (-2.0 * rest * spacing + spacing * spacing))
+        for i in range(near - 1, -1, -1):
+            value *= ratio
+            ratio *= falloff
+            if abs(value.real) < 1e-300:
+                break
+            found[i] += value
+    return found

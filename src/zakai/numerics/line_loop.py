@@ -1,7 +1,7 @@
 """Steps on one grid in one compiled loop.
 
 The transition of an interval is by the modes of the operator (`line_modes`), a Gaussian kernel (`line_filters`) or a splitting
-into diffusion and a potential (`line_splitting`).  A sample multiplies the density after the transition (`line_sample`); an
+into diffusion and a potential (`line_splitting`).  A sample multiplies the density after the transition (`line_step`); an
 increment is a part of the potential, or of the kernel.
 
 With kernels or potentials the grid is a window of a longer table, and the loop moves it by whole spacings.  It stops before the
@@ -11,183 +11,43 @@ first step that is not accurate enough, or needs another grid or table, and retu
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import boolean, float64, int64, types
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.compiled import kernel
 from zakai.numerics.line_averages import AVERAGES
 from zakai.numerics.line_density import circular_moments, highest_of, moments, separated, spectrum, support, waves
 from zakai.numerics.line_filters import BAND, convolved
 from zakai.numerics.line_modes import LOG_NOISE, decomposed, narrow
-from zakai.numerics.line_sample import likelihood, product
+from zakai.numerics.line_segment import (
+    AFTER,
+    COLUMNS,
+    FAILED,
+    KERNEL,
+    MARGIN,
+    OK,
+    RANGE,
+    RELIABLE,
+    SPLIT,
+    TABLE,
+    Grid,
+    Limits,
+    Mechanisms,
+    Segment,
+    Steps,
+)  # fmt: skip
 from zakai.numerics.line_splitting import divided
-from zakai.numerics.line_terms import DRIFT, PHI, Transition, failed, observation_of
+from zakai.numerics.line_step import checked, copied, extent, likelihood, product
+from zakai.numerics.line_terms import PHI, Transition, failed, observation_of
 from zakai.numerics.line_weak import WEAK_SHARE, weak_error, weaken
 from zakai.numerics.line_window import ALIGNMENT, CUT
 
 Array = NDArray[Any]
 
-COLUMNS = (
-    "gained", "mean", "variance", "aliasing", "edge", "negative", "time", "depth", "growth", "made", "error", "log_floor",
-)  # fmt: skip
-# The transition: whole with a sample after it, split with increments inside, whole with increments inside, split with a sample.
-FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = 0, 1, 2, 3
-OK, FAILED, RANGE, AFTER, TABLE = 0, 1, 2, 3, 4  # why the loop ends
-RELIABLE = 1e-3  # of the promised error: smaller estimates are not reported
-MARGIN = 96  # points of a table of coefficients in time beyond the grid, of which a third may be used before it is made again
-
-
-class Mechanisms(NamedTuple):
-    """What the steps of a record may need; only that is compiled.
-
-    `modes`: transitions by modes, else `kernels` or `splits` or both; `samples`: samples after the transition; `weak`: their
-    likelihoods have kinks and act in the weak sense.
-    """
-
-    modes: bool
-    kernels: bool
-    splits: bool
-    samples: bool
-    weak: bool
-
-
-class Grid(NamedTuple):
-    """The data of a grid: `modes` (N, N), their transpose, `rates` (N,), and terms `table` (K, R, 4 + m, T) as in `line_terms`.
-
-    K = 1 where the terms do not depend on the interval.  With modes the table is that of the grid, and `covariance` the largest
-    G.  Else it is longer than the grid, which begins at `start`; the first point of the table is `offset` away from the origin of
-    the kernels.  `fine` (m, F) are the values of an h with kinks at the nodes of `line_weak`, else empty.
-    """
-
-    modes: Array
-    transposed: Array
-    rates: Array
-    table: Array
-    covariance: float
-    start: int
-    offset: float
-    spacing: float
-    closed: bool
-    fine: Array
-
-
-class Steps(NamedTuple):
-    """The K steps to take.
-
-    `kinds` (K,) are FACTOR, SPLIT, KERNEL or SPLIT_FACTOR.  `observed` (K, m) are zero where nothing is observed, as are the
-    inverses of S `precisions` (K, P, m, m).  `constants` (K,) are those of the log-likelihoods.  `channels` (K, 6) are a, b, V,
-    k0, k1, k2 of Gaussian kernels, NaN where the transition is split.  `drifts`
-    (K, Q, R) and `outputs` (K, P, R) are the factors of the terms of f and h, and `covariances` (K, Q) are G, at the Gauss nodes
-    of an interval, or one number where they do not depend on time.
-    """
-
-    kinds: Array
-    lengths: Array
-    observed: Array
-    precisions: Array
-    constants: Array
-    channels: Array
-    drifts: Array
-    outputs: Array
-    covariances: Array
-
-    def after(self, count: int) -> Steps:
-        """Return the steps without the first ones."""
-        return Steps(*(part[count:] for part in self))
-
-
-class Limits(NamedTuple):
-    """What a step must keep.
-
-    `negligible` is the spectrum that need not be resolved, `error` the largest error that is made, `splitting` that of the
-    splitting of one interval, `cut` the density relative to its maximum that a grid must hold, `generous` the size of a grid that
-    is kept though fewer points would do, and `finest` that of the largest grid that is taken so that kernels are filters of
-    positive numbers.
-    """
-
-    negligible: float
-    error: float
-    splitting: float
-    cut: float
-    generous: float
-    finest: float
-
-
-class Segment(NamedTuple):
-    """The densities after the first steps, the first points of their grids in the table, and their reports.
-
-    `why` is why the loop ended, and `answer` the range of the grid that it needs, relative to the centre of the present one, and
-    its spacing.
-    """
-
-    densities: Array
-    starts: Array
-    reports: Array
-    why: int
-    answer: Array
-
-
 _V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1]
-
-
-@helper
-def _extent(
-    now: Array, low: int, high: int, channel: Array, drifts: Array, table: Array, spread: float, tau: float, middle: float,
-    spacing: float, cut: float,
-) -> tuple[float, float]:  # fmt: skip
-    """Return the range of points that a density occupies after the transition, as if it were Gaussian."""
-    half = now.size // 2
-    left, right = float(low - half), float(high - half)
-    if np.isnan(channel[0]):
-        down, up = 0.0, 0.0
-        for r in range(drifts.size):
-            down, up = down + drifts[r] * table[r, DRIFT, low], up + drifts[r] * table[r, DRIFT, high]
-        left, right = left + min(down * tau / spacing, 0.0), right + max(up * tau / spacing, 0.0)
-    else:
-        shift, spread = (channel[1] + (channel[0] - 1.0) * middle) / spacing, channel[2]
-        left, right = channel[0] * left + shift, channel[0] * right + shift
-    centre, width = 0.5 * (left + right), 0.5 * abs(right - left)
-    width = np.sqrt(width * width - 2.0 * np.log(cut) * spread / spacing**2) + 2.0
-    return min(centre - width + half, float(low)), max(centre + width + half, float(high))
-
-
-@helper
-def _checked(
-    now: Array, low: int, high: int, filters: bool, weak: bool, positive: bool, closed: bool, cut: float, negligible: float,
-    spacing: float, cosines: Array, sines: Array, answer: Array,
-) -> tuple[int, float, float, float, float, float]:  # fmt: skip
-    """Normalise a prediction that is accurate; return OK, its mass, aliasing, mass at the ends, negative mass, highest frequency.
-
-    `answer` receives the support; where another grid is needed, its range in points and its spacing.
-    """
-    size = now.size
-    left, right, first, last, negative, aliasing, middle, highest, _ = spectrum(now, cut, negligible, cosines, sines)
-    bound = max(100.0 * cut, 0.0 if positive else 4.0 * aliasing)
-    edge = 0.0 if closed else max(left, right)
-    if filters and not positive:  # what is outside of the band is filtered too
-        aliasing = max(aliasing, middle)
-    answer[0], answer[1], answer[2] = float(low), float(high), 0.7 * spacing
-    status, mass = OK, 0.0
-    if not (aliasing <= 30.0 * negligible):
-        status = RANGE if filters and not weak and aliasing < np.inf else FAILED
-    elif not (edge <= bound):
-        status = RANGE if (filters or weak) and edge < np.inf else FAILED
-        answer[0] = min(low, (0 if left > bound else low) - size // 3 * (left > bound))
-        answer[1] = max(high, (size if right > bound else high) + size // 3 * (right > bound))
-        answer[2] = spacing
-    else:
-        for j in range(size):
-            now[j] = max(now[j], 0.0)
-            mass += now[j]
-        if not (1e-200 < mass < 1e200):
-            status = FAILED
-        for j in range(size):
-            now[j] /= mass
-        answer[0], answer[1] = first, last
-    return status, mass, aliasing, edge, negative, highest
 
 
 @cache
@@ -218,10 +78,10 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool) -
             cut = max(limits[3], min(30.0 * np.exp(log_floor), CUT))
             low, high = support(now, cut)
             if place != start or timed:
-                _copied(table[own], start, local)
+                copied(table[own], start, local)
                 place = start
             if movable:
-                first, last = _extent(
+                first, last = extent(
                     now, low, high, channels[k], drifts[k, 0], local, covariances[k, 0] * tau, tau,
                     offset + spacing * (start + half), spacing, cut,
                 )  # fmt: skip
@@ -243,7 +103,7 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool) -
                     for j in range(size):
                         now[j] = b[j + by] if 0 <= j + by < size else 0.0
                     start, place = start + by, start + by
-                    _copied(table[own], start, local)
+                    copied(table[own], start, local)
                     low, high = support(now, cut)
             # The transition.
             at, before, inside = highest_of(now), moments(now)[2], kinds[k] == SPLIT or kinds[k] == KERNEL
@@ -266,7 +126,7 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool) -
                 status = RANGE if move.needed > 0.0 and not (move.error < np.inf) else FAILED
                 break
             positive = filters and move.needed == 0.0
-            status, mass, aliasing, edge, negative, highest = _checked(
+            status, mass, aliasing, edge, negative, highest = checked(
                 now, low, high, filters, weak, positive, closed, cut, negligible, spacing, cosines, sines, answer
             )
             if status != OK:
@@ -355,15 +215,6 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool) -
         return done, status
 
     return advance
-
-
-@helper
-def _copied(table: Array, start: int, to: Array) -> None:
-    """Copy the columns of terms (R, 4 + m, T) from `start` on."""
-    for r in range(to.shape[0]):
-        for i in range(to.shape[1]):
-            for j in range(to.shape[2]):
-                to[r, i, j] = table[r, i, start + j]
 
 
 _WHOLE = np.ones((1, 5, 1))

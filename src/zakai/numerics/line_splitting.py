@@ -48,7 +48,7 @@ def divided(
 
     Args:
         now: the density (N,).
-        table, drifts, outputs, precisions, covariances, observed: see `line_loop.Grid` and `line_loop.Steps`.
+        table, drifts, outputs, precisions, covariances, observed: see `line_segment.Grid` and `line_segment.Steps`.
         averages: the weights of `line_averages`.
         inside: whether the observation acts inside the interval.
         tau: the length of the interval.

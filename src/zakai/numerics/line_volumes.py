@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import get_lapack_funcs
 
 from zakai.numerics import line_window as lw
+from zakai.numerics.line_polynomial import interpolated_logs
 
 Array = NDArray[Any]
 Bands = tuple[Array, Array, Array]
@@ -95,7 +96,7 @@ class Volumes(NamedTuple):
 
         def at(offsets: Array) -> Array:
             s = np.arcsinh((offsets - self.centre) / self.scale)
-            return lw.interpolated_logs(smooth, window, s) / (window.spacing * self.scale * np.cosh(s))
+            return interpolated_logs(smooth, window, s) / (window.spacing * self.scale * np.cosh(s))
 
         return at
 

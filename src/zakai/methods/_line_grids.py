@@ -1,0 +1,128 @@
+"""The tables of f and h on a grid that the compiled loop of one-state filters reads."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from zakai.methods._line_steps import probed, resolved
+from zakai.methods._line_system import Prepared, spectral, tables
+from zakai.numerics import line_window as lw
+from zakai.numerics.line_panels import GAUSS_NODES
+from zakai.numerics.line_segment import MARGIN, Grid
+from zakai.numerics.line_terms import CELL, DRIFT, OBSERVED, PHI, SLOPE
+from zakai.numerics.line_weak import at_nodes, nodes
+
+BLOCK = 2048  # points by which the tables of a spacing are apart; a table has twice as many
+SHARED = 128  # points of the largest grid on which many steps share a decomposition
+LOBATTO = np.array([0.0, 0.5 - 0.5 / np.sqrt(5.0), 0.5 + 0.5 / np.sqrt(5.0)])  # nodes within a spacing
+_NONE = np.zeros(0)
+
+
+
+def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
+    """Return what the loop knows of a grid, None where the operator has no decomposition or a formula no value."""
+    if not prepared.gaussian:
+        found: tuple[Grid | None] = prepared.once(("grid", window), lambda: (_decomposed_grid(prepared, window),))
+        return found[0]
+    index, size = round(window.centre / window.spacing), window.size
+    if window.closed:
+        begin, length = 0, size
+    elif prepared.mixed:
+        begin, length = index - size // 2 - MARGIN, size + 2 * MARGIN
+    else:
+        begin, length = BLOCK * round(index / BLOCK) - BLOCK, 2 * BLOCK
+    start = 0 if window.closed else index - size // 2 - begin
+    offsets = window.offsets if window.closed else window.spacing * (begin + np.arange(float(length)))
+    if prepared.mixed:
+        table = _mixed(prepared, window, window.origin + offsets, rows)
+    else:
+        key = ("table", window.origin, window.spacing, begin, length)
+        table = prepared.once(key, lambda: _separated(prepared, window, window.origin + offsets))
+    if not np.isfinite(table[:, :, OBSERVED:, start : start + size]).all():
+        return None
+    offset = window.origin - prepared.origin + float(offsets[0])
+    fine = _fine(prepared, window, window.origin + offsets)
+    return Grid(_NONE[None], _NONE[None], _NONE, table, 0.0, start, offset, window.spacing, window.closed, fine)
+
+
+def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
+    # The decomposition of a large grid takes longer than steps on a coarser one.
+    if window.size > SHARED and not window.closed and not prepared.kinked:
+        return None
+    decomposed = spectral(prepared, window)
+    if decomposed is None or not (decomposed.scale > 0).all():
+        return None
+    table = _separated(prepared, window, window.points)
+    table[0, 0, PHI] = np.log(decomposed.scale)
+    if not np.isfinite(table[0, 0, [PHI, *range(OBSERVED, table.shape[2])]]).all():
+        return None
+    modes, covariance = np.ascontiguousarray(decomposed.modes), float(np.max(tables(prepared, window).covariance))
+    fine = _fine(prepared, window, window.points)
+    return Grid(
+        modes, np.ascontiguousarray(modes.T), decomposed.rates, table, covariance, 0, 0.0, window.spacing, window.closed, fine
+    )
+
+
+def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:
+    """Return the terms (1, R, 4 + m, T) of f and h at points (T,)."""
+    system, start, theta = prepared.system, prepared.model.start, prepared.theta
+    assert system.separated is not None
+    parts = np.moveaxis(system.separated[1](_nodes(window, x), start, theta), 0, -1)
+    table = np.zeros((1, len(parts), OBSERVED + system.m, len(x)))
+    table[0, :, CELL] = _cells(window, parts[:, 0])
+    table[0, :, DRIFT:] = parts[..., :-1:3]
+    if prepared.yau is not None:
+        table[0, 0, PHI] = prepared.yau.potential(x, start, theta)
+    return table
+
+
+def _fine(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:
+    """Return an h with kinks, of samples, at the nodes of points (m, F), else nothing."""
+    system = prepared.system
+    if not prepared.weak:
+        return _NONE[None]
+
+    def make() -> np.ndarray:
+        points = nodes(x, window.spacing)[:, None]
+        return at_nodes(system.observation(points, prepared.model.start, prepared.theta).T)
+
+    found: np.ndarray = prepared.once(("fine", window.origin, window.spacing, float(x[0]), len(x)), make)
+    return found
+
+
+def _nodes(window: lw.Window, x: np.ndarray) -> np.ndarray:
+    """Return Lobatto's nodes (3 T + 1, 1) of the spacings above points (T,)."""
+    return np.append((x[:, None] + window.spacing * LOBATTO).reshape(-1), x[-1] + window.spacing)[:, None]
+
+
+def _cells(window: lw.Window, f: np.ndarray) -> np.ndarray:
+    """Return the integrals (..., T) of f over spacings from values at Lobatto's nodes (..., 3 T + 1)."""
+    ends, inner = f[..., ::3], f[..., 1::3] + f[..., 2::3]
+    return np.asarray(window.spacing / 12.0 * (ends[..., :-1] + 5.0 * inner + ends[..., 1:]))
+
+
+def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) -> np.ndarray:
+    """Return terms (K, 7, 4 + m, T) at points (T,): f and h at the Gauss nodes of intervals and, for samples, at their ends.
+
+    Those of intervals in which the nodes do not resolve the coefficients are NaN.
+    """
+    system, theta, count = prepared.system, prepared.theta, len(GAUSS_NODES)
+    starts, lengths = prepared.schedule.starts[rows, None], prepared.lengths[rows, None]
+    times = np.concatenate([starts + lengths * GAUSS_NODES, starts + lengths], axis=1)
+    table = np.zeros((*times.shape, OBSERVED + system.m, len(x)))
+    f = system.drift(_nodes(window, x), times[..., None], theta)[..., 0]
+    table[..., CELL, :], table[..., DRIFT, :] = _cells(window, f), f[..., :-1:3]
+    assert system.slope is not None
+    table[..., SLOPE, :] = system.slope(x[:, None], times[..., None], theta)[..., 0]
+    table[..., OBSERVED:, :] = np.moveaxis(system.observation(x[:, None], times[..., None], theta), -1, 2)
+    at = window.points[:: max(1, window.size // 8), None]
+
+    def coefficients(t: np.ndarray) -> np.ndarray:
+        f: np.ndarray = system.drift(at, t[..., None], theta)[..., 0]
+        if system.samples:
+            return f
+        return np.concatenate([f, system.observation(at, t[..., None], theta).reshape(*t.shape, -1)], axis=-1)
+
+    known = coefficients(times[:, :count])
+    table[~resolved(coefficients(probed(starts, lengths)), known), :, :OBSERVED] = np.nan
+    return table

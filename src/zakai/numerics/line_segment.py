@@ -1,0 +1,108 @@
+"""The arguments and results of the compiled loop of one-state filters (`line_loop`)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+COLUMNS = (
+    "gained", "mean", "variance", "aliasing", "edge", "negative", "time", "depth", "growth", "made", "error", "log_floor",
+)  # fmt: skip
+# The transition: whole with a sample after it, split with increments inside, whole with increments inside, split with a sample.
+FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = 0, 1, 2, 3
+OK, FAILED, RANGE, AFTER, TABLE = 0, 1, 2, 3, 4  # why the loop ends
+RELIABLE = 1e-3  # of the promised error: smaller estimates are not reported
+MARGIN = 96  # points of a table of coefficients in time beyond the grid, of which a third may be used before it is made again
+
+
+class Mechanisms(NamedTuple):
+    """What the steps of a record may need; only that is compiled.
+
+    `modes`: transitions by modes, else `kernels` or `splits` or both; `samples`: samples after the transition; `weak`: their
+    likelihoods have kinks and act in the weak sense.
+    """
+
+    modes: bool
+    kernels: bool
+    splits: bool
+    samples: bool
+    weak: bool
+
+
+class Grid(NamedTuple):
+    """The data of a grid: `modes` (N, N), their transpose, `rates` (N,), and terms `table` (K, R, 4 + m, T) as in `line_terms`.
+
+    K = 1 where the terms do not depend on the interval.  With modes the table is that of the grid, and `covariance` the largest
+    G.  Else it is longer than the grid, which begins at `start`; the first point of the table is `offset` away from the origin of
+    the kernels.  `fine` (m, F) are the values of an h with kinks at the nodes of `line_weak`, else empty.
+    """
+
+    modes: Array
+    transposed: Array
+    rates: Array
+    table: Array
+    covariance: float
+    start: int
+    offset: float
+    spacing: float
+    closed: bool
+    fine: Array
+
+
+class Steps(NamedTuple):
+    """The K steps to take.
+
+    `kinds` (K,) are FACTOR, SPLIT, KERNEL or SPLIT_FACTOR.  `observed` (K, m) are zero where nothing is observed, as are the
+    inverses of S `precisions` (K, P, m, m).  `constants` (K,) are those of the log-likelihoods.  `channels` (K, 6) are a, b, V,
+    k0, k1, k2 of Gaussian kernels, NaN where the transition is split.  `drifts`
+    (K, Q, R) and `outputs` (K, P, R) are the factors of the terms of f and h, and `covariances` (K, Q) are G, at the Gauss nodes
+    of an interval, or one number where they do not depend on time.
+    """
+
+    kinds: Array
+    lengths: Array
+    observed: Array
+    precisions: Array
+    constants: Array
+    channels: Array
+    drifts: Array
+    outputs: Array
+    covariances: Array
+
+    def after(self, count: int) -> Steps:
+        """Return the steps without the first ones."""
+        return Steps(*(part[count:] for part in self))
+
+
+class Limits(NamedTuple):
+    """What a step must keep.
+
+    `negligible` is the spectrum that need not be resolved, `error` the largest error that is made, `splitting` that of the
+    splitting of one interval, `cut` the density relative to its maximum that a grid must hold, `generous` the size of a grid that
+    is kept though fewer points would do, and `finest` that of the largest grid that is taken so that kernels are filters of
+    positive numbers.
+    """
+
+    negligible: float
+    error: float
+    splitting: float
+    cut: float
+    generous: float
+    finest: float
+
+
+class Segment(NamedTuple):
+    """The densities after the first steps, the first points of their grids in the table, and their reports.
+
+    `why` is why the loop ended, and `answer` the range of the grid that it needs, relative to the centre of the present one, and
+    its spacing.
+    """
+
+    densities: Array
+    starts: Array
+    reports: Array
+    why: int
+    answer: Array
