@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import betaln, expit, gammaln, log_expit, logit
+from scipy.special import betaln, gammaln, log_expit
 
+from zakai.densities.mapped import IntervalMap
 from zakai.errors import InputError
 from zakai.models._errors import did_you_mean, listing
 
@@ -17,58 +18,30 @@ _TEXT = re.compile(r"\s*([A-Za-z-]+)\s*\(([^()]*)\)\s*")
 
 
 class _Family(NamedTuple):
-    """A family: the names of its arguments, which of them must be positive, and three functions of u and the arguments.
-
-    `value` is the parameter at u, `place` its inverse, `log_density` that of u (with the Jacobian of the transform).
-    """
+    """A family: the names of its arguments, its log density in u, and the interval of the parameter, None for the whole line."""
 
     arguments: tuple[str, ...]
-    positive: tuple[str, ...]
-    value: Callable[..., float]
-    place: Callable[..., float]
     log_density: Callable[..., float]
+    interval: Callable[..., IntervalMap] | None = None
 
 
 def _log_normal(u: float, mean: float, deviation: float) -> float:
     return float(-0.5 * ((u - mean) / deviation) ** 2 - np.log(deviation) - 0.5 * np.log(2 * np.pi))
 
 
+def _positive(*numbers: float) -> IntervalMap:
+    return IntervalMap(0.0, np.inf)
+
+
+_ANY = ("mean", "mean of the logarithm", "low", "high")  # arguments that need not be positive
 _FAMILIES: Mapping[str, _Family] = {
-    "normal": _Family(("mean", "standard deviation"), ("standard deviation",), lambda u, m, s: u, lambda x, m, s: x, _log_normal),
-    "lognormal": _Family(
-        ("mean of the logarithm", "standard deviation of the logarithm"),
-        ("standard deviation of the logarithm",),
-        lambda u, m, s: np.exp(u),
-        lambda x, m, s: np.log(x),
-        _log_normal,
-    ),
-    "half-normal": _Family(
-        ("scale",),
-        ("scale",),
-        lambda u, s: np.exp(u),
-        lambda x, s: np.log(x),
-        lambda u, s: np.log(2) + _log_normal(np.exp(u), 0.0, s) + u,
-    ),
-    "gamma": _Family(
-        ("shape", "rate"),
-        ("shape", "rate"),
-        lambda u, a, b: np.exp(u),
-        lambda x, a, b: np.log(x),
-        lambda u, a, b: a * (u + np.log(b)) - b * np.exp(u) - gammaln(a),
-    ),
-    "uniform": _Family(
-        ("low", "high"),
-        (),
-        lambda u, a, b: a + (b - a) * expit(u),
-        lambda x, a, b: logit((x - a) / (b - a)),
-        lambda u, a, b: log_expit(u) + log_expit(-u),
-    ),
+    "normal": _Family(("mean", "standard deviation"), _log_normal),
+    "lognormal": _Family(("mean of the logarithm", "standard deviation of the logarithm"), _log_normal, _positive),
+    "half-normal": _Family(("scale",), lambda u, s: np.log(2) + _log_normal(np.exp(u), 0.0, s) + u, _positive),
+    "gamma": _Family(("shape", "rate"), lambda u, a, b: a * (u + np.log(b)) - b * np.exp(u) - gammaln(a), _positive),
+    "uniform": _Family(("low", "high"), lambda u, a, b: log_expit(u) + log_expit(-u), IntervalMap),
     "beta": _Family(
-        ("a", "b"),
-        ("a", "b"),
-        lambda u, a, b: expit(u),
-        lambda x, a, b: logit(x),
-        lambda u, a, b: a * log_expit(u) + b * log_expit(-u) - betaln(a, b),
+        ("a", "b"), lambda u, a, b: a * log_expit(u) + b * log_expit(-u) - betaln(a, b), lambda a, b: IntervalMap(0.0, 1.0)
     ),
 }
 
@@ -93,15 +66,16 @@ class Prior:
         if len(numbers) != len(family.arguments) or not np.isfinite(numbers).all():
             raise InputError(f"{where}: {text!r}: expected {kind}({', '.join(family.arguments)}) with finite numbers")
         for argument, number in zip(family.arguments, numbers, strict=True):
-            if argument in family.positive and number <= 0:
+            if argument not in _ANY and number <= 0:
                 raise InputError(f"{where}: {text!r}: the {argument} is {number:g}; it must be positive")
         if kind == "uniform" and not numbers[0] < numbers[1]:
             raise InputError(f"{where}: {text!r}: low is not below high")
         self.family, self.numbers = family, numbers
+        self.interval = None if family.interval is None else family.interval(*numbers)
 
     def value(self, u: float) -> float:
         """Return the parameter at u."""
-        return float(self.family.value(u, *self.numbers))
+        return u if self.interval is None else float(self.interval.x(np.asarray(u)))
 
     def log_density(self, u: float) -> float:
         """Return the log density of u."""
@@ -116,5 +90,5 @@ class Prior:
     def place(self, value: float) -> float:
         """Return u for a value of the parameter; where the prior excludes it, u = 0."""
         with np.errstate(all="ignore"):
-            u = float(self.family.place(float(value), *self.numbers))
+            u = float(value if self.interval is None else self.interval.w(np.asarray(float(value))))
         return u if np.isfinite(u) and abs(u) < 50 else 0.0
