@@ -10,13 +10,12 @@ import numpy as np
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.health_warnings import warnings_of_run
-from zakai.engine.notes import notes_on_angles, notes_on_formulas
+from zakai.engine.notes import notes_on_angles, notes_on_formulas, why_not_finite
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import KEPT, Setting
 from zakai.engine.versions import versions
 from zakai.errors import InputError
 from zakai.methods._protocol import Infos, stacked
-from zakai.models.numeric import explain_nonfinite, numpy_function
 from zakai.records import Record
 from zakai.records.noise import notes_on_noise
 from zakai.records.schedule import ROUNDING, Schedule, schedule_of
@@ -155,13 +154,9 @@ class Run:
             return
         points = centre + np.linspace(-8.0, 8.0, 257)[:, None, None] * np.diag(width)
         points = points.reshape(-1, model.n)
-        inputs = self.schedule.inputs
-        u = None if inputs is None else inputs.at(stop, model.input_hold)
         for key in ("drift", "observation"):
-            values = numpy_function(getattr(model, key), model)(points, stop, self.setting.theta.real, u)
-            wrong = ~np.isfinite(values).all(axis=-1)
-            if wrong.any():
-                reason = explain_nonfinite(model, key, getattr(model, key), points[wrong][0], stop, u)
+            reason = why_not_finite(model, key, points, stop, self.setting.theta.real, self.schedule.inputs)
+            if reason:
                 raise InputError(f"{model.source}: {reason}, which the density reaches")
 
     def start_moments(self) -> tuple[np.ndarray, np.ndarray]:

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import explain_nonfinite, numpy_function
-from zakai.records import Record
+from zakai.records import Inputs, Record
 
 _KEYS = ("drift", "diffusion", "observation")
 _REACH, _TIMES = 3.0, 32  # deviations from the mean, and number of times, that are checked
@@ -34,20 +35,23 @@ def notes_on_formulas(model: Model, theta: np.ndarray, record: Record, mean: np.
     checked = np.unique(np.linspace(0, len(times) - 1, _TIMES).astype(int))
     notes = []
     for key in keys:
-        formulas = getattr(model, key)
-        evaluate = numpy_function(list(formulas), model)
         for k in checked:
             points = (mean[k] + steps * np.sqrt(np.maximum(variance[k], 0.0))).reshape(-1, model.n)
             points = points[_inside(model, points) & np.isfinite(points).all(axis=1)]
-            t = float(times[k])
-            u = None if record.inputs is None else record.inputs.at(t, model.input_hold)
-            with np.errstate(all="ignore"):
-                wrong = ~np.isfinite(evaluate(points, t, theta, u)).all(axis=-1)
-            if wrong.any():
-                reason = explain_nonfinite(model, key, formulas, points[wrong][0], t, u)
+            reason = why_not_finite(model, key, points, float(times[k]), theta, record.inputs)
+            if reason:
                 notes.append(f"{reason}, within {_REACH:g} deviations of the mean; give a [domain], or change the formula")
                 break
     return notes
+
+
+def why_not_finite(model: Model, key: str, points: np.ndarray, t: float, theta: np.ndarray, inputs: Inputs | None) -> str:
+    """Return why the formulas of a key are not finite at one of the points (P, n), or nothing where they are."""
+    formulas, u = getattr(model, key), None if inputs is None else inputs.at(t, model.input_hold)
+    evaluate = kept(model, (why_not_finite, key), lambda: numpy_function(list(formulas), model))
+    with np.errstate(all="ignore"):
+        wrong = ~np.isfinite(evaluate(points, t, theta, u)).all(axis=-1)
+    return explain_nonfinite(model, key, formulas, points[wrong][0], t, u) if wrong.any() else ""
 
 
 def notes_on_angles(model: Model, record: Record) -> list[str]:
