@@ -179,7 +179,7 @@ class _Part(NamedTuple):
 
     def evidence(self, theta: np.ndarray) -> Any:
         """Return the log-likelihood at the parameters, complex where they are."""
-        found = segments(self.setting.at(theta), self.schedule, None, self.values)
+        found = segments(self.setting._replace(theta=theta), self.schedule, None, self.values)
         return np.sum(np.concatenate([segment.infos.log_likelihood_increment for segment in found]))
 
 

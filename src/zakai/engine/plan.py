@@ -45,12 +45,12 @@ class Plan(NamedTuple):
         """The name of the method, or of those of the blocks."""
         return self.settings[0].method.name if self.division is None else self.division.method
 
-    def runs(self, record: Record, keep: str | None, most: float = KEPT_BYTES, theta: Any = None) -> list[Run]:
-        """Return a run for each block; `theta` (p,) are other values of the parameters, complex for a derivative."""
+    def runs(self, record: Record, keep: str | None, most: float = KEPT_BYTES) -> list[Run]:
+        """Return a run for each block; densities may take `most` bytes in all."""
         if self.division is None:
-            return [Run(self.settings[0].at(theta), record, keep, most)]
+            return [Run(self.settings[0], record, keep, most)]
         return [
-            Run(setting.at(theta), record_of_block(record, block), keep, most / len(self.settings))
+            Run(setting, record_of_block(record, block), keep, most / len(self.settings))
             for setting, block in zip(self.settings, self.blocks, strict=True)
         ]
 

@@ -39,10 +39,6 @@ class Setting(NamedTuple):
         depends = model.depends_on_time or (method.absolute is not None and method.absolute(options))
         return cls(model, prior, method, options, model.theta(), not depends)
 
-    def at(self, theta: np.ndarray | None) -> Setting:
-        """Return the setting with other values of the parameters; None stands for these."""
-        return self if theta is None else self._replace(theta=theta)
-
     def prepared(self, schedule: Schedule) -> Any:
         """Return what the method prepares for a schedule, kept for the last schedules of each model.
 

@@ -41,12 +41,12 @@ def erf(values: Any) -> Array:
     return np.asarray(real_erf(values.real) + 1j * slope * values.imag)
 
 
-def log_sum_exp(logs: Any, axis: int = -1, signs: Any = 1.0) -> Array:
-    """Return log sum_i signs_i exp(logs_i) along an axis; -inf for an empty sum."""
+def log_sum_exp(logs: Any, axis: int = -1) -> Array:
+    """Return log sum_i exp(logs_i) along an axis; -inf for an empty sum."""
     logs = np.asarray(logs)
     top = np.max(logs.real, axis=axis, keepdims=True, initial=-np.inf)
     top = np.where(np.isfinite(top), top, 0.0)
-    total = np.sum(signs * np.exp(logs - top), axis=axis)
+    total = np.sum(np.exp(logs - top), axis=axis)
     with np.errstate(divide="ignore"):
         return np.asarray(np.log(total) + np.squeeze(top, axis=axis))
 

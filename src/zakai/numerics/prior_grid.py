@@ -58,7 +58,6 @@ def prior_grid(
     *,
     tolerance: float = 1e-12,
     aligned: bool = True,
-    box: tuple[Array, Array] | None = None,
     source: str = "prior: log_density",
 ) -> PriorGrid:
     """Return a grid for a density with unknown location and scale, which may have several peaks.
@@ -72,7 +71,6 @@ def prior_grid(
         periodic: whether a coordinate is an angle (n,); the density is evaluated in (-pi, pi].
         tolerance: bound on the neglected density, relative to its maximum.
         aligned: whether the axes of the grid are the coordinate axes; else the Cholesky factor of the covariance where n > 1.
-        box: (low, high) where the mass is known to be; the search is then skipped.
         source: what an error message calls the density.
 
     Returns:
@@ -91,7 +89,7 @@ def prior_grid(
             values = np.asarray(log_density(x)).reshape(offsets.shape[:-1])
         return values
 
-    low, high = box_of_peaks(evaluate, n, angles, tolerance, source) if box is None else box
+    low, high = box_of_peaks(evaluate, n, angles, tolerance, source)
     grid = _fitted(evaluate, np.asarray(low, float), np.asarray(high, float), np.eye(n), angles, tolerance, source)
     if n > 1 and not aligned and not any(angles):
         weights = np.exp(grid.log_values.real - np.max(grid.log_values.real)).ravel()
