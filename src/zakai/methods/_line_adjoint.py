@@ -11,8 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.methods._line_gauge import Gauge, gauge_of
-from zakai.methods._line_loop import TOGETHER, grid_of, steps_of
+from zakai.methods._line_grids import grid_of
+from zakai.methods._line_loop import TOGETHER
 from zakai.methods._line_message import LOWEST, PAD, SURE, Message, support, taper
+from zakai.methods._line_steps import steps_of
 from zakai.methods._line_system import Prepared, State, covariance_at, state_moments
 from zakai.methods._line_update import factor_at_end
 from zakai.methods._line_way import EXCURSION, negligible, smoothing_tolerance
@@ -20,7 +22,7 @@ from zakai.methods._protocol import Infos
 from zakai.numerics import line_backward as lb
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_adjoint import by_adjoints
-from zakai.numerics.line_loop import SPLIT, SPLIT_FACTOR
+from zakai.numerics.line_segment import SPLIT, SPLIT_FACTOR
 
 Array = Any
 

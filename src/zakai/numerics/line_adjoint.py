@@ -15,7 +15,7 @@ from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line_averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, averaged, averaging
 from zakai.numerics.line_backward import ERROR, LOG_MASS, Filtered, Limits, Message, Taken, kept, multiplied, spread
 from zakai.numerics.line_density import highest_of, waves
-from zakai.numerics.line_loop import SPLIT, Grid, Steps
+from zakai.numerics.line_segment import SPLIT, Grid, Steps
 from zakai.numerics.line_splitting import differences, residual, split
 
 Array = NDArray[Any]
