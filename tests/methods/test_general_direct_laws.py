@@ -20,6 +20,17 @@ LAWS = {
     ),
     "von-mises": ({"observation": ["x"], "observation_family": "von-mises", "concentration": "5"}, [0.5, -0.2, 0.9, 1.5, 0.2]),
     "noise that depends on the state": ({"observation": ["0"], "observation_noise": [["exp(x)"]]}, [0.5, -0.4, 2.9, 0.2, 1.0]),
+    "log density": ({"observation_log_density": "-log(pi*(1 + (z - x)**2))", "observed": ["z"]}, [0.5, 0.2, 9.0, -0.4, 0.1]),
+    "table": (
+        {"observation": ["depth(x)"], "observation_noise": [["0.1"]],
+         "tables": {"depth": {"x": [-4, -1, 0, 2, 4], "values": [-1, -0.8, 0, 0.5, 2], "kind": "cubic"}}},
+        [0.5, 0.2, 0.4, -0.4, 0.1],
+    ),
+    "kink": ({"observation": ["max(x, 0.2)"], "observation_noise": [["0.1"]]}, [0.5, 0.2, 0.4, 0.1, 0.6]),
+    "bearing": (
+        {"observation": ["atan2(x - 2, 1)"], "observation_family": "von-mises", "concentration": "20"},
+        [-1.0, -0.9, -1.2, -0.8, -1.1],
+    ),
     "sinc": ({"observation": ["sinc(x)"], "observation_noise": [["0.1"]]}, [0.5, 0.8, 0.9, 0.1, 0.2]),
 }  # fmt: skip
 

@@ -117,13 +117,32 @@ def general_direct(model: Model) -> tuple[Condition, ...]:
     Chen and Dong, Theorems 6 and 7, in their corrected form; G may be singular where the drift is affine.
     """
     conditions = [determined(model)]
-    if model.features:
-        own, sampled = features.of_dynamics(model), model.observation_kind == "samples"
-        words, source = "; ".join(own.values() or model.features.values()), "a sample enters only at its time"
-        conditions.append(Condition("features are in what a sample depends on", sampled and not own, words, source))
+    conditions.extend(_features_beside_inputs(model))
     if any(condition.holds is not True for condition in conditions):
         return tuple(conditions)
-    return (*conditions, *_yau_conditions(model, f"{_SURVEY}, (32) corrected", lambda form: _few_directions(model, form)))
+    source = f"{_SURVEY}, (32) corrected"
+    own = _inputs_of_increments(model)
+    return (*conditions, *own, *_yau_conditions(model, source, lambda form: _few_directions(model, form)))
+
+
+def _features_beside_inputs(model: Model) -> tuple[Condition, ...]:
+    """Return what holds where formulas have features other than inputs: these may be in what a sample depends on."""
+    every = {name: words for name, words in model.features.items() if name != features.INPUTS}
+    if not every:
+        return ()
+    own = {name: words for name, words in features.of_dynamics(model).items() if name != features.INPUTS}
+    holds, words = model.observation_kind == "samples" and not own, "; ".join(own.values() or every.values())
+    return (Condition("features are in what a sample depends on", holds, words, "a sample enters only at its time"),)
+
+
+def _inputs_of_increments(model: Model) -> tuple[Condition, ...]:
+    """Return what holds of inputs in h that act in continuous time."""
+    entry = next((part for part in model.observation if part.free_symbols & set(model.u)), None)
+    if entry is None or model.observation_kind == "samples":
+        return ()
+    affine = affine_observation(model) is not None
+    words = f"h contains {short(str(entry))}, and {'is affine' if affine else 'is not affine'}"
+    return (Condition("h is affine where increments depend on inputs", affine, words, "the integral of h'S^-1 dy"),)
 
 
 @lru_cache(maxsize=64)
@@ -141,6 +160,7 @@ def gaussian_sum(model: Model) -> tuple[Condition, ...]:
 def _few_directions(model: Model, form: YauForm) -> Condition:
     """Quadrature is in the coordinates of a nonlinear h and of phi."""
     law = [*model.observation, *model.observation_noise.diagonal(), *model.family_parameters.values()]
+    law += [] if model.log_density is None else [model.log_density]
     nonlinear = law if features.OF_OBSERVATION & model.features.keys() else []
     nonlinear = nonlinear or ([] if affine_observation(model) else list(model.observation))
     used = {name for name, symbol in zip(model.state, model.x) if any(f.has(symbol) for f in (*nonlinear, form.potential))}

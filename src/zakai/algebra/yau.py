@@ -18,7 +18,7 @@ import sympy as sp
 from zakai.algebra._readable import readable, short
 from zakai.algebra.grouping import MANY_TERMS, grouped, terms_of, tidy
 from zakai.algebra.identities import is_zero
-from zakai.models.features import of_dynamics
+from zakai.models.features import INPUTS, of_dynamics
 from zakai.models.model import Model
 
 DEEPEST = 4  # functions inside of each other that are integrated
@@ -79,14 +79,16 @@ def tidy_state(expression: sp.Expr, x: tuple[sp.Symbol, ...]) -> sp.Expr:
 def yau_form(model: Model) -> YauForm | NoYauForm:
     """The Yau form of the drift; affine parts, and quadratic parts of the potential, are kept in L and l."""
     x, n = model.x, model.n
-    features = of_dynamics(model)
+    features = [words for feature, words in of_dynamics(model).items() if feature != INPUTS]
     if features:
-        return NoYauForm(False, f"{'; '.join(features.values())}: the Yau form is for f(x, t) with g(t)")
+        return NoYauForm(False, f"{'; '.join(features)}: the Yau form is for f(x, u, t) with g(u, t)")
     matrix, offset, rest = _affine_and_rest(model.drift, x)
     if all(term == 0 for term in rest):
         zero = sp.ImmutableMatrix.zeros(n, 1)
         return YauForm(sp.ImmutableMatrix(matrix), sp.ImmutableMatrix(offset), sp.Integer(0), zero)
-    covariance = model.covariance
+    covariance, inputs = model.covariance, set(model.u)
+    if driven := (covariance.free_symbols | rest.free_symbols) & inputs:
+        return NoYauForm(False, f"phi would depend on the input {min(map(str, driven))}, and jump where it jumps")
     if is_zero(covariance.det()) is not False:
         return NoYauForm(False, "the drift is not affine and G is singular, so that G grad phi cannot be solved for phi")
     gradient = (inverse(covariance) * rest).applyfunc(lambda e: tidy_state(e, x))

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
+from zakai.methods._outside_tables import OutsideTables
 from zakai.models.features import CROSS_NOISE, OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
 from zakai.models.functions import Floor, Maximum, Minimum, TableFunction
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-from zakai.models.table import Table
 from zakai.records.inputs import Inputs
 
 Array = Any
@@ -37,7 +37,7 @@ class Formulas(NamedTuple):
     observation: Function
     noise: Function
     cross: Function | None
-    arguments: tuple[Function, ...]
+    outside: OutsideTables
     separated: tuple[Function, Function] | None
 
 
@@ -56,7 +56,7 @@ def _formulas(model: Model) -> Formulas:
         numpy_function(model.observation, model, (m,)),
         numpy_function(model.observation_noise, model, (m, m)),
         numpy_function(cross, model, (3, m)) if joint else None,
-        tuple(numpy_function(list(call.args), model, (len(call.args),)) for call in _tables(model)),
+        OutsideTables(model),
         _separated(model),
     )
 
@@ -95,14 +95,6 @@ def _rough(formula: sp.Expr, x: sp.Symbol) -> bool:
     return linear or any(part.has(x) for part in formula.atoms(*_KINKS))
 
 
-def _tables(model: Model) -> list[Any]:
-    """Return the calls of tables in the formulas of a model that depend on the state."""
-    parts = [*model.drift, *model.diffusion, *model.observation, *model.observation_noise, *model.family_parameters.values()]
-    parts += [] if model.log_density is None else [model.log_density]
-    calls = {call for part in parts for call in part.atoms(TableFunction) if call.has(model.x[0])}
-    return sorted(calls, key=str)
-
-
 class System:
     """The formulas of a model with one state as functions of points, times and parameters; `inputs` are those of a record."""
 
@@ -116,9 +108,7 @@ class System:
         self.slope, self.spread = self._optional(formulas.slope), self._optional(formulas.spread)
         self.cross = self._optional(formulas.cross)
         self.separated = None if formulas.separated is None else (self._bound(formulas.separated[0]), formulas.separated[1])
-        self._tables: list[tuple[Table, Function]] = [
-            (call.table, self._bound(arguments)) for call, arguments in zip(_tables(model), formulas.arguments, strict=True)
-        ]
+        self.tabulated, self._outside = bool(formulas.outside), self._bound(formulas.outside)
         # Whether G depends on the state, and whether samples have a law that is not N(h, S(t)).
         self.state_dependent = STATE_DEPENDENT_DIFFUSION in model.features
         self.reflecting = any(interval.reflecting for interval in model.domain.values())
@@ -137,11 +127,6 @@ class System:
         steady_noises = self.steady_observation and self.steady_noise and self.steady_cross
         self.steady = not self.moving and (self.samples or steady_noises)
         self.varying = not self.steady or self.cross is not None
-
-    @property
-    def tabulated(self) -> bool:
-        """Whether a formula contains a table of the state."""
-        return bool(self._tables)
 
     def _bound(self, function: Function) -> Function:
         """Return a function of points, times and parameters alone."""
@@ -170,10 +155,7 @@ class System:
 
     def outside(self, points: Array, t: float, theta: Array) -> Array:
         """Return which points (N,) lead beyond the range of a table."""
-        found = np.zeros(len(points), bool)
-        for table, arguments in self._tables:
-            found |= table.outside(*np.moveaxis(arguments(points[:, None], t, theta).real, -1, 0))
-        return found
+        return self._outside(points[:, None], t, theta)
 
 
 def within(times: Array, start: float, stop: float) -> Array:

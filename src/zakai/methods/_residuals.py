@@ -54,13 +54,15 @@ class Sensors(NamedTuple):
         varies = model.observation.has(model.t), model.observation_noise.has(model.t)
         return cls(model, numpy_function(model.observation, model), noise, varies)
 
-    def noise_at(self, times: Array, theta: Array, which: Array) -> Array:
-        """Return the block (Q, k, k) of S at times (Q,)."""
-        S = self.noise(np.zeros(self.model.n), np.asarray(times, float), theta)
+    def noise_at(self, times: Array, theta: Array, which: Array, u: Array | None = None) -> Array:
+        """Return the block (Q, k, k) of S at times (Q,) and inputs u."""
+        S = self.noise(np.zeros(self.model.n), np.asarray(times, float), theta, u)
         return np.array(np.broadcast_to(S, (len(times), self.model.m, self.model.m))[:, which[:, None], which])
 
-    def at_end(self, schedule: Schedule, k: int, values: Array, theta: Array, seen: Array) -> Factor:
-        """Return the likelihood of the coordinates `seen` (m,) at the stop of interval k, as one factor there."""
+    def at_end(
+        self, schedule: Schedule, k: int, values: Array, theta: Array, seen: Array, u: Array | None = None
+    ) -> Factor:
+        """Return the likelihood of the coordinates `seen` (m,) at the stop of interval k, with inputs u there, as one factor."""
         which, stop = np.flatnonzero(seen), schedule.stops[k]
         m, v = len(seen), values[which]
         # The length is free of the rounding of the times.
@@ -69,7 +71,7 @@ class Sensors(NamedTuple):
             return Factor(np.array([stop]), np.zeros((1, 0, m)), np.zeros(m), 0.0)
         target = np.zeros(m, v.dtype)
         if self.model.observation_kind == "samples":
-            S = self.noise_at(np.array([stop]), theta, which)[0]
+            S = self.noise_at(np.array([stop]), theta, which, u)[0]
             root, scale = np.linalg.inv(cholesky(S)), np.ones(len(which))
             constant = -0.5 * (log_determinant(S) + len(which) * np.log(2 * np.pi))
         else:

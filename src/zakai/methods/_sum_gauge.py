@@ -12,6 +12,8 @@ import numpy as np
 import sympy as sp
 
 from zakai.algebra.exponential_sum import exponential_sum
+from zakai.models.features import JUMP_FUNCTIONS
+from zakai.models.functions import Maximum, Minimum, TableFunction
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.complex_step import log_sum_exp
@@ -19,15 +21,17 @@ from zakai.numerics.gaussian_sum import Array, Components, dot, product, tilted
 from zakai.numerics.sum_quadrature import refit
 
 _POINTS = 64
+_FLAT, _NUMBER = (TableFunction, Minimum, Maximum, *JUMP_FUNCTIONS), sp.Rational(31, 41)
 _AGREED = 1e-6  # relative error of the masses of components that e^phi multiplies or divides
 
 
 def directions_of(functions: Sequence[sp.Expr], model: Model) -> Array:
     """Return an orthonormal W (n, k) such that the functions depend on x through W'x alone, at every time and for all parameters.
 
-    Found from the gradients at random states, times and parameters; a coordinate that no function has is never in the span.
+    Found from the gradients at random states, times, parameters, inputs and observations; a coordinate that no function has is
+    never in the span.  Of a function that is constant in places, as a table is, those of its arguments count.
     """
-    n = model.n
+    n, functions = model.n, _without_flat(functions, model)
     jacobian = sp.Matrix([[sp.diff(f, symbol) for symbol in model.x] for f in functions])
     used = np.array([any(entry != 0 for entry in jacobian[:, i]) for i in range(n)])
     if used.sum() <= 1:
@@ -37,16 +41,27 @@ def directions_of(functions: Sequence[sp.Expr], model: Model) -> Array:
     times = model.start + rng.uniform(0.0, 3.0, _POINTS)
     own = model.theta()
     theta = own * rng.uniform(0.7, 1.4, (_POINTS, len(own))) + rng.uniform(0, 1e-2, (_POINTS, len(own)))
-    rows = numpy_function(jacobian, model, jacobian.shape)(x, times, theta).reshape(-1, n)
+    u, z = rng.standard_normal((_POINTS, len(model.u))), rng.standard_normal((_POINTS, model.m))
+    rows = numpy_function(jacobian, model, jacobian.shape)(x, times, theta, u, z).reshape(-1, n)
     rows = rows[np.isfinite(rows).all(axis=1)]
     size = np.linalg.norm(rows, axis=1, keepdims=True)
     rows = (rows / np.where(size > 0, size, 1.0))[size[:, 0] > 0]
-    if not len(rows):
-        return np.eye(n)[:, used]
+    # A coordinate of which no gradient knows, as where a function is constant at all of these states, is a direction of its own.
+    rows = np.vstack([rows, np.eye(n)[used & ~rows.any(axis=0)]])
     _, values, vectors = np.linalg.svd(rows, full_matrices=False)
     rank = int(np.sum(values > 1e-9 * values[0]))
     # As many directions as coordinates: the coordinates themselves.
     return np.asarray(np.eye(n)[:, used] if rank >= used.sum() else vectors[:rank].T)
+
+
+def _without_flat(functions: Sequence[sp.Expr], model: Model) -> list[sp.Expr]:
+    """Return the functions with a number for each call that may be constant in places, and the arguments of those calls."""
+    found: list[sp.Expr] = []
+    for f in functions:
+        calls = [call for call in f.atoms(*_FLAT) if call.has(*model.x)]
+        for part in (f, *(a for call in calls for a in call.args)):
+            found.append(part.replace(lambda e: e.has(*model.x) and isinstance(e, _FLAT), lambda e: _NUMBER))
+    return found
 
 
 def span(directions: Array) -> Array:

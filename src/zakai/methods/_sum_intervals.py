@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai.methods._protocol import Info
+from zakai.methods._sum_static import Sum
 from zakai.methods._sum_system import Factor
-from zakai.methods._sum_update import Moment, Sum, average, move
+from zakai.methods._sum_update import Moment, average, move
 from zakai.numerics.flow import Transition, at
 from zakai.numerics.gaussian_sum import Array, Components, shares
 from zakai.records.schedule import Schedule
@@ -33,11 +34,17 @@ class Prepared:
     halves: Intervals
     halved: Array
     precision: Array
+    inputs: list[Array | None]
     notes: tuple[str, ...] = ()
 
     def moment(self, k: int, time: float) -> Moment:
-        """Return what acts on sums at a time of interval k."""
-        return Moment(self.static, time, self.theta, self.precision[k])
+        """Return what acts on sums at a time of interval k, with the inputs at its end."""
+        return Moment(self.static, time, self.theta, self.precision[k], self.inputs[k])
+
+    def first(self) -> Moment:
+        """Return what acts on the prior, which knows no inputs."""
+        static, none = self.static, np.zeros(len(self.static.model.u))
+        return Moment(static, float(static.model.start), self.theta, static.system.start_precision(self.theta.real), none)
 
 
 def prepared_of(static: Sum, schedule: Schedule, theta: Array) -> tuple[Prepared, tuple[float, float]]:
@@ -47,8 +54,9 @@ def prepared_of(static: Sum, schedule: Schedule, theta: Array) -> tuple[Prepared
     halved[rows] = np.arange(len(rows))
     whole, errors = _intervals(static, schedule, theta)
     halves, _ = _intervals(static, schedule.halved(rows), theta)
-    times = schedule.stops if len(schedule) else np.array([static.model.start])
-    return Prepared(static, theta, whole, halves, halved, static.system.precision(times, theta.real)), errors
+    inputs = static.system.end_inputs(schedule)
+    u = np.zeros((len(schedule), len(static.model.u))) if schedule.inputs is None else np.array(inputs)
+    return Prepared(static, theta, whole, halves, halved, static.system.precision(schedule.stops, theta.real, u), inputs), errors
 
 
 def _intervals(static: Sum, schedule: Schedule, theta: Array) -> tuple[Intervals, tuple[float, float]]:

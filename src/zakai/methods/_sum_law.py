@@ -1,7 +1,8 @@
 """Samples of a Gaussian-sum method whose law is not N(h(x, t), S(t)): families, and noise that depends on the state.
 
 A component is multiplied by p(z | x) itself.  How far that is from what one Gaussian can follow is measured by statistics s(x)
-whose Fisher information is about one, in the place of S^(-1/2) h: 2 sqrt(h) of a count, 2 asin(sqrt(h)) of a probability.
+whose Fisher information is about one, in the place of S^(-1/2) h: 2 sqrt(h) of a count, 2 asin(sqrt(h)) of a probability.  Of
+`observation_log_density` it is the deviance residual of the observation, sqrt(2 (max l - l)) with l = log p(z | x).
 """
 
 from __future__ import annotations
@@ -42,15 +43,21 @@ def statistics_of(model: Model) -> list[tuple[int, sp.Expr]]:
     return found
 
 
+_DEEPEST = 1e8  # nats below the maximum at which a log density counts
+
+
 class SampleLaw:
-    """The law of the samples of a model, and its M statistics."""
+    """The law of the samples of a model, and its M statistics; `formulas` are those that depend on the state as the law does."""
 
     def __init__(self, model: Model):
-        self.model = model
-        found = statistics_of(model)
-        self.formulas = [formula for _, formula in found]
-        self._columns = np.array([column for column, _ in found])
-        self._statistics = numpy_function(self.formulas, model)
+        self.model, self._columns = model, np.zeros(1, int)
+        self.formulas: list[sp.Expr] = [] if model.log_density is None else [model.log_density]
+        self._statistics = None
+        if model.log_density is None:
+            found = statistics_of(model)
+            self.formulas = [formula for _, formula in found]
+            self._columns = np.array([column for column, _ in found])
+            self._statistics = numpy_function(self.formulas, model)
 
     def __len__(self) -> int:
         return len(self.formulas)
@@ -59,12 +66,21 @@ class SampleLaw:
         """Return the metric (M, M) of the statistics of the coordinates `seen` (m,)."""
         return np.diag(1.0 * seen[self._columns])
 
-    def statistics(self, x: Array, t: float, theta: Array) -> Array:
-        """Return s (..., M) at points x (..., n), zero where it has no value."""
+    def statistics(self, x: Array, t: float, theta: Array, u: Array | None, values: Array | None) -> Array:
+        """Return s (..., M) at points x (..., n), zero where it has no value; `values` (m,) are the observation, if known."""
         with np.errstate(all="ignore"):
-            s = self._statistics(x, t, theta)
+            if self._statistics is not None:
+                s = self._statistics(x, t, theta, u)
+            elif values is None:
+                return np.zeros((*x.shape[:-1], 1))
+            else:
+                logs = log_likelihood(self.model, values, np.ones(self.model.m, bool), x, t, theta, u)[..., None]
+                top = np.max(logs, initial=-np.inf, where=np.isfinite(logs))
+                s = np.sqrt(2.0 * np.clip(top - logs, 0.0, _DEEPEST))
         return np.where(np.isfinite(s), s, 0.0)
 
-    def likelihood(self, seen: Array, t: float, theta: Array, origin: Array) -> Callable[[Array, Array], Array]:
+    def likelihood(
+        self, seen: Array, t: float, theta: Array, u: Array | None, origin: Array
+    ) -> Callable[[Array, Array], Array]:
         """Return log p(z | x, t) of the coordinates `seen` as a function of x - origin (..., n) and z (m,); NaN without a law."""
-        return lambda offsets, values: log_likelihood(self.model, values, seen, origin + offsets, t, theta)
+        return lambda offsets, values: log_likelihood(self.model, values, seen, origin + offsets, t, theta, u)

@@ -20,12 +20,15 @@ import sympy as sp
 
 from zakai.algebra.systems import yau_system
 from zakai.methods._affine_system import Matrices, precision_of
+from zakai.methods._input_pieces import pieces_of
+from zakai.methods._outside_tables import OutsideTables
 from zakai.methods._residuals import Factor as Residuals
 from zakai.methods._residuals import Sensors
 from zakai.methods._sum_law import SampleLaw, has_own_law
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
-from zakai.numerics.flow import Coefficients, FlowResult, integrate
+from zakai.numerics.complex_step import cholesky
+from zakai.numerics.flow import Coefficients, FlowResult, composed, integrate
 from zakai.numerics.gaussian_sum import Array
 from zakai.records.schedule import Schedule
 
@@ -40,6 +43,7 @@ class Factor(NamedTuple):
 
     `times` (J,), `before`, `after` and `energy` (J, m, m) or None for zero, `spread` and `weight` (m, m).  Samples with a law of
     their own have `law`(z, dy) = log p(dy | z), of which the power `share` is taken; `energy` is then that of statistics.
+    `inputs` (number of inputs,) are those at the end.
     """
 
     times: Array
@@ -51,6 +55,7 @@ class Factor(NamedTuple):
     offset: Any
     law: Callable[[Array, Array], Array] | None = None
     share: float = 1.0
+    inputs: Array | None = None
 
 
 class System:
@@ -59,10 +64,12 @@ class System:
     def __init__(self, model: Model, splitting: str):
         yau = yau_system(model)
         assert yau is not None
+        self.model = model
         n, m = model.n, model.m
         self.n, self.m, self.lie = n, m, splitting == "lie"
         self.sampled = model.observation_kind == "samples"
         self.law = SampleLaw(model) if has_own_law(model) else None
+        self.law_is_formula = model.log_density is not None
         self.affine, self.unobserved = yau.slope is not None and self.law is None, yau.unobserved is not None
         # Whether the increments drive the equation inside an interval.
         self.rates = self.affine and not self.sampled and not self.lie
@@ -80,41 +87,63 @@ class System:
         self._equation = Matrices(blocks, model)
         slope, intercept = yau.slope or sp.zeros(m, n), yau.intercept or sp.zeros(m, 1)
         self._sensor = Matrices([slope, intercept + slope * centre, model.observation_noise], model)
-        self.autonomous = not (self._equation.varying or self.rates and self._sensor.varying)
+        parts = [self._equation, self._sensor] if self.rates else [self._equation]
+        self.outside = OutsideTables(model)
+        self.hold, driven = model.input_hold, any(part.driven for part in parts)
+        # Whether a piece of an interval has one flow for each length: the inputs are constant in it.
+        self.autonomous = not any(part.timed for part in parts) and (model.input_hold == "zero" or not driven)
 
-    def observe(self, z: Array, t: Any, theta: Array) -> Array:
-        """Return h (..., m) at points z (..., n), or the statistics of a law."""
+    def observe(self, z: Array, t: Any, theta: Array, u: Array | None, values: Array | None = None) -> Array:
+        """Return h (..., m) at points z (..., n) and inputs u, or the statistics of a law, for an observation if it is known."""
         if self.law is not None:
-            return self.law.statistics(self.origin + z, t, theta)
-        return self.sensors.observed(self.origin + z, t, theta)
+            return self.law.statistics(self.origin + z, t, theta, u, values)
+        return np.asarray(self.sensors.observed(self.origin + z, t, theta, u))
 
-    def noise(self, times: Array, theta: Array) -> Array:
-        """Return S (R, m, m) at times (R,)."""
-        return np.asarray(np.broadcast_to(self.sensors.noise(self.origin, times, theta), (len(times), self.m, self.m)))
+    def noise(self, times: Array, theta: Array, u: Array | None) -> Array:
+        """Return S (R, m, m) at times (R,) and inputs (R, number of inputs)."""
+        return np.asarray(np.broadcast_to(self.sensors.noise(self.origin, times, theta, u), (len(times), self.m, self.m)))
 
-    def precision(self, times: Array, theta: Array) -> Array:
+    def precision(self, times: Array, theta: Array, u: Array | None) -> Array:
         """Return S^-1 (R, m, m) at times (R,), or the metric of the statistics of a law."""
         if self.law is not None:
             return np.broadcast_to(np.eye(len(self.law)), (len(times), len(self.law), len(self.law)))
-        return np.linalg.inv(self.noise(times, theta))
+        return np.linalg.inv(self.noise(times, theta, u))
 
-    def slope(self, t: float, theta: Array) -> tuple[Array, Array]:
+    def start_precision(self, theta: Array) -> Array:
+        """Return the same at the start with inputs of zero, before any are known; the identity where there is none."""
+        none = np.zeros((1, len(self.model.u)))
+        try:
+            found: Array = self.precision(np.array([float(self.model.start)]), theta, none)[0]
+            cholesky(found)
+        except np.linalg.LinAlgError:
+            return np.eye(self.m)
+        return found
+
+    def slope(self, t: float, theta: Array, u: Array | None) -> tuple[Array, Array]:
         """Return C (m, n) and c (m,) of an affine h = C z + c at a time."""
-        C, c, _ = self._sensor(np.array([t]), theta)
+        C, c, _ = self._sensor(np.array([t]), theta, None if u is None else u[None])
         return C[0], c[0, :, 0]
 
+    def end_inputs(self, schedule: Schedule) -> list[Array | None]:
+        """Return the inputs at the ends of intervals; an increment ends before they jump."""
+        if schedule.inputs is None:
+            return [None] * len(schedule)
+        return list(schedule.inputs.at(schedule.stops, self.hold, before=not self.sampled))
+
     def transitions(self, schedule: Schedule, theta: Array) -> FlowResult:
-        """Return the transitions of all intervals."""
-        inside = schedule.inside
+        """Return the transitions of all intervals, each composed of those of its pieces, and the errors of the pieces."""
+        pieces = pieces_of(schedule, self.hold, len(self.model.u))
+        inside = schedule.inside[pieces.row]
         whole = np.asarray(inside.all(axis=1))
 
         def coefficients(times: Array, rows: Array) -> Coefficients:
-            L, l, G, Q, p, r, Qf, pf, rf = self._equation(times, theta)
+            u = pieces.inputs(times, rows)
+            L, l, G, Q, p, r, Qf, pf, rf = self._equation(times, theta, u)
             if not self.rates:
                 full = whole[rows, None, None]
                 Q, p, r = (np.where(full, one, other) for one, other in ((Qf, Q), (pf, p), (rf, r)))
                 return Coefficients(L, l, G, Q, p, r[:, 0])
-            C, c, S = self._sensor(times, theta)
+            C, c, S = self._sensor(times, theta, u)
             precision = precision_of(S, inside[rows])
             gain = np.swapaxes(C, 1, 2) @ precision
             driven = precision @ c
@@ -124,17 +153,20 @@ class System:
             return Coefficients(L, offset, G, Q - 0.5 * gain @ C, linear, constant)
 
         if self.autonomous or not len(schedule):
-            return integrate(coefficients, np.zeros(len(schedule)), schedule.lengths, True)
-        return integrate(coefficients, schedule.starts, schedule.stops, False)
+            found = integrate(coefficients, np.zeros(len(pieces.row)), pieces.lengths, True)
+        else:
+            found = integrate(coefficients, pieces.starts, pieces.stops, False)
+        return found._replace(transition=composed(found.transition, pieces.row, len(schedule)))
 
     def factors(self, schedule: Schedule, theta: Array) -> tuple[list[Factor], float]:
         """Return the factors of all intervals, and the largest error of their integrals over time."""
         nothing = np.zeros((self.m, self.m))
         none = Factor(np.zeros(1), None, None, None, nothing, nothing, 0.0)
+        ends = self.end_inputs(schedule)
         if self.law is not None:
-            return [self._of_law(self.law, schedule, k, theta, none) for k in range(len(schedule))], 0.0
+            return [self._of_law(self.law, schedule, k, theta, none, u) for k, u in enumerate(ends)], 0.0
         complete = Schedule(schedule.starts, schedule.stops, np.ones_like(schedule.seen), schedule.lengths[:, None] + nothing[0])
-        half = 0.5 * np.linalg.inv(self.noise(schedule.stops[:1], theta))
+        half = nothing if self.sampled else 0.5 * np.linalg.inv(self.noise(schedule.stops[:1], theta, None))
         found, worst = [none] * len(schedule), 0.0
         for k in range(len(schedule)):
             inside, seen, length = schedule.inside[k], schedule.seen[k], float(schedule.lengths[k])
@@ -142,10 +174,10 @@ class System:
             early = late = none
             if (whole and not self.rates) or not (whole or self.unobserved or self.rates or self.sampled) and length > 0:
                 if any(self.sensors.varies):
-                    *ends, error = self.sensors.inside(complete, k, np.zeros(self.m), theta, self.probes)
+                    *both, error = self.sensors.inside(complete, k, np.zeros(self.m), theta, self.probes)
                     worst = max(worst, error)
-                    before, after = (_squares(end) / length for end in ends)
-                    times = ends[0].times
+                    before, after = (_squares(end) / length for end in both)
+                    times = both[0].times
                 else:
                     before, after, times = half, half, schedule.stops[k : k + 1]
                 start, end = (None, before + after) if self.lie else (before, after)
@@ -156,29 +188,33 @@ class System:
                 continue
             at_end = seen & ~inside if self.rates else seen
             if at_end.any():
-                found[k] = self._at_end(schedule, k, theta, at_end)
+                found[k] = self._at_end(schedule, k, theta, at_end, ends[k])
             if late.energy is not None:
                 found[k] = _joined(found[k], late)
         return found, worst
 
-    def _of_law(self, law: SampleLaw, schedule: Schedule, k: int, theta: Array, none: Factor) -> Factor:
+    def _of_law(
+        self, law: SampleLaw, schedule: Schedule, k: int, theta: Array, none: Factor, u: Array | None
+    ) -> Factor:
         """Return the factor of the samples at the end of interval k."""
         seen, stop = schedule.seen[k], float(schedule.stops[k])
         if not seen.any():
             return none
-        likelihood = law.likelihood(seen, stop, theta, self.origin)
-        return none._replace(times=np.array([stop]), energy=law.energy(seen)[None], law=likelihood)
+        likelihood = law.likelihood(seen, stop, theta, u, self.origin)
+        return none._replace(times=np.array([stop]), energy=law.energy(seen)[None], law=likelihood, inputs=u)
 
-    def _at_end(self, schedule: Schedule, k: int, theta: Array, at_end: Array) -> Factor:
+    def _at_end(self, schedule: Schedule, k: int, theta: Array, at_end: Array, u: Array | None) -> Factor:
         """Return the factor of observations that act at the end of interval k."""
-        observed = self.sensors.at_end(schedule, k, np.zeros(self.m), theta, at_end)
+        observed = self.sensors.at_end(schedule, k, np.zeros(self.m), theta, at_end, u)
         energy = _squares(observed)
         if self.sampled:
             nothing = np.zeros((self.m, self.m))
-            return Factor(observed.times, None, None, energy, np.diag(1.0 * at_end), nothing, observed.constant)
+            return Factor(
+                observed.times, None, None, energy, np.diag(1.0 * at_end), nothing, observed.constant, inputs=u
+            )
         spans = np.where(schedule.inside[k], schedule.lengths[k], schedule.elapsed[k])
         spread = np.diag(np.where(at_end, 1.0 / np.where(at_end, spans, 1.0), 0.0))
-        return Factor(observed.times, None, None, energy, spread, spread @ energy[0] @ spread, 0.0)
+        return Factor(observed.times, None, None, energy, spread, spread @ energy[0] @ spread, 0.0, inputs=u)
 
 
 def _squares(factor: Residuals) -> Array:
@@ -203,6 +239,7 @@ def _joined(factor: Factor, other: Factor) -> Factor:
         np.zeros_like(factor.spread),
         factor.weight - factor.spread @ factor.energy.sum(axis=0) @ factor.spread,
         factor.offset,
+        inputs=factor.inputs,
     )
 
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.errors import InputError
 from zakai.methods._protocol import Info
-from zakai.methods._sum_gauge import SumGauge, directions_of, span
-from zakai.methods._sum_system import Factor, System, system_of
-from zakai.models.model import Model
+from zakai.methods._sum_static import Sum
+from zakai.methods._sum_system import Factor
 from zakai.numerics.flow import Transition
 from zakai.numerics.gaussian_sum import (
     Array,
@@ -37,71 +36,21 @@ from zakai.numerics.sum_quadrature import (
     refit,
     refit_affine,
     rows_of,
+    steepest,
     tilted,
     together,
     without_loss,
 )
 from zakai.numerics.sum_reduction import FIVE, PRUNED, exchange, gathered, groups, parents_of, split
 
-# Components by the number of directions in which they must be narrow.
-COMPONENTS = {0: 1, 1: 20, 2: 64, 3: 128}
-MOST_DIRECTIONS = 5
-# Up to so many directions the start of an affine h, which is exact from there on, is not reduced.
-MOST_WHOLE = 2
 # How often components are split before a sample, and how many times more of them there may be while it is used.
 ROUNDS, SPLIT_FACTOR = 5, 6
-# The share of the components that the companion has.  The error falls about like the inverse of their number, so that the
-# distance of the two is about the error of the longer one, or more.
-_COMPANION = 0.35
 # The loss that a component is meant to have at most; a transition that widens it beyond needs more rounds of exchanges.
 _FINE, _MOST_ROUNDS = 0.1, 12
 # The share of the reach of its nodes beyond which a component that an observation moves is not known.
 _REACHED = 0.8
 # The largest energy of h, in nats, between two nodes over a component whose share of the largest is more than this.
 _STEEP, _COUNTED = 32.0, 1e-2
-
-
-class Sum:
-    """What does not depend on data or parameters: the system, its gauge, and how the sum is kept."""
-
-    def __init__(self, model: Model, splitting: str, components: int | None, reduction: str, tolerance: float, alpha: float):
-        self.model = model
-        self.system: System = system_of(model, splitting)
-        self.gauge = SumGauge(self.system.potential, model, self.system.origin)
-        self.angles = tuple(model.state.index(name) for name in model.periodic)
-        self.affine = self.system.affine
-        formulas = list(model.observation) if self.system.law is None else self.system.law.formulas
-        self.directions = np.zeros((model.n, 0)) if self.affine else directions_of(formulas, model)
-        self.start_directions = span(np.hstack([self.directions, self.gauge.directions]))
-        k = self.start_directions.shape[1]
-        if max(k, self.directions.shape[1]) > MOST_DIRECTIONS:
-            raise InputError(
-                f"{model.source}: h and phi vary in {k} directions of the state; quadrature takes {MOST_DIRECTIONS} at most"
-            )
-        self.asked, self.components = components, COMPONENTS.get(k, 192) if components is None else components
-        self.reduction, self.tolerance, self.alpha = reduction, tolerance, alpha
-        self.split_merge = reduction == "split-merge"
-        # The last factor of an interval corrects for what both halves lose; other reductions may have negative parts.
-        self.corrections = 1 + self.system.halves if self.split_merge else 0
-        # Whether an interval is split in time: its error is that of the companion, which takes two steps of half the length.
-        self.split_time = not self.system.rates and not self.system.sampled
-        # Whether components are split before each observation rather than after it.
-        self.split_before = self.system.sampled and bool(self.directions.shape[1]) and self.split_merge
-
-    def limits(self, count: int) -> tuple[int, int]:
-        """Return how many components the sum and its companion may have, for a prior that was cut into `count` Gaussians."""
-        k = self.start_directions.shape[1]
-        if k == 0 or self.affine and self.asked is None and k <= MOST_WHOLE:  # nothing is merged
-            used = count if self.affine else self.components
-            return used, used
-        used = min(self.components, count) if self.affine else self.components
-        return used, round(_COMPANION * used) if used >= 6 else used + 4
-
-
-@lru_cache(maxsize=32)
-def sum_of(model: Model, splitting: str, components: int | None, reduction: str, tolerance: float, alpha: float) -> Sum:
-    """Return what does not depend on data or parameters, made once."""
-    return Sum(model, splitting, components, reduction, tolerance, alpha)
 
 
 def move(transition: Transition, v: Components, inputs: Array, angles: tuple[int, ...]) -> Components:
@@ -130,12 +79,14 @@ def losses(curved: Curvature, share: Array) -> Array:
 
 
 class Moment(NamedTuple):
-    """A time with the parameters and S^-1 (m, m) there, for what is done to a sum at that time."""
+    """A time with the parameters, S^-1 (m, m), the inputs and the observation there, for what is done to a sum at that time."""
 
     static: Sum
     time: float
     theta: Array
     precision: Array
+    inputs: Array | None = None
+    values: Array | None = None
 
     def share(self, v: Components) -> tuple[Array, Any]:
         """Return the share in u = e^phi v of each component of v (K,), and the logarithm of the mass of u."""
@@ -150,7 +101,7 @@ class Moment(NamedTuple):
 
     def observe(self, z: Array) -> Array:
         """Return h at points without derivatives."""
-        return self.static.system.observe(z, self.time, self.theta.real)
+        return self.static.system.observe(z, self.time, self.theta.real, self.inputs, self.values)
 
     def curvature(self, v: Components) -> Curvature:
         """Return how far h is from affine over each component."""
@@ -182,7 +133,7 @@ class Moment(NamedTuple):
             def log_factor(z: Array, _: Array) -> Array:
                 value: Any = constant
                 for j, t in enumerate(factor.times):
-                    h = static.system.observe(z, t, theta)
+                    h = static.system.observe(z, t, theta, factor.inputs)
                     if linear is not None:
                         value = value + h @ linear[j]
                     if energy is not None:
@@ -192,7 +143,7 @@ class Moment(NamedTuple):
 
             return refit(v, log_factor, static.directions, energy is not None, corrections)
         for j, t in enumerate(factor.times):
-            C, c = static.system.slope(t, theta)
+            C, c = static.system.slope(t, theta, factor.inputs)
             if linear is not None:
                 v = tilted(v, linear[j] @ C, linear[j] @ c)
             if energy is not None:
@@ -203,14 +154,16 @@ class Moment(NamedTuple):
         self, v: Components, factor: Factor, values: Array, most: int, edge: Array, moved: float
     ) -> tuple[Components, Info]:
         """Return the sum after the factor at the end of an interval, at most `most` components, and what the step reports."""
-        static = self.static
+        self, static = self._replace(values=values.real), self.static
         curved = bool(static.directions.shape[1])
         health = dict.fromkeys(("nonlinearity", "quadrature", "pruned", "merged"), 0.0)
-        health["without_law"] = self._without_law(v, factor, values)
-        remaining = 1.0
+        health["without_law"] = 0.0 if factor.law is None else self._share(v, partial(_lawless, factor.law, values))
+        remaining, at_once = 1.0, None
         while remaining > 0.0:
             if curved and static.split_merge and (static.system.sampled or factor.energy is not None):
                 fraction = min(remaining, self._fraction(v, factor))
+                if fraction < 1.0 == remaining and static.system.sampled:
+                    at_once = self.share(self.multiply(v, factor, values).sum)[1].real
                 v, product = self._sharp(v, part_of(factor, fraction), values, most, health)
             else:
                 fraction, product = remaining, self.multiply(v, factor, values, static.corrections)
@@ -222,6 +175,8 @@ class Moment(NamedTuple):
             health["nonlinearity"] += average(share, product.loss)
             health["quadrature"] += average(share, product.doubt)
             moved = max(moved, average(share, product.moved))
+        if at_once is not None:
+            health["quadrature"] = max(health["quadrature"], abs(float(np.tanh(at_once - log_mass.real))))
         if curved and not static.split_before:
             v = self._reduced(v, most, health)
         v, u, parts = self.normalised(v)
@@ -230,19 +185,22 @@ class Moment(NamedTuple):
         health |= {
             "tail_depth": moved / _REACHED,
             "components": float(1.0 / np.sum(share**2)),
+            "outside_tables": self._share(v, self._beyond) if static.system.outside else 0.0,
             "edge_weight": float(np.sum(share * edge)) if len(edge) == len(share) else 0.0,
         }
         return v, Info(log_mass, wrapped(static.system.origin + mean, static.angles), cov, health)
 
-    def _without_law(self, v: Components, factor: Factor, values: Array) -> float:
-        """Return the share of the mass where the law of a sample has no value."""
-        if factor.law is None:
-            return 0.0
+    def _share(self, v: Components, marked: Callable[[Array], Array]) -> float:
+        """Return the share of the mass at points (K, Q, n) that are `marked` (K, Q)."""
         directions = self.static.directions
         rule = gauss_hermite(directions.shape[1])
         real = Components(*(array.real for array in v))
-        logs = factor.law(points(real, regression(real.covs, directions), rule.nodes), values)
-        return average(self.share(v)[0], np.isnan(logs.real) @ rule.weights)
+        return average(self.share(v)[0], marked(points(real, regression(real.covs, directions), rule.nodes)) @ rule.weights)
+
+    def _beyond(self, z: Array) -> Array:
+        """Return which points lead beyond the range of a table."""
+        system = self.static.system
+        return system.outside(system.origin + z, self.time, self.theta.real, self.inputs)
 
     def _fraction(self, v: Components, factor: Factor) -> float:
         """Return the power of a factor, 1/2^i, that is smooth enough for the nodes over the components that count."""
@@ -250,9 +208,14 @@ class Moment(NamedTuple):
             return 1.0
         share = self.share(v)[0].real
         counted = share > _COUNTED * np.max(share, initial=0.0)
-        metric = np.abs(factor.energy.real).sum(axis=0) + 1e-300 * np.eye(len(self.precision))
-        energies = curvature(selected(v, counted), self.observe, metric, self.static.directions)
-        steep = float(np.max(energies.residual + energies.linear, initial=0.0)) * SEARCH[self.static.directions.shape[1]][1] ** 2
+        v, directions = selected(v, counted), self.static.directions
+        law, values = factor.law, self.values
+        if law is not None and values is not None and self.static.system.law_is_formula:
+            steep = 2.0 * factor.share * steepest(v, lambda z: np.asarray(law(z, values)), directions)
+        else:
+            metric = np.abs(factor.energy.real).sum(axis=0) + 1e-300 * np.eye(len(self.precision))
+            energies = curvature(v, self.observe, metric, directions)
+            steep = float(np.max(energies.residual + energies.linear, initial=0.0)) * SEARCH[directions.shape[1]][1] ** 2
         return float(np.exp2(-np.ceil(np.log2(steep / _STEEP)))) if _STEEP < steep < np.inf else 1.0
 
     def _sharp(
@@ -312,6 +275,11 @@ class Moment(NamedTuple):
             if len(v.signs) == before and paid == 0.0:
                 break
         return v
+
+
+def _lawless(law: Callable[[Array, Array], Array], values: Array, z: Array) -> Array:
+    """Return at which points a law has no value."""
+    return np.asarray(np.isnan(law(z, values).real))
 
 
 def part_of(factor: Factor, fraction: float) -> Factor:

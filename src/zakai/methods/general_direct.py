@@ -20,8 +20,9 @@ from zakai.methods import _sum_start as start
 from zakai.methods._options import one_of, real_number, whole_number
 from zakai.methods._protocol import Info, Method
 from zakai.methods._sum_intervals import Prepared, advance, prepared_of
-from zakai.methods._sum_update import SPLIT_FACTOR, Sum, sum_of
-from zakai.models.features import OBSERVATION_FAMILY, SINC, STATE_DEPENDENT_OBSERVATION_NOISE
+from zakai.methods._sum_static import Sum, sum_of
+from zakai.methods._sum_update import SPLIT_FACTOR
+from zakai.models import features
 from zakai.models.model import Model
 from zakai.numerics.gaussian_sum import Array, Components, selected, shares, wrapped
 from zakai.numerics.sum_reduction import PRUNED, gathered, groups
@@ -96,6 +97,8 @@ def _check(model: Model, components: Any, splitting: Any, reduction: Any, tolera
         whole_number("components", components, 1)
     for name, value in (("alpha", alpha), ("tolerance", tolerance)):
         real_number(name, value, "a number between 0 and 1", lambda number: 0 < number < 1)
+    if splitting == "lie" and model.observation_kind != "samples" and model.observation.free_symbols & set(model.u):
+        raise InputError('option splitting: "lie" is for an observation without inputs; use "strang"')
 
 
 def _notes(static: Sum, schedule: Schedule, errors: tuple[float, float]) -> tuple[str, ...]:
@@ -119,7 +122,7 @@ def init(prepared: Prepared, prior: Any) -> State:
     static, theta = prepared.static, prepared.theta
     model, gauge, origin = static.model, static.gauge, static.system.origin
     t = float(model.start)
-    now = prepared.moment(0, t)
+    now = prepared.first()
     with np.errstate(all="ignore"):
         doubt = None if gauge.none else lambda u: gauge.doubt(u, t, theta)
         far = static.affine and static.asked is None
@@ -214,6 +217,7 @@ BOUNDS = {
     "quadrature": (1e-2, "relative error of the masses of components, by two rules of quadrature"),
     "pruned": (1e-3, "weight of components that were dropped in one step"),
     "merged": (0.1, "loss by merging components because their number is limited"),
+    "outside_tables": (1e-4, "share of the mass where a table is constant beyond its range"),
     "edge_weight": (1e-6, "weight of the outermost Gaussians of the start: the posterior is in tails that it has not"),
     "without_law": (1e-6, "share of the mass where the law of the observation has no value, as for counts with a negative mean"),
     "tail_depth": (1.0, "distance by which the observation moves the density into the tails of single Gaussians"),
@@ -233,5 +237,5 @@ METHOD = Method(
     bounds=BOUNDS,
     valid=valid,
     shorter="give fewer components",
-    handles=frozenset({OBSERVATION_FAMILY, SINC, STATE_DEPENDENT_OBSERVATION_NOISE}),
+    handles=features.OF_OBSERVATION | {features.INPUTS, features.JUMPS, features.KINKS, features.SINC, features.TABLES},
 )

@@ -32,6 +32,8 @@ AGREED, _PLACED = 1e-3, 12
 # component keeps its weight.
 _RIDGE, _CHANGE, _LIGHT = 1e-3, 0.5, 1e-12
 _EMPTY = 1e30
+# The depth in nats below the largest from which a product is negligible.
+_SMALL = 40.0
 
 LogFactor = Callable[[Array, Array], Array]
 
@@ -136,6 +138,28 @@ def refit(
         new = _rebalanced(sum_, new, points(sum_, gain, rule.nodes)[..., 0], values, rule, corrections)
     moved = np.abs(shift.real).max(axis=1) / rule.nodes[-1, -1]
     return Refitted(new, moved, loss, doubt)
+
+
+def steepest(sum_: Components, log_factor: Callable[[Array], Array], directions: Array) -> float:
+    """Return by how many nats a factor falls from the largest of the first nodes to the larger of its neighbours.
+
+    Along the direction in which that is most, of the components whose products are not negligible.
+    """
+    k = directions.shape[1]
+    rule = equidistant(*SEARCH[k], k)
+    real = Components(*(array.real for array in sum_))
+    logs = log_factor(points(real, regression(real.covs, directions), rule.nodes)).real
+    logs = np.where(np.isfinite(logs), logs, -_EMPTY)
+    top, place = logs.max(axis=1), logs.argmax(axis=1)
+    total = top + real.log_weights
+    used = (total > total.max(initial=-_EMPTY) - _SMALL) & (top > -_EMPTY)
+    grids = np.pad(logs[used].reshape(-1, *[rule.size] * k), [(0, 0)] + [(1, 1)] * k, constant_values=-_EMPTY)
+    at = np.array(np.unravel_index(place[used], [rule.size] * k)) + 1
+    rows, falls = np.arange(len(grids)), [np.zeros(1)]
+    for axis in np.eye(k, dtype=int)[:, :, None]:
+        beside = [grids[(rows, *(at + sign * axis))] for sign in (-1, 1)]
+        falls.append(top[used] - np.maximum(*beside))
+    return float(np.concatenate(falls).max())
 
 
 def _located(
