@@ -250,3 +250,11 @@ def test_a_method_that_does_not_handle_a_feature_is_refused_with_the_reason(feat
             with pytest.raises(ConditionError, match=f"{name} does not hold: it fails that"):
                 zakai.filter(model, record, name)
     assert analysis.eta is None and analysis.algebra.verdict == "undecided" and str(analysis) and analysis.to_latex()
+
+
+@pytest.mark.parametrize("name", ["level", "Add", "list"])
+def test_a_table_may_have_the_name_of_something_in_the_printers_of_sympy(name):
+    table = {name: ([0.0, 1.0], [0.0, 2.0])}
+    model = zakai.Model(state=["x"], drift=[f"-x + {name}(x)**2"], observation=["x"], tables=table)
+    analysis = zakai.analyze(model)
+    assert f"{name}(x)**2" in str(model.drift) and rf"\operatorname{{{name}}}^{{2}}" in analysis.to_latex()
