@@ -18,7 +18,7 @@ import sympy as sp
 from zakai.algebra._readable import readable, short
 from zakai.algebra.grouping import MANY_TERMS, grouped, terms_of, tidy
 from zakai.algebra.identities import is_zero
-from zakai.models.features import INPUTS, of_dynamics
+from zakai.models.features import INPUTS, JUMP_FUNCTIONS, of_dynamics
 from zakai.models.model import Model
 
 DEEPEST = 4  # functions inside of each other that are integrated
@@ -106,6 +106,8 @@ def yau_form(model: Model) -> YauForm | NoYauForm:
     potential = _potential(gradient, x)
     if potential is None:
         return NoYauForm(None, f"no closed form was found for phi with grad phi = {list(gradient)}")
+    if jumps := potential.atoms(*JUMP_FUNCTIONS):
+        return NoYauForm(False, f"phi contains {readable(min(jumps, key=str))}, and would jump in time")
     return YauForm(
         sp.ImmutableMatrix(matrix.applyfunc(tidy)),
         sp.ImmutableMatrix(offset.applyfunc(tidy)),

@@ -10,7 +10,7 @@ import numpy as np
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.health_warnings import warnings_of_run
-from zakai.engine.notes import notes_on_angles, notes_on_formulas, why_not_finite
+from zakai.engine.notes import notes_on_angles, notes_on_formulas, notes_on_tables, why_not_finite
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import KEPT, Setting
 from zakai.engine.versions import versions
@@ -108,6 +108,7 @@ class Run:
                 *_after_gaps(self.schedule),
                 *notes_on_noise(setting.model, self.schedule),
                 *notes_on_angles(setting.model, record),
+                *notes_on_tables(setting.model, setting.theta.real, record),
                 *self.empty.notes,
             ]
         )

@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from zakai.models._entries import formula
+from zakai.models.features import formulas_of
+from zakai.models.functions import TableFunction
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import explain_nonfinite, numpy_function
@@ -63,6 +66,21 @@ def notes_on_angles(model: Model, record: Record) -> list[str]:
     if largest <= 2 * np.pi + 1e-6:
         return []
     return [f"observed angles of up to {largest:g} are taken modulo 2 pi; give them in radians"]
+
+
+def notes_on_tables(model: Model, theta: np.ndarray, record: Record) -> list[str]:
+    """Return a sentence for every table of time or inputs alone that is constant beyond its range at a time of the record."""
+    calls = {call for part in formulas_of(model) for call in part.atoms(TableFunction) if not call.has(*model.x)}
+    notes = []
+    for call in sorted(calls, key=str):
+        times = np.concatenate([[model.start], record.times])
+        u = None if record.inputs is None else record.inputs.at(times, model.input_hold)
+        arguments = numpy_function(list(call.args), model)(np.zeros(model.n), times, theta, u)
+        beyond = call.table.outside(*np.moveaxis(arguments, -1, 0))
+        if beyond.any():
+            when = f"at {int(beyond.sum())} of {len(times)} times, first at t = {times[beyond][0]:g}"
+            notes.append(f"{formula(call)} is beyond the range of the table, where that is constant, {when}; extend the table")
+    return notes
 
 
 def _is_partial(formulas: Any, model: Model) -> bool:

@@ -23,6 +23,7 @@ class Formulas:
         n, m, x = model.n, model.m, list(model.x)
         drift, observation = sp.Matrix(model.drift), sp.Matrix(model.observation)
         slope, change = drift.jacobian(x), [drift.diff(symbol) for symbol in (model.t, *model.u)]
+        change = [column.replace(sp.DiracDelta, lambda *_: sp.S.Zero) for column in change]  # sign(t) has no slope but its jump
         self.shapes = (n, m)
         self.motion = numpy_function([*drift, *slope, *model.covariance, *sp.Matrix.hstack(*change)], model)
         self.sensor = numpy_function([*observation, *observation.jacobian(x)], model)

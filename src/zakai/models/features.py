@@ -55,7 +55,7 @@ def of_dynamics(model: Model) -> dict[str, str]:
     """Return the features that the law of the state has, apart from what is observed."""
     matrices = (model.diffusion, model.process_noise)
     found = {feature: words for feature, words in model.features.items() if feature not in (*OF_OBSERVATION, *_OF_FORMULAS)}
-    found |= _of_formulas([*model.drift, *(entry for matrix in matrices for entry in matrix.todok().values())])
+    found |= _of_formulas([*model.drift, *(entry for matrix in matrices for entry in matrix.todok().values())], model)
     if not any(part.free_symbols & set(model.u) for part in (model.drift, model.diffusion)):
         found.pop(INPUTS, None)
     return found
@@ -83,7 +83,7 @@ def features_of(model: Model) -> dict[str, str]:
         found[OBSERVATION_LOG_DENSITY] = f"observation_log_density: {_short(model.log_density)}"
     if model.domain:
         found[DOMAIN] = f"domain: {', '.join(f'{name} {interval}' for name, interval in model.domain.items())}"
-    return found | _of_formulas(formulas_of(model))
+    return found | _of_formulas(formulas_of(model), model)
 
 
 def formulas_of(model: Model) -> list[sympy.Expr]:
@@ -94,12 +94,13 @@ def formulas_of(model: Model) -> list[sympy.Expr]:
     return formulas + ([] if model.log_density is None else [model.log_density])
 
 
-def _of_formulas(formulas: list[sympy.Expr]) -> dict[str, str]:
+def _of_formulas(formulas: list[sympy.Expr], model: Model) -> dict[str, str]:
+    """Return the features that functions of the state are; a function of time and inputs alone is a coefficient."""
     found = {}
     for feature, functions in _OF_FORMULAS.items():
-        entry = next((formula for formula in formulas if formula.has(*functions)), None)
-        if entry is not None:
-            found[feature] = f"a formula contains {_short(next(iter(entry.atoms(*functions))))}"
+        calls = (call for formula in formulas for call in formula.atoms(*functions) if call.has(*model.x))
+        if (call := next(calls, None)) is not None:
+            found[feature] = f"a formula contains {_short(call)}"
     return found
 
 
