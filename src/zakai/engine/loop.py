@@ -10,7 +10,7 @@ import numpy as np
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.health_warnings import warnings_of_run
-from zakai.engine.notes import notes_on_angles, notes_on_formulas, notes_on_tables, why_not_finite
+from zakai.engine.notes import notes_on_angles, notes_on_formulas, notes_on_misfit, notes_on_tables, why_not_finite
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import KEPT, Setting
 from zakai.engine.versions import versions
@@ -195,8 +195,10 @@ class Run:
             _density=self.density if kept else None,
             _no_density=self._no_density(),
         )
-        undefined = notes_on_formulas(model, self.setting.theta.real, self.record, result.mean, result.variance)
-        result.warnings.extend([*undefined, *self.notes, *warnings_of_run(result)])
+        theta = self.setting.theta.real
+        undefined = notes_on_formulas(model, theta, self.record, result.mean, result.variance)
+        misfit = notes_on_misfit(model, theta, self.schedule, self.values, infos.log_likelihood_increment)
+        result.warnings.extend([*undefined, *self.notes, *misfit, *warnings_of_run(result)])
         return result
 
     def _no_density(self) -> str:
