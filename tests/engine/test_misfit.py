@@ -11,7 +11,8 @@ PRIOR = {"kind": "gaussian", "mean": [0.3], "cov": [[0.4]]}
 
 def warned(method, observation, value, kind="samples", **keys):
     model = zakai.Model(
-        state=["x"], drift=["0"], observation=[observation], observation_kind=kind, observation_noise=[["0.1"]], prior=PRIOR, **keys
+        state=["x"], drift=["0"], observation=[observation], observation_kind=kind, observation_noise=[["0.1"]], prior=PRIOR,
+        **keys,
     )  # fmt: skip
     result = zakai.filter(model, zakai.Record([0.1, 0.2, 0.3], [[0.1], [value], [0.2]], kind), method)
     return [warning for warning in result.warnings if "cannot be explained" in warning]

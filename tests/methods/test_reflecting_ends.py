@@ -224,3 +224,29 @@ def test_a_smoother_is_refused_in_one_line():
     model = model_of(upper=1.0, prior={"kind": "density", "log_density": "0"})
     with pytest.raises(zakai.InputError, match="no backward pass for a state with reflecting ends"):
         zakai.smooth(model, samples(TIMES[:1], [0.3]))
+
+
+def test_an_exponential_prior_at_an_end_that_it_has_flux_through_is_the_folded_process():
+    """The state is |y| of dy = -y dt + dv, whose transition is known; the solution has a layer at the end, the prior none."""
+    domain = {"x": {"lower": 0.0, "boundary": "reflecting"}}
+    prior = {"kind": "density", "log_density": "-x"}
+    model = zakai.Model(
+        state=["x"], drift=["-x"], observation=["x"], observation_kind="samples", observation_noise=[["0.1"]], domain=domain,
+        prior=prior,
+    )  # fmt: skip
+    times, values = [0.1, 0.25], [0.1, 0.8]
+    result = zakai.filter(model, zakai.Record(times, np.array(values)[:, None], "samples"))
+    nodes, weights = np.polynomial.legendre.leggauss(400)
+    x, weights = 15.0 * (nodes + 1.0), 15.0 * weights
+    p, last, expected = np.exp(-x), 0.0, []
+    for time, value in zip(times, values, strict=True):
+        decay, last = np.exp(last - time), time
+        variance = 0.5 * (1.0 - decay**2)
+        kernel = sum(np.exp(-0.5 * (sign * x[:, None] - decay * x) ** 2 / variance) for sign in (1.0, -1.0))
+        p = kernel / np.sqrt(2 * np.pi * variance) @ (weights * p) * np.exp(-5.0 * (value - x) ** 2) / np.sqrt(0.2 * np.pi)
+        mass = weights @ p
+        p = p / mass
+        expected.append((weights @ (x * p), np.log(mass)))
+    found = np.column_stack([result.mean[1:, 0], result.log_likelihood_increments[1:]])
+    assert found == pytest.approx(np.array(expected), abs=1e-6)
+    assert not result.warnings

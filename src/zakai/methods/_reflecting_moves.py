@@ -122,10 +122,13 @@ def propagated(
             if tried.split or lost:
                 break
             left, right = reached(tried.values, before, domain)
-            coarse = before.unresolved(tried.values) > 30.0 * negligible
+            unresolved = before.unresolved(tried.values)
+            coarse = unresolved > 30.0 * negligible
+            # Oscillations of what is not resolved reach the ends as well.
+            edge = unresolved if coarse else EDGE
             width = before.upper - before.lower
-            lower = max(before.lower - 0.4 * width * (left > EDGE), domain.lower)
-            upper = min(before.upper + 0.4 * width * (right > EDGE), domain.upper)
+            lower = max(before.lower - 0.4 * width * (left > edge), domain.lower)
+            upper = min(before.upper + 0.4 * width * (right > edge), domain.upper)
             least = before.size + 1 if coarse else before.size
             if (lower, upper) == (before.lower, before.upper) and (not coarse or before.size == SIZES[-1]):
                 # What the points do not resolve within the substep, as layers at the ends, shows with more of them only.
@@ -139,7 +142,7 @@ def propagated(
                     break
                 continue
             wider, values_there = moved(values, element, lower, upper, least, negligible)
-            if wider.unresolved(values_there) > 30.0 * negligible and max(left, right) > EDGE:
+            if wider.unresolved(values_there) > 30.0 * negligible and max(left, right) > edge:
                 tried = tried._replace(split=True)
                 break
             before, own = wider, values_there
