@@ -51,7 +51,7 @@ def test_a_jump_of_the_prior_costs_little_and_is_in_the_estimate(name, method):
         np.max(np.abs(np.sqrt(result.variance[1:, 0]) / deviation - 1)),
         abs(result.log_likelihood - total),
     )
-    assert worst < 2e-3
+    assert worst < 2e-4
     assert worst < 10 * np.nanmax(result.health["error_estimate"])
 
 

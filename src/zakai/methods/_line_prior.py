@@ -10,7 +10,7 @@ import numpy as np
 from zakai.numerics.line_window import Window
 
 Array = Any
-_PLACES = 16  # in a spacing
+_PLACES = 256  # in a spacing, to which the place of a jump is known
 
 
 def averaged(evaluate: Callable[[Array], Array], window: Window) -> Array:
