@@ -47,3 +47,35 @@ def test_kinks_are_as_accurate_as_smooth_functions(drift, f, observation, h, noi
     assert np.max(errors) < 2e-5
     assert result.log_likelihood == pytest.approx(log_likelihood, abs=4e-5)
     assert np.max(errors) < 10.0 * np.nanmax(result.health["error_estimate"]) + 1e-5
+
+
+FLAT = {
+    "max(x, 0.9)": (0.012, [1.139, 0.988, 0.731, 0.919], lambda x: np.maximum(x, 0.9)),
+    "min(x, 2*x)": (0.002, [-1.078, 0.321, -2.494, -3.329], lambda x: np.minimum(x, 2 * x)),
+}
+
+
+@pytest.mark.parametrize("method", ["limited-direct", "yau-yau"])
+@pytest.mark.parametrize("formula", FLAT)
+def test_sharp_samples_whose_grid_is_refined_to_its_largest_size(formula, method):
+    """A refined grid that is cut at its largest size loses the part of the density that the sample does not see."""
+    variance, values, h = FLAT[formula]
+    times = np.array([0.35, 0.4, 0.55, 0.8])
+    model = zakai.Model(
+        state=["x"], drift=["-x/2"], observation=[formula], observation_kind="samples", observation_noise=[[variance]],
+        prior={"kind": "gaussian", "mean": [0.3], "cov": [[0.8]]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record(times, np.array(values)[:, None], "samples"), method)
+    x = np.linspace(-6.0, 5.0, 2201)
+    p, last, expected = np.exp(-0.5 * (x - 0.3) ** 2 / 0.8), 0.0, []
+    for time, value in zip(times, values, strict=True):
+        decay, last = np.exp(-0.5 * (time - last)), time
+        kernel = np.exp(-0.5 * (x[:, None] - decay * x) ** 2 / (1.0 - decay**2))
+        p = kernel @ (p / p.sum()) / kernel.sum(axis=0).max() * np.exp(-0.5 * (value - h(x)) ** 2 / variance)
+        mass = p.sum()
+        mean = x @ p / mass
+        expected.append((mean, np.sqrt((x - mean) ** 2 @ p / mass), np.log(mass / np.sqrt(2 * np.pi * variance))))
+    mean, deviation, gained = np.array(expected).T
+    assert np.abs(result.mean[1:, 0] - mean).max() < 1e-4 * deviation.min()
+    assert np.abs(np.sqrt(result.variance[1:, 0]) / deviation - 1).max() < 1e-4
+    assert result.log_likelihood_increments[1:] == pytest.approx(gained, abs=1e-3)

@@ -59,7 +59,7 @@ def sampled_weakly(
     """
     system, start, theta = prepared.system, prepared.model.start, prepared.theta
     precision, constant = np.ascontiguousarray(prepared.coefficients.precisions[k, 0]), prepared.coefficients.constants[k]
-    observed = np.ascontiguousarray(observed, float)
+    observed, source = np.ascontiguousarray(observed, float), (values, window)
     while True:
         at = int(np.argmax(values))
         centre = system.observation(window.points[at : at + 1, None], start, theta)[0]
@@ -72,11 +72,11 @@ def sampled_weakly(
         total = float(np.sum(product))
         product = product / total
         error = 0.5 * weak_error(product, change)
-        new = lw.refined(window)
-        if error <= WEAK_SHARE * prepared.tolerance or new.size > prepared.largest:
+        new, covers = _finer(prepared, product, window)
+        if error <= WEAK_SHARE * prepared.tolerance or new.size > prepared.largest or not covers:
             break
-        values, window = lw.resampled(values, window, new), new
-        values = values / np.sum(values)
+        # From the whole density: one that ends within a grid cannot be interpolated there.
+        values, window = lw.resampled(*source, new), new
     rest = observed - centre
     gained = np.log(total) + best + constant - 0.5 * rest @ precision @ rest
     reference = float(np.log(values.max()))
@@ -84,6 +84,17 @@ def sampled_weakly(
     depth = float(product @ np.where(product > 0, reference - known, 0.0))
     look = figures(prepared, product, window)._replace(aliasing=error)
     return Product(product, gained, depth, growth, window), look
+
+
+def _finer(prepared: Prepared, values: Array, window: lw.Window) -> tuple[lw.Window, bool]:
+    """Return a finer grid for a density, and whether that holds it with the margins that a grid is kept with."""
+    if window.closed:
+        return lw.refined(window), True
+    look = figures(prepared, values, window)
+    low, high = window.offsets[look.first], window.offsets[look.last]
+    new = lw.quantized(window, low, high, window.spacing / 2**0.5 * 1.001, margin=0.16, most=lw.SIZES[-1])
+    least = new.size // 16
+    return new, bool(new.offsets[least] <= low and high < new.offsets[-least])
 
 
 def _sample_noise(prepared: Prepared, stop: float, at_end: np.ndarray) -> tuple[Array, Any]:
