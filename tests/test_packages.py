@@ -131,11 +131,10 @@ def test_only_peers_import_jax_or_a_library_of_filters():
 
 
 def test_whoever_imports_jax_sets_double_precision():
-    peers = [file for file in FILES if file.startswith("peers/") and file != "peers/_float64.py"]
-    names = {file: {name for name, at_the_top in imports(file) if at_the_top} for file in peers}
-    importing = [file for file in peers if any(name.partition(".")[0] in JAX for name in names[file])]
-    assert importing
-    assert [file for file in importing if not any(name.startswith("zakai.peers") for name in names[file])] == []
+    names = {file: {name for name, top in imports(file) if top} for file in FILES if file.startswith("peers/")}
+    importing = {file for file, own in names.items() if any(name.partition(".")[0] in JAX for name in own)}
+    setting = {file for file, own in names.items() if any(name.startswith("zakai.peers") for name in own)}
+    assert importing and importing <= setting | {"peers/_float64.py"}
 
 
 def test_numerics_imports_neither_sympy_nor_a_model():
