@@ -12,9 +12,10 @@ from zakai.errors import ConditionError, InputError
 
 
 def relative_error(result, reference, box, k):
-    """The largest error of the normalised density, relative to its maximum."""
-    expected = reference / (reference.sum() * box.cell)
-    computed = np.exp(result.density(k).log_density(box.x))
+    """The largest error of the normalised density at every third point of each axis, relative to its maximum."""
+    every_third = (slice(None, None, 3),) * box.n
+    expected = reference[every_third] / (reference.sum() * box.cell)
+    computed = np.exp(result.density(k).log_density(box.x[every_third]))
     return np.abs(computed - expected).max() / expected.max()
 
 

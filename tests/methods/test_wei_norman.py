@@ -217,7 +217,7 @@ def test_three_states_with_a_passive_drift_are_as_the_equation_says():
 
 def test_the_observed_block_of_three_states_is_kalman_and_bucys():
     model = zakai.load_model("gallery:passive-drift")
-    record = record_of(model, np.arange(1, 9) * 0.05, seed=2)
+    record = record_of(model, np.arange(1, 5) * 0.05, seed=2)
     result = zakai.filter(model, record, "wei-norman")
     # x1 and x2 + x3 are a linear system by themselves.
     block = zakai.Model(
