@@ -17,11 +17,11 @@ from zakai.methods._line_message import LOWEST, PAD, SURE, Message, support, tap
 from zakai.methods._line_steps import steps_of
 from zakai.methods._line_system import Prepared, State, covariance_at, state_moments
 from zakai.methods._line_update import factor_at_end
-from zakai.methods._line_way import EXCURSION, negligible, smoothing_tolerance
+from zakai.methods._line_way import negligible, smoothing_tolerance
 from zakai.methods._protocol import Infos
 from zakai.numerics import line_backward as lb
 from zakai.numerics import line_window as lw
-from zakai.numerics.line_adjoint import by_adjoints
+from zakai.numerics.line_adjoint import EXCURSION, by_adjoints
 from zakai.numerics.line_segment import SPLIT, SPLIT_FACTOR
 
 Array = Any
@@ -54,22 +54,26 @@ def back(
         observed: the observations (K, m).
     """
     k, first = rows.stop - 1, rows.start
+    split = prepared.gaussian
     if prepared.kinked or not _served(prepared, k):
         return None
-    for window in _shared(states[k - first], states[k - first + 1].window, later, product, grid):
+    shared = _shared(states[k - first], states[k - first + 1].window, later, product, grid)
+    if split and shared and not shared[-1].closed:
+        shared.append(lw.refined(shared[-1], 2.0))  # for a kernel that is narrow in spacings
+    for window in shared:
         begin, most = k, TOGETHER if prepared.mixed else MOST
         own = states[k - first].window
-        if not _holds(window, *own.offsets[[0, -1]]):
+        if not _holds(window, *own.offsets[[0, -1]]) or (split and window.spacing < own.spacing):
             most = 1
         while begin > first and k - begin < most - 1 and _served(prepared, begin - 1):
             earlier = states[begin - 1 - first].window
-            shifted = prepared.gaussian and own.spacing == window.spacing and own.origin == window.origin
+            shifted = split and own.spacing == window.spacing and own.origin == window.origin
             if earlier != own and not (shifted and earlier.spacing == own.spacing and earlier.size == own.size == window.size):
                 break
             begin -= 1
         here = slice(begin, k + 1)
         before = states[begin - first : k + 1 - first]
-        for stride in (1,) if prepared.gaussian else STRIDES:
+        for stride in (0,) if split else STRIDES:
             taken = _taken(prepared, here, before, later, product, grid, window, stride, observed[begin - first : k + 1 - first])
             if taken is not None:
                 return taken
@@ -91,7 +95,7 @@ def _taken(
     limits = lb.Limits(smoothing_tolerance(prepared), SHARE * prepared.tolerance, negligible(prepared), prepared.cut)
     now, start, longer, gauge = lw.resampled(product, grid, window), 0, window, np.zeros(1)
     filtered, centres = _before(before, window)
-    if prepared.gaussian:
+    if not stride:
         table = grid_of(prepared, window, here)
         if table is None:
             return None

@@ -19,6 +19,7 @@ from zakai.methods._line_moves import MAGNUS, Report
 from zakai.methods._line_system import Prepared, State, covariance_at
 from zakai.methods._line_volumes import pulled_back
 from zakai.numerics import line_window as lw
+from zakai.numerics.line_adjoint import EXCURSION
 from zakai.numerics.line_operator import Spectral, exponential_action
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line_polynomial import local_polynomial
@@ -28,7 +29,6 @@ Array = Any
 MOST_SUBSTEPS = 500
 ROUNDING = 1e-15  # of the maximum: smaller values of psi are not kept
 NOISE = 1e-11  # of the maximum: what is rounding in psi
-EXCURSION = 3.9  # standard deviations of the noise that a path between two points goes beyond them, but for exp(-30)
 RESOLVED = 0.25  # spacing in standard deviations of the noise
 DIVISIONS = (1, 2, 4, 8, 16, 32)  # parts of an interval in which an increment acts
 DIVIDED = 1e-2  # of the tolerance that they may leave

@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line_averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, averaged, averaging
-from zakai.numerics.line_backward import ERROR, LOG_MASS, Filtered, Limits, Message, Taken, kept, multiplied, spread
-from zakai.numerics.line_density import highest_of, waves
+from zakai.numerics.line_backward import ERROR, LOG_MASS, SMALLEST, Filtered, Limits, Message, Taken, kept, multiplied, spread
+from zakai.numerics.line_density import highest_of, support, waves
 from zakai.numerics.line_segment import SPLIT, Grid, Steps
 from zakai.numerics.line_splitting import differences, residual, split
 
 Array = NDArray[Any]
 
-MOST_SUBSTEPS = 64
+MOST_SUBSTEPS = 512
+EXCURSION = 3.9  # standard deviations of the noise that a path between two points goes beyond them, but for exp(-30)
 STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
 _WHOLE = np.ones((1, 5, 1))
 _V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1]
@@ -98,24 +99,34 @@ def _adjoint(
 ) -> tuple[int, int, int, int, float]:  # fmt: skip
     """How many intervals were taken, and the support, the start and the error of the message b, which is replaced."""
     size, timed, depth = b.size, table.shape[0] > 1, 8.0 - np.log(cut)
-    local, found = np.empty((table.shape[1], table.shape[2], b.size)), np.empty(b.size)
     for i in range(lengths.size - 1, -1, -1):
-        row, taken = out[i], lengths.size - 1 - i
+        row, taken, low, high = out[i], lengths.size - 1 - i, 0, size - 1
         if start < 0 or start + size > table.shape[3]:
             return taken, first, last, start, error
+        if not closed:  # the paths from one support to the other
+            begins, ends = support(densities[i], SMALLEST)
+            margin = int(EXCURSION * np.sqrt(max(covariances[i].max(), 0.0) * lengths[i]) / spacing) + 1
+            low = max(min(first, begins + starts[i] - start) - margin, low)
+            high = min(max(last, ends + starts[i] - start) + margin, high)
+        points = high - low + 1
+        local, now, found = np.empty((table.shape[1], table.shape[2], points)), np.empty(points), np.zeros(size)
         for r in range(local.shape[0]):
             for l in range(local.shape[1]):
-                for j in range(size):
-                    local[r, l, j] = table[i if timed else 0, r, l, start + j]
+                for j in range(points):
+                    local[r, l, j] = table[i if timed else 0, r, l, start + low + j]
         at, before = highest_of(product), spread(b, first, last)
         row[LOG_MASS] = logs[i, at]
-        for j in range(size):
-            found[j] = b[j] * np.exp(logs[i, j] - logs[i, at]) if b[j] > 0.0 else 0.0
+        for j in range(first, last + 1):
+            found[j] = b[j] * np.exp(logs[i, j] - logs[i, at])
         between = spread(found, first, last)
+        for j in range(points):
+            now[j] = found[low + j]
         made, constant = _split(
-            found, product, local, drifts[i], outputs[i], precisions[i], covariances[i], averages, observed[i], inside[i],
-            lengths[i], at, first, last, spacing, closed, depth, most,
+            now, product[low : high + 1], local, drifts[i], outputs[i], precisions[i], covariances[i], averages, observed[i],
+            inside[i], lengths[i], at - low, first - low, last - low, spacing, closed, depth, most,
         )  # fmt: skip
+        for j in range(size):
+            found[j] = now[j - low] if low <= j <= high else 0.0
         row[LOG_MASS] += constant
         if not (made < np.inf):
             return taken, first, last, start, error
