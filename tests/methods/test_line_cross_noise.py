@@ -163,10 +163,25 @@ def test_a_gap_of_a_path_is_said():
     assert any("cross_noise is omitted" in sentence for sentence in zakai.filter(model, path, "yau-yau").warnings)
 
 
-def test_a_smoother_on_a_grid_is_refused_in_one_line():
-    model = zakai.Model(state=["x"], drift=["-x**3"], observation=["x"], cross_noise=[["0.1"]], prior=PRIOR)
-    with pytest.raises(zakai.InputError, match="no backward pass with cross_noise"):
-        zakai.smooth(model, zakai.Record(TIMES[:1], ONE[:1], "increments"), "yau-yau")
+def test_the_smoother_of_a_linear_system_is_the_gaussian_one():
+    model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], observation_noise=[["0.3"]], cross_noise=[["0.25"]],
+                        prior={"kind": "gaussian", "mean": [0.5], "cov": [[0.2]]})  # fmt: skip
+    record = zakai.Record([0.05, 0.4, 1.0], [[0.1], [-0.2], [0.4]], "increments")
+    grid, exact = (zakai.smooth(model, record, method) for method in ("yau-yau", "kalman-bucy"))
+    np.testing.assert_allclose(grid.mean, exact.mean, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(grid.variance, exact.variance, rtol=0, atol=1e-6)
+    assert grid.warnings == []
+
+
+def test_the_smoothed_mean_at_the_start_is_what_the_evidence_says():
+    # The derivative of the evidence for the mean of a prior N(mean, v) is the smoothed mean less the prior's, divided by v.
+    def model(mean):
+        return zakai.Model(state=["x"], drift=["x - x**3"], observation=["x + x**2/3"], observation_noise=[["0.3"]],
+                           cross_noise=[["0.25"]], prior={"kind": "gaussian", "mean": [mean], "cov": [[0.2]]})  # fmt: skip
+
+    record = zakai.Record([0.1, 0.5], [[0.1], [-0.2]], "increments")
+    low, high = (zakai.filter(model(0.5 + apart), record, "yau-yau", tolerance=1e-8).log_likelihood for apart in (-0.01, 0.01))
+    assert zakai.smooth(model(0.5), record, "yau-yau").mean[0, 0] == pytest.approx(0.5 + 0.2 * (high - low) / 0.02, abs=2e-5)
 
 
 REFUSED = {

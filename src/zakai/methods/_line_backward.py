@@ -36,12 +36,10 @@ def message(prepared: Prepared, state: State) -> Message:
     """Return the message one at the last time.
 
     Raises:
-        InputError: the model has reflecting ends, or cross_noise.
+        InputError: the model has reflecting ends.
     """
     if prepared.system.reflecting:
         raise InputError(f"{prepared.model.source}: smooth: there is no backward pass for a state with reflecting ends yet")
-    if prepared.system.cross is not None:
-        raise InputError(f"{prepared.model.source}: smooth: grids have no backward pass with cross_noise yet; take kalman-bucy")
     origin, centre, spacing, size, closed, unit = state.window
     return Message(np.zeros(size), origin, centre, spacing, unit, closed, spacing, 0.0)
 
