@@ -267,6 +267,10 @@ class Stepper:
         result = Field(values, fine.grid, fine.log_scale)
         return regridded(result, self.bounds), self.report(result), difference
 
+    def resolved(self, field: Field, report: Report) -> tuple[Field, float]:
+        """Return the density as it is: what its grid does not resolve is reported."""
+        return field, 0.0
+
     def report(self, result: Field) -> Report:
         """Return the errors that the grid shows."""
         found = survey(result.values.real, result.grid, self.bounds.edge)

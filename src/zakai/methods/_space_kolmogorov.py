@@ -23,6 +23,7 @@ from zakai.methods._space_system import System, grid_of, moments_of, prior_on_gr
 from zakai.models.features import CROSS_NOISE
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex
+from zakai.numerics.prior_grid import mixture_grid
 from zakai.numerics.space_fixed import LARGEST_RANGE, Motion, fits, fixed_step, motion, refitted
 from zakai.numerics.space_grid import Grid
 from zakai.numerics.space_step import (
@@ -49,6 +50,7 @@ OUTLIER_EDGE = 1e-15
 ACCURATE_DEPTH = 27.0  # nats below the maximum that rounding leaves accurate
 ALIKE = 0.5  # how much the errors of different intervals have in common
 SHARE = 0.2  # of the tolerance, for the error in time of one interval
+LOST = 1.0  # error of a density relative to itself
 KEPT = 0.98  # largest share of an error that an interval is taken to leave
 WIDER = 1.1  # growth of the deviations after which the error of a substep is measured again
 MOST_TABLES = 64  # grids whose motion is kept
@@ -265,6 +267,8 @@ class Prepared:
         if found is not None and not fits(found, result.grid, self.bounds):
             result = positive(refitted(result, self.bounds), self.bounds)
             mass = result.values.sum() * result.grid.cell
+        if not report.splitting + report.of_grid(self.bounds.reach) < LOST and np.isfinite(update.depth):
+            result, mass = self._gaussian(result, mean, cov), 1.0
         edge, tails = max(report.edges, update.edges), max(report.tails, update.tails)
         made = (report.splitting + report.interpolation) * (1 + update.depth) + 1e-15 * np.exp(min(update.depth, 40.0))
         made = made + self.bounds.reach**2 * edge * 0.1 + tails
@@ -287,6 +291,21 @@ class Prepared:
         if any(not new / WIDER <= old <= WIDER**3 * new for new, old in zip(deviations.tolist(), measured.tolist(), strict=True)):
             control = control._replace(age=CHECKED)
         return self._state(result, mass, control, measured, min(error, 1e3), kept), Info(gained, mean, cov, health)
+
+    def _gaussian(self, lost: Field, mean: Array, cov: Array) -> Field:
+        """Return the Gaussian with the moments of a density that its grid does not hold, where they exist."""
+        if not (np.isfinite(mean).all() and np.isfinite(cov).all() and np.linalg.eigvalsh(cov).min() > 0):
+            return lost
+        bounds, one = self.bounds, np.ones(1)
+        try:
+            found = mixture_grid(
+                one, mean[None], cov[None], bounds.periodic, tolerance=min(bounds.edge, bounds.tail), aligned=any(self.angles)
+            )
+        except InputError:  # a variance is too small
+            return lost
+        values = np.exp(found.log_values)
+        grid = Grid(found.centre, found.basis, values.shape, found.closed)
+        return Field(values / (values.sum() * grid.cell), grid, 0.0)
 
     def _state(self, found: Field, mass: Any, control: Control, deviations: Array, error: float, kept: float) -> State:
         return State(

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.numerics.space_grid import Grid, padded
+from zakai.numerics.space_grid import Grid, filtered, gaussian_response, padded
 from zakai.numerics.space_survey import Survey, deviations_in_spacings, narrowest, survey
 from zakai.numerics.space_transport import (
     Dynamics,
@@ -31,14 +31,14 @@ from zakai.numerics.space_window import LEAST, Bounds, adjusted, enlargement, fi
 
 Array = NDArray[Any]
 Potential = Callable[[Grid, float, float, bool], Factor]  # at the start (False) or the end (True) of a substep
-SUPPORT = 200  # points that are moved to see where a density goes
+SUPPORT = 400  # points that are moved to see where a density goes
 TRIES = 7
 MARGIN = 0.03  # of the bounds, for a grid of short steps
 ACCEPTED = 3.0  # times the bound on tails, from a density that had such tails before
 HARMFUL = 100.0  # times the bound on tails
-MOST_PARTS, MOST_WORK = 512, 2**24  # substeps of an interval, and substeps times points
+MOST_PARTS, MOST_WORK = 512, 2**22  # substeps of an interval, and substeps times points
 BALANCED = 0.5  # of the error that the grid makes, below which shorter substeps do not make that in time
-MOST_ENLARGED = 4.0  # times its own width that a grid may need for the noise of a substep
+MOST_ENLARGED = 8.0  # times its own volume that a grid may need for the noise of a substep
 NEGLIGIBLE = 1e-40  # of the maximum
 NOISE = 2.0  # the largest noise, as a multiple of the most negative value
 CHECKED = 64  # intervals after which the error of single substeps is measured again
@@ -213,13 +213,13 @@ class Stepper:
 
     def _support(self, real: Array) -> Array:
         """Return the numbers of some points that cover the support of a density."""
-        stride = max(1, int(np.ceil((real.size / (4.0 * SUPPORT)) ** (1 / real.ndim))))
-        used = np.zeros(real.shape, bool)
-        used[tuple(slice(s // 2 % stride, None, stride) for s in real.shape)] = True
-        used &= real > MARGIN * self.bounds.edge * real.max()
-        if not used.any():
-            used.flat[int(np.argmax(real))] = True
-        return np.flatnonzero(used)
+        used = np.flatnonzero(real > MARGIN * self.bounds.edge * real.max())
+        if not used.size:
+            return np.array([np.argmax(real)])
+        chosen = [used[np.linspace(0, used.size - 1, min(SUPPORT, used.size)).astype(int)]]
+        for index in np.unravel_index(used, real.shape):
+            chosen.append(used[[np.argmin(index), np.argmax(index)]])
+        return np.concatenate(chosen)
 
     def _fits(self, used: Array, widths: Array, grid: Grid) -> bool:
         """Return whether a grid is neither too wide nor too fine for its density."""
@@ -299,6 +299,19 @@ class Stepper:
         """Return the density after one substep, on a grid that fits it."""
         result, _, report = self._moved(field, t0, t1, self._moves(field, (t0, t1))[0], potential, self._survey(field).tails)
         return result, report
+
+    def resolved(self, field: Field, report: Report) -> tuple[Field, float]:
+        """Return a density whose noise does not grow, and the relative difference from the one that is given.
+
+        What the grid does not resolve to the tolerance is spread until it does.
+        """
+        if not self.tolerance < report.tails < np.inf:
+            return field, 0.0
+        real = field.values.real
+        tails = survey(real, field.grid, self.bounds.edge).tails
+        variances = 2 * np.log(np.maximum(tails / self.tolerance, 1.0)) / np.pi**2
+        values = filtered(field.values, gaussian_response(np.diag(variances), field.grid.sizes))
+        return field._replace(values=values), float(np.abs(values.real - real).sum() / np.abs(real).sum())
 
     def double(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report, float]:
         """Return the extrapolated density after two halves of a substep, and the difference from the whole substep."""
@@ -392,8 +405,9 @@ def advance(
         parts, report = int(singles), NOTHING
         for i in range(parts):
             field, more = stepper.single(field, t0 + tau * i / parts, t0 + tau * (i + 1) / parts, potential)
-            field, report = positive(field, stepper.bounds), report.worst(more)
-        return field, report._replace(splitting=error / parts**2), control._replace(age=control.age + 1)
+            field, spread = stepper.resolved(field, more)
+            field, report = positive(field, stepper.bounds), report.worst(more._replace(splitting=spread))
+        return field, report._replace(splitting=report.splitting + error / parts**2), control._replace(age=control.age + 1)
     if not control.fixed and control.measured > 0 and tau > 2 * control.measured:
         doubles = max(doubles, np.ceil(min(tau / (1.5 * control.measured), MOST_PARTS)))
     return _adaptively(stepper, field, t0, tau, potential, int(doubles), allowed, 1.0 / least)
@@ -415,7 +429,7 @@ def _adaptively(
         if 1 - done - length < 0.3 * length:
             length = 1 - done if 1 - done <= 1.3 * length else 0.5 * (1 - done)
         begin, end = t0 + tau * done, t0 + tau * (done + length)
-        limit = stepper.limit(field, begin, end) if left > 1 else end
+        limit = stepper.limit(field, begin, end)
         if limit < end:
             end, length = limit, (limit - begin) / tau
         result, more, difference = stepper.double(field, begin, end, potential)
@@ -429,7 +443,9 @@ def _adaptively(
         if error > 3 * wanted and left > 1 and not (stalled and difference < SMALL):
             before, length, growth = (error, length), length * min(change, 0.7), 1.0
             continue
-        field, report, before = positive(result, stepper.bounds), report.worst(more._replace(splitting=error)), (np.inf, 1.0)
+        result, spread = stepper.resolved(result, more)
+        field, report = positive(result, stepper.bounds), report.worst(more._replace(splitting=error + spread))
+        before = np.inf, 1.0
         growth, rate = 3.0, max(rate, difference * (4 / 3) / max((tau * length) ** 3, 1e-300))
         done, last, length = done + length, length, length * (max(change, 1.0) if stalled else change)
     return field, report, Control(rate, tau * last, 0)

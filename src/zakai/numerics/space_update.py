@@ -23,6 +23,7 @@ from zakai.numerics.space_window import Bounds, adjusted, fitted_grid, whitened_
 Array = NDArray[Any]
 _STEEP = 4.0  # change of the log-likelihood between neighbours that a grid may have before it is refined
 _TRIES = 16
+POINT = 0.1  # deviations in spacings of a product that is one point: rounding of the likelihood
 
 
 class Update(NamedTuple):
@@ -43,7 +44,8 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
     """Return the product of a density and a factor that is given by its logarithm at the points of a grid (J,).
 
     A factor that is narrower than the grid's spacing is found on a sequence of finer grids, with a power of it below one as long
-    as neighbours differ by many nats.  `tails` are those of the spectrum of the density.
+    as neighbours differ by many nats.  `tails` are those of the spectrum of the density.  A product that is zero, or one point,
+    is replaced by the density.
     """
     grid, values = field.grid, field.values
     coefficients: Array | None = None
@@ -97,6 +99,9 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
         found = survey(_exp(product - top), grid, bounds.edge)
     if best is not None:
         _, grid, values, logs, product, top, found = best
+    inverse = grid.inverse
+    if not np.diagonal(inverse @ found.cov @ inverse.T).min() > POINT**2:
+        return Update(field, 1.0, 1.0, np.inf, True)
     peak = int(np.argmax(product))
     ratio = float(values.real.flat[peak] / max(field.values.real.max(), values.real.max()))
     shift = float(logs.real.flat[peak])

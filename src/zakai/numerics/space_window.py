@@ -171,12 +171,12 @@ def padded_sizes(grid: Grid, noise: Array, bounds: Bounds) -> tuple[int, ...]:
 
 
 def enlargement(grid: Grid, noise: Array, bounds: Bounds) -> float:
-    """Return the largest ratio of the width that a density needs to be spread by N(0, noise) to the width of its grid."""
+    """Return the ratio of the volume that a density needs to be spread by N(0, noise) to that of its grid."""
     inverse = grid.inverse
     variances = np.diagonal(inverse @ noise @ inverse.T)
     half = 0.5 * np.array(grid.sizes)
     ratios = bounds.reach * np.sqrt((half / bounds.reach) ** 2 + variances) / half
-    return float(np.max(np.where(grid.closed, 1.0, ratios)))
+    return float(np.prod(np.where(grid.closed, 1.0, ratios)))
 
 
 def whitened_grid(offsets: Array, logs: Array, noise: Array, narrowness: Array, bounds: Bounds, grid: Grid) -> Grid:
