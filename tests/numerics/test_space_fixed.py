@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from zakai.numerics.space_field import Field
 from zakai.numerics.space_fixed import refitted
 from zakai.numerics.space_grid import Grid
-from zakai.numerics.space_step import Field
 from zakai.numerics.space_window import Bounds
 
 

@@ -22,9 +22,11 @@ from zakai.methods._space_cross import CrossSystem, cross_formulas, potential_of
 from zakai.methods._space_observed import MOST_PANELS
 from zakai.methods._space_reversed import Gauge, Path, Reversed, ReversedStepper, gauge_of, path_of
 from zakai.methods._space_system import moments_of
+from zakai.numerics.space_advance import Control, advance
+from zakai.numerics.space_field import NOTHING, Field, Report, positive
 from zakai.numerics.space_fixed import fits, refitted
-from zakai.numerics.space_grid import Grid, filtered, gather, gaussian_response, relative_index, resampled, rounded_size
-from zakai.numerics.space_step import NOTHING, Control, Field, Report, advance, positive
+from zakai.numerics.space_grid import Grid, filtered, gaussian_response, rounded_size
+from zakai.numerics.space_spline import gather, relative_index, resampled
 from zakai.numerics.space_survey import survey
 from zakai.numerics.space_update import Update, updated
 from zakai.numerics.space_window import Bounds, fitted_grid

@@ -19,26 +19,17 @@ from zakai.methods._protocol import Info
 from zakai.methods._space import State
 from zakai.methods._space_cross import CrossSystem, potential_of
 from zakai.methods._space_observed import MOST_PANELS, Observations
+from zakai.methods._space_short import predicted_on
 from zakai.methods._space_system import System, grid_of, moments_of, prior_on_grid, system_of, valid_noise
 from zakai.models.features import CROSS_NOISE
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.prior_grid import mixture_grid
-from zakai.numerics.space_fixed import LARGEST_RANGE, Motion, fits, fixed_step, motion, refitted
+from zakai.numerics.space_advance import CHECKED, Control, advance
+from zakai.numerics.space_field import NOTHING, Field, Report, positive
+from zakai.numerics.space_fixed import fits, refitted
 from zakai.numerics.space_grid import Grid
-from zakai.numerics.space_step import (
-    CHECKED,
-    NOTHING,
-    Control,
-    Field,
-    Report,
-    Stepper,
-    advance,
-    extrapolated,
-    grid_report,
-    moments_difference,
-    positive,
-)
+from zakai.numerics.space_step import Stepper
 from zakai.numerics.space_survey import Survey, survey
 from zakai.numerics.space_update import Update, updated
 from zakai.numerics.space_window import MOST, Bounds
@@ -53,8 +44,6 @@ SHARE = 0.2  # of the tolerance, for the error in time of one interval
 LOST = 0.5  # error of a density relative to itself
 KEPT = 0.98  # largest share of an error that an interval is taken to leave
 WIDER = 1.1  # growth of the deviations after which the error of a substep is measured again
-MOST_TABLES = 64  # grids whose motion is kept
-MOST_FIXED = 8  # substeps of an interval on a grid that stays
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +108,7 @@ class Prepared:
         factor, constant = last.factor(k, inside, values)
         quick, found = None, None
         if not (self.correlated and inside.any()):
-            quick = self._fixed(begin, control, allowed, length, potential)
+            quick = predicted_on(self, begin, control, allowed, length, potential)
         bounds, rates = self.bounds, values / max(length, 1e-300)
         for _ in range(3):
             if quick is not None:
@@ -192,70 +181,6 @@ class Prepared:
                 more = more._replace(splitting=max(more.splitting, 1.0))
             report = report.worst(more)
         return result, report, control
-
-    def _fixed(
-        self, begin: Field, control: Control, allowed: float, length: float, potential: Any
-    ) -> tuple[Field, Report, Control, Survey] | None:
-        """Return the prediction of a short interval in which the grid can stay, and its survey, or None.
-
-        What is prepared depends on the grid and the length alone; whether an interval is short depends on the state and on the
-        interval.
-        """
-        grid = begin.grid
-        if self.system.varies or self.system.state_dependent or length == 0 or self.bounds.periodic != grid.closed:
-            return None
-        moved = self._motion(grid, length)
-        if not length <= moved.longest:
-            return None
-        factor = None if potential is None else potential(grid, 0.0, length, True)
-        if factor is not None and not np.ptp(factor.log.real) < LARGEST_RANGE:
-            return None
-
-        def substeps(parts: int) -> Field:
-            values, top, factors = begin.values, 0.0, None
-            if factor is not None:
-                top = float(factor.log.real.max())
-                outer = np.exp((factor.log - top) / (6 * parts))
-                factors = outer, outer * outer * np.exp(factor.correction / parts**3)
-            for _ in range(parts):
-                values = fixed_step(values, grid, moved, length / parts, factors)
-            return Field(values, grid, begin.log_scale + top)
-
-        known = control.fixed and control.known(length, allowed)
-        if known:
-            error = control.rate * length**3
-            parts = max(1, int(np.ceil(np.sqrt(error / allowed))))
-            if parts > MOST_FIXED:
-                return None
-            result, splitting = substeps(parts), error / parts**2
-            control = control._replace(age=control.age + 1)
-        else:
-            result, coarse = substeps(2), substeps(1)
-            values, difference = extrapolated(result.values, coarse.values, 0.0)
-            difference = max(difference, min(moments_difference(result.values, coarse.values, grid), 5 * difference))
-            splitting = difference ** (5 / 3)
-            if not splitting <= allowed:
-                return None
-            result = result._replace(values=values)
-            control = Control(difference * (4 / 3) / length**3, length, 0, True)
-        found = survey(result.values, grid, self.bounds.edge)
-        report = grid_report(found)
-        if not (report.edges <= 3 * self.bounds.edge and report.tails <= self.bounds.tail):
-            return None
-        return positive(result, self.bounds), report._replace(splitting=splitting), control, found
-
-    def _motion(self, grid: Grid, length: float) -> Motion:
-        """Return the motion of a grid, which is kept where it depends on the grid alone."""
-        dynamics = self.observations.dynamics
-        if is_complex(self.theta):
-            return motion(dynamics, grid, length)
-        key = (grid.centre.tobytes(), grid.basis.tobytes(), grid.sizes, np.ceil(np.log2(length)))
-        kept = self.motions.get(key)
-        if kept is None:
-            if len(self.motions) >= MOST_TABLES:
-                self.motions.clear()
-            kept = self.motions[key] = motion(dynamics, grid, length)
-        return kept
 
     def _reported(
         self, state: State, update: Update, report: Report, control: Control, constant: Any, kept: float, found: Survey | None

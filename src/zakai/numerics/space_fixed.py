@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.numerics.space_grid import Grid, filtered, gather, gaussian_response, indices, resampled
-from zakai.numerics.space_step import Field
+from zakai.numerics.space_field import Field
+from zakai.numerics.space_grid import Grid, filtered, gaussian_response, indices
+from zakai.numerics.space_spline import gather, resampled
 from zakai.numerics.space_survey import Survey, narrowest, survey
 from zakai.numerics.space_transport import Dynamics
 from zakai.numerics.space_window import LEAST, Bounds, fitted_grid
@@ -46,26 +47,30 @@ class Motion(NamedTuple):
 
 
 def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
-    """Return the motion of a grid for lengths up to the power of two that is not below tau."""
+    """Return the motion of a grid for lengths up to the power of two that is not below tau, without points if it is too long."""
     unit = math.ldexp(1.0, math.ceil(math.log2(tau)))
-    n, points, inverse = grid.n, np.asfortranarray(grid.points), grid.inverse
+    n, inverse = grid.n, grid.inverse
     away = STEEP_AT * grid.basis * np.array(grid.sizes)
     inside = grid.centre + np.concatenate([np.zeros((1, n)), away.T, -away.T])
-    slopes: list[Array] = []
     with np.errstate(all="ignore"):
         matrices = np.stack([inverse @ dynamics.jacobian(x, 0.0).real @ grid.basis for x in inside])
         rate = float(np.abs(matrices).sum(axis=2).max())
+    variances = inverse @ dynamics.noise(0.0, 1.0)[0] @ inverse.T
+    noise = float((np.diagonal(variances).real / (np.array(grid.sizes) / 11.0) ** 2).max())
+    longest = 1.0 / max(rate / STEEPEST, noise / LARGEST_NOISE, 1e-300)
+    if not np.isfinite(rate) or longest <= 0.5 * unit:
+        return Motion(np.zeros((3, 0)), unit, np.zeros((n, 0)), variances, 0.0)
+    points = np.asfortranarray(grid.points)
+    slopes: list[Array] = []
+    with np.errstate(all="ignore"):
         for share in (0.0, 0.5, 0.5, 1.0):
             at = points - (unit * share) * slopes[-1][:, :n] if slopes else points
             slopes.append(dynamics.drift(at, 0.0))
     moved = np.stack([-unit * slope.T for slope in slopes])
     moved[:, :n] = inverse @ moved[:, :n]
     moved[:, n] = np.where(np.abs(moved[:, n].real) < LARGEST_RANGE, moved[:, n], 0.0)
-    variances = inverse @ dynamics.noise(0.0, 1.0)[0] @ inverse.T
-    noise = float((np.diagonal(variances).real / (np.array(grid.sizes) / 11.0) ** 2).max())
-    longest = 1.0 / max(rate / STEEPEST, noise / LARGEST_NOISE, 1e-300)
     start = indices(grid.sizes).T + (np.array(grid.sizes) // 2)[:, None]
-    return Motion(EXTENSION @ moved.reshape(4, -1), unit, start, variances, longest if np.isfinite(rate) else 0.0)
+    return Motion(EXTENSION @ moved.reshape(4, -1), unit, start, variances, longest)
 
 
 @lru_cache(maxsize=64)

@@ -1,13 +1,11 @@
-"""The Kolmogorov forward equation over an interval, in substeps on grids that follow the mass, with an estimate of the error.
+"""Substeps of the Kolmogorov forward equation on grids that follow the mass, with an estimate of the error.
 
 A substep is the symmetric splitting of `space_transport`, of order two.  Taken once and in two halves it gives an estimate of its
-error and, extrapolated in the logarithm, a result of order four.  Short intervals whose error is known to be small from
-earlier ones are taken in single substeps.
+error and, extrapolated in the logarithm, a result of order four.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -15,7 +13,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.numerics.space_grid import Grid, filtered, gaussian_response, padded
+from zakai.numerics.space_field import (
+    Field,
+    Report,
+    better,
+    extrapolated,
+    finer_by,
+    grid_report,
+    moments_difference,
+    positive,
+    refinable,
+)
+from zakai.numerics.space_grid import Grid, filtered, gaussian_response
+from zakai.numerics.space_resample import padded
 from zakai.numerics.space_survey import Survey, deviations_in_spacings, narrowest, survey
 from zakai.numerics.space_transport import (
     Dynamics,
@@ -34,87 +44,7 @@ Potential = Callable[[Grid, float, float, bool], Factor]  # at the start (False)
 SUPPORT = 400  # points that are moved to see where a density goes
 TRIES = 7
 MARGIN = 0.03  # of the bounds, for a grid of short steps
-ACCEPTED = 3.0  # times the bound on tails, from a density that had such tails before
-HARMFUL = 100.0  # times the bound on tails
-MOST_PARTS, MOST_WORK = 512, 2**22  # substeps of an interval, and substeps times points
-BALANCED = 0.5  # of the error that the grid makes, below which shorter substeps do not make that in time
 MOST_ENLARGED = 8.0  # times its own volume that a grid may need for the noise of a substep
-NEGLIGIBLE = 1e-40  # of the maximum
-NOISE = 2.0  # the largest noise, as a multiple of the most negative value
-CHECKED = 64  # intervals after which the error of single substeps is measured again
-WORTH, SMALL = 1.5, 0.05  # least order in its length of a small error of a substep for which shorter ones are tried
-_EXTRAPOLATED = 1.0  # the error that extrapolation leaves, as a multiple of difference^(5/3)
-
-
-class Field(NamedTuple):
-    """A density `values` (*sizes), but for exp(`log_scale`), on a grid."""
-
-    values: Array
-    grid: Grid
-    log_scale: Any
-
-    @property
-    def log_mass(self) -> Any:
-        """The logarithm of the integral."""
-        return np.log(self.values.sum() * self.grid.cell) + self.log_scale
-
-
-class Control(NamedTuple):
-    """The error of a substep as it was measured last.
-
-    `rate` is the error of a substep of length one (it grows as the cube), from substeps of length `measured`, `age` intervals
-    ago, on a `fixed` grid or on grids that follow the mass.
-    """
-
-    rate: float
-    measured: float
-    age: int
-    fixed: bool = False
-
-    def known(self, tau: float, allowed: float) -> bool:
-        """Return whether the error of a substep of length tau is known well enough: the larger it is, the sooner it expires."""
-        error = self.rate * tau**3
-        fresh = np.isfinite(error) and self.age * (1 + 4 * error / allowed) < CHECKED
-        return bool(fresh and tau <= 2 * self.measured)
-
-
-class Report(NamedTuple):
-    """The errors of an interval, relative to the density.
-
-    Those of the splitting in time, of interpolation, at the edges, in the tails of the spectrum, and the negative mass.
-    """
-
-    splitting: float
-    interpolation: float
-    edges: float
-    tails: float
-    negative: float
-
-    def of_grid(self, reach: float) -> float:
-        """Return the error that the grid makes; a Gaussian has fallen to the bound on edges at `reach` deviations."""
-        return self.interpolation + 0.1 * reach**2 * self.edges + self.tails
-
-    def worst(self, other: Report) -> Report:
-        """Return the total of the errors of methods, and the largest of those of grids."""
-        return Report(
-            self.splitting + other.splitting,
-            # The error of interpolation changes its sign with the phase of a point between two others.
-            float(np.hypot(self.interpolation, other.interpolation)),
-            max(self.edges, other.edges),
-            max(self.tails, other.tails),
-            max(self.negative, other.negative),
-        )
-
-
-def grid_report(found: Survey) -> Report:
-    """Return the errors that a grid shows."""
-    edges, tails = found.edges.tolist(), found.tails.tolist()
-    # 1e-4 / s^6 for a standard deviation of s spacings that has such tails
-    interpolation = sum(1e-4 / (-2 * math.log(min(max(tail, 1e-15), 0.9)) / math.pi**2) ** 3 for tail in tails)
-    return Report(0.0, interpolation, max(edges), max(tails), found.negative)
-
-
-NOTHING = Report(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class _Move(NamedTuple):
@@ -327,125 +257,3 @@ class Stepper:
         # Moments differ by a few times as much as densities; by more only where rounding far away counts.
         difference = max(difference, min(moments_difference(fine.values, coarse.values, fine.grid), 5 * difference))
         return Field(values, fine.grid, fine.log_scale), first.worst(second), difference
-
-
-def refinable(tails: Array, before: Array, ratio: Array, start: Any, bounds: Bounds) -> Array:
-    """Return along which axes (n,) a finer grid leaves smaller tails of the spectrum; `before` are those of the last grid.
-
-    Small tails that the density had at the `start` need none.  `ratio` is that of the spacings of the last grid to those of this.
-    """
-    return np.asarray((tails > 3 * np.clip(start, bounds.tail, ACCEPTED * bounds.tail)) & better(tails, before, ratio, bounds))
-
-
-def better(tails: Any, before: Any, ratio: Any, bounds: Bounds) -> Array:
-    """Return along which axes spacings that are smaller by a ratio make the tails of the spectrum as small as they should.
-
-    The logarithm of those of a Gaussian grows as the square of the ratio, of an analytic density as the ratio.  What a kink adds
-    to the spectrum decreases as a power of the spacing, which is enough while it is `HARMFUL`; what interpolation adds does not.
-    """
-    logs, last = (np.log(np.clip(t, 1e-300, 0.99)) for t in (tails, before))
-    return np.asarray(logs < np.maximum(ratio, 1.0) ** np.where(tails > HARMFUL * bounds.tail, 0.2, 0.5) * last)
-
-
-def finer_by(grid: Grid, last: Grid) -> Array:
-    """Return the ratio of the spacings of the last grid to those of a grid along each axis (n,)."""
-    return np.asarray(np.linalg.norm(last.basis, axis=0) / np.linalg.norm(grid.basis, axis=0))
-
-
-def positive(field: Field, bounds: Bounds) -> Field:
-    """Return the density without negative values, those of denormal size, and the noise of interpolation.
-
-    The noise is what is not larger than a few times the most negative value, and not larger than the bound on edges.
-    """
-    real = field.values.real
-    noise = 0.0 if bounds.band_limited else min(-NOISE * real.min(), bounds.edge * real.max())
-    return field._replace(values=np.where(real > max(NEGLIGIBLE * real.max(), noise), field.values, 0.0))
-
-
-def extrapolated(fine: Array, coarse: Array, log_ratio: Any) -> tuple[Array, float]:
-    """Return fine (fine / coarse)^(1/3), the extrapolation of an error of order two, and the relative difference."""
-    coarse = coarse * np.exp(log_ratio)
-    difference = float(np.abs(fine.real - coarse.real).sum() / np.abs(fine.real).sum())
-    good = (fine.real > 0) & (coarse.real > 0.2 * fine.real) & (coarse.real < 5.0 * fine.real)
-    ratio = np.where(good, fine, 1.0) / np.where(good, coarse, 1.0)
-    return np.where(fine.real > 0, fine * np.exp(np.log(ratio) / 3), 0.0), difference
-
-
-def moments_difference(fine: Array, coarse: Array, grid: Grid) -> float:
-    """Return the largest difference of two densities on a grid: of means in deviations, and of variances, relative to them."""
-    # Rounding far from the mean has a large variance.
-    one, two = (survey(np.where(u.real > 1e-12 * u.real.max(), u.real, 0.0), grid) for u in (fine, coarse))
-    variances = np.maximum(np.diagonal(one.cov), 1e-6 * np.diagonal(grid.basis @ grid.basis.T))
-    means = np.abs(one.mean - two.mean) / np.sqrt(variances)
-    return float(max(means.max(), (np.abs(np.diagonal(one.cov - two.cov)) / variances).max()))
-
-
-def advance(
-    stepper: Stepper,
-    field: Field,
-    t0: float,
-    tau: float,
-    potential: Potential | None,
-    control: Control,
-    allowed: float,
-    least: int = 1,
-) -> tuple[Field, Report, Control]:
-    """Return the density after the interval from t0 of length tau, with an error of the splitting of about `allowed`.
-
-    `least` is the number of substeps that resolve the coefficients' variation in time.
-    """
-    if tau <= 0:
-        return field, NOTHING, control
-    known = not control.fixed and control.known(tau, allowed)
-    error = control.rate * tau**3 if known else np.inf
-    singles = np.ceil(np.sqrt(error / allowed)) if np.isfinite(error) else np.inf
-    doubles = max(1.0, np.ceil((_EXTRAPOLATED * (0.75 * min(error, 1.0)) ** (5 / 3) / allowed) ** 0.25)) if known else 1.0
-    singles, doubles = max(singles, 2.0 * least if least > 1 else 1.0), max(doubles, least)
-    if singles < 2 * doubles and stepper.limit(field, t0, t0 + tau / singles) >= t0 + tau / singles:
-        parts, report = int(singles), NOTHING
-        for i in range(parts):
-            field, more = stepper.single(field, t0 + tau * i / parts, t0 + tau * (i + 1) / parts, potential)
-            field, spread = stepper.resolved(field, more)
-            field, report = positive(field, stepper.bounds), report.worst(more._replace(splitting=spread))
-        return field, report._replace(splitting=report.splitting + error / parts**2), control._replace(age=control.age + 1)
-    if not control.fixed and control.measured > 0 and tau > 2 * control.measured:
-        doubles = max(doubles, np.ceil(min(tau / (1.5 * control.measured), MOST_PARTS)))
-    return _adaptively(stepper, field, t0, tau, potential, int(doubles), allowed, 1.0 / least)
-
-
-def _adaptively(
-    stepper: Stepper, field: Field, t0: float, tau: float, potential: Potential | None, parts: int, allowed: float, longest: float
-) -> tuple[Field, Report, Control]:
-    """Return the density after an interval in extrapolated substeps whose lengths follow from the error of each.
-
-    Shorter substeps are tried as long as the error is larger than the tolerance and than what the grid makes, and decreases with
-    an order of at least `WORTH`: at a kink it does not.  No interval has more than about `MOST_PARTS` substeps, and fewer on
-    large grids; its report says what error they make.
-    """
-    done, length, report, rate = 0.0, 1.0 / parts, NOTHING, 0.0
-    left, before, stalled, growth, work = MOST_PARTS + 2.0 * parts, (np.inf, 1.0), False, 3.0, 0
-    while done < 1 - 1e-12:
-        length = min(max(length, (1 - done) / left), longest, 1 - done)
-        if 1 - done - length < 0.3 * length:
-            length = 1 - done if 1 - done <= 1.3 * length else 0.5 * (1 - done)
-        begin, end = t0 + tau * done, t0 + tau * (done + length)
-        limit = stepper.limit(field, begin, end)
-        if limit < end:
-            end, length = limit, (limit - begin) / tau
-        result, more, difference = stepper.double(field, begin, end, potential)
-        work += result.values.size
-        difference = min(difference, 10.0) if np.isfinite(difference) else 10.0
-        error = _EXTRAPOLATED * difference ** (5 / 3)
-        wanted = max(allowed * length, BALANCED / 3 * min(more.of_grid(stepper.bounds.reach), 1.0))
-        change = float(np.clip(0.9 * (wanted / max(error, 1e-30)) ** 0.25, 0.2, growth))
-        left = max(min(left - 1, (MOST_WORK - work) / result.values.size), 1)
-        stalled = stalled or SMALL > difference and error > before[0] * (length / before[1]) ** WORTH
-        if error > 3 * wanted and left > 1 and not (stalled and difference < SMALL):
-            before, length, growth = (error, length), length * min(change, 0.7), 1.0
-            continue
-        result, spread = stepper.resolved(result, more)
-        field, report = positive(result, stepper.bounds), report.worst(more._replace(splitting=error + spread))
-        before = np.inf, 1.0
-        growth, rate = 3.0, max(rate, difference * (4 / 3) / max((tau * length) ** 3, 1e-300))
-        done, last, length = done + length, length, length * (max(change, 1.0) if stalled else change)
-    return field, report, Control(rate, tau * last, 0)

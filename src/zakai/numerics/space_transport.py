@@ -20,15 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.space_diffusion import diffused
-from zakai.numerics.space_grid import (
-    Grid,
-    filtered,
-    gather,
-    gaussian_response,
-    relative_index,
-    spread,
-    transformed,
-)
+from zakai.numerics.space_grid import Grid, filtered, gaussian_response, spread, transformed
+from zakai.numerics.space_spline import gather, relative_index
 
 Array = NDArray[Any]
 _TERMS = 18

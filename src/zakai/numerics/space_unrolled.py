@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from zakai.numerics.complex_step import is_complex
-from zakai.numerics.space_grid import Grid, sinc_resampled, triangular_resampled
+from zakai.numerics.space_grid import Grid
+from zakai.numerics.space_resample import sinc_resampled, triangular_resampled
 
 Array = NDArray[Any]
 Interpolant = Callable[[Array, Grid, Grid], Array]

@@ -8,15 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.numerics.space_grid import (
-    Grid,
-    filtered,
-    gather,
-    gaussian_response,
-    relative_index,
-    triangular_resampled,
-)
-from zakai.numerics.space_step import Field, better, finer_by, positive, refinable
+from zakai.numerics.space_field import Field, better, finer_by, positive, refinable
+from zakai.numerics.space_grid import Grid, filtered, gaussian_response
+from zakai.numerics.space_resample import triangular_resampled
+from zakai.numerics.space_spline import gather, relative_index
 from zakai.numerics.space_survey import deviations_in_spacings, narrowest, survey
 from zakai.numerics.space_window import Bounds, adjusted, fitted_grid, whitened_grid
 

@@ -1,0 +1,87 @@
+"""Predictions over short intervals on a grid that stays."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zakai.numerics.complex_step import is_complex
+from zakai.numerics.space_advance import Control
+from zakai.numerics.space_field import Field, Report, extrapolated, grid_report, moments_difference, positive
+from zakai.numerics.space_fixed import LARGEST_RANGE, Motion, fixed_step, motion
+from zakai.numerics.space_grid import Grid
+from zakai.numerics.space_survey import Survey, survey
+
+if TYPE_CHECKING:
+    from zakai.methods._space_kolmogorov import Prepared
+
+Array = Any
+MOST_TABLES = 64  # grids whose motion is kept
+MOST_FIXED = 8  # substeps of an interval on a grid that stays
+
+
+def predicted_on(
+    prepared: Prepared, begin: Field, control: Control, allowed: float, length: float, potential: Any
+) -> tuple[Field, Report, Control, Survey] | None:
+    """Return the prediction of a short interval in which the grid can stay, and its survey, or None.
+
+    What is prepared depends on the grid and the length alone; whether an interval is short depends on the state and on the
+    interval.
+    """
+    grid = begin.grid
+    if prepared.system.varies or prepared.system.state_dependent or length == 0 or prepared.bounds.periodic != grid.closed:
+        return None
+    moved = _motion(prepared, grid, length)
+    if not length <= moved.longest:
+        return None
+    factor = None if potential is None else potential(grid, 0.0, length, True)
+    if factor is not None and not np.ptp(factor.log.real) < LARGEST_RANGE:
+        return None
+
+    def substeps(parts: int) -> Field:
+        values, top, factors = begin.values, 0.0, None
+        if factor is not None:
+            top = float(factor.log.real.max())
+            outer = np.exp((factor.log - top) / (6 * parts))
+            factors = outer, outer * outer * np.exp(factor.correction / parts**3)
+        for _ in range(parts):
+            values = fixed_step(values, grid, moved, length / parts, factors)
+        return Field(values, grid, begin.log_scale + top)
+
+    known = control.fixed and control.known(length, allowed)
+    if known:
+        error = control.rate * length**3
+        parts = max(1, int(np.ceil(np.sqrt(error / allowed))))
+        if parts > MOST_FIXED:
+            return None
+        result, splitting = substeps(parts), error / parts**2
+        control = control._replace(age=control.age + 1)
+    else:
+        result, coarse = substeps(2), substeps(1)
+        values, difference = extrapolated(result.values, coarse.values, 0.0)
+        difference = max(difference, min(moments_difference(result.values, coarse.values, grid), 5 * difference))
+        splitting = difference ** (5 / 3)
+        if not splitting <= allowed:
+            return None
+        result = result._replace(values=values)
+        control = Control(difference * (4 / 3) / length**3, length, 0, True)
+    found = survey(result.values, grid, prepared.bounds.edge)
+    report = grid_report(found)
+    if not (report.edges <= 3 * prepared.bounds.edge and report.tails <= prepared.bounds.tail):
+        return None
+    return positive(result, prepared.bounds), report._replace(splitting=splitting), control, found
+
+
+def _motion(prepared: Prepared, grid: Grid, length: float) -> Motion:
+    """Return the motion of a grid, which is kept where it depends on the grid alone."""
+    dynamics = prepared.observations.dynamics
+    if is_complex(prepared.theta):
+        return motion(dynamics, grid, length)
+    key = (grid.centre.tobytes(), grid.basis.tobytes(), grid.sizes, np.ceil(np.log2(length)))
+    kept = prepared.motions.get(key)
+    if kept is None:
+        if len(prepared.motions) >= MOST_TABLES:
+            prepared.motions.clear()
+        kept = prepared.motions[key] = motion(dynamics, grid, length)
+    return kept

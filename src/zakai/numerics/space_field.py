@@ -1,0 +1,122 @@
+"""A density on a grid, the errors that a grid makes, and what a finer grid would leave of them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai.numerics.space_grid import Grid
+from zakai.numerics.space_survey import Survey, survey
+from zakai.numerics.space_window import Bounds
+
+Array = NDArray[Any]
+ACCEPTED = 3.0  # times the bound on tails, from a density that had such tails before
+HARMFUL = 100.0  # times the bound on tails
+NEGLIGIBLE = 1e-40  # of the maximum
+NOISE = 2.0  # the largest noise, as a multiple of the most negative value
+
+
+class Field(NamedTuple):
+    """A density `values` (*sizes), but for exp(`log_scale`), on a grid."""
+
+    values: Array
+    grid: Grid
+    log_scale: Any
+
+    @property
+    def log_mass(self) -> Any:
+        """The logarithm of the integral."""
+        return np.log(self.values.sum() * self.grid.cell) + self.log_scale
+
+
+class Report(NamedTuple):
+    """The errors of an interval, relative to the density.
+
+    Those of the splitting in time, of interpolation, at the edges, in the tails of the spectrum, and the negative mass.
+    """
+
+    splitting: float
+    interpolation: float
+    edges: float
+    tails: float
+    negative: float
+
+    def of_grid(self, reach: float) -> float:
+        """Return the error that the grid makes; a Gaussian has fallen to the bound on edges at `reach` deviations."""
+        return self.interpolation + 0.1 * reach**2 * self.edges + self.tails
+
+    def worst(self, other: Report) -> Report:
+        """Return the total of the errors of methods, and the largest of those of grids."""
+        return Report(
+            self.splitting + other.splitting,
+            # The error of interpolation changes its sign with the phase of a point between two others.
+            float(np.hypot(self.interpolation, other.interpolation)),
+            max(self.edges, other.edges),
+            max(self.tails, other.tails),
+            max(self.negative, other.negative),
+        )
+
+
+def grid_report(found: Survey) -> Report:
+    """Return the errors that a grid shows."""
+    edges, tails = found.edges.tolist(), found.tails.tolist()
+    # 1e-4 / s^6 for a standard deviation of s spacings that has such tails
+    interpolation = sum(1e-4 / (-2 * math.log(min(max(tail, 1e-15), 0.9)) / math.pi**2) ** 3 for tail in tails)
+    return Report(0.0, interpolation, max(edges), max(tails), found.negative)
+
+
+NOTHING = Report(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def refinable(tails: Array, before: Array, ratio: Array, start: Any, bounds: Bounds) -> Array:
+    """Return along which axes (n,) a finer grid leaves smaller tails of the spectrum; `before` are those of the last grid.
+
+    Small tails that the density had at the `start` need none.  `ratio` is that of the spacings of the last grid to those of this.
+    """
+    return np.asarray((tails > 3 * np.clip(start, bounds.tail, ACCEPTED * bounds.tail)) & better(tails, before, ratio, bounds))
+
+
+def better(tails: Any, before: Any, ratio: Any, bounds: Bounds) -> Array:
+    """Return along which axes spacings that are smaller by a ratio make the tails of the spectrum as small as they should.
+
+    The logarithm of those of a Gaussian grows as the square of the ratio, of an analytic density as the ratio.  What a kink adds
+    to the spectrum decreases as a power of the spacing, which is enough while it is `HARMFUL`; what interpolation adds does not.
+    """
+    logs, last = (np.log(np.clip(t, 1e-300, 0.99)) for t in (tails, before))
+    return np.asarray(logs < np.maximum(ratio, 1.0) ** np.where(tails > HARMFUL * bounds.tail, 0.2, 0.5) * last)
+
+
+def finer_by(grid: Grid, last: Grid) -> Array:
+    """Return the ratio of the spacings of the last grid to those of a grid along each axis (n,)."""
+    return np.asarray(np.linalg.norm(last.basis, axis=0) / np.linalg.norm(grid.basis, axis=0))
+
+
+def positive(field: Field, bounds: Bounds) -> Field:
+    """Return the density without negative values, those of denormal size, and the noise of interpolation.
+
+    The noise is what is not larger than a few times the most negative value, and not larger than the bound on edges.
+    """
+    real = field.values.real
+    noise = 0.0 if bounds.band_limited else min(-NOISE * real.min(), bounds.edge * real.max())
+    return field._replace(values=np.where(real > max(NEGLIGIBLE * real.max(), noise), field.values, 0.0))
+
+
+def extrapolated(fine: Array, coarse: Array, log_ratio: Any) -> tuple[Array, float]:
+    """Return fine (fine / coarse)^(1/3), the extrapolation of an error of order two, and the relative difference."""
+    coarse = coarse * np.exp(log_ratio)
+    difference = float(np.abs(fine.real - coarse.real).sum() / np.abs(fine.real).sum())
+    good = (fine.real > 0) & (coarse.real > 0.2 * fine.real) & (coarse.real < 5.0 * fine.real)
+    ratio = np.where(good, fine, 1.0) / np.where(good, coarse, 1.0)
+    return np.where(fine.real > 0, fine * np.exp(np.log(ratio) / 3), 0.0), difference
+
+
+def moments_difference(fine: Array, coarse: Array, grid: Grid) -> float:
+    """Return the largest difference of two densities on a grid: of means in deviations, and of variances, relative to them."""
+    # Rounding far from the mean has a large variance.
+    one, two = (survey(np.where(u.real > 1e-12 * u.real.max(), u.real, 0.0), grid) for u in (fine, coarse))
+    variances = np.maximum(np.diagonal(one.cov), 1e-6 * np.diagonal(grid.basis @ grid.basis.T))
+    means = np.abs(one.mean - two.mean) / np.sqrt(variances)
+    return float(max(means.max(), (np.abs(np.diagonal(one.cov - two.cov)) / variances).max()))
