@@ -21,6 +21,7 @@ from zakai.methods._space import State
 from zakai.methods._space_cross import CrossSystem, cross_formulas, potential_of
 from zakai.methods._space_observed import MOST_PANELS
 from zakai.methods._space_reversed import Gauge, Path, Reversed, ReversedStepper, gauge_of, path_of
+from zakai.methods._space_short import motion_of, predicted_on
 from zakai.methods._space_system import moments_of
 from zakai.numerics.space_advance import Control, advance
 from zakai.numerics.space_field import NOTHING, Field, Report, positive
@@ -249,11 +250,11 @@ def _stayed(
 ) -> tuple[Field, Report, Control] | None:
     """Return psi after a short interval on a grid that stays, where it can."""
     bounds = view.bounds
-    if bounds.periodic != now.grid.closed or view._motion(now.grid, length).longest < length:
+    if bounds.periodic != now.grid.closed or motion_of(view, now.grid, length).longest < length:
         return None
-    quick = view._fixed(now, control, allowed, length, potential)
+    quick = predicted_on(view, now, control, allowed, length, potential)
     if quick is None:  # a grid with a margin may do
-        quick = view._fixed(positive(refitted(now, bounds), bounds), control, allowed, length, potential)
+        quick = predicted_on(view, positive(refitted(now, bounds), bounds), control, allowed, length, potential)
     if quick is None:
         return None
     result, report, control, found = quick

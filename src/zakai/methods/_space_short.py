@@ -32,7 +32,7 @@ def predicted_on(
     grid = begin.grid
     if prepared.system.varies or prepared.system.state_dependent or length == 0 or prepared.bounds.periodic != grid.closed:
         return None
-    moved = _motion(prepared, grid, length)
+    moved = motion_of(prepared, grid, length)
     if not length <= moved.longest:
         return None
     factor = None if potential is None else potential(grid, 0.0, length, True)
@@ -73,7 +73,7 @@ def predicted_on(
     return positive(result, prepared.bounds), report._replace(splitting=splitting), control, found
 
 
-def _motion(prepared: Prepared, grid: Grid, length: float) -> Motion:
+def motion_of(prepared: Prepared, grid: Grid, length: float) -> Motion:
     """Return the motion of a grid, which is kept where it depends on the grid alone."""
     dynamics = prepared.observations.dynamics
     if is_complex(prepared.theta):
