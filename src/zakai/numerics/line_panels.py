@@ -23,8 +23,10 @@ _MOST = 600
 
 def interpolation(points: Array) -> Array:
     """Return the matrix from values at the Gauss nodes to values at points in [0, 1]."""
-    basis = np.polynomial.legendre.legvander(2 * GAUSS_NODES - 1, NODES - 1)
-    return np.asarray(np.polynomial.legendre.legvander(2 * points - 1, NODES - 1) @ np.linalg.inv(basis))
+    return np.asarray(np.polynomial.legendre.legvander(2 * points - 1, NODES - 1) @ _COEFFICIENTS)
+
+
+_COEFFICIENTS = np.linalg.inv(np.polynomial.legendre.legvander(2 * GAUSS_NODES - 1, NODES - 1))  # of Legendre polynomials
 
 
 @lru_cache(maxsize=16)
