@@ -79,3 +79,34 @@ def test_sharp_samples_whose_grid_is_refined_to_its_largest_size(formula, method
     assert np.abs(result.mean[1:, 0] - mean).max() < 1e-4 * deviation.min()
     assert np.abs(np.sqrt(result.variance[1:, 0]) / deviation - 1).max() < 1e-4
     assert result.log_likelihood_increments[1:] == pytest.approx(gained, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("drift", "f", "bound"),
+    [
+        ("-3*sign(x)", lambda x: -3.0 * np.sign(x), 2e-4),
+        ("-abs(x)*x - 2*max(x, 1/2)", lambda x: -np.abs(x) * x - 2.0 * np.maximum(x, 0.5), 5e-6),
+    ],
+)
+def test_increments_of_a_drift_with_jumps_or_kinks(drift, f, bound):
+    times, noise = np.cumsum([0.05, 0.3, 1.0, 0.02, 0.5, 0.1]), 0.1
+    model = zakai.Model(
+        state=["x"], drift=[drift], observation=["x"], observation_noise=[[noise]],
+        prior={"kind": "gaussian", "mean": [0.1], "cov": [[0.25]]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, times, seed=2)
+    result = zakai.filter(model, record, "yau-yau")
+    rates = record.values[:, 0] / np.diff(times, prepend=0.0)
+    potentials = [lambda x, r=r: (x * r - 0.5 * x**2) / noise for r in rates]
+    parts = []
+    for count in (800, 1600):
+        faces = np.round(np.linspace(-4.0, 4.0, count + 1), 9)  # a face lies at each jump
+        zero = [np.zeros_like] * len(times)
+        found = posterior(f, lambda x: -0.5 * (x - 0.1) ** 2 / 0.25, times, zero, faces, 1e-3, 60, potentials)
+        parts.append(np.concatenate([np.ravel(part) for part in found]))
+    exact = parts[1] + (parts[1] - parts[0]) / 3.0
+    deviation = np.sqrt(exact[6:12])
+    errors = np.abs(result.mean[1:, 0] - exact[:6]) / deviation, np.abs(np.sqrt(result.variance[1:, 0]) / deviation - 1.0)
+    assert np.max(errors) < bound
+    assert result.log_likelihood == pytest.approx(exact[-1], abs=bound)
+    assert np.max(errors) < 10.0 * np.nanmax(result.health["error_estimate"])

@@ -27,7 +27,8 @@ class Formulas(NamedTuple):
     """Functions of x (..., 1), t (...), theta (p,) and the inputs; None where a derivative is not that of a smooth function.
 
     `slope` is f', `spread` G' and G''; `cross` is g C with its derivative and h' (3, m), None for independent noises.
-    `separated` are the functions a (R,) of t and g (R, 2 + m) of x with (f, f', h) = sum a_r g_r.
+    `separated` are the functions a (R,) of t and g (R, 2 + m) of x with (f, f', h) = sum a_r g_r; `kinks` (K,) are zero where
+    f, G or an h that acts within intervals has a kink or a jump.
     """
 
     drift: Function
@@ -39,6 +40,7 @@ class Formulas(NamedTuple):
     cross: Function | None
     outside: OutsideTables
     separated: tuple[Function, Function] | None
+    kinks: Function | None
 
 
 @lru_cache(maxsize=32)
@@ -58,7 +60,28 @@ def _formulas(model: Model) -> Formulas:
         numpy_function(cross, model, (3, m)) if joint else None,
         OutsideTables(model),
         _separated(model),
+        numpy_function(roots, model, (len(roots),)) if (roots := _roots(model)) else None,
     )
+
+
+def _roots(model: Model) -> list[sp.Expr]:
+    """Return functions of x alone that are zero where the equation between samples has coefficients with a kink or a jump."""
+    x, given = model.x[0], {model.t, *model.u}
+    inside = [] if model.observation_kind == "samples" else list(model.observation)
+    found: set[sp.Expr] = set()
+    for part in (model.drift[0], model.covariance[0], *inside):
+        for call in part.atoms(*_JUMPS, *_KINKS, TableFunction):
+            first = call.args[0]
+            if isinstance(call, (Minimum, Maximum)):
+                found.add(first - call.args[1])
+            elif isinstance(call, Floor):
+                found.add(sp.sin(sp.pi * first))
+            elif isinstance(call, TableFunction):
+                if call.table.degree == 1 and len(call.args) == 1 and not call.table.periodic:
+                    found.update(first - sp.Float(node, 17) for node in call.table.axes[0])
+            else:
+                found.add(first)
+    return sorted((root for root in found if root.has(x) and not root.free_symbols & given), key=str)
 
 
 def _separated(model: Model) -> tuple[Function, Function] | None:
@@ -106,7 +129,7 @@ class System:
         self.drift, self.covariance = self._bound(formulas.drift), self._bound(formulas.covariance)
         self.observation, self.noise = self._bound(formulas.observation), self._bound(formulas.noise)
         self.slope, self.spread = self._optional(formulas.slope), self._optional(formulas.spread)
-        self.cross = self._optional(formulas.cross)
+        self.cross, self.kinks = self._optional(formulas.cross), self._optional(formulas.kinks)
         self.separated = None if formulas.separated is None else (self._bound(formulas.separated[0]), formulas.separated[1])
         self.tabulated, self._outside = bool(formulas.outside), self._bound(formulas.outside)
         # Whether G depends on the state, and whether samples have a law that is not N(h, S(t)).

@@ -1,6 +1,7 @@
-"""One interval in which the density of one state contracts so much that no uniform grid holds it, as by -x^3 from a broad prior.
+"""One interval of one state on finite volumes (`numerics/line_volumes.py`), where a uniform grid does not serve.
 
-It is solved on finite volumes (`numerics/line_volumes.py`) that are small where the drift leads and grow with the distance, with
+That is where the density contracts so much that no uniform grid holds it, as by -x^3 from a broad prior, and where coefficients
+have kinks or jumps.  The cells are small where the drift leads and grow with the distance; kinks and jumps are faces.  There are
 more and more cells and steps until the result settles.
 """
 
@@ -12,29 +13,32 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from zakai.methods._line_coefficients import coefficients
+from zakai.methods._line_course import FAST, LEVELS, Course, course_of, drift_along, ends_of
 from zakai.methods._line_model import within
 from zakai.methods._line_moves import Moved, Report
-from zakai.methods._line_system import Prepared, covariance_at, finite
+from zakai.methods._line_system import Prepared
 from zakai.numerics import line_window as lw
+from zakai.numerics.line_panels import GAUSS_NODES, interpolation
 from zakai.numerics.line_polynomial import local_polynomial
-from zakai.numerics.line_volumes import Bands, Volumes, advanced, ends_of_steps, volumes
+from zakai.numerics.line_volumes import Bands, Volumes, advanced
 
 Array = Any
 
-FAST = 5.0  # ranges of a density that the drift crosses in an interval, below which it is not followed
 STIFF = 100.0  # the same, above which no uniform grid is tried
 MOST_TRAVEL = 20.0  # ranges of a density, as it is at the time, that it moves on uniform grids
 MOST_DEVIATIONS = 100.0  # range of a density on a uniform grid, in the smallest deviations of its parts
-LEVELS = ((256, 24), (512, 34), (1024, 48), (2048, 68), (4096, 96), (8192, 136), (16384, 192))  # cells and steps
+EDGE = 1e-9  # density in the outermost cells, relative to the maximum, beyond which they are too few
 SETTLED = 1e-2  # error above which volumes do not serve
 NARROWEST = 40.0  # range of a density in cells
 SHARE = 0.1  # of the tolerance that volumes may leave
 SMOOTH = 1e-7  # error of a backward interval at which more cells are not taken
-FIRST = 0.1  # of the time in which the drift would cross the range of the density: the first step
-FASTEST = 100.0  # ranges of the density in the interval, divided by the tolerance: a faster drift counts as this
-REACH = 8.0  # standard deviations to the end of a density
-_FLOW_POINTS = 17
-_FLOW_STEPS = 32
+
+
+def rough(prepared: Prepared, inside: np.ndarray) -> bool:
+    """Return whether coefficients have kinks or jumps with which a uniform grid has no decomposition of the operator."""
+    system = prepared.system
+    needed = system.varying or bool(inside.any()) or system.slope is None or system.spread is None
+    return needed and system.kinks is not None
 
 
 def contracted(
@@ -47,35 +51,41 @@ def contracted(
     rates: np.ndarray,
     report: Report,
 ) -> Moved | None:
-    """Return the density after an interval, None where it does not contract much or volumes do not serve."""
+    """Return the density after an interval, None where a uniform grid is better or volumes do not serve."""
     if window.closed:
         return None
-    ends = _ends(values, window)
-    width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(_drift(prepared, window, ends, start))))
-    if not speed * length > FAST * width:
+    ends = ends_of(values, window)
+    width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(drift_along(prepared, window, ends, start))))
+    general = rough(prepared, inside)
+    if not (general or speed * length > FAST * width):
         return None
-    course = _course(prepared, window, ends, start, length)
+    course = course_of(prepared, values, window, ends, start, length, inside)
     if course is None:
         return None
     stiff = speed * length > STIFF * width
-    if not (stiff or course.way.travel > MOST_TRAVEL or course.way.deviations > MOST_DEVIATIONS):
+    if not (general or stiff or course.way.travel > MOST_TRAVEL or course.way.deviations > MOST_DEVIATIONS):
         return None
     if width < NARROWEST * course.finest:  # sharper than the cells where it begins
         return None
 
     def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
-        masses = lw.density_at(values, window, cells.offsets) * cells.widths
-        interval = prepared, values, window, cells, start, inside, rates, steps, course.fastest
-        return _advanced(masses / np.sum(masses), *interval)
+        density = lw.density_at(values, window, cells.offsets)
+        masses = density * cells.widths
+        return _advanced(masses / np.sum(masses), prepared, density, cells, start, inside, rates, steps, course)
 
     def summed(masses: Array) -> Array:
         return masses.reshape(-1, 2).sum(axis=1)
 
-    found = _settled(SHARE * prepared.tolerance, course, length, at_level, summed)
+    # Cells do not bring back what the grid does not resolve.
+    allowed = max(SHARE * prepared.tolerance, SHARE * lw.figures(values, False, prepared.negligible).aliasing)
+    found = _settled(allowed, course, at_level, summed)
     if found is None:
         return None
     masses, cells, gained, error = found
-    report.time, report.noise = report.time + error, max(report.noise, min(error, 1.0))
+    density = np.abs((masses / cells.widths).real)
+    if max(density[0], density[-1]) > EDGE * np.max(density):  # the cells do not hold it
+        return None
+    report.time, report.noise = report.time + error + course.unresolved, max(report.noise, min(error, 1.0))
     resampled = _resampled(prepared, cells, masses, window, error)
     assert resampled.look is not None
     report.density(resampled.look)
@@ -92,8 +102,9 @@ class Worth(NamedTuple):
 
     def at(self, offsets: Array) -> Array:
         """Return the values at offsets from the origin (J,)."""
-        s = np.arcsinh((offsets - self.cells.centre) / self.cells.scale)
-        return local_polynomial(self.values, self.cells.logarithmic, s)
+        size = self.cells.size
+        index = self.cells.place(np.clip(offsets, *self.cells.faces[[0, -1]]))
+        return local_polynomial(self.values, lw.Window(0.0, size // 2 + 0.5, 1.0, size, False, 1.0), index)
 
 
 def pulled_back(
@@ -112,15 +123,16 @@ def pulled_back(
         log_worth: the logarithm of the function at offsets from the origin of the window (J,).
         values: the density before the interval.
     """
-    ends = _ends(values, window)
-    course = _course(prepared, window, ends, start, length)
+    ends = ends_of(values, window)
+    course = course_of(prepared, values, window, ends, start, length, inside)
     if course is None:
         return None
 
     def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
         logs = log_worth(cells.offsets)
         top = float(np.max(logs))
-        interval = prepared, values, window, cells, start, inside, rates, steps, course.fastest
+        density = lw.density_at(values, window, cells.offsets)
+        interval = prepared, density, cells, start, inside, rates, steps, course
         found, gained = _advanced(np.exp(logs - top), *interval, backward=True)
         return found, gained + top
 
@@ -128,38 +140,13 @@ def pulled_back(
         padded = np.concatenate([found[:1], found, found[-1:]])
         return (9.0 * (found[::2] + found[1::2]) - padded[:-2:2] - padded[3::2]) / 16.0
 
-    found = _settled(SMOOTH, course, length, at_level, between)
+    found = _settled(SMOOTH, course, at_level, between)
     return None if found is None else Worth(found[1], found[0], float(found[2]), found[3])
-
-
-class _Course(NamedTuple):
-    """How an interval moves a density, the cells that hold it all the way, the first step, and the fastest drift that counts."""
-
-    way: _Way
-    cells: Volumes
-    finest: float
-    quick: float
-    fastest: float
-
-
-def _course(prepared: Prepared, window: lw.Window, ends: Array, start: float, length: float) -> _Course | None:
-    """Return the course of a density between two offsets, None where the drift leads beyond all numbers."""
-    width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(_drift(prepared, window, ends, start))))
-    fastest = FASTEST * width / (length * prepared.tolerance)
-    quick = min(FIRST * width / max(min(speed, fastest), 1e-300), 0.1 * length)
-    way = _way(prepared, window, ends, start, ends_of_steps(length, quick, _FLOW_STEPS))
-    if not np.isfinite([way.low, way.high]).all() or not way.high > way.low:
-        return None
-    centre, scale = 0.5 * (way.low + way.high), 0.5 * (way.high - way.low)
-    cells = volumes(window.origin, centre, scale, min(ends[0], centre - scale), max(ends[1], centre + scale), LEVELS[0][0])
-    finest = (cells.last - cells.first) / LEVELS[-1][0] * np.hypot(scale, max(abs(ends[0] - centre), abs(ends[1] - centre)))
-    return _Course(way, cells, float(finest), quick, fastest)
 
 
 def _settled(
     allowed: float,
-    course: _Course,
-    length: float,
+    course: Course,
     at_level: Callable[[Volumes, Array], tuple[Array, Any]],
     paired: Callable[[Array], Array],
 ) -> tuple[Array, Volumes, Any, float] | None:
@@ -174,7 +161,7 @@ def _settled(
     error = np.inf
     for size, count in LEVELS:
         cells = course.cells._replace(size=size)
-        values, gained = at_level(cells, ends_of_steps(length, course.quick, count))
+        values, gained = at_level(cells, course.steps(count))
         if before is not None:
             coarse = paired(values)
             # The error of second order falls to a quarter where the size of the cells is halved.
@@ -195,78 +182,39 @@ def _settled(
     return best[0], best[2], best[1], error
 
 
-def _ends(values: Array, window: lw.Window) -> Array:
-    """Return the ends of the support of a density as offsets from the origin (2,)."""
-    look = lw.figures(values, False)
-    return window.offsets[[max(look.first - 1, 0), min(look.last + 1, window.size - 1)]]
-
-
-def _drift(prepared: Prepared, window: lw.Window, offsets: Array, t: float) -> Array:
-    return finite(prepared.system.drift(window.origin + offsets[:, None], t, prepared.theta.real)[:, 0])
-
-
-class _Way(NamedTuple):
-    """How the drift moves a density: by how many of its ranges, their most in the smallest deviations of parts, and to where."""
-
-    travel: float
-    deviations: float
-    low: float
-    high: float
-
-
-def _way(prepared: Prepared, window: lw.Window, ends: Array, start: float, steps: Array) -> _Way:
-    """Follow Gaussian parts of a density between two offsets by exponential Euler steps."""
-    count, width = _FLOW_POINTS, float(ends[1] - ends[0])
-    x, t, travel, most = np.linspace(float(ends[0]), float(ends[1]), count), start, 0.0, 0.0
-    own, noise = np.full(count, (width / (2.0 * REACH)) ** 2), np.zeros(count)
-    for step in np.diff(steps):
-        near = 1e-6 * np.maximum(np.abs(window.origin + x), 1e-3 * width)
-        f = _drift(prepared, window, np.concatenate([x, x + near, x - near]), t)
-        slope = 0.5 * step * (f[count : 2 * count] - f[2 * count :]) / near
-        G = covariance_at(prepared.system, window.origin + x, t, prepared.theta.real)
-        by = step * f[:count] * _relative(np.minimum(slope, 3.0))
-        x, t = x + by, t + step
-        slope = np.minimum(2.0 * slope, 0.0)  # what drifts apart, the points show
-        own, noise = own * np.exp(slope), noise * np.exp(slope) + step * G * _relative(slope)
-        reach = REACH * np.sqrt(noise)
-        low, high = float(np.min(x - reach)), float(np.max(x + reach))
-        wide = float(np.max(x) - np.min(x)) + 2.0 * float(np.min(reach))
-        most = max(most, wide / float(np.sqrt(np.min(own + noise))))
-        travel += float(np.max(np.abs(by))) / wide
-    return _Way(travel, most, low, high)
-
-
-def _relative(x: Array) -> Array:
-    """Return (exp(x) - 1) / x."""
-    small = np.abs(x) < 1e-8
-    return np.where(small, 1.0, np.expm1(x) / np.where(small, 1.0, x))
-
-
 def _advanced(
     masses: Array,
     prepared: Prepared,
-    values: Array,
-    window: lw.Window,
+    density: Array,
     cells: Volumes,
     start: float,
     inside: np.ndarray,
     rates: np.ndarray,
     ends: Array,
-    fastest: float,
+    course: Course,
     backward: bool = False,
 ) -> tuple[Array, Any]:
-    """Return the masses of cells after steps, and the logarithm of their sum."""
-    density, at = lw.density_at(values, window, cells.offsets), cast(lw.Window, cells)  # by its points
-    known: list[Bands] = []
+    """Return the masses of cells after steps, and the logarithm of their sum; `density` is the one before the interval."""
+    at, bounds = cast(lw.Window, cells), course.bounds  # by its points
+    known: dict[int, Bands] = {}
 
-    def bands(times: Array) -> list[Bands]:
-        if not known or prepared.system.varying:
-            t = within(start + (times if prepared.system.varying else times[:1]), start, start + float(ends[-1]))
-            drift, covariance, potential, constant = coefficients(prepared, at, t, inside, rates, density)
-            potential = potential + constant[:, None] - offset
-            drift = np.where(np.abs(drift) < fastest, drift, fastest * np.sign(drift.real))
-            known[:] = [cells.bands(*part) for part in zip(covariance, drift, potential, strict=True)]
-        return known if prepared.system.varying else known * len(times)
+    def operators(times: Array) -> Bands:
+        drift, covariance, potential, constant = coefficients(prepared, at, times, inside, rates, density)
+        drift = np.where(np.abs(drift) < course.fastest, drift, course.fastest * np.sign(drift.real))
+        covariance = covariance if covariance.ndim == 2 else covariance[:, None]
+        return cells.bands(covariance, drift, potential + constant[:, None] - offset)
+
+    def bands(times: Array) -> Bands:
+        part = int(np.searchsorted(bounds, 0.5 * (times[0] + times[-1]))) - 1 if prepared.system.varying else 0
+        first, last = bounds[part : part + 2]
+        if part not in known:
+            nodes = first + (last - first) * GAUSS_NODES if prepared.system.varying else np.zeros(1)
+            known[part] = operators(within(start + nodes, start + first, start + last))
+        if not prepared.system.varying:
+            return known[part]
+        matrix = interpolation((times - first) / (last - first))
+        below, diagonal, above = (matrix @ one for one in known[part])
+        return below, diagonal, above
 
     offset = 0.0
     if inside.any():

@@ -14,10 +14,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import complex128, float64, int64
 from numpy.typing import NDArray
-from scipy.linalg import get_lapack_funcs
 
 from zakai.numerics import line_window as lw
+from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line_polynomial import interpolated_logs
 
 Array = NDArray[Any]
@@ -25,11 +26,21 @@ Bands = tuple[Array, Array, Array]
 
 _COUNTS = (1, 2, 3, 4, 6)  # steps of implicit Euler that are extrapolated
 _TIMES = np.unique([j / count for count in _COUNTS for j in range(1, count + 1)])  # of a step, at which they need the operator
-_PLACES = {count: np.searchsorted(_TIMES, [j / count for j in range(1, count + 1)]).tolist() for count in _COUNTS}
+# The rows of the operators at those times (6, C) for the steps of each count, -1 where there are no more.
+_PLACES = np.array([[np.searchsorted(_TIMES, j / c) if j <= c else -1 for c in _COUNTS] for j in range(1, _COUNTS[-1] + 1)])
+_BACKWARD = np.ascontiguousarray(_PLACES[::-1])
+
+
+BASE = 256  # cells of which there is a multiple by a power of two
+_FEWEST = 8  # cells between two cuts
+_BESIDE = 1e-10  # of the range in s: how far beside a cut coefficients are those of its side
 
 
 class Volumes(NamedTuple):
-    """Cells between the faces origin + centre + scale sinh(s), s uniform from `first` to `last`."""
+    """Cells between the faces origin + centre + scale sinh(s), s from `first` to `last`, uniform between two `cuts`.
+
+    The cuts are faces, at which coefficients may have a kink or a jump.
+    """
 
     origin: float
     centre: float
@@ -37,6 +48,7 @@ class Volumes(NamedTuple):
     first: float
     last: float
     size: int
+    cuts: tuple[float, ...] = ()
 
     @property
     def closed(self) -> bool:
@@ -44,20 +56,31 @@ class Volumes(NamedTuple):
         return False
 
     @property
-    def logarithmic(self) -> lw.Window:
-        """The grid of s at the middles of the cells."""
-        spacing = (self.last - self.first) / self.size
-        return lw.Window(0.0, self.first + spacing * (self.size // 2 + 0.5), spacing, self.size, False, spacing)
+    def ends(self) -> tuple[Array, Array]:
+        """Between which s (P + 1,) the cells are uniform, and how many lie before each (P + 1,)."""
+        s = np.array([self.first, *self.cuts, self.last])
+        counts = np.maximum(np.round(BASE * np.diff(s) / (s[-1] - s[0])).astype(int), _FEWEST)
+        counts[np.argmax(counts)] += BASE - counts.sum()
+        return s, np.concatenate([[0], np.cumsum(counts)]) * (self.size // BASE)
+
+    def _offset(self, index: Array) -> Array:
+        s, before = self.ends
+        return self.centre + self.scale * np.sinh(np.interp(index, before, s))
+
+    def place(self, offsets: Array) -> Array:
+        """Return how many cells lie before offsets (J,) from the origin, NaN beyond the cells."""
+        s, before = self.ends
+        return np.interp(np.arcsinh((offsets - self.centre) / self.scale), s, before, np.nan, np.nan)
 
     @property
     def offsets(self) -> Array:
         """The middles of the cells in s (N,) as offsets from the origin."""
-        return self.centre + self.scale * np.sinh(self.logarithmic.offsets)
+        return self._offset(np.arange(self.size) + 0.5)
 
     @property
     def faces(self) -> Array:
         """The faces (N + 1,) as offsets from the origin."""
-        return self.centre + self.scale * np.sinh(np.linspace(self.first, self.last, self.size + 1))
+        return self._offset(np.arange(self.size + 1.0))
 
     @property
     def widths(self) -> Array:
@@ -66,37 +89,50 @@ class Volumes(NamedTuple):
 
     @property
     def points(self) -> Array:
-        """The middles of the cells, then the faces between two cells (2 N - 1,)."""
-        return self.origin + np.concatenate([self.offsets, self.faces[1:-1]])
+        """The middles of the cells, the faces between two cells, and points on both sides of each cut (2 N - 1 + 2 C,)."""
+        s = np.repeat(self.cuts, 2) + np.tile([-_BESIDE, _BESIDE], len(self.cuts)) * (self.last - self.first)
+        beside = self.centre + self.scale * np.sinh(s)
+        return self.origin + np.concatenate([self.offsets, self.faces[1:-1], beside])
 
     def bands(self, covariance: Array, drift: Array, potential: Array) -> Bands:
-        """Return the operator on the masses of the cells: below, on and above the diagonal.
+        """Return the operators on the masses of the cells at times (T,): below, on and above the diagonal.
 
         Args:
-            covariance: G, one number, or its values at `points` (2 N - 1,).
-            drift: f at `points`.
-            potential: V at `points`.
+            covariance: G (T, 1), or its values at `points` (T, P).
+            drift: f at `points` (T, P).
+            potential: V at `points` (T, P).
         """
         size, offsets, faces, widths = self.size, self.offsets, self.faces, self.widths
-        apart = np.diff(offsets)
-        share, f, G = (offsets[1:] - faces[1:-1]) / apart, drift[size:], 0.5 * (covariance * np.ones(2 * size - 1))[:size]
-        out = (f * share + G[:-1] / apart) / widths[:-1]  # of the flux from a cell to the next
-        back = (G[1:] / apart - f * (1.0 - share)) / widths[1:]
-        diagonal = np.array(potential[:size])
-        diagonal[:-1] -= out
-        diagonal[1:] -= back
+        apart, f = np.diff(offsets), drift[:, size : 2 * size - 1].copy()
+        sides = drift[:, 2 * size - 1 :]
+        f[:, self.ends[1][1:-1] - 1] = 0.5 * (sides[:, ::2] + sides[:, 1::2])  # at a jump
+        share, G = (offsets[1:] - faces[1:-1]) / apart, np.broadcast_to(covariance, drift.shape)[:, :size]
+        out = (f * share + 0.5 * G[:, :-1] / apart) / widths[:-1]  # of the flux from a cell to the next
+        back = (0.5 * G[:, 1:] / apart - f * (1.0 - share)) / widths[1:]
+        diagonal = potential[:, :size] + 0.0 * (covariance[:, :1] + drift[:, :1])  # of the type of all three
+        diagonal[:, :-1] -= out
+        diagonal[:, 1:] -= back
         return out, diagonal, back
 
     def density(self, masses: Array) -> Callable[[Array], Array]:
         """Return the function that interpolates the density at offsets (J,), zero where masses are rounding."""
-        window = self.logarithmic
-        smooth = np.array(masses)
-        smooth[1:-1] -= np.diff(masses, 2) / 24.0  # from the mean over a cell to the value in its middle
-        smooth = np.where(smooth.real > 0, smooth, 0.0)
+        s, before = self.ends
+        parts = []
+        for first, last in zip(before[:-1], before[1:], strict=True):
+            own, size = masses[first:last], last - first
+            curvature = np.diff(own, 2)[np.clip(np.arange(size) - 1, 0, size - 3)]
+            smooth = own - curvature / 24.0  # from the mean over a cell to the value in its middle
+            parts.append((np.where(smooth.real > 0, smooth, 0.0), lw.Window(0.0, first + size // 2 + 0.5, 1.0, size, False, 1.0)))
+        steps = np.diff(s) / np.diff(before)
 
         def at(offsets: Array) -> Array:
-            s = np.arcsinh((offsets - self.centre) / self.scale)
-            return interpolated_logs(smooth, window, s) / (window.spacing * self.scale * np.cosh(s))
+            index, found = self.place(offsets), np.zeros(offsets.shape, masses.dtype)
+            part = np.searchsorted(before[1:-1], index, side="right")
+            for j, (smooth, window) in enumerate(parts):
+                here = (part == j) & np.isfinite(index)
+                inner = np.clip(index[here], before[j] + 1e-6, before[j + 1] - 1e-6)  # a face itself lies beyond a window
+                found[here] = interpolated_logs(smooth, window, inner)
+            return found / (steps[part] * np.sqrt(self.scale**2 + (offsets - self.centre) ** 2))
 
         return at
 
@@ -112,11 +148,11 @@ def ends_of_steps(length: float, first: float, count: int) -> Array:
     return np.concatenate([[0.0], first * (length / first) ** np.linspace(0.0, 1.0, count)])
 
 
-def advanced(bands: Callable[[Array], list[Bands]], values: Array, ends: Array, backward: bool = False) -> tuple[Array, Any]:
+def advanced(bands: Callable[[Array], Bands], values: Array, ends: Array, backward: bool = False) -> tuple[Array, Any]:
     """Return the masses after steps, with the sum one, and the logarithm of their sum before.
 
     Args:
-        bands: the operators at times after the start (T,).
+        bands: the operators at times after the start (T,), or one that holds at all times.
         values: the masses (N,); `backward` what a mass in each cell is worth at the end, which the adjoint operator takes to
             the start.
         ends: the ends of the steps (T + 1,), with the start.
@@ -125,25 +161,62 @@ def advanced(bands: Callable[[Array], list[Bands]], values: Array, ends: Array, 
     gained: Any = 0.0
     steps = list(zip(ends[:-1], ends[1:], strict=True))
     for start, stop in steps[::-1] if backward else steps:
-        values = _extrapolated(bands(start + (stop - start) * _TIMES), values, stop - start, backward)
+        below, diagonal, above = bands(start + (stop - start) * _TIMES)
+        if backward:
+            below, above = above, below
+        arrays = [np.ascontiguousarray(part) for part in (below, diagonal, above, values)]
+        if any(np.iscomplexobj(part) for part in arrays):
+            arrays = [part.astype(complex) for part in arrays]
+        values = _extrapolated(*arrays, stop - start, _BACKWARD if backward else _PLACES)
         total = np.sum(values)
         values, gained = values / total, gained + np.log(total)
     return values, gained
 
 
-def _extrapolated(bands: list[Bands], values: Array, step: float, backward: bool) -> Array:
-    """Return the masses after a step, from the operators at parts `_TIMES` of it."""
-    row = []
-    for count in _COUNTS:
-        h, now = step / count, values
-        for part in _PLACES[count][::-1] if backward else _PLACES[count]:
-            below, diagonal, above = bands[part]
-            if backward:
-                below, above = above, below
-            (solve,) = get_lapack_funcs(("gtsv",), (diagonal, now))
-            now = solve(-h * below, 1.0 - h * diagonal, -h * above, now)[3]
-        row.append(now)
-    for k in range(1, len(row)):
-        for j in range(len(row) - 1, k - 1, -1):
-            row[j] = row[j] + (row[j] - row[j - 1]) / (_COUNTS[j] / _COUNTS[j - k] - 1.0)
-    return row[-1]
+@kernel(
+    float64[::1](float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1], float64, int64[:, ::1]),
+    complex128[::1](complex128[:, ::1], complex128[:, ::1], complex128[:, ::1], complex128[::1], float64, int64[:, ::1]),
+)
+def _extrapolated(below: Array, diagonal: Array, above: Array, values: Array, step: float, places: Array) -> Array:
+    """Return the masses after a step, from the operators at parts `_TIMES` of it.
+
+    `places` (6, C) are the rows of the operators of each series of Euler steps, -1 where it has no more steps.
+    """
+    counts = len(_COUNTS)
+    row = np.empty((counts, values.shape[0]), values.dtype)
+    for j in range(counts):
+        row[j] = values
+        for i in range(places.shape[0]):
+            part = places[i, j]
+            if part >= 0:
+                part = min(part, diagonal.shape[0] - 1)
+                _solve(below[part], diagonal[part], above[part], row[j], step / _COUNTS[j])
+    for k in range(1, counts):
+        for j in range(counts - 1, k - 1, -1):
+            row[j] += (row[j] - row[j - 1]) / (_COUNTS[j] / _COUNTS[j - k] - 1.0)
+    return row[counts - 1].copy()
+
+
+@helper
+def _solve(below: Array, diagonal: Array, above: Array, x: Array, h: float) -> None:
+    """Replace x by the solution of (1 - h L) y = x for a tridiagonal L, by elimination with row exchanges."""
+    size = x.shape[0]
+    first, second, third = np.empty_like(x), np.empty_like(x), np.empty_like(x)  # the rows of the triangular matrix
+    now, right = 1.0 - h * diagonal[0], -h * above[0]
+    for i in range(size - 1):
+        low, mid = -h * below[i], 1.0 - h * diagonal[i + 1]
+        high = -h * above[i + 1] if i + 2 < size else 0.0 * mid
+        if abs(low.real) > abs(now.real):
+            factor = now / low
+            first[i], second[i], third[i] = low, mid, high
+            now, right = right - factor * mid, -factor * high
+            x[i], x[i + 1] = x[i + 1], x[i] - factor * x[i + 1]
+        else:
+            factor = low / now
+            first[i], second[i], third[i] = now, right, 0.0 * mid
+            now, right = mid - factor * right, high
+            x[i + 1] -= factor * x[i]
+    x[size - 1] /= now
+    x[size - 2] = (x[size - 2] - second[size - 2] * x[size - 1]) / first[size - 2]
+    for i in range(size - 3, -1, -1):
+        x[i] = (x[i] - second[i] * x[i + 1] - third[i] * x[i + 2]) / first[i]

@@ -1,0 +1,145 @@
+"""How an interval moves a density of one state, and the finite volumes that hold it all the way (`_line_volumes.py`)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.methods._line_coefficients import resolved_parts
+from zakai.methods._line_system import Prepared, covariance_at, finite
+from zakai.numerics import line_window as lw
+from zakai.numerics.line_panels import Panels
+from zakai.numerics.line_volumes import Volumes, ends_of_steps, volumes
+
+Array = Any
+
+FAST = 5.0  # ranges of a density that the drift crosses in an interval, below which it is not followed
+LEVELS = ((256, 24), (512, 34), (1024, 48), (2048, 68), (4096, 96), (8192, 136), (16384, 192))  # cells and steps
+FIRST = 0.1  # of the time in which the drift would cross the range of the density: the first step
+FASTEST = 100.0  # ranges of the density in the interval, divided by the tolerance: a faster drift counts as this
+REACH = 8.0  # standard deviations to the end of a density
+KINK_PROBES = 1025  # points between which kinks are sought
+MOST_KINKS = 16
+GENTLE = 0.25  # of the steps where the density does not contract much
+_FLOW_POINTS = 17
+_FLOW_STEPS = 32
+
+
+class Course(NamedTuple):
+    """How an interval moves a density, the cells that hold it all the way, the first step, and the fastest drift that counts.
+
+    Between two `bounds` (B + 1,) the coefficients are polynomials of time, up to the relative error `unresolved`; `share` is that
+    of the steps of `LEVELS` that are taken.
+    """
+
+    way: _Way
+    cells: Volumes
+    finest: float
+    quick: float
+    fastest: float
+    bounds: Array
+    unresolved: float
+    share: float
+
+    def steps(self, count: int) -> Array:
+        """Return the ends of about `count` steps, none of which crosses a bound."""
+        ends = ends_of_steps(float(self.bounds[-1]), self.quick, int(np.ceil(self.share * count)))
+        return np.union1d(self.bounds, ends[:-1])
+
+
+def course_of(
+    prepared: Prepared, values: Array, window: lw.Window, ends: Array, start: float, length: float, inside: np.ndarray
+) -> Course | None:
+    """Return the course of a density between two offsets, None where the drift leads beyond all numbers."""
+    width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(drift_along(prepared, window, ends, start))))
+    fastest = FASTEST * width / (length * prepared.tolerance)
+    quick = min(FIRST * width / max(min(speed, fastest), 1e-300), 0.1 * length)
+    parts = Panels([(0.0, length)], 0.0)
+    if prepared.system.varying:
+        parts = resolved_parts(prepared, values, window, start, length, inside)
+    bounds = np.array([0.0, *(stop for _, stop in parts.bounds)])
+    way = _way(prepared, window, ends, start, np.union1d(bounds, ends_of_steps(length, quick, _FLOW_STEPS)))
+    if not np.isfinite([way.low, way.high]).all() or not way.high > way.low:
+        return None
+    centre, scale = 0.5 * (way.low + way.high), 0.5 * (way.high - way.low)
+    cells = volumes(window.origin, centre, scale, min(ends[0], centre - scale), max(ends[1], centre + scale), LEVELS[0][0])
+    finest = (cells.last - cells.first) / LEVELS[-1][0] * np.hypot(scale, max(abs(ends[0] - centre), abs(ends[1] - centre)))
+    cells = cells._replace(cuts=_cuts(prepared, cells, start))
+    share = 1.0 if speed * length > FAST * width else GENTLE
+    return Course(way, cells, float(finest), quick, fastest, bounds, parts.error, share)
+
+
+def ends_of(values: Array, window: lw.Window) -> Array:
+    """Return the ends of the support of a density as offsets from the origin (2,)."""
+    look = lw.figures(values, False)
+    return window.offsets[[max(look.first - 1, 0), min(look.last + 1, window.size - 1)]]
+
+
+def drift_along(prepared: Prepared, window: lw.Window, offsets: Array, t: float) -> Array:
+    """Return f at offsets from the origin (J,)."""
+    return finite(prepared.system.drift(window.origin + offsets[:, None], t, prepared.theta.real)[:, 0])
+
+
+def _cuts(prepared: Prepared, cells: Volumes, start: float) -> tuple[float, ...]:
+    """Return where in the range of cells coefficients have kinks or jumps, in s; nothing where these are many."""
+    kinks, theta = prepared.system.kinks, prepared.theta.real
+    if kinks is None:
+        return ()
+
+    def values(s: Array) -> Array:
+        return kinks(cells.origin + (cells.centre + cells.scale * np.sinh(s))[..., None], start, theta)
+
+    s = np.linspace(cells.first, cells.last, KINK_PROBES)
+    negative = values(s) < 0
+    at, which = np.nonzero(negative[1:] != negative[:-1])
+    if not 0 < len(at) <= MOST_KINKS:
+        return ()
+    low, high, left = s[at], s[at + 1], negative[at, which]
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        same = (values(middle)[np.arange(len(at)), which] < 0) == left
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    found: list[float] = []
+    apart = 1e-6 * (cells.last - cells.first)
+    for one in sorted(0.5 * (low + high)):
+        if one - (found[-1] if found else cells.first) > apart and cells.last - one > apart:
+            found.append(float(one))
+    return tuple(found)
+
+
+class _Way(NamedTuple):
+    """How the drift moves a density: by how many of its ranges, their most in the smallest deviations of parts, and to where."""
+
+    travel: float
+    deviations: float
+    low: float
+    high: float
+
+
+def _way(prepared: Prepared, window: lw.Window, ends: Array, start: float, steps: Array) -> _Way:
+    """Follow Gaussian parts of a density between two offsets by exponential Euler steps."""
+    count, width = _FLOW_POINTS, float(ends[1] - ends[0])
+    x, t, travel, most = np.linspace(float(ends[0]), float(ends[1]), count), start, 0.0, 0.0
+    own, noise = np.full(count, (width / (2.0 * REACH)) ** 2), np.zeros(count)
+    for step in np.diff(steps):
+        near = 1e-6 * np.maximum(np.abs(window.origin + x), 1e-3 * width)
+        f = drift_along(prepared, window, np.concatenate([x, x + near, x - near]), t)
+        slope = 0.5 * step * (f[count : 2 * count] - f[2 * count :]) / near
+        G = covariance_at(prepared.system, window.origin + x, t, prepared.theta.real)
+        by = step * f[:count] * _relative(np.minimum(slope, 3.0))
+        x, t = x + by, t + step
+        slope = np.minimum(2.0 * slope, 0.0)  # what drifts apart, the points show
+        own, noise = own * np.exp(slope), noise * np.exp(slope) + step * G * _relative(slope)
+        reach = REACH * np.sqrt(noise)
+        low, high = float(np.min(x - reach)), float(np.max(x + reach))
+        wide = float(np.max(x) - np.min(x)) + 2.0 * float(np.min(reach))
+        most = max(most, wide / float(np.sqrt(np.min(own + noise))))
+        travel += float(np.max(np.abs(by))) / wide
+    return _Way(travel, most, low, high)
+
+
+def _relative(x: Array) -> Array:
+    """Return (exp(x) - 1) / x."""
+    small = np.abs(x) < 1e-8
+    return np.where(small, 1.0, np.expm1(x) / np.where(small, 1.0, x))
