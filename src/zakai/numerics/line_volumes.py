@@ -182,41 +182,46 @@ def _extrapolated(below: Array, diagonal: Array, above: Array, values: Array, st
 
     `places` (6, C) are the rows of the operators of each series of Euler steps, -1 where it has no more steps.
     """
-    counts = len(_COUNTS)
-    row = np.empty((counts, values.shape[0]), values.dtype)
+    counts, size = len(_COUNTS), values.shape[0]
+    row, upper = np.empty((counts, size), values.dtype), np.empty((3, size), values.dtype)
     for j in range(counts):
-        row[j] = values
+        for i in range(size):
+            row[j, i] = values[i]
         for i in range(places.shape[0]):
-            part = places[i, j]
-            if part >= 0:
-                part = min(part, diagonal.shape[0] - 1)
-                _solve(below[part], diagonal[part], above[part], row[j], step / _COUNTS[j])
+            if places[i, j] >= 0:
+                part = min(places[i, j], diagonal.shape[0] - 1)
+                _solve(below, diagonal, above, part, row, j, step / _COUNTS[j], upper)
     for k in range(1, counts):
         for j in range(counts - 1, k - 1, -1):
-            row[j] += (row[j] - row[j - 1]) / (_COUNTS[j] / _COUNTS[j - k] - 1.0)
-    return row[counts - 1].copy()
+            share = 1.0 / (_COUNTS[j] / _COUNTS[j - k] - 1.0)
+            for i in range(size):
+                row[j, i] += share * (row[j, i] - row[j - 1, i])
+    return row[counts - 1]
 
 
 @helper
-def _solve(below: Array, diagonal: Array, above: Array, x: Array, h: float) -> None:
-    """Replace x by the solution of (1 - h L) y = x for a tridiagonal L, by elimination with row exchanges."""
-    size = x.shape[0]
-    first, second, third = np.empty_like(x), np.empty_like(x), np.empty_like(x)  # the rows of the triangular matrix
-    now, right = 1.0 - h * diagonal[0], -h * above[0]
+def _solve(below: Array, diagonal: Array, above: Array, k: int, x: Array, j: int, h: float, upper: Array) -> None:
+    """Replace x[j] by the solution of (1 - h L) y = x[j], L with the bands of row k, by elimination with row exchanges.
+
+    `upper` (3, N) holds the triangular matrix.
+    """
+    size = x.shape[1]
+    now, right = 1.0 - h * diagonal[k, 0], -h * above[k, 0]
     for i in range(size - 1):
-        low, mid = -h * below[i], 1.0 - h * diagonal[i + 1]
-        high = -h * above[i + 1] if i + 2 < size else 0.0 * mid
+        low, mid, high = -h * below[k, i], 1.0 - h * diagonal[k, i + 1], 0.0 * now
+        if i + 2 < size:
+            high = -h * above[k, i + 1]
         if abs(low.real) > abs(now.real):
             factor = now / low
-            first[i], second[i], third[i] = low, mid, high
+            upper[0, i], upper[1, i], upper[2, i] = low, mid, high
             now, right = right - factor * mid, -factor * high
-            x[i], x[i + 1] = x[i + 1], x[i] - factor * x[i + 1]
+            x[j, i], x[j, i + 1] = x[j, i + 1], x[j, i] - factor * x[j, i + 1]
         else:
             factor = low / now
-            first[i], second[i], third[i] = now, right, 0.0 * mid
+            upper[0, i], upper[1, i], upper[2, i] = now, right, 0.0 * now
             now, right = mid - factor * right, high
-            x[i + 1] -= factor * x[i]
-    x[size - 1] /= now
-    x[size - 2] = (x[size - 2] - second[size - 2] * x[size - 1]) / first[size - 2]
+            x[j, i + 1] -= factor * x[j, i]
+    x[j, size - 1] /= now
+    x[j, size - 2] = (x[j, size - 2] - upper[1, size - 2] * x[j, size - 1]) / upper[0, size - 2]
     for i in range(size - 3, -1, -1):
-        x[i] = (x[i] - second[i] * x[i + 1] - third[i] * x[i + 2]) / first[i]
+        x[j, i] = (x[j, i] - upper[1, i] * x[j, i + 1] - upper[2, i] * x[j, i + 2]) / upper[0, i]
