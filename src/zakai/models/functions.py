@@ -21,15 +21,6 @@ class _Real(sympy.Function):  # type: ignore[misc]
     def _eval_is_extended_real(self) -> bool:
         return True
 
-    def _sympystr(self, printer: Any) -> str:
-        # SymPy would look for a method of the printer by the name, and find another for a table named `level` or `Add`.
-        return f"{type(self).__name__}({', '.join(map(printer.doprint, self.args))})"
-
-    def _latex(self, printer: Any, exp: str | None = None) -> str:
-        name = printer.doprint(sympy.Symbol(type(self).__name__))
-        power = "" if exp is None else f"^{{{exp}}}"
-        return rf"\operatorname{{{name}}}{power}{{\left({', '.join(map(printer.doprint, self.args))}\right)}}"
-
 
 class Minimum(_Real):
     """min(a, b); its derivative at a = b is the mean of the two."""
@@ -80,6 +71,15 @@ class TableFunction(_Real):
         if orders[argindex - 1] > self.table.degree:
             return sympy.Integer(0)
         return table_function(self.table, orders)(*self.args)
+
+    def _sympystr(self, printer: Any) -> str:
+        # SymPy would look for a method of the printer by the name, and find another for a table named `level` or `Add`.
+        return f"{type(self).__name__}({', '.join(map(printer.doprint, self.args))})"
+
+    def _latex(self, printer: Any, exp: str | None = None) -> str:
+        name = printer.doprint(sympy.Symbol(type(self).__name__))
+        power = "" if exp is None else f"^{{{exp}}}"
+        return rf"\operatorname{{{name}}}{power}{{\left({', '.join(map(printer.doprint, self.args))}\right)}}"
 
 
 def table_function(table: Table, orders: tuple[int, ...] | None = None) -> Any:
