@@ -32,8 +32,7 @@ AGREED, _PLACED = 1e-3, 12
 # component keeps its weight.
 _RIDGE, _CHANGE, _LIGHT = 1e-3, 0.5, 1e-12
 _EMPTY = 1e30
-# The depth in nats below the largest from which a product is negligible.
-_SMALL = 40.0
+_SMALL = 40.0  # depth in nats below the largest from which a product is negligible
 
 LogFactor = Callable[[Array, Array], Array]
 
@@ -148,8 +147,8 @@ def steepest(sum_: Components, log_factor: Callable[[Array], Array], directions:
     k = directions.shape[1]
     rule = equidistant(*SEARCH[k], k)
     real = Components(*(array.real for array in sum_))
-    logs = log_factor(points(real, regression(real.covs, directions), rule.nodes)).real
-    logs = np.where(np.isfinite(logs), logs, -_EMPTY)
+    found = log_factor(points(real, regression(real.covs, directions), rule.nodes)).real
+    logs = np.where(np.isfinite(found), found, -_EMPTY)
     top, place = logs.max(axis=1), logs.argmax(axis=1)
     total = top + real.log_weights
     used = (total > total.max(initial=-_EMPTY) - _SMALL) & (top > -_EMPTY)
