@@ -99,7 +99,8 @@ class AffineSystem:
         self._noise = Matrices([model.observation_noise], model)
         self._cross = None if model.cross_noise.is_zero_matrix else Matrices([model.diffusion * model.cross_noise], model)
         parts = [self.matrices] if self._cross is None else [self.matrices, self._cross]
-        self.varying = any(part.varying for part in [*parts, self._observation])
+        self.observation_varies = self._observation.varying
+        self.varying = self.observation_varies or any(part.varying for part in parts)
         # Whether a piece has one flow for each length: the inputs are constant in it.
         self.autonomous = not any(part.timed for part in parts) and (model.input_hold == "zero" or not self.matrices.driven)
         self.inputs = len(model.u)
@@ -220,7 +221,7 @@ class Setup:
     def observation(self, schedule: Schedule) -> tuple[Array, Array, Array]:
         """Return C (K, m, n), c (K, m) and S (K, m, m) at the ends of intervals; increments end before an input jumps."""
         stops, inputs = schedule.stops, schedule.inputs
-        if self.system.varying:
+        if self.system.observation_varies:
             u = np.zeros((len(stops), self.system.inputs))
             if inputs is not None:
                 u = inputs.at(stops, self.system.hold, before=self.system.kind != "samples")
