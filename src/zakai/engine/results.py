@@ -13,6 +13,7 @@ import numpy as np
 from zakai import _display
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
+from zakai.engine.variables import attributes_of, variables_of
 from zakai.errors import InputError
 from zakai.models.model import Model
 from zakai.records import Record
@@ -259,8 +260,6 @@ class FilterResult:
         """Return the result as an xarray Dataset with dimensions `time`, of dates if the record has some, and `state`."""
         import xarray
 
-        from zakai.engine.stored import attributes_of, variables_of
-
         variables = variables_of(self)
         if self.dates is not None:
             variables["time"] = (["time"], self.dates, {})
@@ -289,6 +288,4 @@ class FilterResult:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as NetCDF, atomically."""
-        from zakai.engine.stored import attributes_of, variables_of
-
         save_variables(variables_of(self), attributes_of(self), path)

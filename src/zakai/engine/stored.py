@@ -1,4 +1,4 @@
-"""Results as the variables and attributes of files, and back."""
+"""Results that were written to files."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from zakai.engine.results import FilterResult
+from zakai.engine.variables import DIMENSIONS
 from zakai.errors import InputError
 from zakai.models._errors import named
 from zakai.models.files import read_model
@@ -16,14 +17,7 @@ from zakai.records.dates import Clock
 from zakai.records.netcdf import load_variables
 from zakai.records.writing import shown
 
-_LARGEST_COV = 32  # number of states up to which covariances are stored
 _LONGEST_NAME = 64  # of a state, or a method
-# All others are over the time.
-_DIMENSIONS = {
-    **{name: (name,) for name in ("time", "state", "state_")},
-    **{name: ("time", "state") for name in ("mean", "variance")},
-    "cov": ("time", "state", "state_"),
-}
 # Names that health figures had in version 0.1.
 _RENAMED = {
     "missed": "tolerance_ratio",
@@ -34,39 +28,6 @@ _RENAMED = {
     "resolution": "std_in_spacings",
     "negative": "negative_mass",
 }
-
-
-def variables_of(result: FilterResult) -> dict[str, tuple[list[str], np.ndarray, dict[str, Any]]]:
-    """Return the variables of a file by name: their dimensions, values and attributes."""
-    names = np.array(result.state, dtype=object)
-    found = {
-        "time": result.times,
-        "state": names,
-        "state_": names,
-        "mean": result.mean,
-        "variance": result.variance,
-        "log_likelihood_increment": result.log_likelihood_increments,
-    }
-    if len(names) <= _LARGEST_COV:
-        found["cov"] = result.cov
-    variables: dict[str, Any] = {name: (list(_DIMENSIONS.get(name, ("time",))), array, {}) for name, array in found.items()}
-    for name, values in result.health.items():
-        variables[name] = (["time"], values, {"description": result.bounds.get(name, (0, name))[1]})
-    return variables
-
-
-def attributes_of(result: FilterResult) -> dict[str, Any]:
-    """Return the attributes of a file."""
-    clock = {} if result.clock is None else {f"time_{name}": str(value) for name, value in result.clock._asdict().items()}
-    return {
-        **clock,
-        "method": result.method,
-        "why": result.why,
-        "log_likelihood": result.log_likelihood,
-        "warnings": "\n".join(result.warnings),
-        "model": result.model.text if result.model is not None else "",
-        **result.attributes,
-    }
 
 
 def load_result(path: str | os.PathLike[str]) -> FilterResult:
@@ -101,7 +62,7 @@ def result_of(variables: Mapping[str, Any], attributes: Mapping[str, Any], sourc
             fault = f"{ascii(word[:40])} is no name of a method or a state"
             raise InputError(f"{source}: {fault}; give a result written by zakai filter")
     text = str(attributes.get("model", ""))
-    known = {*_DIMENSIONS, "log_likelihood_increment"}
+    known = {*DIMENSIONS, "log_likelihood_increment"}
     return FilterResult(
         times=arrays["time"],
         mean=arrays["mean"],
@@ -136,7 +97,7 @@ def _check_layout(variables: Mapping[str, Any], source: str) -> None:
             raise InputError(f"{source}: has no variable {name!r}; give a result written by zakai filter")
     sizes = {name: np.size(variables[of][1]) for name, of in (("time", "time"), ("state", "state"), ("state_", "state"))}
     for name, (dimensions, values, _) in variables.items():
-        expected = _DIMENSIONS.get(name, ("time",))
+        expected = DIMENSIONS.get(name, ("time",))
         numbers = values.dtype.kind == "f" or name in ("state", "state_")
         if tuple(dimensions) != expected or not numbers or values.shape != tuple(sizes[axis] for axis in expected):
             over = ", ".join(map(str, dimensions))[:60]
