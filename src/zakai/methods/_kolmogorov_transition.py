@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -46,11 +45,6 @@ class System:
             while len(self._kernels) > KEPT:
                 self._kernels.popitem(last=False)
         return kernels
-
-
-@lru_cache(maxsize=8)
-def system_of(model: Model, theta: bytes, dtype: str, order: int, form: str) -> System:
-    return System(model, np.frombuffer(theta, dtype), order, form)
 
 
 @dataclass(frozen=True, eq=False)

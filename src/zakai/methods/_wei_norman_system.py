@@ -94,8 +94,3 @@ class System:
             else:
                 logs = logs + r[k] * self.rates[k](at, 0.0, self.theta)[..., 0]
         return r @ self.directions, logs
-
-
-@lru_cache(maxsize=32)
-def system_of(model: Model, theta: bytes, dtype: str) -> System:
-    return System(model, np.frombuffer(theta, dtype))

@@ -29,8 +29,8 @@ from zakai.methods._kolmogorov_transition import (
     Attempt,
     Prediction,
     Prepared,
+    System,
     grid_for,
-    system_of,
     times_factor,
     transition,
 )
@@ -38,11 +38,13 @@ from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info, Method
 from zakai.methods._residuals import Factor
 from zakai.methods._space_system import prior_on_grid
+from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.numerics.dyadic_grid import Field, Grid, edge_masses, quadrature_error
 from zakai.records.schedule import Schedule
 
 MOST_SUBSTEPS = 1024
+KEPT = 8  # values of the parameters and options for which a model's system is kept
 ACCURATE = 1e-6  # the estimated error of an interval to which kernels are shortened
 EDGE = 1e-10  # probability near an edge from which a grid is enlarged
 ATTEMPTS = 16
@@ -95,7 +97,8 @@ def prepare(
     one_of("form", form, FORMS)
     one_of("splitting", splitting, ("strang", "lie"))
     theta = np.asarray(theta)
-    system = system_of(model, theta.tobytes(), theta.dtype.str, order, form)
+    key = theta.tobytes(), theta.dtype.str, order, form
+    system = kept(model, System, lambda: System(model, theta, order, form), key, KEPT)
     return Prepared(system, schedule, schedule.lengths, substeps, splitting == "lie")
 
 

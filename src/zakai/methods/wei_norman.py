@@ -24,7 +24,8 @@ from zakai.methods._options import whole_number
 from zakai.methods._protocol import Info, Method
 from zakai.methods._residuals import Factor
 from zakai.methods._space_system import prior_on_grid
-from zakai.methods._wei_norman_system import Array, System, system_of
+from zakai.methods._wei_norman_system import Array, System
+from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior
@@ -32,6 +33,7 @@ from zakai.numerics import sinc_grid
 from zakai.numerics.sinc_grid import Field, Generator, moments, resolution_of
 from zakai.records.schedule import Schedule
 
+KEPT = 8  # values of the parameters for which a model's system is kept
 POINTS = {1: 96, 2: 56, 3: 44}  # along an axis at the start
 MOST_POINTS = {1: 256, 2: 112, 3: 72}  # at most
 RESOLVED = 1e-10  # share of the density at the highest frequency from which the grid gets more points
@@ -97,7 +99,7 @@ def prepare(model: Model, schedule: Schedule, theta: Array, *, points: int | Non
     if points is not None:
         whole_number("points", points, 16, 4096)
     theta = np.asarray(theta)
-    system = system_of(model, theta.tobytes(), theta.dtype.str)
+    system = kept(model, System, lambda: System(model, theta), (theta.tobytes(), theta.dtype.str), KEPT)
     return Prepared(system, schedule, schedule.lengths, points)
 
 
