@@ -334,3 +334,20 @@ def test_what_a_linearisation_cannot_follow_is_refused(keys, words):
     system = model(**keys)
     with pytest.raises(zakai.ConditionError, match=words):
         run(system, zakai.Record([0.1], [[1.0, 2.0]], system.observation_kind))
+
+
+def test_it_begins_with_the_moments_of_a_density_of_three_states():
+    """Each state has the law of N(1, 1/2) and N(-1, 1/4) with weights 1 and 1 / sqrt(2)."""
+    names = ["x", "y", "z"]
+    terms = " + ".join(f"log(exp(-({name} - 1)**2) + exp(-2*({name} + 1)**2))" for name in names)
+    model = zakai.Model(
+        state=names,
+        drift=[f"-{name}" for name in names],
+        observation=names,
+        prior={"kind": "density", "log_density": terms},
+    )
+    result = zakai.filter(model, zakai.Record([0.1], np.zeros((1, 3)), "increments"), "extended-kalman-bucy")
+    weight = 1 / (1 + np.sqrt(0.5))
+    mean = 2 * weight - 1
+    assert np.allclose(result.mean[0], mean, rtol=0, atol=1e-9)
+    assert np.allclose(result.cov[0], (1.25 + 0.25 * weight - mean**2) * np.eye(3), rtol=0, atol=1e-9)
