@@ -126,7 +126,7 @@ class PowerSeries:
             found = transition_of(z, series, widths)
             mismatch = 0.0 * widths
             if not self.steady:
-                mismatch = _mismatch(expansion, taylor, begins, widths, theta.real, parts)
+                mismatch = _mismatch(expansion, taylor, z.B[0].real, begins, widths, theta.real, origin, parts)
         errors = np.where(np.isfinite(series.remainder), series.remainder, np.inf)
         errors = np.where(mismatch > RESOLVED, np.maximum(errors, mismatch), errors).reshape(len(starts), -1)
         # The most that any part leaves, in each of them.
@@ -137,8 +137,10 @@ class PowerSeries:
         return found, error
 
 
-def _mismatch(expansion: Expansion, taylor: Array, begins: Array, widths: Array, theta: Array, parts: int) -> Array:
-    """Return how far the Taylor polynomials of parts are from the coefficients, relative to their sizes in the interval.
+def _mismatch(
+    expansion: Expansion, taylor: Array, B: Array, begins: Array, widths: Array, theta: Array, origin: Array, parts: int
+) -> Array:
+    """Return how far the Taylor polynomials of parts are from the coefficients, in units of the interval and of G = (B'B)^-1.
 
     A pulse that is flat at the start of a part does not appear in the series there.
     """
@@ -146,12 +148,23 @@ def _mismatch(expansion: Expansion, taylor: Array, begins: Array, widths: Array,
     shares = (np.arange(count) + 0.7 + 0.25 * np.sin(7.0 * np.arange(count))) / count
     times = begins[:, None] + widths[:, None] * shares
     values = expansion.values(times, theta)
-    difference = np.abs(value(taylor.real[:, :, None], widths[:, None] * shares) - values)
+    difference = value(taylor.real[:, :, None], widths[:, None] * shares) - values
     # Neither the time nor a value is known better than to its rounding.
     steps = np.abs(np.diff(values, axis=1)).max(axis=1, keepdims=True) * (count / widths[:, None, None])
     noise = 8.0 * np.finfo(float).eps * (np.abs(times[:, :, None]) * steps + np.abs(values))
-    sizes = np.abs(values).reshape(-1, parts * count, values.shape[2]).max(axis=1).repeat(parts, axis=0)
-    found = (np.maximum(difference - noise, 0.0) / np.maximum(sizes, 1e-290)[:, None]).max(axis=(1, 2))
+    difference = np.sign(difference) * np.maximum(np.abs(difference) - noise, 0.0)
+    F, B, T = np.linalg.inv(B)[:, None], B[:, None], parts * widths[:, None]
+
+    def sizes(entries: Array) -> Array:
+        """Return the size of the terms in x'.x, in x and in 1, (3, J)."""
+        G, L, l, Q, p, r = taylor_data(entries, origin)
+        square, vector = T[..., None, None], T[..., None]
+        squares = [B @ G @ transposed(B), square * (B @ L @ F), square**2 * (transposed(F) @ Q @ F)]
+        groups = [squares, [np.sqrt(vector) * apply(B, l), vector**1.5 * apply(transposed(F), p)], [T * r]]
+        return np.stack([np.max([np.abs(one).reshape(len(B), -1).max(axis=1) for one in group], axis=0) for group in groups])
+
+    scales = np.maximum(sizes(values).reshape(3, -1, parts).max(axis=2), 1.0).repeat(parts, axis=1)
+    found = (sizes(difference) / scales).max(axis=0)
     return np.where(np.isfinite(found), found, np.inf)
 
 
