@@ -78,7 +78,13 @@ def faults(file: str, found: Iterable[tuple[str, bool]]) -> list[str]:
 # What a method of an object needs when it is called: it is written in a later module, which imports the object's.
 CALLED = {
     "densities/_density.py": {"zakai.report.axes", "zakai.records.density_files"},
-    "engine/results.py": {"zakai.report", "zakai.report.axes", "zakai.engine.forecast", "zakai.engine.residuals"},
+    "engine/results.py": {
+        "zakai.report",
+        "zakai.report.axes",
+        "zakai.engine.forecast",
+        "zakai.engine.residuals",
+        "zakai.engine.stored",
+    },
     # The parts of one method.
     "methods/_space.py": {"zakai.methods._space_direct", "zakai.methods._space_kolmogorov"},
     "methods/_line_system.py": {"zakai.methods._line_steps"},
