@@ -8,6 +8,7 @@ from mpmath import mp
 
 import zakai
 from zakai.algebra.kolmogorov_series import kolmogorov_series
+from zakai.algebra.theorems import conditions_of
 from zakai.errors import ConditionError
 
 NAMES = ["cubic", "van der pol", "lorenz", "slanted"]
@@ -133,3 +134,9 @@ def test_the_numbers_of_terms_grow_as_they_must():
 def test_what_is_no_polynomial_or_depends_on_time_is_refused(changed, said):
     with pytest.raises(ConditionError, match=said):
         kolmogorov_series(zakai.Model(**(CUBIC | changed)), 2)
+
+
+def test_a_kink_of_h_is_refused_whose_sums_over_the_grid_have_no_error_figure():
+    model = zakai.Model(state=["x"], drift=["-sin(x)"], observation=["abs(x)"], observation_kind="samples")
+    failed = [condition.statement for condition in conditions_of("kolmogorov-series", model) if condition.holds is False]
+    assert failed == ["f and h are smooth"]

@@ -177,7 +177,7 @@ def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
     if conditions[0].holds is not True:
         return tuple(conditions)
     varying = [part for part in (*model.drift, *model.covariance) if model.t in part.free_symbols]
-    kinked = [part for part in model.drift if part.has(sp.Abs, sp.sign)]
+    kinked = [part for part in (*model.drift, *model.observation) if part.has(sp.Abs, sp.sign)]
     return (
         *conditions,
         Condition(
@@ -187,7 +187,7 @@ def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
             source,
         ),
         definite_covariance(model),
-        Condition("f is smooth", not kinked, f"f contains {short(str(kinked[0]))}" if kinked else "no absolute value", source),
+        Condition("f and h are smooth", not kinked, short(str(kinked[0])) if kinked else "no absolute value", source),
         Condition("there is one state", model.n == 1, f"n = {model.n}", "the grid of this method"),
         Condition("the state is no angle", not model.periodic, f"periodic: {list(model.periodic)}", "the grid of this method"),
     )
