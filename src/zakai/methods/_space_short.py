@@ -2,23 +2,41 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
+from zakai.methods._space_system import System
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.space_advance import Control
 from zakai.numerics.space_field import Field, Report, extrapolated, grid_report, moments_difference, positive
 from zakai.numerics.space_fixed import LARGEST_RANGE, Motion, fixed_step, motion
 from zakai.numerics.space_grid import Grid
 from zakai.numerics.space_survey import Survey, survey
-
-if TYPE_CHECKING:
-    from zakai.methods._space_kolmogorov import Prepared
+from zakai.numerics.space_window import Bounds
 
 Array = Any
 MOST_TABLES = 64  # grids whose motion is kept
 MOST_FIXED = 8  # substeps of an interval on a grid that stays
+
+
+class Prepared(Protocol):
+    """What is used here of a prepared filter; its `observations` have the `dynamics`."""
+
+    @property
+    def system(self) -> System: ...
+
+    @property
+    def theta(self) -> Array: ...
+
+    @property
+    def bounds(self) -> Bounds: ...
+
+    @property
+    def observations(self) -> Any: ...
+
+    @property
+    def motions(self) -> dict[Any, Any]: ...
 
 
 def predicted_on(
