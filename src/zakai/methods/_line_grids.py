@@ -42,7 +42,7 @@ def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
         return None
     offset = window.origin - prepared.origin + float(offsets[0])
     fine = _fine(prepared, window, window.origin + offsets)
-    return Grid(_NONE[None], _NONE[None], _NONE, table, 0.0, start, offset, window.spacing, window.closed, fine)
+    return Grid(_NONE[None], _NONE[None], _NONE, table, 0.0, start, offset, window.spacing, fine)
 
 
 def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
@@ -59,7 +59,7 @@ def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
     modes, covariance = np.ascontiguousarray(decomposed.modes), float(np.max(tables(prepared, window).covariance))
     fine = _fine(prepared, window, window.points)
     return Grid(
-        modes, np.ascontiguousarray(modes.T), decomposed.rates, table, covariance, 0, 0.0, window.spacing, window.closed, fine
+        modes, np.ascontiguousarray(modes.T), decomposed.rates, table, covariance, 0, 0.0, window.spacing, fine
     )
 
 

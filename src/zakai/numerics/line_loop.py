@@ -14,7 +14,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import boolean, float64, int64, types
+from numba import float64, int64, types
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
@@ -51,19 +51,19 @@ _V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :
 
 
 @cache
-def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool) -> Any:
+def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) -> Any:
     """Return the loop with the code of these mechanisms only."""
     filters = not modal
 
     @kernel(
         types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]
-            _V, int64, _Q, float64, _M, _M, _V, _T, _M, _M, float64, float64, boolean, int64[::1], _V, _M, _Q, _V, _M, _T, _T, _M,
+            _V, int64, _Q, float64, _M, _M, _V, _T, _M, _M, float64, float64, int64[::1], _V, _M, _Q, _V, _M, _T, _T, _M,
             float64, float64, _V, _V, _M, int64[::1], _M, _M
         )
     )  # fmt: skip
     def advance(
         values: Array, start: int, table: Array, covariance: float, modes: Array, transposed: Array, rates: Array,
-        averages: Array, cosines: Array, sines: Array, offset: float, spacing: float, closed: bool, kinds: Array, lengths: Array,
+        averages: Array, cosines: Array, sines: Array, offset: float, spacing: float, kinds: Array, lengths: Array,
         observed: Array, precisions: Array, constants: Array, channels: Array, drifts: Array, outputs: Array, covariances: Array,
         error: float, log_floor: float, limits: Array, answer: Array, densities: Array, starts: Array, out: Array, fine: Array,
     ) -> tuple[int, int]:  # fmt: skip
@@ -240,7 +240,7 @@ def advance(
     averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
     done, why = _loop(*mechanisms)(
         np.ascontiguousarray(values), grid.start, grid.table, grid.covariance, grid.modes, grid.transposed, grid.rates, averages,
-        *waves(size), grid.offset, grid.spacing, grid.closed, *steps, error, log_floor, np.array(limits), answer, densities,
+        *waves(size), grid.offset, grid.spacing, *steps, error, log_floor, np.array(limits), answer, densities,
         starts, out, grid.fine,
     )  # fmt: skip
     return Segment(densities[:done], starts[:done], out[:done], why, answer)

@@ -22,7 +22,7 @@ class Mechanisms(NamedTuple):
     """What the steps of a record may need; only that is compiled.
 
     `modes`: transitions by modes, else `kernels` or `splits` or both; `samples`: samples after the transition; `weak`: their
-    likelihoods have kinks and act in the weak sense.
+    likelihoods have kinks and act in the weak sense; `closed`: grids around the circle.
     """
 
     modes: bool
@@ -30,6 +30,7 @@ class Mechanisms(NamedTuple):
     splits: bool
     samples: bool
     weak: bool
+    closed: bool
 
 
 class Grid(NamedTuple):
@@ -48,7 +49,6 @@ class Grid(NamedTuple):
     start: int
     offset: float
     spacing: float
-    closed: bool
     fine: Array
 
 
