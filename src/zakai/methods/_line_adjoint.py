@@ -103,7 +103,7 @@ def _taken(
         filtered, ends = filtered._replace(starts=filtered.starts + start), np.append(centres[1:], window.centre)
         logs = _likelihoods(prepared, here, observed, window.origin + ends[:, None] + window.spacing * lw.index(window.size))
         steps = steps_of(prepared, here, observed)
-        taken = by_adjoints(_on(later, window, start, now), filtered, table, logs, steps, limits)
+        taken = by_adjoints(_on(later, window, start, now), filtered, table, logs, steps, window.closed, limits)
     else:
         lengths = np.ascontiguousarray(prepared.lengths[here])
         longer = _longer(prepared, window, stride, float(np.max(lengths)))

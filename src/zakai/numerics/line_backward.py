@@ -29,7 +29,7 @@ ROUNDING = 1e-15  # of the maximum: smaller values of psi are not kept
 SURE = 100.0  # errors of psi from which its small values count
 LEAST = 1e-11  # of the maximum: the same
 NOISE = 4e-16  # rounding of a decomposition relative to the norm of psi
-NEGLIGIBLE_MODES = 42.0  # -log of what is left of a mode that is left out
+NEGLIGIBLE_MODES = 42.0  # -log of the factor of a mode that is negligible
 LOG_MASS, MEAN_AT, VARIANCE, ALIASING, EDGE, ERROR = range(6)  # what is reported of a smoothed density
 
 

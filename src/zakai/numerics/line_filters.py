@@ -166,7 +166,7 @@ def convolved(
     shift += (a - 1.0) * middle
     k0 += (k1 + k2 * middle) * middle
     k1 += 2.0 * k2 * middle
-    exponent = k0 - 0.5 * np.log(a)
+    log_factor = k0 - 0.5 * np.log(a)
     for j in range(size):
         gauge[j] = np.exp(phi[j] - phi[at]) if phi[j] != phi[at] else 1.0
     if closed:
@@ -178,7 +178,7 @@ def convolved(
         for j in range(size):
             now[j] *= gauge[j]
     else:
-        exponent -= 0.5 * shift * shift / variance
+        log_factor -= 0.5 * shift * shift / variance
         pull, square = k1 - a * shift / variance, k2 + 0.5 * a * (1.0 - a) / variance
         _quadratic(early, pull * spacing, square * spacing**2)
         _quadratic(late, shift / variance * spacing, 0.5 * (a - 1.0) / variance * spacing**2)
@@ -186,7 +186,7 @@ def convolved(
             now[j] *= early[j] / gauge[j]
             late[j], early[j] = late[j] * gauge[j], 1.0
         rounding, clipped = filtered(now, taps_of(width, depth, size, narrow), late, early, narrow)
-    return Transition(0.0, rounding, clipped, variance, a, needed, exponent)
+    return Transition(0.0, rounding, clipped, variance, a, needed, log_factor)
 
 
 _APPLIED = [

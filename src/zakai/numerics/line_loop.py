@@ -131,7 +131,7 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
             )
             if status != OK:
                 break
-            predicted, gained = moments(now)[2], np.log(mass) + constants[k] + move.exponent
+            predicted, gained = moments(now)[2], np.log(mass) + constants[k] + move.log_factor
             if filters:
                 log_floor *= min(max(predicted / max(move.contraction**2 * before, 1e-300), 1.0), 20.0)
                 log_floor = max(log_floor, np.log(max(cut, move.clipped)))

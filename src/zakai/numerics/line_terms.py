@@ -24,7 +24,7 @@ class Transition(NamedTuple):
     `error` is that of a splitting, infinite where the transition failed; `rounding` the rounding error and `clipped` the largest
     value that may have become zero, relative to the maximum; `spread` the variance of its noise and `contraction` the factor of
     deviations; `needed` the spacing that filters of positive numbers need, where that of the grid is larger, else zero;
-    `exponent` a constant of the logarithm of the mass.
+    `log_factor` a constant of the logarithm of the mass.
     """
 
     error: float
@@ -33,7 +33,7 @@ class Transition(NamedTuple):
     spread: float
     contraction: float
     needed: float
-    exponent: float
+    log_factor: float
 
 
 @helper
