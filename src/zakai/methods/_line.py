@@ -84,14 +84,7 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
 
 
 def init(prepared: Prepared, prior: Any) -> State:
-    """Return the prior on a grid that fits it; that of a formula, whose peaks are searched for, is kept."""
-    if not isinstance(prior, DensityPrior):
-        return _prior_state(prepared, prior)
-    found: State = prepared.once(("prior", prior), lambda: _prior_state(prepared, prior))
-    return found
-
-
-def _prior_state(prepared: Prepared, prior: Any) -> State:
+    """Return the prior on a grid that fits it."""
     model, closed, variable = prepared.model, bool(prepared.model.periodic), variable_of(prepared.model)
     if isinstance(prior, DensityPrior):
         function, log_density = numpy_function([prior.log_density], model, (1,)), None
