@@ -58,7 +58,7 @@ class State(NamedTuple):
 
 
 class Coefficients(NamedTuple):
-    """What the compiled loop knows of the coefficients in time of K intervals: see `line_loop.Steps`.
+    """What the compiled loop knows of the coefficients in time of K intervals: see `line_segment.Steps`.
 
     `resolved` (K,) marks intervals in which the Gauss nodes resolve them.
     """
