@@ -167,3 +167,16 @@ def test_wrong_options_are_refused(options, words):
     model, record = spread_out(1)
     with pytest.raises(InputError, match=words):
         zakai.filter(model, record, "limited-direct", **options)
+
+
+def test_another_method_on_the_same_model_changes_nothing():
+    def model(name):
+        prior = {"kind": "density", "log_density": "-(x-0.4)**2/2"}
+        parts = {"drift": ["tanh(x)"], "observation": ["x"], "observation_kind": "increments", "prior": prior}
+        return zakai.Model(name=name, state=["x"], **parts)
+
+    record = zakai.simulate(model("a"), 0.3 * np.arange(1, 11), seed=1)[1]
+    expected = zakai.filter(model("a"), record, "limited-direct").mean
+    other = model("b")
+    zakai.filter(other, record, "yau-yau")
+    assert np.allclose(zakai.filter(other, record, "limited-direct").mean, expected, rtol=0, atol=1e-9)
