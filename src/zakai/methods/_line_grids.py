@@ -22,8 +22,7 @@ _NONE = np.zeros(0)
 def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
     """Return what the loop knows of a grid, None where the operator has no decomposition or a formula no value."""
     if not prepared.gaussian:
-        place = ("grid", prepared.yau is None, window)
-        found: tuple[Grid | None] = prepared.once(place, lambda: (_decomposed_grid(prepared, window),))
+        found: tuple[Grid | None] = prepared.once(("grid", window), lambda: (_decomposed_grid(prepared, window),))
         return found[0]
     index, size = round(window.centre / window.spacing), window.size
     if window.closed:
@@ -37,7 +36,7 @@ def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
     if prepared.mixed:
         table = _mixed(prepared, window, window.origin + offsets, rows)
     else:
-        key = ("table", prepared.yau is None, window.origin, window.spacing, begin, length)
+        key = ("table", window.origin, window.spacing, begin, length)
         table = prepared.once(key, lambda: _separated(prepared, window, window.origin + offsets))
     if not np.isfinite(table[:, :, OBSERVED:, start : start + size]).all():
         return None

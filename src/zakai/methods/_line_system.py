@@ -30,7 +30,7 @@ KEPT = 120  # tables and decompositions of grids that are kept for a model
 
 
 @lru_cache(maxsize=8)
-def _kept(model: Model, theta: bytes, kind: str) -> dict[Any, Any]:
+def _kept(model: Model, theta: bytes, kind: str, setting: Any) -> dict[Any, Any]:
     return {}
 
 
@@ -99,8 +99,9 @@ class Prepared:
 
     @cached_property
     def kept(self) -> dict[Any, Any]:
-        """What was computed for single grids, shared by all schedules of a model with these parameters."""
-        return _kept(self.model, self.theta.tobytes(), self.theta.dtype.str)
+        """What was computed for single grids, shared by all schedules of a model with these parameters and this method."""
+        setting = self.tolerance, self.yau is None, self.kernels is None, self.series is None, self.lie, self.origin
+        return _kept(self.model, self.theta.tobytes(), self.theta.dtype.str, setting)
 
     @cached_property
     def divides(self) -> bool:
