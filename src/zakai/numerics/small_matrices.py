@@ -13,8 +13,8 @@ from zakai.numerics.transition import Array
 @helper
 def dot(left: Array, right: Array) -> Any:  # pragma: no cover
     """Return the scalar product of two vectors, without conjugation."""
-    total = 0.0 * left[0]
-    for i in range(len(left)):
+    total = left[0] * right[0]
+    for i in range(1, len(left)):
         total += left[i] * right[i]
     return total
 
@@ -24,8 +24,8 @@ def multiply(out: Array, left: Array, right: Array) -> None:  # pragma: no cover
     """Set `out` (n, p) to left right."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
-            total = 0.0 * out[i, j]
-            for a in range(len(right)):
+            total = left[i, 0] * right[0, j]
+            for a in range(1, len(right)):
                 total += left[i, a] * right[a, j]
             out[i, j] = total
 
