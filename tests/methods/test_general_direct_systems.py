@@ -188,8 +188,9 @@ def test_a_prior_of_any_width_over_the_bend_of_the_gauge_is_right_or_warned_of(v
     if not result.warnings:
         mean, evidence = errors(result, exact)
         assert mean <= 0.01 and evidence <= 0.01 and np.abs(result.variance / exact.variance - 1).max() <= 0.01
-    # Only what lies beyond 8.6 deviations of the prior is not there.
-    assert (not result.warnings) if step > 1e-6 else all(line.startswith("edge_weight") for line in result.warnings)
+    # The increments of the short steps have values of long ones; what lies beyond 8.6 deviations of the prior is not there.
+    known = ("edge_weight", "cannot be explained")
+    assert (not result.warnings) if step > 1e-6 else all(any(word in line for word in known) for line in result.warnings)
 
 
 @pytest.mark.parametrize("reduction", ["algorithm-1", "nnls"])
