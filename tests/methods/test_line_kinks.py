@@ -110,3 +110,20 @@ def test_increments_of_a_drift_with_jumps_or_kinks(drift, f, bound):
     assert np.max(errors) < bound
     assert result.log_likelihood == pytest.approx(exact[-1], abs=bound)
     assert np.max(errors) < 10.0 * np.nanmax(result.health["error_estimate"])
+
+
+def test_a_tank_that_empties_through_a_hole_is_filtered_like_one_with_a_smooth_law():
+    def tank(root):
+        parts = {"observation": ["h"], "observation_kind": "samples", "observation_noise": [["0.01"]], "diffusion": [["0.1"]]}
+        prior = {"kind": "gaussian", "mean": [1.0], "cov": [[0.05]]}
+        return zakai.Model(state=["h"], drift=[f"0.5 - 0.4*sqrt({root})"], prior=prior, **parts)
+
+    rng = np.random.default_rng(5)
+    times = np.cumsum(10 ** rng.uniform(-2.5, -0.2, 120))
+    record = zakai.simulate(tank("h"), times, seed=5)[1]
+    values = np.where(rng.random(120) < 0.2, np.nan, record.values[:, 0])[:, None]
+    record = zakai.Record(times, values, "samples")
+    kinked, smooth = (zakai.filter(tank(root), record) for root in ("max(h, 0)", "0.5*(h + sqrt(h**2 + 0.0001))"))
+    # The level stays 10 deviations above zero.
+    assert np.abs((kinked.mean - smooth.mean) / np.sqrt(smooth.variance)).max() < 1e-3
+    assert np.nanmax(kinked.health["error_estimate"]) < 1e-4

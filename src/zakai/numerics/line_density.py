@@ -150,8 +150,8 @@ def spectrum(values: Array, cut: float, negligible: float, cosines: Array, sines
         elif k < nyquist * 5 // 8:
             break
         k -= stride
-    if highest < 0 and aliasing > negligible:
-        highest = nyquist
+    if highest < 0:
+        highest = nyquist if aliasing > negligible else stride - 1
     if cut >= 1e-14:  # smaller values are accurate
         cut = max(cut, min(aliasing, 1e-4))
     first, last = 0, size - 1
