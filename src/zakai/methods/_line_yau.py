@@ -20,8 +20,9 @@ from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel, Nodes, nodes_of, parts
-from zakai.numerics.line_collocation import Channels, Coefficients
+from zakai.numerics.line_collocation import Channels
 from zakai.numerics.line_filters import applied
+from zakai.numerics.transition import Coefficients
 
 Array = Any
 

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.numerics.flow_series import NODES, STAGES, WEIGHTS, Coefficients, solve
-from zakai.numerics.transition import Array, Flow, Motion, Transition, at, compose, motion, spread_first
+from zakai.numerics.flow_series import NODES, STAGES, WEIGHTS, solve
+from zakai.numerics.transition import Array, Coefficients, Flow, Motion, Transition, at, compose, motion, spread_first
 
 __all__ = [
     "Coefficients", "Flow", "FlowResult", "Motion", "Transition", "at", "compose", "composed", "integrate", "motion",

@@ -11,30 +11,14 @@ so that it does not depend on the units of the coordinates.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.flow_kernel import panels
-from zakai.numerics.transition import Array, Transition, symmetric, transposed
+from zakai.numerics.transition import Array, Coefficients, Transition, symmetric, transposed
 
 STAGES = 8  # Gauss nodes of a panel: the coefficients are polynomials of degree 7 on it
-
-
-class Coefficients(NamedTuple):
-    """The coefficients of equation (1) at J times, for n states and k inputs.
-
-    `matrix` L (J, n, n), `offset` l (J, n, k), `covariance` G (J, n, n), `quadratic` Q (J, n, n), `linear` p (J, n, k),
-    `constant` r (J, k).
-    """
-
-    matrix: Array
-    offset: Array
-    covariance: Array
-    quadratic: Array
-    linear: Array
-    constant: Array
 
 
 def _gauss(stages: int) -> tuple[Array, Array, Array, Array]:

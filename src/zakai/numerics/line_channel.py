@@ -25,7 +25,8 @@ from numba import float64
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
-from zakai.numerics.line_collocation import NODES, STAGES, Channels, Coefficients, collocated
+from zakai.numerics.line_collocation import NODES, STAGES, Channels, collocated
+from zakai.numerics.transition import Coefficients
 
 Array = NDArray[Any]
 

@@ -9,21 +9,11 @@ from numba import complex128, float64, void
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
+from zakai.numerics.transition import Coefficients
 
 Array = NDArray[Any]
 
 STAGES = 8
-
-
-class Coefficients(NamedTuple):
-    """L, G and Q at times (...); l, p and r (..., k), an entry for each input."""
-
-    matrix: Array
-    offset: Array
-    covariance: Array
-    quadratic: Array
-    linear: Array
-    constant: Array
 
 
 class Channels(NamedTuple):

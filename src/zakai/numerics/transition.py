@@ -28,6 +28,21 @@ from zakai.numerics.complex_step import log_determinant
 Array = NDArray[Any]
 
 
+class Coefficients(NamedTuple):
+    """The coefficients of equation (1) at J times, for n states and k inputs; of one state without the axes of states.
+
+    `matrix` L (J, n, n), `offset` l (J, n, k), `covariance` G (J, n, n), `quadratic` Q (J, n, n), `linear` p (J, n, k),
+    `constant` r (J, k).
+    """
+
+    matrix: Array
+    offset: Array
+    covariance: Array
+    quadratic: Array
+    linear: Array
+    constant: Array
+
+
 class Transition(NamedTuple):
     """The arrays of equation (2).
 
