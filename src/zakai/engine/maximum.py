@@ -79,19 +79,25 @@ def maximum(function: Function, values: np.ndarray, box: np.ndarray, names: tupl
     search = minimize(objective, np.zeros(len(values)), jac=True, method="L-BFGS-B", bounds=limits, options=settings)
     assert objective.best is not None
     # The search may have moved far: the best point gives the new units.
-    values = np.clip(values + scale * objective.best[1], box[:, 0], box[:, 1])
+    values, old = np.clip(values + scale * objective.best[1], box[:, 0], box[:, 1]), scale
     scale = np.where(values != 0, np.abs(values), scale)
     limits = (box - values[:, None]) / scale[:, None]
     objective, u = _Objective(function, values, scale), np.zeros(len(values))
     value, gradient = objective.exact(u)
     iterations = int(search.nit)
+    deviations = np.sqrt(np.abs(np.diag(search.hess_inv.todense()))) * old / scale
+    information, place = np.zeros((0, 0)), u
     for _ in range(8):
         held = ((u <= limits[:, 0]) & (gradient > 0)) | ((u >= limits[:, 1]) & (gradient < 0))
         free = ~held
-        information = _information(objective, u, free)
+        if not information.size:
+            information, place = _information(objective, u, deviations, free), u
         cov, distance, problem = _inverse(information, gradient, free, names)
         if not np.isfinite(distance) or distance < 1e-2 * NEAR:
-            break
+            if not np.any(np.abs(u - place)[free] > NEAR * np.sqrt(np.diag(cov)[free])):
+                break
+            information, deviations = np.zeros((0, 0)), np.sqrt(np.diag(cov))  # of the place where the search has ended
+            continue
         # Newton's step, in the box; where it gains nothing, rounding has been reached.
         trial = np.clip(u - np.nan_to_num(cov) @ np.where(free, gradient, 0.0), limits[:, 0], limits[:, 1])
         new, slope = objective.exact(trial)
@@ -111,17 +117,14 @@ def maximum(function: Function, values: np.ndarray, box: np.ndarray, names: tupl
     return Found(values, -value, covariance, converged, message, problem, iterations)
 
 
-def _information(objective: _Objective, u: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Return the Hessian of the negative log-likelihood, by steps of about a thousandth of a standard error."""
-    for size in (1e-4, 1e-6, 1e-8):
-        steps = np.full(len(u), size)
-        first = np.diag(hessian(lambda v: objective.exact(v)[1], u, steps))
-        if np.isfinite(first[free]).all():
+def _information(objective: _Objective, u: np.ndarray, deviations: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Return the Hessian of the negative log-likelihood, by steps of about a thousandth of the standard deviations (p,)."""
+    steps = np.clip(np.where(np.isfinite(deviations) & (deviations > 0), 1e-3 * deviations, 1e-4), 1e-7, 1e-2)
+    for size in (1.0, 1e-2, 1e-4):
+        found = hessian(lambda v: objective.exact(v)[1], u, size * steps)
+        if np.isfinite(found[np.ix_(free, free)]).all():
             break
-    with np.errstate(invalid="ignore", divide="ignore"):
-        better = np.where(free & (first > 0), 1e-3 / np.sqrt(first), steps)
-    steps = np.clip(np.where(np.isfinite(better), better, steps), 1e-7, 1e-1)
-    return hessian(lambda v: objective.exact(v)[1], u, steps)
+    return found
 
 
 def _inverse(
