@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -102,6 +102,11 @@ class Prepared:
         """What was computed for single grids, shared by all schedules of a model with these parameters and this method."""
         setting = self.tolerance, self.yau is None, self.kernels is None, self.series is None, self.lie, self.origin
         return _kept(self.model, self.theta.tobytes(), self.theta.dtype.str, setting)
+
+    @cached_property
+    def real(self) -> Prepared:
+        """The same at the real part of the parameters, whose tables all directions of a gradient share."""
+        return replace(self, theta=self.theta.real.copy())
 
     @cached_property
     def divides(self) -> bool:
@@ -377,4 +382,5 @@ def _decomposed(prepared: Prepared, window: lw.Window) -> Spectral | None:
     if window.closed and abs(np.sum(steps).real) > 1e-12 * max(1.0, float(np.sum(np.abs(steps.real)))):
         return None
     gauge = np.concatenate([np.zeros(1), np.cumsum(steps[:-1])])
-    return Spectral(window.closed, window.spacing, covariance, potential, gauge, scale)
+    modes = spectral(prepared.real, window) if np.iscomplexobj(theta) else None
+    return Spectral(window.closed, window.spacing, covariance, potential, gauge, scale, modes)

@@ -168,7 +168,16 @@ class Spectral:
         v_t = (G v')' / 2 - ((f - G'/2)^2 / G + f' - G''/2) / 2 v = -H v,      exp(tau L) = s U exp(-tau lambda) U' / s.
     """
 
-    def __init__(self, closed: bool, spacing: float, covariance: Any, potential: Array, gauge: Array, scale: Any = 1.0):
+    def __init__(
+        self,
+        closed: bool,
+        spacing: float,
+        covariance: Any,
+        potential: Array,
+        gauge: Array,
+        scale: Any = 1.0,
+        known: Spectral | None = None,
+    ):
         """Decompose H.
 
         Of a G that depends on the state, -(G v')' is D' G D v with the derivative D of the interpolant between the points: no
@@ -180,6 +189,7 @@ class Spectral:
             potential: ((f - G'/2)^2 / G + f' - G''/2) / 2 at the points (N,).
             gauge: int f / G (N,).
             scale: G^(-1/2) where G depends on the state.
+            known: the decomposition of the real part of a complex H.
         """
         size = len(potential)
         unit = 1.0 if closed else spacing
@@ -188,7 +198,9 @@ class Spectral:
         else:
             slope = derivative_between(size, closed) / unit
             operator = 0.5 * (slope.T * covariance) @ slope + np.diag(potential)
-        self.rates, self.modes = np.linalg.eigh(operator.real)
+        self.rates: Array
+        self.modes: Array
+        self.rates, self.modes = np.linalg.eigh(operator.real) if known is None else (known.rates, known.modes)
         self.change = self.modes.T @ operator.imag @ self.modes if np.iscomplexobj(operator) else None
         self.top = float(gauge.real.max())
         self.scale = np.exp(gauge - self.top) * scale
