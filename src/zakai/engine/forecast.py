@@ -9,6 +9,7 @@ import numpy as np
 from zakai.engine.batch import filter_all
 from zakai.engine.loop import Run
 from zakai.errors import InputError
+from zakai.methods._states import Joined
 from zakai.records import Inputs, Record
 from zakai.records.inputs import check_inputs
 
@@ -54,5 +55,5 @@ class ForecastRun(Run):
     def __init__(self, run: Run, state: Any, last: float):
         super().__init__(run.setting, run.record, None, run.most)
         self.state = self.first = state
-        self.states = [state]
+        self.states = Joined([[state]])
         self.schedule.starts[0] = last

@@ -16,6 +16,7 @@ from zakai.engine.setting import KEPT, Setting
 from zakai.engine.versions import versions
 from zakai.errors import InputError
 from zakai.methods._protocol import Infos, stacked
+from zakai.methods._states import Joined
 from zakai.records import Record
 from zakai.records.noise import notes_on_noise
 from zakai.records.schedule import ROUNDING, Schedule, schedule_of
@@ -89,6 +90,7 @@ def joined(parts: Sequence[Infos]) -> Infos:
 
 def size_of(state: Any) -> int:
     """Return the bytes of the arrays of a state, or of several."""
+    state = state.parts if isinstance(state, Joined) else state
     return sum(map(size_of, state)) if isinstance(state, tuple | list) else getattr(state, "nbytes", 8)
 
 
@@ -101,7 +103,7 @@ class Run:
         self.keep, self.must_keep = keep != "moments", keep == "densities"
         self.empty, self.state = setting.begin()
         self.first = self.state
-        self.states: list[Any] = [self.state]
+        self.states: Joined[Any] = Joined([[self.state]])
         self.parts: list[Infos] = []
         self.notes: dict[str, None] = dict.fromkeys(
             [
@@ -135,11 +137,11 @@ class Run:
         self.done += len(states)
         if not self.keep:
             return
-        self.states.extend(states)
+        self.states.append(states)
         self.bytes += size_of(states[-1]) * len(states)
         # Densities that will not fit are not kept to begin with.
         if self.bytes / self.done * len(self.schedule) > self.most and not self.must_keep:
-            self.keep, self.states = False, self.states[:1]
+            self.keep, self.states = False, Joined([[self.first]])
 
     def _explain(self, infos: Infos) -> None:
         """Raise InputError where a formula is not finite on a density that was lost."""

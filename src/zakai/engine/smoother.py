@@ -25,7 +25,7 @@ from zakai.engine.results import FilterResult
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
 from zakai.methods._protocol import Infos, stacked
-from zakai.methods._states import Preceded
+from zakai.methods._states import Joined
 from zakai.models.model import Model
 from zakai.records import Record
 
@@ -175,7 +175,7 @@ class SmoothingRun(Run):
         if states is None:
             with np.errstate(all="ignore"):
                 states, _ = advance(self.setting, prepared, slice(first - begin, last - begin), state, self.values[first:last])
-        return range(first, last), prepared, begin, Preceded(state, states)
+        return range(first, last), prepared, begin, Joined([[state], states])
 
     def smooth(self) -> None:
         """Replace the filter's moments by the smoothed ones."""

@@ -29,7 +29,7 @@ from zakai.methods._gaussian_families import (
 )
 from zakai.methods._gaussian_paths import draw
 from zakai.methods._protocol import Backward, Info, Infos
-from zakai.methods._states import Preceded, field_of
+from zakai.methods._states import field_of
 from zakai.numerics import gaussian_backward
 from zakai.numerics.families import Family, solve, weigh
 from zakai.numerics.transition import Array, at, symmetric
@@ -150,8 +150,7 @@ def segment(
     if not is_single(prepared, states[0]) or len(later.logs) > 1:
         return None
     assert prepared.loop is not None
-    after = states.rest if isinstance(states, Preceded) else states[1:]
-    means, covs = (np.array(field_of(after, name)[:, 0]) for name in ("mean", "cov"))
+    means, covs = (np.array(field_of(states, name)[1:, 0]) for name in ("mean", "cov"))
     moved, masses = Message(*(np.array(field, order="C") for field in later)), np.empty(len(values))
     gaussian_backward.segment(
         rows.start, moved.centre, moved.information, moved.slopes[0], moved.logs, *prepared.loop, np.ascontiguousarray(values),

@@ -12,6 +12,7 @@ Magnus' series of fourth order in adaptive substeps elsewhere.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,7 @@ from zakai.methods._line_system import (
 from zakai.methods._line_update import exponential_factor, factor_at_end, sampled_weakly
 from zakai.methods._line_volumes import contracted
 from zakai.methods._protocol import Info, Infos
+from zakai.methods._states import Joined
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior, GaussianPrior
@@ -158,17 +160,17 @@ def _state(values: Array, window: lw.Window, error: float, log_floor: float) -> 
 def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
     """Return the state after interval k and the observation at its stop, and the report."""
     if prepared.fast[k]:
-        found = loop.run(prepared, slice(k, k + 1), state, observed[None])
+        found = loop.one(prepared, k, state, observed)
         if found is not None:
-            return found[0][0], loop.one_of(found[1], 0)
+            return found
     # Attempts that overflow are taken again in shorter substeps.
     with np.errstate(all="ignore"):
         return _step(prepared, k, state, observed)
 
 
-def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[list[State], Infos]:
+def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos]:
     """Return the states after the intervals of a slice, and their reports."""
-    states: list[State] = []
+    states: Joined[State] = Joined()
     parts: list[Infos] = []
     k = rows.start
     while k < rows.stop:
@@ -179,12 +181,12 @@ def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray)
         if last > k:
             found = loop.run(prepared, slice(k, last), state, observed[k - rows.start : last - rows.start])
         if found is not None:
-            states += found[0]
+            states.append(found[0])
             parts.append(found[1])
         else:
             with np.errstate(all="ignore"):
                 state, info = _step(prepared, k, state, observed[k - rows.start])
-            states.append(state)
+            states.append([state])
             parts.append(_alone(info))
         k, state = rows.start + len(states), states[-1]
     return states, loop.joined(parts)

@@ -14,7 +14,6 @@ from zakai.methods._line_gauge import Gauge, gauge_of
 from zakai.methods._line_grids import grid_of
 from zakai.methods._line_loop import TOGETHER
 from zakai.methods._line_message import LOWEST, PAD, SURE, Message, support, taper
-from zakai.methods._line_steps import steps_of
 from zakai.methods._line_system import Prepared, State, covariance_at, state_moments
 from zakai.methods._line_update import factor_at_end
 from zakai.methods._line_way import negligible, smoothing_tolerance
@@ -102,8 +101,8 @@ def _taken(
         start = table.start
         filtered, ends = filtered._replace(starts=filtered.starts + start), np.append(centres[1:], window.centre)
         logs = _likelihoods(prepared, here, observed, window.origin + ends[:, None] + window.spacing * lw.index(window.size))
-        steps = steps_of(prepared, here, observed)
-        taken = by_adjoints(_on(later, window, start, now), filtered, table, logs, steps, window.closed, limits)
+        message, steps = _on(later, window, start, now), prepared.steps.part(here)
+        taken = by_adjoints(message, filtered, table, logs, steps, np.ascontiguousarray(observed, float), window.closed, limits)
     else:
         lengths = np.ascontiguousarray(prepared.lengths[here])
         longer = _longer(prepared, window, stride, float(np.max(lengths)))

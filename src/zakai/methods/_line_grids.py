@@ -19,6 +19,11 @@ _NONE = np.zeros(0)
 
 
 
+def known(prepared: Prepared, window: lw.Window) -> bool:
+    """Return whether the decomposition on a grid, or that there is none, has been computed already."""
+    return ("grid", window) in prepared.kept
+
+
 def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
     """Return what the loop knows of a grid, None where the operator has no decomposition or a formula no value."""
     if not prepared.gaussian:
@@ -32,17 +37,18 @@ def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
     else:
         begin, length = BLOCK * round(index / BLOCK) - BLOCK, 2 * BLOCK
     start = 0 if window.closed else index - size // 2 - begin
-    offsets = window.offsets if window.closed else window.spacing * (begin + np.arange(float(length)))
-    if prepared.mixed:
-        table = _mixed(prepared, window, window.origin + offsets, rows)
-    else:
-        key = ("table", window.origin, window.spacing, begin, length)
-        table = prepared.once(key, lambda: _separated(prepared, window, window.origin + offsets))
-    if not np.isfinite(table[:, :, OBSERVED:, start : start + size]).all():
-        return None
-    offset = window.origin - prepared.origin + float(offsets[0])
-    fine = _fine(prepared, window, window.origin + offsets)
-    return Grid(_NONE[None], _NONE[None], _NONE, table, 0.0, start, offset, window.spacing, fine)
+
+    def make() -> tuple[Grid, np.ndarray]:
+        offsets = window.offsets if window.closed else window.spacing * (begin + np.arange(float(length)))
+        x = window.origin + offsets
+        table = _mixed(prepared, window, x, rows) if prepared.mixed else _separated(prepared, window, x)
+        offset, fine = window.origin - prepared.origin + float(offsets[0]), _fine(prepared, window, x)
+        missing = ~np.isfinite(table[:, :, OBSERVED:]).all(axis=(0, 1, 2))
+        return Grid(_NONE[None], _NONE, table, 0.0, 0, offset, window.spacing, fine), np.append(0, np.cumsum(missing))
+
+    key = ("table", window.origin, window.spacing, begin, length)
+    grid, missing = make() if prepared.mixed else prepared.once(key, make)
+    return None if missing[start + size] > missing[start] else grid._replace(start=start)
 
 
 def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
@@ -56,11 +62,9 @@ def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
     table[0, 0, PHI] = np.log(decomposed.scale)
     if not np.isfinite(table[0, 0, [PHI, *range(OBSERVED, table.shape[2])]]).all():
         return None
-    modes, covariance = np.ascontiguousarray(decomposed.modes), float(np.max(tables(prepared, window).covariance))
+    modes, covariance = np.ascontiguousarray(decomposed.modes.T), float(np.max(tables(prepared, window).covariance))
     fine = _fine(prepared, window, window.points)
-    return Grid(
-        modes, np.ascontiguousarray(modes.T), decomposed.rates, table, covariance, 0, 0.0, window.spacing, fine
-    )
+    return Grid(modes, decomposed.rates, table, covariance, 0, 0.0, window.spacing, fine)
 
 
 def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:

@@ -6,12 +6,12 @@ for its one interval first: whether steps are taken one by one or together makes
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods._line_grids import grid_of
-from zakai.methods._line_steps import steps_of
+from zakai.methods._line_grids import grid_of, known
 from zakai.methods._line_system import (
     FINEST,
     Prepared,
@@ -24,17 +24,17 @@ from zakai.methods._line_system import (
     tables,
 )
 from zakai.methods._protocol import Info, Infos
+from zakai.methods._states import Joined, StackedStates
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_density import support
 from zakai.numerics.line_filters import BAND
 from zakai.numerics.line_loop import advance
 from zakai.numerics.line_modes import narrow
-from zakai.numerics.line_segment import AFTER, COLUMNS, FACTOR, FAILED, RANGE, Limits, Steps
+from zakai.numerics.line_segment import AFTER, COLUMNS, FACTOR, FAILED, RANGE, Segment
 
 LARGER = 0.2  # margin of a new grid, relative to the range of the density
-KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
-SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
 TOGETHER = 32  # intervals whose tables of coefficients in time are computed together
+ATTEMPTS = 8  # grids on which a step is tried
 HEALTH = {
     "edge_mass": "edge",
     "negative_mass": "negative",
@@ -43,63 +43,85 @@ HEALTH = {
     "tail_depth": "depth",
     "error_estimate": "error",
 }
-_AT = {name: i for i, name in enumerate(COLUMNS)}
 
 
-def run(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[list[State], Infos] | None:
+class Piece(NamedTuple):
+    """Steps on one grid that begin with interval `first`; `last` is the state after them, on the grid of the next step."""
+
+    first: int
+    before: State
+    grid_start: int
+    segment: Segment
+    last: State
+
+    @property
+    def states(self) -> Sequence[State]:
+        """The states after the steps."""
+        reports = self.segment.reports
+        centres = self.before.centre + self.before.spacing * (reports[:, START] - self.grid_start)
+        fields = {"values": self.segment.densities, "centre": centres, "error": reports[:, ERROR], "log_floor": reports[:, FLOOR]}
+        return Joined([StackedStates[State](self.before, fields)[:-1], [self.last]])
+
+
+START, ERROR, FLOOR = (COLUMNS.index(name) for name in ("start", "error", "log_floor"))
+
+
+def run(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos] | None:
     """Return the states after the first intervals of `rows`, as many as the loop takes, and their reports; None for none."""
-    splitting = SHARE * prepared.tolerance if prepared.yau is None else KERNEL_SHARE * prepared.promised
-    generous = FINEST if prepared.timed and prepared.model.periodic else prepared.generous
-    limits = Limits(prepared.negligible, prepared.promised, splitting, prepared.cut, generous, prepared.finest)
-    states: list[State] = []
-    parts: list[Infos] = []
-    attempts, first = 0, rows.start
-    steps = steps_of(prepared, rows, observed)
-    while first < rows.stop and attempts < 8:
-        if not prepared.gaussian and _narrow(prepared, first, state, limits.cut):
+    pieces = taken(prepared, rows, state, observed)
+    if not pieces:
+        return None
+    return Joined([piece.states for piece in pieces]), joined([_infos(prepared, piece) for piece in pieces])
+
+
+def one(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info] | None:
+    """Return the state after interval k, and its report; None where the loop does not take it."""
+    pieces = taken(prepared, slice(k, k + 1), state, observed[None])
+    return (pieces[0].last, _info(prepared, pieces[0])) if pieces else None
+
+
+def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> list[Piece]:
+    """Return the first steps of `rows`, as many as the loop takes."""
+    pieces: list[Piece] = []
+    attempts, first, observed = 0, rows.start, np.ascontiguousarray(observed, float)
+    while first < rows.stop and attempts < ATTEMPTS:
+        window = state.window
+        if not prepared.gaussian and not known(prepared, window) and _narrow(prepared, first, state):
             break
         here = slice(first, min(rows.stop, first + TOGETHER) if prepared.mixed else rows.stop)
-        grid = grid_of(prepared, state.window, here)
+        grid = grid_of(prepared, window, here)
         if grid is None:
             break
-        some = Steps(*(part[: here.stop - first] for part in steps))
         found = advance(
-            prepared.mechanisms, np.asarray(state.values), grid, some, float(state.error), float(state.log_floor), limits
-        )
-        taken = len(found.reports)
-        if taken:
-            centres = state.centre + state.spacing * (found.starts - grid.start)
-            done = [
-                State(values, state.origin, centre, state.spacing, state.unit, state.closed, error, log_floor)
-                for values, centre, error, log_floor in zip(
-                    found.densities, centres.tolist(), found.reports[:, 10].tolist(), found.reports[:, 11].tolist(), strict=True
-                )
-            ]
-            stops = prepared.schedule.stops[first : first + taken].tolist()
-            parts.append(_infos(prepared, state.window, centres, found.reports, done, stops))
-            states += done
-            state, steps, attempts, first = done[-1], steps.after(taken), 0, first + taken
+            prepared.mechanisms, np.ascontiguousarray(state.values), grid, prepared.steps, first,
+            observed[first - rows.start : here.stop - rows.start], float(state.error), float(state.log_floor), prepared.limits,
+        )  # fmt: skip
         attempts += 1
-        if found.why == AFTER:
-            states[-1] = state = regridded(prepared, state)
-        elif found.why == RANGE:
-            larger = _covering(prepared, state, *found.answer[:3])
+        if len(found.reports):
+            before, attempts = state, 1
+            *_, error, log_floor, start = found.reports[-1].tolist()
+            centre = state.centre + state.spacing * (start - grid.start)
+            state = state._replace(values=found.densities[-1], centre=centre, error=error, log_floor=log_floor)
+            state = regridded(prepared, state) if found.why == AFTER else state
+            pieces.append(Piece(first, before, grid.start, found, state))
+            first += len(found.reports)
+        if found.why == RANGE:
+            larger = _covering(prepared, state, *found.answer.tolist())
             if larger is None:
                 break
             state = larger
         elif found.why == FAILED:
             break
-    if not states:
-        return None
-    return states, joined(parts)
+    return pieces
 
 
-def _narrow(prepared: Prepared, k: int, state: State, cut: float) -> bool:
+def _narrow(prepared: Prepared, k: int, state: State) -> bool:
     """Return whether the loop leaves interval k to another grid, before the present one is decomposed."""
     if prepared.kinds[k] != FACTOR or state.closed:
         return False
     covariance = float(np.max(tables(prepared, state.window).covariance))
-    low, high = support(np.ascontiguousarray(state.values), max(cut, min(30.0 * np.exp(state.log_floor), lw.CUT)))
+    cut = max(prepared.cut, min(30.0 * np.exp(state.log_floor), lw.CUT))
+    low, high = support(np.ascontiguousarray(state.values), cut)
     return narrow(high - low, state.spacing, covariance * prepared.lengths[k])
 
 
@@ -145,32 +167,51 @@ def regridded(prepared: Prepared, state: State) -> State:
     return state if new == window else moved_to(prepared, state, new)
 
 
-def _infos(
-    prepared: Prepared, window: lw.Window, centres: np.ndarray, out: np.ndarray, states: list[State], stops: list[float]
-) -> Infos:
-    column = {name: out[:, i] for name, i in _AT.items()}
-    mean = window.origin + (centres + window.spacing * column["mean"])
-    variance = window.spacing**2 * column["variance"]
+def _infos(prepared: Prepared, piece: Piece) -> Infos:
+    """Return the reports of some steps."""
+    states, stops = piece.states, prepared.schedule.stops[piece.first :].tolist()
+
+    def each(function: Callable[[State, float], Any]) -> np.ndarray:
+        return np.array([function(*pair) for pair in zip(states, stops)])
+
+    columns = dict(zip(COLUMNS, piece.segment.reports.T))
+    mean, variance, health = _report(prepared, piece, columns, each)
+    return Infos(columns["gained"], mean[:, None], variance[:, None, None], health)
+
+
+def _info(prepared: Prepared, piece: Piece) -> Info:
+    """Return the report of a single step."""
+
+    def each(function: Callable[[State, float], Any]) -> np.ndarray:
+        return np.asarray(function(piece.states[0], float(prepared.schedule.stops[piece.first])))
+
+    columns = dict(zip(COLUMNS, piece.segment.reports[0].tolist()))
+    mean, variance, health = _report(prepared, piece, columns, each)
+    return Info(columns["gained"], np.array([mean]), np.array([[variance]]), health)
+
+
+def _report(
+    prepared: Prepared, piece: Piece, columns: Mapping[str, Any], each: Callable[[Callable[[State, float], Any]], np.ndarray]
+) -> tuple[Any, Any, dict[str, Any]]:
+    """Return the mean, the variance and the health figures of steps, as arrays (K,), or as the numbers of a single one.
+
+    `each` applies a function to the state after every step and the time.
+    """
+    origin, centre, spacing = piece.before[1:4]
+    mean = origin + (centre + spacing * (columns["start"] - piece.grid_start) + spacing * columns["mean"])
+    variance = spacing**2 * columns["variance"]
+    health = {name: columns[source] for name, source in HEALTH.items()}
+    health["tolerance_ratio"] = columns["made"] / prepared.promised
+    health["std_in_spacings"] = np.sqrt(columns["variance"])
     if prepared.model.domain:
-        pairs = [state_moments(prepared, one.values, one.window, 0.0, 0.0) for one in states]
-        mean, variance = (np.array(part) for part in zip(*pairs, strict=True))
-    health = {name: column[source] for name, source in HEALTH.items()}
-    health["tolerance_ratio"] = column["made"] / prepared.promised
-    health["std_in_spacings"] = np.sqrt(column["variance"])
-    if prepared.model.domain:
-        edges = np.array([edge_of_moments(prepared, one.values, one.window) for one in states])
-        health["edge_mass"] = np.maximum(health["edge_mass"], edges)
-        health["tolerance_ratio"] = np.maximum(health["tolerance_ratio"], 10.0 * edges / prepared.promised)
-        health["error_estimate"] = np.maximum(health["error_estimate"], 10.0 * edges)
+        mean, variance = each(lambda one, t: state_moments(prepared, one.values, one.window, 0.0, 0.0)).T
+        edges = each(lambda one, t: edge_of_moments(prepared, one.values, one.window))
+        for name, edge in (
+            ("edge_mass", edges), ("tolerance_ratio", 10.0 * edges / prepared.promised), ("error_estimate", 10.0 * edges)
+        ):  # fmt: skip
+            health[name] = np.maximum(health[name], edge)
     if prepared.system.general:
-        health["without_law"] = np.zeros(len(out))
+        health["without_law"] = 0.0 * columns["made"]
     if prepared.system.tabulated:
-        shares = [outside_tables(prepared, one.values, one.window, stop) for one, stop in zip(states, stops)]
-        health["outside_tables"] = np.array(shares)
-    return Infos(column["gained"], mean[:, None], variance[:, None, None], health)
-
-
-def one_of(infos: Infos, k: int) -> Info:
-    """Return the report of one step."""
-    health: dict[str, Any] = {name: float(values[k]) for name, values in infos.health.items()}
-    return Info(infos.log_likelihood_increment[k], infos.mean[k], infos.cov[k], health)
+        health["outside_tables"] = each(lambda one, t: outside_tables(prepared, one.values, one.window, t))
+    return mean, variance, health

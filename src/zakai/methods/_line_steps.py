@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from zakai.methods._line_system import Coefficients, Prepared
-from zakai.numerics.line_collocation import Channels
+from zakai.numerics.line_filters import kernel_size
 from zakai.numerics.line_panels import GAUSS_NODES, interpolation
-from zakai.numerics.line_segment import FACTOR, KERNEL, Steps
+from zakai.numerics.line_segment import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Steps
 
 RESOLVED = 1e-8  # relative error of the interpolants of coefficients in time
 PROBES = np.linspace(0.0, 1.0, 129)  # parts of an interval at which coefficients are compared with their interpolants
@@ -79,28 +79,40 @@ def resolved(exact: np.ndarray, nodes: np.ndarray) -> np.ndarray:
 _TO_PROBES = interpolation(PROBES)
 
 
-def _numbers(c: Channels, rates: np.ndarray) -> np.ndarray:
-    """Return a, b, V, k0, k1, k2 (K, 6) of kernels for rates of observations (K, m)."""
-    inputs = [np.ones(len(c.scale)), *rates.T]
-    shift, slope, constant = np.zeros(len(c.scale)), np.zeros(len(c.scale)), np.zeros(len(c.scale))
-    for i, one in enumerate(inputs):
-        shift, slope = shift + c.shift[:, i] * one, slope + c.slope[:, i] * one
-        for j, other in enumerate(inputs):
-            constant = constant + c.constant[:, i, j] * one * other
-    return np.stack([c.scale, shift, c.variance, constant, slope, c.curvature], axis=1)
+def kinds_of(prepared: Prepared) -> np.ndarray:
+    """Return how the compiled loop of `_line_loop` takes each interval (K,), -1 where it does not."""
+    system, schedule, yau, kernels = prepared.system, prepared.schedule, prepared.yau, prepared.kernels
+    positive = prepared.lengths > 0
+    none = np.full(len(schedule), -1)
+    if not len(schedule) or np.iscomplexobj(prepared.theta) or prepared.lie or (prepared.model.periodic and not system.samples):
+        return none
+    silent = ~schedule.seen.any(axis=1)
+    regular = positive & np.all(schedule.seen == prepared.inside, axis=1)
+    if not prepared.gaussian:
+        usable = system.samples and not system.moving and system.separated is not None
+        return np.where(positive & (silent | (not system.general)), FACTOR, -1) if usable else none
+    if system.separated is None and not prepared.mixed:
+        return none
+    whole = np.zeros(len(schedule), bool)
+    if kernels is not None and yau is not None and yau.unobserved and yau.steady_gauge:
+        whole = positive & (kernels.place >= 0) & (kernels.errors[kernels.place] == 0)
+    split = positive & prepared.divides & prepared.coefficients.resolved
+    if system.samples:
+        whole = whole & (silent | (not system.general))
+        return np.where(whole, FACTOR, np.where(split, SPLIT_FACTOR, -1))
+    inside = np.where(whole, KERNEL, -1) if yau is not None and yau.affine else np.where(split, SPLIT, -1)
+    return np.where(silent, np.where(whole, FACTOR, inside), np.where(regular, inside, -1))
 
 
-def steps_of(prepared: Prepared, rows: slice, observed: np.ndarray) -> Steps:
-    """Return the steps of some intervals."""
-    kinds, lengths, kernels = prepared.kinds[rows], prepared.lengths[rows], prepared.kernels
-    channels = np.full((len(kinds), 6), np.nan)
+def steps_of(prepared: Prepared) -> Steps:
+    """Return what the compiled loop reads of all intervals."""
+    kinds, kernels, c = prepared.kinds, prepared.kernels, prepared.coefficients
+    inputs = 1 + prepared.system.m
+    packed = np.full((len(kinds), kernel_size(inputs)), np.nan)
     here = np.flatnonzero((kinds == KERNEL) | (kinds == FACTOR))
     if prepared.gaussian and kernels is not None and len(here):
-        which = kernels.place[rows][here]
-        rates = np.where((kinds == KERNEL)[:, None], observed / lengths[:, None], 0.0)[here]
-        channels[here] = _numbers(Channels(*(part[which] for part in kernels.channels)), rates)
-    observed = np.ascontiguousarray(observed, float)
-    c = Coefficients(*(part[rows] for part in prepared.coefficients))
+        found = [part[kernels.place[here]].reshape(len(here), -1) for part in kernels.channels]
+        packed[here] = np.concatenate(found, axis=1)
     precisions = np.where((kinds == KERNEL)[:, None, None, None], 0.0, c.precisions)
-    lengths = np.ascontiguousarray(lengths)
-    return Steps(kinds, lengths, observed, precisions, c.constants, channels, c.drifts, c.outputs, c.covariances)
+    lengths = np.ascontiguousarray(prepared.lengths)
+    return Steps(kinds, lengths, precisions, c.constants, packed, c.drifts, c.outputs, c.covariances)

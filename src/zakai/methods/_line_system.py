@@ -18,13 +18,15 @@ from zakai.numerics import line_window as lw
 from zakai.numerics.line_density import support
 from zakai.numerics.line_operator import Spectral
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
-from zakai.numerics.line_segment import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Mechanisms
+from zakai.numerics.line_segment import Limits, Mechanisms, Steps
 from zakai.numerics.line_weak import PARTS, at_nodes, nodes, weak
 from zakai.records.schedule import Schedule
 
 Array = Any
 
 NOISE = 3e-15  # error of a density relative to its maximum, which matters in its tails
+KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
+SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
 FINEST = 1024  # points of the largest grid for Gaussian kernels and splitting
 KEPT = 120  # tables and decompositions of grids that are kept for a model
 
@@ -177,7 +179,23 @@ class Prepared:
     @cached_property
     def kinds(self) -> np.ndarray:
         """How the compiled loop takes each interval (K,): FACTOR, SPLIT or KERNEL; -1 where it does not."""
+        from zakai.methods._line_steps import kinds_of
+
         return kinds_of(self)
+
+    @cached_property
+    def steps(self) -> Steps:
+        """What the compiled loop reads of all intervals."""
+        from zakai.methods._line_steps import steps_of
+
+        return steps_of(self)
+
+    @cached_property
+    def limits(self) -> Array:
+        """What a step of the compiled loop must keep, as the fields of `line_segment.Limits`."""
+        splitting = SHARE * self.tolerance if self.yau is None else KERNEL_SHARE * self.promised
+        generous = FINEST if self.timed and self.model.periodic else self.generous
+        return np.array(Limits(self.negligible, self.promised, splitting, self.cut, generous, self.finest), float)
 
     @cached_property
     def mechanisms(self) -> Mechanisms:
@@ -211,31 +229,6 @@ class Prepared:
                     break
         self.kept[key] = found  # the last one that was used is the last one to go
         return found
-
-
-def kinds_of(prepared: Prepared) -> np.ndarray:
-    """Return how the compiled loop of `_line_loop` takes each interval (K,), -1 where it does not."""
-    system, schedule, yau, kernels = prepared.system, prepared.schedule, prepared.yau, prepared.kernels
-    positive = prepared.lengths > 0
-    none = np.full(len(schedule), -1)
-    if not len(schedule) or np.iscomplexobj(prepared.theta) or prepared.lie or (prepared.model.periodic and not system.samples):
-        return none
-    silent = ~schedule.seen.any(axis=1)
-    regular = positive & np.all(schedule.seen == prepared.inside, axis=1)
-    if not prepared.gaussian:
-        usable = system.samples and not system.moving and system.separated is not None
-        return np.where(positive & (silent | (not system.general)), FACTOR, -1) if usable else none
-    if system.separated is None and not prepared.mixed:
-        return none
-    whole = np.zeros(len(schedule), bool)
-    if kernels is not None and yau is not None and yau.unobserved and yau.steady_gauge:
-        whole = positive & (kernels.place >= 0) & (kernels.errors[kernels.place] == 0)
-    split = positive & prepared.divides & prepared.coefficients.resolved
-    if system.samples:
-        whole = whole & (silent | (not system.general))
-        return np.where(whole, FACTOR, np.where(split, SPLIT_FACTOR, -1))
-    inside = np.where(whole, KERNEL, -1) if yau is not None and yau.affine else np.where(split, SPLIT, -1)
-    return np.where(silent, np.where(whole, FACTOR, inside), np.where(regular, inside, -1))
 
 
 def resampled(prepared: Prepared, values: Array, window: lw.Window, new: lw.Window) -> Array:

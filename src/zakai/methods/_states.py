@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
@@ -35,14 +36,22 @@ class StackedStates(Sequence[S], Generic[S]):
         return sum(getattr(values, "nbytes", 8 * len(values)) for values in self.fields.values())
 
 
-class Preceded(Sequence[S], Generic[S]):
-    """A state and those after it."""
+class Joined(Sequence[S], Generic[S]):
+    """Sequences of states, one after the other."""
 
-    def __init__(self, first: S, rest: Sequence[S]):
-        self.first, self.rest = first, rest
+    def __init__(self, parts: Iterable[Sequence[S]] = ()):
+        self.parts: list[Sequence[S]] = []
+        self.ends: list[int] = []
+        for part in parts:
+            self.append(part)
+
+    def append(self, part: Sequence[S]) -> None:
+        """Append a sequence."""
+        self.parts.append(part)
+        self.ends.append(len(self) + len(part))
 
     def __len__(self) -> int:
-        return 1 + len(self.rest)
+        return self.ends[-1] if self.ends else 0
 
     @overload
     def __getitem__(self, index: int) -> S: ...
@@ -52,11 +61,14 @@ class Preceded(Sequence[S], Generic[S]):
         places = range(len(self))[index]
         if isinstance(places, range):
             return [self[place] for place in places]
-        return self.rest[places - 1] if places else self.first
+        part = bisect_right(self.ends, places)
+        return self.parts[part][places - self.ends[part]]
 
 
 def field_of(states: Sequence[Any], name: str) -> np.ndarray:
     """Return one field of all states as an array, without making those that are stacked."""
+    if isinstance(states, Joined):
+        return np.concatenate([field_of(part, name) for part in states.parts])
     if isinstance(states, StackedStates) and name in states.fields:
         return np.asarray(states.fields[name])
     return np.array([getattr(state, name) for state in states])

@@ -6,6 +6,7 @@ for increments with y linear between observations, acts inside of the equation.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -78,7 +79,7 @@ def step(prepared: Any, k: int, state: Any, values: np.ndarray) -> tuple[Any, In
     return result
 
 
-def segment(prepared: Any, rows: slice, state: Any, values: np.ndarray) -> tuple[list[Any], Infos] | None:
+def segment(prepared: Any, rows: slice, state: Any, values: np.ndarray) -> tuple[Sequence[Any], Infos] | None:
     """Return the states after the intervals of a slice, and their reports, for one state without reflecting ends."""
     return _line.segment(prepared, rows, state, values) if module_of(prepared.model) is _line else None
 

@@ -144,7 +144,9 @@ def _adjoint(
     return lengths.size, first, last, start, error
 
 
-def by_adjoints(message: Message, before: Filtered, grid: Grid, logs: Array, steps: Steps, closed: bool, limits: Limits) -> Taken:
+def by_adjoints(
+    message: Message, before: Filtered, grid: Grid, logs: Array, steps: Steps, observed: Array, closed: bool, limits: Limits
+) -> Taken:
     """Return the message before the last intervals, as many as the adjoints of splittings take.
 
     Args:
@@ -153,12 +155,13 @@ def by_adjoints(message: Message, before: Filtered, grid: Grid, logs: Array, ste
         grid: the table of the grids.
         logs: the log-likelihoods of what is observed at the end of each interval (K, N), on the grid of the density there.
         steps: the intervals.
+        observed: what is observed in them (K, m), zero where nothing is.
         closed: whether the grid is around the circle.
         limits: what an interval must keep.
     """
     count, size = len(steps.lengths), len(message.values)
     b, product, products, out = message.values.copy(), message.product.copy(), np.empty((count, size)), np.zeros((count, 6))
-    kinds, lengths, observed, precisions, _, _, *rest = steps
+    kinds, lengths, precisions, _, _, *rest = steps
     averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
     taken, first, last, start, error = _adjoint(
         b, message.first, message.last, message.start, message.error, product, *before, grid.table, grid.spacing, closed,

@@ -113,7 +113,7 @@ def multiplied(
     for j in range(size):
         product[j] /= total
         b[j] /= total
-    left, right, _, _, _, aliasing, _, _, _ = spectrum(product, CUT, SMALLEST, cosines, sines)
+    left, right, _, _, _, aliasing, _, _, _ = spectrum(product, CUT, SMALLEST, cosines, sines, False)
     row[LOG_MASS] += np.log(total)
     row[ALIASING], row[EDGE] = aliasing, 0.0 if closed else max(left, right)
     if closed:
@@ -181,7 +181,7 @@ def _decomposed(
         now = np.dot(coefficients, modes[:count])
         highest = now[highest_of(now)]
         noise = NOISE * np.sqrt(norm) * max(1.0, np.exp(min(tau * rates[0], 600.0)))
-        left, right, _, _, _, aliasing, _, _, _ = spectrum(now, CUT, SMALLEST, long_cosines, long_sines)
+        left, right, _, _, _, aliasing, _, _, _ = spectrum(now, CUT, SMALLEST, long_cosines, long_sines, False)
         level = max(noise, (ROUNDING + 2.0 * aliasing) * highest)
         # b relative to where its product with the density is largest.
         density, least = densities[i], floors[i] * densities[i, highest_of(densities[i])]

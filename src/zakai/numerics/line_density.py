@@ -97,15 +97,24 @@ def waves(size: int) -> tuple[Array, Array]:
 _F = float64
 
 
-@kernel(types.UniTuple(_F, 9)(_F[::1], _F, _F, _F[:, ::1], _F[:, ::1]))  # type: ignore[no-untyped-call]
-def spectrum(values: Array, cut: float, negligible: float, cosines: Array, sines: Array) -> tuple[float, ...]:
+@kernel(types.UniTuple(_F, 9)(_F[::1], _F, _F, _F[:, ::1], _F[:, ::1], boolean))  # type: ignore[no-untyped-call]
+def spectrum(
+    values: Array, cut: float, negligible: float, cosines: Array, sines: Array, search: bool
+) -> tuple[float, ...]:
     """Return figures of the ends and of the spectrum of values (N,), N > 2; of a large grid few frequencies are computed.
+
+    Args:
+        values: (N,).
+        cut: the smallest value that counts, relative to the largest.
+        negligible: the modulus of a frequency that does not count, relative to the mass.
+        cosines, sines: `waves` of N.
+        search: whether the highest frequency that is not negligible is found.
 
     Returns:
         The largest moduli of the two outermost points on the left and on the right, relative to the maximum; the first and last
         point above `cut` times the maximum; the negative share of the mass; relative to the mass, the largest spectrum in the
         highest eighth of the frequencies, and around eleven sixteenths of the highest; the highest frequency that is not
-        negligible, and the number of frequencies.
+        negligible, or a bound of it, and the number of frequencies.
     """
     size = values.shape[0]
     nyquist = size // 2
@@ -127,7 +136,7 @@ def spectrum(values: Array, cut: float, negligible: float, cosines: Array, sines
     while k > 0:
         in_top = k >= nyquist * 7 // 8
         in_middle = nyquist * 5 // 8 <= k < nyquist * 3 // 4
-        if in_top or in_middle or highest < 0:
+        if in_top or in_middle or (search and highest < 0):
             if not in_top and not top_known:
                 top_known = True
                 if aliasing > negligible:

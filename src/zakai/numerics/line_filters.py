@@ -136,6 +136,30 @@ def _quadratic(values: Array, slope: float, curvature: float) -> None:
             ratio *= step
 
 
+def kernel_size(inputs: int) -> int:
+    """Return the number of parameters of the kernel of an interval, see `kernel_of`."""
+    return 3 + 2 * inputs + inputs * inputs
+
+
+@helper
+def kernel_of(parameters: Array, observed: Array, length: float, to: Array) -> None:
+    """Write a, b, V, k0, k1, k2 of a kernel for increments (m,) over an interval of a length, infinite where none acts inside.
+
+    With the inputs e = (1, increments / length) the parameters are those of `line_collocation.Channels`, one after the other.
+    """
+    count = 1 + observed.size
+    shift, variance, constant = parameters[1 : 1 + count], parameters[1 + count], parameters[2 + count : -1 - count]
+    slope = parameters[-1 - count : -1]
+    to[0], to[1], to[2], to[3], to[4], to[5] = parameters[0], 0.0, variance, 0.0, 0.0, parameters[-1]
+    for i in range(count):
+        one = observed[i - 1] / length if i > 0 else 1.0
+        to[1] += shift[i] * one
+        to[4] += slope[i] * one
+        for j in range(count):
+            other = observed[j - 1] / length if j > 0 else 1.0
+            to[3] += constant[i * count + j] * one * other
+
+
 @inlined
 def convolved(
     now: Array, phi: Array, channel: Array, middle: float, spacing: float, finest: float, depth: float, closed: bool

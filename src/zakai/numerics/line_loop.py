@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from zakai.numerics.compiled import kernel
 from zakai.numerics.line_averages import AVERAGES
 from zakai.numerics.line_density import circular_moments, highest_of, moments, separated, spectrum, support, waves
-from zakai.numerics.line_filters import BAND, convolved
-from zakai.numerics.line_modes import LOG_NOISE, decomposed, narrow
+from zakai.numerics.line_filters import BAND, convolved, kernel_of
+from zakai.numerics.line_modes import LOG_NOISE, decayed, decomposed, narrow
 from zakai.numerics.line_segment import (
     AFTER,
     COLUMNS,
@@ -34,7 +34,6 @@ from zakai.numerics.line_segment import (
     SPLIT,
     TABLE,
     Grid,
-    Limits,
     Mechanisms,
     Segment,
     Steps,
@@ -57,32 +56,39 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
 
     @kernel(
         types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]
-            _V, int64, _Q, float64, _M, _M, _V, _T, _M, _M, float64, float64, int64[::1], _V, _M, _Q, _V, _M, _T, _T, _M,
-            float64, float64, _V, _V, _M, int64[::1], _M, _M
+            _V, int64, _Q, float64, _M, _V, _T, _M, _M, float64, float64, int64, _M, int64[::1], _V, _Q, _V, _M, _T, _T, _M,
+            float64, float64, _V, _M, _M, _M
         )
     )  # fmt: skip
     def advance(
-        values: Array, start: int, table: Array, covariance: float, modes: Array, transposed: Array, rates: Array,
-        averages: Array, cosines: Array, sines: Array, offset: float, spacing: float, kinds: Array, lengths: Array,
-        observed: Array, precisions: Array, constants: Array, channels: Array, drifts: Array, outputs: Array, covariances: Array,
-        error: float, log_floor: float, limits: Array, answer: Array, densities: Array, starts: Array, out: Array, fine: Array,
+        values: Array, start: int, table: Array, covariance: float, modes: Array, rates: Array, averages: Array, cosines: Array,
+        sines: Array, offset: float, spacing: float, begin: int, observed: Array, kinds: Array, lengths: Array,
+        precisions: Array, constants: Array, kernel_parameters: Array, drifts: Array, outputs: Array, covariances: Array,
+        error: float, log_floor: float, limits: Array, densities: Array, out: Array, fine: Array,
     ) -> tuple[int, int]:  # fmt: skip
-        """Return the number of steps, and why the loop ended."""
+        """Return the number of steps, and why the loop ended; the last row of `out` receives the answer."""
         negligible, most, generous, size, length = limits[0], limits[1], limits[4], values.size, table.shape[3]
-        half, timed, movable = size // 2, table.shape[0] > 1, filters and not closed
+        half, timed, movable, near = size // 2, table.shape[0] > 1, filters and not closed, length == size + 2 * MARGIN
         now, local = values.copy(), np.empty((table.shape[1], table.shape[2], size))
-        b, change = np.empty(size), np.empty(size)
-        home, place, status, done = start, -1, OK, 0
-        for k in range(lengths.size):
-            own, row, tau = k if timed else 0, out[k], lengths[k]
+        b, change, channel, decay, answer = np.empty(size), np.empty(size), np.full(6, np.nan), rates, out[-1]
+        home, place, status, done, last_tau = start, -1, OK, 0, np.nan
+        for i in range(observed.shape[0]):
+            k = begin + i
+            own, row, tau, kind = i if timed else 0, out[i], lengths[k], kinds[k]
+            inside, seen = kind == SPLIT or kind == KERNEL, False
+            if samples:
+                for j in range(observed.shape[1]):
+                    seen |= precisions[k, 0, j, j] != 0.0
             cut = max(limits[3], min(30.0 * np.exp(log_floor), CUT))
             low, high = support(now, cut)
             if place != start or timed:
                 copied(table[own], start, local)
                 place = start
+            if kernels:
+                kernel_of(kernel_parameters[k], observed[i], tau if kind == KERNEL else np.inf, channel)
             if movable:
                 first, last = extent(
-                    now, low, high, channels[k], drifts[k, 0], local, covariances[k, 0] * tau, tau,
+                    now, low, high, channel, drifts[k, 0], local, covariances[k, 0] * tau, tau,
                     offset + spacing * (start + half), spacing, cut,
                 )  # fmt: skip
                 answer[0], answer[1], answer[2], status = first, last, spacing, OK
@@ -95,7 +101,7 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
                     break
                 if first < 0 or last > size - 1:
                     by = ALIGNMENT * int(np.floor((0.5 * (first + last) - half) / ALIGNMENT + 0.5))
-                    if abs(by) > length or start + by < 0 or start + by + size > length or (timed and abs(by) > MARGIN // 2):
+                    if abs(by) > length or start + by < 0 or start + by + size > length or (near and abs(by) > MARGIN // 2):
                         status = RANGE
                         break
                     for j in range(size):
@@ -106,19 +112,21 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
                     copied(table[own], start, local)
                     low, high = support(now, cut)
             # The transition.
-            at, before, inside = highest_of(now), moments(now)[2], kinds[k] == SPLIT or kinds[k] == KERNEL
+            at, before = highest_of(now), moments(now)[2]
             depth, finest = 8.0 - np.log(cut), (high - low) * 1.2 * spacing / (limits[5] - 2 * ALIGNMENT)
             move = failed(0.0, 0.0)
             if modal:
                 if closed or not narrow(high - low, spacing, covariance * tau):
-                    rounding = decomposed(now, local[0, PHI], modes, transposed, rates, tau, 0.1 * most, closed)
+                    if tau != last_tau:
+                        decay, last_tau = decayed(rates, tau), tau
+                    rounding = decomposed(now, local[0, PHI], modes, decay, 0.1 * most, closed)
                     move = Transition(0.0, rounding, 0.0, 0.0, 1.0, 0.0, 0.0)
-            elif kernels and not np.isnan(channels[k, 0]):
+            elif kernels and not np.isnan(channel[0]):
                 middle = offset + spacing * (start + half)
-                move = convolved(now, local[0, PHI], channels[k], middle, spacing, finest, depth, closed)
+                move = convolved(now, local[0, PHI], channel, middle, spacing, finest, depth, closed)
             elif splits:
                 move = divided(
-                    now, local, drifts[k], outputs[k], precisions[k], covariances[k], averages, observed[k], inside, tau, spacing,
+                    now, local, drifts[k], outputs[k], precisions[k], covariances[k], averages, observed[i], inside, tau, spacing,
                     closed, depth, limits[2], finest,
                 )  # fmt: skip
             if not (move.error < np.inf and move.rounding < max(1e-11, 1e-3 * most)):
@@ -127,8 +135,9 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
                 break
             positive = filters and move.needed == 0.0
             status, mass, aliasing, edge, negative, highest = checked(
-                now, low, high, filters, weak, positive, closed, cut, negligible, spacing, cosines, sines, answer
-            )
+                now, low, high, filters, weak, positive, closed, weak or not seen, cut, negligible, spacing, cosines, sines,
+                answer,
+            )  # fmt: skip
             if status != OK:
                 break
             predicted, gained = moments(now)[2], np.log(mass) + constants[k] + move.log_factor
@@ -140,36 +149,31 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
                 log_floor = LOG_NOISE
                 floor = np.exp(log_floor) + aliasing + edge + move.rounding
             # The sample, on a finer grid where the product is not resolved.
-            worst, growth, below, seen = aliasing, 0.0, 0.0, False
-            if samples:
+            worst, growth, below = aliasing, 0.0, 0.0
+            if seen:
                 h, centre = observation_of(local, outputs[k, 0], at)
-                gained += likelihood(h, centre, precisions[k, 0], observed[k], b)
+                gained += likelihood(h, centre, precisions[k, 0], observed[i], b)
                 if weak:
-                    for i in range(centre.size):
-                        seen |= precisions[k, 0, i, i] != 0.0
-                    if seen:
-                        weaken(fine, start, precisions[k, 0], observed[k], centre, b, change)
-                        seen = False
-                for j in range(size):
-                    seen |= b[j] != 0.0
-                if seen:
-                    added, growth, below = product(now, b)
-                    left, right, answer[0], answer[1], _, aliasing, _, top, _ = spectrum(now, cut, negligible, cosines, sines)
-                    limit = 30.0 * negligible
-                    if weak:  # of a kink the spectrum falls slowly
-                        aliasing, limit = 0.5 * weak_error(now, change), WEAK_SHARE * most
-                    else:
-                        highest = top
-                    if not (aliasing <= limit):
-                        answer[0], answer[1], answer[2] = float(low), float(high), 0.6 * spacing
-                        status = RANGE if positive and not weak and aliasing < np.inf else FAILED
-                        break
-                    if np.isnan(added) or not (closed or max(left, right) < 1e-10):
-                        status = FAILED
-                        break
-                    if not closed:
-                        edge = max(edge, min(left, right) if positive else max(left, right))
-                    worst, gained = max(worst, aliasing), gained + added
+                    weaken(fine, start, precisions[k, 0], observed[i], centre, b, change)
+                added, growth, below = product(now, b)
+                left, right, answer[0], answer[1], _, aliasing, _, top, _ = spectrum(
+                    now, cut, negligible, cosines, sines, not weak
+                )
+                limit = 30.0 * negligible
+                if weak:  # of a kink the spectrum falls slowly
+                    aliasing, limit = 0.5 * weak_error(now, change), WEAK_SHARE * most
+                else:
+                    highest = top
+                if not (aliasing <= limit):
+                    answer[0], answer[1], answer[2] = float(low), float(high), 0.6 * spacing
+                    status = RANGE if (positive or modal) and not weak and aliasing < np.inf else FAILED
+                    break
+                if np.isnan(added) or not (closed or max(left, right) < 1e-10):
+                    status = FAILED
+                    break
+                if not closed:
+                    edge = max(edge, min(left, right) if positive else max(left, right))
+                worst, gained = max(worst, aliasing), gained + added
             # The report.
             row[1], row[2] = moments(now)[1:]
             width = row[2]
@@ -190,28 +194,28 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
             log_floor = min(log_floor + max(below - 1.0, 0.0), 0.0)
             row[8], row[9], row[10], row[11] = growth, made, error, log_floor
             for j in range(size):
-                densities[k, j] = now[j]
-            starts[k], home, done = start, start, k + 1
+                densities[i, j] = now[j]
+            row[12], home, done = start, start, i + 1
             # Whether the same grid serves for the next step: as in `line_window.fitted`.
             low, high = int(answer[0]), int(answer[1])
             if filters or weak:
                 low, high = support(now, cut)
             resolving = (BAND if filters else 0.92) * (size // 2) / (max(highest, 0.0) + 1.0)
             least, points = max(3, size // 16), high - low + 1.0
-            if resolving < 0.97 or (not timed and abs(home + half - length // 2) > length // 4):
+            if resolving < 0.97 or (not near and abs(home + half - length // 2) > length // 4):
                 status = AFTER
             elif closed:
                 status = AFTER if size > generous and size > 2.2 * size / resolving else OK
             elif modal:
                 fewer = size > generous and size > 1.6 * (1.2 * points * min(1.0, 1.0 / resolving) + 16.0)
                 status = AFTER if fewer or low < least or high >= size - least else OK
-            elif timed and abs(start - MARGIN) > MARGIN // 3:
+            elif near and abs(start - MARGIN) > MARGIN // 3:
                 status = TABLE
             if status != OK:
                 break
         if status == RANGE:  # the step is tried again on another grid, from that of the last state
-            for i in range(2):
-                answer[i] = spacing * (answer[i] + start - home - half)
+            for j in range(2):
+                answer[j] = spacing * (answer[j] + start - home - half)
         return done, status
 
     return advance
@@ -221,26 +225,26 @@ _WHOLE = np.ones((1, 5, 1))
 
 
 def advance(
-    mechanisms: Mechanisms, values: Array, grid: Grid, steps: Steps, error: float, log_floor: float, limits: Limits
-) -> Segment:
-    """Return the first steps, as many as are accurate on one grid.
+    mechanisms: Mechanisms, values: Array, grid: Grid, steps: Steps, first: int, observed: Array, error: float, log_floor: float,
+    limits: Array,
+) -> Segment:  # fmt: skip
+    """Return steps, as many as are accurate on one grid.
 
     Args:
         mechanisms: what the steps may need.
         values: probabilities (N,).
         grid: the grid.
-        steps: the steps.
+        steps: the intervals, of which `first` is the first that is taken.
+        observed: what is observed in the intervals from there on (K, m), zero where nothing is.
         error: the estimate of the relative error of `values`.
         log_floor: the logarithm of the error of small values, relative to the largest.
-        limits: what a step must keep.
+        limits: what a step must keep, as the fields of `Limits`.
     """
-    count, size = len(steps.lengths), len(values)
-    densities, out, starts = np.empty((count, size)), np.empty((count, len(COLUMNS))), np.empty(count, np.int64)
-    answer = np.zeros(3)
+    count, size = len(observed), len(values)
+    densities, out = np.empty((count, size)), np.empty((count + 1, len(COLUMNS)))
     averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
     done, why = _loop(*mechanisms)(
-        np.ascontiguousarray(values), grid.start, grid.table, grid.covariance, grid.modes, grid.transposed, grid.rates, averages,
-        *waves(size), grid.offset, grid.spacing, *steps, error, log_floor, np.array(limits), answer, densities,
-        starts, out, grid.fine,
+        values, grid.start, grid.table, grid.covariance, grid.modes, grid.rates, averages, *waves(size), grid.offset,
+        grid.spacing, first, observed, *steps, error, log_floor, limits, densities, out, grid.fine,
     )  # fmt: skip
-    return Segment(densities[:done], starts[:done], out[:done], why, answer)
+    return Segment(densities[:done], out[:done], why, out[-1, :3])

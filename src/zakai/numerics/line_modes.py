@@ -16,6 +16,7 @@ Array = NDArray[Any]
 LOG_NOISE = -33.4  # logarithm of the error of a decomposition relative to the maximum
 _NARROW = 7.0  # support of a density, in standard deviations of the noise, below which a step is left to another grid
 _SUPPORT = 1e-13  # values relative to the maximum beyond which a density counts as ended
+_NEGLIGIBLE = 42.0  # -log of the factor of a mode that is negligible
 _SPREAD = 0.01  # of the value at an abrupt end that the interpolant spreads to the middle of the grid
 
 
@@ -27,8 +28,20 @@ def narrow(points: float, spacing: float, variance: float) -> bool:
 
 
 @helper
+def decayed(rates: Array, time: float) -> Array:
+    """Return exp(-time rates) of the modes that are not negligible; the rates increase."""
+    count = 1
+    while count < rates.size and time * (rates[count] - rates[0]) < _NEGLIGIBLE:
+        count += 1
+    decay = np.empty(count)
+    for n in range(count):
+        decay[n] = np.exp(-time * rates[n])
+    return decay
+
+
+@helper
 def decomposed(
-    now: Array, phi: Array, modes: Array, transposed: Array, rates: Array, time: float, most: float, closed: bool
+    now: Array, phi: Array, modes: Array, decay: Array, most: float, closed: bool
 ) -> float:
     """Replace a density by that after an interval, after = exp(phi); return the relative error.
 
@@ -38,9 +51,8 @@ def decomposed(
     Args:
         now: the density (N,).
         phi: the logarithm of the gauge (N,).
-        modes, transposed: U (N, N) and U'.
-        rates: (N,).
-        time: the length of the interval.
+        modes: U' (N, N).
+        decay: exp(-time rates) (M,) of the modes that are not negligible.
         most: the largest error.
         closed: whether the grid goes around the circle.
     """
@@ -53,10 +65,10 @@ def decomposed(
         reach += inner[j] * inner[j]
         if not closed and (now[j] <= limit or j < 2 or j >= now.size - 2):
             end = max(end, inner[j])
-    coefficients = np.dot(transposed, inner)
-    for j in range(now.size):
-        coefficients[j] *= np.exp(-time * rates[j])
-    moved = np.dot(modes, coefficients)
+    coefficients = np.dot(modes[: decay.size], inner)
+    for j in range(decay.size):
+        coefficients[j] *= decay[j]
+    moved = np.dot(coefficients, modes[: decay.size])
     # Beyond the support there is only rounding, which must not be amplified.
     noise = 4e-16 * np.sqrt(reach)
     left, right = 0, now.size - 1

@@ -10,6 +10,7 @@ Array = NDArray[Any]
 
 COLUMNS = (
     "gained", "mean", "variance", "aliasing", "edge", "negative", "time", "depth", "growth", "made", "error", "log_floor",
+    "start",
 )  # fmt: skip
 # The transition: whole with a sample after it, split with increments inside, whole with increments inside, split with a sample.
 FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = 0, 1, 2, 3
@@ -34,7 +35,7 @@ class Mechanisms(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """The data of a grid: `modes` (N, N), their transpose, `rates` (N,), and terms `table` (K, R, 4 + m, T) as in `line_terms`.
+    """The data of a grid: the rows of `modes` (N, N), `rates` (N,), and terms `table` (K, R, 4 + m, T) as in `line_terms`.
 
     K = 1 where the terms do not depend on the interval.  With modes the table is that of the grid, and `covariance` the largest
     G.  Else it is longer than the grid, which begins at `start`; the first point of the table is `offset` away from the origin of
@@ -42,7 +43,6 @@ class Grid(NamedTuple):
     """
 
     modes: Array
-    transposed: Array
     rates: Array
     table: Array
     covariance: float
@@ -53,28 +53,27 @@ class Grid(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """The K steps to take.
+    """K intervals.
 
-    `kinds` (K,) are FACTOR, SPLIT, KERNEL or SPLIT_FACTOR.  `observed` (K, m) are zero where nothing is observed, as are the
-    inverses of S `precisions` (K, P, m, m).  `constants` (K,) are those of the log-likelihoods.  `channels` (K, 6) are a, b, V,
-    k0, k1, k2 of Gaussian kernels, NaN where the transition is split.  `drifts`
-    (K, Q, R) and `outputs` (K, P, R) are the factors of the terms of f and h, and `covariances` (K, Q) are G, at the Gauss nodes
-    of an interval, or one number where they do not depend on time.
+    `kinds` (K,) are FACTOR, SPLIT, KERNEL or SPLIT_FACTOR.  `precisions` (K, P, m, m) are the inverses of S, zero where nothing
+    is observed.  `constants` (K,) are those of the log-likelihoods.  `kernels` (K, .) are the parameters of Gaussian kernels
+    (`line_filters.kernel_of`), NaN where the transition is split.  `drifts` (K, Q, R) and `outputs` (K, P, R) are the factors of
+    the terms of f and h, and `covariances` (K, Q) are G, at the Gauss nodes of an interval, or one number where they do not
+    depend on time.
     """
 
     kinds: Array
     lengths: Array
-    observed: Array
     precisions: Array
     constants: Array
-    channels: Array
+    kernels: Array
     drifts: Array
     outputs: Array
     covariances: Array
 
-    def after(self, count: int) -> Steps:
-        """Return the steps without the first ones."""
-        return Steps(*(part[count:] for part in self))
+    def part(self, rows: slice) -> Steps:
+        """Return some of the intervals."""
+        return Steps(*(part[rows] for part in self))
 
 
 class Limits(NamedTuple):
@@ -95,14 +94,13 @@ class Limits(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """The densities after the first steps, the first points of their grids in the table, and their reports.
+    """The densities (K, N) after the first steps and their reports (K, len(COLUMNS)).
 
-    `why` is why the loop ended, and `answer` the range of the grid that it needs, relative to the centre of the present one, and
-    its spacing.
+    The last column of a report is the first point of the grid in the table.  `why` is why the loop ended, and `answer` the range
+    of the grid that it needs, relative to the centre of the present one, and its spacing.
     """
 
     densities: Array
-    starts: Array
     reports: Array
     why: int
     answer: Array

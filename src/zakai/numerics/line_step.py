@@ -18,6 +18,10 @@ from zakai.numerics.line_terms import DRIFT, exponent_added
 
 Array = NDArray[Any]
 
+_OVERFLOW = 690.0
+_LEAST = 1e-280  # value of a density where its product with a likelihood is largest
+_MOST_GROWTH = 1e80
+
 
 @helper
 def extent(
@@ -42,15 +46,16 @@ def extent(
 
 @helper
 def checked(
-    now: Array, low: int, high: int, filters: bool, weak: bool, positive: bool, closed: bool, cut: float, negligible: float,
-    spacing: float, cosines: Array, sines: Array, answer: Array,
+    now: Array, low: int, high: int, filters: bool, weak: bool, positive: bool, closed: bool, search: bool, cut: float,
+    negligible: float, spacing: float, cosines: Array, sines: Array, answer: Array,
 ) -> tuple[int, float, float, float, float, float]:  # fmt: skip
     """Normalise a prediction that is accurate; return OK, its mass, aliasing, mass at the ends, negative mass, highest frequency.
 
-    `answer` receives the support; where another grid is needed, its range in points and its spacing.
+    The frequency is found with `search`.  `answer` receives the support; where another grid is needed, its range in points and
+    its spacing.
     """
     size = now.size
-    left, right, first, last, negative, aliasing, middle, highest, _ = spectrum(now, cut, negligible, cosines, sines)
+    left, right, first, last, negative, aliasing, middle, highest, _ = spectrum(now, cut, negligible, cosines, sines, search)
     bound = max(100.0 * cut, 0.0 if positive else 4.0 * aliasing)
     edge = 0.0 if closed else max(left, right)
     if filters and not positive:  # what is outside of the band is filtered too
@@ -60,7 +65,7 @@ def checked(
     if not (aliasing <= 30.0 * negligible):
         status = RANGE if filters and not weak and aliasing < np.inf else FAILED
     elif not (edge <= bound):
-        status = RANGE if (filters or weak) and edge < np.inf else FAILED
+        status = RANGE if edge < np.inf else FAILED
         answer[0] = min(low, (0 if left > bound else low) - size // 3 * (left > bound))
         answer[1] = max(high, (size if right > bound else high) + size // 3 * (right > bound))
         answer[2] = spacing
@@ -104,26 +109,29 @@ def product(now: Array, b: Array) -> tuple[float, float, float]:
     """Replace probabilities by their normalised product with exp(b).
 
     Returns:
-        The logarithm of the sum, which is NaN where the product vanishes; by how much errors relative to the maximum grow; and
-        the depth of the product below the maximum of the density, in nats.
+        The logarithm of the sum, which is NaN where the product almost vanishes; by how much errors relative to the maximum
+        grow; and the depth of the product below the maximum of the density, in nats.
     """
-    largest, best, total, growth, depth = 0.0, -np.inf, 0.0, 0.0, 0.0
+    largest, top, best, total, growth, depth = 0.0, 0, -np.inf, 0.0, 0.0, 0.0
     logs = np.empty(now.size)
     for j in range(now.size):
         if not (b[j] > IMPOSSIBLE):
             b[j] = IMPOSSIBLE
         largest = max(largest, now[j])
         logs[j] = np.log(now[j]) if now[j] > 0 else -np.inf
-        best = max(best, logs[j] + b[j])
-    for j in range(now.size):
-        now[j] = np.exp(logs[j] + b[j] - best)
-        total += now[j]
-    if not (-np.inf < best < np.inf and total > 0):
+        if logs[j] + b[j] > best:
+            best, top = logs[j] + b[j], j
+    if not (best < np.inf and now[top] > _LEAST):
         return np.nan, growth, depth
-    reference = np.log(largest)
+    reference, scale = np.log(largest), 1.0 / now[top]
     for j in range(now.size):
-        growth += np.exp(min(b[j] + reference - best - np.log(total), 200.0))
+        change = b[j] - b[top]
+        factor = np.exp(min(change, _OVERFLOW))
+        growth += factor
+        now[j] = now[j] * scale * factor if change < _OVERFLOW else np.exp(logs[j] + b[j] - best)
+        total += now[j]
+    for j in range(now.size):
         now[j] /= total
         if now[j] > 0:
             depth += now[j] * (reference - logs[j])
-    return np.log(total) + best, growth, depth
+    return np.log(total) + best, min(growth / total * largest * scale, _MOST_GROWTH), depth

@@ -115,7 +115,8 @@ def figures(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: fl
         cut: the smallest value that counts, relative to the largest.
     """
     real = np.ascontiguousarray(values.real)
-    left, right, first, last, negative, aliasing, middle, highest, nyquist = spectrum(real, cut, negligible, *waves(len(real)))
+    found = spectrum(real, cut, negligible, *waves(len(real)), True)
+    left, right, first, last, negative, aliasing, middle, highest, nyquist = found
     rough = middle < 6.0 * aliasing
     if aliasing <= negligible or (rough and aliasing < 1e-9):
         resolving = 0.92 * nyquist / (max(highest, 0.0) + 1.0)
