@@ -17,7 +17,11 @@ R = TypeVar("R")
 _compiler: Any = partial(njit, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 
 
-def kernel(signature: Any, derivative: Any = None) -> Callable[[Callable[..., R]], Callable[..., R]]:
+# Sums may be taken in any order, so that several terms are added at once; the order depends on the processor and the size alone.
+_REORDERED: Any = frozenset({"reassoc", "nsz", "contract"})
+
+
+def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """Return a decorator that compiles a function for one signature when it is first called, by Python or by another kernel.
 
     The compiled code is kept beside the source, or in the user's cache folder.  Where neither can be written, the function is
@@ -26,13 +30,15 @@ def kernel(signature: Any, derivative: Any = None) -> Callable[[Callable[..., R]
     Args:
         signature: the types of the arguments and of the result.
         derivative: those of complex arguments, for which the function is compiled when it first receives one.
+        reordered: whether its sums may be taken in any order.
     """
+    fastmath = set(_REORDERED) if reordered else False
 
     def decorate(function: Callable[..., R]) -> Callable[..., R]:
         try:
-            dispatcher = _compiler(cache=True)(function)
+            dispatcher = _compiler(cache=True, fastmath=fastmath)(function)
         except RuntimeError:  # no folder for the cache
-            dispatcher = _compiler()(function)
+            dispatcher = _compiler(fastmath=fastmath)(function)
         compiled = dispatcher.compile
 
         def compile_declared(arguments: Any) -> Any:
@@ -65,6 +71,11 @@ def kernel(signature: Any, derivative: Any = None) -> Callable[[Callable[..., R]
 def helper(function: F) -> F:
     """Compile a function that only kernels call, as a part of each of them; it has no entry for Python."""
     return cast(F, _compiler(no_cpython_wrapper=True)(function))
+
+
+def summing(function: F) -> F:
+    """Compile a function that only kernels call, as a part of each of them; its sums may be taken in any order."""
+    return cast(F, _compiler(no_cpython_wrapper=True, fastmath=set(_REORDERED))(function))
 
 
 def inlined(function: F) -> F:

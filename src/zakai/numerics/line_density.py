@@ -9,12 +9,12 @@ import numpy as np
 from numba import boolean, float64, int64, types
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.compiled import helper, kernel, summing
 
 Array = NDArray[Any]
 
 
-@helper
+@summing
 def moments(values: Array) -> tuple[float, float, float]:
     """Return the sum of values, and their mean and variance as an index from the middle."""
     mass, mean, square = 0.0, 0.0, 0.0
@@ -28,7 +28,7 @@ def moments(values: Array) -> tuple[float, float, float]:
     return mass, mean, square / mass
 
 
-@helper
+@summing
 def circular_moments(values: Array, cosines: Array, sines: Array) -> tuple[float, float]:
     """Return the argument of E exp(i x) as an index from the middle, and the variance in squares of the spacing.
 
@@ -97,7 +97,7 @@ def waves(size: int) -> tuple[Array, Array]:
 _F = float64
 
 
-@kernel(types.UniTuple(_F, 9)(_F[::1], _F, _F, _F[:, ::1], _F[:, ::1], boolean))  # type: ignore[no-untyped-call]
+@kernel(types.UniTuple(_F, 9)(_F[::1], _F, _F, _F[:, ::1], _F[:, ::1], boolean), reordered=True)  # type: ignore[no-untyped-call]
 def spectrum(
     values: Array, cut: float, negligible: float, cosines: Array, sines: Array, search: bool
 ) -> tuple[float, ...]:
@@ -123,8 +123,8 @@ def spectrum(
         top = max(top, values[i])
         total += abs(values[i])
         mass += values[i]
-    # The even part at 0 .. N / 2, and the odd part, with zeros beyond.
-    even, odd = np.zeros(nyquist + 2), np.zeros(nyquist + 2)
+    # The even part at 0 .. N / 2, and the odd part.
+    even, odd = np.zeros(nyquist + 1), np.zeros(nyquist + 1)
     even[0] = values[0]
     for i in range(1, nyquist + 1):
         mirrored = values[size - i] if 2 * i < size else 0.0
@@ -142,13 +142,10 @@ def spectrum(
                 if aliasing > negligible:
                     # Above, nothing can be resolved: what counts is noise or too much for this grid.
                     negligible = 4.0 * aliasing
-            real, imag, other_real, other_imag = 0.0, 0.0, 0.0, 0.0
-            for i in range(0, nyquist + 1, 2):
+            real, imag = 0.0, 0.0
+            for i in range(nyquist + 1):
                 real += cosines[k, i] * even[i]
                 imag += sines[k, i] * odd[i]
-                other_real += cosines[k, i + 1] * even[i + 1]
-                other_imag += sines[k, i + 1] * odd[i + 1]
-            real, imag = real + other_real, imag + other_imag
             size_here = scale * np.sqrt(real * real + imag * imag)
             if in_top:
                 aliasing = max(aliasing, size_here)

@@ -15,7 +15,8 @@ from numba import complex128, float64, int64
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from zakai.numerics.compiled import helper, inlined, kernel
+from zakai.numerics.compiled import helper, inlined, kernel, summing
+from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line_density import highest_of
 from zakai.numerics.line_terms import Transition, failed
 
@@ -25,34 +26,36 @@ WIDE = 1.96  # variance of a kernel, in squares of the spacing, from which its s
 BAND = 0.625  # part of the frequencies of a grid for which the filters of narrow kernels are exact
 _NODES = 128  # of the periodic transfer function of a narrow kernel
 _TAPS = 50
-_COSINES = np.cos(2.0 * np.pi / _NODES * np.arange(_NODES))
 _FREQUENCIES = 2.0 * np.pi / _NODES * np.arange(_NODES // 2 + 1)
+# From values at the frequencies to coefficients, by the rule of trapezoids.
+_COSINES = 2.0 / _NODES * np.cos(_FREQUENCIES[:, None] * np.arange(_TAPS))
+_COSINES[[0, -1]] *= 0.5
 _PASSED = 0.5 * erfc((_FREQUENCIES - np.pi) * 5.2 / ((1.0 - BAND) * np.pi))  # one up to the band, and one half at the end
 
 
-@helper
+@summing
 def taps_of(variance: float, depth: float, most: int, narrow: bool) -> Array:
     """Return the filter (T,) of a Gaussian kernel, at distances 0 .. T - 1.
 
     It is up to `most` of its samples, down to exp(-depth), or for a narrow kernel the coefficients of a periodic transfer
     function that agrees with exp(-variance w^2 / 2) in the band.
     """
-    taps = np.empty(_TAPS if narrow else int(min(np.ceil(np.sqrt(2.0 * depth * variance)) + 1, float(most))))
     if not narrow:
-        top = 1.0 / np.sqrt(2.0 * np.pi * variance)
+        taps = np.empty(int(min(np.ceil(np.sqrt(2.0 * depth * variance)) + 1, float(most))))
         for n in range(taps.size):
-            taps[n] = top * np.exp(-0.5 * n * n / variance)
+            taps[n] = -0.5 * n * n / variance - 0.5 * np.log(2.0 * np.pi * variance)
+        exponentiate(taps)
         return taps
-    transfer = np.empty(_FREQUENCIES.size)
+    taps, transfer, beyond = np.zeros(_TAPS), np.empty(_FREQUENCIES.size), np.empty(_FREQUENCIES.size)
     for i in range(transfer.size):
-        w = _FREQUENCIES[i]
-        transfer[i] = np.exp(-0.5 * variance * w * w) * _PASSED[i]
-        transfer[i] += np.exp(-0.5 * variance * (2.0 * np.pi - w) ** 2) * (1.0 - _PASSED[i])
-    for n in range(_TAPS):
-        total = 0.5 * (transfer[0] + transfer[-1] * _COSINES[n * (_NODES // 2) % _NODES])
-        for i in range(1, transfer.size - 1):
-            total += transfer[i] * _COSINES[i * n % _NODES]
-        taps[n] = total * 2.0 / _NODES
+        transfer[i] = -0.5 * variance * _FREQUENCIES[i] ** 2
+        beyond[i] = -0.5 * variance * (2.0 * np.pi - _FREQUENCIES[i]) ** 2
+    exponentiate(transfer)
+    exponentiate(beyond)
+    for i in range(transfer.size):
+        weight = transfer[i] * _PASSED[i] + beyond[i] * (1.0 - _PASSED[i])
+        for n in range(_TAPS):
+            taps[n] += weight * _COSINES[i, n]
     return taps
 
 
@@ -192,7 +195,8 @@ def convolved(
     k1 += 2.0 * k2 * middle
     log_factor = k0 - 0.5 * np.log(a)
     for j in range(size):
-        gauge[j] = np.exp(phi[j] - phi[at]) if phi[j] != phi[at] else 1.0
+        gauge[j] = phi[j] - phi[at] if phi[j] != phi[at] else 0.0
+    exponentiate(gauge)
     if closed:
         if a != 1.0 or k1 != 0.0 or k2 != 0.0:
             return failed(variance, 0.0)

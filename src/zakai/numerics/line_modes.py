@@ -9,6 +9,7 @@ from numba import boolean, float64
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line_density import highest_of
 
 Array = NDArray[Any]
@@ -35,7 +36,8 @@ def decayed(rates: Array, time: float) -> Array:
         count += 1
     decay = np.empty(count)
     for n in range(count):
-        decay[n] = np.exp(-time * rates[n])
+        decay[n] = -time * rates[n]
+    exponentiate(decay)
     return decay
 
 
@@ -60,7 +62,9 @@ def decomposed(
     reach, top, highest, end, limit = 0.0, 0.0, 0.0, 0.0, _SUPPORT * now[at]
     after, inner = np.empty(now.size), np.empty(now.size)
     for j in range(now.size):
-        after[j] = np.exp(phi[j] - phi[at]) if phi[j] != phi[at] else 1.0
+        after[j] = phi[j] - phi[at]
+    exponentiate(after)
+    for j in range(now.size):
         inner[j] = now[j] / after[j]
         reach += inner[j] * inner[j]
         if not closed and (now[j] <= limit or j < 2 or j >= now.size - 2):

@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import helper, inlined
+from zakai.numerics.compiled import helper, inlined, summing
+from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line_averages import EARLY, IMPOSSIBLE, LATE, MEAN, MOST_MAGNUS, averaged, averaging
 from zakai.numerics.line_density import highest_of, moments
 from zakai.numerics.line_filters import filtered, taps_of, wrapped
@@ -140,7 +141,7 @@ def differences(b: Array, spacing: float, closed: bool, first: Array, second: Ar
             second[j] = two * (b[above] - 2.0 * b[j] + b[below])
 
 
-@helper
+@summing
 def residual(
     values: Array, b: Array, first: Array, second: Array, drift: Array, spread: float, spacing: float, tau: float
 ) -> float:
@@ -198,7 +199,7 @@ def split(
     """
     size, count, weight, part = now.size, 2 * int(substeps), 1.0 / (6.0 * substeps), spread / (2.0 * substeps)
     correction, negligible, clipped = spread / (72.0 * substeps**3), 1e-13 * now[highest_of(now)], 0.0
-    middle, joint, late, work = np.empty(size), np.empty(size), np.empty(size), np.ones(size)
+    early, middle, joint, late, work = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     for j in range(1, size):
         if narrow and not (abs(phi[j] - phi[j - 1]) + 5.0 * weight * abs(b[j] - b[j - 1]) < _STEEPEST):
             for i in (j - 1, j):
@@ -212,11 +213,18 @@ def split(
                 return np.inf, 1.0
             clipped = max(clipped, now[j])
             now[j], outer, gauge = 0.0, -_OVERFLOW, 0.0
-        now[j] *= np.exp(outer - gauge)
-        middle[j] = np.exp(4.0 * outer - correction * first[j] * first[j])
-        late[j] = np.exp(outer + gauge)
-        joint[j] = np.exp(2.0 * outer) if substeps > 1.0 else 1.0
-        work[j] = np.exp(gauge) if narrow else 1.0
+        early[j], late[j], joint[j], work[j] = outer - gauge, outer + gauge, 2.0 * outer, gauge
+        middle[j] = 4.0 * outer - correction * first[j] * first[j]
+    for exponents in (early, middle, late):
+        exponentiate(exponents)
+    if narrow:
+        exponentiate(work)
+    else:
+        work[:] = 1.0
+    if substeps > 1.0:
+        exponentiate(joint)
+    for j in range(size):
+        now[j] *= early[j]
     variance = part / (spacing * spacing)
     taps = taps_of(variance, depth, size, narrow)
     rounding, clipped = 0.0, clipped * 1e-13 / negligible

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper
+from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line_averages import IMPOSSIBLE
 from zakai.numerics.line_density import spectrum
 from zakai.numerics.line_segment import FAILED, OK, RANGE
@@ -123,12 +124,13 @@ def product(now: Array, b: Array) -> tuple[float, float, float]:
             best, top = logs[j] + b[j], j
     if not (best < np.inf and now[top] > _LEAST):
         return np.nan, growth, depth
-    reference, scale = np.log(largest), 1.0 / now[top]
+    reference, scale, factors = np.log(largest), 1.0 / now[top], np.empty(now.size)
     for j in range(now.size):
-        change = b[j] - b[top]
-        factor = np.exp(min(change, _OVERFLOW))
-        growth += factor
-        now[j] = now[j] * scale * factor if change < _OVERFLOW else np.exp(logs[j] + b[j] - best)
+        factors[j] = min(b[j] - b[top], _OVERFLOW)
+    exponentiate(factors)
+    for j in range(now.size):
+        growth += factors[j]
+        now[j] = now[j] * scale * factors[j] if b[j] - b[top] < _OVERFLOW else np.exp(logs[j] + b[j] - best)
         total += now[j]
     for j in range(now.size):
         now[j] /= total
