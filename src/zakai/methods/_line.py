@@ -23,7 +23,7 @@ from zakai.methods import _line_loop as loop
 from zakai.methods._line_cross import OMITTED
 from zakai.methods._line_domain import on_the_line, variable_of
 from zakai.methods._line_grids import SHARED
-from zakai.methods._line_model import System
+from zakai.methods._line_model import system_of
 from zakai.methods._line_moves import Report, by_decomposition, by_kernel, by_substeps
 from zakai.methods._line_prior import averaged
 from zakai.methods._line_system import (
@@ -71,7 +71,7 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
     """
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 1e-12 <= tolerance <= 0.1:
         raise InputError(f"option tolerance: {tolerance!r} must be a number from 1e-12 to 0.1")
-    system = System(on_the_line(model), schedule.inputs)
+    system = system_of(on_the_line(model)).given(schedule.inputs)
     # A sample may lead deep into the tails, where a small error counts; increments do not.
     negligible = 1e-13 if system.samples else float(np.clip(1e-6 * tolerance, 1e-13, 1e-10))
     if system.kinked_drift:  # the spectrum of a density falls slowly

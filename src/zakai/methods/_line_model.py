@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -121,17 +122,11 @@ def _rough(formula: sp.Expr, x: sp.Symbol) -> bool:
 class System:
     """The formulas of a model with one state as functions of points, times and parameters; `inputs` are those of a record."""
 
-    def __init__(self, model: Model, inputs: Inputs | None = None):
+    def __init__(self, model: Model):
         x, given = model.x[0], {model.t, *model.u}
-        self.model, self.inputs, self.m = model, inputs, model.m
+        self.model, self.m = model, model.m
         self.samples = model.observation_kind == "samples"
-        formulas = _formulas(model)
-        self.drift, self.covariance = self._bound(formulas.drift), self._bound(formulas.covariance)
-        self.observation, self.noise = self._bound(formulas.observation), self._bound(formulas.noise)
-        self.slope, self.spread = self._optional(formulas.slope), self._optional(formulas.spread)
-        self.cross, self.kinks = self._optional(formulas.cross), self._optional(formulas.kinks)
-        self.separated = None if formulas.separated is None else (self._bound(formulas.separated[0]), formulas.separated[1])
-        self.tabulated, self._outside = bool(formulas.outside), self._bound(formulas.outside)
+        self._bind(None)
         # Whether G depends on the state, and whether samples have a law that is not N(h, S(t)).
         self.state_dependent = STATE_DEPENDENT_DIFFUSION in model.features
         self.reflecting = any(interval.reflecting for interval in model.domain.values())
@@ -144,12 +139,30 @@ class System:
         self.rough = any(not _continuous(part, x) or _rough(part, x) for part in (model.drift[0], model.covariance[0]))
         self.moving = bool((model.drift.free_symbols | model.covariance.free_symbols) & given)
         self.steady_observation = not model.observation.free_symbols & given
+        self.steady_covariance = not model.covariance.free_symbols & given
         self.steady_noise = not model.observation_noise.free_symbols & given
         self.steady_cross = not (model.diffusion.free_symbols | model.cross_noise.free_symbols) & given
         # Whether the equation of an interval has constant coefficients, and whether they need not be computed for each.
         steady_noises = self.steady_observation and self.steady_noise and self.steady_cross
         self.steady = not self.moving and (self.samples or steady_noises)
         self.varying = not self.steady or self.cross is not None
+
+    def given(self, inputs: Inputs | None) -> System:
+        """Return the same with the inputs of a record."""
+        if inputs is None:
+            return self
+        found = copy(self)
+        found._bind(inputs)
+        return found
+
+    def _bind(self, inputs: Inputs | None) -> None:
+        self.inputs, formulas = inputs, _formulas(self.model)
+        self.drift, self.covariance = self._bound(formulas.drift), self._bound(formulas.covariance)
+        self.observation, self.noise = self._bound(formulas.observation), self._bound(formulas.noise)
+        self.slope, self.spread = self._optional(formulas.slope), self._optional(formulas.spread)
+        self.cross, self.kinks = self._optional(formulas.cross), self._optional(formulas.kinks)
+        self.separated = None if formulas.separated is None else (self._bound(formulas.separated[0]), formulas.separated[1])
+        self.tabulated, self._outside = bool(formulas.outside), self._bound(formulas.outside)
 
     def _bound(self, function: Function) -> Function:
         """Return a function of points, times and parameters alone."""
@@ -179,6 +192,12 @@ class System:
     def outside(self, points: Array, t: float, theta: Array) -> Array:
         """Return which points (N,) lead beyond the range of a table."""
         return self._outside(points[:, None], t, theta)
+
+
+@lru_cache(maxsize=32)
+def system_of(model: Model) -> System:
+    """Return the formulas of a model, made once."""
+    return System(model)
 
 
 def within(times: Array, start: float, stop: float) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from zakai.methods._line_system import Coefficients, Prepared
@@ -19,28 +21,24 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
     schedule, system, theta = prepared.schedule, prepared.system, prepared.theta
     count, seen, m = len(schedule), schedule.seen, system.m
     starts, lengths, stops = schedule.starts[:, None], prepared.lengths[:, None], schedule.stops[:, None]
-    nodes = starts + lengths * GAUSS_NODES if prepared.timed else np.full((count, 1), prepared.model.start)
-    nodes = np.clip(nodes, starts, np.nextafter(stops, starts)) if prepared.timed else nodes
-    ends = stops if system.samples else nodes
-    if not system.samples and prepared.timed and system.steady_observation and system.steady_noise:
-        ends = nodes[:, :1]
+    if prepared.timed:
+        nodes = np.clip(starts + lengths * GAUSS_NODES, starts, np.nextafter(stops, starts))
+        t = np.concatenate([nodes, stops, probed(starts, lengths)], axis=1)
+    else:
+        t = np.concatenate([np.full((count, 1), prepared.model.start), stops], axis=1)
+    size = len(GAUSS_NODES) if prepared.timed else 1
+    own, probes, ends = slice(size), slice(size + 1, None), slice(size, size + 1) if system.samples else slice(size)
+    if not system.samples and system.steady_observation and system.steady_noise:
+        ends = slice(1)
 
-    def covariance(t: np.ndarray) -> np.ndarray:
-        G = system.covariance(np.zeros((1, 1, 1)), t, theta)[..., 0, 0] if prepared.divides else np.zeros(1)
-        return np.array(np.broadcast_to(G, t.shape))
+    def everywhere(function: Callable[..., np.ndarray], steady: bool) -> np.ndarray:
+        """Return a function of time alone at all times."""
+        found = function(_X, t[:1, :1] if steady else t, theta)
+        return np.broadcast_to(found, (*t.shape, *found.shape[2:]))
 
-    def factors(t: np.ndarray) -> np.ndarray:
-        if prepared.mixed:  # the terms of the table are those at the nodes and at the end
-            rows = [len(GAUSS_NODES)] if system.samples and t.shape[1] == 1 else range(t.shape[1])
-            return np.broadcast_to(np.eye(len(GAUSS_NODES) + 1)[rows], (count, t.shape[1], len(GAUSS_NODES) + 1)).copy()
-        assert system.separated is not None
-        found: np.ndarray = system.separated[0](_X, t, theta)
-        return np.array(np.broadcast_to(found, (*t.shape, found.shape[-1])))
-
-    def precision(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def precision(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if system.general:  # the loop takes only intervals without observations
-            return np.zeros((*t.shape, m, m)), np.zeros(count)
-        noise = np.broadcast_to(system.noise(_X, t, theta), (*t.shape, m, m))
+            return np.zeros((*noise.shape[:2], m, m)), np.zeros(count)
         both = (seen[:, :, None] & seen[:, None])[:, None]
         block = np.where(both, noise, 0.0) + np.eye(m) * ~seen[:, None, :, None]
         constant = np.zeros(count)
@@ -48,15 +46,20 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
             constant = -0.5 * (np.linalg.slogdet(block[:, 0])[1] + np.log(2 * np.pi) * seen.sum(axis=1))
         return np.where(both, np.linalg.inv(block), 0.0), constant
 
-    drifts, outputs, covariances, (precisions, constants) = factors(nodes), factors(ends), covariance(nodes), precision(ends)
+    if prepared.mixed:  # the terms of the table are those at the nodes and at the end
+        factors = np.broadcast_to(np.eye(size + 1), (count, size + 1, size + 1))
+    else:
+        assert system.separated is not None
+        factors = everywhere(system.separated[0], False)
+    G = everywhere(system.covariance, system.steady_covariance)[..., 0, 0] if prepared.divides else np.zeros(t.shape)
+    noise = everywhere(system.noise, system.steady_noise)
+    precisions, constants = precision(noise[:, ends])
     good = np.ones(count, bool)
     if prepared.timed and count:
-        t = probed(starts, lengths)
-        good &= resolved(covariance(t)[..., None], covariances[..., None])
-        if not prepared.mixed:
-            good &= resolved(factors(t), factors(nodes))
-        if not system.samples and not system.steady_noise:
-            good &= resolved(precision(t)[0], precisions)
+        good &= system.steady_covariance or resolved(G[:, probes, None], G[:, own, None])
+        good &= prepared.mixed or resolved(factors[:, probes], factors[:, own])
+        good &= system.samples or system.steady_noise or resolved(precision(noise[:, probes])[0], precisions)
+    drifts, outputs, covariances = (np.array(part, order="C") for part in (factors[:, own], factors[:, ends], G[:, own]))
     return Coefficients(drifts, outputs, covariances, precisions, constants, good)
 
 
