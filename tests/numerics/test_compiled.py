@@ -1,10 +1,23 @@
 """Compilation of kernels."""
 
+import time
+
 import numpy as np
 from numba import float64
 
-from zakai.numerics.compiled import kernel
+from zakai.numerics.compiled import kernel, working_time
 from zakai.numerics.exponentials import exponentiate
+
+
+def test_the_clock_of_work_stands_still_while_a_kernel_is_compiled():
+    names = {}
+    exec("def advance(x):\n    return x + 1.0", names)  # from no file, so that nothing is read from a cache
+    advance = kernel(float64(float64))(names["advance"])
+    worked, began = working_time(), time.monotonic()
+    assert advance(1.0) == 2.0
+    time.sleep(0.02)
+    worked, spent = working_time() - worked, time.monotonic() - began
+    assert 0.02 <= worked < 0.5 * spent
 
 
 def test_exponentials_of_arrays_are_those_of_numpy():

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 import os
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from threading import Lock, Timer
+from threading import Event, Lock, Thread
 
 from zakai._progress import bar
 from zakai.engine.loop import Run
+from zakai.numerics.compiled import working_time
 
 LONG = 10.0  # seconds of work that are announced
 FIRST = 10.0  # seconds after which a first observation that is not done is announced
@@ -32,19 +32,18 @@ def filter_all(runs: Sequence[Run], progress: Progress | None, blocks: float = 1
     threads = min(os.cpu_count() or 1, len(runs))
     with bar("filtering") if progress is None else nullcontext(progress) as advance:
         watch = _Watch(sum(len(run.schedule) for run in runs), threads, advance, blocks)
-        first = Timer(FIRST, watch.report_nothing, runs[:1])
-        first.daemon = True
-        first.start()
+        finished = Event()
+        Thread(target=watch.report_nothing, args=(runs[:1], finished), daemon=True).start()
         try:
             if threads == 1:
                 for run in runs:
                     run.all(watch.report)
                 return
             with ThreadPoolExecutor(threads) as pool:
-                for finished in [pool.submit(run.all, watch.report) for run in runs]:
-                    finished.result()
+                for one in [pool.submit(run.all, watch.report) for run in runs]:
+                    one.result()
         finally:
-            first.cancel()
+            finished.set()
 
 
 class _Watch:
@@ -57,11 +56,17 @@ class _Watch:
         self.began, self.waiting = 0.0, threads
         self.slow = 0  # successive measurements by which the rest takes long
 
-    def report_nothing(self, run: Run) -> None:
-        """Log that the first observation takes long, with what shortens it."""
-        if self.done == 0:
-            name, shorter = run.setting.method.name, run.setting.method.shorter
-            _LOG.warning("%s: the first observation takes more than %.0f s; to shorten it, %s", name, FIRST, shorter)
+    def report_nothing(self, runs: Sequence[Run], finished: Event) -> None:
+        """Log that the first observation of runs takes long, with what shortens it, unless they finish before."""
+        began = working_time()
+        while runs and self.done == 0:
+            left = FIRST - (working_time() - began)
+            if left <= 0.0:
+                name, shorter = runs[0].setting.method.name, runs[0].setting.method.shorter
+                _LOG.warning("%s: the first observation takes more than %.0f s; to shorten it, %s", name, FIRST, shorter)
+                return
+            if finished.wait(max(left, 0.1)):
+                return
 
     def report(self, run: Run, count: int) -> None:
         """Add intervals that a run has done; log once that the rest takes long, with what shortens it."""
@@ -70,14 +75,14 @@ class _Watch:
             done, total = round(self.done / self.blocks), round(self.total / self.blocks)
             if self.progress is not None:
                 self.progress(min(done, total), total)
-            now = time.monotonic()
-            if self.waiting:  # the first interval of a thread waits for what it compiles: it says nothing of the others
+            now = working_time()
+            if self.waiting:  # the first interval of a thread waits for what it prepares: it says nothing of the others
                 self.began, self.counted, self.waiting = now, self.done, self.waiting - 1
             spent = now - self.began
             if spent <= SURE or self.slow == 2:
                 return
             left = spent / (self.done - self.counted) * (self.total - self.done)
-            # Two successive measurements: other kernels may be compiled during the first.
+            # Two successive measurements: other grids may be prepared during the first.
             self.began, self.counted, self.slow = now, self.done, self.slow + 1 if left > LONG else 0
             if self.slow == 2:
                 name, shorter = run.setting.method.name, run.setting.method.shorter

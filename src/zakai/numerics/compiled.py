@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar, cast
@@ -19,6 +20,35 @@ _compiler: Any = partial(njit, nogil=True, error_model="numpy", no_cfunc_wrapper
 
 # Sums may be taken in any order, so that several terms are added at once; the order depends on the processor and the size alone.
 _REORDERED: Any = frozenset({"reassoc", "nsz", "contract"})
+
+
+class _Compilation:
+    """The seconds that this process has spent compiling."""
+
+    def __init__(self) -> None:
+        self.depth, self.before, self.since = 0, 0.0, 0.0
+
+    def __enter__(self) -> None:
+        if self.depth == 0:
+            self.since = time.monotonic()
+        self.depth += 1
+
+    def __exit__(self, *error: object) -> None:
+        self.depth -= 1
+        if self.depth == 0:
+            self.before += time.monotonic() - self.since
+
+    def seconds(self) -> float:
+        """Return the seconds until now."""
+        return self.before + (time.monotonic() - self.since if self.depth else 0.0)
+
+
+_compilation = _Compilation()
+
+
+def working_time() -> float:
+    """Return a clock in seconds that stands still while kernels are compiled."""
+    return time.monotonic() - _compilation.seconds()
 
 
 def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -> Callable[[Callable[..., R]], Callable[..., R]]:
@@ -49,7 +79,7 @@ def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -
             pairs = zip(arguments, expected, strict=True)
             if any(dispatcher.typingctx.can_convert(given, wanted) is None for given, wanted in pairs):
                 raise TypeError(f"{function.__name__}{arguments}: the kernel takes {expected}")
-            with global_compiler_lock:  # threads of a batch come here together
+            with global_compiler_lock, _compilation:  # threads of a batch come here together
                 known = dispatcher.overloads.get(tuple(expected))
                 if known is not None:
                     return known.entry_point
