@@ -1,6 +1,6 @@
 """The latency of one observation of an online filter, in process, after a warm-up.
 
-    python benchmarks/online.py [--observations 1000000] [--systems spiral kalman] [--watch]
+    python benchmarks/online.py [--observations 20000] [--systems spiral kalman] [--watch]
 
 The spiral sensor (one state, time-varying, a new filter every 1,000 observations) by the method that `auto` takes, and a
 Kalman-Bucy filter of four states.  Linear algebra has one thread (OMP_NUM_THREADS=1), and the garbage of the warm-up is frozen
@@ -26,7 +26,7 @@ import numpy as np
 
 import zakai
 
-WARM = 5000
+WARM = 2000
 BATCH = 10_000
 STEP = 0.01
 LIFE = 1000  # observations after which the spiral starts again: its drift, t x / 40, takes the state from every sensor
@@ -116,7 +116,7 @@ def measure(name: str, count: int, watch: bool) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--observations", type=int, default=1_000_000)
+    parser.add_argument("--observations", type=int, default=20_000)
     parser.add_argument("--systems", nargs="+", choices=["spiral", "kalman"], default=["spiral", "kalman"])
     parser.add_argument("--watch", action="store_true")
     arguments = parser.parse_args()
