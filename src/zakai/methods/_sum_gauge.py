@@ -95,14 +95,20 @@ class SumGauge:
         """Return phi at the points z (..., n)."""
         return np.asarray(self._potential(self.origin + z, t, theta))
 
+    def terms(self, t: float, theta: Array) -> tuple[Array, Array]:
+        """Return c (E,) and q (E, n) of e^phi = sum_e exp(c_e + q_e.z), where it is exact."""
+        if self.none:
+            return np.zeros(1), np.zeros((1, self.n))
+        numbers = self._numbers(self.origin, t, theta)
+        return numbers[:, 0], numbers[:, 1:]
+
     def lift(self, v: Components, t: float, theta: Array) -> Components:
         """Return the components of u = e^phi v: `count` for each of v, one after another."""
         if self.none:
             return v
         if not self.exact:
             return refit(v, lambda z, _: self.potential(z, t, theta), self.directions, True, agreed=_AGREED).sum
-        numbers = self._numbers(self.origin, t, theta)
-        return tilted(v, numbers[:, 0], numbers[:, 1:])
+        return tilted(v, *self.terms(t, theta))
 
     def divide(self, u: Components, t: float, theta: Array) -> Components:
         """Return components of v = e^-phi u, each with its moments: for the start, where u is given.
@@ -113,8 +119,7 @@ class SumGauge:
             return u
         if not self.exact:
             return refit(u, lambda z, _: -self.potential(z, t, theta), self.directions, True, agreed=_AGREED).sum
-        numbers = self._numbers(self.origin, t, theta)
-        constants, slopes = numbers[:, 0], numbers[:, 1:]
+        constants, slopes = self.terms(t, theta)
         largest = np.argmax((constants + u.means @ slopes.T).real, axis=1)
         constant, slope = constants[largest], slopes[largest]
         across = dot(u.covs, slope[:, None, :])

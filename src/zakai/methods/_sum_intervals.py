@@ -80,10 +80,14 @@ def advance(
             product = prepared.moment(k, t0).multiply(v, factor, values, start=True)
             v, moved = product.sum, average(shares(product.sum)[0], product.moved)
         if t1 > t0:
-            inputs = np.ones(1)
-            if static.system.rates:
-                inputs = np.append(inputs, np.where(schedule.inside[row], values, 0.0) / schedule.lengths[row])
-            v = move(at(intervals.transitions, row), v, inputs, static.angles)
+            v = move(at(intervals.transitions, row), v, inputs_of(static, schedule, row, values), static.angles)
         v, info = prepared.moment(k, t1).update(v, factor, values, most, edge, moved)
         log_likelihood = log_likelihood + info.log_likelihood_increment
     return v, info._replace(log_likelihood_increment=log_likelihood)
+
+
+def inputs_of(static: Sum, schedule: Schedule, row: int, values: Array) -> Array:
+    """Return what drives the equation over an interval: one, and for affine h the rates of the increments."""
+    if not static.system.rates:
+        return np.ones(1)
+    return np.append(1.0, np.where(schedule.inside[row], values, 0.0) / schedule.lengths[row])

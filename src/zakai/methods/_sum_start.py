@@ -19,6 +19,7 @@ from zakai.models.prior import DensityPrior, GaussianPrior
 from zakai.numerics.gaussian_sum import Array, Components, components, joined, moments, regression, selected, shares
 from zakai.numerics.prior_grid import prior_grid
 from zakai.numerics.sum_quadrature import refit
+from zakai.numerics.sum_reduction import PRUNED, gathered, groups
 
 # The width of a narrow Gaussian in spacings of its grid: a flat sum of them is flat to 2 exp(-2 pi^2 0.8^2) = 7e-6.
 WIDTH = 0.8
@@ -179,6 +180,16 @@ def _cut_density(model: Model, prior: DensityPrior, origin: Array, theta: Array)
     kept = share > 1e-30 * share.max()
     edge = _outermost(tuple(len(line) for line in lines), closed)
     return selected(sum_._replace(means=sum_.means - origin), kept), edge[kept]
+
+
+def merged(sum_: Components, share: Array, loss: Array, most: int, angles: tuple[int, ...]) -> Components:
+    """Return the narrow Gaussians merged to at most `most`."""
+    if len(share) <= most:
+        return sum_
+    used = share > 0.01 * PRUNED / len(share)
+    few = selected(sum_, used)
+    label, _ = groups(share[used], few.means.real, few.covs.real, loss[used], most, angles)
+    return gathered(few, label, angles)
 
 
 def given(model: Model, prior: Any, origin: Array) -> Components:

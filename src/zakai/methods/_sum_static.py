@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from copy import copy
+from functools import cached_property, lru_cache
 
 import numpy as np
+import sympy as sp
 
 from zakai.errors import InputError
 from zakai.methods._sum_gauge import SumGauge, directions_of, span
@@ -47,6 +49,14 @@ class Sum:
         self.split_time = not self.system.rates and not self.system.sampled
         # Whether components are split before each observation rather than after it.
         self.split_before = self.system.sampled and bool(self.directions.shape[1]) and self.split_merge
+
+    @cached_property
+    def plain(self) -> Sum:
+        """The same for sums that need no gauge, and whose angles are any real numbers."""
+        other = copy(self)
+        other.angles = ()
+        other.gauge = SumGauge(sp.Integer(0), self.model, self.system.origin)
+        return other
 
     def limits(self, count: int) -> tuple[int, int]:
         """Return how many components the sum and its companion may have, for a prior that was cut into `count` Gaussians."""

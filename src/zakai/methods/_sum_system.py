@@ -75,8 +75,8 @@ class System:
         self.rates = self.affine and not self.sampled and not self.lie
         # Whether a part of the factor of an increment is at the start of its interval.
         self.halves = not self.lie and not self.rates and not self.sampled
-        self.origin, deviation = _centre(model)
-        self.probes = self.origin + np.random.default_rng(0).standard_normal((8, n)) * deviation
+        self.origin, self.scale = _centre(model)
+        self.probes = self.origin + np.random.default_rng(0).standard_normal((8, n)) * self.scale
         self.potential, self.sensors = yau.form.potential, Sensors.of(model)
         centre = sp.Matrix([sp.Rational(float(value)) for value in self.origin])
         blocks = [yau.form.matrix, yau.form.offset + yau.form.matrix * centre, model.covariance]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,13 +18,12 @@ from zakai.numerics.gaussian_sum import (
     Components,
     dot,
     joined,
-    log_volumes,
     moments,
     regression,
     selected,
     shares,
-    solve,
     symmetric,
+    weighed,
     wrapped,
 )
 from zakai.numerics.sum_curvature import Curvature, curvature
@@ -56,16 +56,13 @@ _STEEP, _COUNTED = 32.0, 1e-2
 def move(transition: Transition, v: Components, inputs: Array, angles: tuple[int, ...]) -> Components:
     """Return every component after the transition: weigh by exp(-z'Omega z / 2 + eta.z + c), map, add noise."""
     offset, vector = transition.offset @ inputs, transition.vector @ inputs
-    means, covs, logs = v.means, v.covs, v.log_weights + inputs @ transition.constant @ inputs
+    constant = inputs @ transition.constant @ inputs
     if np.any(transition.information) or np.any(vector):
-        pulled = means @ transition.information
-        system = np.eye(means.shape[1]) + covs @ transition.information
-        covs, gradient = symmetric(solve(system, covs)), vector - pulled
-        shift = dot(covs, gradient[:, None, :])
-        logs = logs + means @ vector - 0.5 * dot(means, pulled) + 0.5 * dot(gradient, shift) - 0.5 * log_volumes(system)
-        means = means + shift
-    covs = symmetric(transition.map @ covs @ transition.map.T) + transition.noise
-    return Components(logs, wrapped(means @ transition.map.T + offset, angles), covs, v.signs)
+        v = weighed(v, constant, vector, transition.information)
+    else:
+        v = v._replace(log_weights=v.log_weights + constant)
+    covs = symmetric(transition.map @ v.covs @ transition.map.T) + transition.noise
+    return Components(v.log_weights, wrapped(v.means @ transition.map.T + offset, angles), covs, v.signs)
 
 
 def average(share: Array, figures: Array) -> float:
@@ -78,7 +75,8 @@ def losses(curved: Curvature, share: Array) -> Array:
     return curved.residual / (average(share, curved.linear) + 1e-300)
 
 
-class Moment(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Moment:
     """A time with the parameters, S^-1 (m, m), the inputs and the observation there, for what is done to a sum at that time."""
 
     static: Sum
@@ -154,7 +152,7 @@ class Moment(NamedTuple):
         self, v: Components, factor: Factor, values: Array, most: int, edge: Array, moved: float
     ) -> tuple[Components, Info]:
         """Return the sum after the factor at the end of an interval, at most `most` components, and what the step reports."""
-        self, static = self._replace(values=values.real), self.static
+        self, static = replace(self, values=values.real), self.static
         curved = bool(static.directions.shape[1])
         health = dict.fromkeys(("nonlinearity", "quadrature", "pruned", "merged"), 0.0)
         health["without_law"] = 0.0 if factor.law is None else self._share(v, partial(_lawless, factor.law, values))

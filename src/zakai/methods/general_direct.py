@@ -19,13 +19,13 @@ from zakai.errors import InputError
 from zakai.methods import _sum_start as start
 from zakai.methods._options import one_of, real_number, whole_number
 from zakai.methods._protocol import Info, Method
+from zakai.methods._sum_backward import BACKWARD
 from zakai.methods._sum_intervals import Prepared, advance, prepared_of
 from zakai.methods._sum_static import Sum, sum_of
 from zakai.methods._sum_update import SPLIT_FACTOR
 from zakai.models import features
 from zakai.models.model import Model
 from zakai.numerics.gaussian_sum import Array, Components, selected, shares, wrapped
-from zakai.numerics.sum_reduction import PRUNED, gathered, groups
 from zakai.records.schedule import Schedule
 
 TOLERANCE = 1e-3
@@ -133,7 +133,7 @@ def init(prepared: Prepared, prior: Any) -> State:
         # Before a sample there are as many as while it is used.
         factor = SPLIT_FACTOR if static.split_before else 1
         counts = most if static.split_time else dict.fromkeys(most)
-        sums = [_merged(narrow, share, loss, factor * count, static.angles) for count in counts]
+        sums = [start.merged(narrow, share, loss, factor * count, static.angles) for count in counts]
         error = start.difference(gauge.lift(sums[0], t, theta), start.given(model, prior, origin), static.angles)
         if doubt is not None:
             error = max(error, float(np.max(doubt(u))))
@@ -142,16 +142,6 @@ def init(prepared: Prepared, prior: Any) -> State:
     edge = edge if static.affine and len(edge) <= most[0] else np.zeros(0)
     second = sums[1] if len(sums) > 1 else selected(sums[0], slice(0))
     return State(sums[0], second, np.array(most), edge, error, 0.0, t)
-
-
-def _merged(sum_: Components, share: Array, loss: Array, most: int, angles: tuple[int, ...]) -> Components:
-    """Return the narrow Gaussians merged to at most `most`."""
-    if len(share) <= most:
-        return sum_
-    used = share > 0.01 * PRUNED / len(share)
-    few = selected(sum_, used)
-    label, _ = groups(share[used], few.means.real, few.covs.real, loss[used], most, angles)
-    return gathered(few, label, angles)
 
 
 def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
@@ -236,6 +226,7 @@ METHOD = Method(
     state=State,
     bounds=BOUNDS,
     valid=valid,
+    backward=BACKWARD,
     shorter="give fewer components",
     handles=features.OF_OBSERVATION | {features.INPUTS, features.JUMPS, features.KINKS, features.SINC, features.TABLES},
 )

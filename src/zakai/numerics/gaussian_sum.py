@@ -139,6 +139,16 @@ def symmetric(matrices: Array) -> Array:
     return 0.5 * (matrices + np.swapaxes(matrices, -1, -2))
 
 
+def weighed(sum_: Components, logs: Any, slopes: Array, information: Array) -> Components:
+    """Return each component times exp(log + slope.x - x'information x / 2); the arguments may be one for all components."""
+    pulled = slopes - np.squeeze(information @ sum_.means[..., None], -1)
+    system = np.eye(sum_.means.shape[1]) + sum_.covs @ information
+    covs = symmetric(solve(system, sum_.covs))
+    shift = dot(covs, pulled[:, None, :])
+    logs = sum_.log_weights + logs + 0.5 * dot(sum_.means, slopes + pulled) + 0.5 * dot(pulled, shift)
+    return Components(logs - 0.5 * log_volumes(system), sum_.means + shift, covs, sum_.signs)
+
+
 def tilted(sum_: Components, constants: Array, slopes: Array) -> Components:
     """Return the sum times sum_j exp(c_j + q_j.x): J components for each of the sum, one after another.
 
