@@ -193,6 +193,26 @@ def test_a_drift_with_another_theorem_has_the_same_smoother():
     np.testing.assert_allclose(one.variance, other.variance, atol=1e-12)
 
 
+def test_the_one_shot_form_has_the_smoother_of_the_stepwise_form():
+    weights, means, covs = [0.4, 0.6], [[1, 0], [-1, 1]], [[[0.5, 0], [0, 0.3]], [[0.1, 0], [0, 0.5]]]
+    two = zakai.Model(
+        state=["x", "y"], drift=["-x + y", "-y"], observation=["x + 1", "y"],
+        prior={"kind": "mixture", "weights": weights, "means": means, "covs": covs},
+    )  # fmt: skip
+    one = zakai.Model(
+        state=["x"], drift=["-x"], observation=["x"], prior={"kind": "gaussian", "mean": [1.0], "cov": [[0.3]]}
+    )
+    for model, theorem in ((two, "theorem-4"), (two, "theorem-5"), (one, "theorem-6")):
+        values = 0.1 * np.arange(3.0 * model.n).reshape(3, model.n)
+        record = zakai.Record([0.1, 0.4, 0.5], values, "increments")
+        shot, steps = (zakai.smooth(model, record, "hu-yau", form=form, theorem=theorem) for form in ("one-shot", "stepwise"))
+        np.testing.assert_allclose(shot.mean, steps.mean, atol=1e-11)
+        np.testing.assert_allclose(shot.cov, steps.cov, atol=1e-11)
+        np.testing.assert_allclose(shot.density(1).mean(), steps.mean[1], atol=1e-11)
+        np.testing.assert_allclose(shot.sample_paths(5, seed=1), steps.sample_paths(5, seed=1), atol=1e-9)
+        assert shot.warnings == [] and shot.health["evidence_error"][1:].max() < 1e-11
+
+
 def test_blocks_are_smoothed_one_by_one():
     def model(state, drift, prior):
         return zakai.Model(state=state, drift=drift, observation=state, observation_kind="samples", prior=prior)
@@ -232,8 +252,6 @@ def test_a_method_or_a_form_without_a_backward_pass_is_refused():
         zakai.smooth(line, record, "gaussian-sum", reduction="nnls")
     with pytest.raises(zakai.InputError, match='riccati="euler" has no backward pass'):
         zakai.smooth(line, record, "extended-kalman-bucy", riccati="euler")
-    with pytest.raises(zakai.InputError, match='take form="stepwise"'):
-        zakai.smooth(line, record, "hu-yau", form="one-shot")
 
 
 def test_a_result_is_stored_and_read(tmp_path):

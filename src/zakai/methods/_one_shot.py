@@ -164,13 +164,14 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     sigma = _sigma(prepared, new)
     found = posterior(base.gauge, tilts_at(base.tilts, k), base.stops[k], sigma)
     health = families.health_of(own_state, sigma, found)
-    health = {"lost_digits": _rounding(own, new), **health}
+    health = {"lost_digits": rounding(prepared, new), **health}
     increment = found.log_mass - state.log_scale
     return new._replace(log_scale=np.asarray(found.log_mass)), Info(increment, found.mean + base.setup.origin, found.cov, health)
 
 
-def _rounding(k: Constants, state: State) -> float:
+def rounding(prepared: Prepared, state: State) -> float:
     """Return the rounding, in nats, of the terms that cancel in the evidence: that of each interval grows with the statistics."""
+    k = prepared.constants
     terms = k.intercept @ state.y, state.c, (np.abs(state.a) + np.abs(k.slope.T @ state.y)) @ np.abs(state.b)
     return float(state.steps * np.finfo(float).eps * sum(abs(term) for term in terms))
 
@@ -181,6 +182,13 @@ def _sigma(prepared: Prepared, state: State) -> Family:
     found = families.times_gauge(state.own.families, setup, -1.0)
     constant = k.intercept @ state.y - state.c + (state.a + k.slope.T @ state.y) @ state.b
     return weigh(found._replace(mean=found.mean + state.b), np.zeros((len(state.b),) * 2), -state.a, constant)
+
+
+def stepwise(prepared: Prepared, state: State) -> families.State:
+    """Return the same density as a state of the stepwise form."""
+    found = _sigma(prepared, state)
+    found = families.times_gauge(found._replace(log_mass=found.log_mass - state.log_scale), prepared.base.setup, 1.0)
+    return families.State(*found, state.own.log_error, state.own.edge, state.own.time)
 
 
 def density(prepared: Prepared, state: State) -> Density:

@@ -13,7 +13,6 @@ stable over any time; Theorems 4 and 5 then are one method, for e^F cancels.  `f
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -29,7 +28,7 @@ from zakai.methods import _one_shot as one_shot
 from zakai.methods._affine_system import AffineSystem
 from zakai.methods._gaussian_backward import BACKWARD, Message
 from zakai.methods._options import one_of, real_number
-from zakai.methods._protocol import Info, Method
+from zakai.methods._protocol import Backward, Info, Method
 from zakai.models.features import INPUTS
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
@@ -130,7 +129,7 @@ def step(prepared: Prepared, k: int, state: Any, values: Array) -> tuple[Any, In
     if isinstance(prepared, one_shot.Prepared):
         return one_shot.step(prepared, k, state, values)
     state, info = families.step(prepared, k, state, values)
-    return state, _without_loss(info)
+    return state, info._replace(health={"lost_digits": 0.0, **info.health})
 
 
 def density(prepared: Prepared, state: Any) -> Density:
@@ -140,23 +139,40 @@ def density(prepared: Prepared, state: Any) -> Density:
     return families.density(prepared, state)
 
 
-def message(prepared: Prepared, state: Any) -> Message:
-    """Return the message of the backward pass at the last time."""
+def _stepwise(prepared: Any, state: Any) -> tuple[Any, Any]:
+    """Return what the stepwise form prepares, and the state in that form."""
     if isinstance(prepared, one_shot.Prepared):
-        raise InputError(
-            f'{prepared.base.model.source}: option form: "one-shot" has no smoother; take form="stepwise"'
-        )
-    return BACKWARD.message(prepared, state)
+        return prepared.base, one_shot.stepwise(prepared, state)
+    return prepared, state
+
+
+def message(prepared: Any, state: Any) -> Message:
+    """Return the message of the backward pass at the last time."""
+    return BACKWARD.message(*_stepwise(prepared, state))
+
+
+def backward(prepared: Any, k: int, later: Message, values: Array, state: Any) -> Message:
+    """Return the message at the start of interval k, which needs no state."""
+    return BACKWARD.step(prepared.base if isinstance(prepared, one_shot.Prepared) else prepared, k, later, values, state)
 
 
 def smoothed(prepared: Any, state: Any, later: Message) -> tuple[Message, Info]:
     """Return the message normalised, and the smoothed moments."""
-    own, info = BACKWARD.smoothed(prepared, state, later)
-    return own, _without_loss(info)
+    lost = one_shot.rounding(prepared, state) if isinstance(prepared, one_shot.Prepared) else 0.0
+    own, info = BACKWARD.smoothed(*_stepwise(prepared, state), later)
+    return own, info._replace(health={"lost_digits": lost, **info.health})
 
 
-def _without_loss(info: Info) -> Info:
-    return info._replace(health={"lost_digits": 0.0, **info.health})
+def smoothed_density(prepared: Any, state: Any, later: Message) -> Density:
+    """Return the smoothed density."""
+    return BACKWARD.density(*_stepwise(prepared, state), later)
+
+
+def draw(prepared: Any, k: int, later: Array, values: Array, state: Any, rng: np.random.Generator) -> tuple[Array, float]:
+    """Return draws of the state at the start of interval k given those at its end."""
+    assert BACKWARD.draw is not None
+    base, own = _stepwise(prepared, state)
+    return BACKWARD.draw(base, k, later, values, own, rng)
 
 
 BOUNDS: Mapping[str, tuple[float, str]] = {
@@ -164,7 +180,7 @@ BOUNDS: Mapping[str, tuple[float, str]] = {
     "lost_digits": (1e-6, 'rounding of the evidence in nats, as the statistics of one shot cancel; take form="stepwise"'),
 }
 
-# An online filter and a smoother need the stepwise form, whose state is that of the families.
+# An online filter needs the stepwise form, whose state is that of the families.
 METHOD: Method[Prepared, Any] = Method(
     name="hu-yau",
     source="Hu and Yau 2002, Theorems 3 to 6, corrected; any prior: Makowski 1986",
@@ -180,5 +196,5 @@ METHOD: Method[Prepared, Any] = Method(
     absolute=lambda options: bool(options["form"] == "one-shot"),
     valid=cast(Any, families.valid),
     handles=frozenset({INPUTS}),
-    backward=replace(cast(Any, BACKWARD), message=message, smoothed=smoothed, segment=None),
+    backward=Backward(message, backward, smoothed, smoothed_density, draw=draw),
 )
