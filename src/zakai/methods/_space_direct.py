@@ -55,7 +55,7 @@ class Prepared(base.Prepared):
         values = np.exp(found.log_values - np.max(found.log_values.real))
         values, grid = opened(values, Grid(found.centre, found.basis, values.shape, found.closed))
         error = found.error if found.error > 1e-6 else 0.0
-        return self._started(positive(self._folded(Field(values, grid, 0.0)), self.bounds), error)
+        return self.started(positive(self._folded(Field(values, grid, 0.0)), self.bounds), error)
 
     def density(self, state: State) -> Field:
         """Return the posterior on a grid, folded onto the circle where it is wide."""

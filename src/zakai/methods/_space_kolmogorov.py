@@ -71,9 +71,9 @@ class Prepared:
         values = np.exp(found.log_values - np.max(found.log_values.real))
         error = found.error if found.error > 1e-6 else 0.0
         grid = Grid(found.centre, found.basis, values.shape, found.closed)
-        return self._started(positive(Field(values, grid, 0.0), self.bounds), error)
+        return self.started(positive(Field(values, grid, 0.0), self.bounds), error)
 
-    def _started(self, field: Field, error: float) -> State:
+    def started(self, field: Field, error: float) -> State:
         """Return the state of a prior."""
         mass, control = field.values.sum() * field.grid.cell, Control(np.inf, 0.0, 0)
         return self._state(field, mass, control, np.zeros(self.model.n), error, 0.9)

@@ -21,6 +21,7 @@ import numpy as np
 from zakai.algebra.theorems import kolmogorov_series as theorem
 from zakai.densities import GridDensity
 from zakai.errors import InputError
+from zakai.methods._borrowed_backward import OF_MESSAGE, borrowed
 from zakai.methods._heat_series import FORMS
 from zakai.methods._kolmogorov_transition import (
     FEW,
@@ -250,6 +251,23 @@ def valid(prepared: Prepared, state: State) -> bool:
     return fits and bool(np.isfinite(numbers).all()) and state.unit > 0
 
 
+BOUNDS = {
+    "edge_mass": (1e-9, "probability in the outermost points of the grid"),
+    "quadrature_error": (1e-9, "the grid is too coarse for the density"),
+    "truncation": (1e-4, "the estimated error of the composed series over one interval; set substeps to more, or to None"),
+    "negative_mass": (1e-12, 'share of the density that became negative and was cut; set form to "log"'),
+    "tail_depth": (18.0, "nats below its maximum at which the density lies after an observation: the series is cut there"),
+    "time_quadrature_error": (1e-5, "nats: coefficients vary too fast within an interval to be integrated"),
+    "splitting_error": (0.02, "deviations of the mean, or nats, by which the splitting is off; give shorter intervals"),
+}
+
+
+def accuracy(prepared: Prepared) -> float:
+    """Return the error of the evidence that one interval may leave."""
+    sampled = prepared.system.model.observation_kind == "samples"
+    return BOUNDS["truncation" if sampled else "splitting_error"][0]
+
+
 METHOD = Method(
     name="kolmogorov-series",
     source="Yau 1993, Theorems 10 to 12, in the logarithmic form; the likelihood online",
@@ -262,15 +280,8 @@ METHOD = Method(
     step=step,
     density=density,
     state=State,
-    bounds={
-        "edge_mass": (1e-9, "probability in the outermost points of the grid"),
-        "quadrature_error": (1e-9, "the grid is too coarse for the density"),
-        "truncation": (1e-4, "the estimated error of the composed series over one interval; set substeps to more, or to None"),
-        "negative_mass": (1e-12, 'share of the density that became negative and was cut; set form to "log"'),
-        "tail_depth": (18.0, "nats below its maximum at which the density lies after an observation: the series is cut there"),
-        "time_quadrature_error": (1e-5, "nats: coefficients vary too fast within an interval to be integrated"),
-        "splitting_error": (0.02, "deviations of the mean, or nats, by which the splitting is off; give shorter intervals"),
-    },
+    bounds={**BOUNDS, **OF_MESSAGE},
     shorter="set order to 3 or give shorter records",
     valid=valid,
+    backward=borrowed(density, accuracy),
 )

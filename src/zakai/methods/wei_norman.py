@@ -20,6 +20,7 @@ import numpy as np
 
 from zakai.algebra.exponentials import wei_norman_filter as theorem
 from zakai.densities import GridDensity
+from zakai.methods._borrowed_backward import OF_MESSAGE, borrowed
 from zakai.methods._options import whole_number
 from zakai.methods._protocol import Info, Method
 from zakai.methods._residuals import Factor
@@ -98,7 +99,6 @@ def prepare(model: Model, schedule: Schedule, theta: Array, *, points: int | Non
     """
     if points is not None:
         whole_number("points", points, 16, 4096)
-    theta = np.asarray(theta)
     system = kept(model, System, lambda: System(model, theta), (theta.tobytes(), theta.dtype.str), KEPT)
     return Prepared(system, schedule, schedule.lengths, points)
 
@@ -197,8 +197,8 @@ def _part(
     ranging = np.ptp(drive.real[matters]) if matters.any() else 0.0
     stable = sinc_grid.STABLE / generator.size(field.spacing)
     fastest = max(np.max(np.abs(one.real[matters]), initial=0.0) / d for one, d in zip(f, field.spacing * sizes))
-    limits = [left, max(stable, min(8 * stable, TRAVEL / max(fastest, 1e-300)))]
-    tau = float(np.nanmin([*limits, DRIVE / max(ranging, 1e-300), STEP / max(system.speed, 1e-300)]))
+    longest = max(stable, min(8 * stable, TRAVEL / max(fastest, 1e-300)))
+    tau = float(np.nanmin([left, longest, DRIVE / max(ranging, 1e-300), STEP / max(system.speed, 1e-300)]))
     field, scale, noise = sinc_grid.cleaned(sinc_grid.exponential(generator, field, tau))
     statistics = system.advanced(state.statistics, rates, tau) if whole else state.statistics
     state = state.on(field)._replace(statistics=statistics, log_scale=state.log_scale + scale - level * tau)
@@ -263,8 +263,7 @@ def density(prepared: Prepared, state: State) -> GridDensity:
     with np.errstate(divide="ignore"):
         logs = np.log(np.maximum(field.values.real, 0.0))
     centre = field.low.real + field.spacing * (field.sizes // 2)
-    names = prepared.system.model.state
-    return GridDensity(logs, centre, np.diag(field.spacing), names, (False,) * len(names))
+    return GridDensity(logs, centre, np.diag(field.spacing), prepared.system.model.state, (False,) * prepared.system.n)
 
 
 def valid(prepared: Prepared, state: State) -> bool:
@@ -288,6 +287,7 @@ METHOD = Method(
     density=density,
     state=State,
     bounds={
+        **OF_MESSAGE,
         "aliasing": (1e-8, "share of the density at the highest frequency of the grid; set points to more"),
         "edge_mass": (1e-9, "probability in the outermost points of the grid"),
         "tail_depth": (3.0, "deviations by which the observations drove the density into its tails, of which rounding leaves 7"),
@@ -296,4 +296,5 @@ METHOD = Method(
     },
     shorter="set points to fewer",
     valid=valid,
+    backward=borrowed(density, lambda prepared: 1e-6),
 )
