@@ -124,6 +124,18 @@ def test_a_model_with_every_key_is_written_and_read_again():
         numpy_function(model.drift, model)(x, 0.0, model.theta())
 
 
+@pytest.mark.parametrize(
+    "keys", [{"periodic": ["x"]}, {"domain": {"x": {"lower": -1.0, "upper": 2.0, "boundary": "reflecting"}}}]
+)
+def test_a_uniform_prior_is_the_constant_density(keys):
+    keys = {"state": ["x"], "drift": ["cos(x)"], "observation": ["sin(x)"], "observation_kind": "samples", **keys}
+    uniform = zakai.Model(**keys, prior={"kind": "uniform"})
+    constant = zakai.Model(**keys, prior={"kind": "density", "log_density": "0"})
+    record = zakai.Record([0.1, 0.7], [0.3, -0.2], "samples")
+    assert read_model(uniform.to_toml(), "again").prior.log_density == 0
+    assert np.array_equal(zakai.filter(uniform, record).mean, zakai.filter(constant, record).mean)
+
+
 def test_a_log_density_is_given_as_text_or_as_an_expression():
     x, z = sympy.symbols("x z")
     keys = {"state": ["x"], "drift": ["0"], "observed": ["z"], "observation_kind": "samples"}

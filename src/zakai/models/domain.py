@@ -39,13 +39,18 @@ class Interval(NamedTuple):
         """Whether the finite ends reflect."""
         return self.boundary == "reflecting"
 
+    @property
+    def bounded(self) -> bool:
+        """Whether both ends are finite."""
+        return math.isfinite(self.upper - self.lower)
+
     def contains(self, x: Any) -> NDArray[np.bool_]:
         """Return where x is inside; a reflecting end belongs to the domain, a natural one does too, as the limit of paths."""
         return np.asarray((x >= self.lower) & (x <= self.upper))
 
     def reflected(self, x: Any) -> Any:
         """Return x, mirrored at the ends until it is inside."""
-        if math.isfinite(self.lower) and math.isfinite(self.upper):
+        if self.bounded:
             width = self.upper - self.lower
             place = np.mod(x - self.lower, 2 * width)
             return self.lower + np.minimum(place, 2 * width - place)

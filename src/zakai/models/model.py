@@ -268,7 +268,9 @@ class Model:
         return other
 
     def _prior(self, given: Any) -> tuple[Prior | None, dict[str, Any] | None]:
-        return read_prior(given, self.x, reader(self, in_time=False), tuple(name in self.periodic for name in self.state))
+        periodic = tuple(name in self.periodic for name in self.state)
+        bounded = tuple(name in self.domain and self.domain[name].bounded for name in self.state)
+        return read_prior(given, self.x, reader(self, in_time=False), periodic, bounded)
 
     def to_toml(self) -> str:
         """The model as the text of a model file that gives this model again."""

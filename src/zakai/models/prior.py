@@ -103,6 +103,7 @@ _KEYS = {
     "gaussian": ("mean", "cov"),
     "mixture": ("weights", "means", "covs"),
     "density": ("log_density",),
+    "uniform": (),
     "grid": ("log_values", "centre", "basis"),
     "interval": ("values", "nodes", "rule"),
 }
@@ -110,12 +111,17 @@ _OPTIONAL = {"grid": ("lower", "upper")}
 
 
 def read_prior(
-    keys: Any, states: Sequence[sympy.Symbol], read_formula: Callable[[str], sympy.Expr], periodic: tuple[bool, ...]
+    keys: Any,
+    states: Sequence[sympy.Symbol],
+    read_formula: Callable[[str], sympy.Expr],
+    periodic: tuple[bool, ...],
+    bounded: tuple[bool, ...],
 ) -> tuple[Prior | None, dict[str, Any] | None]:
     """The prior of the table `[prior]`, and the table in plain numbers and text.
 
     `keys` is the table (or a prior, a density of `zakai.densities`, or None), `states` the symbols of the states, `periodic`
-    which of them are angles, `read_formula` reads the formula of a density. Raises InputError, naming the key.
+    which of them are angles, `bounded` which have a domain with two ends, `read_formula` reads the formula of a density.
+    Raises InputError, naming the key.
     """
     if keys is None:
         return None, None
@@ -145,6 +151,22 @@ def read_prior(
         prior: Prior = _read_gaussian(keys, n)
     elif kind == "mixture":
         prior = _read_mixture(keys, n)
+    elif kind == "uniform":
+        for state, angle, between in zip(states, periodic, bounded, strict=True):
+            if not (angle or between):
+                raise InputError(
+                    f"kind: uniform is for angles and for domains with two ends, and {str(state)!r} has neither; list it in "
+                    'periodic, give it a [domain] with lower and upper, or write kind = "gaussian" with a large variance'
+                )
+        return DensityPrior(sympy.Integer(0)), {"kind": kind}
+    elif kind == "uniform":
+        for state, angle, between in zip(states, periodic, bounded, strict=True):
+            if not (angle or between):
+                raise InputError(
+                    f"kind: uniform is for angles and domains with two ends, and {str(state)!r} has neither; list it in "
+                    'periodic, give [domain] its lower and upper, or write kind = "gaussian" with a large variance'
+                )
+        return DensityPrior(sympy.Integer(0)), {"kind": kind}
     elif kind == "grid":
         log_density, grid = read_grid(keys, states, periodic)
         return DensityPrior(log_density), grid
