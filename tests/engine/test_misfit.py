@@ -29,3 +29,13 @@ def test_a_sample_beyond_every_value_of_h_warns_on_a_circle(method):
 def test_a_fill_value_of_a_linear_system_warns_and_ten_deviations_do_not(kind):
     assert warned("kalman-bucy", "x", 9.97e36, kind)
     assert not warned("kalman-bucy", "x", 7.0 if kind == "samples" else 1.0, kind)
+
+
+def test_a_fill_value_that_a_grid_rejects_is_in_the_evidence():
+    model = zakai.Model(
+        state=["x", "y"], drift=["y - x", "-y - y**3"], observation=["x"], observation_kind="samples",
+        observation_noise=[["1/10 + x**2"]], prior={"kind": "gaussian", "mean": [0.0, 0.0], "cov": [1.0, 1.0]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record([0.2, 0.4, 0.6], [0.2, 1e8, 0.1], "samples"), "yau-yau")
+    # No state within 60 deviations explains the value: |z - h| > 9e7, S < 4000.
+    assert result.log_likelihood < -(9e7**2) / 2 / 4000 and result.warnings

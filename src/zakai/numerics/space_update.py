@@ -40,7 +40,7 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
 
     A factor that is narrower than the grid's spacing is found on a sequence of finer grids, with a power of it below one as long
     as neighbours differ by many nats.  `tails` are those of the spectrum of the density.  A product that is zero, or one point,
-    is replaced by the density.
+    leaves the density as it is; its mass on the grid of the density is that of the result.
     """
     grid, values = field.grid, field.values
     coefficients: Array | None = None
@@ -54,7 +54,7 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
             product = np.log(real) + np.where(np.isnan(logs.real), -np.inf, logs.real)
         top = float(product.max())
         if not np.isfinite(top):
-            return Update(field, 1.0, 1.0, np.inf, True)
+            return _unchanged(field, log_factor)
         power = _power(logs.real, product, grid)
         if power == 1.0:
             found = survey(_exp(product - top), grid, bounds.edge)
@@ -96,7 +96,7 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
         _, grid, values, logs, product, top, found = best
     inverse = grid.inverse
     if not np.diagonal(inverse @ found.cov @ inverse.T).min() > POINT**2:
-        return Update(field, 1.0, 1.0, np.inf, True)
+        return _unchanged(field, log_factor)
     peak = int(np.argmax(product))
     ratio = float(values.real.flat[peak] / max(field.values.real.max(), values.real.max()))
     shift = float(logs.real.flat[peak])
@@ -110,6 +110,16 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
         max(-np.log(max(ratio, 1e-300)), 0.0),
         truncated,
     )
+
+
+def _unchanged(field: Field, log_factor: Callable[[Grid], Array]) -> Update:
+    """Return the density itself with the mass of its product with a factor that no point of the grid resolves."""
+    logs = log_factor(field.grid).real.reshape(field.grid.sizes)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        product = np.log(np.maximum(field.values.real, 0.0)) + np.where(np.isnan(logs), -np.inf, logs)
+        top = float(product.max())
+        mass = top + np.log(_exp(product - top).sum() / field.values.real.sum()) if np.isfinite(top) else -np.inf
+    return Update(field._replace(log_scale=field.log_scale + mass), 1.0, 1.0, np.inf, True)
 
 
 def _exp(logs: Array) -> Array:
