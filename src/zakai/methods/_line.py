@@ -159,6 +159,10 @@ def _state(values: Array, window: lw.Window, error: float, log_floor: float) -> 
 
 def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
     """Return the state after interval k and the observation at its stop, and the report."""
+    if prepared.parts is not None:
+        states, infos = prepared.parts.segment(slice(k, k + 1), state, observed[None], segment_of_whole)
+        figures = {name: float(values[0]) for name, values in infos.health.items()}
+        return states[0], Info(infos.log_likelihood_increment[0], infos.mean[0], infos.cov[0], figures)
     if prepared.fast[k]:
         found = loop.one(prepared, k, state, observed)
         if found is not None:
@@ -170,6 +174,13 @@ def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tupl
 
 def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos]:
     """Return the states after the intervals of a slice, and their reports."""
+    if prepared.parts is not None:
+        return prepared.parts.segment(rows, state, observed, segment_of_whole)
+    return segment_of_whole(prepared, rows, state, observed)
+
+
+def segment_of_whole(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos]:
+    """Return the same of intervals that are not cut into parts."""
     states: Joined[State] = Joined()
     parts: list[Infos] = []
     k = rows.start

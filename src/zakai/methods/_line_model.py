@@ -90,7 +90,7 @@ def _separated(model: Model) -> tuple[Function, Function] | None:
     x, given = model.x[0], {model.t, *model.u}
     terms: dict[sp.Expr, list[sp.Expr]] = {}
     for row, formula in enumerate([model.drift[0], *model.observation]):
-        for form in (formula, sp.expand(formula, power_exp=False, power_base=False, log=False, trig=True)):
+        for form in (formula, sp.expand(_added(formula, model), power_exp=False, power_base=False, log=False)):
             pairs = [term.as_independent(x, as_Add=False) for term in sp.Add.make_args(form)]
             separable = not any(part.free_symbols & given for _, part in pairs)
             if separable:
@@ -107,6 +107,17 @@ def _separated(model: Model) -> tuple[Function, Function] | None:
 
 
 _MOST_TERMS = 8
+
+
+def _added(formula: sp.Expr, model: Model) -> sp.Expr:
+    """Return a formula with sin(a + b) and cos(a + b), a of x alone and b of t and inputs, by the theorem of addition."""
+    x, given, known = model.x[0], {model.t, *model.u}, {}
+    for call in formula.atoms(sp.sin, sp.cos):
+        b, a = call.args[0].as_independent(x, as_Add=True)
+        if a != 0 and b.free_symbols & given and not a.free_symbols & given:
+            turned = sp.sin(a) * sp.cos(b) + sp.cos(a) * sp.sin(b), sp.cos(a) * sp.cos(b) - sp.sin(a) * sp.sin(b)
+            known[call] = turned[0 if isinstance(call, sp.sin) else 1]
+    return formula.xreplace(known)
 
 
 def _continuous(formula: sp.Expr, x: sp.Symbol) -> bool:

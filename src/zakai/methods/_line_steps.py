@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from zakai.methods._line_system import Coefficients, Prepared
+from zakai.methods._line_system import Coefficients, Prepared, finite
+from zakai.models.prior import GaussianPrior
 from zakai.numerics.line_filters import kernel_size
 from zakai.numerics.line_panels import GAUSS_NODES, interpolation
 from zakai.numerics.line_segment import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Steps
@@ -56,14 +57,27 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
     precisions, constants = precision(noise[:, ends])
     good = np.ones(count, bool)
     if prepared.timed and count:
+        terms = _mixed_terms(prepared, t) if prepared.mixed else factors
         good &= system.steady_covariance or resolved(G[:, probes, None], G[:, own, None])
-        good &= prepared.mixed or resolved(factors[:, probes], factors[:, own])
+        good &= resolved(terms[:, probes], terms[:, own])
         good &= system.samples or system.steady_noise or resolved(precision(noise[:, probes])[0], precisions)
     drifts, outputs, covariances = (np.array(part, order="C") for part in (factors[:, own], factors[:, ends], G[:, own]))
     return Coefficients(drifts, outputs, covariances, precisions, constants, good)
 
 
 _X = np.zeros((1, 1, 1))
+
+
+def _mixed_terms(prepared: Prepared, t: np.ndarray) -> np.ndarray:
+    """Return f, and h of increments, at times (K, T) and points where the state may be (K, T, C)."""
+    system, prior = prepared.system, prepared.model.prior
+    points = np.linspace(-np.pi, np.pi, 9)
+    if isinstance(prior, GaussianPrior) and not prepared.model.domain and not prepared.model.periodic:
+        points = float(prior.mean[0]) + np.linspace(-5.0, 5.0, 9) * float(np.sqrt(prior.cov[0, 0]))
+    terms = system.drift(points[:, None], t[..., None], prepared.theta)
+    if not system.samples:
+        terms = np.concatenate([terms, system.observation(points[:, None], t[..., None], prepared.theta)], axis=-1)
+    return np.asarray(finite(terms).reshape(*t.shape, -1))
 
 
 def probed(starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -118,4 +132,5 @@ def steps_of(prepared: Prepared) -> Steps:
         packed[here] = np.concatenate(found, axis=1)
     precisions = np.where((kinds == KERNEL)[:, None, None, None], 0.0, c.precisions)
     lengths = np.ascontiguousarray(prepared.lengths)
-    return Steps(kinds, lengths, precisions, c.constants, packed, c.drifts, c.outputs, c.covariances)
+    shares = np.ones(len(kinds)) if prepared.shares is None else prepared.shares
+    return Steps(kinds, lengths, shares, precisions, c.constants, packed, c.drifts, c.outputs, c.covariances)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line_segment import Limits, Mechanisms, Steps
 from zakai.numerics.line_weak import PARTS, at_nodes, nodes, weak
 from zakai.records.schedule import Schedule
+
+if TYPE_CHECKING:
+    from zakai.methods._line_parts import Parts
 
 Array = Any
 
@@ -79,7 +82,7 @@ class Prepared:
 
     `tolerance` is what substeps are chosen for, `promised` the error of a step above which a result warns; `negligible` the
     spectrum that need not be resolved; `generous` the size of a grid that is kept though fewer points would do; `kept` holds what
-    was computed for single grids.
+    was computed for single grids; `shares` (K,) are those of parts in the time of their intervals.
     """
 
     model: Model
@@ -98,6 +101,7 @@ class Prepared:
     origin: float = 0.0
     series: PowerSeries | None = None
     notes: tuple[str, ...] = ()
+    shares: np.ndarray | None = None
 
     @cached_property
     def kept(self) -> dict[Any, Any]:
@@ -170,6 +174,13 @@ class Prepared:
         from zakai.methods._line_steps import coefficients_of
 
         return coefficients_of(self)
+
+    @cached_property
+    def parts(self) -> Parts | None:
+        """The parts of intervals in which the Gauss nodes do not resolve the coefficients, None where they do in all."""
+        from zakai.methods._line_parts import parts_of
+
+        return parts_of(self)
 
     @property
     def largest(self) -> int:

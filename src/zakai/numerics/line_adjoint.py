@@ -48,7 +48,7 @@ def _split(
     made, constant, magnus = 0.0, 0.0, 0
     if averages.shape[0] > 1:
         made, pair = averaging(
-            product, table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, spacing
+            product, table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, spacing, closed
         )
         if not (made <= most):
             magnus = int(min(max(np.ceil(1.1 * (pair / most) ** 0.25), 1.0), 1e6))
@@ -161,7 +161,7 @@ def by_adjoints(
     """
     count, size = len(steps.lengths), len(message.values)
     b, product, products, out = message.values.copy(), message.product.copy(), np.empty((count, size)), np.zeros((count, 6))
-    kinds, lengths, precisions, _, _, *rest = steps
+    kinds, lengths, _, precisions, _, _, *rest = steps
     averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
     taken, first, last, start, error = _adjoint(
         b, message.first, message.last, message.start, message.error, product, *before, grid.table, grid.spacing, closed,

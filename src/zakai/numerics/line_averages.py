@@ -95,18 +95,22 @@ def averaged(
 
 
 @helper
-def _generated(u: Array, parts: Array, spread: float, spacing: float, weight: float, to: Array) -> None:
+def _generated(u: Array, parts: Array, spread: float, spacing: float, weight: float, closed: bool, to: Array) -> None:
     """Add the integral of the equation's right-hand side with a weight, by differences of fourth order."""
-    inner, flow = u.size - 4, np.empty(u.size)
-    for j in range(u.size):
-        flow[j] = parts[0, j] * u[j]
+    size, around, flow = u.size, np.zeros(u.size + 4), np.zeros(u.size + 4)
+    for j in range(size):
+        around[j + 2], flow[j + 2] = u[j], parts[0, j] * u[j]
+    skipped = 0 if closed else 2  # points at the ends of a line
+    if closed:
+        for j in range(2):
+            around[j], flow[j] = around[size + j], flow[size + j]
+            around[size + 2 + j], flow[size + 2 + j] = around[2 + j], flow[2 + j]
     one, two = weight / (12.0 * spacing), 0.5 * weight * spread / (12.0 * spacing * spacing)
-    a, b, c, d, e = u[:inner], u[1 : inner + 1], u[2 : inner + 2], u[3 : inner + 3], u[4:]
-    first, second, fourth, fifth = flow[:inner], flow[1 : inner + 1], flow[3 : inner + 3], flow[4:]
-    own, found = parts[1, 2 : inner + 2], to[2 : inner + 2]
-    for j in range(inner):
+    a, b, c, d, e = around[:size], around[1 : size + 1], around[2 : size + 2], around[3 : size + 3], around[4:]
+    first, second, fourth, fifth = flow[:size], flow[1 : size + 1], flow[3 : size + 3], flow[4:]
+    for j in range(skipped, size - skipped):
         curved = 16.0 * (b[j] + d[j]) - a[j] - e[j] - 30.0 * c[j]
-        found[j] += two * curved - one * (8.0 * (fourth[j] - second[j]) - fifth[j] + first[j]) + weight * own[j] * c[j]
+        to[j] += two * curved - one * (8.0 * (fourth[j] - second[j]) - fifth[j] + first[j]) + weight * parts[1, j] * c[j]
 
 
 # Which operator (B, D, E) acts on which density, with which weight, and to which density it is added.  From the density 0 they
@@ -122,7 +126,7 @@ _PRODUCTS = np.array(
 @helper
 def averaging(
     values: Array, table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, averages: Array,
-    tau: float, observed: Array, inside: bool, at: int, spacing: float,
+    tau: float, observed: Array, inside: bool, at: int, spacing: float, closed: bool,
 ) -> tuple[float, float]:  # fmt: skip
     """Return estimates of the errors of the mean and of two averages in a part of an interval.
 
@@ -145,7 +149,7 @@ def averaging(
                 exponent_added(h, centre, precisions[q], observed, w, w * tau, parts[i, 1])
     add(found[0], 1.0, values)
     for operator, of, weight, to in _PRODUCTS:
-        _generated(found[of], parts[operator], spreads[operator], spacing, float(weight), found[to])
+        _generated(found[of], parts[operator], spreads[operator], spacing, float(weight), closed, found[to])
     one, two, mass, limit = 0.0, 0.0, 0.0, 1e-12 * values[highest_of(values)]
     for j in range(size):
         mass += values[j]

@@ -56,13 +56,13 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
 
     @kernel(
         types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]
-            _V, int64, _Q, float64, _M, _V, _T, _M, _M, float64, float64, int64, _M, int64[::1], _V, _Q, _V, _M, _T, _T, _M,
+            _V, int64, _Q, float64, _M, _V, _T, _M, _M, float64, float64, int64, _M, int64[::1], _V, _V, _Q, _V, _M, _T, _T, _M,
             float64, float64, _V, _M, _M, _M
         )
     )  # fmt: skip
     def advance(
         values: Array, start: int, table: Array, covariance: float, modes: Array, rates: Array, averages: Array, cosines: Array,
-        sines: Array, offset: float, spacing: float, begin: int, observed: Array, kinds: Array, lengths: Array,
+        sines: Array, offset: float, spacing: float, begin: int, observed: Array, kinds: Array, lengths: Array, shares: Array,
         precisions: Array, constants: Array, kernel_parameters: Array, drifts: Array, outputs: Array, covariances: Array,
         error: float, log_floor: float, limits: Array, densities: Array, out: Array, fine: Array,
     ) -> tuple[int, int]:  # fmt: skip
@@ -127,7 +127,7 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
             elif splits:
                 move = divided(
                     now, local, drifts[k], outputs[k], precisions[k], covariances[k], averages, observed[i], inside, tau, spacing,
-                    closed, depth, limits[2], finest,
+                    closed, depth, limits[2] * shares[k], finest,
                 )  # fmt: skip
             if not (move.error < np.inf and move.rounding < max(1e-11, 1e-3 * most)):
                 answer[0], answer[1], answer[2] = float(low), float(high), move.needed

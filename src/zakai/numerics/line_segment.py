@@ -55,15 +55,17 @@ class Grid(NamedTuple):
 class Steps(NamedTuple):
     """K intervals.
 
-    `kinds` (K,) are FACTOR, SPLIT, KERNEL or SPLIT_FACTOR.  `precisions` (K, P, m, m) are the inverses of S, zero where nothing
-    is observed.  `constants` (K,) are those of the log-likelihoods.  `kernels` (K, .) are the parameters of Gaussian kernels
-    (`line_filters.kernel_of`), NaN where the transition is split.  `drifts` (K, Q, R) and `outputs` (K, P, R) are the factors of
-    the terms of f and h, and `covariances` (K, Q) are G, at the Gauss nodes of an interval, or one number where they do not
+    `kinds` (K,) are FACTOR, SPLIT, KERNEL or SPLIT_FACTOR.  `shares` (K,) are the parts of `Limits.splitting` that an interval
+    may leave.  `precisions` (K, P, m, m) are the inverses of S, zero where nothing is observed.  `constants` (K,) are those of
+    the log-likelihoods.  `kernels` (K, .) are the parameters of Gaussian kernels (`line_filters.kernel_of`), NaN where the
+    transition is split.  `drifts` (K, Q, R) and `outputs` (K, P, R) are the factors of the terms of f and h, and `covariances`
+    (K, Q) are G, at the Gauss nodes of an interval, or one number where they do not
     depend on time.
     """
 
     kinds: Array
     lengths: Array
+    shares: Array
     precisions: Array
     constants: Array
     kernels: Array

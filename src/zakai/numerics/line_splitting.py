@@ -65,7 +65,7 @@ def divided(
     magnus, substeps = 0.0, 1.0  # pairs of averages, one after the other, or the mean
     if varying:
         mean_error, pair_error = averaging(
-            now, table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, spacing
+            now, table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, spacing, closed
         )
         if mean_error > most:
             magnus = max(np.ceil(1.1 * (pair_error / most) ** 0.25), 1.0)
@@ -99,7 +99,7 @@ def divided(
             rounding, clipped, spread, constant = rounding + noise, max(clipped, end), spread + own_spread, constant + added
             if varying and (magnus == 0.0 or i % 2 == 1):
                 mean_error, pair_error = averaging(
-                    now, table, drifts, outputs, precisions, covariances, weights, tau, observed, inside, at, spacing
+                    now, table, drifts, outputs, precisions, covariances, weights, tau, observed, inside, at, spacing, closed
                 )
                 time, pairs = time + (pair_error if magnus > 0.0 else mean_error), pairs + pair_error
             total = moments(now)[0]

@@ -1,0 +1,89 @@
+"""Intervals in which few nodes do not resolve the coefficients, cut into parts in which they do.
+
+The observation is linear in time within an interval, so that each part has its share of an increment; a sample, or an increment
+that was gathered over more than the interval, belongs to the last part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.methods._line_system import Prepared, State
+from zakai.methods._protocol import Infos
+from zakai.records.schedule import Schedule, lengths_of
+
+ROUNDS = 8  # of cutting: parts shorter than 2^-8 of an interval are left to adaptive substeps
+SUMS = ("time_error", "tolerance_ratio")  # figures of parts that add up
+
+Segment = Callable[[Prepared, slice, State, np.ndarray], tuple[Sequence[State], Infos]]
+
+
+class Parts(NamedTuple):
+    """What is known of the parts of all intervals.
+
+    Those of interval k are first[k] to first[k + 1].
+    """
+
+    prepared: Prepared
+    first: np.ndarray
+
+    def segment(self, rows: slice, state: State, observed: np.ndarray, run: Segment) -> tuple[list[State], Infos]:
+        """Return the states after the intervals of a slice, and their reports, by `run` for the parts."""
+        first = self.first[rows.start : rows.stop + 1]
+        inner = slice(int(first[0]), int(first[-1]))
+        values = np.repeat(observed, np.diff(first), axis=0)
+        assert self.prepared.shares is not None
+        own = np.where(self.prepared.inside[inner], self.prepared.shares[inner, None], 1.0)
+        values = np.where(self.prepared.schedule.seen[inner], values * own, 0.0)
+        states, infos = run(self.prepared, inner, state, values)
+        begin, last = first[:-1] - first[0], first[1:] - first[0] - 1
+        health = {
+            name: figures[last] if name in ("error_estimate", "std_in_spacings")
+            else (np.add if name in SUMS else np.fmax).reduceat(figures, begin)
+            for name, figures in infos.health.items()
+        }  # fmt: skip
+        gained = np.add.reduceat(infos.log_likelihood_increment, begin)
+        return [states[i] for i in last], Infos(gained, infos.mean[last], infos.cov[last], health)
+
+
+def parts_of(prepared: Prepared) -> Parts | None:
+    """Return the parts of the intervals of a schedule, None where no interval needs any."""
+    if not prepared.timed or prepared.kernels is not None or np.iscomplexobj(prepared.theta):
+        return None
+    found, owner = prepared, np.arange(len(prepared.schedule))
+    for _ in range(ROUNDS):
+        schedule = found.schedule
+        cut = (found.lengths > 0) & ~found.coefficients.resolved
+        if not cut.any():
+            break
+        bounds = [_bounds(found, k) if cut[k] else [schedule.starts[k]] for k in range(len(schedule))]
+        counts = np.array([len(bound) for bound in bounds])
+        starts = np.concatenate(bounds)
+        stops = np.append(starts[1:], schedule.stops[-1])
+        ends = np.cumsum(counts) - 1
+        stops[ends] = schedule.stops
+        parent = np.repeat(np.arange(len(schedule)), counts)
+        last = np.zeros(len(starts), bool)
+        last[ends] = True
+        whole, inside = lengths_of(starts, stops)[:, None], found.inside[parent]
+        seen = schedule.seen[parent] & (inside | last[:, None])
+        elapsed = np.where(inside, whole, np.where(seen, schedule.elapsed[parent], 0.0))
+        schedule = Schedule(starts, stops, seen, elapsed, schedule.inputs)
+        found = replace(found, schedule=schedule, lengths=schedule.lengths, inside=schedule.inside)
+        owner = owner[parent]
+    if found is prepared:
+        return None
+    first = np.searchsorted(owner, np.arange(len(prepared.schedule) + 1))
+    shares = np.where(found.lengths < prepared.lengths[owner], found.lengths / prepared.lengths[owner], 1.0)
+    return Parts(replace(found, shares=shares), first)
+
+
+def _bounds(prepared: Prepared, k: int) -> list[Any]:
+    """Return where the parts of an interval begin: where inputs have a jump or a kink, else at the middle."""
+    start, stop = float(prepared.schedule.starts[k]), float(prepared.schedule.stops[k])
+    pieces = [first for first, _ in prepared.system.pieces(start, stop)]
+    return pieces if len(pieces) > 1 else [start, start + 0.5 * (stop - start)]

@@ -1,0 +1,81 @@
+"""Coefficients that vary fast within the intervals between observations, against Runge-Kutta steps of the equation."""
+
+import numpy as np
+import pytest
+
+import zakai
+
+STEPS = 800  # of Runge and Kutta, for each interval
+
+
+def solved(f, G, h, S, increments, box, times, values, log_prior):
+    """Mean, variance and log-likelihood for u_t = (G u)'' / 2 - (f u)' + (h dy/dt - h^2 / 2) u / S on a periodic grid."""
+    size = 128
+    x = box[0] + (box[1] - box[0]) * np.arange(size) / size
+    wave = 2j * np.pi * np.fft.fftfreq(size, (box[1] - box[0]) / size)
+    u, rows, total, start = np.exp(log_prior(x)), [], 0.0, 0.0
+    u = u / u.sum()
+    for stop, value in zip(times, values, strict=True):
+        step = (stop - start) / STEPS
+
+        def slope(t, u, rate=value / (stop - start)):
+            flow = np.fft.ifft(wave**2 * np.fft.fft(0.5 * G(t) * u) - wave * np.fft.fft(f(x, t) * u)).real
+            return flow + ((h(x, t) * rate - 0.5 * h(x, t) ** 2) / S(t) * u if increments else 0.0)
+
+        for i in range(STEPS):
+            t = start + i * step
+            a = slope(t, u)
+            b = slope(t + step / 2, u + step / 2 * a)
+            c = slope(t + step / 2, u + step / 2 * b)
+            u = u + step / 6 * (a + 2 * b + 2 * c + slope(t + step, u + step * c))
+        if not increments:
+            u = u * np.exp(-0.5 * (value - h(x, stop)) ** 2 / S(stop)) / np.sqrt(2 * np.pi * S(stop))
+        total, u, start = total + np.log(u.sum()), u / u.sum(), stop
+        mean = (x * u).sum()
+        rows.append((mean, ((x - mean) ** 2 * u).sum()))
+    return np.array(rows), total
+
+
+CASES = {
+    "forced": ("x - x**3 + cos(9*t)", lambda x, t: x - x**3 + np.cos(9 * t), {}),
+    "noise": ("x - x**3", lambda x, t: x - x**3, {"G": lambda t: (0.6 + 0.3 * np.sin(12 * t)) ** 2, "g": "0.6 + 0.3*sin(12*t)"}),
+    "gain": ("x - x**3", lambda x, t: x - x**3, {"h": lambda x, t: x * (1 + np.cos(14 * t)), "text": "x*(1 + cos(14*t))"}),
+    "mixed": ("tanh(x + cos(8*t)) - x", lambda x, t: np.tanh(x + np.cos(8 * t)) - x, {}),
+}
+
+
+@pytest.mark.parametrize("increments", [False, True], ids=["samples", "increments"])
+@pytest.mark.parametrize("name", CASES)
+def test_coefficients_that_vary_within_intervals(name, increments):
+    text, f, own = CASES[name]
+    h, G = own.get("h", lambda x, t: x), own.get("G", lambda t: 0.36)
+    model = zakai.Model(
+        state=["x"], drift=[text], diffusion=[[own.get("g", "0.6")]], observation=[own.get("text", "x")],
+        observation_noise=[["0.2"]], observation_kind="increments" if increments else "samples",
+        prior={"kind": "gaussian", "mean": [0.2], "cov": [0.3]},
+    )  # fmt: skip
+    times = np.cumsum([0.3, 0.05, 0.55, 0.4])
+    truth = np.array([0.3, 0.5, 0.6, 0.9])
+    values = truth * np.diff(times, prepend=0.0) if increments else truth
+    box, log_prior = (-4.0, 4.0), lambda x: -0.5 * (x - 0.2) ** 2 / 0.3
+    expected, total = solved(f, G, h, lambda t: 0.2, increments, box, times, values, log_prior)
+    result = zakai.filter(model, zakai.Record(times, values[:, None], model.observation_kind), method="yau-yau")
+    assert not result.warnings
+    np.testing.assert_allclose(result.mean[1:, 0], expected[:, 0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(result.variance[1:, 0], expected[:, 1], rtol=0, atol=1e-6)
+    assert abs(result.log_likelihood - total) < 1e-6
+
+
+def test_a_forced_angle_around_the_end_of_its_grid():
+    model = zakai.Model(
+        state=["x"], drift=["sin(x) + 3*cos(7*t)"], diffusion=[["0.7"]], observation=["cos(x)"], observation_noise=[["0.2"]],
+        observation_kind="samples", periodic=["x"], prior={"kind": "density", "log_density": "2*cos(x - 3)"},
+    )  # fmt: skip
+    times, values = np.cumsum([0.3, 0.05, 0.55, 0.4]), np.array([-0.9, -1.1, -0.6, -1.0])
+    expected, total = solved(
+        lambda x, t: np.sin(x) + 3 * np.cos(7 * t), lambda t: 0.49, lambda x, t: np.cos(x), lambda t: 0.2, False,
+        (0.0, 2 * np.pi), times, values, lambda x: 2 * np.cos(x - 3),
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record(times, values[:, None], "samples"), method="yau-yau")
+    assert not result.warnings
+    assert abs(result.log_likelihood - total) < 1e-6
