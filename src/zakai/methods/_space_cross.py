@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import sympy
 
-from zakai.methods._space_functions import point_function
+from zakai.methods._space_functions import PointFunction
 from zakai.methods._space_observed import Observations
 from zakai.methods._space_system import System, without_jumps
 from zakai.models.model import Model
@@ -52,10 +52,10 @@ class CrossFormulas:
         potential -= sum((gain[i, j] * along(h[i], j) for i, j in pairs), sympy.S.Zero) / 2
         divergence = sum((without_jumps(f, s) for f, s in zip(drift, x, strict=True)), sympy.S.Zero)
         covariance = sympy.Matrix(model.covariance) - cross * gain * cross.T
-        self.drift = point_function([*drift, divergence], self.model, (n + 1,))
+        self.drift = PointFunction([*drift, divergence], self.model, (n + 1,))
         self.jacobian = numpy_function([without_jumps(f, s) for f in drift for s in x], self.model, (n, n))
         self.covariance = numpy_function(covariance, self.model, (n, n))
-        self.potential = point_function([potential, *(without_jumps(potential, s) for s in x)], self.model, (n + 1,))
+        self.potential = PointFunction([potential, *(without_jumps(potential, s) for s in x)], self.model, (n + 1,))
         given, noise = {model.t, *model.u}, bool(model.observation_noise.free_symbols & {model.t, *model.u})
         self.state_dependent = bool(covariance.free_symbols & set(x))
         self.covariance_varies = noise or bool(covariance.free_symbols & given)
@@ -96,7 +96,7 @@ class CrossSystem(System):
         def bind(function: Callable[..., Array]) -> Callable[..., Array]:
             return lambda x, t, theta: function(x, t, theta, given(t))
 
-        self.drift, self.jacobian, self.covariance = map(bind, (formulas.drift, formulas.jacobian, formulas.covariance))
+        self.drift, self.jacobian, self.covariance = bind(formulas.drift), bind(formulas.jacobian), bind(formulas.covariance)
         self.potential = bind(formulas.potential)
 
 

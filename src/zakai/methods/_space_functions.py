@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,51 +11,113 @@ from numpy.typing import NDArray
 
 from zakai.models.model import Model
 from zakai.models.numeric import COMPLEX, REAL, program_of
+from zakai.numerics.complex_step import is_complex
+from zakai.numerics.formula_kernel import BINARY, CLOCK, NEITHER, UNARY, Formulas
 
 Array = NDArray[Any]
 SOURCES = ("x", "t", "theta", "u")
 
 
-def point_function(expressions: Sequence[sympy.Expr], model: Model, shape: tuple[int, ...]) -> Callable[..., Array]:
-    """Return the expressions as a function f(x, t, theta, u) of many points.
+class PointFunction:
+    """Expressions as a function of many points.
 
-    x (J, n) are points, t is one time (or times that broadcast with the points), theta (p,), and u (..., number of inputs) the
-    inputs at these times. The result is (J, *shape), with the values of one expression contiguous; an undefined value is NaN.
+    Args:
+        expressions: formulas in the state, the time, the parameters and the inputs of a model.
+        model: the model.
+        shape: the shape of the values at one point.
     """
-    program = program_of(list(expressions), model)
-    outputs = program.outputs
-    fixed: list[Any] = [None] * len(program.instructions)
-    sources: list[tuple[int, int, int]] = []
-    steps: list[tuple[int, str, tuple[int, ...], Any]] = []
-    for slot, (operation, operands, constant) in enumerate((i.operation, i.operands, i.constant) for i in program.instructions):
-        if operation == "constant":
-            fixed[slot] = constant
-        elif operation in SOURCES:
-            sources.append((slot, SOURCES.index(operation), constant))
-        else:
-            steps.append((slot, operation, operands, constant))
-    real, derived = (
-        [(slot, constant if name == "table" else functions[name], operands, None if name == "table" else constant)
-         for slot, name, operands, constant in steps]
-        for functions in (REAL, COMPLEX)
-    )  # fmt: skip
 
-    def function(x: Array, t: Any, theta: Array, u: Array | None = None) -> Array:
+    def __init__(self, expressions: Sequence[sympy.Expr], model: Model, shape: tuple[int, ...]):
+        program = program_of(list(expressions), model)
+        self._shape, self._outputs, self._instructions = shape, program.outputs, program.instructions
+        self._fixed: list[Any] = [i.constant if i.operation == "constant" else None for i in program.instructions]
+        self._sources = [
+            (slot, SOURCES.index(i.operation), i.constant)
+            for slot, i in enumerate(program.instructions)
+            if i.operation in SOURCES
+        ]
+        steps = [(s, i) for s, i in enumerate(program.instructions) if i.operation not in ("constant", *SOURCES)]
+        self._real, self._derived = (
+            [
+                (s, i.constant, i.operands, None) if i.operation == "table"
+                else (s, functions[i.operation], i.operands, i.constant)
+                for s, i in steps
+            ]
+            for functions in (REAL, COMPLEX)
+        )  # fmt: skip
+        self._formulas = self._translated()
+
+    def __call__(self, x: Array, t: Any, theta: Array, u: Array | None = None) -> Array:
+        """Return the values (J, *shape), with those of one expression contiguous; an undefined value is NaN.
+
+        Args:
+            x: points (J, n).
+            t: one time, or times that broadcast with the points.
+            theta: parameters (p,).
+            u: the inputs at these times (..., number of inputs).
+        """
         derivative = np.iscomplexobj(x) or np.iscomplexobj(theta)
-        values = fixed.copy()
-        for slot, source, index in sources:
+        if not derivative and np.ndim(t) == 0 and x.ndim == 2:
+            formulas = self.formulas(theta)
+            if formulas is not None and formulas.fast(len(x)):
+                result = formulas.at(x, float(t))
+                return result.reshape((len(x), *self._shape)) if len(self._shape) > 1 else result
+        values = self._fixed.copy()
+        for slot, source, index in self._sources:
             given: Any = (x, t, theta, u)[source]
             values[slot] = given if source == 1 else given[..., index]
-        for slot, operation, operands, constant in derived if derivative else real:
+        for slot, operation, operands, constant in self._derived if derivative else self._real:
             if constant is not None:
                 values[slot] = operation(values[operands[0]], constant)
             else:
                 values[slot] = operation(*[values[operand] for operand in operands])
         batch = x.shape[:-1] if np.ndim(t) == 0 else np.broadcast_shapes(x.shape[:-1], np.shape(t))
-        result = np.empty((len(outputs), *batch), complex if derivative else float)
-        for row, slot in enumerate(outputs):
+        result = np.empty((len(self._outputs), *batch), complex if derivative else float)
+        for row, slot in enumerate(self._outputs):
             result[row] = values[slot]
         result = result.transpose((*range(1, result.ndim), 0))
-        return result.reshape((*batch, *shape)) if len(shape) > 1 else result
+        return result.reshape((*batch, *self._shape)) if len(self._shape) > 1 else result
 
-    return function
+    def formulas(self, theta: Array) -> Formulas | None:
+        """Return the formulas as arrays for some parameters, or None where they have tables, inputs or derivatives."""
+        found = self._formulas
+        if found is None or is_complex(theta):
+            return None
+        parameters = [(slot, index) for slot, source, index in self._sources if source == 2]
+        if not parameters:
+            return found
+        given = found.given.copy()
+        for slot, index in parameters:
+            given[slot] = theta[index]
+        return Formulas(found.code, given, found.coordinates, found.outputs)
+
+    def _translated(self) -> Formulas | None:
+        """Return the program as arrays, without parameters."""
+        operations, count = (*BINARY, *UNARY), len(self._instructions)
+        code: list[tuple[int, int, int, int]] = []
+        constants: list[float] = []
+        for slot, instruction in enumerate(self._instructions):
+            operation, operands, constant = instruction.operation, instruction.operands, instruction.constant
+            if operation in ("constant", "x", "t", "theta"):
+                continue
+            if operation == "power" and not (isinstance(constant, int) and 2 <= constant <= 64):
+                constants.append(float(constant))
+                code.append((operations.index("general_power"), slot, operands[0], count + len(constants) - 1))
+            elif operation == "power":
+                code.append((operations.index("power"), slot, operands[0], constant))
+            elif operation not in operations:
+                return None
+            elif len(operands) == 1:
+                code.append((operations.index(operation), slot, operands[0], 0))
+            else:
+                first = operands[0]
+                for other in operands[1:]:
+                    code.append((operations.index(operation), slot, first, other))
+                    first = slot
+        given = np.array([0.0 if value is None else float(value) for value in self._fixed] + constants)
+        coordinates = np.full(len(given), NEITHER)
+        for slot, source, index in self._sources:
+            if source < 2:
+                coordinates[slot] = index if source == 0 else CLOCK
+        lines = np.array(code, np.int64).reshape(-1, 4)
+        return Formulas(lines, given, coordinates, np.array(self._outputs, np.int64))

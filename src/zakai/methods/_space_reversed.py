@@ -183,8 +183,9 @@ class ReversedStepper(Stepper):
         away = x - mean
         return np.asarray((_times(precision, away) * away) @ np.ones(away.shape[-1]) / self.bounds.reach**2)
 
-    def _drift(self, x: Array, t: Any) -> Array:
-        return super()._drift(x, t) / (1.0 + _eighth_power(self._far(x, t)))[..., None]
+    def _deciding(self) -> Dynamics:
+        dynamics = super()._deciding()
+        return dynamics._replace(drift=lambda x, t: dynamics.drift(x, t) / (1.0 + _eighth_power(self._far(x, t)))[..., None])
 
     def _within(self, moved: Array, goal: Grid, t0: float) -> Array:
         """Return displacements with a rate that lets b fall to zero where psi is cut off: exp of the rate may be large there."""

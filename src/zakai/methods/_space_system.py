@@ -11,7 +11,7 @@ import numpy as np
 import sympy
 
 from zakai.methods._space import State
-from zakai.methods._space_functions import point_function
+from zakai.methods._space_functions import PointFunction
 from zakai.models.features import OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
 from zakai.models.functions import TableFunction
 from zakai.models.model import Model
@@ -35,11 +35,11 @@ class System:
         n, m, x = model.n, model.m, model.x
         divergence = sum((without_jumps(f, s) for f, s in zip(model.drift, x, strict=True)), start=sympy.S.Zero)
         self.n, self.hold = n, model.input_hold
-        self.drift = point_function([*model.drift, divergence], model, (n + 1,))
+        self.drift: Callable[..., Array] = PointFunction([*model.drift, divergence], model, (n + 1,))
         self.jacobian = numpy_function([without_jumps(f, s) for f in model.drift for s in x], model, (n, n))
         self.covariance = numpy_function(model.covariance, model, (n, n))
-        self.observe = point_function(list(model.observation), model, (m,))
-        self.slopes = point_function([without_jumps(h, s) for h in model.observation for s in x], model, (m, n))
+        self.observe = PointFunction(list(model.observation), model, (m,))
+        self.slopes = PointFunction([without_jumps(h, s) for h in model.observation for s in x], model, (m, n))
         self.noise = numpy_function(model.observation_noise, model, (m, m))
         given = {model.t, *model.u}
         self.drift_varies = bool(model.drift.free_symbols & given)
@@ -57,7 +57,7 @@ class System:
         if self.state_dependent:
             spread = [sum((without_jumps(model.covariance[i, j], x[j]) for j in range(n)), start=sympy.S.Zero) for i in range(n)]
             twice = sum((without_jumps(d, s) for d, s in zip(spread, x, strict=True)), start=sympy.S.Zero)
-            self.spreading = point_function([*spread, twice], model, (n + 1,))
+            self.spreading = PointFunction([*spread, twice], model, (n + 1,))
         self._caches: dict[bytes, Caches] = {}
 
     def over(self, inputs: Inputs | None, start: float, stop: float) -> System:
@@ -111,6 +111,7 @@ class System:
         return Dynamics(
             lambda x, t: self.drift(x, t, theta), lambda x, t: self.jacobian(x, t, theta), noise, self.drift_varies,
             diffusion if self.state_dependent else None,
+            self.drift.formulas(theta) if isinstance(self.drift, PointFunction) else None,
         )  # fmt: skip
 
 

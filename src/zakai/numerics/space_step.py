@@ -33,7 +33,7 @@ from zakai.numerics.space_transport import (
     Linearisation,
     characteristics,
     linearised,
-    runge_kutta,
+    moved_points,
     steps_needed,
     transported,
 )
@@ -111,7 +111,7 @@ class Stepper:
 
     def _moves(self, field: Field, times: tuple[float, ...]) -> list[_Move]:
         """Choose the target grids of substeps that follow each other by moving points of the density."""
-        grid, real, bounds = field.grid, field.values.real, self.bounds
+        grid, real, bounds, dynamics = field.grid, field.values.real, self.bounds, self._deciding()
         found, linears = self._survey(field), self._linear(field, times)
         narrow, widths = narrowest(found, grid, bounds.tail, bounds.spacings)
         holds = bool(np.all(found.edges <= 0.5 * bounds.edge) and np.all(found.tails <= 0.5 * bounds.tail))
@@ -124,10 +124,10 @@ class Stepper:
         noise, moved, steps = np.zeros_like(found.cov), np.zeros_like(start), 0
         for (a, b), linear in zip(pairwise(times), linears, strict=True):
             if not steps:
-                steps, moved = steps_needed(self._drift, grid.centre + start, a, b, grid.basis, tolerance, self.dynamics.varying)
+                steps, moved = steps_needed(dynamics, grid.centre + start, a, b, inverse, tolerance)
             else:
                 with np.errstate(all="ignore"):
-                    moved = moved + runge_kutta(self._drift, grid.centre + start + moved, a, b, steps)[:, : grid.n]
+                    moved = moved + moved_points(dynamics, grid.centre + start + moved, a, b, steps)[:, : grid.n]
             noise = linear.map.real @ noise @ linear.map.real.T + linear.noise.real
             good = np.isfinite(moved).all(axis=1)
             short = np.abs(moved[good] @ inverse.T).max(initial=0.0) < 1.5 and (np.diagonal(noise) / variances).max() < 0.2
@@ -137,9 +137,10 @@ class Stepper:
             moves.append(_Move(linear, steps, target))
         return moves
 
-    def _drift(self, x: Array, t: Any) -> Array:
-        """The drift without derivatives, for decisions."""
-        return np.asarray(self.dynamics.drift(x, t).real)
+    def _deciding(self) -> Dynamics:
+        """Return the drift without derivatives, for decisions."""
+        dynamics = self.dynamics
+        return dynamics if dynamics.formulas is not None else dynamics._replace(drift=lambda x, t: dynamics.drift(x, t).real)
 
     def _support(self, real: Array) -> Array:
         """Return the numbers of some points that cover the support of a density."""

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zakai.numerics.formula_kernel import Formulas
 from zakai.numerics.space_diffusion import diffused
 from zakai.numerics.space_grid import Grid, filtered, gaussian_response, spread, transformed
 from zakai.numerics.space_spline import gather, relative_index
@@ -36,7 +37,7 @@ class Dynamics(NamedTuple):
 
     `drift(x, t)` returns f and its divergence (J, n + 1) at points (J, n), `jacobian(x, t)` (n, n) at one point, `noise(t0, t1)`
     the averages of G and of (1 - s) G over an interval; `varying` is true if f depends on t; `diffusion(x, t)` returns G
-    (J, n, n) at points where it depends on the state, for which `noise` is not used.
+    (J, n, n) at points where it depends on the state, for which `noise` is not used; `formulas` is the drift as arrays.
     """
 
     drift: Callable[[Array, Any], Array]
@@ -44,6 +45,7 @@ class Dynamics(NamedTuple):
     noise: Callable[[float, float], tuple[Array, Array]]
     varying: bool
     diffusion: Callable[[Array, float], Array] | None = None
+    formulas: Formulas | None = None
 
 
 def runge_kutta(
@@ -91,18 +93,28 @@ def runge_kutta(
     return result
 
 
+def moved_points(dynamics: Dynamics, x: Array, t0: float, t1: float, steps: int) -> Array:
+    """Return the displacement and the integral of the divergence (J, n + 1) along characteristics from t0 to t1."""
+    if dynamics.formulas is not None and dynamics.formulas.fast(len(x)):
+        n = x.shape[1]
+        return dynamics.formulas.flow(x, t0, t1, steps, np.zeros(n), np.zeros((n, n)), np.full(n, np.inf))
+    return runge_kutta(dynamics.drift, x, t0, t1, steps)
+
+
 def steps_needed(
-    drift: Callable[[Array, Any], Array], x: Array, t0: float, t1: float, scale: Array, tolerance: Array, varying: bool
+    dynamics: Dynamics, x: Array, t0: float, t1: float, inverse: Array, tolerance: Array
 ) -> tuple[int, Array]:
-    """Return how many Runge-Kutta steps move points x (J, n) to `tolerance` (J,) of `scale` (n, n), and their displacement."""
+    """Return how many Runge-Kutta steps move points x (J, n) to a tolerance, and their displacement.
+
+    The `tolerance` (J,) is that of a component in the basis with an inverse (n, n).
+    """
     n, steps = x.shape[1], 1
-    if varying:
-        steps = _fastest(drift, x[:: max(1, len(x) // 8)], t0, t1)
-    inverse = np.linalg.inv(scale)
+    if dynamics.varying:
+        steps = _fastest(dynamics.drift, x[:: max(1, len(x) // 8)], t0, t1)
     with np.errstate(all="ignore"):
-        last = runge_kutta(drift, x, t0, t1, steps)[:, :n]
+        last = moved_points(dynamics, x, t0, t1, steps)[:, :n]
         while steps < _MOST_STEPS:
-            finer = runge_kutta(drift, x, t0, t1, 2 * steps)[:, :n]
+            finer = moved_points(dynamics, x, t0, t1, 2 * steps)[:, :n]
             error = np.abs((finer - last) @ inverse.T).max(axis=1) / tolerance
             worst = float(np.max(np.where(np.isfinite(error), error, np.inf)))
             if worst <= 1:
@@ -188,14 +200,19 @@ def characteristics(
     The result is (J, n + 1); `begun` is a time between t0 and t1, and what is known from t1 back to it.
     """
     inverse, sizes, open_axes = source.inverse, np.array(source.sizes), ~np.array(source.closed)
+    points = target.points
+    if begun is not None:
+        points, t1 = points + begun[1][:, : source.n], begun[0]
+    if dynamics.formulas is not None and dynamics.formulas.fast(len(points)):
+        limits = np.where(open_axes & (not any(periodic)), sizes, np.inf)
+        moved = dynamics.formulas.flow(points, t1, t0, steps, source.centre, inverse, limits)
+        return moved if begun is None else begun[1] + moved
 
     def beyond(x: Array) -> Array:
         z = np.abs(transformed(x.real - source.centre, inverse))
         return np.asarray(np.any(~(z < sizes) & open_axes, axis=1))
 
-    points, end = target.points, None if any(periodic) else beyond
-    if begun is not None:
-        points, t1 = points + begun[1][:, : source.n], begun[0]
+    end = None if any(periodic) else beyond
     parts = np.array_split(points, -(-len(points) // _TOGETHER))
     with np.errstate(all="ignore"):
         moved = np.concatenate([runge_kutta(dynamics.drift, part, t1, t0, steps, end) for part in parts])

@@ -1,0 +1,231 @@
+"""Evaluation of formulas that are given as arrays, at many points, in one kernel."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import helper, kernel
+
+Array = NDArray[Any]
+# Operations of two operands, then of one; `power` has an integer exponent as its second operand.
+BINARY = ("add", "multiply", "divide", "general_power", "atan2", "min", "max", "power")
+UNARY = (
+    "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "erf", "sign", "abs", "floor", "sqrt",
+    "log1p", "expm1", "logcosh",
+)  # fmt: skip
+BLOCK = 128  # points that are evaluated together
+LARGE = 4096  # points for which NumPy is as fast
+CLOCK, NEITHER = -1, -2  # what a slot holds that holds no coordinate
+
+
+@helper
+def _binary(operation: int, a: Any, b: Any, out: Any, exponent: int) -> None:
+    """Write the result of an operation on rows; `exponent` is that of a whole power."""
+    if operation == 0:
+        for i in range(out.size):
+            out[i] = a[i] + b[i]
+    elif operation == 1:
+        for i in range(out.size):
+            out[i] = a[i] * b[i]
+    elif operation == 2:
+        for i in range(out.size):
+            out[i] = a[i] / b[i]
+    elif operation == 3:
+        for i in range(out.size):
+            out[i] = a[i] ** b[i]
+    elif operation == 4:
+        for i in range(out.size):
+            out[i] = math.atan2(a[i], b[i])
+    elif operation == 5:
+        for i in range(out.size):
+            out[i] = a[i] if a[i] < b[i] or a[i] != a[i] else b[i]
+    elif operation == 6:
+        for i in range(out.size):
+            out[i] = a[i] if a[i] > b[i] or a[i] != a[i] else b[i]
+    else:
+        for i in range(out.size):
+            result, factor, rest = 1.0, a[i], exponent
+            while rest > 0:
+                if rest & 1:
+                    result *= factor
+                factor *= factor
+                rest >>= 1
+            out[i] = result
+
+
+@helper
+def _unary(operation: int, a: Any, out: Any) -> None:
+    """Write the result of a function of a row."""
+    for i in range(out.size):
+        u = a[i]
+        if operation == 0:
+            out[i] = math.sin(u)
+        elif operation == 1:
+            out[i] = math.cos(u)
+        elif operation == 2:
+            out[i] = math.tan(u)
+        elif operation == 3:
+            out[i] = math.asin(u)
+        elif operation == 4:
+            out[i] = math.acos(u)
+        elif operation == 5:
+            out[i] = math.atan(u)
+        elif operation == 6:
+            out[i] = math.sinh(u)
+        elif operation == 7:
+            out[i] = math.cosh(u)
+        elif operation == 8:
+            out[i] = math.tanh(u)
+        elif operation == 9:
+            out[i] = math.exp(u)
+        elif operation == 10:
+            out[i] = math.log(u)
+        elif operation == 11:
+            out[i] = math.erf(u)
+        elif operation == 12:
+            out[i] = 0.0 * u if u == 0.0 or u != u else math.copysign(1.0, u)
+        elif operation == 13:
+            out[i] = abs(u)
+        elif operation == 14:
+            out[i] = math.floor(u) if math.isfinite(u) else u
+        elif operation == 15:
+            out[i] = math.sqrt(u)
+        elif operation == 16:
+            out[i] = math.log1p(u)
+        elif operation == 17:
+            out[i] = math.expm1(u)
+        else:
+            out[i] = abs(u) + math.log1p(math.exp(-2.0 * abs(u))) - math.log(2.0)
+
+
+@helper
+def _run(code: Any, values: Any, size: int) -> None:
+    """Compute the slots (S, BLOCK) that operations write, at the first points of a block."""
+    for line in range(code.shape[0]):
+        operation, result, a, b = code[line]
+        if operation < 8:
+            second = a if operation == 7 else b
+            _binary(operation, values[a, :size], values[second, :size], values[result, :size], b)
+        else:
+            _unary(operation - 8, values[a, :size], values[result, :size])
+
+
+@kernel("void(int64[:, ::1], float64[::1], int64[::1], int64[::1], float64[:, ::1], float64[:, ::1])")
+def _evaluate(code: Any, given: Any, coordinates: Any, outputs: Any, x: Any, out: Any) -> None:
+    """Write the outputs of a program (k, J) at points x (n, J)."""
+    values = np.empty((given.size, BLOCK))
+    for s in range(given.size):
+        values[s] = given[s]
+    for first in range(0, x.shape[1], BLOCK):
+        size = min(BLOCK, x.shape[1] - first)
+        for s in range(given.size):
+            if coordinates[s] >= 0:
+                values[s, :size] = x[coordinates[s], first : first + size]
+        _run(code, values, size)
+        for k in range(outputs.size):
+            out[k, first : first + size] = values[outputs[k], :size]
+
+
+@kernel(
+    "void(int64[:, ::1], float64[::1], int64[::1], int64[::1], float64[:, ::1], float64, float64, int64, float64[::1],"
+    " float64[:, ::1], float64[::1], float64[:, ::1])"
+)
+def _flow(
+    code: Any, given: Any, coordinates: Any, outputs: Any, x: Any, t0: float, t1: float, steps: int,
+    centre: Any, inverse: Any, limits: Any, out: Any,
+) -> None:  # fmt: skip
+    """Write the change (k, J) of points x (n, J), the first n outputs being their velocity: Runge-Kutta steps of order four.
+
+    A point that after a step has an index beyond a limit (n,), relative to a centre, is given up: its change is NaN.
+    """
+    n, count = x.shape
+    values = np.empty((given.size, BLOCK))
+    slopes = np.empty((outputs.size, BLOCK))
+    for s in range(given.size):
+        values[s] = given[s]
+    h = (t1 - t0) / steps
+    for first in range(0, count, BLOCK):
+        size = min(BLOCK, count - first)
+        change = out[:, first : first + size]
+        change[:] = 0.0
+        slopes[:] = 0.0
+        for step in range(steps):
+            total = np.zeros((outputs.size, size))
+            for stage in range(4):
+                share = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
+                for s in range(given.size):
+                    d = coordinates[s]
+                    if d >= 0:
+                        for i in range(size):
+                            values[s, i] = x[d, first + i] + change[d, i] + share * h * slopes[d, i]
+                    elif d == CLOCK:
+                        values[s, :size] = t0 + (step + share) * h
+                _run(code, values, size)
+                weight = h / 6 if stage == 0 or stage == 3 else h / 3
+                for k in range(outputs.size):
+                    for i in range(size):
+                        slopes[k, i] = values[outputs[k], i]
+                        total[k, i] += weight * slopes[k, i]
+            for k in range(outputs.size):
+                for i in range(size):
+                    change[k, i] += total[k, i]
+            alive = 0
+            for i in range(size):
+                inside = True
+                for d in range(n):
+                    index = 0.0
+                    for e in range(n):
+                        index += inverse[d, e] * (x[e, first + i] + change[e, i] - centre[e])
+                    inside = inside and abs(index) < limits[d]
+                if inside:
+                    alive += 1
+                else:
+                    change[:, i] = np.nan
+            if alive == 0:
+                break
+
+
+class Formulas:
+    """A program of formulas as arrays.
+
+    Args:
+        code: operation, slot of the result, and slots of the operands, the second an exponent for a whole power (L, 4).
+        given: the values of all slots (S,), used where no operation writes them.
+        coordinates: for each slot the coordinate of x that it holds, CLOCK for the time, or NEITHER (S,).
+        outputs: the slots of the results (k,).
+    """
+
+    def __init__(self, code: Array, given: Array, coordinates: Array, outputs: Array):
+        self.code, self.given, self.coordinates, self.outputs = code, given, coordinates, outputs
+
+    def fast(self, count: int) -> bool:
+        """Return whether the kernel is faster than NumPy for so many points: NumPy's sines and exponentials are vectorised."""
+        return count <= LARGE or not (self.code[:, 0] >= len(BINARY)).any()
+
+    def at(self, x: Array, t: float) -> Array:
+        """Return the results (J, k) at points x (J, n) and one time, with the values of each result contiguous."""
+        out = np.empty((self.outputs.size, len(x)))
+        given = np.where(self.coordinates == CLOCK, t, self.given)
+        _evaluate(self.code, given, self.coordinates, self.outputs, np.ascontiguousarray(x.T), out)
+        return out.T
+
+    def flow(self, x: Array, t0: float, t1: float, steps: int, centre: Array, inverse: Array, limits: Array) -> Array:
+        """Return the change (J, k) of points x (J, n) from t0 to t1, the first n results being their velocity.
+
+        Args:
+            x: the points.
+            t0: the first time.
+            t1: the last time, before or after the first.
+            steps: the number of Runge-Kutta steps of order four.
+            centre: a point (n,).
+            inverse: the inverse of a basis (n, n).
+            limits: components in this basis, relative to the centre, beyond which a point is given up: its change is NaN (n,).
+        """
+        out = np.empty((self.outputs.size, len(x)))
+        points = np.ascontiguousarray(x.T)
+        _flow(self.code, self.given, self.coordinates, self.outputs, points, t0, t1, steps, centre, inverse, limits, out)
+        return out.T
