@@ -53,7 +53,7 @@ class CrossFormulas:
         divergence = sum((without_jumps(f, s) for f, s in zip(drift, x, strict=True)), sympy.S.Zero)
         covariance = sympy.Matrix(model.covariance) - cross * gain * cross.T
         self.drift = PointFunction([*drift, divergence], self.model, (n + 1,))
-        self.jacobian = numpy_function([without_jumps(f, s) for f in drift for s in x], self.model, (n, n))
+        self.jacobian = PointFunction([without_jumps(f, s) for f in drift for s in x], self.model, (n, n))
         self.covariance = numpy_function(covariance, self.model, (n, n))
         self.potential = PointFunction([potential, *(without_jumps(potential, s) for s in x)], self.model, (n + 1,))
         given, noise = {model.t, *model.u}, bool(model.observation_noise.free_symbols & {model.t, *model.u})

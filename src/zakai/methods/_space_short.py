@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
 import numpy as np
@@ -50,6 +51,12 @@ def predicted_on(
     grid = begin.grid
     if prepared.system.varies or prepared.system.state_dependent or length == 0 or prepared.bounds.periodic != grid.closed:
         return None
+    known, parts = control.fixed and control.known(length, allowed), 1
+    if known:
+        parts = max(1, math.ceil(math.sqrt(control.rate * length**3 / allowed)))
+    unlikely = not control.fixed and length <= control.measured and not control.extrapolated(length) <= allowed
+    if parts > MOST_FIXED or unlikely:
+        return None
     moved = motion_of(prepared, grid, length)
     if not length <= moved.longest:
         return None
@@ -67,13 +74,8 @@ def predicted_on(
             values = fixed_step(values, grid, moved, length / parts, factors)
         return Field(values, grid, begin.log_scale + top)
 
-    known = control.fixed and control.known(length, allowed)
     if known:
-        error = control.rate * length**3
-        parts = max(1, int(np.ceil(np.sqrt(error / allowed))))
-        if parts > MOST_FIXED:
-            return None
-        result, splitting = substeps(parts), error / parts**2
+        result, splitting = substeps(parts), control.rate * length**3 / parts**2
         control = control._replace(age=control.age + 1)
     else:
         result, coarse = substeps(2), substeps(1)

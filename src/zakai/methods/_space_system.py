@@ -36,7 +36,7 @@ class System:
         divergence = sum((without_jumps(f, s) for f, s in zip(model.drift, x, strict=True)), start=sympy.S.Zero)
         self.n, self.hold = n, model.input_hold
         self.drift: Callable[..., Array] = PointFunction([*model.drift, divergence], model, (n + 1,))
-        self.jacobian = numpy_function([without_jumps(f, s) for f in model.drift for s in x], model, (n, n))
+        self.jacobian: Callable[..., Array] = PointFunction([without_jumps(f, s) for f in model.drift for s in x], model, (n, n))
         self.covariance = numpy_function(model.covariance, model, (n, n))
         self.observe = PointFunction(list(model.observation), model, (m,))
         self.slopes = PointFunction([without_jumps(h, s) for h in model.observation for s in x], model, (m, n))

@@ -44,6 +44,10 @@ class Control(NamedTuple):
         fresh = np.isfinite(error) and self.age * (1 + 4 * error / allowed) < CHECKED
         return bool(fresh and tau <= 2 * self.measured)
 
+    def extrapolated(self, tau: float) -> float:
+        """Return the error that extrapolation leaves of a substep of length tau."""
+        return float(_EXTRAPOLATED * (0.75 * min(self.rate * tau**3, 1.0)) ** (5 / 3))
+
 
 def advance(
     stepper: Stepper,
@@ -64,7 +68,7 @@ def advance(
     known = not control.fixed and control.known(tau, allowed)
     error = control.rate * tau**3 if known else np.inf
     singles = np.ceil(np.sqrt(error / allowed)) if np.isfinite(error) else np.inf
-    doubles = max(1.0, np.ceil((_EXTRAPOLATED * (0.75 * min(error, 1.0)) ** (5 / 3) / allowed) ** 0.25)) if known else 1.0
+    doubles = max(1.0, np.ceil((control.extrapolated(tau) / allowed) ** 0.25)) if known else 1.0
     singles, doubles = max(singles, 2.0 * least if least > 1 else 1.0), max(doubles, least)
     if singles < 2 * doubles and stepper.limit(field, t0, t0 + tau / singles) >= t0 + tau / singles:
         parts, report = int(singles), NOTHING

@@ -53,7 +53,7 @@ def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
     away = STEEP_AT * grid.basis * np.array(grid.sizes)
     inside = grid.centre + np.concatenate([np.zeros((1, n)), away.T, -away.T])
     with np.errstate(all="ignore"):
-        matrices = np.stack([inverse @ dynamics.jacobian(x, 0.0).real @ grid.basis for x in inside])
+        matrices = inverse @ dynamics.jacobian(inside, 0.0).real @ grid.basis
         rate = float(np.abs(matrices).sum(axis=2).max())
     variances = inverse @ dynamics.noise(0.0, 1.0)[0] @ inverse.T
     noise = float((np.diagonal(variances).real / (np.array(grid.sizes) / 11.0) ** 2).max())

@@ -6,6 +6,7 @@ spreading by a Gaussian is exact in frequency.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -145,12 +146,13 @@ def gradient(values: Array, grid: Grid) -> Array:
     k, _ = _frequencies(values.shape)
     axes = tuple(range(values.ndim))
     return np.stack([np.fft.irfftn(1j * k[d] * spectrum, values.shape, axes) for d in axes])
-_SIZES = np.array([8, 12, 16, 20, 24, 28, 32, 36, 40, 44, 48, 52, 56, 60, 64, 70, 72, 80, 84, 90, 96, 100, 108, 112, 120, 128,
+SIZES = np.array([8, 12, 16, 20, 24, 28, 32, 36, 40, 44, 48, 52, 56, 60, 64, 70, 72, 80, 84, 90, 96, 100, 108, 112, 120, 128,
                    140, 144, 160, 180, 192, 216, 240, 256, 288, 320, 360, 384, 432, 480, 512, 576, 640, 720, 768, 864, 960, 1024,
                    1152, 1280, 1440, 1536, 1728, 1920, 2048])  # fmt: skip
+_SIZES = SIZES.tolist()
 
 
 def rounded_size(points: float, least: int, most: int) -> int:
     """Return the smallest size, fast for the Fourier transform, of at least so many points, between two bounds."""
     wanted = min(max(points, least), most)
-    return int(_SIZES[min(int(np.searchsorted(_SIZES, wanted - 1e-9)), len(_SIZES) - 1)])
+    return _SIZES[min(bisect_left(_SIZES, wanted - 1e-9), len(_SIZES) - 1)]

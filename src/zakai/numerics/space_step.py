@@ -79,7 +79,7 @@ class Stepper:
         mean, drift = grid.centre + found.mean, self.dynamics.drift
         with np.errstate(all="ignore"):
             middle = mean + 0.5 * (t1 - t0) * drift(mean[None], t0)[0, :-1].real
-            jacobian = self.dynamics.jacobian(middle, 0.5 * (t0 + t1))
+            jacobian = self.dynamics.jacobian(middle[None], 0.5 * (t0 + t1))[0]
         jacobian = jacobian if np.all(np.isfinite(jacobian)) else np.zeros_like(jacobian)
         noises = [self.dynamics.noise(a, b) for a, b in pairwise(times)]
         if self.dynamics.diffusion is not None:

@@ -35,7 +35,7 @@ _LARGEST_VOLUME = 300.0  # nats; points beyond come from outside of the grid
 class Dynamics(NamedTuple):
     """The drift and the noise of a system.
 
-    `drift(x, t)` returns f and its divergence (J, n + 1) at points (J, n), `jacobian(x, t)` (n, n) at one point, `noise(t0, t1)`
+    `drift(x, t)` returns f and its divergence (J, n + 1) at points (J, n), `jacobian(x, t)` (J, n, n), `noise(t0, t1)`
     the averages of G and of (1 - s) G over an interval; `varying` is true if f depends on t; `diffusion(x, t)` returns G
     (J, n, n) at points where it depends on the state, for which `noise` is not used; `formulas` is the drift as arrays.
     """

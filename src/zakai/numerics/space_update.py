@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -159,13 +160,11 @@ def _next(
             ratio = np.clip(bounds.spacings / deviations_in_spacings(found.tails), 1.1, 2)
             finer = np.where(found.tails > bounds.tail, ratio, 1.0)
             return adjusted(grid, np.zeros(grid.n), np.zeros(grid.n), finer, bounds)
-    used = tempered >= tempered.max() + np.log(bounds.edge)  # equal, where logarithms are too large to subtract
-    flat = np.flatnonzero(used)
-    near = grid.offsets[flat]
-    levels = tempered.reshape(-1)[flat] - tempered.max()
+    levels = (tempered - tempered.max()).reshape(-1)  # equal, where logarithms are too large to subtract
     if bounds.band_limited:
-        return whitened_grid(near, levels, noise, narrow, bounds, grid)
-    return fitted_grid(near, levels, grid.centre, noise, narrow, bounds, grid)
+        used = np.flatnonzero(levels >= np.log(bounds.edge))
+        return whitened_grid(grid.offsets[used], levels[used], noise, narrow, bounds, grid)
+    return fitted_grid(grid.offsets, levels, grid.centre, noise, narrow, bounds, grid, least=math.log(bounds.edge))
 
 
 def _at_end(product: Array, grid: Grid, predicted: Grid, bounds: Bounds) -> bool:

@@ -7,14 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zakai.numerics.space_fit import fit
 from zakai.numerics.space_grid import Grid, rounded_size
 
 Array = NDArray[Any]
 LEAST = {1: 32, 2: 20, 3: 16, 4: 12}
 MOST = {1: 1024, 2: 512, 3: 128, 4: 40}
 POINTS = {1: 2**10, 2: 2**18, 3: 2**18, 4: 2**19}  # of a grid; the work of a substep is proportional to them
-_CORRELATED = 0.6  # correlation above which the axes follow the covariance
-_OPEN, _CLOSED = 0.6, 0.85  # shares of a circle below which an axis is cut open, and above which it is closed
 
 
 class Bounds(NamedTuple):
@@ -52,6 +51,7 @@ def fitted_grid(
     bounds: Bounds,
     previous: Grid,
     extra: float = 0.0,
+    least: float = -np.inf,
 ) -> Grid:
     """Return a grid for points with a Gaussian N(0, noise) added.
 
@@ -64,67 +64,17 @@ def fitted_grid(
         bounds: what the grid must keep.
         previous: the grid of the points; its axes are kept where they still fit.
         extra: share of its width by which the grid is wider at each end.
+        least: smallest logarithm of a point that counts.
     """
     n = len(start)
-    weights = np.exp(logs)
-    weights = weights / weights.sum()
-    x = offsets
-    if any(previous.closed):
-        turn = np.exp(1j * np.where(previous.closed, x, 0.0))
-        middle = np.angle(weights @ turn)
-        around = middle + (x - middle) - 2 * np.pi * np.round((x - middle) / (2 * np.pi))
-        x = np.where(previous.closed, around, x)
-    mean = weights @ x
-    apart = x - mean
-    cov = (apart * weights[:, None]).T @ apart + noise
-    shape = _shape(cov, previous, bounds.periodic)
-    inverse = np.linalg.inv(shape)
-    z, spread, added = apart @ inverse.T, inverse @ cov @ inverse.T, inverse @ noise @ inverse.T
-    spreading = np.sqrt(np.maximum(bounds.reach**2 + 2 * np.minimum(logs, 0.0), 0.0))[:, None] * np.sqrt(np.diagonal(added))
-    low, high = (z - spreading).min(axis=0), (z + spreading).max(axis=0)
-    low, high = low - extra * (high - low), high + extra * (high - low)
-    scale = np.sqrt(np.diagonal(spread))
-    scaled = spread / np.outer(scale, scale) + 1e-10 * np.eye(n)
-    conditional = scale / np.sqrt(np.diagonal(np.linalg.inv(scaled)))
-    spacing = conditional * np.clip(narrowness, 1e-3, 1.0) / bounds.spacings
-    return _sized(mean + start, shape, low, high, spacing, bounds, previous)
-
-
-def _shape(cov: Array, previous: Grid, periodic: tuple[bool, ...]) -> Array:
-    """Return axes (columns) of unit size in their own coordinate: aligned, the previous ones, or the Cholesky factor's."""
-    n = len(cov)
-    if any(periodic) or n == 1:
-        return np.eye(n)
-    old = previous.basis / np.diagonal(previous.basis)
-    for axes in (old, np.eye(n)):
-        inverse = np.linalg.inv(axes)
-        spread = inverse @ cov @ inverse.T
-        scale = np.sqrt(np.diagonal(spread))
-        if np.abs(spread / np.outer(scale, scale) - np.eye(n)).max() < _CORRELATED:
-            return np.asarray(axes)
-    scale = np.sqrt(np.diagonal(cov))
-    factor = np.linalg.cholesky(cov / np.outer(scale, scale) + 1e-8 * np.eye(n))
-    return np.asarray(scale[:, None] * (factor / np.diagonal(factor)) / scale)
-
-
-def _sized(centre: Array, shape: Array, low: Array, high: Array, spacing: Array, bounds: Bounds, previous: Grid | None) -> Grid:
-    n = len(centre)
-    sizes, closed, steps = [], [], np.ones(n)
-    middle = 0.5 * (low + high)
-    spacing = spacing * _coarser((high - low) / spacing + 4, bounds)
-    for d in range(n):
-        width = high[d] - low[d] + 4 * spacing[d]
-        share = width / (2 * np.pi)
-        was = previous is not None and previous.closed[d]
-        circle = bool(bounds.periodic[d]) and share > (_OPEN if was else _CLOSED)
-        if circle:
-            width, middle[d] = 2 * np.pi, 0.0
-        size = rounded_size(width / spacing[d], LEAST[n], bounds.most)
-        sizes.append(size)
-        closed.append(circle)
-        # Points to spare go to the width and to the spacing alike.
-        steps[d] = 2 * np.pi / size if circle else max(width / size, np.sqrt(width / size * min(spacing[d], 1.3 * width / size)))
-    return Grid(centre + shape @ middle, shape * steps, tuple(sizes), tuple(closed))
+    centre, basis = np.zeros(n), np.empty((n, n))
+    sizes, closed = np.empty(n, np.int64), np.empty(n, bool)
+    fit(
+        np.array(offsets.T, order="C"), np.ascontiguousarray(logs), least, start, np.ascontiguousarray(noise), narrowness,
+        np.ascontiguousarray(previous.basis), np.array(previous.closed), np.array(bounds.periodic), bounds.reach, bounds.spacings,
+        extra, LEAST[n], bounds.most, POINTS[n], centre, basis, sizes, closed,
+    )  # fmt: skip
+    return Grid(centre, basis, tuple(sizes.tolist()), tuple(closed.tolist()))
 
 
 def _coarser(sizes: Array, bounds: Bounds) -> float:
