@@ -26,9 +26,8 @@ from zakai.methods._space_system import moments_of
 from zakai.numerics.space_advance import Control, advance
 from zakai.numerics.space_field import NOTHING, Field, Report, positive
 from zakai.numerics.space_fixed import fits, refitted
-from zakai.numerics.space_grid import Grid, filtered, gaussian_response, rounded_size
+from zakai.numerics.space_grid import Grid, filtered, rounded_size
 from zakai.numerics.space_spline import gather, relative_index, resampled
-from zakai.numerics.space_survey import survey
 from zakai.numerics.space_update import Update, updated
 from zakai.numerics.space_window import Bounds, fitted_grid
 
@@ -63,11 +62,11 @@ class Message(NamedTuple):
     def log(self, periodic: tuple[bool, ...]) -> Callable[[Grid], Array]:
         """Return log b (J,), but for the scale, as a function of a grid; it is -inf where psi is rounding."""
         values, own = self.field.values, self.field.grid
-        coefficients = filtered(values, gaussian_response(np.zeros((own.n, own.n)), own.sizes, spline=True))
+        coefficients = filtered(values, np.zeros((own.n, own.n)), spline=True)
         least = NOISE * values.max()
 
         def log(grid: Grid) -> Array:
-            found = gather(coefficients, relative_index(grid.offsets, grid.centre, own, periodic), own)
+            found = gather(coefficients, relative_index(grid, own, periodic), own)
             known = found > least
             return np.where(known, np.log(np.where(known, found, 1.0)) - self.gauge.log(grid.points), -np.inf)
 
@@ -112,7 +111,7 @@ def _product(prepared: base.Prepared, state: State, later: Message, tail: float)
     bounds = _general(prepared).bounds
     bounds, own = bounds._replace(tail=max(bounds.tail, tail)), prepared.density(state)
     own = _refined(Field(own.values.real, own.grid, own.log_scale), later.field.grid, bounds)
-    tails = float(survey(own.values, own.grid, bounds.edge).tails.max())
+    tails = float(own.survey(bounds).tails.max())
     return updated(own, later.log(bounds.periodic), bounds, tails)
 
 

@@ -102,7 +102,7 @@ class Stepper:
 
     def _adapted(self, source: Field, result: Field) -> Field | None:
         """Return the source on a wider or finer grid, or None where the result is within bounds or nothing can be changed."""
-        found = survey(result.values.real, result.grid, self.bounds.edge)
+        found = result.survey(self.bounds)
         wide, coarse = found.edges > 10 * self.bounds.edge, found.tails > 10 * self.bounds.tail
         if not (wide.any() or coarse.any()):
             return None
@@ -175,7 +175,7 @@ class Stepper:
 
     def report(self, result: Field) -> Report:
         """Return the errors that the grid shows."""
-        found = survey(result.values.real, result.grid, self.bounds.edge)
+        found = result.survey(self.bounds)
         real = result.values.real
         negative = float(-np.minimum(real, 0.0).sum() / real.sum())
         return Report(0.0, 0.0, float(found.edges.max()), float(found.tails.max()), negative)
@@ -217,7 +217,7 @@ def regridded(field: Field, bounds: Bounds) -> Field:
     """Return the density on a grid with as many points as it needs, where its own has many more or its axes are skew."""
     grid = field.grid
     real = np.where(field.values.real > 0, field.values.real, 0.0)
-    narrow, _ = narrowest(survey(real, grid, bounds.edge, bounds.tail), grid, bounds.tail)
+    narrow, _ = narrowest(survey(real, grid, bounds.edge, bounds.tail), bounds.tail)
     used = np.flatnonzero(real > bounds.edge * real.max())
     with np.errstate(divide="ignore"):
         logs = np.log(real.reshape(-1)[used] / real.max())

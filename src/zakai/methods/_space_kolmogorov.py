@@ -30,7 +30,7 @@ from zakai.numerics.space_field import NOTHING, Field, Report, positive
 from zakai.numerics.space_fixed import fits, refitted
 from zakai.numerics.space_grid import Grid
 from zakai.numerics.space_step import Stepper
-from zakai.numerics.space_survey import Survey, survey
+from zakai.numerics.space_survey import Survey
 from zakai.numerics.space_update import Update, updated
 from zakai.numerics.space_window import MOST, Bounds
 from zakai.records.schedule import Schedule
@@ -186,7 +186,7 @@ class Prepared:
         self, state: State, update: Update, report: Report, control: Control, constant: Any, kept: float, found: Survey | None
     ) -> tuple[State, Info]:
         result = positive(update.field, self.bounds) if found is None else update.field
-        mean, cov = moments_of(result.values.real, result.grid, self.angles, found)
+        mean, cov = moments_of(result.values.real, result.grid, self.angles, found or result.survey(self.bounds))
         mass = result.values.sum() * result.grid.cell
         gained = np.log(mass) + (result.log_scale + constant)
         if found is not None and not fits(found, result.grid, self.bounds):
@@ -241,7 +241,7 @@ class Prepared:
     def _kept(self, begin: Field, predicted: Field, result: Field) -> float:
         """Return the share of an error of the mean, in deviations, that an interval leaves."""
         before, between, after = (
-            max(float(np.linalg.det(survey(f.values, f.grid).cov)), 1e-300) for f in (begin, predicted, result)
+            max(float(np.linalg.det(f.survey(self.bounds).cov)), 1e-300) for f in (begin, predicted, result)
         )
         contracted = (min(before, between) / between * min(after, between) / between) ** (0.5 / self.model.n)
         return float(np.clip(contracted, 0.0, KEPT))

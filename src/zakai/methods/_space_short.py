@@ -13,7 +13,7 @@ from zakai.numerics.space_advance import Control
 from zakai.numerics.space_field import Field, Report, extrapolated, grid_report, moments_difference, positive
 from zakai.numerics.space_fixed import LARGEST_RANGE, Motion, fixed_step, motion
 from zakai.numerics.space_grid import Grid
-from zakai.numerics.space_survey import Survey, survey
+from zakai.numerics.space_survey import Survey
 from zakai.numerics.space_window import Bounds
 
 Array = Any
@@ -86,7 +86,7 @@ def predicted_on(
             return None
         result = result._replace(values=values)
         control = Control(difference * (4 / 3) / length**3, length, 0, True)
-    found = survey(result.values, grid, prepared.bounds.edge)
+    found = result.survey(prepared.bounds)
     report = grid_report(found)
     if not (report.edges <= 3 * prepared.bounds.edge and report.tails <= prepared.bounds.tail):
         return None

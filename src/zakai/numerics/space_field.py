@@ -19,12 +19,22 @@ NEGLIGIBLE = 1e-40  # of the maximum
 NOISE = 2.0  # the largest noise, as a multiple of the most negative value
 
 
-class Field(NamedTuple):
-    """A density `values` (*sizes), but for exp(`log_scale`), on a grid."""
-
+class _Fields(NamedTuple):
     values: Array
     grid: Grid
     log_scale: Any
+
+
+class Field(_Fields):
+    """A density `values` (*sizes), but for exp(`log_scale`), on a grid."""
+
+    def survey(self, bounds: Bounds) -> Survey:
+        """Return the survey with the limits of some bounds, which is kept."""
+        kept: dict[Any, Survey] = self.__dict__
+        key = bounds.edge, bounds.tail
+        if key not in kept:
+            kept[key] = survey(self.values, self.grid, *key)
+        return kept[key]
 
     @property
     def log_mass(self) -> Any:
@@ -101,7 +111,8 @@ def positive(field: Field, bounds: Bounds) -> Field:
     """
     real = field.values.real
     noise = 0.0 if bounds.band_limited else min(-NOISE * real.min(), bounds.edge * real.max())
-    return field._replace(values=np.where(real > max(NEGLIGIBLE * real.max(), noise), field.values, 0.0))
+    values = np.where(real > max(NEGLIGIBLE * real.max(), noise), field.values, 0.0)
+    return field if np.array_equal(values, field.values) else field._replace(values=values)
 
 
 def extrapolated(fine: Array, coarse: Array, log_ratio: Any) -> tuple[Array, float]:

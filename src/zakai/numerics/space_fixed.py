@@ -94,7 +94,7 @@ def _spread(values: Array, cov: Array, separate: bool, spline: bool = False) -> 
     """Return values (*sizes) after spreading by a covariance in index units; with `spline`, the coefficients of their spline."""
     shape = values.shape
     if not separate:
-        return filtered(values, gaussian_response(cov, shape, spline))
+        return filtered(values, cov, spline)
     for d, size in enumerate(shape):
         matrix = _circulant(cov[d, d].item(), size, spline)
         if d == values.ndim - 1:
@@ -137,8 +137,8 @@ def refitted(field: Field, bounds: Bounds) -> Field:
     Along other axes a density may need smaller spacings than along its own; where it does, it stays on its grid.
     """
     grid, real = field.grid, field.values.real
-    found = survey(real, grid, bounds.edge, bounds.tail)
-    narrow, _ = narrowest(found, grid, bounds.tail, bounds.spacings)
+    found = field.survey(bounds)
+    narrow, _ = narrowest(found, bounds.tail, bounds.spacings)
     used = np.flatnonzero(real > 0.3 * bounds.edge * real.max())
     logs = np.log(real.reshape(-1)[used] / real.max())
     new = fitted_grid(grid.offsets[used], logs, grid.centre, np.zeros((grid.n, grid.n)), narrow, bounds, grid, MARGIN)

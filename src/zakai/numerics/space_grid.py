@@ -6,12 +6,16 @@ spreading by a Gaussian is exact in frequency.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfftn, rfftn
+
+from zakai.numerics.compiled import kernel
 
 Array = NDArray[Any]
 
@@ -94,56 +98,82 @@ def weighted_products(weights: Array, points: Array) -> Array:
 
 
 @lru_cache(maxsize=256)
-def _frequencies(sizes: tuple[int, ...]) -> tuple[list[Array], Array]:
-    """Return the frequencies along each axis, shaped for broadcasting, and the spline's response (real transform)."""
+def _frequencies(sizes: tuple[int, ...]) -> list[Array]:
+    """Return the frequencies of a real transform along each axis, shaped for broadcasting."""
     n = len(sizes)
-    out, response = [], np.ones(())
+    out = []
     for d, size in enumerate(sizes):
         k = 2 * np.pi * (np.fft.rfftfreq(size) if d == n - 1 else np.fft.fftfreq(size))
-        view = k.reshape([-1 if a == d else 1 for a in range(n)])
-        out.append(view)
-        response = response * (66 + 52 * np.cos(view) + 2 * np.cos(2 * view)) / 120
-    return out, response
+        out.append(k.reshape([-1 if a == d else 1 for a in range(n)]))
+    return out
+
+
+@kernel("void(complex128[::1], int64[::1], float64[:, ::1], boolean)")
+def _respond(spectrum: Any, sizes: Any, cov: Any, spline: bool) -> None:
+    """Multiply a real transform by that of N(0, cov), cov in index units; with `spline`, divide it by the spline's response."""
+    n = sizes.size
+    waves, factors = np.zeros((n, sizes.max())), np.ones((n, sizes.max()))
+    for d in range(n):
+        for i in range(sizes[d]):
+            waves[d, i] = 2 * math.pi / sizes[d] * (i if 2 * i < sizes[d] or d == n - 1 else i - sizes[d])
+            if spline:
+                factors[d, i] = 120 / (66 + 52 * math.cos(waves[d, i]) + 2 * math.cos(2 * waves[d, i]))
+    half = sizes[n - 1] // 2 + 1
+    index, slope = np.zeros(n, np.int64), 0.0
+    for line in range(spectrum.size // half):
+        rest, factor, exponent, slope = line, 1.0, 0.0, 0.0
+        for d in range(n - 2, -1, -1):
+            index[d] = rest % sizes[d]
+            rest //= sizes[d]
+            factor *= factors[d, index[d]]
+        for d in range(n - 1):
+            slope -= cov[n - 1, d] * waves[d, index[d]]
+            for e in range(n - 1):
+                exponent -= 0.5 * cov[d, e] * waves[d, index[d]] * waves[e, index[e]]
+        for i in range(half):
+            k = waves[n - 1, i]
+            power = min(exponent + k * (slope - 0.5 * cov[n - 1, n - 1] * k), 0.0)
+            spectrum[line * half + i] *= factor * factors[n - 1, i] * math.exp(power)
 
 
 def gaussian_response(cov: Array, sizes: tuple[int, ...], spline: bool = False) -> Array:
     """Return the Fourier multiplier of spreading by N(0, cov), cov (n, n) in index units, divided by the spline's response."""
-    k, response = _frequencies(sizes)
-    n = len(sizes)
-    exponent = np.zeros((), cov.dtype)
-    for i in range(n):
-        if cov[i, i] != 0:
-            exponent = exponent - (0.5 * cov[i, i]) * k[i] ** 2
-        for j in range(i):
-            if cov[i, j] != 0:
-                exponent = exponent - cov[i, j] * (k[i] * k[j])
-    result = np.exp(np.minimum(exponent.real, 0.0) + (1j * exponent.imag if np.iscomplexobj(exponent) else 0.0))
-    return np.asarray(result / response if spline else np.broadcast_to(result, response.shape))
+    response = np.ones((*sizes[:-1], sizes[-1] // 2 + 1), complex)
+    _respond(response.reshape(-1), np.array(sizes), np.ascontiguousarray(cov.real), spline)
+    if not np.iscomplexobj(cov):
+        return np.asarray(response.real)
+    k = _frequencies(sizes)
+    exponent = sum(0.5 * cov[i, j].imag * (k[i] * k[j]) for i in range(len(sizes)) for j in range(len(sizes)))
+    return np.asarray(response.real * (1.0 - 1j * exponent))
 
 
-def filtered(values: Array, response: Array) -> Array:
-    """Return real values (*sizes) with their spectrum multiplied; complex ones carry a derivative in the imaginary part."""
-    sizes, axes = values.shape, tuple(range(values.ndim))
-    if not (np.iscomplexobj(values) or np.iscomplexobj(response)):
-        return np.asarray(np.fft.irfftn(np.fft.rfftn(values) * response, sizes, axes))
-    spectrum = np.fft.rfftn(values.real)
-    change = np.fft.rfftn(np.ascontiguousarray(values.imag)) * response.real + spectrum * response.imag
-    real = np.fft.irfftn(spectrum * response.real, sizes, axes)
-    return np.asarray(real + 1j * np.fft.irfftn(change, sizes, axes))
+def filtered(values: Array, cov: Array, spline: bool = False) -> Array:
+    """Return values (*sizes) after spreading by N(0, cov), cov (n, n) in index units; with `spline`, their spline's coefficients.
+
+    Complex ones carry a derivative in the imaginary part.
+    """
+    sizes = values.shape
+    if not (np.iscomplexobj(values) or np.iscomplexobj(cov)):
+        spectrum = rfftn(values)
+        _respond(spectrum.reshape(-1), np.array(sizes), np.ascontiguousarray(cov), spline)
+        return np.asarray(irfftn(spectrum, sizes, overwrite_x=True))
+    response, spectrum = gaussian_response(cov, sizes, spline), rfftn(values.real)
+    change = rfftn(np.ascontiguousarray(values.imag)) * response.real + spectrum * response.imag
+    return np.asarray(irfftn(spectrum * response.real, sizes) + 1j * irfftn(change, sizes))
 
 
-def spread(values: Array, grid: Grid, cov: Array, spline: bool = False) -> Array:
-    """Return the values after spreading by N(0, cov) in x; with `spline`, the coefficients of their spline."""
-    if not spline and not np.any(cov):
+def spread(values: Array, grid: Grid, cov: Array) -> Array:
+    """Return the values after spreading by N(0, cov) in x."""
+    if not np.any(cov):
         return values
     inverse = grid.inverse
-    return filtered(values, gaussian_response(inverse @ cov @ inverse.T, grid.sizes, spline))
+    return filtered(values, inverse @ cov @ inverse.T)
 
 
 def gradient(values: Array, grid: Grid) -> Array:
     """Return the derivatives of real values along the axes, in index units (n, *sizes)."""
     spectrum = np.fft.rfftn(values)
-    k, _ = _frequencies(values.shape)
+    k = _frequencies(values.shape)
     axes = tuple(range(values.ndim))
     return np.stack([np.fft.irfftn(1j * k[d] * spectrum, values.shape, axes) for d in axes])
 SIZES = np.array([8, 12, 16, 20, 24, 28, 32, 36, 40, 44, 48, 52, 56, 60, 64, 70, 72, 80, 84, 90, 96, 100, 108, 112, 120, 128,

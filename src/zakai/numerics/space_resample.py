@@ -71,7 +71,7 @@ def triangular_resampled(values: Array, grid: Grid, new: Grid, sheared: bool = F
 def sinc_resampled(values: Array, grid: Grid, new: Grid) -> Array:
     """Return the band-limited interpolant of a density at the points of any grid; zero outside of the old one."""
     n = grid.n
-    z = relative_index(new.offsets, new.centre, grid)
+    z = relative_index(new, grid)
     out = np.zeros(len(z), values.dtype)
     rest = int(np.prod(grid.sizes[1:]))
     block = max(1, 8_000_000 // rest)

@@ -14,12 +14,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import is_complex
-from zakai.numerics.space_grid import (
-    Grid,
-    filtered,
-    gaussian_response,
-    transformed,
-)
+from zakai.numerics.space_grid import Grid, filtered
 
 Array = NDArray[Any]
 BLOCK = 5  # points of a block along each axis, of which the six taps of a spline reach two at most
@@ -158,15 +153,56 @@ def gather(coefficients: Array, z: Array, grid: Grid, least: float = 0.0) -> Arr
     return out
 
 
-def relative_index(offsets: Array, start: Array, grid: Grid, periodic: Sequence[bool] | None = None) -> Array:
-    """Return the indices, counted from the first point of a grid, of the points start + offsets (J, n); angles are wrapped."""
-    x = offsets + (start - grid.centre)
-    if periodic is not None and any(periodic):
-        x = np.where(np.array(periodic), x - 2 * np.pi * np.round(x.real / (2 * np.pi)), x)
-    return np.asarray(transformed(x, grid.inverse) + np.array(grid.sizes) // 2)
+@kernel(
+    "void(int64[::1], float64[:, ::1], float64[::1], float64[:, ::1], float64[::1], boolean[::1], float64[:, ::1],"
+    " float64[:, ::1])",
+    "void(int64[::1], float64[:, ::1], float64[::1], float64[:, ::1], float64[::1], boolean[::1], complex128[:, ::1],"
+    " complex128[:, ::1])",
+)
+def _relative(
+    sizes: Any, basis: Any, shift: Any, inverse: Any, first: Any, periodic: Any, moved: Any, z: Any
+) -> None:  # fmt: skip
+    """Write the indices z (n, J) in one grid of the points of another, moved by (k, J), k >= n or J = 0; angles are wrapped."""
+    n, count = z.shape
+    index = np.zeros(n)
+    x = np.zeros(n, z.dtype)
+    for j in range(count):
+        rest = j
+        for d in range(n - 1, -1, -1):
+            index[d] = rest % sizes[d] - sizes[d] // 2
+            rest //= sizes[d]
+        for d in range(n):
+            x[d] = shift[d] + (moved[d, j] if moved.shape[1] else 0.0)
+            for e in range(n):
+                x[d] += basis[d, e] * index[e]
+            if periodic[d] and math.isfinite(x[d].real):
+                x[d] -= 2 * math.pi * np.round(x[d].real / (2 * math.pi))
+        for d in range(n):
+            z[d, j] = first[d]
+            for e in range(n):
+                z[d, j] += inverse[d, e] * x[e]
+
+
+def relative_index(new: Grid, grid: Grid, periodic: Sequence[bool] | None = None, moved: Array | None = None) -> Array:
+    """Return the indices (J, n), counted from the first point of a grid, of the points of another; angles are wrapped.
+
+    Args:
+        new: the grid of the points.
+        grid: the grid of the indices.
+        periodic: which coordinates are angles (n,).
+        moved: displacements that are added to the points, in its first columns (J, n + ...).
+    """
+    n, dtype = grid.n, complex if moved is not None and np.iscomplexobj(moved) else float
+    z = np.empty((n, math.prod(new.sizes)), dtype)
+    displacement = np.zeros((n, 0), dtype) if moved is None else np.ascontiguousarray(moved.T)
+    _relative(
+        np.array(new.sizes), np.ascontiguousarray(new.basis), new.centre - grid.centre, np.ascontiguousarray(grid.inverse),
+        np.array([float(size // 2) for size in grid.sizes]), np.array(periodic or (False,) * n), displacement, z,
+    )  # fmt: skip
+    return z.T
 
 
 def resampled(values: Array, grid: Grid, new: Grid, periodic: Sequence[bool] | None = None) -> Array:
     """Return the spline interpolant of a density at the points of another grid (*sizes)."""
-    coefficients = filtered(values, gaussian_response(np.zeros((grid.n, grid.n)), grid.sizes, spline=True))
-    return gather(coefficients, relative_index(new.offsets, new.centre, grid, periodic), grid).reshape(new.sizes)
+    coefficients = filtered(values, np.zeros((grid.n, grid.n)), spline=True)
+    return gather(coefficients, relative_index(new, grid, periodic), grid).reshape(new.sizes)

@@ -24,9 +24,9 @@ from zakai.numerics.space_field import (
     positive,
     refinable,
 )
-from zakai.numerics.space_grid import Grid, filtered, gaussian_response
+from zakai.numerics.space_grid import Grid, filtered
 from zakai.numerics.space_resample import padded
-from zakai.numerics.space_survey import Survey, deviations_in_spacings, narrowest, survey
+from zakai.numerics.space_survey import deviations_in_spacings, narrowest, survey
 from zakai.numerics.space_transport import (
     Dynamics,
     Factor,
@@ -60,22 +60,14 @@ class Stepper:
 
     def __init__(self, dynamics: Dynamics, bounds: Bounds, tolerance: float):
         self.dynamics, self.bounds, self.tolerance = dynamics, bounds, tolerance
-        self._surveyed: tuple[Array, Survey] | None = None
         self._linearised: tuple[Array, tuple[float, ...], list[Linearisation]] | None = None
-
-    def _survey(self, field: Field) -> Survey:
-        """Return the survey of a density, which is kept for the last one."""
-        if self._surveyed is None or self._surveyed[0] is not field.values:
-            found = survey(field.values, field.grid, self.bounds.edge, self.bounds.tail)
-            self._surveyed = field.values, found
-        return self._surveyed[1]
 
     def _linear(self, field: Field, times: tuple[float, ...]) -> list[Linearisation]:
         """Return the system over intervals that follow each other, linearised in the middle of the path of the mean."""
         last = self._linearised
         if last is not None and last[0] is field.values and last[1] == times:
             return last[2]
-        found, grid, (t0, t1) = self._survey(field), field.grid, (times[0], times[-1])
+        found, grid, (t0, t1) = field.survey(self.bounds), field.grid, (times[0], times[-1])
         mean, drift = grid.centre + found.mean, self.dynamics.drift
         with np.errstate(all="ignore"):
             middle = mean + 0.5 * (t1 - t0) * drift(mean[None], t0)[0, :-1].real
@@ -112,8 +104,8 @@ class Stepper:
     def _moves(self, field: Field, times: tuple[float, ...]) -> list[_Move]:
         """Choose the target grids of substeps that follow each other by moving points of the density."""
         grid, real, bounds, dynamics = field.grid, field.values.real, self.bounds, self._deciding()
-        found, linears = self._survey(field), self._linear(field, times)
-        narrow, widths = narrowest(found, grid, bounds.tail, bounds.spacings)
+        found, linears = field.survey(self.bounds), self._linear(field, times)
+        narrow, widths = narrowest(found, bounds.tail, bounds.spacings)
         holds = bool(np.all(found.edges <= 0.5 * bounds.edge) and np.all(found.tails <= 0.5 * bounds.tail))
         holds = holds and self._fits(found.used, widths, grid)
         support = self._support(real)
@@ -206,7 +198,7 @@ class Stepper:
         before, best, coarse, ratio, smallest = np.ones(n), None, np.zeros(n, bool), np.ones(n), np.inf
         for attempt in range(TRIES):
             result, moved = self._apply(field, t0, t1, move, potential)
-            found = survey(result.values, result.grid, self.bounds.edge)
+            found = result.survey(self.bounds)
             report, wide = grid_report(found), found.edges > 3 * self.bounds.edge
             # A finer grid may have the same tails, and a wider one that has no more points the noise of its spacings.
             same = coarse.any() and not better(found.tails, before, ratio, self.bounds)[coarse].any()
@@ -228,7 +220,8 @@ class Stepper:
 
     def single(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report]:
         """Return the density after one substep, on a grid that fits it."""
-        result, _, report = self._moved(field, t0, t1, self._moves(field, (t0, t1))[0], potential, self._survey(field).tails)
+        tails = field.survey(self.bounds).tails
+        result, _, report = self._moved(field, t0, t1, self._moves(field, (t0, t1))[0], potential, tails)
         return result, report
 
     def resolved(self, field: Field, report: Report) -> tuple[Field, float]:
@@ -241,14 +234,14 @@ class Stepper:
         real = field.values.real
         tails = survey(real, field.grid, self.bounds.edge).tails
         variances = 2 * np.log(np.maximum(tails / self.tolerance, 1.0)) / np.pi**2
-        values = filtered(field.values, gaussian_response(np.diag(variances), field.grid.sizes))
+        values = filtered(field.values, np.diag(variances))
         return field._replace(values=values), float(np.abs(values.real - real).sum() / np.abs(real).sum())
 
     def double(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report, float]:
         """Return the extrapolated density after two halves of a substep, and the difference from the whole substep."""
         middle = 0.5 * (t0 + t1)
         one, two = self._moves(field, (t0, middle, t1))
-        tails = self._survey(field).tails
+        tails = field.survey(self.bounds).tails
         half, _, first = self._moved(field, t0, middle, one, potential, tails)
         fine, moved, second = self._moved(positive(half, self.bounds), middle, t1, two, potential, tails)
         whole = _Move(one.linear.then(two.linear), one.steps, fine.grid)

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.small_matrices import congruence, dot
+from zakai.numerics.space_fit import conditional_deviations
 from zakai.numerics.space_grid import Grid
 
 Array = NDArray[Any]
@@ -23,8 +25,8 @@ class Survey(NamedTuple):
     The `total` of the values, the mean (n,) and covariance (n, n) of the offsets from the centre in x; for each axis (n,) the
     largest `edges` relative to the maximum of the marginal (times the squared distance where they are far from the mean), the
     `tails` of the spectrum at its two highest frequencies relative to the mass, the first and last index `used` (n, 2) above the
-    bound on edges, and the `highest` frequency above the bound on tails, as a share of the highest of the grid; and the
-    negative mass as a share of the total.
+    bound on edges, the `highest` frequency above the bound on tails, as a share of the highest of the grid, and the `conditional`
+    standard deviation of a Gaussian in spacings; and the negative mass as a share of the total.
     """
 
     total: float
@@ -34,6 +36,7 @@ class Survey(NamedTuple):
     tails: Array
     used: Array
     highest: Array
+    conditional: Array
     negative: float
 
 
@@ -60,9 +63,12 @@ def _wave(u: Any, outer: int, size: int, inner: int, k: int, work: Any) -> float
     return total
 
 
-@kernel("void(float64[::1], int64[::1], boolean[::1], float64, float64, float64[::1], float64[:, ::1], float64[:, ::1])")
-def _survey(u: Any, sizes: Any, closed: Any, edge: float, tail: float, mean: Any, cov: Any, axes: Any) -> None:
-    """Write the mean and covariance of the indices; of each axis edge, tail, first, last, highest frequency; the totals."""
+@kernel(
+    "void(float64[::1], int64[::1], boolean[::1], float64[:, ::1], float64, float64, float64[::1], float64[:, ::1],"
+    " float64[:, ::1])"
+)
+def _survey(u: Any, sizes: Any, closed: Any, basis: Any, edge: float, tail: float, mean: Any, cov: Any, axes: Any) -> None:
+    """Write the mean and covariance; of each axis edge, tail, first, last, highest frequency, deviation; and the totals."""
     n, count = sizes.size, u.size
     last = sizes[n - 1]
     index = np.zeros(n)
@@ -134,6 +140,13 @@ def _survey(u: Any, sizes: Any, closed: Any, edge: float, tail: float, mean: Any
         inner *= size
     if not (math.isfinite(total) and total > 0.0):
         axes[:n, :2] = 1.0
+    product, moved = cov.copy(), mean.copy()
+    for d in range(n):
+        product[d, d] = max(cov[d, d], 1e-12)
+    conditional_deviations(axes[:n, 5], product, 1e-9)
+    congruence(cov, basis, cov, product)
+    for d in range(n):
+        mean[d] = dot(basis[d], moved)
 
 
 def survey(values: Array, grid: Grid, edge: float = 0.0, tail: float = 1.0) -> Survey:
@@ -145,29 +158,27 @@ def survey(values: Array, grid: Grid, edge: float = 0.0, tail: float = 1.0) -> S
         edge: share of the maximum that counts as zero.
         tail: share of the mass that counts as zero in the spectrum; 1 leaves `highest` unknown.
     """
-    n, basis = grid.n, grid.basis
-    mean, cov, axes = np.zeros(n), np.zeros((n, n)), np.zeros((n + 1, 5))
+    n = grid.n
+    mean, cov, axes = np.zeros(n), np.zeros((n, n)), np.zeros((n + 1, 6))
     flat = np.ascontiguousarray(values.real).reshape(-1)
-    _survey(flat, np.array(grid.sizes, np.int64), np.array(grid.closed), edge, tail, mean, cov, axes)
-    edges, tails, used, highest = axes[:n, 0], axes[:n, 1], axes[:n, 2:4].astype(int), axes[:n, 4]
+    basis = np.ascontiguousarray(grid.basis)
+    _survey(flat, np.array(grid.sizes, np.int64), np.array(grid.closed), basis, edge, tail, mean, cov, axes)
     total, negative = axes[n, :2].tolist()
-    return Survey(total, basis @ mean, basis @ cov @ basis.T, edges, tails, used, highest, negative / max(total, 1e-300))
+    return Survey(
+        total, mean, cov, axes[:n, 0], axes[:n, 1], axes[:n, 2:4].astype(int), axes[:n, 4], axes[:n, 5],
+        negative / max(total, 1e-300),
+    )  # fmt: skip
 
 
-def narrowest(found: Survey, grid: Grid, tail: float, least: float = 0.0) -> tuple[Array, Array]:
+def narrowest(found: Survey, tail: float, least: float = 0.0) -> tuple[Array, Array]:
     """Return the smallest standard deviation along each axis, in conditional deviations (n,), at most 1, and in spacings (n,).
 
     It follows from the highest frequency at which the spectrum is above `tail` of the mass; where that is so at all frequencies,
     as at a kink, it is not less than `least` spacings.
     """
-    inverse = grid.inverse
-    spread = inverse @ found.cov @ inverse.T
-    scale = np.sqrt(np.maximum(np.diagonal(spread), 1e-12))
-    scaled = spread / np.outer(scale, scale) + 1e-9 * np.eye(grid.n)
-    conditional = scale / np.sqrt(np.diagonal(np.linalg.inv(scaled)))
-    width = np.sqrt(-2 * np.log(tail)) / (np.pi * found.highest)
+    width = math.sqrt(-2 * math.log(tail)) / (math.pi * found.highest)
     width = np.where(found.highest >= 1.0, np.maximum(deviations_in_spacings(found.tails), least), width)
-    return np.minimum(width / conditional, 1.0), np.minimum(width, conditional)
+    return np.minimum(width / found.conditional, 1.0), np.minimum(width, found.conditional)
 
 
 def deviations_in_spacings(tails: Array) -> Array:

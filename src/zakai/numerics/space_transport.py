@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.formula_kernel import Formulas
 from zakai.numerics.space_diffusion import diffused
-from zakai.numerics.space_grid import Grid, filtered, gaussian_response, spread, transformed
+from zakai.numerics.space_grid import Grid, filtered, spread, transformed
 from zakai.numerics.space_spline import gather, relative_index
 
 Array = NDArray[Any]
@@ -261,18 +261,18 @@ def transported(
     inverse, least = source.inverse, faintest(values)
     half = inverse @ linear.before @ inverse.T
     if before is None and noises is None:
-        coefficients = filtered(values, gaussian_response(half, source.sizes, spline=True))
+        coefficients = filtered(values, half, spline=True)
     elif before is None and noises is not None:
         values = diffused(values, source, noises[0], noises[2])
-        coefficients = filtered(values, gaussian_response(0.0 * half, source.sizes, spline=True))
+        coefficients = filtered(values, 0.0 * half, spline=True)
     elif before is not None:
         values, first = weighed(values, before.log / 6)
         least = faintest(values)
         values = spread(values, source, linear.before) if noises is None else diffused(values, source, noises[0], noises[2])
         values, second = weighed(values, before.log / 3 + before.correction)
-        coefficients = filtered(values, gaussian_response(0.0 * half, source.sizes, spline=True))
+        coefficients = filtered(values, 0.0 * half, spline=True)
         top = first + second
-    at = relative_index(target.offsets + moved[:, :-1], target.centre, source, periodic)
+    at = relative_index(target, source, periodic, moved)
     volume = np.exp(np.where(np.abs(moved[:, -1].real) < _LARGEST_VOLUME, moved[:, -1], 0.0))
     result = (gather(coefficients, at, source, least) * volume).reshape(target.sizes)
     if after is not None:

@@ -9,16 +9,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zakai.numerics.compiled import kernel
+from zakai.numerics.complex_step import is_complex
 from zakai.numerics.space_field import Field, better, finer_by, positive, refinable
-from zakai.numerics.space_grid import Grid, filtered, gaussian_response
+from zakai.numerics.space_grid import Grid, filtered
 from zakai.numerics.space_resample import triangular_resampled
 from zakai.numerics.space_spline import gather, relative_index
-from zakai.numerics.space_survey import deviations_in_spacings, narrowest, survey
+from zakai.numerics.space_survey import Survey, deviations_in_spacings, narrowest
 from zakai.numerics.space_window import Bounds, adjusted, fitted_grid, whitened_grid
 
 Array = NDArray[Any]
 _STEEP = 4.0  # change of the log-likelihood between neighbours that a grid may have before it is refined
 _TRIES = 16
+LOWEST = -100.0  # logarithm of a product, relative to its largest, below which it is zero
 POINT = 0.1  # deviations in spacings of a product that is one point: rounding of the likelihood
 
 
@@ -36,6 +39,62 @@ class Update(NamedTuple):
     truncated: bool
 
 
+class _Product(NamedTuple):
+    """The product of a density `values` and a factor on a grid, with the logarithm of the factor (*sizes).
+
+    `levels` are the logarithms of the product, but for its largest, `top`, which is at the index `peak`; `field` is the product
+    but for exp(top); between `peak` and its neighbours the log of the factor changes by at most `steepest`.
+    """
+
+    values: Array
+    logs: Array
+    levels: Array
+    field: Field
+    top: float
+    peak: int
+    steepest: float
+
+
+@kernel(
+    "Tuple((float64, int64, float64))(float64[::1], float64[::1], int64[::1], boolean[::1], float64[::1], float64[::1])"
+)
+def _multiply(values: Any, logs: Any, sizes: Any, closed: Any, levels: Any, product: Any) -> tuple[float, int, float]:
+    """Write the logarithms of a product, but for the largest, and the product; return the largest, its place, and the change.
+
+    Where the product is so small that arithmetic with it is slow it is zero.
+    """
+    top, peak = -np.inf, 0
+    for j in range(values.size):
+        levels[j] = math.log(values[j]) + logs[j] if values[j] > 0.0 and not math.isnan(logs[j]) else -np.inf
+        if levels[j] > top:
+            top, peak = levels[j], j
+    for j in range(values.size):
+        levels[j] -= top
+        product[j] = math.exp(levels[j]) if levels[j] > LOWEST else 0.0
+    steepest, stride = 0.0, 1
+    for d in range(sizes.size - 1, -1, -1):
+        index = peak // stride % sizes[d]
+        for step in (-1, 1):
+            beside = index + step
+            if closed[d]:
+                beside = beside % sizes[d]
+            if 0 <= beside < sizes[d]:
+                change = abs(logs[peak + (beside - index) * stride] - logs[peak])
+                if math.isfinite(change):
+                    steepest = max(steepest, change)
+        stride *= sizes[d]
+    return top, peak, steepest
+
+
+def _multiplied(values: Array, grid: Grid, log_factor: Callable[[Grid], Array]) -> _Product:
+    """Return the product of a density and a factor on a grid."""
+    logs = log_factor(grid).reshape(grid.sizes)
+    levels, product = np.empty(grid.sizes), np.empty(grid.sizes)
+    flat = [np.ascontiguousarray(a.real).reshape(-1) for a in (values, logs)]
+    found = _multiply(*flat, np.array(grid.sizes), np.array(grid.closed), levels.reshape(-1), product.reshape(-1))
+    return _Product(values, logs, levels, Field(product, grid, 0.0), *found)
+
+
 def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, tails: float) -> Update:
     """Return the product of a density and a factor that is given by its logarithm at the points of a grid (J,).
 
@@ -44,132 +103,102 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
     leaves the density as it is; its mass on the grid of the density is that of the result.
     """
     grid, values = field.grid, field.values
-    coefficients: Array | None = None
-    inverse_previous = last = grid
-    logs = log_factor(grid).reshape(grid.sizes)
-    found, before = None, np.ones(grid.n)
-    best: Any = None  # the smallest grid with the smallest edges and tails so far: a later one may be worse
+    coefficients, last, before = None, grid, np.ones(grid.n)
+    best: tuple[float, _Product, Survey] | None = None  # the smallest edges and tails so far: a later grid may be worse
     for attempt in range(_TRIES):
-        real = np.where(values.real > 0, values.real, 0.0)
-        with np.errstate(divide="ignore"):
-            product = np.log(real) + np.where(np.isnan(logs.real), -np.inf, logs.real)
-        top = float(product.max())
-        if not np.isfinite(top):
+        product = _multiplied(values, grid, log_factor)
+        if not np.isfinite(product.top):
             return _unchanged(field, log_factor)
-        power = _power(logs.real, product, grid)
-        if power == 1.0:
-            found = survey(_exp(product - top), grid, bounds.edge)
+        if product.steepest <= _STEEP:
+            found = product.field.survey(bounds)
             worst = float(max(found.tails.max(), found.edges.max()))
-            span = (found.used[:, 1] - found.used[:, 0] + 4) / np.array(grid.sizes)
             wide = found.edges > 3 * bounds.edge
             coarse = refinable(found.tails, before, finer_by(grid, last), tails, bounds)
             good = not wide.any() and found.tails.max() <= 3 * bounds.tail
-            if best is not None and not good and not (best[-1].edges > 3 * bounds.edge).any():
-                good = bool(better(worst, best[0], float((best[1].cell / grid.cell) ** (1 / grid.n)), bounds))
+            if best is not None and not good and not (best[2].edges > 3 * bounds.edge).any():
+                ratio = float((best[1].field.grid.cell / grid.cell) ** (1 / grid.n))
+                good = bool(better(worst, best[0], ratio, bounds))
             elif best is not None and not good:
                 good = worst < best[0]
             if best is None or good:
-                best = worst, grid, values, logs, product, top, found
+                best = worst, product, found
             before, last = np.where(coarse & (attempt > 0), found.tails, before), grid
-            sparse = np.array([attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1])
-            if not (wide.any() or coarse.any() or sparse.any()):
+            span = (found.used[:, 1] - found.used[:, 0] + 4) / np.array(grid.sizes)
+            sparse = attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1
+            if not (wide.any() or coarse.any() or sparse):
                 break
         if attempt == _TRIES - 1:
             break
-        new = _next(grid, product, logs.real, power, found, bounds, attempt > 1)
+        new = _next(product, bounds, attempt > 1)
         if new is None or new.same(grid):
             break
+        grid = new
         if bounds.band_limited:
-            grid, values = new, triangular_resampled(field.values, field.grid, new)
-            logs, found = log_factor(grid).reshape(grid.sizes), None
+            values = triangular_resampled(field.values, field.grid, grid)
             continue
         if coefficients is None:
-            inverse_previous = field.grid
-            zero = np.zeros((grid.n, grid.n))
-            coefficients = filtered(field.values, gaussian_response(zero, field.grid.sizes, spline=True))
-        at = relative_index(new.offsets, new.centre, inverse_previous, bounds.periodic)
-        values = gather(coefficients, at, inverse_previous).reshape(new.sizes)
-        grid, values = new, positive(Field(values, new, 0.0), bounds).values
-        logs, found = log_factor(grid).reshape(grid.sizes), None
-    if found is None:
-        found = survey(_exp(product - top), grid, bounds.edge)
-    if best is not None:
-        _, grid, values, logs, product, top, found = best
+            coefficients = filtered(field.values, np.zeros((grid.n, grid.n)), spline=True)
+        at = relative_index(grid, field.grid, bounds.periodic)
+        values = gather(coefficients, at, field.grid).reshape(grid.sizes)
+        values = positive(Field(values, grid, 0.0), bounds).values
+    _, product, found = best or (0.0, product, product.field.survey(bounds))
+    grid, values = product.field.grid, product.values
     inverse = grid.inverse
     if not np.diagonal(inverse @ found.cov @ inverse.T).min() > POINT**2:
         return _unchanged(field, log_factor)
-    peak = int(np.argmax(product))
-    ratio = float(values.real.flat[peak] / max(field.values.real.max(), values.real.max()))
-    shift = float(logs.real.flat[peak])
-    good = np.isfinite(logs.real) & (values.real > 0)
-    result = np.where(good, values, 0.0) * np.exp(np.where(good, np.where((logs.real - shift) > 600, 600, logs - shift), 0.0))
-    truncated = _at_end(_exp(product - top), grid, field.grid, bounds)
+    ratio = float(values.real.flat[product.peak] / max(field.values.real.max(), values.real.max()))
+    result = product.field.values
+    if is_complex(values, product.logs):  # the derivative of the logarithm of the product
+        change = values.imag / np.where(result > 0, values.real, 1.0) + product.logs.imag
+        result = result + 1j * result * np.where(result > 0, change, 0.0)
+    new_field = product.field._replace(log_scale=field.log_scale + product.top)
+    if result is not product.field.values:
+        new_field = new_field._replace(values=result)
     return Update(
-        positive(Field(result, grid, field.log_scale + shift), bounds),
+        positive(new_field, bounds),
         float(found.edges.max()),
         float(found.tails.max()),
-        max(-np.log(max(ratio, 1e-300)), 0.0),
-        truncated,
+        max(-math.log(max(ratio, 1e-300)), 0.0),
+        _at_end(product.field, field.grid, bounds),
     )
 
 
 def _unchanged(field: Field, log_factor: Callable[[Grid], Array]) -> Update:
     """Return the density itself with the mass of its product with a factor that no point of the grid resolves."""
-    logs = log_factor(field.grid).real.reshape(field.grid.sizes)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        product = np.log(np.maximum(field.values.real, 0.0)) + np.where(np.isnan(logs), -np.inf, logs)
-        top = float(product.max())
-        mass = top + np.log(_exp(product - top).sum() / field.values.real.sum()) if np.isfinite(top) else -np.inf
+    product, mass = _multiplied(field.values, field.grid, log_factor), -np.inf
+    if np.isfinite(product.top):
+        mass = product.top + float(np.log(product.field.values.sum() / field.values.real.sum()))
     return Update(field._replace(log_scale=field.log_scale + mass), 1.0, 1.0, np.inf, True)
 
 
-def _exp(logs: Array) -> Array:
-    """Return exponentials, zero where they are so small that arithmetic with them is slow."""
-    return np.where(logs > -100.0, np.exp(np.maximum(logs, -100.0)), 0.0)
-
-
-def _power(logs: Array, product: Array, grid: Grid) -> float:
-    """Return the power of the factor that changes by few nats between the neighbours of the largest product."""
-    at = np.unravel_index(int(np.argmax(product)), product.shape)
-    steepest = 0.0
-    for d, size in enumerate(grid.sizes):
-        for step in (-1, 1):
-            beside = list(at)
-            beside[d] += step
-            if grid.closed[d]:
-                beside[d] %= size
-            if 0 <= beside[d] < size and np.isfinite(logs[tuple(beside)]):
-                steepest = max(steepest, abs(float(logs[tuple(beside)] - logs[at])))
-    return 1.0 if steepest <= _STEEP else _STEEP / steepest
-
-
-def _next(
-    grid: Grid, product: Array, logs: Array, power: float, found: Any, bounds: Bounds, late: bool
-) -> Grid | None:
+def _next(product: _Product, bounds: Bounds, late: bool) -> Grid | None:
     """Return the next grid: around the product with a power of the factor, or one that mends what the checks found."""
-    if power < 1.0:
+    grid, levels = product.field.grid, product.levels.reshape(-1)
+    noise, narrow = np.zeros((grid.n, grid.n)), np.ones(grid.n)
+    if product.steepest > _STEEP:
+        logs = product.logs.real.reshape(-1)
         with np.errstate(invalid="ignore"):
-            tempered = product - (1 - power) * np.where(np.isfinite(logs), logs, 0.0)
-        tempered = np.where(np.isnan(tempered), -np.inf, tempered)
+            levels = levels - (1 - _STEEP / product.steepest) * np.where(np.isfinite(logs), logs, 0.0)
+        levels = np.where(np.isnan(levels), -np.inf, levels)
+        levels = levels - levels.max()
         noise = 0.25 * grid.basis @ grid.basis.T
-        narrow = np.ones(grid.n)
     else:
-        tempered, noise = product, np.zeros((grid.n, grid.n))
-        narrow, _ = narrowest(survey(_exp(product - product.max()), grid, bounds.edge, bounds.tail), grid, bounds.tail)
+        found = product.field.survey(bounds)
+        narrow, _ = narrowest(found, bounds.tail)
         if late and (found.tails > bounds.tail).any() and not (found.edges > 3 * bounds.edge).any():
             ratio = np.clip(bounds.spacings / deviations_in_spacings(found.tails), 1.1, 2)
             finer = np.where(found.tails > bounds.tail, ratio, 1.0)
             return adjusted(grid, np.zeros(grid.n), np.zeros(grid.n), finer, bounds)
-    levels = (tempered - tempered.max()).reshape(-1)  # equal, where logarithms are too large to subtract
     if bounds.band_limited:
-        used = np.flatnonzero(levels >= np.log(bounds.edge))
+        used = np.flatnonzero(levels >= math.log(bounds.edge))
         return whitened_grid(grid.offsets[used], levels[used], noise, narrow, bounds, grid)
     return fitted_grid(grid.offsets, levels, grid.centre, noise, narrow, bounds, grid, least=math.log(bounds.edge))
 
 
-def _at_end(product: Array, grid: Grid, predicted: Grid, bounds: Bounds) -> bool:
-    """Return whether the product has mass where the predicted window ends."""
-    z = relative_index(grid.offsets, grid.centre, predicted, bounds.periodic)
+def _at_end(product: Field, predicted: Grid, bounds: Bounds) -> bool:
+    """Return whether a product has mass where the predicted window ends."""
+    z = relative_index(product.grid, predicted, bounds.periodic)
     sizes = np.array(predicted.sizes)
     outer = ((z < 1.5) | (z > sizes - 2.5)) & ~np.array(predicted.closed)
-    return bool(product.reshape(-1)[outer.any(axis=1)].sum() > 1e-4 * product.sum())
+    values = product.values.reshape(-1)
+    return bool(values[outer.any(axis=1)].sum() > 1e-4 * values.sum())
