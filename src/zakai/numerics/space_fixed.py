@@ -1,8 +1,7 @@
 """Short substeps on a grid that stays where it is: the splitting of `space_transport`, without its linearised noise.
 
 What depends on the grid alone is prepared once, for intervals of any length: along the characteristics that end in a point the
-displacement and the change of volume are polynomials in the length, the continuous extension of the classical Runge-Kutta
-formula (of order three).
+displacement and the change of volume are polynomials in the length, of degree five, that interpolate two Runge-Kutta steps.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from zakai.numerics.space_field import Field
 from zakai.numerics.space_grid import Grid, filtered, gaussian_response, indices
 from zakai.numerics.space_spline import gather, resampled
 from zakai.numerics.space_survey import Survey, narrowest, survey
-from zakai.numerics.space_transport import Dynamics
+from zakai.numerics.space_transport import Dynamics, moved_points
 from zakai.numerics.space_window import LEAST, Bounds, fitted_grid
 
 Array = NDArray[Any]
@@ -27,14 +26,16 @@ STEEP_AT = 0.25  # share of the width of a grid from its centre at which L is ta
 MARGIN = 0.07  # share of its width by which a grid that is to stay is wider at each end
 LARGEST_NOISE = 0.2  # of the variance of a density that fills its grid
 LARGEST_RANGE = 300.0  # nats between the largest and the smallest factor of a potential
-# The continuous extension of the classical formula: powers of the share of a step (rows), its four slopes (columns).
-EXTENSION = np.array([[1.0, 0.0, 0.0, 0.0], [-1.5, 1.0, 1.0, -0.5], [2 / 3, -2 / 3, -2 / 3, 2 / 3]])
+# The coefficients of s, ..., s^5 of a polynomial from its slope at 0, its values and slopes at 1/2, and those at 1.
+EXTENSION = np.linalg.inv(
+    [[1, 0, 0, 0, 0], [1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32], [1, 1, 3 / 4, 1 / 2, 5 / 16], [1, 1, 1, 1, 1], [1, 2, 3, 4, 5]]
+)
 
 
 class Motion(NamedTuple):
     """The motion of the points of a grid along characteristics backward in time.
 
-    `coefficients` (3, (n + 1) J) of tau / `unit`, ... of the displacement in spacings and of the log of the change of volume; the
+    `coefficients` (5, (n + 1) J) of tau / `unit`, ... of the displacement in spacings and of the log of the change of volume; the
     indices `start` (n, J) of the points; the noise `variances` (n, n) per unit of time, in spacings; the `longest` time for which
     a density that fills the grid can stay on it.
     """
@@ -59,18 +60,17 @@ def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
     noise = float((np.diagonal(variances).real / (np.array(grid.sizes) / 11.0) ** 2).max())
     longest = 1.0 / max(rate / STEEPEST, noise / LARGEST_NOISE, 1e-300)
     if not np.isfinite(rate) or longest <= 0.5 * unit:
-        return Motion(np.zeros((3, 0)), unit, np.zeros((n, 0)), variances, 0.0)
+        return Motion(np.zeros((5, 0)), unit, np.zeros((n, 0)), variances, 0.0)
     points = np.asfortranarray(grid.points)
-    slopes: list[Array] = []
     with np.errstate(all="ignore"):
-        for share in (0.0, 0.5, 0.5, 1.0):
-            at = points - (unit * share) * slopes[-1][:, :n] if slopes else points
-            slopes.append(dynamics.drift(at, 0.0))
-    moved = np.stack([-unit * slope.T for slope in slopes])
+        half = moved_points(dynamics, points, 0.0, -0.5 * unit, 1)
+        whole = half + moved_points(dynamics, points + half[:, :n], -0.5 * unit, -unit, 1)
+        slopes = [-unit * dynamics.drift(points + moved, 0.0) for moved in (0.0, half[:, :n], whole[:, :n])]
+    moved = np.stack([part.T for part in (slopes[0], half, slopes[1], whole, slopes[2])])
     moved[:, :n] = inverse @ moved[:, :n]
     moved[:, n] = np.where(np.abs(moved[:, n].real) < LARGEST_RANGE, moved[:, n], 0.0)
     start = indices(grid.sizes).T + (np.array(grid.sizes) // 2)[:, None]
-    return Motion(EXTENSION @ moved.reshape(4, -1), unit, start, variances, longest)
+    return Motion(EXTENSION @ moved.reshape(5, -1), unit, start, variances, longest)
 
 
 @lru_cache(maxsize=64)
@@ -109,7 +109,7 @@ def fixed_step(values: Array, grid: Grid, moved: Motion, tau: float, factors: tu
     half = 0.5 * tau * moved.variances
     separate = np.count_nonzero(half) == np.count_nonzero(half.diagonal())
     s = tau / moved.unit
-    change = (np.array([s, s * s, s**3]) @ moved.coefficients).reshape(grid.n + 1, -1)
+    change = (s ** np.arange(1, 6) @ moved.coefficients).reshape(grid.n + 1, -1)
     at, volume = (moved.start + change[:-1]).T, np.exp(change[-1]).reshape(grid.sizes)
     if factors is None:
         values = gather(_spread(values, half, separate, True), at, grid).reshape(grid.sizes)

@@ -55,6 +55,16 @@ class Grid(_Fields):
         """The points (J, n)."""
         return self.centre + self.offsets
 
+    def refines(self, other: Grid) -> bool:
+        """Return whether this grid has the same window as another one, and no fewer points."""
+        widths = self.basis * np.array(self.sizes) - other.basis * np.array(other.sizes)
+        return (
+            np.array_equal(self.centre, other.centre)
+            and self.closed == other.closed
+            and all(a >= b for a, b in zip(self.sizes, other.sizes, strict=True))
+            and bool(np.abs(widths).max() <= 1e-12 * np.abs(other.basis).max())
+        )
+
     def same(self, other: Grid) -> bool:
         """Return whether both grids are the same to the last bit."""
         return (

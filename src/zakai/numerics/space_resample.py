@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -98,8 +99,23 @@ def _shifted(values: Array, axis: int, shift: Array) -> Array:
     return np.take(moved, np.arange(padding_size, padding_size + size), axis=axis)
 
 
+@lru_cache(maxsize=256)
+def _finer(size: int, new: int, closed: bool) -> Array:
+    """Return the matrix (new, size) of band-limited interpolation along an axis, at more points over the same width."""
+    at = (np.arange(new) - new // 2) * (size / new)
+    apart = at[:, None] - (np.arange(size) - size // 2)
+    if not closed:
+        return np.sinc(apart)
+    waves = np.arange(1, (size + 1) // 2)
+    matrix = 1.0 + 2.0 * np.cos(2 * np.pi / size * apart[..., None] * waves).sum(axis=-1)
+    return np.asarray((matrix + (np.cos(np.pi * apart) if size % 2 == 0 else 0.0)) / size)
+
+
 def refined(values: Array, grid: Grid, sizes: tuple[int, ...]) -> tuple[Array, Grid]:
     """Return the band-limited interpolant on a grid over the same window with more points."""
+    for d, size in enumerate(sizes):
+        if size != grid.sizes[d]:
+            matrix = _finer(grid.sizes[d], size, grid.closed[d])
+            values = np.moveaxis(np.tensordot(matrix, values, axes=([1], [d])), 0, d)
     basis = grid.basis * (np.array(grid.sizes) / np.array(sizes))
-    new = Grid(grid.centre, basis, sizes, grid.closed)
-    return triangular_resampled(values, grid, new), new
+    return np.ascontiguousarray(values), Grid(grid.centre, basis, sizes, grid.closed)

@@ -13,7 +13,7 @@ from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.space_field import Field, better, finer_by, positive, refinable
 from zakai.numerics.space_grid import Grid, filtered
-from zakai.numerics.space_resample import triangular_resampled
+from zakai.numerics.space_resample import refined, triangular_resampled
 from zakai.numerics.space_spline import gather, relative_index
 from zakai.numerics.space_survey import Survey, deviations_in_spacings, narrowest
 from zakai.numerics.space_window import Bounds, adjusted, fitted_grid, whitened_grid
@@ -104,6 +104,7 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
     """
     grid, values = field.grid, field.values
     coefficients, last, before = None, grid, np.ones(grid.n)
+    sparse = False
     best: tuple[float, _Product, Survey] | None = None  # the smallest edges and tails so far: a later grid may be worse
     for attempt in range(_TRIES):
         product = _multiplied(values, grid, log_factor)
@@ -124,15 +125,19 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
                 best = worst, product, found
             before, last = np.where(coarse & (attempt > 0), found.tails, before), grid
             span = (found.used[:, 1] - found.used[:, 0] + 4) / np.array(grid.sizes)
-            sparse = attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1
+            sparse = bool(attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1)
             if not (wide.any() or coarse.any() or sparse):
                 break
         if attempt == _TRIES - 1:
             break
-        new = _next(product, bounds, attempt > 1)
+        new = _next(product, bounds, sparse)
         if new is None or new.same(grid):
             break
         grid = new
+        if grid.refines(field.grid):
+            values, _ = refined(field.values, field.grid, grid.sizes)
+            values = positive(Field(values, grid, 0.0), bounds).values
+            continue
         if bounds.band_limited:
             values = triangular_resampled(field.values, field.grid, grid)
             continue
@@ -171,7 +176,7 @@ def _unchanged(field: Field, log_factor: Callable[[Grid], Array]) -> Update:
     return Update(field._replace(log_scale=field.log_scale + mass), 1.0, 1.0, np.inf, True)
 
 
-def _next(product: _Product, bounds: Bounds, late: bool) -> Grid | None:
+def _next(product: _Product, bounds: Bounds, sparse: bool) -> Grid | None:
     """Return the next grid: around the product with a power of the factor, or one that mends what the checks found."""
     grid, levels = product.field.grid, product.levels.reshape(-1)
     noise, narrow = np.zeros((grid.n, grid.n)), np.ones(grid.n)
@@ -185,7 +190,7 @@ def _next(product: _Product, bounds: Bounds, late: bool) -> Grid | None:
     else:
         found = product.field.survey(bounds)
         narrow, _ = narrowest(found, bounds.tail)
-        if late and (found.tails > bounds.tail).any() and not (found.edges > 3 * bounds.edge).any():
+        if not sparse and (found.tails > bounds.tail).any() and not (found.edges > 3 * bounds.edge).any():
             ratio = np.clip(bounds.spacings / deviations_in_spacings(found.tails), 1.1, 2)
             finer = np.where(found.tails > bounds.tail, ratio, 1.0)
             return adjusted(grid, np.zeros(grid.n), np.zeros(grid.n), finer, bounds)
