@@ -21,7 +21,7 @@ from zakai.numerics.space_transport import Dynamics, moved_points
 from zakai.numerics.space_window import LEAST, Bounds, fitted_grid
 
 Array = NDArray[Any]
-STEEPEST = 0.3  # largest tau |L|
+STEEPEST = 1.0  # largest tau |L|
 STEEP_AT = 0.25  # share of the width of a grid from its centre at which L is taken too
 MARGIN = 0.07  # share of its width by which a grid that is to stay is wider at each end
 LARGEST_NOISE = 0.2  # of the variance of a density that fills its grid
