@@ -50,6 +50,10 @@ class Observations:
         return {}
 
     @cached_property
+    def _laws(self) -> dict[bytes, tuple[Array, Any]]:
+        return {}
+
+    @cached_property
     def dynamics(self) -> Dynamics:
         """The drift and the noise."""
         return self.system.dynamics(self.theta)
@@ -186,6 +190,24 @@ class Observations:
 
         return min(average(function, start, length, 1e-2).panels, MOST_PANELS)
 
+    def _law(self, seen: Array, stop: float, elapsed: Array) -> tuple[Array, Any]:
+        """Return the precision of what is `seen` (m,) at a time and the logarithm of the constant of its density."""
+        system, theta, samples = self.system, self.theta, self.model.observation_kind == "samples"
+        key = seen.tobytes() + elapsed.tobytes()
+        if key in self._laws:
+            return self._laws[key]
+        rows, origin, spans = np.ix_(seen, seen), np.zeros(self.model.n), np.minimum(elapsed[:, None], elapsed)
+        if samples or not system.noise_varies:
+            cov = system.noise(origin, stop, theta) * spans
+        else:
+            distinct, which = np.unique(spans, return_inverse=True)
+            noise = np.stack([s * average(lambda t: system.noise(origin, t, theta), stop - s, s).whole for s in distinct])
+            cov = np.take_along_axis(noise, which.reshape(1, *spans.shape), axis=0)[0]
+        law = np.linalg.inv(cov[rows]), -0.5 * (log_determinant(cov[rows]) + int(seen.sum()) * np.log(2 * np.pi))
+        if not system.noise_varies and samples:
+            self._laws[key] = law
+        return law
+
     def factor(self, k: int, inside: Array, values: Array) -> tuple[Any, Any]:
         """Return the log-likelihood of what is observed at the end of interval k, without a constant, and the constant."""
         schedule, system, theta, m = self.schedule, self.system, self.theta, self.model.m
@@ -195,20 +217,13 @@ class Observations:
         if system.general:
             stop, u = float(schedule.stops[k]), self.inputs_at(float(schedule.stops[k]))
             return lambda grid: log_likelihood(self.model, values, seen, grid.points, stop, theta, u), 0.0
-        stop, rows, origin = self.start(k) + float(self.lengths[k]), np.ix_(seen, seen), np.zeros(self.model.n)
-        samples = self.model.observation_kind == "samples"
-        elapsed = np.ones(m) if samples else schedule.elapsed[k]
-        spans = np.minimum(elapsed[:, None], elapsed)
-        if samples or not system.noise_varies:
-            cov = system.noise(origin, stop, theta) * spans
-        else:
-            distinct, which = np.unique(spans, return_inverse=True)
-            noise = np.stack([s * average(lambda t: system.noise(origin, t, theta), stop - s, s).whole for s in distinct])
-            cov = np.take_along_axis(noise, which.reshape(1, m, m), axis=0)[0]
-        precision = np.linalg.inv(cov[rows])
-        z, count = values[seen], int(seen.sum())
+        stop, elapsed = self.start(k) + float(self.lengths[k]), np.ones(m)
+        if self.model.observation_kind != "samples":
+            elapsed = schedule.elapsed[k]
+        precision, normalisation = self._law(seen, stop, elapsed)
+        z = values[seen]
         # A sample by its density; an increment relative to noise alone.
-        constant = -0.5 * (log_determinant(cov[rows]) + count * np.log(2 * np.pi)) if samples else 0.5 * z @ precision @ z
+        constant = normalisation if self.model.observation_kind == "samples" else 0.5 * z @ precision @ z
 
         def log_factor(grid: Grid) -> Array:
             residual = z - self.observed(grid, stop)[:, seen] * elapsed[seen]

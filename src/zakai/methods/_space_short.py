@@ -19,6 +19,7 @@ from zakai.numerics.space_window import Bounds
 Array = Any
 MOST_TABLES = 64  # grids whose motion is kept
 MOST_FIXED = 8  # substeps of an interval on a grid that stays
+MOST_REDUCED = 16.0  # reduction of the error of extrapolated substeps that twice as many may be expected to bring
 
 
 class Prepared(Protocol):
@@ -51,11 +52,11 @@ def predicted_on(
     grid = begin.grid
     if prepared.system.varies or prepared.system.state_dependent or length == 0 or prepared.bounds.periodic != grid.closed:
         return None
-    known, parts = control.fixed and control.known(length, allowed), 1
+    known, singles, pairs = control.known(length, allowed), MOST_FIXED, 1
     if known:
-        parts = max(1, math.ceil(math.sqrt(control.rate * length**3 / allowed)))
-    unlikely = not control.fixed and length <= control.measured and not control.extrapolated(length) <= allowed
-    if parts > MOST_FIXED or unlikely:
+        singles = max(1, math.ceil(math.sqrt(control.rate * length**3 / allowed)))
+        pairs = max(1, math.ceil((control.extrapolated(length) / allowed) ** 0.25))
+    if min(singles, 3 * pairs) > MOST_FIXED:
         return None
     moved = motion_of(prepared, grid, length)
     if not length <= moved.longest:
@@ -74,18 +75,23 @@ def predicted_on(
             values = fixed_step(values, grid, moved, length / parts, factors)
         return Field(values, grid, begin.log_scale + top)
 
-    if known:
-        result, splitting = substeps(parts), control.rate * length**3 / parts**2
+    if known and control.fixed and singles <= 3 * pairs:
+        result, splitting = substeps(singles), control.rate * length**3 / singles**2
         control = control._replace(age=control.age + 1)
     else:
-        result, coarse = substeps(2), substeps(1)
-        values, difference = extrapolated(result.values, coarse.values, 0.0)
-        difference = max(difference, min(moments_difference(result.values, coarse.values, grid), 5 * difference))
-        splitting = difference ** (5 / 3)
-        if not splitting <= allowed:
-            return None
+        coarse = substeps(pairs)
+        while True:
+            result = substeps(2 * pairs)
+            values, difference = extrapolated(result.values, coarse.values, 0.0)
+            difference = max(difference, min(moments_difference(result.values, coarse.values, grid), 5 * difference))
+            splitting = difference ** (5 / 3)
+            if splitting <= allowed:
+                break
+            coarse, pairs = result, 2 * pairs
+            if not splitting <= MOST_REDUCED * allowed or 3 * pairs > MOST_FIXED:
+                return None
         result = result._replace(values=values)
-        control = Control(difference * (4 / 3) / length**3, length, 0, True)
+        control = Control(difference * (4 / 3) * pairs**2 / length**3, length, 0, True)
     found = result.survey(prepared.bounds)
     report = grid_report(found)
     if not (report.edges <= 3 * prepared.bounds.edge and report.tails <= prepared.bounds.tail):
