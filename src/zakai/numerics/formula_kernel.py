@@ -210,7 +210,7 @@ class Formulas:
         """Return the results (J, k) at points x (J, n) and one time, with the values of each result contiguous."""
         out = np.empty((self.outputs.size, len(x)))
         given = np.where(self.coordinates == CLOCK, t, self.given)
-        _evaluate(self.code, given, self.coordinates, self.outputs, np.ascontiguousarray(x.T), out)
+        _evaluate(self.code, given, self.coordinates, self.outputs, np.array(x.T, order="C"), out)
         return out.T
 
     def flow(self, x: Array, t0: float, t1: float, steps: int, centre: Array, inverse: Array, limits: Array) -> Array:
@@ -226,6 +226,6 @@ class Formulas:
             limits: components in this basis, relative to the centre, beyond which a point is given up: its change is NaN (n,).
         """
         out = np.empty((self.outputs.size, len(x)))
-        points = np.ascontiguousarray(x.T)
+        points = np.array(x.T, order="C")
         _flow(self.code, self.given, self.coordinates, self.outputs, points, t0, t1, steps, centre, inverse, limits, out)
         return out.T

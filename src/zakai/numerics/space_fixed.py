@@ -27,9 +27,9 @@ MARGIN = 0.07  # share of its width by which a grid that is to stay is wider at 
 LARGEST_NOISE = 0.2  # of the variance of a density that fills its grid
 LARGEST_RANGE = 300.0  # nats between the largest and the smallest factor of a potential
 # The coefficients of s, ..., s^5 of a polynomial from its slope at 0, its values and slopes at 1/2, and those at 1.
-EXTENSION: Array = np.linalg.inv(
-    [[1.0, 0, 0, 0, 0], [1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32], [1, 1, 3 / 4, 1 / 2, 5 / 16], [1, 1, 1, 1, 1], [1, 2, 3, 4, 5]]
-)
+_POWERS = np.arange(1, 6)
+EXTENSION: Array = np.linalg.inv(np.stack([s**_POWERS if value else _POWERS * s ** (_POWERS - 1.0) for s, value in (
+    (0.0, False), (0.5, True), (0.5, False), (1.0, True), (1.0, False))]))  # fmt: skip
 
 
 class Motion(NamedTuple):

@@ -22,6 +22,7 @@ Array = NDArray[Any]
 _STEEP = 4.0  # change of the log-likelihood between neighbours that a grid may have before it is refined
 _TRIES = 16
 LOWEST = -100.0  # logarithm of a product, relative to its largest, below which it is zero
+MOST_REFINED = 2.0  # ratio of spacings by which a grid is refined at once
 POINT = 0.1  # deviations in spacings of a product that is one point: rounding of the likelihood
 
 
@@ -90,7 +91,7 @@ def _multiplied(values: Array, grid: Grid, log_factor: Callable[[Grid], Array]) 
     """Return the product of a density and a factor on a grid."""
     logs = log_factor(grid).reshape(grid.sizes)
     levels, product = np.empty(grid.sizes), np.empty(grid.sizes)
-    flat = [np.ascontiguousarray(a.real).reshape(-1) for a in (values, logs)]
+    flat = [np.array(a.real, order="C").reshape(-1) for a in (values, logs)]
     found = _multiply(*flat, np.array(grid.sizes), np.array(grid.closed), levels.reshape(-1), product.reshape(-1))
     return _Product(values, logs, levels, Field(product, grid, 0.0), *found)
 
@@ -130,7 +131,7 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
                 break
         if attempt == _TRIES - 1:
             break
-        new = _next(product, bounds, sparse)
+        new = _next(product, bounds, sparse, attempt > 1)
         if new is None or new.same(grid):
             break
         grid = new
@@ -176,7 +177,7 @@ def _unchanged(field: Field, log_factor: Callable[[Grid], Array]) -> Update:
     return Update(field._replace(log_scale=field.log_scale + mass), 1.0, 1.0, np.inf, True)
 
 
-def _next(product: _Product, bounds: Bounds, sparse: bool) -> Grid | None:
+def _next(product: _Product, bounds: Bounds, sparse: bool, late: bool) -> Grid | None:
     """Return the next grid: around the product with a power of the factor, or one that mends what the checks found."""
     grid, levels = product.field.grid, product.levels.reshape(-1)
     noise, narrow = np.zeros((grid.n, grid.n)), np.ones(grid.n)
@@ -190,9 +191,10 @@ def _next(product: _Product, bounds: Bounds, sparse: bool) -> Grid | None:
     else:
         found = product.field.survey(bounds)
         narrow, _ = narrowest(found, bounds.tail)
-        if not sparse and (found.tails > bounds.tail).any() and not (found.edges > 3 * bounds.edge).any():
-            ratio = np.clip(bounds.spacings / deviations_in_spacings(found.tails), 1.1, 2)
-            finer = np.where(found.tails > bounds.tail, ratio, 1.0)
+        ratio = bounds.spacings / deviations_in_spacings(found.tails)
+        near = late or (not sparse and ratio.max() < MOST_REFINED)
+        if near and (found.tails > bounds.tail).any() and not (found.edges > 3 * bounds.edge).any():
+            finer = np.where(found.tails > bounds.tail, np.clip(ratio, 1.1, MOST_REFINED), 1.0)
             return adjusted(grid, np.zeros(grid.n), np.zeros(grid.n), finer, bounds)
     if bounds.band_limited:
         used = np.flatnonzero(levels >= math.log(bounds.edge))
