@@ -72,3 +72,24 @@ REFUSED = {
 def test_what_does_not_hold_is_refused(name):
     failed = [condition for condition in conditions_of("limited-direct", model_of(**REFUSED[name])) if condition.holds is False]
     assert len(failed) == 1
+
+
+def test_rounding_that_a_gauge_lifts_far_out_is_not_followed_there():
+    """The transition is cosh(x + y) N(x1 - x0, tau I) / cosh(x0 + y0), apart from a constant."""
+    model = zakai.Model(
+        state=["x", "y"], drift=["tanh(x + y)", "tanh(x + y)"], observation=["x", "y + sin(3*x)/10"],
+        observation_kind="samples", prior={"kind": "gaussian", "mean": [0, 0], "cov": [0.5, 0.5]},
+    )  # fmt: skip
+    times = np.cumsum(np.random.default_rng(0).uniform(0.02, 0.2, 32))
+    _, record = zakai.simulate(model, times, seed=1)
+    result = zakai.filter(model, record, "limited-direct")
+    x, start = np.linspace(-7.0, 11.0, 181), 0.0
+    grid = np.stack(np.meshgrid(x, x, indexing="ij"))
+    u, sensor = np.exp(-(grid**2).sum(axis=0)), np.stack([grid[0], grid[1] + np.sin(3 * grid[0]) / 10])
+    for t, z, found in zip(times, record.values, result.mean[1:], strict=True):
+        kernel = np.exp(-0.5 * (x[:, None] - x) ** 2 / (t - start))
+        u = (kernel @ (u / np.cosh(grid.sum(axis=0))) @ kernel) * np.cosh(grid.sum(axis=0))
+        u, start = u * np.exp(-0.5 * ((z[:, None, None] - sensor) ** 2).sum(axis=0)), t
+        u /= u.sum()
+        np.testing.assert_allclose(found, (grid * u).sum(axis=(1, 2)), atol=1e-7)
+    assert result.warnings == []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -118,6 +120,27 @@ class Stepper:
         larger = tuple(max(a, b) for a, b in zip(larger, sizes, strict=True))
         return Field(*padded(values, grid, larger), source.log_scale)
 
+    def _moved(self, begin: Field, move: Callable[[Field], Field]) -> tuple[Field, Field]:
+        """Return the source on a grid on which it can be moved, and the result: of larger grids those that make it better.
+
+        A gauge that increases outwards lifts rounding, the more the wider the grid is.
+        """
+        result = move(begin)
+        for _ in range(TRIES - 1):
+            larger = self._adapted(begin, result)
+            if larger is None:
+                break
+            new = move(larger)
+            if not self._excess(new) < self._excess(result):
+                break
+            begin, result = larger, new
+        return begin, result
+
+    def _excess(self, result: Field) -> float:
+        """Return the largest of edges and tails, relative to their bounds."""
+        found = result.survey(self.bounds)
+        return float(max(found.edges.max() / self.bounds.edge, found.tails.max() / self.bounds.tail))
+
     def _prepared(self, source: Field, t0: float, t1: float) -> Field:
         sizes = padded_sizes(source.grid, self.flow(t0, t1).spread.real, self.bounds)
         return Field(*padded(source.values, source.grid, sizes), source.log_scale)
@@ -131,13 +154,7 @@ class Stepper:
             length = self.limit(source, begin_time, begin_time + length) - begin_time
             last = begin_time + length >= t1 - 1e-12 * (t1 - t0)
             a, b = begin_time, t1 if last else begin_time + length
-            begin = self._prepared(source, a, b)
-            for _ in range(TRIES):
-                result = self.apply(begin, a, b, potential)
-                better = self._adapted(begin, result)
-                if better is None:
-                    break
-                begin = better
+            _, result = self._moved(self._prepared(source, a, b), partial(self.apply, t0=a, t1=b, potential=potential))
             if last and a == t0:
                 return result, self.report(result)
             source, begin_time = regridded(result, self.bounds), b
@@ -155,13 +172,11 @@ class Stepper:
     def double(self, source: Field, t0: float, t1: float, potential: Any) -> tuple[Field, Report, float]:
         """Return the extrapolated density after two halves of a substep, and the difference from the whole substep."""
         middle = 0.5 * (t0 + t1)
-        begin = self._prepared(source, t0, t1)
-        for _ in range(TRIES):
-            fine = self.apply(self.apply(begin, t0, middle, potential), middle, t1, potential)
-            better = self._adapted(begin, fine)
-            if better is None:
-                break
-            begin = better
+
+        def halves(begin: Field) -> Field:
+            return self.apply(self.apply(begin, t0, middle, potential), middle, t1, potential)
+
+        begin, fine = self._moved(self._prepared(source, t0, t1), halves)
         coarse = self.apply(begin, t0, t1, potential)
         # Where Q is not zero two flows move a grid elsewhere than one flow.
         whole = _at(coarse, fine.grid)
