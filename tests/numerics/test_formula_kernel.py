@@ -23,7 +23,8 @@ def test_the_kernel_agrees_with_sympy():
     found = function(points, 0.6, model.theta())
     for x, row in zip(points[:3], found[177:], strict=True):
         values = dict(zip((*model.x, model.t, *model.parameter_symbols), (*x, 0.6, 0.3), strict=True))
-        exact = [float(h.subs({s: sympy.Rational(str(v)) for s, v in values.items()}).evalf(30)) for h in model.observation[:4, :]]
+        values = {symbol: sympy.Rational(str(value)) for symbol, value in values.items()}
+        exact = [float(h.subs(values).evalf(30)) for h in model.observation[:4, :]]
         exact.append(2 * min(x) - max(x[0], 0.6) + np.floor(x[0]))
         assert np.allclose(row, exact, rtol=1e-13, atol=1e-14)
 
