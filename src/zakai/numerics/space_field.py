@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zakai.numerics.compiled import kernel
 from zakai.numerics.space_grid import Grid
 from zakai.numerics.space_survey import Survey, survey
 from zakai.numerics.space_window import Bounds
@@ -104,15 +105,31 @@ def finer_by(grid: Grid, last: Grid) -> Array:
     return np.asarray(np.linalg.norm(last.basis, axis=0) / np.linalg.norm(grid.basis, axis=0))
 
 
+@kernel("boolean(float64[::1], float64)", "boolean(complex128[::1], float64)")
+def _make_positive(values: Any, edge: float) -> bool:
+    """Set negative and negligible values to zero, and those that are not larger than the noise; return whether there are any."""
+    top, low = 0.0, 0.0
+    for j in range(values.size):
+        if values[j].real > top:
+            top = values[j].real
+        elif values[j].real < low:
+            low = values[j].real
+    least, changed = max(NEGLIGIBLE * top, min(-NOISE * low, edge * top)), False
+    for j in range(values.size):
+        if not values[j].real > least and values[j] != 0.0:
+            values[j] = 0.0
+            changed = True
+    return changed
+
+
 def positive(field: Field, bounds: Bounds) -> Field:
     """Return the density without negative values, those of denormal size, and the noise of interpolation.
 
     The noise is what is not larger than a few times the most negative value, and not larger than the bound on edges.
     """
-    real = field.values.real
-    noise = 0.0 if bounds.band_limited else min(-NOISE * real.min(), bounds.edge * real.max())
-    values = np.where(real > max(NEGLIGIBLE * real.max(), noise), field.values, 0.0)
-    return field if np.array_equal(values, field.values) else field._replace(values=values)
+    values = np.array(field.values, order="C")
+    changed = _make_positive(values.reshape(-1), 0.0 if bounds.band_limited else bounds.edge)
+    return field._replace(values=values) if changed else field
 
 
 def extrapolated(fine: Array, coarse: Array, log_ratio: Any) -> tuple[Array, float]:

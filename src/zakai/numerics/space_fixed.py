@@ -51,13 +51,13 @@ def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
     """Return the motion of a grid for lengths up to the power of two that is not below tau, without points if it is too long."""
     unit = math.ldexp(1.0, math.ceil(math.log2(tau)))
     n, inverse = grid.n, grid.inverse
-    away = STEEP_AT * grid.basis * np.array(grid.sizes)
+    away = STEEP_AT * grid.basis * grid.shape
     inside = grid.centre + np.concatenate([np.zeros((1, n)), away.T, -away.T])
     with np.errstate(all="ignore"):
         matrices = inverse @ dynamics.jacobian(inside, 0.0).real @ grid.basis
         rate = float(np.abs(matrices).sum(axis=2).max())
     variances = inverse @ dynamics.noise(0.0, 1.0)[0] @ inverse.T
-    noise = float((np.diagonal(variances).real / (np.array(grid.sizes) / 11.0) ** 2).max())
+    noise = float((np.diagonal(variances).real / (grid.shape / 11.0) ** 2).max())
     longest = 1.0 / max(rate / STEEPEST, noise / LARGEST_NOISE, 1e-300)
     if not np.isfinite(rate) or longest <= 0.5 * unit:
         return Motion(np.zeros((5, 0)), unit, np.zeros((n, 0)), variances, 0.0)
@@ -69,7 +69,7 @@ def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
     moved = np.stack([part.T for part in (slopes[0], half, slopes[1], whole, slopes[2])])
     moved[:, :n] = inverse @ moved[:, :n]
     moved[:, n] = np.where(np.abs(moved[:, n].real) < LARGEST_RANGE, moved[:, n], 0.0)
-    start = indices(grid.sizes).T + (np.array(grid.sizes) // 2)[:, None]
+    start = indices(grid.sizes).T + (grid.shape // 2)[:, None]
     return Motion(EXTENSION @ moved.reshape(5, -1), unit, start, variances, longest)
 
 
@@ -122,12 +122,11 @@ def fixed_step(values: Array, grid: Grid, moved: Motion, tau: float, factors: tu
 
 def fits(found: Survey, grid: Grid, bounds: Bounds) -> bool:
     """Return whether a density that a grid covers and resolves can stay on it: it will soon move and change its width."""
-    sizes = np.array(grid.sizes)
     needed = np.maximum(found.used[:, 1] - found.used[:, 0] + 4, LEAST[grid.n])
     return bool(
         found.edges.max() <= 0.5 * bounds.edge
         and found.tails.max() <= 0.5 * bounds.tail
-        and np.prod(np.minimum(needed / sizes, 1.0)) > 0.4
+        and np.prod(np.minimum(needed / grid.shape, 1.0)) > 0.4
     )
 
 

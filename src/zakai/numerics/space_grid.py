@@ -16,8 +16,23 @@ from numpy.typing import NDArray
 from scipy.fft import irfftn, rfftn
 
 from zakai.numerics.compiled import kernel
+from zakai.numerics.small_matrices import solve
 
 Array = NDArray[Any]
+
+
+@kernel("void(float64[:, ::1], float64[:, ::1])", "void(complex128[:, ::1], complex128[:, ::1])")
+def _invert(matrix: Any, out: Any) -> None:
+    """Turn `out`, the unit matrix, into the inverse of a matrix, which is overwritten."""
+    solve(matrix, out)
+
+
+def inverted(matrix: Array) -> Array:
+    """Return the inverse of a small matrix (n, n); one of a singular matrix is not finite."""
+    matrix = np.array(matrix, order="C")
+    out = np.eye(len(matrix), dtype=matrix.dtype)
+    _invert(matrix, out)
+    return out
 
 
 class _Fields(NamedTuple):
@@ -36,9 +51,19 @@ class Grid(_Fields):
         return len(self.sizes)
 
     @cached_property
+    def shape(self) -> Array:
+        """The sizes as an array (n,)."""
+        return np.array(self.sizes, np.int64)
+
+    @cached_property
+    def circles(self) -> Array:
+        """Which axes are closed, as an array (n,)."""
+        return np.array(self.closed)
+
+    @cached_property
     def inverse(self) -> Array:
         """The inverse of the basis."""
-        return np.linalg.inv(self.basis)
+        return inverted(self.basis)
 
     @cached_property
     def cell(self) -> float:

@@ -149,7 +149,7 @@ def gather(coefficients: Array, z: Array, grid: Grid, least: float = 0.0) -> Arr
     dtype = complex if is_complex(coefficients, z) else float
     out = np.empty(len(z), dtype)
     c, at = np.ascontiguousarray(coefficients, dtype).reshape(-1), np.ascontiguousarray(z.T, dtype)
-    _gather(c, np.array(grid.sizes, np.int64), np.array(grid.closed), least, at, out)
+    _gather(c, grid.shape, grid.circles, least, at, out)
     return out
 
 
@@ -196,8 +196,8 @@ def relative_index(new: Grid, grid: Grid, periodic: Sequence[bool] | None = None
     z = np.empty((n, math.prod(new.sizes)), dtype)
     displacement = np.zeros((n, 0), dtype) if moved is None else np.ascontiguousarray(moved.T)
     _relative(
-        np.array(new.sizes), np.ascontiguousarray(new.basis), new.centre - grid.centre, np.ascontiguousarray(grid.inverse),
-        np.array([float(size // 2) for size in grid.sizes]), np.array(periodic or (False,) * n), displacement, z,
+        new.shape, np.ascontiguousarray(new.basis), new.centre - grid.centre, np.ascontiguousarray(grid.inverse),
+        (grid.shape // 2).astype(float), np.array(periodic or (False,) * n), displacement, z,
     )  # fmt: skip
     return z.T
 

@@ -146,9 +146,8 @@ class Stepper:
 
     def _fits(self, used: Array, widths: Array, grid: Grid) -> bool:
         """Return whether a grid is neither too wide nor too fine for its density."""
-        sizes = np.array(grid.sizes)
         needed = np.maximum((used[:, 1] - used[:, 0] + 4) * np.minimum(self.bounds.spacings / widths, 1.0), LEAST[grid.n])
-        return bool(np.prod(np.minimum(needed / sizes, 1.0)) > 0.55)
+        return bool(np.prod(np.minimum(needed / grid.shape, 1.0)) > 0.55)
 
     def _apply(
         self,

@@ -162,7 +162,7 @@ def survey(values: Array, grid: Grid, edge: float = 0.0, tail: float = 1.0) -> S
     mean, cov, axes = np.zeros(n), np.zeros((n, n)), np.zeros((n + 1, 6))
     flat = np.ascontiguousarray(values.real).reshape(-1)
     basis = np.ascontiguousarray(grid.basis)
-    _survey(flat, np.array(grid.sizes, np.int64), np.array(grid.closed), basis, edge, tail, mean, cov, axes)
+    _survey(flat, grid.shape, grid.circles, basis, edge, tail, mean, cov, axes)
     total, negative = axes[n, :2].tolist()
     return Survey(
         total, mean, cov, axes[:n, 0], axes[:n, 1], axes[:n, 2:4].astype(int), axes[:n, 4], axes[:n, 5],

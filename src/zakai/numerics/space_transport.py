@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.formula_kernel import Formulas
 from zakai.numerics.space_diffusion import diffused
-from zakai.numerics.space_grid import Grid, filtered, spread, transformed
+from zakai.numerics.space_grid import Grid, filtered, inverted, spread, transformed
 from zakai.numerics.space_spline import gather, relative_index
 
 Array = NDArray[Any]
@@ -148,7 +148,7 @@ class Linearisation:
     @cached_property
     def before(self) -> Array:
         """The half of the noise before the motion, Phi^-1 (Q / 2) Phi^-T."""
-        inverse = np.linalg.inv(self.map)
+        inverse = inverted(self.map)
         return np.asarray(0.5 * inverse @ self.noise @ inverse.T)
 
     def then(self, other: Linearisation) -> Linearisation:
@@ -161,7 +161,7 @@ def linearised(matrix: Array, mean: Array, falling: Array, tau: float, span: flo
 
     Where the eigenvalues of L times the span are large L is reduced: it is a means to a smaller error of the splitting only.
     """
-    size = np.abs(np.linalg.inv(basis) @ matrix.real @ basis).sum(axis=1).max()
+    size = np.abs(inverted(basis) @ matrix.real @ basis).sum(axis=1).max()
     rate = span * np.abs(np.linalg.eigvals(matrix.real)).max() if span * size > _LARGEST else 0.0
     shrunk = _LARGEST / rate if rate > _LARGEST else 1.0
     L = shrunk * matrix
@@ -199,7 +199,7 @@ def characteristics(
 
     The result is (J, n + 1); `begun` is a time between t0 and t1, and what is known from t1 back to it.
     """
-    inverse, sizes, open_axes = source.inverse, np.array(source.sizes), ~np.array(source.closed)
+    inverse, sizes, open_axes = source.inverse, source.shape, ~source.circles
     points = target.points
     if begun is not None:
         points, t1 = points + begun[1][:, : source.n], begun[0]

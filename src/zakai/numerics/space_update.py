@@ -92,7 +92,7 @@ def _multiplied(values: Array, grid: Grid, log_factor: Callable[[Grid], Array]) 
     logs = log_factor(grid).reshape(grid.sizes)
     levels, product = np.empty(grid.sizes), np.empty(grid.sizes)
     flat = [np.array(a.real, order="C").reshape(-1) for a in (values, logs)]
-    found = _multiply(*flat, np.array(grid.sizes), np.array(grid.closed), levels.reshape(-1), product.reshape(-1))
+    found = _multiply(*flat, grid.shape, grid.circles, levels.reshape(-1), product.reshape(-1))
     return _Product(values, logs, levels, Field(product, grid, 0.0), *found)
 
 
@@ -125,7 +125,7 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
             if best is None or good:
                 best = worst, product, found
             before, last = np.where(coarse & (attempt > 0), found.tails, before), grid
-            span = (found.used[:, 1] - found.used[:, 0] + 4) / np.array(grid.sizes)
+            span = (found.used[:, 1] - found.used[:, 0] + 4) / grid.shape
             sparse = bool(attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1)
             if not (wide.any() or coarse.any() or sparse):
                 break
@@ -204,8 +204,9 @@ def _next(product: _Product, bounds: Bounds, sparse: bool, late: bool) -> Grid |
 
 def _at_end(product: Field, predicted: Grid, bounds: Bounds) -> bool:
     """Return whether a product has mass where the predicted window ends."""
+    if product.grid is predicted and product.survey(bounds).edges.max() <= bounds.edge:
+        return False
     z = relative_index(product.grid, predicted, bounds.periodic)
-    sizes = np.array(predicted.sizes)
-    outer = ((z < 1.5) | (z > sizes - 2.5)) & ~np.array(predicted.closed)
+    outer = ((z < 1.5) | (z > predicted.shape - 2.5)) & ~predicted.circles
     values = product.values.reshape(-1)
     return bool(values[outer.any(axis=1)].sum() > 1e-4 * values.sum())

@@ -71,7 +71,7 @@ def fitted_grid(
     sizes, closed = np.empty(n, np.int64), np.empty(n, bool)
     fit(
         np.array(offsets.T, order="C"), np.ascontiguousarray(logs), least, start, np.ascontiguousarray(noise), narrowness,
-        np.ascontiguousarray(previous.basis), np.array(previous.closed), np.array(bounds.periodic), bounds.reach, bounds.spacings,
+        np.ascontiguousarray(previous.basis), previous.circles, np.array(bounds.periodic), bounds.reach, bounds.spacings,
         extra, LEAST[n], bounds.most, POINTS[n], centre, basis, sizes, closed,
     )  # fmt: skip
     return Grid(centre, basis, tuple(sizes.tolist()), tuple(closed.tolist()))
@@ -124,7 +124,7 @@ def enlargement(grid: Grid, noise: Array, bounds: Bounds) -> float:
     """Return the ratio of the volume that a density needs to be spread by N(0, noise) to that of its grid."""
     inverse = grid.inverse
     variances = np.diagonal(inverse @ noise @ inverse.T)
-    half = 0.5 * np.array(grid.sizes)
+    half = 0.5 * grid.shape
     ratios = bounds.reach * np.sqrt((half / bounds.reach) ** 2 + variances) / half
     return float(np.prod(np.where(grid.closed, 1.0, ratios)))
 
