@@ -21,7 +21,8 @@ from zakai.numerics.space_transport import Dynamics, moved_points
 from zakai.numerics.space_window import LEAST, Bounds, fitted_grid
 
 Array = NDArray[Any]
-STEEPEST = 1.0  # largest tau |L|
+STEEPEST = 0.6  # largest tau |L|
+SHORT = 0.15  # largest |L| times a Runge-Kutta step
 STEEP_AT = 0.25  # share of the width of a grid from its centre at which L is taken too
 MARGIN = 0.07  # share of its width by which a grid that is to stay is wider at each end
 LARGEST_NOISE = 0.2  # of the variance of a density that fills its grid
@@ -63,8 +64,9 @@ def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
         return Motion(np.zeros((5, 0)), unit, np.zeros((n, 0)), variances, 0.0)
     points = np.asfortranarray(grid.points)
     with np.errstate(all="ignore"):
-        half = moved_points(dynamics, points, 0.0, -0.5 * unit, 1)
-        whole = half + moved_points(dynamics, points + half[:, :n], -0.5 * unit, -unit, 1)
+        steps = math.ceil(0.5 * unit * rate / SHORT) or 1
+        half = moved_points(dynamics, points, 0.0, -0.5 * unit, steps)
+        whole = half + moved_points(dynamics, points + half[:, :n], -0.5 * unit, -unit, steps)
         slopes = [-unit * dynamics.drift(points + moved, 0.0) for moved in (0.0, half[:, :n], whole[:, :n])]
     moved = np.stack([part.T for part in (slopes[0], half, slopes[1], whole, slopes[2])])
     moved[:, :n] = inverse @ moved[:, :n]
