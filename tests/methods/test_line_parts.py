@@ -8,13 +8,10 @@ import zakai
 STEPS = 800  # of Runge and Kutta, for each interval
 
 
-def solved(f, G, h, S, increments, box, times, values, log_prior):
-    """Mean, variance and log-likelihood for u_t = (G u)'' / 2 - (f u)' + (h dy/dt - h^2 / 2) u / S on a periodic grid."""
-    size = 128
-    x = box[0] + (box[1] - box[0]) * np.arange(size) / size
-    wave = 2j * np.pi * np.fft.fftfreq(size, (box[1] - box[0]) / size)
-    u, rows, total, start = np.exp(log_prior(x)), [], 0.0, 0.0
-    u = u / u.sum()
+def solved(f, G, h, S, increments, x, times, values, start, u):
+    """The densities after each time, not normalised, of u_t = (G u)'' / 2 - (f u)' + (h dy/dt - h^2 / 2) u / S."""
+    wave = 2j * np.pi * np.fft.fftfreq(len(x), x[1] - x[0])
+    found = []
     for stop, value in zip(times, values, strict=True):
         step = (stop - start) / STEPS
 
@@ -30,10 +27,13 @@ def solved(f, G, h, S, increments, box, times, values, log_prior):
             u = u + step / 6 * (a + 2 * b + 2 * c + slope(t + step, u + step * c))
         if not increments:
             u = u * np.exp(-0.5 * (value - h(x, stop)) ** 2 / S(stop)) / np.sqrt(2 * np.pi * S(stop))
-        total, u, start = total + np.log(u.sum()), u / u.sum(), stop
-        mean = (x * u).sum()
-        rows.append((mean, ((x - mean) ** 2 * u).sum()))
-    return np.array(rows), total
+        found.append(u)
+        start = stop
+    return found
+
+
+def grid(low, high):
+    return low + (high - low) * np.arange(128) / 128
 
 
 CASES = {
@@ -57,13 +57,24 @@ def test_coefficients_that_vary_within_intervals(name, increments):
     times = np.cumsum([0.3, 0.05, 0.55, 0.4])
     truth = np.array([0.3, 0.5, 0.6, 0.9])
     values = truth * np.diff(times, prepend=0.0) if increments else truth
-    box, log_prior = (-4.0, 4.0), lambda x: -0.5 * (x - 0.2) ** 2 / 0.3
-    expected, total = solved(f, G, h, lambda t: 0.2, increments, box, times, values, log_prior)
-    result = zakai.filter(model, zakai.Record(times, values[:, None], model.observation_kind), method="yau-yau")
+    x = grid(-4.0, 4.0)
+    prior = np.exp(-0.5 * (x - 0.2) ** 2 / 0.3)
+    law = f, G, h, lambda t: 0.2, increments, x
+    expected = solved(*law, times, values, 0.0, prior / prior.sum())
+    record = zakai.Record(times, values[:, None], model.observation_kind)
+    result = zakai.filter(model, record, method="yau-yau")
     assert not result.warnings
-    np.testing.assert_allclose(result.mean[1:, 0], expected[:, 0], rtol=0, atol=1e-6)
-    np.testing.assert_allclose(result.variance[1:, 0], expected[:, 1], rtol=0, atol=1e-6)
-    assert abs(result.log_likelihood - total) < 1e-6
+    for k, u in enumerate(expected, 1):
+        mean = (x * u).sum() / u.sum()
+        assert abs(result.mean[k, 0] - mean) < 1e-6
+        assert abs(result.variance[k, 0] - ((x - mean) ** 2 * u).sum() / u.sum()) < 1e-6
+    total = expected[-1].sum()
+    assert abs(result.log_likelihood - np.log(total)) < 1e-6
+    # The equation is linear: x(t_2) times the density there leads to its expectation given all observations.
+    smoothed = zakai.smooth(model, record, method="yau-yau")
+    weighted = solved(*law, times[2:], values[2:], times[1], x * expected[1])[-1].sum() / total
+    assert not smoothed.warnings
+    assert abs(smoothed.mean[2, 0] - weighted) < 1e-6
 
 
 def test_a_forced_angle_around_the_end_of_its_grid():
@@ -72,10 +83,10 @@ def test_a_forced_angle_around_the_end_of_its_grid():
         observation_kind="samples", periodic=["x"], prior={"kind": "density", "log_density": "2*cos(x - 3)"},
     )  # fmt: skip
     times, values = np.cumsum([0.3, 0.05, 0.55, 0.4]), np.array([-0.9, -1.1, -0.6, -1.0])
-    expected, total = solved(
-        lambda x, t: np.sin(x) + 3 * np.cos(7 * t), lambda t: 0.49, lambda x, t: np.cos(x), lambda t: 0.2, False,
-        (0.0, 2 * np.pi), times, values, lambda x: 2 * np.cos(x - 3),
-    )  # fmt: skip
+    x = grid(0.0, 2 * np.pi)
+    prior = np.exp(2 * np.cos(x - 3))
+    law = lambda x, t: np.sin(x) + 3 * np.cos(7 * t), lambda t: 0.49, lambda x, t: np.cos(x), lambda t: 0.2, False, x
+    total = np.log(solved(*law, times, values, 0.0, prior / prior.sum())[-1].sum())
     result = zakai.filter(model, zakai.Record(times, values[:, None], "samples"), method="yau-yau")
     assert not result.warnings
     assert abs(result.log_likelihood - total) < 1e-6

@@ -25,6 +25,7 @@ from zakai.methods._line_system import Prepared, State, state_moments
 from zakai.methods._line_update import exponential_factor, factor_at_end
 from zakai.methods._line_way import Way, negligible, smoothing_tolerance
 from zakai.methods._protocol import Backward, Info, Infos
+from zakai.methods._states import Joined
 from zakai.numerics import line_window as lw
 
 Array = Any
@@ -72,11 +73,28 @@ def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message,
     return _smoothed(prepared, state, later, _product(state, later))
 
 
-@np.errstate(all="ignore")
 def segment(
     prepared: Prepared, rows: slice, states: Sequence[State], later: Message, observed: np.ndarray
 ) -> tuple[Message, Infos]:
     """Return the message at the start of the intervals of a slice, and the reports after each."""
+    if prepared.parts is None:
+        return _of_whole(prepared, rows, states, later, observed)
+    # What a report says of the step after it belongs to that interval's gain.
+    parts = prepared.parts
+    inner, values, last = parts.cut(rows, observed)
+    between, _ = _line.segment_of_whole(parts.prepared, inner, states[0], values)
+    found, infos = _of_whole(parts.prepared, inner, Joined([[states[0]], between]), later, values)
+    gained = infos.log_likelihood_increment
+    health = {name: np.fmax.reduceat(figures, last) for name, figures in infos.health.items()}
+    reports = Infos(np.add.reduceat(gained, last), infos.mean[last], infos.cov[last], health)
+    return found._replace(logs=found.logs + np.sum(gained[: last[0]])), reports
+
+
+@np.errstate(all="ignore")
+def _of_whole(
+    prepared: Prepared, rows: slice, states: Sequence[State], later: Message, observed: np.ndarray
+) -> tuple[Message, Infos]:
+    """Return the same of intervals that are not cut into parts."""
     parts: list[Infos] = []
     stop = rows.stop
     while stop > rows.start:

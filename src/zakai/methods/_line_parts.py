@@ -31,16 +31,20 @@ class Parts(NamedTuple):
     prepared: Prepared
     first: np.ndarray
 
-    def segment(self, rows: slice, state: State, observed: np.ndarray, run: Segment) -> tuple[list[State], Infos]:
-        """Return the states after the intervals of a slice, and their reports, by `run` for the parts."""
+    def cut(self, rows: slice, observed: np.ndarray) -> tuple[slice, np.ndarray, np.ndarray]:
+        """Return the parts of some intervals, what is observed in them, and which ones are the last of their intervals."""
+        assert self.prepared.shares is not None
         first = self.first[rows.start : rows.stop + 1]
         inner = slice(int(first[0]), int(first[-1]))
-        values = np.repeat(observed, np.diff(first), axis=0)
-        assert self.prepared.shares is not None
         own = np.where(self.prepared.inside[inner], self.prepared.shares[inner, None], 1.0)
-        values = np.where(self.prepared.schedule.seen[inner], values * own, 0.0)
+        values = np.repeat(observed, np.diff(first), axis=0) * own
+        return inner, np.where(self.prepared.schedule.seen[inner], values, 0.0), first[1:] - first[0] - 1
+
+    def segment(self, rows: slice, state: State, observed: np.ndarray, run: Segment) -> tuple[list[State], Infos]:
+        """Return the states after the intervals of a slice, and their reports, by `run` for the parts."""
+        inner, values, last = self.cut(rows, observed)
         states, infos = run(self.prepared, inner, state, values)
-        begin, last = first[:-1] - first[0], first[1:] - first[0] - 1
+        begin = np.append(0, last[:-1] + 1)
         health = {
             name: figures[last] if name in ("error_estimate", "std_in_spacings")
             else (np.add if name in SUMS else np.fmax).reduceat(figures, begin)
