@@ -12,7 +12,7 @@ from numba import boolean, float64, int64, types
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
-from zakai.numerics.line_averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, averaged, averaging
+from zakai.numerics.line_averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, averaged, averaging, operators
 from zakai.numerics.line_backward import ERROR, LOG_MASS, SMALLEST, Filtered, Limits, Message, Taken, kept, multiplied, spread
 from zakai.numerics.line_density import highest_of, support, waves
 from zakai.numerics.line_segment import SPLIT, Grid, Steps
@@ -47,9 +47,9 @@ def _split(
     phi, slope, curvature, drift, b = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     made, constant, magnus = 0.0, 0.0, 0
     if averages.shape[0] > 1:
-        made, pair = averaging(
-            product, table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, spacing, closed
-        )
+        both, spreads = np.empty((3, 2, size)), np.empty(3)
+        operators(table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, both, spreads)
+        made, pair = averaging(product, both, spreads, spacing, closed)
         if not (made <= most):
             magnus = int(min(max(np.ceil(1.1 * (pair / most) ** 0.25), 1.0), 1e6))
             made = pair / float(magnus) ** 4

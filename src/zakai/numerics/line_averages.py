@@ -124,29 +124,40 @@ _PRODUCTS = np.array(
 
 
 @helper
-def averaging(
-    values: Array, table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, averages: Array,
-    tau: float, observed: Array, inside: bool, at: int, spacing: float, closed: bool,
-) -> tuple[float, float]:  # fmt: skip
+def operators(
+    table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, averages: Array, tau: float,
+    observed: Array, inside: bool, at: int, to: Array, spreads: Array,
+) -> None:  # fmt: skip
+    """Write f and the potential (3, 2, N), and int G dt (3,), of B, D and E in a part of an interval, see `averaging`."""
+    to[:] = 0.0
+    for i in range(3):
+        weights, whole = averages[MEAN if i == 0 else (DIFFERENCE if i == 1 else SECOND)], 0.0
+        spreads[i] = 0.0
+        for q in range(weights.size):
+            spreads[i] += tau * weights[q] * covariances[q]
+            whole += weights[q]
+        for r in range(table.shape[0]):
+            weight = 0.0
+            for q in range(weights.size):
+                weight += tau * weights[q] * drifts[q, r]
+            if weight != 0.0:
+                add(to[i, 0], weight, table[r, DRIFT])
+        if inside and (i == 0 or outputs.shape[0] > 1):
+            for q in range(outputs.shape[0]):
+                w = whole if outputs.shape[0] == 1 else weights[q]
+                h, centre = observation_of(table, outputs[q], at)
+                exponent_added(h, centre, precisions[q], observed, w, w * tau, to[i, 1])
+
+
+@helper
+def averaging(values: Array, parts: Array, spreads: Array, spacing: float, closed: bool) -> tuple[float, float]:
     """Return estimates of the errors of the mean and of two averages in a part of an interval.
 
     With the integral B of the operator, D the difference of the averages and E the second Legendre coefficient they are
     [B, D] / 4 + [B, [B, E]] / 10, and of fifth order 5 |[B, D] / 4|^(5/3) + [B, [B, E]] / 10.
     """
     size = values.size
-    parts, spreads, found = np.zeros((3, 2, size)), np.zeros(3), np.zeros((8, size))
-    for i in range(3):
-        weights, whole = averages[MEAN if i == 0 else (DIFFERENCE if i == 1 else SECOND)], 0.0
-        for q in range(weights.size):
-            spreads[i] += tau * weights[q] * covariances[q]
-            whole += weights[q]
-            for r in range(table.shape[0]):
-                add(parts[i, 0], tau * weights[q] * drifts[q, r], table[r, DRIFT])
-        if inside and (i == 0 or outputs.shape[0] > 1):
-            for q in range(outputs.shape[0]):
-                w = whole if outputs.shape[0] == 1 else weights[q]
-                h, centre = observation_of(table, outputs[q], at)
-                exponent_added(h, centre, precisions[q], observed, w, w * tau, parts[i, 1])
+    found = np.zeros((8, size))
     add(found[0], 1.0, values)
     for operator, of, weight, to in _PRODUCTS:
         _generated(found[of], parts[operator], spreads[operator], spacing, float(weight), closed, found[to])

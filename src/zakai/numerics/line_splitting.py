@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, inlined, summing
 from zakai.numerics.exponentials import exponentiate
-from zakai.numerics.line_averages import EARLY, IMPOSSIBLE, LATE, MEAN, MOST_MAGNUS, averaged, averaging
+from zakai.numerics.line_averages import EARLY, IMPOSSIBLE, LATE, MEAN, MOST_MAGNUS, averaged, averaging, operators
 from zakai.numerics.line_density import highest_of, moments
 from zakai.numerics.line_filters import filtered, taps_of, wrapped
 from zakai.numerics.line_terms import Transition, failed
@@ -63,10 +63,10 @@ def divided(
     begin, phi, drift = now.copy(), np.empty(size), np.empty(size)
     b, first, second = np.empty(size), np.empty(size), np.empty(size)
     magnus, substeps = 0.0, 1.0  # pairs of averages, one after the other, or the mean
+    both, spreads = np.empty((3, 2, size if varying else 1)), np.empty(3)
     if varying:
-        mean_error, pair_error = averaging(
-            now, table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, spacing, closed
-        )
+        operators(table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, both, spreads)
+        mean_error, pair_error = averaging(now, both, spreads, spacing, closed)
         if mean_error > most:
             magnus = max(np.ceil(1.1 * (pair_error / most) ** 0.25), 1.0)
     for _ in range(8):
@@ -98,9 +98,9 @@ def divided(
             splitting += residual(now, b, first, second, drift, own_spread, spacing, length) / substeps**4
             rounding, clipped, spread, constant = rounding + noise, max(clipped, end), spread + own_spread, constant + added
             if varying and (magnus == 0.0 or i % 2 == 1):
-                mean_error, pair_error = averaging(
-                    now, table, drifts, outputs, precisions, covariances, weights, tau, observed, inside, at, spacing, closed
-                )
+                if parts > 1:
+                    operators(table, drifts, outputs, precisions, covariances, weights, tau, observed, inside, at, both, spreads)
+                mean_error, pair_error = averaging(now, both, spreads, spacing, closed)
                 time, pairs = time + (pair_error if magnus > 0.0 else mean_error), pairs + pair_error
             total = moments(now)[0]
             if not (1e-200 < total < 1e200):
