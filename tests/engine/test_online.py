@@ -270,3 +270,18 @@ def test_an_outlier_of_fifty_deviations_neither_breaks_nor_freezes_the_filter(ke
     assert [k for k, _ in refused] in ([], [20]) and all("not used" in text for _, text in refused)
     # After two units of time the system has come back.
     assert np.all(abs(estimate.mean - usual.mean) < 3 * np.sqrt(np.diag(usual.cov)))
+
+
+def test_a_density_that_moves_far_is_the_same_to_the_bit_online():
+    model = zakai.Model(
+        state=["x"],
+        drift=["5*sin(3*t) - x + sin(x)/7"],
+        observation=["x"],
+        observation_kind="samples",
+        observation_noise=[["1/100"]],
+        prior={"kind": "gaussian", "mean": [0.1], "cov": [[1.0]]},
+    )
+    _, record = zakai.simulate(model, 0.05 * np.arange(1, 61), seed=1)
+    result, online = zakai.filter(model, record), zakai.online(model)
+    found = [online.update(*pair).mean for pair in zip(record.times, record.values, strict=True)]
+    assert np.array_equal(found, result.mean[1:])

@@ -54,11 +54,15 @@ class Piece(NamedTuple):
     segment: Segment
     last: State
 
+    def centre(self, start: Any) -> Any:
+        """Return the centres of grids that begin at points of the table: multiples of the spacing, however they came there."""
+        return self.before.spacing * (round(self.before.centre / self.before.spacing) + (start - self.grid_start))
+
     @property
     def states(self) -> Sequence[State]:
         """The states after the steps."""
         reports = self.segment.reports
-        centres = self.before.centre + self.before.spacing * (reports[:, START] - self.grid_start)
+        centres = self.centre(reports[:, START])
         fields = {"values": self.segment.densities, "centre": centres, "error": reports[:, ERROR], "log_floor": reports[:, FLOOR]}
         return Joined([StackedStates[State](self.before, fields)[:-1], [self.last]])
 
@@ -98,12 +102,11 @@ def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -
         )  # fmt: skip
         attempts += 1
         if len(found.reports):
-            before, attempts = state, 1
+            attempts, piece = 1, Piece(first, state, grid.start, found, state)
             *_, error, log_floor, start = found.reports[-1].tolist()
-            centre = state.centre + state.spacing * (start - grid.start)
-            state = state._replace(values=found.densities[-1], centre=centre, error=error, log_floor=log_floor)
+            state = state._replace(values=found.densities[-1], centre=piece.centre(start), error=error, log_floor=log_floor)
             state = regridded(prepared, state) if found.why == AFTER else state
-            pieces.append(Piece(first, before, grid.start, found, state))
+            pieces.append(piece._replace(last=state))
             first += len(found.reports)
         if found.why == RANGE:
             larger = _covering(prepared, state, *found.answer.tolist())
@@ -197,8 +200,8 @@ def _report(
 
     `each` applies a function to the state after every step and the time.
     """
-    origin, centre, spacing = piece.before[1:4]
-    mean = origin + (centre + spacing * (columns["start"] - piece.grid_start) + spacing * columns["mean"])
+    origin, spacing = piece.before.origin, piece.before.spacing
+    mean = origin + (piece.centre(columns["start"]) + spacing * columns["mean"])
     variance = spacing**2 * columns["variance"]
     health = {name: columns[source] for name, source in HEALTH.items()}
     health["tolerance_ratio"] = columns["made"] / prepared.promised
