@@ -25,6 +25,7 @@ from zakai.methods._line_domain import on_the_line, variable_of
 from zakai.methods._line_grids import SHARED
 from zakai.methods._line_model import system_of
 from zakai.methods._line_moves import Report, by_decomposition, by_kernel, by_substeps
+from zakai.methods._line_parts import segment_of_parts
 from zakai.methods._line_prior import averaged
 from zakai.methods._line_system import (
     NOISE,
@@ -160,7 +161,7 @@ def _state(values: Array, window: lw.Window, error: float, log_floor: float) -> 
 def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
     """Return the state after interval k and the observation at its stop, and the report."""
     if prepared.parts is not None:
-        states, infos = prepared.parts.segment(slice(k, k + 1), state, observed[None], segment_of_whole)
+        states, infos = segment_of_parts(prepared.parts, slice(k, k + 1), state, observed[None], segment_of_whole)
         figures = {name: float(values[0]) for name, values in infos.health.items()}
         return states[0], Info(infos.log_likelihood_increment[0], infos.mean[0], infos.cov[0], figures)
     if prepared.fast[k]:
@@ -175,7 +176,7 @@ def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tupl
 def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos]:
     """Return the states after the intervals of a slice, and their reports."""
     if prepared.parts is not None:
-        return prepared.parts.segment(rows, state, observed, segment_of_whole)
+        return segment_of_parts(prepared.parts, rows, state, observed, segment_of_whole)
     return segment_of_whole(prepared, rows, state, observed)
 
 

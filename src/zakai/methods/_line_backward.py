@@ -20,6 +20,7 @@ from zakai.methods import _line
 from zakai.methods._line_adjoint import back
 from zakai.methods._line_loop import joined
 from zakai.methods._line_message import Message, points_of, reliable, support
+from zakai.methods._line_parts import cut
 from zakai.methods._line_paths import draw
 from zakai.methods._line_system import Prepared, State, state_moments
 from zakai.methods._line_update import exponential_factor, factor_at_end
@@ -81,7 +82,7 @@ def segment(
         return _of_whole(prepared, rows, states, later, observed)
     # What a report says of the step after it belongs to that interval's gain.
     parts = prepared.parts
-    inner, values, last = parts.cut(rows, observed)
+    inner, values, last = cut(parts, rows, observed)
     between, _ = _line.segment_of_whole(parts.prepared, inner, states[0], values)
     found, infos = _of_whole(parts.prepared, inner, Joined([[states[0]], between]), later, values)
     gained = infos.log_likelihood_increment

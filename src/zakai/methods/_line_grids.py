@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from zakai.methods._line_steps import probed, resolved
+from zakai.methods._line_steps import parts_needed, probed
 from zakai.methods._line_system import Prepared, spectral, tables
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_panels import GAUSS_NODES
@@ -111,8 +111,9 @@ def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) ->
     Those of intervals in which the nodes do not resolve the coefficients are NaN.
     """
     system, theta, count = prepared.system, prepared.theta, len(GAUSS_NODES)
-    starts, lengths = prepared.schedule.starts[rows, None], prepared.lengths[rows, None]
-    times = np.concatenate([starts + lengths * GAUSS_NODES, starts + lengths], axis=1)
+    starts, stops = prepared.schedule.starts[rows, None], prepared.schedule.stops[rows, None]
+    inner = np.clip(starts + prepared.lengths[rows, None] * GAUSS_NODES, starts, np.nextafter(stops, starts))
+    times = np.concatenate([inner, stops], axis=1)
     table = np.zeros((*times.shape, OBSERVED + system.m, len(x)))
     f = system.drift(_nodes(window, x), times[..., None], theta)[..., 0]
     table[..., CELL, :], table[..., DRIFT, :] = _cells(window, f), f[..., :-1:3]
@@ -128,5 +129,5 @@ def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) ->
         return np.concatenate([f, system.observation(at, t[..., None], theta).reshape(*t.shape, -1)], axis=-1)
 
     known = coefficients(times[:, :count])
-    table[~resolved(coefficients(probed(starts, lengths)), known), :, :OBSERVED] = np.nan
+    table[parts_needed(coefficients(probed(starts, stops)), known) != 1, :, :OBSERVED] = np.nan
     return table

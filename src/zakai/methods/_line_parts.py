@@ -8,50 +8,44 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from zakai.methods._line_system import Prepared, State
+from zakai.methods._line_system import Parts, Prepared, State
 from zakai.methods._protocol import Infos
 from zakai.records.schedule import Schedule, lengths_of
 
-ROUNDS = 8  # of cutting: parts shorter than 2^-8 of an interval are left to adaptive substeps
+ROUNDS = 2  # of cutting, after which what is not resolved is left to adaptive substeps
 SUMS = ("time_error", "tolerance_ratio")  # figures of parts that add up
 
 Segment = Callable[[Prepared, slice, State, np.ndarray], tuple[Sequence[State], Infos]]
 
 
-class Parts(NamedTuple):
-    """What is known of the parts of all intervals.
+def cut(parts: Parts, rows: slice, observed: np.ndarray) -> tuple[slice, np.ndarray, np.ndarray]:
+    """Return the parts of some intervals, what is observed in them, and which ones are the last of their intervals."""
+    prepared, first = parts.prepared, parts.first[rows.start : rows.stop + 1]
+    assert prepared.shares is not None
+    inner = slice(int(first[0]), int(first[-1]))
+    own = np.where(prepared.inside[inner], prepared.shares[inner, None], 1.0)
+    values = np.repeat(observed, np.diff(first), axis=0) * own
+    return inner, np.where(prepared.schedule.seen[inner], values, 0.0), first[1:] - first[0] - 1
 
-    Those of interval k are first[k] to first[k + 1].
-    """
 
-    prepared: Prepared
-    first: np.ndarray
-
-    def cut(self, rows: slice, observed: np.ndarray) -> tuple[slice, np.ndarray, np.ndarray]:
-        """Return the parts of some intervals, what is observed in them, and which ones are the last of their intervals."""
-        assert self.prepared.shares is not None
-        first = self.first[rows.start : rows.stop + 1]
-        inner = slice(int(first[0]), int(first[-1]))
-        own = np.where(self.prepared.inside[inner], self.prepared.shares[inner, None], 1.0)
-        values = np.repeat(observed, np.diff(first), axis=0) * own
-        return inner, np.where(self.prepared.schedule.seen[inner], values, 0.0), first[1:] - first[0] - 1
-
-    def segment(self, rows: slice, state: State, observed: np.ndarray, run: Segment) -> tuple[list[State], Infos]:
-        """Return the states after the intervals of a slice, and their reports, by `run` for the parts."""
-        inner, values, last = self.cut(rows, observed)
-        states, infos = run(self.prepared, inner, state, values)
-        begin = np.append(0, last[:-1] + 1)
-        health = {
-            name: figures[last] if name in ("error_estimate", "std_in_spacings")
-            else (np.add if name in SUMS else np.fmax).reduceat(figures, begin)
-            for name, figures in infos.health.items()
-        }  # fmt: skip
-        gained = np.add.reduceat(infos.log_likelihood_increment, begin)
-        return [states[i] for i in last], Infos(gained, infos.mean[last], infos.cov[last], health)
+def segment_of_parts(
+    parts: Parts, rows: slice, state: State, observed: np.ndarray, run: Segment
+) -> tuple[list[State], Infos]:
+    """Return the states after the intervals of a slice, and their reports, by `run` for the parts."""
+    inner, values, last = cut(parts, rows, observed)
+    states, infos = run(parts.prepared, inner, state, values)
+    begin = np.append(0, last[:-1] + 1)
+    health = {
+        name: figures[last] if name in ("error_estimate", "std_in_spacings")
+        else (np.add if name in SUMS else np.fmax).reduceat(figures, begin)
+        for name, figures in infos.health.items()
+    }  # fmt: skip
+    gained = np.add.reduceat(infos.log_likelihood_increment, begin)
+    return [states[i] for i in last], Infos(gained, infos.mean[last], infos.cov[last], health)
 
 
 def parts_of(prepared: Prepared) -> Parts | None:
@@ -61,10 +55,10 @@ def parts_of(prepared: Prepared) -> Parts | None:
     found, owner = prepared, np.arange(len(prepared.schedule))
     for _ in range(ROUNDS):
         schedule = found.schedule
-        cut = (found.lengths > 0) & ~found.coefficients.resolved
-        if not cut.any():
+        needed = np.where(found.lengths > 0, found.coefficients.parts, 1)
+        if not (needed > 1).any():
             break
-        bounds = [_bounds(found, k) if cut[k] else [schedule.starts[k]] for k in range(len(schedule))]
+        bounds = [_bounds(found, k, n) if n > 1 else [schedule.starts[k]] for k, n in enumerate(needed)]
         counts = np.array([len(bound) for bound in bounds])
         starts = np.concatenate(bounds)
         stops = np.append(starts[1:], schedule.stops[-1])
@@ -83,11 +77,12 @@ def parts_of(prepared: Prepared) -> Parts | None:
         return None
     first = np.searchsorted(owner, np.arange(len(prepared.schedule) + 1))
     shares = np.where(found.lengths < prepared.lengths[owner], found.lengths / prepared.lengths[owner], 1.0)
-    return Parts(replace(found, shares=shares), first)
+    found.shares = shares
+    return Parts(found, first)
 
 
-def _bounds(prepared: Prepared, k: int) -> list[Any]:
-    """Return where the parts of an interval begin: where inputs have a jump or a kink, else at the middle."""
+def _bounds(prepared: Prepared, k: int, count: int) -> list[Any]:
+    """Return where the parts of an interval begin: where inputs have a jump or a kink, else in equal steps."""
     start, stop = float(prepared.schedule.starts[k]), float(prepared.schedule.stops[k])
     pieces = [first for first, _ in prepared.system.pieces(start, stop)]
-    return pieces if len(pieces) > 1 else [start, start + 0.5 * (stop - start)]
+    return pieces if len(pieces) > 1 else list(start + (stop - start) / count * np.arange(count))

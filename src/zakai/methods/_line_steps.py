@@ -13,6 +13,7 @@ from zakai.numerics.line_panels import GAUSS_NODES, interpolation
 from zakai.numerics.line_segment import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Steps
 
 RESOLVED = 1e-8  # relative error of the interpolants of coefficients in time
+MOST_PARTS = 16  # in which an interval is cut at a time
 PROBES = np.linspace(0.0, 1.0, 129)  # parts of an interval at which coefficients are compared with their interpolants
 
 
@@ -24,7 +25,7 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
     starts, lengths, stops = schedule.starts[:, None], prepared.lengths[:, None], schedule.stops[:, None]
     if prepared.timed:
         nodes = np.clip(starts + lengths * GAUSS_NODES, starts, np.nextafter(stops, starts))
-        t = np.concatenate([nodes, stops, probed(starts, lengths)], axis=1)
+        t = np.concatenate([nodes, stops, probed(starts, stops)], axis=1)
     else:
         t = np.concatenate([np.full((count, 1), prepared.model.start), stops], axis=1)
     size = len(GAUSS_NODES) if prepared.timed else 1
@@ -55,14 +56,16 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
     G = everywhere(system.covariance, system.steady_covariance)[..., 0, 0] if prepared.divides else np.zeros(t.shape)
     noise = everywhere(system.noise, system.steady_noise)
     precisions, constants = precision(noise[:, ends])
-    good = np.ones(count, bool)
+    parts = np.ones(count, int)
     if prepared.timed and count:
         terms = _mixed_terms(prepared, t) if prepared.mixed else factors
-        good &= system.steady_covariance or resolved(G[:, probes, None], G[:, own, None])
-        good &= resolved(terms[:, probes], terms[:, own])
-        good &= system.samples or system.steady_noise or resolved(precision(noise[:, probes])[0], precisions)
+        parts = parts_needed(terms[:, probes], terms[:, own])
+        if not system.steady_covariance:
+            parts = np.maximum(parts, parts_needed(G[:, probes, None], G[:, own, None]))
+        if not (system.samples or system.steady_noise):
+            parts = np.maximum(parts, parts_needed(precision(noise[:, probes])[0], precisions))
     drifts, outputs, covariances = (np.array(part, order="C") for part in (factors[:, own], factors[:, ends], G[:, own]))
-    return Coefficients(drifts, outputs, covariances, precisions, constants, good)
+    return Coefficients(drifts, outputs, covariances, precisions, constants, parts)
 
 
 _X = np.zeros((1, 1, 1))
@@ -80,17 +83,19 @@ def _mixed_terms(prepared: Prepared, t: np.ndarray) -> np.ndarray:
     return np.asarray(finite(terms).reshape(*t.shape, -1))
 
 
-def probed(starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+def probed(starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
     """Return times (K, P) at which coefficients are compared with their interpolants, of which the last are before the ends."""
-    return np.clip(starts + lengths * PROBES, starts, np.nextafter(starts + lengths, starts))
+    return np.clip(starts + (stops - starts) * PROBES, starts, np.nextafter(stops, starts))
 
 
-def resolved(exact: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Return whether the interpolants of values at the nodes (K, Q, ...) agree with those at the probes (K, P, ...)."""
+def parts_needed(exact: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Return in how many parts (K,) interpolants of values at nodes (K, Q, ...) agree with probes (K, P, ...), 0 for never."""
     exact, nodes = exact.reshape(*exact.shape[:2], -1), nodes.reshape(*nodes.shape[:2], -1)
     scale = np.maximum(np.abs(exact).max(axis=1), 1e-300)
     rest = np.abs(_TO_PROBES @ nodes - exact).max(axis=1) / scale
-    return np.asarray(rest.max(axis=1) <= RESOLVED)
+    excess = rest.max(axis=1) / RESOLVED
+    more = np.ceil(1.1 * np.nan_to_num(excess) ** (1.0 / len(GAUSS_NODES)))
+    return np.where(excess <= 1.0, 1, np.where(np.isfinite(excess), np.clip(more, 2, MOST_PARTS), 0)).astype(int)
 
 
 _TO_PROBES = interpolation(PROBES)
@@ -113,7 +118,7 @@ def kinds_of(prepared: Prepared) -> np.ndarray:
     whole = np.zeros(len(schedule), bool)
     if kernels is not None and yau is not None and yau.unobserved and yau.steady_gauge:
         whole = positive & (kernels.place >= 0) & (kernels.errors[kernels.place] == 0)
-    split = positive & prepared.divides & prepared.coefficients.resolved
+    split = positive & prepared.divides & (prepared.coefficients.parts == 1)
     if system.samples:
         whole = whole & (silent | (not system.general))
         return np.where(whole, FACTOR, np.where(split, SPLIT_FACTOR, -1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,9 +21,6 @@ from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line_segment import Limits, Mechanisms, Steps
 from zakai.numerics.line_weak import PARTS, at_nodes, nodes, weak
 from zakai.records.schedule import Schedule
-
-if TYPE_CHECKING:
-    from zakai.methods._line_parts import Parts
 
 Array = Any
 
@@ -65,7 +62,7 @@ class State(NamedTuple):
 class Coefficients(NamedTuple):
     """What the compiled loop knows of the coefficients in time of K intervals: see `line_segment.Steps`.
 
-    `resolved` (K,) marks intervals in which the Gauss nodes resolve them.
+    `parts` (K,) are in how many parts of an interval the Gauss nodes would resolve them, 0 for never.
     """
 
     drifts: Array
@@ -73,7 +70,7 @@ class Coefficients(NamedTuple):
     covariances: Array
     precisions: Array
     constants: Array
-    resolved: Array
+    parts: Array
 
 
 @dataclass(eq=False)
@@ -240,6 +237,13 @@ class Prepared:
                     break
         self.kept[key] = found  # the last one that was used is the last one to go
         return found
+
+
+class Parts(NamedTuple):
+    """The parts of all intervals: those of interval k are first[k] to first[k + 1] of `prepared`."""
+
+    prepared: Prepared
+    first: Array
 
 
 def resampled(prepared: Prepared, values: Array, window: lw.Window, new: lw.Window) -> Array:
