@@ -28,7 +28,7 @@ NOISE = 3e-15  # error of a density relative to its maximum, which matters in it
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
 FINEST = 1024  # points of the largest grid for Gaussian kernels and splitting
-KEPT = 120  # tables and decompositions of grids that are kept for a model
+KEPT_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are kept for a model
 
 
 @lru_cache(maxsize=8)
@@ -229,14 +229,25 @@ class Prepared:
         """Return what `make` returns for a key, from the last ones that were kept; a value depends on its key alone."""
         found = self.kept.pop(key, None)
         if found is None:
-            found = make()
-            while len(self.kept) >= KEPT:
+            value = make()
+            found = value, _bytes_of(value)
+            excess = found[1] - KEPT_BYTES + sum(size for _, size in list(self.kept.values()))
+            while excess > 0 and self.kept:
                 try:
-                    self.kept.pop(next(iter(self.kept)), None)
+                    excess -= self.kept.pop(next(iter(self.kept)), (None, 0))[1]
                 except (StopIteration, RuntimeError):  # another thread was faster
                     break
         self.kept[key] = found  # the last one that was used is the last one to go
-        return found
+        return found[0]
+
+
+def _bytes_of(value: Any) -> int:
+    """Return the bytes of the arrays in a value and in the attributes of its objects."""
+    if isinstance(value, tuple | list):
+        return sum(map(_bytes_of, value))
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    return 64 + sum(map(_bytes_of, getattr(value, "__dict__", {}).values()))
 
 
 class Parts(NamedTuple):
