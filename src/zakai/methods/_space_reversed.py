@@ -133,7 +133,9 @@ class Reversed:
             noise = covariance(x, -s) if fixed is None else fixed
             push = _times(precision, away)
             noisy = _times(noise, push)
-            pulled = (found[..., :n] + 0.5 * noisy - speed) * push + 0.5 * away * _times(change, away)
+            pulled = (found[..., :n] + 0.5 * noisy) * push
+            if path.begin is not path.end:
+                pulled += 0.5 * away * _times(change, away) - speed * push
             found[..., n] = -0.5 * np.einsum("...ij,...ij->...", noise, precision) - pulled @ np.ones(n)
             found[..., :n] = -found[..., :n] - noisy
             if system.spreading is not None:
