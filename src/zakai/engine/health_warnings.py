@@ -62,9 +62,10 @@ def warnings_of_run(result: FilterResult) -> list[str]:
     for name, (bound, what) in result.bounds.items():
         over = result.health[name] > bound if name in result.health else np.zeros(0, bool)
         if over.any():
+            times = len(over) - int(np.isnan(result.health[name][0]))  # a filter has no figure of the start
             worst = int(np.nanargmax(np.where(over, result.health[name], -np.inf)))
             said.append(
-                f"{name} exceeds {bound:g} at {int(over.sum())} of {len(over) - 1} times, most at t = "
+                f"{name} exceeds {bound:g} at {int(over.sum())} of {times} times, most at t = "
                 f"{result.times[worst]:g} ({result.health[name][worst]:.2g}): {advised(name, what)}"
             )
     return said

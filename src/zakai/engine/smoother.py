@@ -24,7 +24,7 @@ from zakai.engine.plan import plan_of
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
-from zakai.methods._protocol import Infos, stacked
+from zakai.methods._protocol import Info, Infos, stacked
 from zakai.methods._states import Joined
 from zakai.models.model import Model
 from zakai.records import Record
@@ -157,7 +157,7 @@ class SmoothingRun(Run):
         self.after: list[Sequence[Any] | None] = []  # the states after each interval of a segment, while there is memory
         self.messages: list[Any] = []  # at the end of each segment
         self.held = 0
-        self.start: tuple[np.ndarray, np.ndarray] | None = None
+        self.start: Info | None = None  # what is smoothed at the start
 
     def _take(self, states: Sequence[Any], infos: Infos) -> None:
         self.segments.append((self.done, _alone(self.state)))
@@ -192,9 +192,8 @@ class SmoothingRun(Run):
             expected = float(forward[rows.start])
         self.parts.reverse()
         _, info = self.backward.smoothed(self.empty, self.first, message)
-        figure = self.parts[0].health["evidence_error"]
-        figure[0] = max(figure[0], abs(float(info.log_likelihood_increment) - expected))
-        self.start = info.mean, info.cov
+        error = abs(float(info.log_likelihood_increment) - expected)
+        self.start = info._replace(health={**info.health, "evidence_error": error})
 
     def _backward(
         self, prepared: Any, rows: slice, states: Sequence[Any], message: Any, observed: range
@@ -225,7 +224,7 @@ class SmoothingRun(Run):
 
     def start_moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean and the covariance at the start, smoothed once the record is."""
-        return super().start_moments() if self.start is None else self.start
+        return super().start_moments() if self.start is None else (self.start.mean, self.start.cov)
 
     def result(self, why: str, considered: Mapping[str, tuple[Condition, ...]]) -> FilterResult:
         """Return the result, of the filter until the record is smoothed."""
@@ -233,6 +232,8 @@ class SmoothingRun(Run):
         if self.start is None:
             return result
         result._density = self.density
+        for name, figures in result.health.items():
+            figures[0] = self.start.health[name]
         result.bounds = {**result.bounds, "evidence_error": (self.backward.accuracy(self.empty), _EVIDENCE)}
         result.warnings = [*self.notes, *warnings_of_run(result)]
         return result
