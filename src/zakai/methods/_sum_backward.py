@@ -22,7 +22,7 @@ from zakai.errors import InputError
 from zakai.methods import _sum_start as start
 from zakai.methods._protocol import Backward, Info
 from zakai.methods._sum_intervals import Prepared, inputs_of
-from zakai.methods._sum_update import SPLIT_FACTOR, move
+from zakai.methods._sum_update import move
 from zakai.models.prior import GaussianPrior
 from zakai.numerics.flow import at
 from zakai.numerics.gaussian_exponents import Exponents, adjoint, product, quotient
@@ -40,6 +40,7 @@ from zakai.numerics.gaussian_sum import (
 
 WIDER = 3.0  # variance of g relative to that of the filter's density
 SINGULAR = 1e-13  # eigenvalue of a correlation matrix that is zero
+FLAT = 2  # directions in which a Gaussian is cut into many
 NEGLIGIBLE = 1e-14  # share of a Gaussian of a smoothed density that is left out
 LEAST = 1e-9  # variance of g along an axis relative to that of the prior
 OF_OBSERVATIONS = ("nonlinearity", "quadrature", "pruned", "merged", "without_law", "outside_tables", "tail_depth")
@@ -70,11 +71,15 @@ def message(prepared: Prepared, state: Any) -> Message:
 
 
 def _last(prepared: Prepared, v: Components, time: float, most: int) -> Exponents:
-    """Return e^phi as a sum of at most `most` exponentials; where it is one and h is affine, as it is."""
+    """Return e^phi as a sum of exponentials: as it is, or cut into at most `most` that are narrow where h is curved.
+
+    Samples cut it themselves; in more directions than `FLAT` the sum of the narrow ones would not be flat.
+    """
     static, theta, origin = prepared.static, prepared.theta, prepared.static.system.origin
     gauge, n = static.gauge, static.model.n
     mean, cov = _cover(prepared, v, time)
-    if not static.directions.shape[1] and (gauge.none or gauge.exact):
+    cut = static.directions.shape[1] and not static.split_before and static.start_directions.shape[1] <= FLAT
+    if not cut and (gauge.none or gauge.exact):
         constants, slopes = gauge.terms(time, theta)
         return Exponents(np.zeros(n), constants, slopes, np.zeros((len(constants), n, n))).around(mean)
     doubt = None if gauge.none else lambda u: gauge.doubt(u, time, theta)
@@ -84,7 +89,6 @@ def _last(prepared: Prepared, v: Components, time: float, most: int) -> Exponent
     narrow = gauge.lift(narrow, time, theta)
     share = shares(narrow)[0]
     loss = replace(prepared.first(), static=static.plain, time=time).losses(narrow, share)
-    most = most * SPLIT_FACTOR if static.split_before else most
     return quotient(start.merged(narrow, share, loss, most, ()), mean, cov)
 
 
