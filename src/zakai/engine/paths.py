@@ -46,7 +46,7 @@ def sample_paths(runs: Sequence[SmoothingRun], places: Sequence[Sequence[int]], 
         if run.backward.draw is None:
             raise InputError(
                 f"sample_paths: the method {run.setting.method.name} does not draw paths for this model; take yau-yau for one "
-                "state, or kalman-bucy, benes or hu-yau, where one holds"
+                "state, or kalman-bucy, benes, hu-yau or general-direct, where one holds"
             )
     found = np.empty((count, times, n))
     generators = np.random.default_rng(seed).spawn(len(runs))

@@ -56,8 +56,8 @@ def draw(
     """
     if prepared.model.n > 1:
         raise InputError(
-            f"{prepared.model.source}: sample_paths: density grids draw paths of one state only; take kalman-bucy, benes or "
-            "hu-yau, where one holds"
+            f"{prepared.model.source}: sample_paths: density grids draw paths of one state only; take kalman-bucy, benes, "
+            "hu-yau or general-direct, where one holds"
         )
     assert LINE.draw is not None
     return LINE.draw(prepared, k, later, values, state, rng)
