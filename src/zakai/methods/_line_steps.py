@@ -85,7 +85,7 @@ def _mixed_terms(prepared: Prepared, t: np.ndarray) -> np.ndarray:
 
 def probed(starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
     """Return times (K, P) at which coefficients are compared with their interpolants, of which the last are before the ends."""
-    return np.clip(starts + (stops - starts) * PROBES, starts, np.nextafter(stops, starts))
+    return np.asarray(np.clip(starts + (stops - starts) * PROBES, starts, np.nextafter(stops, starts)))
 
 
 def parts_needed(exact: np.ndarray, nodes: np.ndarray) -> np.ndarray:
