@@ -114,20 +114,30 @@ def _run(code: Any, values: Any, size: int) -> None:
             _unary(operation - 8, values[a, :size], values[result, :size])
 
 
+@helper
+def _block(given: Any) -> Any:
+    """Return the values of all slots at the points of a block (S, BLOCK)."""
+    values = np.empty((given.size, BLOCK))
+    for s in range(given.size):
+        for i in range(BLOCK):
+            values[s, i] = given[s]
+    return values
+
+
 @kernel("void(int64[:, ::1], float64[::1], int64[::1], int64[::1], float64[:, ::1], float64[:, ::1])")
 def _evaluate(code: Any, given: Any, coordinates: Any, outputs: Any, x: Any, out: Any) -> None:
     """Write the outputs of a program (k, J) at points x (n, J)."""
-    values = np.empty((given.size, BLOCK))
-    for s in range(given.size):
-        values[s] = given[s]
+    values = _block(given)
     for first in range(0, x.shape[1], BLOCK):
         size = min(BLOCK, x.shape[1] - first)
         for s in range(given.size):
             if coordinates[s] >= 0:
-                values[s, :size] = x[coordinates[s], first : first + size]
+                for i in range(size):
+                    values[s, i] = x[coordinates[s], first + i]
         _run(code, values, size)
         for k in range(outputs.size):
-            out[k, first : first + size] = values[outputs[k], :size]
+            for i in range(size):
+                out[k, first + i] = values[outputs[k], i]
 
 
 @kernel(
@@ -143,18 +153,16 @@ def _flow(
     A point that after a step has an index beyond a limit (n,), relative to a centre, is given up: its change is NaN.
     """
     n, count = x.shape
-    values = np.empty((given.size, BLOCK))
-    slopes = np.empty((outputs.size, BLOCK))
-    for s in range(given.size):
-        values[s] = given[s]
+    values = _block(given)
+    slopes, total = np.zeros((outputs.size, BLOCK)), np.zeros((outputs.size, BLOCK))
     h = (t1 - t0) / steps
     for first in range(0, count, BLOCK):
         size = min(BLOCK, count - first)
         change = out[:, first : first + size]
-        change[:] = 0.0
-        slopes[:] = 0.0
+        for k in range(outputs.size):
+            for i in range(size):
+                change[k, i] = slopes[k, i] = 0.0
         for step in range(steps):
-            total = np.zeros((outputs.size, size))
             for stage in range(4):
                 share = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
                 for s in range(given.size):
@@ -163,13 +171,14 @@ def _flow(
                         for i in range(size):
                             values[s, i] = x[d, first + i] + change[d, i] + share * h * slopes[d, i]
                     elif d == CLOCK:
-                        values[s, :size] = t0 + (step + share) * h
+                        for i in range(size):
+                            values[s, i] = t0 + (step + share) * h
                 _run(code, values, size)
                 weight = h / 6 if stage == 0 or stage == 3 else h / 3
                 for k in range(outputs.size):
                     for i in range(size):
                         slopes[k, i] = values[outputs[k], i]
-                        total[k, i] += weight * slopes[k, i]
+                        total[k, i] = weight * slopes[k, i] + (total[k, i] if stage else 0.0)
             for k in range(outputs.size):
                 for i in range(size):
                     change[k, i] += total[k, i]
@@ -184,7 +193,8 @@ def _flow(
                 if inside:
                     alive += 1
                 else:
-                    change[:, i] = np.nan
+                    for k in range(outputs.size):
+                        change[k, i] = np.nan
             if alive == 0:
                 break
 

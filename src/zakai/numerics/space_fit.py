@@ -18,8 +18,12 @@ _OPEN, _CLOSED = 0.6, 0.85  # shares of a circle below which an axis is cut open
 @helper
 def invert(out: Any, matrix: Any) -> None:
     """Set `out` (n, n) to the inverse of a matrix."""
-    out[:] = np.eye(len(matrix))
-    solve(matrix.copy(), out)
+    n = len(matrix)
+    work = np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
+            work[i, j], out[i, j] = matrix[i, j], (1.0 if i == j else 0.0)
+    solve(work, out)
 
 
 @helper
@@ -51,13 +55,12 @@ def _axes(shape: Any, cov: Any, previous: Any, aligned: bool) -> None:
     """Set `shape` to axes (columns) of unit size in their own coordinate: those of the states, previous ones, or Cholesky's."""
     n = len(cov)
     inverse, product, spread = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    shape[:] = np.eye(n)
-    if aligned or n == 1:
-        return
     for attempt in range(2):
         for i in range(n):
             for j in range(n):
                 shape[i, j] = previous[i, j] / previous[j, j] if attempt == 0 else (1.0 if i == j else 0.0)
+        if aligned or n == 1:
+            continue
         invert(inverse, shape)
         congruence(spread, inverse, cov, product)
         worst = 0.0
@@ -66,6 +69,8 @@ def _axes(shape: Any, cov: Any, previous: Any, aligned: bool) -> None:
                 worst = max(worst, abs(spread[i, j]) / math.sqrt(spread[i, i] * spread[j, j]))
         if worst < _CORRELATED:
             return
+    if aligned or n == 1:
+        return
     factor = np.zeros((n, n))
     for i in range(n):
         for j in range(i + 1):
@@ -94,7 +99,7 @@ def _moments(x: Any, logs: Any, least: float, closed: Any, mean: Any, cov: Any) 
                     cosine += math.exp(logs[j]) * math.cos(x[d, j])
             middle = math.atan2(sine, cosine)
             for j in range(count):
-                x[d, j] -= 2 * math.pi * np.round((x[d, j] - middle) / (2 * math.pi))
+                x[d, j] -= 2 * math.pi * math.floor((x[d, j] - middle) / (2 * math.pi) + 0.5)
     for j in range(count):
         if logs[j] >= least:
             weight = math.exp(logs[j]) / total
@@ -126,15 +131,23 @@ def fit(
     `least` do not count.
     """
     n, count = x.shape
-    mean, cov = np.zeros(n), noise.copy()
+    mean, cov = np.zeros(n), np.empty((n, n))
+    for d in range(n):
+        for e in range(n):
+            cov[d, e] = noise[d, e]
     _moments(x, logs, least, was_closed, mean, cov)
     shape, inverse, product = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    _axes(shape, cov, previous, periodic.any())
+    aligned = False
+    for d in range(n):
+        aligned = aligned or periodic[d]
+    _axes(shape, cov, previous, aligned)
     invert(inverse, shape)
     spread, added = np.empty((n, n)), np.empty((n, n))
     congruence(spread, inverse, cov, product)
     congruence(added, inverse, noise, product)
-    low, high = np.full(n, np.inf), np.full(n, -np.inf)
+    low, high = np.empty(n), np.empty(n)
+    for d in range(n):
+        low[d], high[d] = np.inf, -np.inf
     for j in range(count):
         if logs[j] >= least:
             beyond = math.sqrt(max(reach**2 + 2 * min(logs[j], 0.0), 0.0))

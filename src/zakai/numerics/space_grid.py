@@ -147,10 +147,14 @@ def _frequencies(sizes: tuple[int, ...]) -> list[Array]:
 def _respond(spectrum: Any, sizes: Any, cov: Any, spline: bool) -> None:
     """Multiply a real transform by that of N(0, cov), cov in index units; with `spline`, divide it by the spline's response."""
     n = sizes.size
-    waves, factors = np.zeros((n, sizes.max())), np.ones((n, sizes.max()))
+    most = 0
+    for d in range(n):
+        most = max(most, sizes[d])
+    waves, factors = np.zeros((n, most)), np.zeros((n, most))
     for d in range(n):
         for i in range(sizes[d]):
             waves[d, i] = 2 * math.pi / sizes[d] * (i if 2 * i < sizes[d] or d == n - 1 else i - sizes[d])
+            factors[d, i] = 1.0
             if spline:
                 factors[d, i] = 120 / (66 + 52 * math.cos(waves[d, i]) + 2 * math.cos(2 * waves[d, i]))
     half = sizes[n - 1] // 2 + 1

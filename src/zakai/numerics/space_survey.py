@@ -139,14 +139,18 @@ def _survey(u: Any, sizes: Any, closed: Any, basis: Any, edge: float, tail: floa
         axes[d, 4] = min((k + 1.0) / (size // 2), 1.0)
         inner *= size
     if not (math.isfinite(total) and total > 0.0):
-        axes[:n, :2] = 1.0
-    product, moved = cov.copy(), mean.copy()
+        for d in range(n):
+            axes[d, 0] = axes[d, 1] = 1.0
+    product, moved, deviations = np.empty((n, n)), np.empty(n), np.empty(n)
     for d in range(n):
-        product[d, d] = max(cov[d, d], 1e-12)
-    conditional_deviations(axes[:n, 5], product, 1e-9)
+        moved[d] = mean[d]
+        for e in range(n):
+            product[d, e] = max(cov[d, d], 1e-12) if d == e else cov[d, e]
+    conditional_deviations(deviations, product, 1e-9)
     congruence(cov, basis, cov, product)
     for d in range(n):
         mean[d] = dot(basis[d], moved)
+        axes[d, 5] = deviations[d]
 
 
 def survey(values: Array, grid: Grid, edge: float = 0.0, tail: float = 1.0) -> Survey:
