@@ -24,7 +24,7 @@ CLOCK, NEITHER = -1, -2  # what a slot holds that holds no coordinate
 
 @helper
 def _binary(operation: int, a: Any, b: Any, out: Any, exponent: int) -> None:
-    """Write the result of an operation on rows; `exponent` is that of a whole power."""
+    """Write the result of an operation on rows; the last argument is the exponent of a whole power."""
     if operation == 0:
         for i in range(out.size):
             out[i] = a[i] + b[i]
