@@ -87,7 +87,7 @@ CALLED = {
     },
     # The parts of one method.
     "methods/_space.py": {"zakai.methods._space_direct", "zakai.methods._space_kolmogorov"},
-    "methods/_line_system.py": {"zakai.methods._line_steps"},
+    "methods/_line_system.py": {"zakai.methods._line_parts", "zakai.methods._line_steps"},
 }
 
 
