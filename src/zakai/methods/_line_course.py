@@ -62,12 +62,21 @@ def course_of(
     way = _way(prepared, window, ends, start, np.union1d(bounds, ends_of_steps(length, quick, _FLOW_STEPS)))
     if not np.isfinite([way.low, way.high]).all() or not way.high > way.low:
         return None
-    centre, scale = 0.5 * (way.low + way.high), 0.5 * (way.high - way.low)
-    cells = volumes(window.origin, centre, scale, min(ends[0], centre - scale), max(ends[1], centre + scale), LEVELS[0][0])
+    centre, scale, walls = 0.5 * (way.low + way.high), 0.5 * (way.high - way.low), walls_of(prepared, window.origin)
+    low, high = np.clip([min(ends[0], centre - scale), max(ends[1], centre + scale)], *walls)
+    cells = volumes(window.origin, centre, scale, float(low), float(high), LEVELS[0][0])
     finest = (cells.last - cells.first) / LEVELS[-1][0] * np.hypot(scale, max(abs(ends[0] - centre), abs(ends[1] - centre)))
     cells = cells._replace(cuts=_cuts(prepared, cells, start))
     share = 1.0 if speed * length > FAST * width else GENTLE
     return Course(way, cells, float(finest), quick, fastest, bounds, parts.error, share)
+
+
+def walls_of(prepared: Prepared, origin: float) -> tuple[float, float]:
+    """Return the reflecting ends of the domain as offsets from the origin."""
+    if not prepared.system.reflecting:
+        return -np.inf, np.inf
+    domain = prepared.model.domain[prepared.model.state[0]]
+    return domain.lower - origin, domain.upper - origin
 
 
 def ends_of(values: Array, window: lw.Window) -> Array:
@@ -121,14 +130,14 @@ def _way(prepared: Prepared, window: lw.Window, ends: Array, start: float, steps
     """Follow Gaussian parts of a density between two offsets by exponential Euler steps."""
     count, width = _FLOW_POINTS, float(ends[1] - ends[0])
     x, t, travel, most = np.linspace(float(ends[0]), float(ends[1]), count), start, 0.0, 0.0
-    own, noise = np.full(count, (width / (2.0 * REACH)) ** 2), np.zeros(count)
+    own, noise, walls = np.full(count, (width / (2.0 * REACH)) ** 2), np.zeros(count), walls_of(prepared, window.origin)
     for step in np.diff(steps):
         near = 1e-6 * np.maximum(np.abs(window.origin + x), 1e-3 * width)
         f = drift_along(prepared, window, np.concatenate([x, x + near, x - near]), t)
         slope = 0.5 * step * (f[count : 2 * count] - f[2 * count :]) / near
         G = covariance_at(prepared.system, window.origin + x, t, prepared.theta.real)
         by = step * f[:count] * _relative(np.minimum(slope, 3.0))
-        x, t = x + by, t + step
+        x, t = np.clip(x + by, *walls), t + step
         slope = np.minimum(2.0 * slope, 0.0)  # what drifts apart, the points show
         own, noise = own * np.exp(slope), noise * np.exp(slope) + step * G * _relative(slope)
         reach = REACH * np.sqrt(noise)

@@ -16,7 +16,7 @@ from scipy.special import erfc, erfcx
 from zakai.methods._line_message import FALL, HALF, PAD
 from zakai.methods._line_system import Prepared, covariance_at, covariance_between, drift_at, finite
 from zakai.numerics import line_window as lw
-from zakai.numerics.line_operator import Spectral, derivatives
+from zakai.numerics.line_operator import Spectral, derivatives, symmetric
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 
 Array = Any
@@ -75,7 +75,7 @@ def gauge_of(prepared: Prepared, window: lw.Window, t: float) -> Gauge:
         if system.state_dependent:
             potential = potential - 0.25 * finite(system.spread(points, t, theta)[:, 1])
             between = covariance_between(system, window, t, theta)
-        modes = Spectral(window.closed, spacing, between, potential, s)
+        modes = Spectral(symmetric(window.closed, spacing, between, potential), s)
     change = mu_slope / G - mu * spread / G**2
     if system.state_dependent:
         change = derivative(own, spacing, window.closed)

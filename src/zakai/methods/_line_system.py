@@ -16,7 +16,7 @@ from zakai.methods._series_kernel import PowerSeries
 from zakai.models.model import Model
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_density import support
-from zakai.numerics.line_operator import Spectral
+from zakai.numerics.line_operator import Spectral, symmetric
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line_segment import Limits, Mechanisms, Steps
 from zakai.numerics.line_weak import PARTS, at_nodes, nodes, weak
@@ -402,4 +402,4 @@ def _decomposed(prepared: Prepared, window: lw.Window) -> Spectral | None:
         return None
     gauge = np.concatenate([np.zeros(1), np.cumsum(steps[:-1])])
     modes = spectral(prepared.real, window) if np.iscomplexobj(theta) else None
-    return Spectral(window.closed, window.spacing, covariance, potential, gauge, scale, modes)
+    return Spectral(symmetric(window.closed, window.spacing, covariance, potential), gauge, scale, modes)

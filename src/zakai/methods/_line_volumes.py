@@ -68,28 +68,64 @@ def contracted(
     if width < NARROWEST * course.finest:  # sharper than the cells where it begins
         return None
 
-    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
-        density = lw.density_at(values, window, cells.offsets)
-        masses = density * cells.widths
-        return _advanced(masses / np.sum(masses), prepared, density, cells, start, inside, rates, steps, course)
-
-    def summed(masses: Array) -> Array:
-        return masses.reshape(-1, 2).sum(axis=1)
-
     # Cells do not bring back what the grid does not resolve.
     allowed = max(SHARE * prepared.tolerance, SHARE * lw.figures(values, False, prepared.negligible).aliasing)
-    found = _settled(allowed, course, at_level, summed)
+
+    def density(offsets: Array) -> Array:
+        return lw.density_at(values, window, offsets)
+
+    found = advanced_by(prepared, density, course, start, inside, rates, allowed)
     if found is None:
         return None
     masses, cells, gained, error = found
-    density = np.abs((masses / cells.widths).real)
-    if max(density[0], density[-1]) > EDGE * np.max(density):  # the cells do not hold it
+    after = np.abs((masses / cells.widths).real)
+    if max(after[0], after[-1]) > EDGE * np.max(after):  # the cells do not hold it
         return None
     report.time, report.noise = report.time + error + course.unresolved, max(report.noise, min(error, 1.0))
     resampled = _resampled(prepared, cells, masses, window, error)
     assert resampled.look is not None
     report.density(resampled.look)
     return resampled._replace(gained=gained)
+
+
+class Settled(NamedTuple):
+    """Values of cells (N,) of sum one, the cells, the logarithm of the scale, and the error."""
+
+    values: Array
+    cells: Volumes
+    log_scale: Any
+    error: float
+
+
+def advanced_by(
+    prepared: Prepared,
+    density: Callable[[Array], Array],
+    course: Course,
+    start: float,
+    inside: np.ndarray,
+    rates: np.ndarray,
+    allowed: float,
+) -> Settled | None:
+    """Return the masses of cells after an interval, None where they do not settle.
+
+    Args:
+        prepared: the system.
+        density: the density before, as a function of offsets (J,).
+        course: the course of the density.
+        start: the time before.
+        inside, rates: which increments act within the interval, and their rates.
+        allowed: the error at which more cells are not taken.
+    """
+
+    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
+        before = density(cells.offsets)
+        masses = before * cells.widths
+        return _advanced(masses / np.sum(masses), prepared, before, cells, start, inside, rates, steps, course)
+
+    def summed(masses: Array) -> Array:
+        return masses.reshape(-1, 2).sum(axis=1)
+
+    return _settled(allowed, course, at_level, summed)
 
 
 class Worth(NamedTuple):
@@ -110,29 +146,29 @@ class Worth(NamedTuple):
 def pulled_back(
     prepared: Prepared,
     log_worth: Callable[[Array], Array],
-    values: Array,
-    window: lw.Window,
+    density: Callable[[Array], Array],
+    course: Course | None,
     start: float,
-    length: float,
     inside: np.ndarray,
     rates: np.ndarray,
 ) -> Worth | None:
     """Return the expectation of a function of the state after an interval, given the state before; None where it does not settle.
 
     Args:
-        log_worth: the logarithm of the function at offsets from the origin of the window (J,).
-        values: the density before the interval.
+        prepared: the system.
+        log_worth: the logarithm of the function at offsets (J,).
+        density: the density before the interval, as a function of offsets (J,).
+        course: the course of the density, None where there is none.
+        start: the time before.
+        inside, rates: which increments act within the interval, and their rates.
     """
-    ends = ends_of(values, window)
-    course = course_of(prepared, values, window, ends, start, length, inside)
     if course is None:
         return None
 
     def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
         logs = log_worth(cells.offsets)
         top = float(np.max(logs))
-        density = lw.density_at(values, window, cells.offsets)
-        interval = prepared, density, cells, start, inside, rates, steps, course
+        interval = prepared, density(cells.offsets), cells, start, inside, rates, steps, course
         found, gained = _advanced(np.exp(logs - top), *interval, backward=True)
         return found, gained + top
 
@@ -141,7 +177,7 @@ def pulled_back(
         return (9.0 * (found[::2] + found[1::2]) - padded[:-2:2] - padded[3::2]) / 16.0
 
     found = _settled(SMOOTH, course, at_level, between)
-    return None if found is None else Worth(found[1], found[0], float(found[2]), found[3])
+    return None if found is None else Worth(found.cells, found.values, float(found.log_scale), found.error)
 
 
 def _settled(
@@ -149,8 +185,8 @@ def _settled(
     course: Course,
     at_level: Callable[[Volumes, Array], tuple[Array, Any]],
     paired: Callable[[Array], Array],
-) -> tuple[Array, Volumes, Any, float] | None:
-    """Return the values of cells, the cells, the logarithm of the scale and the error, with more cells until they settle.
+) -> Settled | None:
+    """Return the values of cells, with more cells until they settle.
 
     Args:
         allowed: the error at which more cells are not taken.
@@ -179,7 +215,7 @@ def _settled(
         before = values, gained
     if best is None or not error < SETTLED:
         return None
-    return best[0], best[2], best[1], error
+    return Settled(best[0], best[2], best[1], error)
 
 
 def _advanced(

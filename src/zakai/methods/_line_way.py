@@ -13,6 +13,7 @@ import numpy as np
 
 from zakai.methods import _line
 from zakai.methods._line_coefficients import coefficients, offset_of, resolved_parts
+from zakai.methods._line_course import course_of, ends_of
 from zakai.methods._line_gauge import Gauge, derivative, gauge_of, generator
 from zakai.methods._line_message import FEWEST, PAD, Message, covering, points_of, reliable, support, taper
 from zakai.methods._line_moves import MAGNUS, Report
@@ -178,8 +179,14 @@ class Way:
     def _by_volumes(self, later: Message) -> Message | None:
         """Return the message at the start of the interval from finite volumes, None where they do not serve."""
         state, window = self.state, self.state.window
-        interval = self.start, self.length, self.inside, self.rates
-        found = pulled_back(self.prepared, later.at, np.asarray(state.values).real, window, *interval)
+        values = np.asarray(state.values).real
+        interval = self.start, self.length, self.inside
+        course = course_of(self.prepared, values, window, ends_of(values, window), *interval)
+
+        def density(offsets: Array) -> Array:
+            return lw.density_at(values, window, offsets)
+
+        found = pulled_back(self.prepared, later.at, density, course, self.start, self.inside, self.rates)
         if found is None:
             return None
         new = points_of(later.window, *self.ends, min(later.needed, window.spacing))

@@ -20,10 +20,10 @@ from zakai.methods._line_system import NOISE, Prepared, outside_tables
 from zakai.methods._line_update import factor_at_end
 from zakai.methods._protocol import Info
 from zakai.methods._reflecting_moves import (
+    CUT,
     SAMPLES,
     SIZES,
     domain_of,
-    fitted,
     logarithm,
     moments,
     negligible_of,
@@ -31,11 +31,12 @@ from zakai.methods._reflecting_moves import (
     propagated,
     sampled,
     support,
+    with_margin,
     without_nan,
 )
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior, GaussianPrior
-from zakai.numerics.line_posterior import General, Likelihood
+from zakai.numerics.line_posterior import General, Likelihood, place
 from zakai.numerics.line_segment import RELIABLE
 from zakai.numerics.lobatto import Element
 from zakai.numerics.prior_grid import mixture_log_density
@@ -96,32 +97,49 @@ def _top(logs: Callable[[Array], Array], lower: float, upper: float) -> float:
     return float(np.max(without_nan(logs(np.linspace(lower, upper, SAMPLES))).real))
 
 
-def _multiplied(prepared: Prepared, values: Array, element: Element, likelihood: Likelihood, report: Report) -> tuple[Any, ...]:
+def _multiplied(
+    prepared: Prepared, values: Array, element: Element, likelihood: Likelihood, report: Report, negligible: float
+) -> tuple[Any, ...]:
     """Return the product with a likelihood, its points, and the logarithm of its mass."""
     domain = domain_of(prepared)
-
-    def logs(x: Array) -> Array:
-        return logarithm(element.at(values, x).real) + likelihood.logs(x).real
-
-    lower, upper = placed(logs, element.lower, element.upper, domain)
-    lower, upper = max(lower, element.lower), min(upper, element.upper)
-    top = _top(logs, lower, upper)
     peak = logarithm(np.max((values / element.weights).real))
 
-    def product(x: Array) -> Array:
+    def product(x: Array, density: Array) -> tuple[Array, Array]:
         # Relative to the largest product: neither factor needs to be a number there.
-        density = np.maximum(element.at(values, x).real, 0.0)
-        derivative = element.at(values, x) / np.where(density > 0, density, 1.0)
-        return np.where(density > 0, derivative, 0.0) * np.exp(logarithm(density) + without_nan(likelihood.logs(x)) - top)
+        logs = without_nan(likelihood.logs(x))
+        own = np.where(density.real > 0, logarithm(density.real), -np.inf)
+        top = np.max(own + logs.real)
+        relative = density / np.where(density.real > 0, density.real, 1.0)
+        return np.where(density.real > 0, relative * np.exp(own + logs - top), 0.0), top
 
-    new, found = sampled(product, lower, upper, negligible_of(prepared))
+    new, density = element, values / element.weights
+    found, top = product(new.points, density)
+    if not new.unresolved(found * new.weights) < negligible or _narrow(found * new.weights, new):
+        ends = place(element.offsets, np.maximum(logarithm(density.real), peak - 70.0), likelihood, element.lower)
+        if ends is not None:
+            low, high = with_margin(element.lower + ends[0], element.lower + ends[1], domain)
+            low, high = max(low, element.lower), min(high, element.upper)
+            for size in SIZES:
+                new = Element(low, high, size)
+                density = element.at(values, new.points)
+                found, top = product(new.points, density)
+                if new.unresolved(found * new.weights) < negligible:
+                    break
+    found = found * new.weights
     report.aliasing = max(report.aliasing, new.unresolved(found))
     mass = np.sum(found)
-    x, weights = new.points, found.real / mass.real
-    report.depth = float(weights @ (peak - logarithm(element.at(values, x).real)))
-    growth = np.exp(np.minimum(without_nan(likelihood.logs(x)).real + peak - top - np.log(mass.real), 80.0))
+    found = found / mass
+    report.depth = float(found.real @ (peak - logarithm(density.real)))
+    growth = np.exp(np.minimum(without_nan(likelihood.logs(new.points)).real + peak - top - np.log(mass.real), 80.0))
     report.growth = float(np.sum(new.weights * growth))
-    return found / mass, new, np.log(mass) + top
+    return found, new, np.log(mass) + top
+
+
+def _narrow(values: Array, element: Element) -> bool:
+    """Return whether a density fills less than a quarter of an element."""
+    density = logarithm((values / element.weights).real)
+    here = element.points[density > np.max(density) - CUT]
+    return bool(here[-1] - here[0] < 0.25 * (element.upper - element.lower))
 
 
 def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
@@ -134,17 +152,17 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
     schedule, length, inside = prepared.schedule, float(prepared.lengths[k]), prepared.inside[k]
     values, report, gained = np.asarray(state.values), Report(), 0.0
     element: Any = state.element  # in the place of a grid
-    before = moments(values, element)
+    before, negligible = moments(values, element), negligible_of(prepared, float(state.error))
     if length > 0:
         rates = np.where(inside, observed, 0.0) / length
-        values, element, gained = propagated(prepared, values, element, k, inside, rates, report)
+        values, element, gained = propagated(prepared, values, element, k, inside, rates, report, negligible)
     predicted, floor = moments(values, element), NOISE + report.aliasing + report.edge
     at_end = schedule.seen[k] & ~inside
     if at_end.any():
         likelihood = factor_at_end(prepared, k, at_end, observed, element)
         if isinstance(likelihood, General):
             report.lawless = float(np.sum(values.real[np.isnan(likelihood.log_density(element.points).real)]))
-        values, element, more = _multiplied(prepared, values, element, likelihood, report)
+        values, element, more = _multiplied(prepared, values, element, likelihood, report, negligible)
         gained = gained + more
     mean, variance = moments(values, element)
     made = 2.0 * report.aliasing + 10.0 * report.edge + report.time + 10.0 * report.negative + min(floor * report.growth, 1.0)
@@ -164,7 +182,6 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
         health["without_law"] = report.lawless
     if prepared.system.tabulated:
         health["outside_tables"] = outside_tables(prepared, values, element, float(schedule.stops[k]))
-    values, element = fitted(prepared, values, element)
     state = State(values, element.lower, element.upper, float(error))
     return state, Info(gained, np.array([mean]), np.array([[variance]]), health)
 

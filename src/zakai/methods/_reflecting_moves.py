@@ -1,18 +1,28 @@
-"""How a density between reflecting ends moves: its Gauss-Lobatto points, and substeps on them."""
+"""How a density between reflecting ends moves over an interval: by modes on Gauss-Lobatto points, or by finite volumes.
+
+The modes of the symmetric operator serve every interval in which no coefficient depends on t and no increment acts:
+
+    exp(tau L) = s U exp(-tau lambda) U' / s,      s'/s = (f - G'/2) / G.
+
+A density on other points is projected onto the modes by the quadrature of its own points.  Finite volumes without flux at the
+ends (`_line_volumes.py`) take the other intervals.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from zakai.errors import InputError
-from zakai.methods import _line_coefficients, _line_moves
+from zakai.methods._line_coefficients import offset_of, potential_of, precision_of
+from zakai.methods._line_course import course_of
 from zakai.methods._line_moves import Report
-from zakai.methods._line_system import Prepared, covariance_at
+from zakai.methods._line_system import Prepared, covariance_at, tables
+from zakai.methods._line_volumes import SHARE, advanced_by
 from zakai.models.domain import Interval
-from zakai.numerics.line_operator import exponential_action
+from zakai.numerics.line_operator import Spectral
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.lobatto import Element
 
@@ -22,21 +32,19 @@ SIZES = (24, 32, 48, 64, 96, 128, 192, 256)
 CUT = 36.0  # nats below the maximum where a density ends
 EDGE = 1e-12  # density at an end that is not one of the domain, relative to the maximum
 SAMPLES = 1001  # points at which the place of a density is sought
-WIDER = 30.0  # factor of the variance in one substep
-RESOLVED = 1e-2  # of the tolerance that more points may change
-MOST_SUBSTEPS = 2000
-
-_MOVES: Any = _line_moves  # which serves grids and elements alike
-_COEFFICIENTS: Any = _line_coefficients
+REACH = 7.2  # standard deviations of the noise by which a density widens
+ATTEMPTS = 24  # elements that are tried
+MOST_PARTS = 64  # of an interval that the volumes do not take as a whole
+PEAK = 1.5  # points in a standard deviation of the noise with which the first element begins
 
 
 def domain_of(prepared: Prepared) -> Interval:
     return prepared.model.domain[prepared.model.state[0]]
 
 
-def negligible_of(prepared: Prepared) -> float:
-    """Return the Legendre coefficient, relative to the largest, that need not be resolved."""
-    return max(prepared.negligible, 1e-5 * prepared.tolerance)
+def negligible_of(prepared: Prepared, error: float = 0.0) -> float:
+    """Return the Legendre coefficient, relative to the largest, that need not be resolved of a density with an error."""
+    return max(prepared.negligible, 1e-5 * prepared.tolerance, 1e-2 * min(error, prepared.tolerance))
 
 
 def without_nan(logs: Array) -> Array:
@@ -61,13 +69,20 @@ def placed(logs: Callable[[Array], Array], lower: float, upper: float, domain: I
         lower, upper = low, high
         if not shrunk:
             break
+    return with_margin(lower, upper, domain)
+
+
+def with_margin(lower: float, upper: float, domain: Interval) -> tuple[float, float]:
+    """Return ends with a margin inside of the domain."""
     margin = 0.1 * (upper - lower)
     return max(lower - margin, domain.lower), min(upper + margin, domain.upper)
 
 
-def sampled(density: Callable[[Array], Array], lower: float, upper: float, negligible: float) -> tuple[Element, Array]:
+def sampled(
+    density: Callable[[Array], Array], lower: float, upper: float, negligible: float, least: int = 0
+) -> tuple[Element, Array]:
     """Return the fewest points that resolve a density, and its probabilities there."""
-    for size in SIZES:
+    for size in [size for size in SIZES if size >= least] or [SIZES[-1]]:
         element = Element(lower, upper, size)
         values = density(element.points) * element.weights
         if element.unresolved(values) < negligible:
@@ -82,150 +97,182 @@ def reached(values: Array, element: Element, domain: Interval) -> tuple[float, f
     return (0.0 if element.lower <= domain.lower else left), (0.0 if element.upper >= domain.upper else right)
 
 
-def moved(values: Array, element: Element, lower: float, upper: float, least: int, negligible: float) -> tuple[Element, Array]:
-    """Return a density on other ends, with at least so many points."""
-    sizes = [size for size in SIZES if size >= least] or [SIZES[-1]]
-    for size in sizes:
-        new = Element(lower, upper, size)
-        found = element.at(values, new.points) * new.weights
-        if new.unresolved(found) < negligible:
-            break
-    return new, found
-
-
 def propagated(
-    prepared: Prepared, values: Array, element: Element, k: int, inside: np.ndarray, rates: np.ndarray, report: Report
-) -> tuple[Array, Element, Any]:
+    prepared: Prepared, values: Array, element: Element, k: int, inside: Array, rates: Array, report: Report,
+    negligible: float,
+) -> tuple[Array, Element, Any]:  # fmt: skip
     """Return the density after interval k, its points, and the logarithm of its mass."""
-    start, length, domain = float(prepared.schedule.starts[k]), float(prepared.lengths[k]), domain_of(prepared)
-    stack, gained, substeps, negligible = [(0.0, length)], 0.0, 0, negligible_of(prepared)
-    if not prepared.system.steady:
-        parts = _COEFFICIENTS.resolved_parts(prepared, values, element, start, length, inside)
-        stack, report.time = parts.bounds[::-1], report.time + parts.error
+    interval = float(prepared.schedule.starts[k]), float(prepared.lengths[k]), inside, rates, report, negligible
+    found = None if prepared.system.varying else _by_modes(prepared, values, element, *interval)
+    values, element, gained = _by_volumes(prepared, values, element, *interval) if found is None else found
+    report.aliasing = max(report.aliasing, element.unresolved(values))
+    report.edge = max(report.edge, *reached(values, element, domain_of(prepared)))
+    real = values.real
+    report.negative = max(report.negative, float(-np.minimum(real, 0.0).sum() / np.abs(real).sum()))
+    mass = np.sum(values)
+    return values / mass, element, gained + np.log(mass)
+
+
+def _by_modes(
+    prepared: Prepared, values: Array, element: Element, start: float, length: float, inside: Array, rates: Array, report: Report,
+    negligible: float,
+) -> tuple[Array, Element, Any] | None:  # fmt: skip
+    """Return the density after an interval, its points, and the logarithm of its mass; None where modes do not serve."""
+    domain, allowed = domain_of(prepared), max(1e-11, 1e-5 * prepared.tolerance)
+    G = covariance_at(prepared.system, element.points, start, prepared.theta).real
+    noise = np.sqrt(np.maximum([np.min(G), np.max(G)], 0.0) * length)
+    own = element.upper - element.lower
+    lower, upper = _apart(element.lower - REACH * noise[1], element.upper + REACH * noise[1], domain)
+    needed = min(PEAK * (upper - lower) / max(noise[0], 1e-300), element.size * (upper - lower) / own)
+    size = next((size for size in SIZES if size >= min(needed, SIZES[4])), SIZES[-1])
+    for _ in range(ATTEMPTS):
+        new, offset = Element(lower, upper, size), 0.0
+        known = _decomposed(prepared, new)
+        if known is None:
+            return None
+        modes, inner = known.modes, _projected(values, element, new, known, negligible)
+        if inside.any():
+            h, precision = tables(prepared, new).observation, precision_of(prepared, start, inside)  # type: ignore[arg-type]
+            potential, constant = potential_of(h, precision, rates, modes.scale * inner)
+            offset, _ = offset_of(length * potential, modes.scale * inner)
+            modes = Spectral(known.operator - np.diag(potential - offset / length), known.gauge, known.scale)
+            offset = offset + length * constant
+        found, error = modes.carried(inner, length)
+        if not np.isfinite(found.real).all():
+            return None
+        unresolved = new.unresolved(found)
+        if inside.any():  # increments mix all waves of the density before
+            unresolved = max(unresolved, new.unresolved(modes.scale * inner))
+        coarse = unresolved > negligible
+        # Oscillations of what is not resolved reach the ends as well.
+        left, right = (float(end) > (unresolved if coarse else EDGE) for end in reached(found, new, domain))
+        if coarse and size < SIZES[-1]:
+            size = SIZES[SIZES.index(size) + 1]
+        elif coarse:
+            return None
+        elif left or right:
+            width = upper - lower
+            lower, upper = _apart(lower - 0.4 * width * left, upper + 0.4 * width * right, domain)
+        elif error < allowed and (inside.any() or abs(np.sum(found.real) - 1.0) < 1e-3):
+            report.time += error
+            return found, new, offset
+        else:
+            return None
+    return None
+
+
+def _apart(lower: float, upper: float, domain: Interval) -> tuple[float, float]:
+    """Return ends out of few that hold two others, so that decompositions serve many times."""
+    apart = 2.0 ** np.floor(np.log2((upper - lower) / 4.0))
+    low, high = apart * np.floor(lower / apart), apart * np.ceil(upper / apart)
+    return max(float(low), domain.lower), min(float(high), domain.upper)
+
+
+class _Operator(NamedTuple):
+    """-L as a symmetric operator (N, N), int f / G (N,), s over the exponential of that (N,), log s (N,), and the modes."""
+
+    operator: Array
+    gauge: Array
+    scale: Array
+    logs: Array
+    modes: Spectral
+
+
+def _decomposed(prepared: Prepared, element: Element) -> _Operator | None:
+    """Return the operator on an element and its decomposition; None where there is none."""
+    system, theta, start = prepared.system, prepared.theta, prepared.model.start
+
+    def make() -> tuple[_Operator | None]:
+        x, known = element.points, tables(prepared, element)  # type: ignore[arg-type]  # by its points
+        G = known.covariance * np.ones(element.size)
+        if not (G.real > 0).all() or system.kinks is not None:
+            return (None,)
+        steps = np.diff(x)
+        nodes = (x[:-1, None] + steps[:, None] * GAUSS_NODES).reshape(-1)
+        slopes = system.drift(nodes[:, None], start, theta)[:, 0] / covariance_at(system, nodes, start, theta)
+        gauge = np.concatenate([np.zeros(1), np.cumsum(steps * (slopes.reshape(len(steps), -1) @ GAUSS_WEIGHTS))])
+        logs = gauge - 0.5 * np.log(G)
+        if not np.isfinite(logs.real).all() or not np.isfinite(known.drift.real).all():
+            return (None,)
+        operator, scale = element.symmetric(G, (known.drift - 0.5 * element.derivative(G)) / G), np.sqrt(element.weights / G)
+        return (_Operator(operator, gauge, scale, logs, Spectral(operator, gauge, scale)),)
+
+    found: tuple[_Operator | None] = prepared.once(("modes", element), make)
+    return found[0]
+
+
+def _projected(values: Array, element: Element, new: Element, known: _Operator, negligible: float) -> Array:
+    """Return a density on some points, divided by s, on those of an operator.
+
+    Where the new points do not resolve it, it is its projection, by the quadrature of its own points.
+    """
+    if element == new:
+        return np.asarray(values / known.modes.scale)
+    found = element.at(values, new.points) * new.weights
+    if new.unresolved(found) < negligible:
+        return np.asarray(found / known.modes.scale)
+    between = new.interpolation(element.points)
+    s = np.exp(between @ known.logs - known.modes.top)
+    return np.asarray((between.T @ (values / s)) / np.sqrt(new.weights))
+
+
+def _by_volumes(
+    prepared: Prepared, values: Array, element: Element, start: float, length: float, inside: Array, rates: Array, report: Report,
+    negligible: float,
+) -> tuple[Array, Element, Any]:  # fmt: skip
+    """Return the density after an interval, its points, and the logarithm of its mass, in parts where volumes do not settle."""
+    stack, gained, count = [(0.0, length)], 0.0 * values[0], 0
     while stack:
         first, last = stack.pop()
-        substeps += 1
-        mean, variance = moments(values, element)
-        noise = float(np.max(covariance_at(prepared.system, np.array([mean.real]), start + first, prepared.theta).real))
-        if noise * (last - first) > WIDER * variance.real and substeps < MOST_SUBSTEPS:
-            middle = first + WIDER * variance.real / noise
-            if first < middle < last:
-                stack.append((middle, last))
-                last = middle
-        reach = 6.0 * float(np.sqrt(noise * (last - first)))
-        lower, upper = max(element.lower - reach, domain.lower), min(element.upper + reach, domain.upper)
-        before, own = moved(values, element, lower, upper, element.size, negligible)
-        while True:
-            tried = _attempt(prepared, own, before, start, first, last, inside, rates)
-            total = float(np.sum(tried.values.real))
-            lost = not 1e-250 < total < 1e6
-            if tried.split or lost:
-                break
-            left, right = reached(tried.values, before, domain)
-            unresolved = before.unresolved(tried.values)
-            coarse = unresolved > 30.0 * negligible
-            # Oscillations of what is not resolved reach the ends as well.
-            edge = unresolved if coarse else EDGE
-            width = before.upper - before.lower
-            lower = max(before.lower - 0.4 * width * (left > edge), domain.lower)
-            upper = min(before.upper + 0.4 * width * (right > edge), domain.upper)
-            least = before.size + 1 if coarse else before.size
-            if (lower, upper) == (before.lower, before.upper) and (not coarse or before.size == SIZES[-1]):
-                # What the points do not resolve within the substep, as layers at the ends, shows with more of them only.
-                finer, more = moved(values, element, lower, upper, before.size + 1, negligible)
-                check = _attempt(prepared, more, finer, start, first, last, inside, rates)
-                change = _difference(tried, before, check, finer)
-                if finer.size > before.size:
-                    before, own, tried = finer, more, check
-                if change < max(RESOLVED * prepared.tolerance, 10.0 * check.error) or finer.size == SIZES[-1]:
-                    tried = tried._replace(error=tried.error + change)
-                    break
-                continue
-            wider, values_there = moved(values, element, lower, upper, least, negligible)
-            if wider.unresolved(values_there) > 30.0 * negligible and max(left, right) > edge:
-                tried = tried._replace(split=True)
-                break
-            before, own = wider, values_there
-        if (tried.split or lost) and substeps < MOST_SUBSTEPS and last - first > 1e-12 * length:
+        count += 1
+        found = _part(prepared, values, element, start + first, last - first, inside, rates, report, negligible)
+        if found is not None:
+            values, element, more = found
+            gained = gained + more
+        elif count + len(stack) < MOST_PARTS:
             middle = first + 0.25 * (last - first)
             stack += [(middle, last), (first, middle)]
-            continue
-        report.aliasing = max(report.aliasing, before.unresolved(tried.values), before.unresolved(own))
-        report.edge = max(report.edge, *reached(tried.values, before, domain))
-        report.negative = max(report.negative, float(-np.minimum(tried.values.real, 0.0).sum() / np.abs(tried.values.real).sum()))
-        report.time += tried.error
-        mass = np.sum(tried.values)
-        values, element, gained = tried.values / mass, before, gained + np.log(mass) + tried.offset
-        if stack:
-            values, element = fitted(prepared, values, element)
-    if substeps >= MOST_SUBSTEPS:
-        report.time = np.inf
+        else:
+            report.time = np.inf
+            break
     return values, element, gained
 
 
-def _attempt(
-    prepared: Prepared, values: Array, element: Element, start: float, first: float, last: float, inside: Array, rates: Array
-) -> Any:
-    """Return the density after the part from start + first to start + last of an interval, as `_line_moves._attempt`.
+def _part(
+    prepared: Prepared, values: Array, element: Element, start: float, length: float, inside: Array, rates: Array, report: Report,
+    negligible: float,
+) -> tuple[Array, Element, Any] | None:  # fmt: skip
+    """Return the density after a part of an interval from finite volumes, None where these do not settle."""
+    domain, at = domain_of(prepared), element
 
-    Where coefficients depend on time a step is compared with two of half its length, and extrapolated: the condition of no flux
-    depends on time too, which leaves an error of second order near the ends.
-    """
-    if prepared.system.steady:
-        return _MOVES._attempt(prepared, values, element, start, first, last, inside, rates)
-    stack, offset, error, count = [(first, last)], 0.0, 0.0, 0
-    while stack:
-        a, b = stack.pop()
-        middle, count = 0.5 * (a + b), count + 1
-        whole = _two_exponentials(prepared, values, element, start, a, b, inside, rates)
-        half = _two_exponentials(prepared, values, element, start, a, middle, inside, rates)
-        halves = _two_exponentials(prepared, half.values, element, start, middle, b, inside, rates)
-        halves = halves._replace(offset=half.offset + halves.offset)
-        change = np.inf if whole.split or half.split or halves.split else _difference(whole, element, halves, element)
-        if not change < 0.1 * prepared.tolerance and count < MOST_SUBSTEPS and middle > a:
-            stack += [(middle, b), (a, middle)]
-            continue
-        more = (halves.values - np.exp(whole.offset - halves.offset) * whole.values) / 3.0
-        values, offset, error = halves.values + more, offset + halves.offset, error + 0.1 * change
-    return halves._replace(values=values, offset=offset, error=error)
+    def before(offsets: Array) -> Array:
+        return at.at(values, at.lower + offsets)
 
+    ends = np.array([0.0, at.upper - at.lower])
+    course = course_of(prepared, values, at, ends, start, length, inside)  # type: ignore[arg-type]  # by its points
+    if course is None:
+        return None
+    found = advanced_by(prepared, before, course, start, inside, rates, SHARE * prepared.tolerance)
+    if found is None:
+        return None
+    report.time += found.error + course.unresolved
+    cells = found.cells
+    density = np.log(np.maximum((found.values / cells.widths).real, 1e-300))
+    here = np.flatnonzero(density > np.max(density) - CUT)
+    faces, tiny = cells.origin + cells.faces, 1e-9 * (cells.faces[-1] - cells.faces[0])
+    if faces[0] - domain.lower < tiny:
+        faces[0] = domain.lower
+    if domain.upper - faces[-1] < tiny:
+        faces[-1] = domain.upper
+    lower, upper = with_margin(float(faces[here[0]]), float(faces[here[-1] + 1]), domain)
+    lower, upper = max(lower, float(faces[0])), min(upper, float(faces[-1]))
+    interpolated = cells.density(found.values)
 
-def _two_exponentials(
-    prepared: Prepared, values: Array, element: Element, start: float, first: float, last: float, inside: Array, rates: Array
-) -> Any:
-    """Return the density after a substep by the integrator of `_line_moves._magnus`, without its error."""
-    length = last - first
-    drift, covariance, potential, constant = _COEFFICIENTS.coefficients(
-        prepared, element, start + first + length * GAUSS_NODES, inside, rates, values
-    )
-    zeroth, moment = length * GAUSS_WEIGHTS, 2.0 * length * GAUSS_WEIGHTS * (GAUSS_NODES - 0.5)
-    offset, split = _COEFFICIENTS.offset_of(zeroth @ potential, values)
-    error = 0.0
-    for w in (0.5 * zeroth - moment, 0.5 * zeroth + moment):
-        matrix = element.generator(w @ covariance, w @ drift, w @ potential - 0.5 * offset)
-        values, rounding = exponential_action(matrix, values)
-        error += rounding
-    return _MOVES._Attempt(values, offset + zeroth @ constant, error, split)
+    def after(x: Array) -> Array:
+        return interpolated(np.clip(x - cells.origin, *cells.faces[[0, -1]]))
 
-
-def _difference(one: Any, element: Element, other: Any, finer: Element) -> float:
-    """Return the relative difference of two solutions, as the integral of its modulus."""
-    found = other.values.real
-    own = element.at(one.values.real, finer.points) * finer.weights * np.exp(one.offset - other.offset)
-    return float(np.sum(np.abs(found - own)) / np.sum(found))
-
-
-def fitted(prepared: Prepared, values: Array, element: Element) -> tuple[Array, Element]:
-    """Return a density on points that fit it: the same unless it fills less than half of them, or fewer resolve it."""
-    domain = domain_of(prepared)
-    lower, upper = placed(lambda x: logarithm(element.at(values, x).real), element.lower, element.upper, domain)
-    if upper - lower > 0.5 * (element.upper - element.lower):
-        lower, upper = element.lower, element.upper
-    least = SIZES[max(SIZES.index(element.size) - 2, 0)]  # the step needs more points than its result
-    new, found = moved(values, element, lower, upper, least, negligible_of(prepared))
-    if new == element:
-        return values, element
-    return found / np.sum(found), new
+    element, values = sampled(after, lower, upper, max(negligible, 1e-2 * found.error))
+    return values / np.sum(values), element, found.log_scale
 
 
 def logarithm(values: Array) -> Array:

@@ -160,6 +160,27 @@ def exponential(matrix: Array) -> Array:
 _INVERSE_FACTORIALS = 1.0 / np.cumprod(np.concatenate([[1.0], np.arange(1.0, 16.0)]))
 
 
+def symmetric(closed: bool, spacing: float, covariance: Any, potential: Array) -> Array:
+    """Return H (N, N) of v_t = (G v')' / 2 - V v = -H v, symmetric.
+
+    Of a G that depends on the state, -(G v')' is D' G D v with the derivative D of the interpolant between the points: no
+    eigenvalue lies below the least value of the potential, however much G varies.
+
+    Args:
+        closed: whether the grid goes around the circle.
+        spacing: its spacing.
+        covariance: G, one number, or its values between the points: (N + 1,) half a spacing below and above each, (N,) below
+            each on the circle.
+        potential: V at the points (N,).
+    """
+    size = len(potential)
+    unit = 1.0 if closed else spacing
+    if np.ndim(covariance) == 0:
+        return np.asarray(-0.5 * covariance * derivatives(size, closed)[1] / unit**2 + np.diag(potential))
+    slope = derivative_between(size, closed) / unit
+    return np.asarray(0.5 * (slope.T * covariance) @ slope + np.diag(potential))
+
+
 class Spectral:
     """The operators exp(tau L), for every tau, where L is similar to a symmetric operator.
 
@@ -168,36 +189,15 @@ class Spectral:
         v_t = (G v')' / 2 - ((f - G'/2)^2 / G + f' - G''/2) / 2 v = -H v,      exp(tau L) = s U exp(-tau lambda) U' / s.
     """
 
-    def __init__(
-        self,
-        closed: bool,
-        spacing: float,
-        covariance: Any,
-        potential: Array,
-        gauge: Array,
-        scale: Any = 1.0,
-        known: Spectral | None = None,
-    ):
+    def __init__(self, operator: Array, gauge: Array, scale: Any = 1.0, known: Spectral | None = None):
         """Decompose H.
 
-        Of a G that depends on the state, -(G v')' is D' G D v with the derivative D of the interpolant between the points: no
-        eigenvalue lies below the least value of the potential, however much G varies.
-
         Args:
-            covariance: G, one number, or its values between the points: (N + 1,) half a spacing below and above each, (N,) below
-                each on the circle.
-            potential: ((f - G'/2)^2 / G + f' - G''/2) / 2 at the points (N,).
+            operator: H (N, N), symmetric.
             gauge: int f / G (N,).
-            scale: G^(-1/2) where G depends on the state.
+            scale: s is the exponential of the gauge times this; G^(-1/2) where G depends on the state.
             known: the decomposition of the real part of a complex H.
         """
-        size = len(potential)
-        unit = 1.0 if closed else spacing
-        if np.ndim(covariance) == 0:
-            operator = -0.5 * covariance * derivatives(size, closed)[1] / unit**2 + np.diag(potential)
-        else:
-            slope = derivative_between(size, closed) / unit
-            operator = 0.5 * (slope.T * covariance) @ slope + np.diag(potential)
         self.rates: Array
         self.modes: Array
         self.rates, self.modes = np.linalg.eigh(operator.real) if known is None else (known.rates, known.modes)
@@ -215,6 +215,12 @@ class Spectral:
         reach = float(np.sqrt(np.sum(inner.real**2)))
         if not np.isfinite(reach):
             return inner, np.inf
+        found = self.scale * self.decayed(inner, length)
+        top, growth = float(np.max(found.real)), max(1.0, float(np.exp(-length * self.rates[0])))
+        return found, 4e-16 * reach * growth / top if top > 0 else np.inf
+
+    def decayed(self, inner: Array, length: float) -> Array:
+        """Return U exp(-length lambda) U' inner."""
         decay = np.exp(-length * self.rates)
         coefficients = self.modes.T @ inner
         moved = decay * coefficients
@@ -226,7 +232,4 @@ class Spectral:
                 same, -length * np.sqrt(np.outer(decay, decay)), (decay[:, None] - decay) / np.where(same, 1.0, apart)
             )
             moved = moved + 1j * ((quotient * self.change) @ coefficients.real)
-        found = self.scale * (self.modes @ moved)
-        top = float(np.max(found.real))
-        growth = max(1.0, float(decay.max()))
-        return found, 4e-16 * reach * growth / top if top > 0 else np.inf
+        return np.asarray(self.modes @ moved)

@@ -212,23 +212,40 @@ def _normalized(values: Array, logs: Array, largest: float) -> tuple[Array, Any,
 
 
 def _placed(values: Array, window: lw.Window, likelihood: Likelihood) -> lw.Window:
-    """Return a grid for the product.
+    """Return a grid for the product; the same where no number compares parts of it, which the depth reports."""
+    top = values.real.max()
+    found = place(window.offsets, np.log(np.maximum(values.real, 1e-30 * top)), likelihood, window.origin)
+    if found is None:
+        return window
+    low, high, finest = found
+    spacing = min(window.spacing, max(finest, (high - low) / 370.0))
+    if window.closed:
+        size = lw.size_for(min(2 * np.pi / spacing, lw.LARGEST_POSTERIOR))
+        return window._replace(size=size, spacing=2 * np.pi / size)
+    return lw.quantized(window, low, high, spacing, margin=0.3, most=lw.LARGEST_POSTERIOR)
+
+
+def place(offsets: Array, logs: Array, likelihood: Likelihood, origin: float) -> tuple[float, float, float] | None:
+    """Return the ends of the product of a density and a likelihood, and the smallest cell that resolves it.
 
     Cells whose bound is far below the best value are left out, and the others divided until the likelihood hardly changes in any.
+
+    Args:
+        offsets: points (N,) relative to the origin.
+        logs: the logarithm of the density at these (N,).
+        likelihood: the likelihood.
+        origin: the point from which offsets count.
     """
-    offsets = window.offsets
-    top = values.real.max()
-    logs = np.log(np.maximum(values.real, 1e-30 * top))
 
     def prior(points: Array) -> Array:
         return np.asarray(np.interp(points.reshape(-1), offsets, logs, left=-200.0, right=-200.0)).reshape(points.shape)
 
     cells = np.stack([offsets[:-1], offsets[1:]], axis=1)
     for _ in range(_LEVELS):
-        product, bound, change = likelihood.cells(cells, prior, window.origin)
+        product, bound, change = likelihood.cells(cells, prior, origin)
         best = float(product.max())
-        if not np.isfinite(best):  # no number compares the cells; the depth reports it
-            return window
+        if not np.isfinite(best):
+            return None
         keep = bound >= best - _DEPTH  # equal, where the logarithms are so large that nothing can be subtracted
         cells, change, product = cells[keep], change[keep], product[keep]
         widths = cells[:, 1] - cells[:, 0]
@@ -238,11 +255,6 @@ def _placed(values: Array, window: lw.Window, likelihood: Likelihood) -> lw.Wind
         quarters = cells[divide, :1] + widths[divide, None] * np.linspace(0.0, 1.0, 5)
         parts = np.stack([quarters[:, :-1], quarters[:, 1:]], axis=2).reshape(-1, 2)
         cells = np.concatenate([cells[~divide], parts])
-    product, _, _ = likelihood.cells(cells, prior, window.origin)
+    product, _, _ = likelihood.cells(cells, prior, origin)
     good = (product >= product.max() - 32.0).any(axis=1)
-    low, high = float(cells[good, 0].min()), float(cells[good, 1].max())
-    spacing = min(window.spacing, max(float((cells[good, 1] - cells[good, 0]).min()), (high - low) / 370.0))
-    if window.closed:
-        size = lw.size_for(min(2 * np.pi / spacing, lw.LARGEST_POSTERIOR))
-        return window._replace(size=size, spacing=2 * np.pi / size)
-    return lw.quantized(window, low, high, spacing, margin=0.3, most=lw.LARGEST_POSTERIOR)
+    return float(cells[good, 0].min()), float(cells[good, 1].max()), float((cells[good, 1] - cells[good, 0]).min())

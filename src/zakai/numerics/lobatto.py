@@ -1,9 +1,9 @@
 """Polynomials on an interval by their values at Gauss-Lobatto points, and the Kolmogorov operator without flux at its ends.
 
-    L u = ((G u)' / 2 - f u)' + V u,      (G u)' / 2 - f u = 0 at both ends
+    L u = ((G u)' / 2 - f u)',      (G u)' / 2 - f u = 0 at both ends
 
-The weak form int phi L u = -int phi' ((G u)' / 2 - f u) has the condition of no flux in it, so that the sum of the quadrature
-keeps its mass to rounding, and the solution is spectrally accurate up to the ends.
+The weak form int phi L u = -int phi' ((G u)' / 2 - f u) has the condition of no flux in it: the solution is spectrally accurate
+up to the ends.
 """
 
 from __future__ import annotations
@@ -63,6 +63,11 @@ class Element(NamedTuple):
         return False
 
     @property
+    def origin(self) -> float:
+        """The point from which offsets count."""
+        return self.lower
+
+    @property
     def half(self) -> float:
         """Half the length."""
         return 0.5 * (self.upper - self.lower)
@@ -79,29 +84,39 @@ class Element(NamedTuple):
         return np.asarray(np.where(x < 0, self.lower + self.half * (1.0 + x), self.upper - self.half * (1.0 - x)))
 
     @property
+    def offsets(self) -> Array:
+        """The points (N,) relative to the lower end."""
+        return np.asarray(self.points - self.lower)
+
+    @property
     def weights(self) -> Array:
         """The weights (N,) of the quadrature."""
         return self.half * rule(self.size).weights
 
-    def generator(self, covariance: Any, drift: Array, potential: Array | None = None) -> Array:
-        """Return L (N, N) of probabilities for G, one number or (N,), f (N,) and V (N,), or integrals over time of these."""
-        D, w = rule(self.size).derivative / self.half, self.weights
-        flux = 0.5 * D * (covariance / w)
-        index = np.arange(self.size)
-        flux[index, index] -= drift / w
-        matrix = -(D.T * w) @ flux
-        if potential is not None:
-            matrix[index, index] += potential
-        return np.asarray(matrix)
+    def symmetric(self, covariance: Array, slope: Array) -> Array:
+        """Return -L (N, N) as a symmetric operator on psi W^(1/2), with u = s psi, for G (N,) and s'/s (N,).
+
+        The flux is s G (psi' - psi s'/s) / 2, and the weak form is sum W G (phi' - phi s'/s) (psi' - psi s'/s) / 2.
+        """
+        root = np.sqrt(self.weights)
+        flux = (rule(self.size).derivative / self.half - np.diag(slope)) * (root * np.sqrt(0.5 * covariance))[:, None] / root
+        return np.asarray(flux.T @ flux)
+
+    def derivative(self, values: Array) -> Array:
+        """Return the derivative of a polynomial at the points from its values there (N,)."""
+        return rule(self.size).derivative @ values / self.half
+
+    def interpolation(self, points: Array) -> Array:
+        """Return the matrix (J, N) from values to those of the polynomial at points (J,)."""
+        apart = points[:, None] - self.points
+        same = apart == 0
+        terms = np.where(same.any(axis=1)[:, None], same, _barycentric(self.weights) / np.where(same, 1.0, apart))
+        return np.asarray(terms / terms.sum(axis=1)[:, None])
 
     def at(self, values: Array, points: Array) -> Array:
         """Return the density at points (J,) from probabilities; zero beyond the ends."""
-        own, scale = self.points, _barycentric(self.weights)
-        apart = points[:, None] - own
-        same = apart == 0
-        terms = np.where(same.any(axis=1)[:, None], same, scale / np.where(same, 1.0, apart))
-        found = (terms @ (values / self.weights)) / terms.sum(axis=1)
-        return np.asarray(np.where((points >= self.lower) & (points <= self.upper), found, 0.0))
+        inside = (points >= self.lower) & (points <= self.upper)
+        return np.asarray(np.where(inside, self.interpolation(points) @ (values / self.weights), 0.0))
 
     def unresolved(self, values: Array) -> float:
         """Return the largest Legendre coefficient in the highest eighth, relative to the largest of all."""
