@@ -59,7 +59,8 @@ def course_of(
     if prepared.system.varying:
         parts = resolved_parts(prepared, values, window, start, length, inside)
     bounds = np.array([0.0, *(stop for _, stop in parts.bounds)])
-    way = _way(prepared, window, ends, start, np.union1d(bounds, ends_of_steps(length, quick, _FLOW_STEPS)))
+    share = 1.0 if speed * length > FAST * width else GENTLE
+    way = _way(prepared, window, ends, start, np.union1d(bounds, ends_of_steps(length, quick, int(share * _FLOW_STEPS))))
     if not np.isfinite([way.low, way.high]).all() or not way.high > way.low:
         return None
     centre, scale, walls = 0.5 * (way.low + way.high), 0.5 * (way.high - way.low), walls_of(prepared, window.origin)
@@ -67,7 +68,6 @@ def course_of(
     cells = volumes(window.origin, centre, scale, float(low), float(high), LEVELS[0][0])
     finest = (cells.last - cells.first) / LEVELS[-1][0] * np.hypot(scale, max(abs(ends[0] - centre), abs(ends[1] - centre)))
     cells = cells._replace(cuts=_cuts(prepared, cells, start))
-    share = 1.0 if speed * length > FAST * width else GENTLE
     return Course(way, cells, float(finest), quick, fastest, bounds, parts.error, share)
 
 

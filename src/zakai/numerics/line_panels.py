@@ -23,10 +23,11 @@ _MOST = 600
 
 def interpolation(points: Array) -> Array:
     """Return the matrix from values at the Gauss nodes to values at points in [0, 1]."""
-    return np.asarray(np.polynomial.legendre.legvander(2 * points - 1, NODES - 1) @ _COEFFICIENTS)
+    return np.asarray((2.0 * points[:, None] - 1.0) ** _POWERS @ _COEFFICIENTS)
 
 
-_COEFFICIENTS = np.linalg.inv(np.polynomial.legendre.legvander(2 * GAUSS_NODES - 1, NODES - 1))  # of Legendre polynomials
+_POWERS = np.arange(NODES)
+_COEFFICIENTS = np.linalg.inv((2.0 * GAUSS_NODES[:, None] - 1.0) ** _POWERS)
 
 
 @lru_cache(maxsize=16)

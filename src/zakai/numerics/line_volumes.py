@@ -11,6 +11,7 @@ Equations II, section IV.9).
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,14 +59,7 @@ class Volumes(NamedTuple):
     @property
     def ends(self) -> tuple[Array, Array]:
         """Between which s (P + 1,) the cells are uniform, and how many lie before each (P + 1,)."""
-        s = np.array([self.first, *self.cuts, self.last])
-        counts = np.maximum(np.round(BASE * np.diff(s) / (s[-1] - s[0])).astype(int), _FEWEST)
-        counts[np.argmax(counts)] += BASE - counts.sum()
-        return s, np.concatenate([[0], np.cumsum(counts)]) * (self.size // BASE)
-
-    def _offset(self, index: Array) -> Array:
-        s, before = self.ends
-        return self.centre + self.scale * np.sinh(np.interp(index, before, s))
+        return _geometry(self)[:2]
 
     def place(self, offsets: Array) -> Array:
         """Return how many cells lie before offsets (J,) from the origin, NaN beyond the cells."""
@@ -75,17 +69,17 @@ class Volumes(NamedTuple):
     @property
     def offsets(self) -> Array:
         """The middles of the cells in s (N,) as offsets from the origin."""
-        return self._offset(np.arange(self.size) + 0.5)
+        return _geometry(self)[2]
 
     @property
     def faces(self) -> Array:
         """The faces (N + 1,) as offsets from the origin."""
-        return self._offset(np.arange(self.size + 1.0))
+        return _geometry(self)[3]
 
     @property
     def widths(self) -> Array:
         """The lengths of the cells (N,)."""
-        return np.diff(self.faces)
+        return _geometry(self)[4]
 
     @property
     def points(self) -> Array:
@@ -135,6 +129,23 @@ class Volumes(NamedTuple):
             return found / (steps[part] * np.sqrt(self.scale**2 + (offsets - self.centre) ** 2))
 
         return at
+
+
+@lru_cache(maxsize=16)
+def _geometry(cells: Volumes) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the ends of the uniform parts in s, the cells before these, the middles, the faces and the widths."""
+    s = np.array([cells.first, *cells.cuts, cells.last])
+    counts = np.maximum(np.round(BASE * np.diff(s) / (s[-1] - s[0])).astype(int), _FEWEST)
+    counts[np.argmax(counts)] += BASE - counts.sum()
+    before = np.concatenate([[0], np.cumsum(counts)]) * (cells.size // BASE)
+    middles, faces = (
+        cells.centre + cells.scale * np.sinh(np.interp(index, before, s))
+        for index in (np.arange(cells.size) + 0.5, np.arange(cells.size + 1.0))
+    )
+    found = s, before, middles, faces, np.diff(faces)
+    for array in found:
+        array.setflags(write=False)
+    return found
 
 
 def volumes(origin: float, centre: float, scale: float, low: float, high: float, size: int) -> Volumes:
