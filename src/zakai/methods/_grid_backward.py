@@ -10,11 +10,12 @@ import numpy as np
 from zakai.errors import InputError
 from zakai.methods._line_backward import BACKWARD as LINE
 from zakai.methods._protocol import Backward, Info, Infos
+from zakai.methods._reflecting_backward import BACKWARD as REFLECTING
 
 
 def _of(prepared: Any) -> Backward[Any, Any, Any]:
     if prepared.model.n == 1:
-        return LINE
+        return REFLECTING if prepared.system.reflecting else LINE
     from zakai.methods._space_backward import BACKWARD as SPACE
 
     return SPACE
@@ -59,8 +60,9 @@ def draw(
             f"{prepared.model.source}: sample_paths: density grids draw paths of one state only; take kalman-bucy, benes, "
             "hu-yau or general-direct, where one holds"
         )
-    assert LINE.draw is not None
-    return LINE.draw(prepared, k, later, values, state, rng)
+    one = _of(prepared).draw
+    assert one is not None
+    return one(prepared, k, later, values, state, rng)
 
 
 def accuracy(prepared: Any) -> float:

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities import Density
-from zakai.errors import InputError
 from zakai.methods import _line
 from zakai.methods._line_adjoint import back
 from zakai.methods._line_loop import joined
@@ -35,13 +34,7 @@ SMALLEST = 1e-13  # value of a smoothed density relative to its maximum that is 
 
 
 def message(prepared: Prepared, state: State) -> Message:
-    """Return the message one at the last time.
-
-    Raises:
-        InputError: the model has reflecting ends.
-    """
-    if prepared.system.reflecting:
-        raise InputError(f"{prepared.model.source}: smooth: there is no backward pass for a state with reflecting ends yet")
+    """Return the message one at the last time."""
     origin, centre, spacing, size, closed, unit = state.window
     return Message(np.zeros(size), origin, centre, spacing, unit, closed, spacing, 0.0)
 

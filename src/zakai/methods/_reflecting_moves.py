@@ -135,7 +135,7 @@ def _by_modes(
             h, precision = tables(prepared, new).observation, precision_of(prepared, start, inside)  # type: ignore[arg-type]
             potential, constant = potential_of(h, precision, rates, modes.scale * inner)
             offset, _ = offset_of(length * potential, modes.scale * inner)
-            modes = Spectral(known.operator - np.diag(potential - offset / length), known.gauge, known.scale)
+            modes = known.weighted(potential - offset / length)
             offset = offset + length * constant
         found, error = modes.carried(inner, length)
         if not np.isfinite(found.real).all():
@@ -177,28 +177,34 @@ class _Operator(NamedTuple):
     logs: Array
     modes: Spectral
 
+    def weighted(self, potential: Array) -> Spectral:
+        """Return the decomposition of the operator with a potential (N,)."""
+        return Spectral(self.operator - np.diag(potential), self.gauge, self.scale)
+
 
 def _decomposed(prepared: Prepared, element: Element) -> _Operator | None:
-    """Return the operator on an element and its decomposition; None where there is none."""
-    system, theta, start = prepared.system, prepared.theta, prepared.model.start
-
-    def make() -> tuple[_Operator | None]:
-        x, known = element.points, tables(prepared, element)  # type: ignore[arg-type]  # by its points
-        G = known.covariance * np.ones(element.size)
-        if not (G.real > 0).all() or system.kinks is not None:
-            return (None,)
-        steps = np.diff(x)
-        nodes = (x[:-1, None] + steps[:, None] * GAUSS_NODES).reshape(-1)
-        slopes = system.drift(nodes[:, None], start, theta)[:, 0] / covariance_at(system, nodes, start, theta)
-        gauge = np.concatenate([np.zeros(1), np.cumsum(steps * (slopes.reshape(len(steps), -1) @ GAUSS_WEIGHTS))])
-        logs = gauge - 0.5 * np.log(G)
-        if not np.isfinite(logs.real).all() or not np.isfinite(known.drift.real).all():
-            return (None,)
-        operator, scale = element.symmetric(G, (known.drift - 0.5 * element.derivative(G)) / G), np.sqrt(element.weights / G)
-        return (_Operator(operator, gauge, scale, logs, Spectral(operator, gauge, scale)),)
-
-    found: tuple[_Operator | None] = prepared.once(("modes", element), make)
+    """Return the operator on an element where no coefficient depends on t, None where it has no decomposition."""
+    found: tuple[_Operator | None] = prepared.once(
+        ("modes", element), lambda: (operator_at(prepared, element, prepared.model.start),)
+    )
     return found[0]
+
+
+def operator_at(prepared: Prepared, element: Element, t: float) -> _Operator | None:
+    """Return the operator on an element at a time and its decomposition; None where there is none."""
+    system, theta, x = prepared.system, prepared.theta, element.points
+    G = covariance_at(system, x, np.asarray(t), theta) * np.ones(element.size)
+    if not (G.real > 0).all() or system.kinks is not None:
+        return None
+    drift, steps = system.drift(x[:, None], t, theta)[:, 0], np.diff(x)
+    nodes = (x[:-1, None] + steps[:, None] * GAUSS_NODES).reshape(-1)
+    slopes = system.drift(nodes[:, None], t, theta)[:, 0] / covariance_at(system, nodes, np.asarray(t), theta)
+    gauge = np.concatenate([np.zeros(1), np.cumsum(steps * (slopes.reshape(len(steps), -1) @ GAUSS_WEIGHTS))])
+    logs = gauge - 0.5 * np.log(G)
+    if not np.isfinite(logs.real).all() or not np.isfinite(drift.real).all():
+        return None
+    operator, scale = element.symmetric(G, (drift - 0.5 * element.derivative(G)) / G), np.sqrt(element.weights / G)
+    return _Operator(operator, gauge, scale, logs, Spectral(operator, gauge, scale))
 
 
 def _projected(values: Array, element: Element, new: Element, known: _Operator, negligible: float) -> Array:
