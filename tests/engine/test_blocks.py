@@ -326,7 +326,6 @@ def test_features_of_models_are_those_of_their_blocks(smooth):
             prior={"kind": "gaussian", "mean": [1.0] * n, "cov": (0.01 * np.eye(n)).tolist()},
         )  # fmt: skip
 
-    parts = parts[:2] if smooth else parts  # reflecting ends have no smoother
     whole, run = model(parts), zakai.smooth if smooth else zakai.filter
     _, record = zakai.simulate(whole, np.arange(1, 11) / 5, seed=2)
     values = record.values.copy()

@@ -220,10 +220,39 @@ def test_the_prior_of_filter_from_is_checked_against_the_domain():
         filter_from(outside, model, record)
 
 
-def test_a_smoother_is_refused_in_one_line():
-    model = model_of(upper=1.0, prior={"kind": "density", "log_density": "0"})
-    with pytest.raises(zakai.InputError, match="no backward pass for a state with reflecting ends"):
-        zakai.smooth(model, samples(TIMES[:1], [0.3]))
+@pytest.mark.parametrize("kind", ["samples", "increments"])
+def test_smoothed_moments_and_paths_are_those_of_matrices(kind):
+    """Forward and backward in finite volumes of second order, extrapolated; f depends on t."""
+    values = np.array([0.3, 0.9, 0.02, 0.7]) * (1.0 if kind == "samples" else lengths(TIMES[:4]))
+    model = model_of("-1 + sin(3*t)", 1.5, observation_noise=[["0.05"]], observation_kind=kind,
+                     prior={"kind": "density", "log_density": "x"})  # fmt: skip
+    result = zakai.smooth(model, zakai.Record(TIMES[:4], values[:, None], kind), "yau-yau")
+    found = []
+    for size in (60, 120):
+        x, still = volumes(lambda x: 0 * x, lambda x: 1 + 0 * x, 0.0, 1.5, size)
+        _, moving = volumes(lambda x: 1 + 0 * x, lambda x: 0 * x, 0.0, 1.5, size)
+        steps, starts = [], np.concatenate([[0.0], TIMES[:3]])
+        for start, stop, value in zip(starts, TIMES[:4], values, strict=True):
+            tau, step = stop - start, np.eye(size)
+            inside = (x * value / tau - 0.5 * x**2) / 0.05 if kind == "increments" else 0.0 * x
+            for t in start + (np.arange(24) + 0.5) * tau / 24:
+                step = expm(tau / 24 * (still + (np.sin(3 * t) - 1) * moving + np.diag(inside))) @ step
+            steps.append(normal(value, 0.05)(x)[:, None] * step if kind == "samples" else step)
+        before, after = [np.exp(x)], [np.ones(size)]
+        for step in steps:
+            before.append(step @ before[-1] / np.sum(step @ before[-1]))
+        for step in steps[::-1]:
+            after.insert(0, after[0] @ step / np.sum(after[0] @ step))
+        rows = [p * b / (p @ b) for p, b in zip(before, after, strict=True)]
+        found.append([(p @ x, p @ x**2 - (p @ x) ** 2) for p in rows])
+    expected = (4 * np.array(found[1]) - found[0]) / 3
+    assert np.column_stack([result.mean[:, 0], result.variance[:, 0]]) == pytest.approx(expected, abs=1e-4)
+    assert not result.warnings
+    paths = result.sample_paths(4000, seed=1)[:, :, 0]
+    assert paths.min() >= 0.0 and paths.max() <= 1.5
+    deviations = np.sqrt(expected[:, 1] / 4000)
+    assert (np.abs(paths.mean(axis=0) - expected[:, 0]) < 4.0 * deviations).all()
+    assert paths.var(axis=0) == pytest.approx(expected[:, 1], rel=0.1)
 
 
 def test_an_exponential_prior_at_an_end_that_it_has_flux_through_is_the_folded_process():

@@ -21,6 +21,7 @@ FASTEST = 100.0  # ranges of the density in the interval, divided by the toleran
 REACH = 8.0  # standard deviations to the end of a density
 KINK_PROBES = 1025  # points between which kinks are sought
 MOST_KINKS = 16
+DIFFUSED = 0.5  # of the time in which noise would double the variance: the first step
 GENTLE = 0.25  # of the steps where the density does not contract much
 _FLOW_POINTS = 17
 _FLOW_STEPS = 32
@@ -29,8 +30,8 @@ _FLOW_STEPS = 32
 class Course(NamedTuple):
     """How an interval moves a density, the cells that hold it all the way, the first step, and the fastest drift that counts.
 
-    Between two `bounds` (B + 1,) the coefficients are polynomials of time, up to the relative error `unresolved`; `share` is that
-    of the steps of `LEVELS` that are taken.
+    `last` is the step with which a message that is sharp at the end begins.  Between two `bounds` (B + 1,) the coefficients are
+    polynomials of time, up to the relative error `unresolved`; `share` is that of the steps of `LEVELS` that are taken.
     """
 
     way: _Way
@@ -41,25 +42,42 @@ class Course(NamedTuple):
     bounds: Array
     unresolved: float
     share: float
+    last: float = np.inf
 
     def steps(self, count: int) -> Array:
-        """Return the ends of about `count` steps, none of which crosses a bound."""
-        ends = ends_of_steps(float(self.bounds[-1]), self.quick, int(np.ceil(self.share * count)))
-        return np.union1d(self.bounds, ends[:-1])
+        """Return the ends of about `count` steps, none of which crosses a bound, graded towards the start and what is sharp."""
+        length, number = float(self.bounds[-1]), int(np.ceil(self.share * count))
+        ends = np.union1d(self.bounds, ends_of_steps(length, self.quick, number)[:-1])
+        if self.last < FIRST * length:
+            ends = np.union1d(ends, length - ends_of_steps(length, self.last, number)[:-1])
+        return ends
 
 
 def course_of(
-    prepared: Prepared, values: Array, window: lw.Window, ends: Array, start: float, length: float, inside: np.ndarray
-) -> Course | None:
-    """Return the course of a density between two offsets, None where the drift leads beyond all numbers."""
+    prepared: Prepared, values: Array, window: lw.Window, ends: Array, start: float, length: float, inside: np.ndarray,
+    sharpest: float = np.inf,
+) -> Course | None:  # fmt: skip
+    """Return the course of a density between two offsets, None where the drift leads beyond all numbers.
+
+    Args:
+        prepared: the system.
+        values, window: the density before the interval, and its grid.
+        ends: its ends as offsets from the origin.
+        start, length: the interval.
+        inside: which increments act within it.
+        sharpest: the standard deviation of a function of the state at the end that is taken back to the start.
+    """
     width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(drift_along(prepared, window, ends, start))))
     fastest = FASTEST * width / (length * prepared.tolerance)
-    quick = min(FIRST * width / max(min(speed, fastest), 1e-300), 0.1 * length)
+    noise = float(np.max(covariance_at(prepared.system, window.origin + np.linspace(*ends, 5), start, prepared.theta.real)))
+    diffused, last = DIFFUSED * np.array([width / (2.0 * REACH), sharpest]) ** 2 / max(noise, 1e-300)
+    quick = min(FIRST * width / max(min(speed, fastest), 1e-300), FIRST * length, float(diffused))
     parts = Panels([(0.0, length)], 0.0)
     if prepared.system.varying:
         parts = resolved_parts(prepared, values, window, start, length, inside)
     bounds = np.array([0.0, *(stop for _, stop in parts.bounds)])
-    share = 1.0 if speed * length > FAST * width else GENTLE
+    ratio = float(np.log2(length / min(quick, float(last)))) / LEVELS[0][1]  # steps grow at most by a factor of two
+    share = 1.0 if speed * length > FAST * width else max(GENTLE, min(ratio, 1.0))
     way = _way(prepared, window, ends, start, np.union1d(bounds, ends_of_steps(length, quick, int(share * _FLOW_STEPS))))
     if not np.isfinite([way.low, way.high]).all() or not way.high > way.low:
         return None
@@ -68,7 +86,7 @@ def course_of(
     cells = volumes(window.origin, centre, scale, float(low), float(high), LEVELS[0][0])
     finest = (cells.last - cells.first) / LEVELS[-1][0] * np.hypot(scale, max(abs(ends[0] - centre), abs(ends[1] - centre)))
     cells = cells._replace(cuts=_cuts(prepared, cells, start))
-    return Course(way, cells, float(finest), quick, fastest, bounds, parts.error, share)
+    return Course(way, cells, float(finest), quick, fastest, bounds, parts.error, share, float(last))
 
 
 def walls_of(prepared: Prepared, origin: float) -> tuple[float, float]:

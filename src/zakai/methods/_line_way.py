@@ -180,7 +180,7 @@ class Way:
         """Return the message at the start of the interval from finite volumes, None where they do not serve."""
         state, window = self.state, self.state.window
         values = np.asarray(state.values).real
-        interval = self.start, self.length, self.inside
+        interval = self.start, self.length, self.inside, float(np.sqrt(later.variance))
         course = course_of(self.prepared, values, window, ends_of(values, window), *interval)
 
         def density(offsets: Array) -> Array:

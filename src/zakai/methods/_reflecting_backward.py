@@ -30,15 +30,16 @@ POINTS = 256  # of a message, on the whole element of the density
 ROUNDING = 1e-15  # of the maximum: smaller values of a message are not kept
 
 
-def _window(lower: float, upper: float) -> lw.Window:
-    spacing = (upper - lower) / POINTS
-    empty = lw.Window(lower, 0.0, spacing, 0, False, spacing)
-    return points_of(empty, 0.0, upper - lower, spacing)
+def _window(prepared: Prepared, lower: float, upper: float) -> lw.Window:
+    """Return the grid of a message between two points, whose origin is an end of the domain."""
+    domain, spacing = domain_of(prepared), (upper - lower) / POINTS
+    origin = domain.lower if np.isfinite(domain.lower) else domain.upper
+    return points_of(lw.Window(origin, 0.0, spacing, 0, False, spacing), lower - origin, upper - origin, spacing)
 
 
 def message(prepared: Prepared, state: State) -> Message:
     """Return the message one at the last time."""
-    origin, centre, spacing, size, closed, unit = _window(float(state.lower), float(state.upper))
+    origin, centre, spacing, size, closed, unit = _window(prepared, float(state.lower), float(state.upper))
     return Message(np.zeros(size), origin, centre, spacing, unit, closed, spacing, 0.0)
 
 
@@ -88,7 +89,7 @@ def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message,
 def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state: State) -> Message:
     """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
     start, length, inside = float(prepared.schedule.starts[k]), float(prepared.lengths[k]), prepared.inside[k]
-    later, before = later.on(_window(*(later.origin + end for end in later.ends))), later.variance
+    later, before = later.on(_window(prepared, *(later.origin + end for end in later.ends))), later.variance
     at_end = prepared.schedule.seen[k] & ~inside
     if at_end.any():
         likelihood = factor_at_end(prepared, k, at_end, observed, None)
@@ -97,17 +98,18 @@ def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state
         return later
     element, values = state.element, np.asarray(state.values).real
     ends = np.array([0.0, element.upper - element.lower])
-    course = course_of(prepared, values, element, ends, start, length, inside)  # type: ignore[arg-type]  # by its points
+    sharpest = float(np.sqrt(later.variance))
+    course = course_of(prepared, values, element, ends, start, length, inside, sharpest)  # type: ignore[arg-type]  # by its points
     rates = np.where(inside, observed, 0.0) / length
     shift = element.lower - later.origin
     found = pulled_back(
         prepared, lambda x: later.at(x + shift), lambda x: element.at(values, element.lower + x), course, start, inside, rates
     )
-    window = _window(element.lower, element.upper)
+    window = _window(prepared, element.lower, element.upper)
     origin, centre, spacing, _, closed, unit = window
     if found is None:
         return Message(np.zeros(window.size), origin, centre, spacing, unit, closed, spacing, np.inf)
-    worth = found.at(window.offsets)
+    worth = found.at(window.offsets - shift)
     logs = np.log(np.maximum(worth, ROUNDING * np.max(worth))) + found.log_scale
     new = Message(logs, origin, centre, spacing, unit, closed, spacing, 0.0)
     kept = float(np.clip(later.variance / np.sqrt(max(before * new.variance, 1e-300)), 0.3, 1.0))

@@ -23,6 +23,7 @@ Array = Any
 PIECE = 10.0  # standard deviations of the noise in which states at the end are taken together
 REACH = 8.0  # of them around, between which the state at the start lies
 RESOLVING = 3.7  # points in a standard deviation
+RESOLVED = 1e-6  # Legendre coefficient of a density that the points of the transition resolve
 FINE = 4  # points in a spacing between which a distribution is interpolated
 SUBSTEPS = 4  # of a part in which the coefficients are polynomials of time
 
@@ -42,12 +43,14 @@ def draw(
     G = covariance_at(prepared.system, x, np.asarray(middle), theta) * np.ones(element.size)
     slope = float(np.max(np.abs(element.derivative(drift))))
     deviation = float(np.sqrt(np.min(G) * min(length, 0.5 / max(slope, 1e-300))))
-    reach = REACH * float(np.sqrt(np.max(G) * length)) + length * float(np.max(np.abs(drift)))
+    wide = REACH * float(np.sqrt(np.max(G) * length))
     low, high = min(element.lower, float(z.min())), max(element.upper, float(z.max()))
     found, order = np.empty(len(z)), np.argsort(z)
     pieces = np.floor((z[order] - low) / (PIECE * deviation)).astype(int)
     for places in np.split(order, np.flatnonzero(np.diff(pieces)) + 1):
         first, last = float(z[places].min()), float(z[places].max())
+        near = np.abs(drift[(x >= first - wide) & (x <= last + wide)])
+        reach = wide + length * float(np.max(near, initial=0.0))
         lower, upper = max(first - reach, low), min(last + reach, high)
         needed = RESOLVING * (upper - lower) / deviation
         piece = Element(lower, upper, next((size for size in SIZES if size >= needed), SIZES[-1]))
@@ -59,10 +62,16 @@ def _drawn(
     prepared: Prepared, k: int, piece: Element, z: Array, observed: np.ndarray, state: State, uniform: Array
 ) -> Array:
     """Return the quantiles (P,) of the law of the state at the start, given those at the end z (P,)."""
-    before = np.maximum(state.element.at(np.asarray(state.values).real, piece.points), 0.0)
-    law = piece.interpolation(z) @ _transition(prepared, k, piece, before, observed) * before
-    fine = np.linspace(piece.lower, piece.upper, FINE * piece.size + 1)
-    mass = np.maximum(law @ piece.interpolation(0.5 * (fine[1:] + fine[:-1])).T, 0.0)
+    own, values = state.element, np.asarray(state.values).real
+    before = np.maximum(own.at(values, piece.points), 0.0)
+    likely = piece.interpolation(z) @ _transition(prepared, k, piece, before, observed)
+    fine = np.linspace(max(piece.lower, own.lower), min(piece.upper, own.upper), FINE * max(piece.size, own.size) + 1)
+    middles = 0.5 * (fine[1:] + fine[:-1])
+    if piece.unresolved(before * piece.weights) < RESOLVED:
+        mass = (likely * before) @ piece.interpolation(middles).T
+    else:
+        mass = likely @ piece.interpolation(middles).T * own.at(values, middles)
+    mass = np.maximum(mass, 0.0)
     total = np.concatenate([np.zeros((len(mass), 1)), np.cumsum(mass, axis=1)], axis=1)
     return np.array([np.interp(u * row[-1], row, fine) for u, row in zip(uniform, total, strict=True)])
 
