@@ -255,6 +255,18 @@ def test_smoothed_moments_and_paths_are_those_of_matrices(kind):
     assert paths.var(axis=0) == pytest.approx(expected[:, 1], rel=0.1)
 
 
+def test_residuals_are_those_of_the_uniform_law():
+    """Brownian motion that begins uniform stays uniform; the noise is Gaussian, or given by its density."""
+    prior, domain = {"kind": "density", "log_density": "0"}, {"x": {"lower": 0, "upper": 1, "boundary": "reflecting"}}
+    shared = {"state": ["x"], "drift": ["0"], "observation_kind": "samples", "domain": domain, "prior": prior}
+    one = zakai.Model(observation=["x"], observation_noise=[["0.02"]], **shared)
+    other = zakai.Model(observed=["z"], observation_log_density="-25*(z - x)**2 - log(0.04*pi)/2", **shared)
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    expected = weights / 2 @ norm.cdf((0.3 - (nodes + 1) / 2) / np.sqrt(0.02))
+    for model, allowed in ((one, 1e-6), (other, 1e-3)):
+        assert zakai.filter(model, samples([0.4], [0.3]), "yau-yau").residuals()[0, 0] == pytest.approx(expected, abs=allowed)
+
+
 def test_an_exponential_prior_at_an_end_that_it_has_flux_through_is_the_folded_process():
     """The state is |y| of dy = -y dt + dv, whose transition is known; the solution has a layer at the end, the prior none."""
     domain = {"x": {"lower": 0.0, "boundary": "reflecting"}}

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.algebra.systems import affine_observation
-from zakai.densities import Density, GaussianMixture, GridDensity
+from zakai.densities import Density, GaussianMixture, GridDensity, IntervalDensity
 from zakai.densities.mapped import MappedDensity
 from zakai.engine.setting import Setting
 from zakai.models.checks import depends_on_state
@@ -28,6 +28,7 @@ from zakai.records.schedule import Schedule
 Array = NDArray[Any]
 Pair = tuple[Array, Array]
 ROUGH = 0.05  # difference of the sums over even and odd points above which a grid is too coarse; the error is about its 4th power
+_CELLS = 1024  # of a density between reflecting ends
 NEGLIGIBLE = 1e-15  # weight of a point, relative to the largest
 
 
@@ -47,12 +48,18 @@ class Mixture(NamedTuple):
         """Return a density as a mixture, without what is negligible; None where it is none."""
         if isinstance(density, GaussianMixture):
             return None if any(density.periodic) else cls(density.weights, density.means, density.covs, ())
-        if not isinstance(density, GridDensity | MappedDensity):
+        if isinstance(density, IntervalDensity):
+            faces = np.linspace(density.nodes[0], density.nodes[-1], _CELLS + 1)
+            points = 0.5 * (faces[1:] + faces[:-1])[:, None]
+            weights = np.exp(density.log_density(points))
+            weights = weights / np.sum(weights)
+        elif isinstance(density, GridDensity | MappedDensity):
+            weights, points = density.weights, density.points
+        else:
             return None
-        weights = density.weights
         used = weights > NEGLIGIBLE * weights.max()
         signs = [np.where(np.indices(weights.shape)[axis] % 2, -1.0, 1.0)[used] for axis in range(weights.ndim)]
-        return cls(weights[used], density.points[used], None, signs)
+        return cls(weights[used], points[used], None, signs)
 
     def probabilities(self, seen: Array, terms: Array, below: Array, upto: Array) -> Pair | None:
         """Return P(Z_j < z_j) and P(Z_j <= z_j) (m,) given the coordinates before; None where the grid is too coarse.

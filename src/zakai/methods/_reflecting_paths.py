@@ -58,9 +58,7 @@ def draw(
     return np.clip(found, domain_of(prepared).lower, domain_of(prepared).upper)[:, None], 0.0
 
 
-def _drawn(
-    prepared: Prepared, k: int, piece: Element, z: Array, observed: np.ndarray, state: State, uniform: Array
-) -> Array:
+def _drawn(prepared: Prepared, k: int, piece: Element, z: Array, observed: np.ndarray, state: State, uniform: Array) -> Array:
     """Return the quantiles (P,) of the law of the state at the start, given those at the end z (P,)."""
     own, values = state.element, np.asarray(state.values).real
     before = np.maximum(own.at(values, piece.points), 0.0)
