@@ -69,7 +69,7 @@ def course_of(
     """
     width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(drift_along(prepared, window, ends, start))))
     fastest = FASTEST * width / (length * prepared.tolerance)
-    noise = float(np.max(covariance_at(prepared.system, window.origin + np.linspace(*ends, 5), start, prepared.theta.real)))
+    noise = float(np.max(covariance_at(prepared.system, window.origin + np.linspace(ends[0], ends[1], 5), start, prepared.theta.real)))
     diffused, last = DIFFUSED * np.array([width / (2.0 * REACH), sharpest]) ** 2 / max(noise, 1e-300)
     quick = min(FIRST * width / max(min(speed, fastest), 1e-300), FIRST * length, float(diffused))
     parts = Panels([(0.0, length)], 0.0)
