@@ -1,4 +1,4 @@
-"""The density of one state on an interval, up to whose ends it is smooth, as at a reflecting end."""
+"""The density of one state on intervals, up to whose ends it is smooth, as at a reflecting end or a kink of the drift."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from zakai.densities._density import WeightedPoints, as_states, coordinate_numbers, generator, probabilities, sample_size
+from zakai.numerics.lobatto import interpolation
 
 _FINE = 4001  # points between which the distribution function is interpolated
 
 
 @dataclass(frozen=True, repr=False)
 class IntervalDensity(WeightedPoints):
-    """A polynomial density by its `values` (N,) at Gauss-Lobatto `nodes` with weights `rule`; zero beyond the nodes."""
+    """A density by its `values` (N,) at Gauss-Lobatto `nodes` with weights `rule`; zero beyond the nodes.
+
+    It is a polynomial, or several, where nodes nearly coincide.
+    """
 
     values: np.ndarray
     nodes: np.ndarray
@@ -37,12 +41,9 @@ class IntervalDensity(WeightedPoints):
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
         at = as_states(x, 1)[..., 0]
-        scale = (-1.0) ** np.arange(len(self.nodes)) * np.sqrt(self.rule)
-        apart = at[..., None] - self.nodes
-        same = apart == 0
-        terms = np.where(same.any(axis=-1)[..., None], same, scale / np.where(same, 1.0, apart))
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = np.log((terms @ self.values) / terms.sum(axis=-1) / np.sum(self.values * self.rule))
+            terms = interpolation(self.nodes, self.rule, at.reshape(-1)) @ self.values
+            found = np.log(terms.reshape(at.shape) / np.sum(self.values * self.rule))
         inside = (at >= self.nodes[0]) & (at <= self.nodes[-1]) & ~np.isnan(found)
         return np.where(inside, found, -np.inf)
 

@@ -15,7 +15,7 @@ from zakai.methods._reflecting_backward import BACKWARD as REFLECTING
 
 def _of(prepared: Any) -> Backward[Any, Any, Any]:
     if prepared.model.n == 1:
-        return REFLECTING if prepared.system.reflecting else LINE
+        return REFLECTING if prepared.pieces else LINE
     from zakai.methods._space_backward import BACKWARD as SPACE
 
     return SPACE

@@ -64,8 +64,8 @@ SLOW_GENEROUS = 256  # points of a grid that is kept though fewer would do
 GENEROUS = 96  # points of a grid that is kept though fewer would do
 
 
-def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: float) -> Prepared:
-    """Return what `step` needs for the intervals of a schedule.
+def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: float, pieces: bool = False) -> Prepared:
+    """Return what `step` needs for the intervals of a schedule; `pieces` is whether that is the one of `_reflecting`.
 
     Raises:
         InputError: the tolerance is not a number from 1e-12 to .1.
@@ -75,11 +75,12 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
     system = system_of(on_the_line(model)).given(schedule.inputs)
     # A sample may lead deep into the tails, where a small error counts; increments do not.
     negligible = 1e-13 if system.samples else float(np.clip(1e-6 * tolerance, 1e-13, 1e-10))
-    if system.kinked_drift:  # the spectrum of a density falls slowly
+    if system.kinked_drift and not pieces:  # the spectrum of a density falls slowly
         negligible = max(negligible, SLOW * float(tolerance))
     generous = SHARED if system.samples and not system.moving else GENEROUS
     lengths, inside = schedule.lengths, schedule.inside
     found = Prepared(model, schedule, theta, system, float(tolerance), lengths, inside, negligible, generous, float(tolerance))
+    found.pieces = pieces
     if found.kinked:  # a grid is finer, and another one takes long to prepare
         found.generous = SLOW_GENEROUS
     found.notes = (OMITTED,) if system.cross is not None and (schedule.seen & ~inside).any() else ()

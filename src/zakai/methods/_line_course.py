@@ -69,7 +69,8 @@ def course_of(
     """
     width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(drift_along(prepared, window, ends, start))))
     fastest = FASTEST * width / (length * prepared.tolerance)
-    noise = float(np.max(covariance_at(prepared.system, window.origin + np.linspace(ends[0], ends[1], 5), start, prepared.theta.real)))
+    points = window.origin + np.linspace(ends[0], ends[1], 5)
+    noise = float(np.max(covariance_at(prepared.system, points, start, prepared.theta.real)))
     diffused, last = DIFFUSED * np.array([width / (2.0 * REACH), sharpest]) ** 2 / max(noise, 1e-300)
     quick = min(FIRST * width / max(min(speed, fastest), 1e-300), FIRST * length, float(diffused))
     parts = Panels([(0.0, length)], 0.0)
@@ -110,29 +111,30 @@ def drift_along(prepared: Prepared, window: lw.Window, offsets: Array, t: float)
 
 def _cuts(prepared: Prepared, cells: Volumes, start: float) -> tuple[float, ...]:
     """Return where in the range of cells coefficients have kinks or jumps, in s; nothing where these are many."""
+    lower, upper = cells.origin + cells.centre + cells.scale * np.sinh([cells.first, cells.last])
+    found, apart = [cells.first], 1e-6 * (cells.last - cells.first)
+    for s in np.arcsinh((kinks_between(prepared, lower, upper, start) - cells.origin - cells.centre) / cells.scale):
+        if s - found[-1] > apart and cells.last - s > apart:
+            found.append(float(s))
+    return tuple(found[1:])
+
+
+def kinks_between(prepared: Prepared, lower: float, upper: float, t: float) -> Array:
+    """Return the states between two, in increasing order, where coefficients have kinks or jumps; none where these are many."""
     kinks, theta = prepared.system.kinks, prepared.theta.real
     if kinks is None:
-        return ()
-
-    def values(s: Array) -> Array:
-        return kinks(cells.origin + (cells.centre + cells.scale * np.sinh(s))[..., None], start, theta)
-
-    s = np.linspace(cells.first, cells.last, KINK_PROBES)
-    negative = values(s) < 0
+        return np.zeros(0)
+    x = np.linspace(lower, upper, KINK_PROBES)
+    negative = kinks(x[:, None], t, theta) < 0
     at, which = np.nonzero(negative[1:] != negative[:-1])
-    if not 0 < len(at) <= MOST_KINKS:
-        return ()
-    low, high, left = s[at], s[at + 1], negative[at, which]
+    if len(at) > MOST_KINKS:
+        return np.zeros(0)
+    low, high, left = x[at], x[at + 1], negative[at, which]
     for _ in range(60):
         middle = 0.5 * (low + high)
-        same = (values(middle)[np.arange(len(at)), which] < 0) == left
+        same = (kinks(middle[:, None], t, theta)[np.arange(len(at)), which] < 0) == left
         low, high = np.where(same, middle, low), np.where(same, high, middle)
-    found: list[float] = []
-    apart = 1e-6 * (cells.last - cells.first)
-    for one in sorted(0.5 * (low + high)):
-        if one - (found[-1] if found else cells.first) > apart and cells.last - one > apart:
-            found.append(float(one))
-    return tuple(found)
+    return np.sort(0.5 * (low + high))
 
 
 class _Way(NamedTuple):

@@ -66,11 +66,20 @@ def _formulas(model: Model) -> Formulas:
 
 
 def _roots(model: Model) -> list[sp.Expr]:
-    """Return functions of x alone that are zero where the equation between samples has coefficients with a kink or a jump."""
+    """Return functions of x alone that are zero where f, G, or an h that acts within intervals, has a kink or a jump.
+
+    Where there are such, those of the h of samples follow.
+    """
+    dynamics = [model.drift[0], model.covariance[0]]
+    found = _zeros(model, [*dynamics, *([] if model.observation_kind == "samples" else model.observation)])
+    return sorted(found | _zeros(model, [*dynamics, *model.observation]), key=str) if found else []
+
+
+def _zeros(model: Model, formulas: list[sp.Expr]) -> set[sp.Expr]:
+    """Return functions of x alone that are zero where formulas have a kink or a jump."""
     x, given = model.x[0], {model.t, *model.u}
-    inside = [] if model.observation_kind == "samples" else list(model.observation)
     found: set[sp.Expr] = set()
-    for part in (model.drift[0], model.covariance[0], *inside):
+    for part in formulas:
         for call in part.atoms(*_JUMPS, *_KINKS, TableFunction):
             first = call.args[0]
             if isinstance(call, (Minimum, Maximum)):
@@ -82,7 +91,7 @@ def _roots(model: Model) -> list[sp.Expr]:
                     found.update(first - sp.Float(node, 17) for node in call.table.axes[0])
             else:
                 found.add(first)
-    return sorted((root for root in found if root.has(x) and not root.free_symbols & given), key=str)
+    return {root for root in found if root.has(x) and not root.free_symbols & given}
 
 
 def _separated(model: Model) -> tuple[Function, Function] | None:
@@ -107,6 +116,7 @@ def _separated(model: Model) -> tuple[Function, Function] | None:
 
 
 _MOST_TERMS = 8
+MOST_PIECES = 8  # formulas with a kink
 
 
 def _added(formula: sp.Expr, model: Model) -> sp.Expr:
@@ -128,6 +138,14 @@ def _rough(formula: sp.Expr, x: sp.Symbol) -> bool:
     """Return whether the derivative of a formula may jump."""
     linear = any(part.table.degree == 1 and part.has(x) for part in formula.atoms(TableFunction))
     return linear or any(part.has(x) for part in formula.atoms(*_KINKS))
+
+
+def in_pieces(model: Model) -> bool:
+    """Return whether densities are polynomials between ends and kinks: a state that is reflected, or one with kinks in f or G."""
+    if any(interval.reflecting for interval in model.domain.values()):
+        return True
+    plain = model.n == 1 and not model.domain and not model.periodic
+    return plain and 0 < len(_roots(model)) <= MOST_PIECES
 
 
 class System:

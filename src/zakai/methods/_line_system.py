@@ -78,8 +78,9 @@ class Prepared:
     """What is known without data.
 
     `tolerance` is what substeps are chosen for, `promised` the error of a step above which a result warns; `negligible` the
-    spectrum that need not be resolved; `generous` the size of a grid that is kept though fewer points would do; `kept` holds what
-    was computed for single grids; `shares` (K,) are those of parts in the time of their intervals.
+    spectrum that need not be resolved; `generous` the size of a grid that is kept though fewer points would do; `pieces` whether
+    densities are polynomials between ends and kinks; `kept` holds what was computed for single grids; `shares` (K,) are those of
+    parts in the time of their intervals.
     """
 
     model: Model
@@ -99,11 +100,12 @@ class Prepared:
     series: PowerSeries | None = None
     notes: tuple[str, ...] = ()
     shares: np.ndarray | None = None
+    pieces: bool = False
 
     @cached_property
     def kept(self) -> dict[Any, Any]:
         """What was computed for single grids, shared by all schedules of a model with these parameters and this method."""
-        setting = self.tolerance, self.yau is None, self.kernels is None, self.series is None, self.lie, self.origin
+        setting = self.pieces, self.tolerance, self.yau is None, self.kernels is None, self.series is None, self.lie, self.origin
         return _kept(self.model, self.theta.tobytes(), self.theta.dtype.str, setting)
 
     @cached_property

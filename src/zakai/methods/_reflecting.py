@@ -24,6 +24,7 @@ from zakai.methods._reflecting_moves import (
     SAMPLES,
     SIZES,
     domain_of,
+    element_of,
     logarithm,
     moments,
     negligible_of,
@@ -39,23 +40,30 @@ from zakai.models.prior import DensityPrior, GaussianPrior
 from zakai.numerics.line_posterior import General, Likelihood, place
 from zakai.numerics.line_segment import RELIABLE
 from zakai.numerics.lobatto import Element
-from zakai.numerics.prior_grid import mixture_log_density
+from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 
 Array = Any
 
 
 class State(NamedTuple):
-    """The probabilities (N,) of the Gauss-Lobatto points between `lower` and `upper`, and an estimate of their error so far."""
+    """The probabilities (N,) of the Gauss-Lobatto points between `lower`, `cuts` (C,) and `upper`; an estimate of their error."""
 
     values: np.ndarray
     lower: float
     upper: float
     error: float
+    cuts: np.ndarray
+
+    @classmethod
+    def of(cls, values: Array, element: Element, error: float) -> State:
+        """Return the state with probabilities at the points of an element."""
+        return cls(values, element.lower, element.upper, error, np.array(element.cuts, float))
 
     @property
     def element(self) -> Element:
         """The points."""
-        return Element(float(self.lower), float(self.upper), len(self.values))
+        size = len(self.values) // (len(self.cuts) + 1)
+        return Element(float(self.lower), float(self.upper), size, tuple(np.asarray(self.cuts).tolist()))
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -67,7 +75,7 @@ def init(prepared: Prepared, prior: Any) -> State:
         def logs(x: Array) -> Array:
             return function(x[:, None], model.start, prepared.theta)
 
-        centre, scale = (domain.lower if np.isfinite(domain.lower) else domain.upper), 1.0
+        lower, upper = _ends_of(prepared, lambda x: logs(x).real)
     else:
         single = isinstance(prior, GaussianPrior)
         weights, means, covs = (
@@ -76,21 +84,30 @@ def init(prepared: Prepared, prior: Any) -> State:
         if np.any(covs[:, 0, 0] <= 1e-28 * means[:, 0] ** 2):
             raise InputError("prior: a variance is zero; a grid needs a density, so give it a small variance")
         mixture = mixture_log_density(weights, means, covs, [False])
-        centre, scale = float(np.mean(means[:, 0])), float(np.sqrt(covs.min()))
+        reach = np.sqrt(2.0 * CUT * covs[:, 0, 0])
+        lower, upper = np.clip([np.min(means[:, 0] - reach), np.max(means[:, 0] + reach)], domain.lower, domain.upper).tolist()
 
         def logs(x: Array) -> Array:
             return mixture(np.zeros(1), x[:, None])
 
-    lower, upper = domain.lower, domain.upper
-    if not np.isfinite(upper - lower):  # powers of two on both sides: the scale of the density is not known
-        steps = scale * 2.0 ** np.arange(-60.0, 61.0, 0.5)
-        points = centre + np.concatenate([-steps[::-1], [0.0], steps])
-        points = np.unique(np.clip(points, lower, upper))
-        lower, upper = support(points, logs(points).real)
     lower, upper = placed(lambda x: logs(x).real, lower, upper, domain)
-    top = _top(logs, lower, upper)
-    element, values = sampled(lambda x: np.exp(without_nan(logs(x)) - top), lower, upper, negligible_of(prepared))
-    return State(values / np.sum(values), element.lower, element.upper, 0.0)
+    top, negligible = _top(logs, lower, upper), negligible_of(prepared)
+    element, values = sampled(prepared, lambda x: np.exp(without_nan(logs(x)) - top), lower, upper, negligible)
+    return State.of(values / np.sum(values), element, max(element.unresolved(values) - negligible, 0.0))
+
+
+def _ends_of(prepared: Prepared, logs: Callable[[Array], Array]) -> tuple[float, float]:
+    """Return ends between which a density of unknown scale lies, from its logarithm."""
+    domain = domain_of(prepared)
+    lower, upper = domain.lower, domain.upper
+    if np.isfinite(upper - lower):
+        return lower, upper
+    if np.isinf(lower) and np.isinf(upper):
+        grid = prior_grid(lambda points: logs(points[:, 0]), 1, [False])
+        return float(grid.points[0, 0]), float(grid.points[-1, 0])
+    end = lower if np.isfinite(lower) else upper  # powers of two
+    points = np.unique(end + np.concatenate([[0.0], 2.0 ** np.arange(-60.0, 61.0, 0.5)]) * (1.0 if end == lower else -1.0))
+    return support(points, logs(points))
 
 
 def _top(logs: Callable[[Array], Array], lower: float, upper: float) -> float:
@@ -120,7 +137,7 @@ def _multiplied(
             low, high = with_margin(element.lower + ends[0], element.lower + ends[1], domain)
             low, high = max(low, element.lower), min(high, element.upper)
             for size in SIZES:
-                new = Element(low, high, size)
+                new = element_of(prepared, low, high, size)
                 density = element.at(values, new.points)
                 found, top = product(new.points, density)
                 if new.unresolved(found * new.weights) < negligible:
@@ -182,16 +199,19 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
         health["without_law"] = report.lawless
     if prepared.system.tabulated:
         health["outside_tables"] = outside_tables(prepared, values, element, float(schedule.stops[k]))
-    state = State(values, element.lower, element.upper, float(error))
+    state = State.of(values, element, float(error))
     return state, Info(gained, np.array([mean]), np.array([[variance]]), health)
 
 
 def valid(prepared: Prepared, state: State) -> bool:
     """Return whether the parts of a state fit together."""
-    values, domain = np.asarray(state.values), domain_of(prepared)
-    if values.ndim != 1 or len(values) not in SIZES or not np.isfinite(values).all() or not np.isfinite(state.error):
+    values, cuts, domain = np.asarray(state.values), np.asarray(state.cuts), domain_of(prepared)
+    if values.ndim != 1 or cuts.ndim != 1 or len(values) not in [size * (len(cuts) + 1) for size in SIZES]:
         return False
-    return bool(domain.lower <= state.lower < state.upper <= domain.upper and values.real.sum() > 0)
+    ends = np.array([state.lower, *cuts, state.upper], float)
+    if not (np.isfinite(values).all() and np.isfinite(ends).all() and np.isfinite(state.error) and (np.diff(ends) > 0).all()):
+        return False
+    return bool(domain.lower <= state.lower and state.upper <= domain.upper and values.real.sum() > 0)
 
 
 def density(prepared: Prepared, state: State) -> IntervalDensity:

@@ -33,7 +33,7 @@ ROUNDING = 1e-15  # of the maximum: smaller values of a message are not kept
 def _window(prepared: Prepared, lower: float, upper: float) -> lw.Window:
     """Return the grid of a message between two points, whose origin is an end of the domain."""
     domain, spacing = domain_of(prepared), (upper - lower) / POINTS
-    origin = domain.lower if np.isfinite(domain.lower) else domain.upper
+    origin = next((end for end in (domain.lower, domain.upper) if np.isfinite(end)), 0.0)
     return points_of(lw.Window(origin, 0.0, spacing, 0, False, spacing), lower - origin, upper - origin, spacing)
 
 
@@ -63,7 +63,7 @@ def _product(prepared: Prepared, state: State, later: Message) -> _Product:
     lower, upper = max(lower, element.lower), min(upper, element.upper)
     top = float(np.max(logs(np.linspace(lower, upper, 4 * element.size))))
     negligible = negligible_of(prepared, float(state.error) + later.error)
-    new, found = sampled(lambda x: np.exp(logs(x) - top), lower, upper, negligible)
+    new, found = sampled(prepared, lambda x: np.exp(logs(x) - top), lower, upper, negligible)
     total = float(np.sum(found))
     return _Product(found / total, new, float(np.log(total)) + top)
 
@@ -120,7 +120,7 @@ def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state
 def density(prepared: Prepared, state: State, later: Message) -> IntervalDensity:
     """Return the smoothed density."""
     values, element, _ = _product(prepared, state, later)
-    return _reflecting.density(prepared, State(values, element.lower, element.upper, float(state.error)))
+    return _reflecting.density(prepared, State.of(values, element, float(state.error)))
 
 
 BACKWARD: Backward[Prepared, State, Message] = Backward(message, step, smoothed, density, None, draw, accuracy)

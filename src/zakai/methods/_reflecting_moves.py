@@ -17,7 +17,7 @@ import numpy as np
 
 from zakai.errors import InputError
 from zakai.methods._line_coefficients import offset_of, potential_of, precision_of
-from zakai.methods._line_course import course_of
+from zakai.methods._line_course import course_of, kinks_between
 from zakai.methods._line_moves import Report
 from zakai.methods._line_system import Prepared, covariance_at, tables
 from zakai.methods._line_volumes import SHARE, advanced_by
@@ -34,12 +34,26 @@ EDGE = 1e-12  # density at an end that is not one of the domain, relative to the
 SAMPLES = 1001  # points at which the place of a density is sought
 REACH = 7.2  # standard deviations of the noise by which a density widens
 ATTEMPTS = 24  # elements that are tried
+MARGIN = 0.02  # of the length of an element, within which of its end a kink does not count
+BESIDE = 1e-6  # the same for an end of the domain
 MOST_PARTS = 64  # of an interval that the volumes do not take as a whole
 PEAK = 1.5  # points in a standard deviation of the noise with which the first element begins
 
 
 def domain_of(prepared: Prepared) -> Interval:
-    return prepared.model.domain[prepared.model.state[0]]
+    return prepared.model.domain.get(prepared.model.state[0], Interval())
+
+
+def element_of(prepared: Prepared, lower: float, upper: float, size: int) -> Element:
+    """Return an element with cuts where coefficients have kinks or jumps, except near ends where the density is negligible."""
+    if prepared.system.kinks is None:
+        return Element(lower, upper, size)
+    apart, width, domain = 2.0 ** np.ceil(np.log2(upper - lower)), upper - lower, domain_of(prepared)
+    low, high = float(apart * np.floor(lower / apart)), float(apart * np.ceil(upper / apart))
+    known = prepared.once(("kinks", low, high), lambda: kinks_between(prepared, low, high, prepared.model.start).tolist())
+    first = lower + width * (BESIDE if lower <= domain.lower else MARGIN)
+    last = upper - width * (BESIDE if upper >= domain.upper else MARGIN)
+    return Element(lower, upper, size, tuple(kink for kink in known if first < kink < last))
 
 
 def negligible_of(prepared: Prepared, error: float = 0.0) -> float:
@@ -79,11 +93,11 @@ def with_margin(lower: float, upper: float, domain: Interval) -> tuple[float, fl
 
 
 def sampled(
-    density: Callable[[Array], Array], lower: float, upper: float, negligible: float, least: int = 0
+    prepared: Prepared, density: Callable[[Array], Array], lower: float, upper: float, negligible: float
 ) -> tuple[Element, Array]:
     """Return the fewest points that resolve a density, and its probabilities there."""
-    for size in [size for size in SIZES if size >= least] or [SIZES[-1]]:
-        element = Element(lower, upper, size)
+    for size in SIZES:
+        element = element_of(prepared, lower, upper, size)
         values = density(element.points) * element.weights
         if element.unresolved(values) < negligible:
             break
@@ -121,12 +135,12 @@ def _by_modes(
     domain, allowed = domain_of(prepared), max(1e-11, 1e-5 * prepared.tolerance)
     G = covariance_at(prepared.system, element.points, start, prepared.theta).real
     noise = np.sqrt(np.maximum([np.min(G), np.max(G)], 0.0) * length)
-    own = element.upper - element.lower
     lower, upper = _apart(element.lower - REACH * noise[1], element.upper + REACH * noise[1], domain)
-    needed = min(PEAK * (upper - lower) / max(noise[0], 1e-300), element.size * (upper - lower) / own)
+    longest = float(np.max(element_of(prepared, lower, upper, SIZES[0]).halves))
+    needed = min(2.0 * PEAK * longest / max(noise[0], 1e-300), element.size * longest / float(np.max(element.halves)))
     size = next((size for size in SIZES if size >= min(needed, SIZES[4])), SIZES[-1])
     for _ in range(ATTEMPTS):
-        new, offset = Element(lower, upper, size), 0.0
+        new, offset = element_of(prepared, lower, upper, size), 0.0
         known = _decomposed(prepared, new)
         if known is None:
             return None
@@ -169,17 +183,29 @@ def _apart(lower: float, upper: float, domain: Interval) -> tuple[float, float]:
 
 
 class _Operator(NamedTuple):
-    """-L as a symmetric operator (N, N), int f / G (N,), s over the exponential of that (N,), log s (N,), and the modes."""
+    """-L as a symmetric operator (N - C, N - C), what it acts on, and its modes.
+
+    `gauge` is int f / G, `scale` s W^(1/2) over the exponential of that, `logs` log s (N,); `joined` is that of the element.
+    """
 
     operator: Array
     gauge: Array
     scale: Array
     logs: Array
+    joined: Array
     modes: Spectral
+
+    @classmethod
+    def of(cls, operator: Array, gauge: Array, scale: Array, logs: Array, joined: Array) -> _Operator:
+        """Return the operator with its modes at the points."""
+        modes = Spectral(operator, gauge, scale)
+        modes.modes = joined @ modes.modes
+        return cls(operator, gauge, scale, logs, joined, modes)
 
     def weighted(self, potential: Array) -> Spectral:
         """Return the decomposition of the operator with a potential (N,)."""
-        return Spectral(self.operator - np.diag(potential), self.gauge, self.scale)
+        operator = self.operator - (self.joined.T * potential) @ self.joined
+        return self.of(operator, self.gauge, self.scale, self.logs, self.joined).modes
 
 
 def _decomposed(prepared: Prepared, element: Element) -> _Operator | None:
@@ -193,8 +219,8 @@ def _decomposed(prepared: Prepared, element: Element) -> _Operator | None:
 def operator_at(prepared: Prepared, element: Element, t: float) -> _Operator | None:
     """Return the operator on an element at a time and its decomposition; None where there is none."""
     system, theta, x = prepared.system, prepared.theta, element.points
-    G = covariance_at(system, x, np.asarray(t), theta) * np.ones(element.size)
-    if not (G.real > 0).all() or system.kinks is not None:
+    G = covariance_at(system, x, np.asarray(t), theta) * np.ones(len(x))
+    if not (G.real > 0).all():
         return None
     drift, steps = system.drift(x[:, None], t, theta)[:, 0], np.diff(x)
     nodes = (x[:-1, None] + steps[:, None] * GAUSS_NODES).reshape(-1)
@@ -203,8 +229,9 @@ def operator_at(prepared: Prepared, element: Element, t: float) -> _Operator | N
     logs = gauge - 0.5 * np.log(G)
     if not np.isfinite(logs.real).all() or not np.isfinite(drift.real).all():
         return None
-    operator, scale = element.symmetric(G, (drift - 0.5 * element.derivative(G)) / G), np.sqrt(element.weights / G)
-    return _Operator(operator, gauge, scale, logs, Spectral(operator, gauge, scale))
+    joined = element.joined(logs.real)
+    operator = element.symmetric(G, (drift - 0.5 * element.derivative(G)) / G, joined)
+    return _Operator.of(operator, gauge, np.sqrt(element.weights / G), logs, joined)
 
 
 def _projected(values: Array, element: Element, new: Element, known: _Operator, negligible: float) -> Array:
@@ -277,7 +304,7 @@ def _part(
     def after(x: Array) -> Array:
         return interpolated(np.clip(x - cells.origin, *cells.faces[[0, -1]]))
 
-    element, values = sampled(after, lower, upper, max(negligible, 1e-2 * found.error))
+    element, values = sampled(prepared, after, lower, upper, max(negligible, 1e-2 * found.error))
     return values / np.sum(values), element, found.log_scale
 
 

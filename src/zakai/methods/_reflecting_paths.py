@@ -15,7 +15,7 @@ import numpy as np
 from zakai.methods._line_coefficients import coefficients, resolved_parts
 from zakai.methods._line_system import Prepared, covariance_at
 from zakai.methods._reflecting import State
-from zakai.methods._reflecting_moves import SIZES, domain_of, operator_at
+from zakai.methods._reflecting_moves import SIZES, domain_of, element_of, operator_at
 from zakai.numerics.lobatto import Element
 
 Array = Any
@@ -40,7 +40,7 @@ def draw(
     element, middle, theta = state.element, start + 0.5 * length, prepared.theta.real
     x = element.points
     drift = prepared.system.drift(x[:, None], middle, theta)[:, 0]
-    G = covariance_at(prepared.system, x, np.asarray(middle), theta) * np.ones(element.size)
+    G = covariance_at(prepared.system, x, np.asarray(middle), theta) * np.ones(len(x))
     slope = float(np.max(np.abs(element.derivative(drift))))
     deviation = float(np.sqrt(np.min(G) * min(length, 0.5 / max(slope, 1e-300))))
     wide = REACH * float(np.sqrt(np.max(G) * length))
@@ -52,8 +52,8 @@ def draw(
         near = np.abs(drift[(x >= first - wide) & (x <= last + wide)])
         reach = wide + length * float(np.max(near, initial=0.0))
         lower, upper = max(first - reach, low), min(last + reach, high)
-        needed = RESOLVING * (upper - lower) / deviation
-        piece = Element(lower, upper, next((size for size in SIZES if size >= needed), SIZES[-1]))
+        needed = RESOLVING * 2.0 * float(np.max(element_of(prepared, lower, upper, SIZES[0]).halves)) / deviation
+        piece = element_of(prepared, lower, upper, next((size for size in SIZES if size >= needed), SIZES[-1]))
         found[places] = _drawn(prepared, k, piece, z[places], observed, state, uniform[places])
     return np.clip(found, domain_of(prepared).lower, domain_of(prepared).upper)[:, None], 0.0
 
@@ -63,7 +63,7 @@ def _drawn(prepared: Prepared, k: int, piece: Element, z: Array, observed: np.nd
     own, values = state.element, np.asarray(state.values).real
     before = np.maximum(own.at(values, piece.points), 0.0)
     likely = piece.interpolation(z) @ _transition(prepared, k, piece, before, observed)
-    fine = np.linspace(max(piece.lower, own.lower), min(piece.upper, own.upper), FINE * max(piece.size, own.size) + 1)
+    fine = np.linspace(max(piece.lower, own.lower), min(piece.upper, own.upper), FINE * max(len(before), len(values)) + 1)
     middles = 0.5 * (fine[1:] + fine[:-1])
     if piece.unresolved(before * piece.weights) < RESOLVED:
         mass = (likely * before) @ piece.interpolation(middles).T
@@ -77,7 +77,7 @@ def _drawn(prepared: Prepared, k: int, piece: Element, z: Array, observed: np.nd
 def _transition(prepared: Prepared, k: int, piece: Element, before: Array, observed: np.ndarray) -> Array:
     """Return T (N, N) from the points of an element to the densities at them, weighted by what is observed inside."""
     start, length, inside = float(prepared.schedule.starts[k]), float(prepared.lengths[k]), prepared.inside[k]
-    rates, bounds, found = np.where(inside, observed, 0.0) / length, [(0.0, length)], np.eye(piece.size)
+    rates, bounds, found = np.where(inside, observed, 0.0) / length, [(0.0, length)], np.eye(len(piece.points))
     if prepared.system.varying:
         parts = resolved_parts(prepared, before, piece, start, length, inside).bounds  # type: ignore[arg-type]  # by its points
         cuts = [np.linspace(*part, SUBSTEPS + 1) for part in parts]

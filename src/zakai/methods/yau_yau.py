@@ -14,6 +14,7 @@ import numpy as np
 from zakai.algebra.theorems import any_smooth_system
 from zakai.methods import _line, _reflecting
 from zakai.methods._grid_backward import BACKWARD
+from zakai.methods._line_model import in_pieces
 from zakai.methods._line_system import State
 from zakai.methods._protocol import Info, Infos, Method
 from zakai.models import features
@@ -44,7 +45,7 @@ HANDLES = features.OF_OBSERVATION | {
 def module_of(model: Model) -> Any:
     """Return the module with `init`, `step`, `density` and `valid` for the model's number of states and its domain."""
     if model.n == 1:
-        return _reflecting if any(interval.reflecting for interval in model.domain.values()) else _line
+        return _reflecting if in_pieces(model) else _line
     from zakai.methods import _space
 
     return _space
@@ -65,7 +66,7 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: f
     """
     if model.n > 1:
         return module_of(model).prepare(model, schedule, theta, tolerance=tolerance)
-    return _line.prepare(model, schedule, theta, 1e-5 if tolerance is None else tolerance)
+    return _line.prepare(model, schedule, theta, 1e-5 if tolerance is None else tolerance, in_pieces(model))
 
 
 def init(prepared: Any, prior: Any) -> Any:

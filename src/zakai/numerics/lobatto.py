@@ -1,9 +1,9 @@
-"""Polynomials on an interval by their values at Gauss-Lobatto points, and the Kolmogorov operator without flux at its ends.
+"""Polynomials on intervals by their values at Gauss-Lobatto points, and the Kolmogorov operator without flux at the ends.
 
     L u = ((G u)' / 2 - f u)',      (G u)' / 2 - f u = 0 at both ends
 
 The weak form int phi L u = -int phi' ((G u)' / 2 - f u) has the condition of no flux in it: the solution is spectrally accurate
-up to the ends.
+up to the ends, and to kinks and jumps of the coefficients where two intervals meet.
 """
 
 from __future__ import annotations
@@ -50,12 +50,39 @@ def _barycentric(weights: Array) -> Array:
     return np.asarray((-1.0) ** np.arange(len(weights)) * np.sqrt(weights))
 
 
+def interpolation(nodes: Array, weights: Array, points: Array) -> Array:
+    """Return the matrix (J, N) from values at nodes to those of the polynomials through them at points (J,).
+
+    Args:
+        nodes: Gauss-Lobatto points (N,), of one interval or of several side by side, whose common ends nearly coincide.
+        weights: the weights of the quadrature (N,).
+        points: (J,).
+    """
+    breaks = np.flatnonzero(np.diff(nodes) < SAME * (nodes[-1] - nodes[0])) + 1
+    found, piece = np.zeros((len(points), len(nodes))), np.searchsorted(nodes[breaks], points, side="right")
+    for j, (first, last) in enumerate(zip([0, *breaks], [*breaks, len(nodes)], strict=True)):
+        here = piece == j
+        apart = points[here, None] - nodes[first:last]
+        same = apart == 0
+        terms = np.where(same.any(axis=1)[:, None], same, _barycentric(weights[first:last]) / np.where(same, 1.0, apart))
+        found[here, first:last] = terms / terms.sum(axis=1)[:, None]
+    return found
+
+
+SAME = 1e-9  # distance of two points, relative to the length of all, below which they are the end of two intervals
+_BESIDE = 1e-11  # how far inside of its interval a common end of two lies
+
+
 class Element(NamedTuple):
-    """`size` Gauss-Lobatto points of [lower, upper]; a density is a vector of probabilities, its values times the weights."""
+    """The intervals between `lower`, `cuts` and `upper`, with `size` Gauss-Lobatto points each.
+
+    A density is a vector of probabilities, its values times the weights.  Coefficients may have kinks and jumps at the cuts.
+    """
 
     lower: float
     upper: float
     size: int
+    cuts: tuple[float, ...] = ()
 
     @property
     def closed(self) -> bool:
@@ -68,20 +95,25 @@ class Element(NamedTuple):
         return self.lower
 
     @property
-    def half(self) -> float:
-        """Half the length."""
-        return 0.5 * (self.upper - self.lower)
+    def halves(self) -> Array:
+        """Half the lengths of the intervals (P,)."""
+        return 0.5 * np.diff([self.lower, *self.cuts, self.upper])
 
     @property
     def spacing(self) -> float:
-        """The mean distance of the points."""
-        return (self.upper - self.lower) / (self.size - 1)
+        """The largest mean distance of the points of an interval."""
+        return float(2.0 * np.max(self.halves)) / (self.size - 1)
 
     @property
     def points(self) -> Array:
-        """The points (N,), of which the first and the last are the ends."""
-        x = rule(self.size).points
-        return np.asarray(np.where(x < 0, self.lower + self.half * (1.0 + x), self.upper - self.half * (1.0 - x)))
+        """The points (N,), of which the first and the last are the ends; those at cuts lie beside them."""
+        x, tiny = rule(self.size).points, _BESIDE * (self.upper - self.lower)
+        low, high = (np.array(ends) for ends in ([self.lower, *self.cuts], [*self.cuts, self.upper]))
+        half = self.halves[:, None]
+        found = np.where(x < 0, low[:, None] + half * (1.0 + x), high[:, None] - half * (1.0 - x))
+        found[1:, 0] += tiny
+        found[:-1, -1] -= tiny
+        return np.asarray(found.reshape(-1))
 
     @property
     def offsets(self) -> Array:
@@ -91,27 +123,53 @@ class Element(NamedTuple):
     @property
     def weights(self) -> Array:
         """The weights (N,) of the quadrature."""
-        return self.half * rule(self.size).weights
+        return np.asarray((self.halves[:, None] * rule(self.size).weights).reshape(-1))
 
-    def symmetric(self, covariance: Array, slope: Array) -> Array:
-        """Return -L (N, N) as a symmetric operator on psi W^(1/2), with u = s psi, for G (N,) and s'/s (N,).
+    def symmetric(self, covariance: Array, slope: Array, joined: Array) -> Array:
+        """Return -L (N - C, N - C) as a symmetric operator, for G (N,) and s'/s (N,).
 
-        The flux is s G (psi' - psi s'/s) / 2, and the weak form is sum W G (phi' - phi s'/s) (psi' - psi s'/s) / 2.
+        With u = s psi the flux is s G (psi' - psi s'/s) / 2, and the weak form is
+
+            sum W G (phi' - phi s'/s) (psi' - psi s'/s) / 2.
+
+        Args:
+            covariance: G.
+            slope: s'/s.
+            joined: from what the operator acts on to psi W^(1/2) at the points (N, N - C), of orthogonal columns of length one.
         """
-        root = np.sqrt(self.weights)
-        flux = (rule(self.size).derivative / self.half - np.diag(slope)) * (root * np.sqrt(0.5 * covariance))[:, None] / root
+        root, count = np.sqrt(self.weights), len(self.halves)
+        flux = -np.diag(slope)
+        for j, half in enumerate(self.halves):
+            here = slice(j * self.size, (j + 1) * self.size)
+            flux[here, here] += rule(self.size).derivative / half
+        flux = flux * (root * np.sqrt(0.5 * covariance))[:, None] / root
+        flux = flux if count == 1 else flux @ joined
         return np.asarray(flux.T @ flux)
 
+    def joined(self, logs: Array) -> Array:
+        """Return the matrix (N, N - C) whose columns are psi W^(1/2) that is s times a function that is continuous at the cuts.
+
+        Args:
+            logs: log s at the points (N,).
+        """
+        total = self.size * len(self.halves)
+        found = np.zeros((total, total - len(self.cuts)))
+        columns = np.arange(total) - np.arange(total) // self.size
+        found[np.arange(total), columns] = 1.0
+        for j in range(1, len(self.halves)):
+            k = j * self.size
+            both = np.sqrt(self.weights[k - 1 : k + 1]) * np.exp(logs[k - 1 : k + 1] - np.max(logs[k - 1 : k + 1]))
+            found[k - 1 : k + 1, columns[k]] = both / np.sqrt(np.sum(both**2))
+        return found
+
     def derivative(self, values: Array) -> Array:
-        """Return the derivative of a polynomial at the points from its values there (N,)."""
-        return rule(self.size).derivative @ values / self.half
+        """Return the derivative of polynomials at the points from their values there (N,)."""
+        found = values.reshape(-1, self.size) @ rule(self.size).derivative.T / self.halves[:, None]
+        return np.asarray(found.reshape(-1))
 
     def interpolation(self, points: Array) -> Array:
-        """Return the matrix (J, N) from values to those of the polynomial at points (J,)."""
-        apart = points[:, None] - self.points
-        same = apart == 0
-        terms = np.where(same.any(axis=1)[:, None], same, _barycentric(self.weights) / np.where(same, 1.0, apart))
-        return np.asarray(terms / terms.sum(axis=1)[:, None])
+        """Return the matrix (J, N) from values to those of the polynomials at points (J,)."""
+        return interpolation(self.points, self.weights, points)
 
     def at(self, values: Array, points: Array) -> Array:
         """Return the density at points (J,) from probabilities; zero beyond the ends."""
@@ -120,5 +178,5 @@ class Element(NamedTuple):
 
     def unresolved(self, values: Array) -> float:
         """Return the largest Legendre coefficient in the highest eighth, relative to the largest of all."""
-        coefficients = np.abs(rule(self.size).analysis @ (values / self.weights).real)
-        return float(coefficients[-max(3, self.size // 8) :].max() / coefficients.max())
+        coefficients = np.abs((values / self.weights).real.reshape(-1, self.size) @ rule(self.size).analysis.T)
+        return float(coefficients[:, -max(3, self.size // 8) :].max() / coefficients.max())
