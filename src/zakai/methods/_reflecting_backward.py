@@ -1,10 +1,11 @@
 """The backward pass for one state between reflecting ends: the message on a uniform grid, the smoothed density on elements.
 
-Finite volumes without flux at the ends take a message back over an interval (`_line_volumes.py`).
+The modes of the operator take a message back over an interval, and finite volumes where these do not serve.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,12 +15,26 @@ from zakai.methods import _reflecting
 from zakai.methods._line_backward import accuracy
 from zakai.methods._line_course import course_of
 from zakai.methods._line_message import SURE, Message, points_of
-from zakai.methods._line_system import NOISE, Prepared
+from zakai.methods._line_system import NOISE, Prepared, covariance_at
 from zakai.methods._line_update import factor_at_end
 from zakai.methods._line_volumes import pulled_back
+from zakai.methods._line_way import smoothing_tolerance
 from zakai.methods._protocol import Backward, Info
 from zakai.methods._reflecting import State
-from zakai.methods._reflecting_moves import domain_of, logarithm, moments, negligible_of, placed, reached, sampled
+from zakai.methods._reflecting_moves import (
+    SIZES,
+    apart,
+    decomposed,
+    domain_of,
+    element_of,
+    logarithm,
+    moments,
+    negligible_of,
+    placed,
+    reached,
+    sampled,
+    weighted,
+)
 from zakai.methods._reflecting_paths import draw
 from zakai.numerics import line_window as lw
 from zakai.numerics.lobatto import Element
@@ -27,6 +42,8 @@ from zakai.numerics.lobatto import Element
 Array = Any
 
 POINTS = 256  # of a message, on the whole element of the density
+MODES_REACH = 4.0  # standard deviations of the noise around the supports of density and message
+SHARE = 1e-2  # of the tolerance that modes may leave
 ROUNDING = 1e-15  # of the maximum: smaller values of a message are not kept
 
 
@@ -96,24 +113,73 @@ def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state
         later = later._replace(logs=later.logs + likelihood.logs(later.window.points).real)
     if length == 0:
         return later
-    element, values = state.element, np.asarray(state.values).real
-    ends = np.array([0.0, element.upper - element.lower])
-    sharpest = float(np.sqrt(later.variance))
-    course = course_of(prepared, values, element, ends, start, length, inside, sharpest)  # type: ignore[arg-type]  # by its points
     rates = np.where(inside, observed, 0.0) / length
+    found = None if prepared.system.varying else _by_modes(prepared, later, start, length, inside, rates, state)
+    found = _by_volumes(prepared, later, start, length, inside, rates, state) if found is None else found
+    kept = float(np.clip(later.variance / np.sqrt(max(before * found.variance, 1e-300)), 0.3, 1.0))
+    return found._replace(error=found.error + kept * later.error)
+
+
+def _by_modes(
+    prepared: Prepared, later: Message, start: float, length: float, inside: Array, rates: Array, state: State
+) -> Message | None:
+    """Return the message at the start of an interval by the modes of the operator, None where they do not serve.
+
+        b(start) = U exp(-tau lambda) U' s b(stop) / s
+
+    The error of psi = s b, of rounding and of what is not resolved, counts where the density is.
+    """
+    own, values = state.element, np.asarray(state.values).real
+    G = covariance_at(prepared.system, own.points, np.asarray(start), prepared.theta.real)
+    reach = MODES_REACH * float(np.sqrt(np.max(G) * length))
+    low, high = (later.origin + end for end in later.ends)
+    lower, upper = apart(min(own.lower, low) - reach, max(own.upper, high) + reach, domain_of(prepared))
+    for size in SIZES[1:]:
+        element = element_of(prepared, lower, upper, size)
+        known = decomposed(prepared, element)
+        if known is None:
+            return None
+        logs, density = later.at(element.points - later.origin), own.at(values, element.points) * element.weights
+        top, constant, modes = float(np.max(logs)), 0.0, known.modes
+        if inside.any():
+            modes, constant = weighted(prepared, known, element, start, length, inside, rates, density)
+        psi = modes.scale * np.exp(logs - top)
+        moved, root = modes.decayed(psi, length), np.sqrt(element.weights)
+        wrong = max(4e-16, element.unresolved(psi * root), element.unresolved(moved * root)) * float(np.sqrt(psi @ psi))
+        error = wrong * max(1.0, float(np.exp(-length * modes.rates[0]))) * float(np.sum(density / modes.scale))
+        error = error / float(density @ (moved / modes.scale))
+        if 0.0 <= error < SHARE * smoothing_tolerance(prepared):
+            break
+    else:
+        return None
+    log_s, between = modes.top - known.logs, element.interpolation
+    return _on(prepared, state, lambda x: (between(x) @ (moved / root)) * np.exp(between(x) @ log_s), top + constant, error)
+
+
+def _by_volumes(
+    prepared: Prepared, later: Message, start: float, length: float, inside: Array, rates: Array, state: State
+) -> Message:
+    """Return the message at the start of an interval by finite volumes."""
+    element, values = state.element, np.asarray(state.values).real
+    ends, sharpest = np.array([0.0, element.upper - element.lower]), float(np.sqrt(later.variance))
+    course = course_of(prepared, values, element, ends, start, length, inside, sharpest)  # type: ignore[arg-type]  # by its points
     shift = element.lower - later.origin
     found = pulled_back(
         prepared, lambda x: later.at(x + shift), lambda x: element.at(values, element.lower + x), course, start, inside, rates
     )
-    window = _window(prepared, element.lower, element.upper)
-    origin, centre, spacing, _, closed, unit = window
     if found is None:
-        return Message(np.zeros(window.size), origin, centre, spacing, unit, closed, spacing, np.inf)
-    worth = found.at(window.offsets - shift)
-    logs = np.log(np.maximum(worth, ROUNDING * np.max(worth))) + found.log_scale
-    new = Message(logs, origin, centre, spacing, unit, closed, spacing, 0.0)
-    kept = float(np.clip(later.variance / np.sqrt(max(before * new.variance, 1e-300)), 0.3, 1.0))
-    return new._replace(error=found.error + kept * later.error)
+        return message(prepared, state)._replace(error=np.inf)
+    worth = found
+    return _on(prepared, state, lambda x: worth.at(x - element.lower), worth.log_scale, worth.error)
+
+
+def _on(prepared: Prepared, state: State, worth: Callable[[Array], Array], log_scale: float, error: float) -> Message:
+    """Return a message by its values, of some scale, where the density is."""
+    window = _window(prepared, float(state.lower), float(state.upper))
+    origin, centre, spacing, _, closed, unit = window
+    values = worth(np.clip(window.points, state.lower, state.upper))
+    logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + log_scale
+    return Message(logs, origin, centre, spacing, unit, closed, spacing, error)
 
 
 @np.errstate(all="ignore")

@@ -30,6 +30,7 @@ Array = Any
 
 SIZES = (24, 32, 48, 64, 96, 128, 192, 256)
 CUT = 36.0  # nats below the maximum where a density ends
+COUNTS = 1e-14  # density relative to the maximum beyond which it is rounding
 EDGE = 1e-12  # density at an end that is not one of the domain, relative to the maximum
 SAMPLES = 1001  # points at which the place of a density is sought
 REACH = 7.2  # standard deviations of the noise by which a density widens
@@ -48,8 +49,8 @@ def element_of(prepared: Prepared, lower: float, upper: float, size: int) -> Ele
     """Return an element with cuts where coefficients have kinks or jumps, except near ends where the density is negligible."""
     if prepared.system.kinks is None:
         return Element(lower, upper, size)
-    apart, width, domain = 2.0 ** np.ceil(np.log2(upper - lower)), upper - lower, domain_of(prepared)
-    low, high = float(apart * np.floor(lower / apart)), float(apart * np.ceil(upper / apart))
+    unit, width, domain = 2.0 ** np.ceil(np.log2(upper - lower)), upper - lower, domain_of(prepared)
+    low, high = float(unit * np.floor(lower / unit)), float(unit * np.ceil(upper / unit))
     known = prepared.once(("kinks", low, high), lambda: kinks_between(prepared, low, high, prepared.model.start).tolist())
     first = lower + width * (BESIDE if lower <= domain.lower else MARGIN)
     last = upper - width * (BESIDE if upper >= domain.upper else MARGIN)
@@ -135,22 +136,20 @@ def _by_modes(
     domain, allowed = domain_of(prepared), max(1e-11, 1e-5 * prepared.tolerance)
     G = covariance_at(prepared.system, element.points, start, prepared.theta).real
     noise = np.sqrt(np.maximum([np.min(G), np.max(G)], 0.0) * length)
-    lower, upper = _apart(element.lower - REACH * noise[1], element.upper + REACH * noise[1], domain)
+    counts = np.flatnonzero((values / element.weights).real > COUNTS * np.max((values / element.weights).real))
+    low, high = element.points[[max(counts[0] - 1, 0), min(counts[-1] + 1, len(values) - 1)]]
+    lower, upper = apart(float(low - REACH * noise[1]), float(high + REACH * noise[1]), domain)
     longest = float(np.max(element_of(prepared, lower, upper, SIZES[0]).halves))
     needed = min(2.0 * PEAK * longest / max(noise[0], 1e-300), element.size * longest / float(np.max(element.halves)))
     size = next((size for size in SIZES if size >= min(needed, SIZES[4])), SIZES[-1])
     for _ in range(ATTEMPTS):
         new, offset = element_of(prepared, lower, upper, size), 0.0
-        known = _decomposed(prepared, new)
+        known = decomposed(prepared, new)
         if known is None:
             return None
         modes, inner = known.modes, _projected(values, element, new, known, negligible)
         if inside.any():
-            h, precision = tables(prepared, new).observation, precision_of(prepared, start, inside)  # type: ignore[arg-type]
-            potential, constant = potential_of(h, precision, rates, modes.scale * inner)
-            offset, _ = offset_of(length * potential, modes.scale * inner)
-            modes = known.weighted(potential - offset / length)
-            offset = offset + length * constant
+            modes, offset = weighted(prepared, known, new, start, length, inside, rates, modes.scale * inner)
         found, error = modes.carried(inner, length)
         if not np.isfinite(found.real).all():
             return None
@@ -166,7 +165,7 @@ def _by_modes(
             return None
         elif left or right:
             width = upper - lower
-            lower, upper = _apart(lower - 0.4 * width * left, upper + 0.4 * width * right, domain)
+            lower, upper = apart(lower - 0.4 * width * left, upper + 0.4 * width * right, domain)
         elif error < allowed and (inside.any() or abs(np.sum(found.real) - 1.0) < 1e-3):
             report.time += error
             return found, new, offset
@@ -175,14 +174,24 @@ def _by_modes(
     return None
 
 
-def _apart(lower: float, upper: float, domain: Interval) -> tuple[float, float]:
+def weighted(
+    prepared: Prepared, known: Operator, element: Element, start: float, length: float, inside: Array, rates: Array, values: Array
+) -> tuple[Spectral, Any]:
+    """Return the modes with the potential of increments, less what is returned as the logarithm of a scale."""
+    h, precision = tables(prepared, element).observation, precision_of(prepared, start, inside)  # type: ignore[arg-type]
+    potential, constant = potential_of(h, precision, rates, values)
+    offset, _ = offset_of(length * potential, values)
+    return known.weighted(potential - offset / length), offset + length * constant
+
+
+def apart(lower: float, upper: float, domain: Interval) -> tuple[float, float]:
     """Return ends out of few that hold two others, so that decompositions serve many times."""
-    apart = 2.0 ** np.floor(np.log2((upper - lower) / 4.0))
-    low, high = apart * np.floor(lower / apart), apart * np.ceil(upper / apart)
+    unit = 2.0 ** np.floor(np.log2((upper - lower) / 4.0))
+    low, high = unit * np.floor(lower / unit), unit * np.ceil(upper / unit)
     return max(float(low), domain.lower), min(float(high), domain.upper)
 
 
-class _Operator(NamedTuple):
+class Operator(NamedTuple):
     """-L as a symmetric operator (N - C, N - C), what it acts on, and its modes.
 
     `gauge` is int f / G, `scale` s W^(1/2) over the exponential of that, `logs` log s (N,); `joined` is that of the element.
@@ -196,7 +205,7 @@ class _Operator(NamedTuple):
     modes: Spectral
 
     @classmethod
-    def of(cls, operator: Array, gauge: Array, scale: Array, logs: Array, joined: Array) -> _Operator:
+    def of(cls, operator: Array, gauge: Array, scale: Array, logs: Array, joined: Array) -> Operator:
         """Return the operator with its modes at the points."""
         modes = Spectral(operator, gauge, scale)
         modes.modes = joined @ modes.modes
@@ -208,15 +217,15 @@ class _Operator(NamedTuple):
         return self.of(operator, self.gauge, self.scale, self.logs, self.joined).modes
 
 
-def _decomposed(prepared: Prepared, element: Element) -> _Operator | None:
+def decomposed(prepared: Prepared, element: Element) -> Operator | None:
     """Return the operator on an element where no coefficient depends on t, None where it has no decomposition."""
-    found: tuple[_Operator | None] = prepared.once(
+    found: tuple[Operator | None] = prepared.once(
         ("modes", element), lambda: (operator_at(prepared, element, prepared.model.start),)
     )
     return found[0]
 
 
-def operator_at(prepared: Prepared, element: Element, t: float) -> _Operator | None:
+def operator_at(prepared: Prepared, element: Element, t: float) -> Operator | None:
     """Return the operator on an element at a time and its decomposition; None where there is none."""
     system, theta, x = prepared.system, prepared.theta, element.points
     G = covariance_at(system, x, np.asarray(t), theta) * np.ones(len(x))
@@ -231,10 +240,10 @@ def operator_at(prepared: Prepared, element: Element, t: float) -> _Operator | N
         return None
     joined = element.joined(logs.real)
     operator = element.symmetric(G, (drift - 0.5 * element.derivative(G)) / G, joined)
-    return _Operator.of(operator, gauge, np.sqrt(element.weights / G), logs, joined)
+    return Operator.of(operator, gauge, np.sqrt(element.weights / G), logs, joined)
 
 
-def _projected(values: Array, element: Element, new: Element, known: _Operator, negligible: float) -> Array:
+def _projected(values: Array, element: Element, new: Element, known: Operator, negligible: float) -> Array:
     """Return a density on some points, divided by s, on those of an operator.
 
     Where the new points do not resolve it, it is its projection, by the quadrature of its own points.
