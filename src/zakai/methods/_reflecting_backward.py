@@ -43,6 +43,7 @@ Array = Any
 
 POINTS = 256  # of a message, on the whole element of the density
 MODES_REACH = 4.0  # standard deviations of the noise around the supports of density and message
+QUADRATURE = 192  # points at which a message is projected onto the modes
 SHARE = 1e-2  # of the tolerance that modes may leave
 ROUNDING = 1e-15  # of the maximum: smaller values of a message are not kept
 
@@ -127,33 +128,45 @@ def _by_modes(
 
         b(start) = U exp(-tau lambda) U' s b(stop) / s
 
-    The error of psi = s b, of rounding and of what is not resolved, counts where the density is.
+    s b is projected onto the modes by the quadrature of its own points.  The error of rounding, and of what is not resolved after
+    the interval, counts where the density is.
     """
     own, values = state.element, np.asarray(state.values).real
     G = covariance_at(prepared.system, own.points, np.asarray(start), prepared.theta.real)
     reach = MODES_REACH * float(np.sqrt(np.max(G) * length))
-    low, high = (later.origin + end for end in later.ends)
-    lower, upper = apart(min(own.lower, low) - reach, max(own.upper, high) + reach, domain_of(prepared))
+    domain = domain_of(prepared)
+    low, high = np.clip([later.origin + end for end in later.ends], domain.lower, domain.upper).tolist()
+    lower, upper = apart(min(own.lower, low) - reach, max(own.upper, high) + reach, domain)
+    after = element_of(prepared, low, high, QUADRATURE)
+    logs = later.at(after.points - later.origin)
+    top, constant = float(np.max(logs)), 0.0
+    weights = after.weights * np.exp(logs - top)
     for size in SIZES[1:]:
         element = element_of(prepared, lower, upper, size)
         known = decomposed(prepared, element)
         if known is None:
             return None
-        logs, density = later.at(element.points - later.origin), own.at(values, element.points) * element.weights
-        top, constant, modes = float(np.max(logs)), 0.0, known.modes
+        density, modes, root = own.at(values, element.points) * element.weights, known.modes, np.sqrt(element.weights)
         if inside.any():
             modes, constant = weighted(prepared, known, element, start, length, inside, rates, density)
-        psi = modes.scale * np.exp(logs - top)
-        moved, root = modes.decayed(psi, length), np.sqrt(element.weights)
-        wrong = max(4e-16, element.unresolved(psi * root), element.unresolved(moved * root)) * float(np.sqrt(psi @ psi))
-        error = wrong * max(1.0, float(np.exp(-length * modes.rates[0]))) * float(np.sum(density / modes.scale))
-        error = error / float(density @ (moved / modes.scale))
+        between = element.interpolation(after.points)
+        psi = (between.T @ (weights * np.exp(between @ known.logs - modes.top))) / root
+        moved = modes.decayed(psi, length)
+        at, log_s, scaled = element.interpolation(own.points), modes.top - known.logs, moved / root
+        own_weights = np.abs(values) * np.exp(at @ log_s)
+        wrong = max(4e-16 * float(np.exp(-length * modes.rates[0])), element.unresolved(moved * root))
+        wrong = wrong * max(float(np.sqrt(psi @ psi)), float(np.max(np.abs(scaled))))
+        error = wrong * float(np.sum(own_weights)) / float(own_weights @ (at @ scaled))
         if 0.0 <= error < SHARE * smoothing_tolerance(prepared):
             break
     else:
         return None
-    log_s, between = modes.top - known.logs, element.interpolation
-    return _on(prepared, state, lambda x: (between(x) @ (moved / root)) * np.exp(between(x) @ log_s), top + constant, error)
+
+    def worth(x: Array) -> Array:
+        at = element.interpolation(x)
+        return (at @ scaled) * np.exp(at @ log_s)
+
+    return _on(prepared, state, worth, top + constant, error)
 
 
 def _by_volumes(
