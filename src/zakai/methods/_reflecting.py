@@ -148,7 +148,7 @@ def _multiplied(
     found = found / mass
     report.depth = float(found.real @ (peak - logarithm(density.real)))
     growth = np.exp(np.minimum(without_nan(likelihood.logs(new.points)).real + peak - top - np.log(mass.real), 80.0))
-    report.growth = float(np.sum(new.weights * growth))
+    report.growth = max(report.growth, 1.0) * float(np.sum(new.weights * growth))
     return found, new, np.log(mass) + top
 
 

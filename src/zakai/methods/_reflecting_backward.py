@@ -148,7 +148,7 @@ def _by_modes(
             return None
         density, modes, root = own.at(values, element.points) * element.weights, known.modes, np.sqrt(element.weights)
         if inside.any():
-            modes, constant = weighted(prepared, known, element, start, length, inside, rates, density)
+            modes, _, constant = weighted(prepared, known, element, start, length, inside, rates, density)
         between = element.interpolation(after.points)
         psi = (between.T @ (weights * np.exp(between @ known.logs - modes.top))) / root
         moved = modes.decayed(psi, length)

@@ -149,13 +149,16 @@ def _by_modes(
             return None
         modes, inner = known.modes, _projected(values, element, new, known, negligible)
         if inside.any():
-            modes, offset = weighted(prepared, known, new, start, length, inside, rates, modes.scale * inner)
+            modes, weight, offset = weighted(prepared, known, new, start, length, inside, rates, modes.scale * inner)
         found, error = modes.carried(inner, length)
         if not np.isfinite(found.real).all():
             return None
-        unresolved = new.unresolved(found)
-        if inside.any():  # increments mix all waves of the density before
-            unresolved = max(unresolved, new.unresolved(modes.scale * inner))
+        unresolved, growth = new.unresolved(found), 0.0
+        if inside.any():  # increments mix all waves of the density before, and may raise errors in its tails
+            before = modes.scale * inner
+            unresolved = max(unresolved, new.unresolved(before))
+            raised = new.weights * np.exp((weight - offset).real) * float(np.max((before / new.weights).real))
+            growth = float(np.sum(raised) / np.sum(found.real))
         coarse = unresolved > negligible
         # Oscillations of what is not resolved reach the ends as well.
         left, right = (float(end) > (unresolved if coarse else EDGE) for end in reached(found, new, domain))
@@ -167,7 +170,8 @@ def _by_modes(
             width = upper - lower
             lower, upper = apart(lower - 0.4 * width * left, upper + 0.4 * width * right, domain)
         elif error < allowed and (inside.any() or abs(np.sum(found.real) - 1.0) < 1e-3):
-            report.time += error
+            report.time, report.growth = report.time + error, growth
+            report.aliasing = max(report.aliasing, unresolved)
             return found, new, offset
         else:
             return None
@@ -176,12 +180,12 @@ def _by_modes(
 
 def weighted(
     prepared: Prepared, known: Operator, element: Element, start: float, length: float, inside: Array, rates: Array, values: Array
-) -> tuple[Spectral, Any]:
-    """Return the modes with the potential of increments, less what is returned as the logarithm of a scale."""
+) -> tuple[Spectral, Array, Any]:
+    """Return the modes with the potential of increments less a number, its integral over time, and that of the number."""
     h, precision = tables(prepared, element).observation, precision_of(prepared, start, inside)  # type: ignore[arg-type]
     potential, constant = potential_of(h, precision, rates, values)
     offset, _ = offset_of(length * potential, values)
-    return known.weighted(potential - offset / length), offset + length * constant
+    return known.weighted(potential - offset / length), length * (potential + constant), offset + length * constant
 
 
 def apart(lower: float, upper: float, domain: Interval) -> tuple[float, float]:

@@ -58,19 +58,20 @@ def interpolation(nodes: Array, weights: Array, points: Array) -> Array:
         weights: the weights of the quadrature (N,).
         points: (J,).
     """
-    breaks = np.flatnonzero(np.diff(nodes) < SAME * (nodes[-1] - nodes[0])) + 1
+    breaks, near = np.flatnonzero(np.diff(nodes) < SAME * (nodes[-1] - nodes[0])) + 1, _NEAR * (nodes[-1] - nodes[0])
     found, piece = np.zeros((len(points), len(nodes))), np.searchsorted(nodes[breaks], points, side="right")
     for j, (first, last) in enumerate(zip([0, *breaks], [*breaks, len(nodes)], strict=True)):
         here = piece == j
         apart = points[here, None] - nodes[first:last]
-        same = apart == 0
+        same = np.abs(apart) <= near
         terms = np.where(same.any(axis=1)[:, None], same, _barycentric(weights[first:last]) / np.where(same, 1.0, apart))
         found[here, first:last] = terms / terms.sum(axis=1)[:, None]
     return found
 
 
 SAME = 1e-9  # distance of two points, relative to the length of all, below which they are the end of two intervals
-_BESIDE = 1e-11  # how far inside of its interval a common end of two lies
+_BESIDE = 1e-12  # how far inside of its interval a common end of two lies
+_NEAR = 1e-10  # distance from a node within which a point is the node: common ends of other intervals lie elsewhere
 
 
 class Element(NamedTuple):
@@ -107,7 +108,8 @@ class Element(NamedTuple):
     @property
     def points(self) -> Array:
         """The points (N,), of which the first and the last are the ends; those at cuts lie beside them."""
-        x, tiny = rule(self.size).points, _BESIDE * (self.upper - self.lower)
+        x = rule(self.size).points
+        tiny = max(_BESIDE * (self.upper - self.lower), 4.0 * float(np.spacing(max(abs(self.lower), abs(self.upper)))))
         low, high = (np.array(ends) for ends in ([self.lower, *self.cuts], [*self.cuts, self.upper]))
         half = self.halves[:, None]
         found = np.where(x < 0, low[:, None] + half * (1.0 + x), high[:, None] - half * (1.0 - x))
