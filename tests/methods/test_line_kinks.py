@@ -102,7 +102,7 @@ def test_increments_of_a_drift_with_jumps_or_kinks(drift, f, bound):
     for count in (800, 1600):
         faces = np.round(np.linspace(-4.0, 4.0, count + 1), 9)  # a face lies at each jump
         zero = [np.zeros_like] * len(times)
-        found = posterior(f, lambda x: -0.5 * (x - 0.1) ** 2 / 0.25, times, zero, faces, 1e-3, 60, potentials)
+        found = posterior(f, lambda x: -0.5 * (x - 0.1) ** 2 / 0.25, times, zero, faces, 1e-3, 200, potentials)
         parts.append(np.concatenate([np.ravel(part) for part in found]))
     exact = parts[1] + (parts[1] - parts[0]) / 3.0
     deviation = np.sqrt(exact[6:12])

@@ -30,6 +30,7 @@ Array = Any
 
 SIZES = (24, 32, 48, 64, 96, 128, 192, 256)
 CUT = 36.0  # nats below the maximum where a density ends
+FLOOR = 1e-11  # Legendre coefficient, relative to the largest, that rounding leaves
 COUNTS = 1e-14  # density relative to the maximum beyond which it is rounding
 EDGE = 1e-12  # density at an end that is not one of the domain, relative to the maximum
 SAMPLES = 1001  # points at which the place of a density is sought
@@ -59,7 +60,7 @@ def element_of(prepared: Prepared, lower: float, upper: float, size: int) -> Ele
 
 def negligible_of(prepared: Prepared, error: float = 0.0) -> float:
     """Return the Legendre coefficient, relative to the largest, that need not be resolved of a density with an error."""
-    return max(prepared.negligible, 1e-5 * prepared.tolerance, 1e-2 * min(error, prepared.tolerance))
+    return max(FLOOR, 1e-5 * prepared.tolerance, 1e-2 * min(error, prepared.tolerance))
 
 
 def without_nan(logs: Array) -> Array:
