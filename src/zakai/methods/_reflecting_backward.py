@@ -14,11 +14,11 @@ from zakai.densities import IntervalDensity
 from zakai.methods import _reflecting
 from zakai.methods._line_backward import accuracy
 from zakai.methods._line_course import course_of
-from zakai.methods._line_message import SURE, Message, points_of
+from zakai.methods._line_message import SURE, Message, points_of, support
 from zakai.methods._line_system import NOISE, Prepared, covariance_at
 from zakai.methods._line_update import factor_at_end
 from zakai.methods._line_volumes import pulled_back
-from zakai.methods._line_way import smoothing_tolerance
+from zakai.methods._line_way import negligible, smoothing_tolerance
 from zakai.methods._protocol import Backward, Info
 from zakai.methods._reflecting import State
 from zakai.methods._reflecting_moves import (
@@ -80,8 +80,8 @@ def _product(prepared: Prepared, state: State, later: Message) -> _Product:
     lower, upper = placed(logs, element.lower, element.upper, domain_of(prepared))
     lower, upper = max(lower, element.lower), min(upper, element.upper)
     top = float(np.max(logs(np.linspace(lower, upper, 4 * element.size))))
-    negligible = negligible_of(prepared, float(state.error) + later.error)
-    new, found = sampled(prepared, lambda x: np.exp(logs(x) - top), lower, upper, negligible)
+    allowed = negligible_of(prepared, float(state.error) + later.error)
+    new, found = sampled(prepared, lambda x: np.exp(logs(x) - top), lower, upper, allowed)
     total = float(np.sum(found))
     return _Product(found / total, new, float(np.log(total)) + top)
 
@@ -99,7 +99,9 @@ def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message,
         "aliasing": element.unresolved(values),
         "std_in_spacings": float(np.sqrt(max(variance, 0.0))) / element.spacing,
     }
-    kept = later._replace(logs=later.logs - log_mass).between(element.lower - later.origin, element.upper - later.origin)
+    density = values / element.weights
+    first, last = element.points[list(support(density, negligible(prepared)))] - later.origin
+    kept = later._replace(logs=later.logs - log_mass).between(float(first), float(last))
     return kept, Info(log_mass, np.array([mean]), np.array([[variance]]), health)
 
 
