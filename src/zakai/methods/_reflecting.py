@@ -23,6 +23,7 @@ from zakai.methods._reflecting_moves import (
     CUT,
     SAMPLES,
     SIZES,
+    SIZES_OF_PRIORS,
     domain_of,
     element_of,
     logarithm,
@@ -92,7 +93,7 @@ def init(prepared: Prepared, prior: Any) -> State:
 
     lower, upper = placed(lambda x: logs(x).real, lower, upper, domain)
     top, negligible = _top(logs, lower, upper), negligible_of(prepared)
-    element, values = sampled(prepared, lambda x: np.exp(without_nan(logs(x)) - top), lower, upper, negligible)
+    element, values = sampled(prepared, lambda x: np.exp(without_nan(logs(x)) - top), lower, upper, negligible, SIZES_OF_PRIORS)
     return State.of(values / np.sum(values), element, max(element.unresolved(values) - negligible, 0.0))
 
 
@@ -206,7 +207,7 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
 def valid(prepared: Prepared, state: State) -> bool:
     """Return whether the parts of a state fit together."""
     values, cuts, domain = np.asarray(state.values), np.asarray(state.cuts), domain_of(prepared)
-    if values.ndim != 1 or cuts.ndim != 1 or len(values) not in [size * (len(cuts) + 1) for size in SIZES]:
+    if values.ndim != 1 or cuts.ndim != 1 or len(values) not in [size * (len(cuts) + 1) for size in SIZES_OF_PRIORS]:
         return False
     ends = np.array([state.lower, *cuts, state.upper], float)
     if not (np.isfinite(values).all() and np.isfinite(ends).all() and np.isfinite(state.error) and (np.diff(ends) > 0).all()):

@@ -29,6 +29,7 @@ from zakai.numerics.lobatto import Element
 Array = Any
 
 SIZES = (24, 32, 48, 64, 96, 128, 192, 256)
+SIZES_OF_PRIORS = (*SIZES, 512, 1024)  # of which no operator is decomposed
 CUT = 36.0  # nats below the maximum where a density ends
 FLOOR = 1e-11  # Legendre coefficient, relative to the largest, that rounding leaves
 COUNTS = 1e-14  # density relative to the maximum beyond which it is rounding
@@ -95,10 +96,15 @@ def with_margin(lower: float, upper: float, domain: Interval) -> tuple[float, fl
 
 
 def sampled(
-    prepared: Prepared, density: Callable[[Array], Array], lower: float, upper: float, negligible: float
+    prepared: Prepared,
+    density: Callable[[Array], Array],
+    lower: float,
+    upper: float,
+    negligible: float,
+    sizes: tuple[int, ...] = SIZES,
 ) -> tuple[Element, Array]:
     """Return the fewest points that resolve a density, and its probabilities there."""
-    for size in SIZES:
+    for size in sizes:
         element = element_of(prepared, lower, upper, size)
         values = density(element.points) * element.weights
         if element.unresolved(values) < negligible:
