@@ -193,46 +193,56 @@ def _extrapolated(below: Array, diagonal: Array, above: Array, values: Array, st
 
     `places` (6, C) are the rows of the operators of each series of Euler steps, -1 where it has no more steps.
     """
-    counts, size = len(_COUNTS), values.shape[0]
-    row, upper = np.empty((counts, size), values.dtype), np.empty((3, size), values.dtype)
-    for j in range(counts):
-        for i in range(size):
-            row[j, i] = values[i]
-        for i in range(places.shape[0]):
-            if places[i, j] >= 0:
-                part = min(places[i, j], diagonal.shape[0] - 1)
-                _solve(below, diagonal, above, part, row, j, step / _COUNTS[j], upper)
-    for k in range(1, counts):
-        for j in range(counts - 1, k - 1, -1):
+    count, size = len(_COUNTS), values.shape[0]
+    row, upper = np.empty((size, count), values.dtype), np.empty((size, 3, count), values.dtype)
+    for i in range(size):
+        for j in range(count):
+            row[i, j] = values[i]
+    for i in range(places.shape[0]):
+        _solve(below, diagonal, above, places[i], row, step, upper)
+    for k in range(1, count):
+        for j in range(count - 1, k - 1, -1):
             share = 1.0 / (_COUNTS[j] / _COUNTS[j - k] - 1.0)
             for i in range(size):
-                row[j, i] += share * (row[j, i] - row[j - 1, i])
-    return row[counts - 1]
+                row[i, j] += share * (row[i, j] - row[i, j - 1])
+    return row[:, count - 1].copy()
 
 
 @helper
-def _solve(below: Array, diagonal: Array, above: Array, k: int, x: Array, j: int, h: float, upper: Array) -> None:
-    """Replace x[j] by the solution of (1 - h L) y = x[j], L with the bands of row k, by elimination with row exchanges.
+def _solve(below: Array, diagonal: Array, above: Array, places: Array, x: Array, step: float, upper: Array) -> None:
+    """Replace x[:, j] by the solutions of (1 - h_j L) y = x[:, j], h_j = step / count, by elimination with row exchanges.
 
-    `upper` (3, N) holds the triangular matrix.
+    L has the bands of row `places[j]`, no solution is wanted where that is negative.  `upper` (N, 3, C) holds the triangular
+    matrices.  The series are solved side by side, since each waits for its divisions.
     """
-    size = x.shape[1]
-    now, right = 1.0 - h * diagonal[k, 0], -h * above[k, 0]
+    size, first, most = x.shape[0], 0, diagonal.shape[0] - 1
+    while places[first] < 0:
+        first += 1
+    now, right = np.empty(len(_COUNTS), x.dtype), np.empty(len(_COUNTS), x.dtype)
+    for j in range(first, len(_COUNTS)):
+        k, h = min(places[j], most), step / _COUNTS[j]
+        now[j], right[j] = 1.0 - h * diagonal[k, 0], -h * above[k, 0]
     for i in range(size - 1):
-        low, mid, high = -h * below[k, i], 1.0 - h * diagonal[k, i + 1], 0.0 * now
-        if i + 2 < size:
-            high = -h * above[k, i + 1]
-        if abs(low.real) > abs(now.real):
-            factor = now / low
-            upper[0, i], upper[1, i], upper[2, i] = low, mid, high
-            now, right = right - factor * mid, -factor * high
-            x[j, i], x[j, i + 1] = x[j, i + 1], x[j, i] - factor * x[j, i + 1]
-        else:
-            factor = low / now
-            upper[0, i], upper[1, i], upper[2, i] = now, right, 0.0 * now
-            now, right = mid - factor * right, high
-            x[j, i + 1] -= factor * x[j, i]
-    x[j, size - 1] /= now
-    x[j, size - 2] = (x[j, size - 2] - upper[1, size - 2] * x[j, size - 1]) / upper[0, size - 2]
+        for j in range(first, len(_COUNTS)):
+            k, h = min(places[j], most), step / _COUNTS[j]
+            low, mid, high = -h * below[k, i], 1.0 - h * diagonal[k, i + 1], 0.0 * now[j]
+            if i + 2 < size:
+                high = -h * above[k, i + 1]
+            if abs(low.real) > abs(now[j].real):
+                inverse = 1.0 / low
+                factor = now[j] * inverse
+                upper[i, 0, j], upper[i, 1, j], upper[i, 2, j] = inverse, mid, high
+                now[j], right[j] = right[j] - factor * mid, -factor * high
+                x[i, j], x[i + 1, j] = x[i + 1, j], x[i, j] - factor * x[i + 1, j]
+            else:
+                inverse = 1.0 / now[j]
+                factor = low * inverse
+                upper[i, 0, j], upper[i, 1, j], upper[i, 2, j] = inverse, right[j], 0.0 * inverse
+                now[j], right[j] = mid - factor * right[j], high
+                x[i + 1, j] -= factor * x[i, j]
+    for j in range(first, len(_COUNTS)):
+        x[size - 1, j] /= now[j]
+        x[size - 2, j] = (x[size - 2, j] - upper[size - 2, 1, j] * x[size - 1, j]) * upper[size - 2, 0, j]
     for i in range(size - 3, -1, -1):
-        x[j, i] = (x[j, i] - upper[1, i] * x[j, i + 1] - upper[2, i] * x[j, i + 2]) / upper[0, i]
+        for j in range(first, len(_COUNTS)):
+            x[i, j] = (x[i, j] - upper[i, 1, j] * x[i + 1, j] - upper[i, 2, j] * x[i + 2, j]) * upper[i, 0, j]
