@@ -117,7 +117,7 @@ class Prepared:
     def divides(self) -> bool:
         """Whether the compiled loop can split the transition into diffusion and a potential."""
         system = self.system
-        smooth = not (system.state_dependent or system.reflecting or system.general or system.rough) and system.slope is not None
+        smooth = not (system.state_dependent or system.general or system.rough) and system.slope is not None
         return smooth and system.cross is None and not (self.model.periodic and not system.samples)
 
     @cached_property
@@ -375,7 +375,7 @@ def _decomposed(prepared: Prepared, window: lw.Window) -> Spectral | None:
     known = tables(prepared, window)
     drift, covariance = known.drift, known.covariance
     system, theta, start = prepared.system, prepared.theta, prepared.model.start
-    if system.moving or system.slope is None or system.spread is None or window.size > lw.LARGEST or system.reflecting:
+    if system.moving or system.slope is None or system.spread is None or window.size > lw.LARGEST:
         return None
     if not (covariance.real > 0).all():
         return None
