@@ -140,12 +140,20 @@ def _rough(formula: sp.Expr, x: sp.Symbol) -> bool:
     return linear or any(part.has(x) for part in formula.atoms(*_KINKS))
 
 
+@lru_cache(maxsize=32)
 def in_pieces(model: Model) -> bool:
-    """Return whether densities are polynomials between ends and kinks: a state that is reflected, or one with kinks in f or G."""
+    """Return whether densities of a state are polynomials between ends and kinks.
+
+    That is where ends reflect, and where f, G, or an h that acts within intervals, has kinks or jumps; but for a continuous f
+    without time between samples, for which a uniform grid is as accurate.
+    """
     if any(interval.reflecting for interval in model.domain.values()):
         return True
-    plain = model.n == 1 and not model.domain and not model.periodic
-    return plain and 0 < len(_roots(model)) <= MOST_PIECES
+    if model.n > 1 or model.domain or model.periodic or not 0 < len(_roots(model)) <= MOST_PIECES:
+        return False
+    f, G, x = model.drift[0], model.covariance[0], model.x[0]
+    steady = model.observation_kind == "samples" and not (f.free_symbols | G.free_symbols) & {model.t, *model.u}
+    return not (steady and _continuous(f, x) and _continuous(G, x) and not _rough(G, x))
 
 
 class System:
