@@ -10,32 +10,7 @@ import numpy as np
 from zakai.densities._density import WeightedPoints, as_states, coordinate_numbers, generator, probabilities, sample_size
 
 _SAME = 1e-9  # distance of two points, relative to the length of all, below which they are the end of two intervals
-_NEAR = 1e-10  # distance from a node within which a point is the node: common ends of other intervals lie elsewhere
 _FINE = 4001  # points between which the distribution function is interpolated
-
-
-def barycentric(weights: np.ndarray) -> np.ndarray:
-    """Return the barycentric weights that belong to those of the quadrature."""
-    return np.asarray((-1.0) ** np.arange(len(weights)) * np.sqrt(weights))
-
-
-def interpolation(nodes: np.ndarray, weights: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the matrix (J, N) from values at nodes to those of the polynomials through them at points (J,).
-
-    Args:
-        nodes: Gauss-Lobatto points (N,), of one interval or of several side by side, whose common ends nearly coincide.
-        weights: the weights of the quadrature (N,).
-        points: (J,).
-    """
-    breaks, near = np.flatnonzero(np.diff(nodes) < _SAME * (nodes[-1] - nodes[0])) + 1, _NEAR * (nodes[-1] - nodes[0])
-    found, piece = np.zeros((len(points), len(nodes))), np.searchsorted(nodes[breaks], points, side="right")
-    for j, (first, last) in enumerate(zip([0, *breaks], [*breaks, len(nodes)], strict=True)):
-        here = piece == j
-        apart = points[here, None] - nodes[first:last]
-        same = np.abs(apart) <= near
-        terms = np.where(same.any(axis=1)[:, None], same, barycentric(weights[first:last]) / np.where(same, 1.0, apart))
-        found[here, first:last] = terms / terms.sum(axis=1)[:, None]
-    return found
 
 
 @dataclass(frozen=True, repr=False)
@@ -66,9 +41,17 @@ class IntervalDensity(WeightedPoints):
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
         at = as_states(x, 1)[..., 0]
+        x, found = at.reshape(-1), np.zeros(at.size)
+        breaks = np.flatnonzero(np.diff(self.nodes) < _SAME * (self.nodes[-1] - self.nodes[0])) + 1
+        piece = np.searchsorted(self.nodes[breaks], x, side="right")
         with np.errstate(divide="ignore", invalid="ignore"):
-            terms = interpolation(self.nodes, self.rule, at.reshape(-1)) @ self.values
-            found = np.log(terms.reshape(at.shape) / np.sum(self.values * self.rule))
+            for j, (first, last) in enumerate(zip([0, *breaks], [*breaks, len(self.nodes)], strict=True)):
+                here, own = piece == j, slice(first, last)
+                apart, scale = x[here, None] - self.nodes[own], (-1.0) ** np.arange(last - first) * np.sqrt(self.rule[own])
+                same = apart == 0
+                terms = np.where(same.any(axis=1)[:, None], same, scale / np.where(same, 1.0, apart))
+                found[here] = (terms @ self.values[own]) / terms.sum(axis=1)
+            found = np.log(found.reshape(at.shape) / np.sum(self.values * self.rule))
         inside = (at >= self.nodes[0]) & (at <= self.nodes[-1]) & ~np.isnan(found)
         return np.where(inside, found, -np.inf)
 

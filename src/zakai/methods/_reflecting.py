@@ -19,7 +19,7 @@ from zakai.methods._line_moves import Report
 from zakai.methods._line_system import NOISE, Prepared, outside_tables
 from zakai.methods._line_update import factor_at_end
 from zakai.methods._protocol import Info
-from zakai.methods._reflecting_moves import (
+from zakai.methods._reflecting_elements import (
     CUT,
     SAMPLES,
     SIZES,
@@ -30,12 +30,12 @@ from zakai.methods._reflecting_moves import (
     moments,
     negligible_of,
     placed,
-    propagated,
     sampled,
     support,
     with_margin,
     without_nan,
 )
+from zakai.methods._reflecting_moves import propagated
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior, GaussianPrior
 from zakai.numerics.line_posterior import General, Likelihood, place

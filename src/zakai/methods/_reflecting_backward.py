@@ -21,7 +21,7 @@ from zakai.methods._line_volumes import pulled_back
 from zakai.methods._line_way import negligible, smoothing_tolerance
 from zakai.methods._protocol import Backward, Info
 from zakai.methods._reflecting import State
-from zakai.methods._reflecting_moves import (
+from zakai.methods._reflecting_elements import (
     SIZES,
     apart,
     decomposed,

@@ -14,8 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.densities.interval import barycentric, interpolation
-
 Array = NDArray[Any]
 
 
@@ -37,7 +35,7 @@ def rule(size: int) -> Rule:
         x = x - (x * values[:, -1] - values[:, -2]) / (size * values[:, -1])
     values = np.polynomial.legendre.legvander(x, size - 1)
     weights = 2.0 / (size * (size - 1) * values[:, -1] ** 2)
-    signs = barycentric(weights)
+    signs = _barycentric(weights)
     apart = x[:, None] - x
     derivative = (signs / signs[:, None]) / np.where(apart == 0, 1.0, apart)
     np.fill_diagonal(derivative, 0.0)
@@ -47,6 +45,32 @@ def rule(size: int) -> Rule:
     return Rule(x, weights, derivative, values.T * weights / norms[:, None])
 
 
+def _barycentric(weights: Array) -> Array:
+    """Return the barycentric weights that belong to those of the quadrature."""
+    return np.asarray((-1.0) ** np.arange(len(weights)) * np.sqrt(weights))
+
+
+def interpolation(nodes: Array, weights: Array, points: Array) -> Array:
+    """Return the matrix (J, N) from values at nodes to those of the polynomials through them at points (J,).
+
+    Args:
+        nodes: Gauss-Lobatto points (N,), of one interval or of several side by side, whose common ends nearly coincide.
+        weights: the weights of the quadrature (N,).
+        points: (J,).
+    """
+    breaks, near = np.flatnonzero(np.diff(nodes) < _SAME * (nodes[-1] - nodes[0])) + 1, _NEAR * (nodes[-1] - nodes[0])
+    found, piece = np.zeros((len(points), len(nodes))), np.searchsorted(nodes[breaks], points, side="right")
+    for j, (first, last) in enumerate(zip([0, *breaks], [*breaks, len(nodes)], strict=True)):
+        here = piece == j
+        apart = points[here, None] - nodes[first:last]
+        same = np.abs(apart) <= near
+        terms = np.where(same.any(axis=1)[:, None], same, _barycentric(weights[first:last]) / np.where(same, 1.0, apart))
+        found[here, first:last] = terms / terms.sum(axis=1)[:, None]
+    return found
+
+
+_SAME = 1e-9  # distance of two points, relative to the length of all, below which they are the end of two intervals
+_NEAR = 1e-10  # distance from a node within which a point is the node: common ends of other intervals lie elsewhere
 _BESIDE = 1e-12  # how far inside of its interval a common end of two lies
 
 
