@@ -35,6 +35,7 @@ def exact(f, h, noise, values):
         ("-x", lambda x: -x, "max(x, 1/10)", lambda x: np.maximum(x, 0.1), 0.05),
         ("sin(x)", np.sin, "abs(x - 3/10)", lambda x: np.abs(x - 0.3), 0.05),
         ("-abs(x)*x", lambda x: -np.abs(x) * x, "x", lambda x: x, 0.2),
+        ("-3*sign(x)", lambda x: -3.0 * np.sign(np.round(x, 9)), "x", lambda x: x, 0.2),
         ("1/2 - x - abs(x)", lambda x: 0.5 - x - np.abs(x), "abs(x)", np.abs, 0.1),
     ],
 )
@@ -47,6 +48,9 @@ def test_kinks_are_as_accurate_as_smooth_functions(drift, f, observation, h, noi
     assert np.max(errors) < 2e-5
     assert result.log_likelihood == pytest.approx(log_likelihood, abs=4e-5)
     assert np.max(errors) < 10.0 * np.nanmax(result.health["error_estimate"]) + 1e-5
+    if "sign" in drift:
+        assert np.nanmax(result.health["error_estimate"]) < 1e-6 and not result.warnings
+        assert np.nanmax(zakai.smooth(model, record, "yau-yau").health["evidence_error"]) < 1e-6
 
 
 FLAT = {
