@@ -1,4 +1,4 @@
-"""One state with reflecting ends: the equation of `_line` on Gauss-Lobatto points, without flux at the ends.
+"""One state with reflecting ends, kinks or jumps: the equation of `_line` on Gauss-Lobatto points between these.
 
     u_t = G u'' / 2 - (f u)' + (h'S^-1 dy/dt - h'S^-1 h / 2) u,      (G u)' / 2 - f u = 0 where the state is reflected
 

@@ -1,4 +1,4 @@
-"""The backward pass for one state between reflecting ends: the message on a uniform grid, the smoothed density on elements.
+"""The backward pass for one state between ends and kinks: the message on a uniform grid, the smoothed density on elements.
 
 The modes of the operator take a message back over an interval, and finite volumes where these do not serve.
 """

@@ -1,4 +1,4 @@
-"""How a density between reflecting ends moves over an interval: by modes on Gauss-Lobatto points, or by finite volumes.
+"""How a density between ends and kinks moves over an interval: by modes on Gauss-Lobatto points, or by finite volumes.
 
 The modes of the symmetric operator serve every interval in which no coefficient depends on t and no increment acts:
 

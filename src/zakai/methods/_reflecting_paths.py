@@ -1,4 +1,4 @@
-"""Draws of a state between reflecting ends at the start of an interval given that at its end.
+"""Draws of a state between ends and kinks at the start of an interval given that at its end.
 
     x ~ p(x) T(x, z),      T(x, z) = s(z) / s(x) sum_j psi_j(x) psi_j(z) exp(-tau lambda_j)
 
