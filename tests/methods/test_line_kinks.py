@@ -131,3 +131,13 @@ def test_a_tank_that_empties_through_a_hole_is_filtered_like_one_with_a_smooth_l
     # The level stays 10 deviations above zero.
     assert np.abs((kinked.mean - smooth.mean) / np.sqrt(smooth.variance)).max() < 1e-3
     assert np.nanmax(kinked.health["error_estimate"]) < 1e-4
+
+
+@pytest.mark.parametrize("diffusion", ["1 + sin(3*t)/2", "1 + sin(3*t)/1000"])
+def test_a_kink_in_h_leaves_the_mass_of_a_prediction_with_a_diffusion_of_t(diffusion):
+    model = zakai.Model(
+        state=["x"], drift=["-x"], diffusion=[[diffusion]], observation=["abs(x + 1)"], observation_kind="samples",
+        observation_noise=[["0.01"]], prior={"kind": "gaussian", "mean": [0.5], "cov": [[0.3]]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record([0.05, 0.85], [0.15, np.nan], "samples"), "yau-yau")
+    assert abs(result.log_likelihood_increments[2]) < 1e-6 and not result.warnings

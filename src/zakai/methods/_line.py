@@ -35,6 +35,7 @@ from zakai.methods._line_system import (
     edge_of_moments,
     figures,
     outside_tables,
+    refitted,
     resampled,
     state_moments,
 )
@@ -225,8 +226,8 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
         found = None if kernel is None else by_kernel(prepared, values, window, start, length, kernel, report)
         if found is None:
             if prepared.gaussian:  # the grids of kernels are finer
-                new = lw.fitted(lw.figures(values, window.closed, prepared.negligible), window, lw.LARGEST, prepared.generous)
-                values, window = lw.resampled(values, window, new), new
+                look = lw.figures(values, window.closed, prepared.negligible)
+                values, window = refitted(prepared, values, window, look, prepared.generous)
             report.positive = False
             interval = start, length, inside, rates, report
             if not prepared.system.varying and not inside.any():

@@ -11,7 +11,7 @@ import numpy as np
 
 from zakai.methods._line_coarse import EDGE, coarsened
 from zakai.methods._line_coefficients import coefficients, offset_of, potential_of, precision_of, resolved_parts
-from zakai.methods._line_system import Prepared, spectral, tables
+from zakai.methods._line_system import Prepared, refitted, spectral, tables
 from zakai.methods._line_yau import moved
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel
@@ -183,10 +183,11 @@ def by_substeps(
             else:
                 middle = first + (last - first) * (0.25 if last - first > 1e-3 * length else 0.0625)
                 stack += [(middle, last), (first, middle)]
-            new = lw.fitted(lw.figures(values, window.closed, negligible), window)
-            values, window = lw.resampled(values, window, new), new
+            values, window = refitted(prepared, values, window, lw.figures(values, window.closed, negligible))
             continue
         assert look is not None
+        if prepared.smoothing and stack:  # what a kink leaves everywhere
+            look = look._replace(aliasing=0.0, left=0.0, right=0.0)
         report.density(look)
         if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
             brought = lw.figures(values, window.closed, negligible).aliasing
@@ -197,8 +198,7 @@ def by_substeps(
         values = values / mass
         gained = gained + np.log(mass) + attempt.offset
         if stack:
-            new = lw.fitted(look, window)
-            values, window = lw.resampled(values, window, new), new
+            values, window = refitted(prepared, values, window, look)
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
     return Moved(values, window, gained, look)

@@ -143,6 +143,11 @@ class Prepared:
         return kinked and not self.model.periodic and not np.iscomplexobj(self.theta)
 
     @property
+    def smoothing(self) -> bool:
+        """Whether all kinks are those of likelihoods: a transition smooths them, and a finer grid has no more of them."""
+        return self.weak and not self.system.rough
+
+    @property
     def kinked(self) -> bool:
         """Whether densities have kinks."""
         return self.weak or self.system.kinked_drift
@@ -280,6 +285,26 @@ def figures(prepared: Prepared, values: Array, window: lw.Window) -> lw.Figures:
         first, last = support(np.ascontiguousarray(values.real), max(prepared.cut, noise))
         look = look._replace(first=first, last=last)
     return look._replace(resolving=1.0) if prepared.weak else look
+
+
+def refitted(
+    prepared: Prepared, values: Array, window: lw.Window, look: lw.Figures, generous: int = 64
+) -> tuple[Array, lw.Window]:
+    """Return a density on the grid for its next substep, and this grid.
+
+    Args:
+        prepared: what is known without data.
+        values: probabilities (N,).
+        window: their grid.
+        look: figures of the density by its spectrum.
+        generous: a grid of up to so many points is kept though fewer would do.
+    """
+    if not prepared.smoothing:
+        new = lw.fitted(look, window, lw.LARGEST, generous)
+        return lw.resampled(values, window, new), new
+    new = lw.fitted(look._replace(resolving=1.0), window, lw.LARGEST, generous)
+    moved = resampled(prepared, values, window, new)
+    return moved / np.sum(moved), new
 
 
 class Tables(NamedTuple):
