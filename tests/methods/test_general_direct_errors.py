@@ -304,3 +304,24 @@ def test_the_error_falls_with_the_number_of_slots():
         # A mode that was dropped decides about a single path.
         errors.append(np.median(away))
     assert errors[0] >= 1.5 * errors[1] >= 2.25 * errors[2]
+
+
+def test_the_error_at_a_kink_of_a_sample_is_reported():
+    """Both sums lose the shape of the same products, so that their distance is far below the error."""
+    values = np.array([0.6, 0.48, 1.1, 0.45, 0.5, 0.9, 0.4, 0.55])
+    times, variance = np.cumsum([0.2, 0.5, 1.5, 1.5, 0.05, 0.05, 1.5, 0.05]), 0.01
+    model = zakai.Model(
+        state=["x"], drift=["-x/2"], observation=["max(x, 1/2)"], observation_kind="samples", observation_noise=[[variance]],
+        prior={"kind": "gaussian", "mean": [0.3], "cov": [[1.0]]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record(times, values, "samples"), "general-direct")
+    x = np.linspace(-6.0, 6.0, 2401)
+    p, last, log_likelihood = np.exp(-0.5 * (x - 0.3) ** 2), 0.0, 0.0
+    for time, value in zip(times, values, strict=True):
+        decay, last = np.exp(-0.5 * (time - last)), time
+        p = np.exp(-0.5 * (x[:, None] - decay * x) ** 2 / (1.0 - decay**2)) @ (p / p.sum())
+        p = p / p.sum() * np.exp(-0.5 * (value - np.maximum(x, 0.5)) ** 2 / variance) / np.sqrt(2 * np.pi * variance)
+        log_likelihood += np.log(p.sum())
+    error = abs(result.log_likelihood - log_likelihood)
+    assert error > 0.04 and result.warnings
+    assert error < 4.0 * np.nanmax(result.health["evidence_error"])
