@@ -141,3 +141,24 @@ def test_a_kink_in_h_leaves_the_mass_of_a_prediction_with_a_diffusion_of_t(diffu
     )  # fmt: skip
     result = zakai.filter(model, zakai.Record([0.05, 0.85], [0.15, np.nan], "samples"), "yau-yau")
     assert abs(result.log_likelihood_increments[2]) < 1e-6 and not result.warnings
+
+
+@pytest.mark.parametrize("method", ["limited-direct", "yau-yau"])
+def test_a_jump_of_a_likelihood_that_no_grid_resolves_does_not_widen_the_grid(method):
+    times = np.cumsum(np.tile([0.09, 0.05, 0.16, 0.3, 0.6], 5))
+    values = np.tile([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0], 4)[: len(times)]
+    model = zakai.Model(
+        state=["x"], drift=["-x/2"], observation=["1/10 + 4/5*heaviside(x - 3/10)"], observation_kind="samples",
+        observation_family="bernoulli", prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record(times, values, "samples"), method)
+    x = np.arange(-7.995, 8.0, 0.01)  # 3/10 lies between two points
+    p, last = np.exp(-0.5 * x**2), 0.0
+    for k, (time, value) in enumerate(zip(times, values, strict=True), 1):
+        decay, last = np.exp(-0.5 * (time - last)), time
+        kernel = np.exp(-0.5 * (x[:, None] - decay * x) ** 2 / (1.0 - decay**2))
+        p = kernel @ (p / p.sum()) * np.abs(1.0 - value - np.where(x > 0.3, 0.9, 0.1))
+        p = p / p.sum()
+        deviation = np.sqrt(p @ (x - p @ x) ** 2)
+        assert abs(result.mean[k, 0] - p @ x) < 0.03 * deviation
+        assert abs(np.sqrt(result.variance[k, 0]) / deviation - 1.0) < 0.03

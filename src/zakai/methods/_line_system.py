@@ -28,6 +28,7 @@ NOISE = 3e-15  # error of a density relative to its maximum, which matters in it
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
 FINEST = 1024  # points of the largest grid for Gaussian kernels and splitting
+UNRESOLVED = 1e-6  # spectrum at the highest frequencies from which waves around a density hide where it ends
 KEPT_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are kept for a model
 
 
@@ -276,11 +277,11 @@ def resampled(prepared: Prepared, values: Array, window: lw.Window, new: lw.Wind
 def figures(prepared: Prepared, values: Array, window: lw.Window) -> lw.Figures:
     """Return the figures of a density.
 
-    The spectrum of kinks does not tell where a density ends.  Of those of likelihoods a coarser grid would fold it, and a finer
-    one has no more of it.
+    A spectrum that falls slowly, of kinks and of what the largest grid does not resolve, does not tell where a density ends.  Of
+    kinks of likelihoods a coarser grid would fold it, and a finer one has no more of it.
     """
     look = lw.figures(values, window.closed, prepared.negligible, prepared.cut)
-    if prepared.kinked:
+    if prepared.kinked or look.aliasing > UNRESOLVED:
         noise = 0.0 if prepared.weak else 1e-2 * look.aliasing  # of waves that the transition leaves everywhere
         first, last = support(np.ascontiguousarray(values.real), max(prepared.cut, noise))
         look = look._replace(first=first, last=last)
