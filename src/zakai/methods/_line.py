@@ -22,44 +22,29 @@ from zakai.errors import InputError
 from zakai.methods import _line_loop as loop
 from zakai.methods._line_cross import OMITTED
 from zakai.methods._line_domain import on_the_line, variable_of
+from zakai.methods._line_figures import edge_of_moments, figures, outside_tables, refitted, resampled, state_moments
 from zakai.methods._line_grids import SHARED
 from zakai.methods._line_model import system_of
 from zakai.methods._line_moves import Report, by_decomposition, by_kernel, by_substeps
 from zakai.methods._line_parts import segment_of_parts
-from zakai.methods._line_prior import averaged
-from zakai.methods._line_system import (
-    NOISE,
-    Prepared,
-    State,
-    covariance_at,
-    edge_of_moments,
-    figures,
-    outside_tables,
-    refitted,
-    resampled,
-    state_moments,
-)
+from zakai.methods._line_prior import init as init
+from zakai.methods._line_prior import state_of
+from zakai.methods._line_system import NOISE, Prepared, State
+from zakai.methods._line_tables import covariance_at
 from zakai.methods._line_update import exponential_factor, factor_at_end, sampled_weakly
 from zakai.methods._line_volumes import contracted
 from zakai.methods._protocol import Info, Infos
 from zakai.methods._states import Joined
 from zakai.models.model import Model
-from zakai.models.numeric import numpy_function
-from zakai.models.prior import DensityPrior, GaussianPrior
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel, around, chosen
 from zakai.numerics.line_density import separated
 from zakai.numerics.line_posterior import General, Likelihood, multiplied
 from zakai.numerics.line_segment import RELIABLE
-from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 from zakai.records.schedule import Schedule
 
 Array = Any
-# The smallest value that counts of a prior with natural ends, relative to the largest: farther out, rounding in the transition
-# exceeds the mass, since the coefficients of the variable w grow exponentially.
-CUT_OF_DOMAIN = 1e-8
 
-SMOOTH = 1e-6  # spectrum at the end of that of a prior beyond which it is averaged around the grid points
 SLOW = 1e-2  # of the tolerance: the spectrum that need not be resolved where f has kinks
 SLOW_GENEROUS = 256  # points of a grid that is kept though fewer would do
 GENEROUS = 96  # points of a grid that is kept though fewer would do
@@ -86,78 +71,6 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
         found.generous = SLOW_GENEROUS
     found.notes = (OMITTED,) if system.cross is not None and (schedule.seen & ~inside).any() else ()
     return found
-
-
-def init(prepared: Prepared, prior: Any) -> State:
-    """Return the prior on a grid that fits it."""
-    model, closed, variable = prepared.model, bool(prepared.model.periodic), variable_of(prepared.model)
-    if isinstance(prior, DensityPrior):
-        function, log_density = numpy_function([prior.log_density], model, (1,)), None
-
-        def evaluate(points: Array) -> Array:
-            return function(points if variable is None else variable.x(points), model.start, prepared.theta)[..., 0]
-
-    else:
-        if isinstance(prior, GaussianPrior):
-            weights, means, covs = np.ones(1), prior.mean[None], prior.cov[None]
-        else:
-            weights, means, covs = prior.weights, prior.means, prior.covs
-        deviations = np.sqrt(covs[:, 0, 0])
-        if np.any(deviations <= 1e-14 * np.abs(means[:, 0])):
-            raise InputError("prior: a variance is zero; a grid needs a density, so give it a small variance")
-        log_density = mixture_log_density(weights, means, covs, [closed])
-        if variable is not None:
-            mixture, log_density = log_density, None
-
-            def evaluate(points: Array) -> Array:
-                return mixture(np.array([variable.end]), variable.offset(points))
-
-    if variable is not None:
-        of_state = evaluate
-
-        def evaluate(points: Array) -> Array:
-            with np.errstate(all="ignore"):
-                return of_state(points) + variable.log_slope(points)[..., 0]
-
-    cut = lw.CUT if variable is None else CUT_OF_DOMAIN
-    if log_density is None:
-        tolerance = 1e-12 if variable is None else cut
-        grid = prior_grid(lambda points: evaluate(points).real, 1, [closed], tolerance=tolerance)
-        low, high = (float(grid.points[i, 0]) for i in (0, -1))
-        # Rather too coarse than without a part of the mass.
-        spacing = max(float(grid.basis[0, 0]), (high - low) / (lw.SIZES[-1] - 2 * lw.ALIGNMENT))
-    else:
-        depth = float(np.sqrt(-2.0 * np.log(cut))) + 0.1
-        low, high = float(np.min(means[:, 0] - depth * deviations)), float(np.max(means[:, 0] + depth * deviations))
-        spacing = float(deviations.min()) / 3.0
-    if closed:
-        size = lw.size_for(2 * np.pi / min(spacing * 0.95, 2 * np.pi / 64))
-        window = lw.Window(0.0, 0.0, 2 * np.pi / size, size, True, 1.0)
-    else:
-        origin = 0.5 * (low + high)
-        window = lw.Window(origin, 0.0, spacing, 0, False, spacing)
-        window = lw.quantized(window, low - origin, high - origin, spacing, margin=0.0, most=lw.SIZES[-1])
-    for attempt in range(8):
-        if log_density is None:
-            points = window.points[:, None]
-            logs = evaluate(np.pi - np.mod(np.pi - points, 2 * np.pi) if closed else points)
-            logs = np.where(np.isnan(logs.real), -np.inf, logs)
-        else:
-            logs = log_density(np.array([window.origin]), window.offsets[:, None])
-        values = np.exp(logs - np.max(logs.real))
-        values = values / np.sum(values)
-        look = lw.figures(values, closed, cut=cut)
-        new = lw.fitted(look, window, lw.SIZES[-1])
-        if new == window or attempt == 7:  # the values belong to this window
-            break
-        window = new
-    if log_density is None and not closed and look.aliasing > SMOOTH:
-        values = averaged(evaluate, window)
-    return _state(values, window, max(0.0, look.aliasing - 1e-12), -700.0)
-
-
-def _state(values: Array, window: lw.Window, error: float, log_floor: float) -> State:
-    return State(values, window.origin, window.centre, window.spacing, window.unit, window.closed, error, log_floor)
 
 
 def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
@@ -296,7 +209,7 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
     if window.closed:
         mean = mean - 2 * np.pi * np.ceil((mean.real - np.pi) / (2 * np.pi))
     log_floor = min(log_floor + max(report.depth - 1.0, 0.0), 0.0)
-    return _state(moved, new, float(error), log_floor), Info(gained, np.array([mean]), np.array([[variance]]), health)
+    return state_of(moved, new, float(error), log_floor), Info(gained, np.array([mean]), np.array([[variance]]), health)
 
 
 def kernel_of(prepared: Prepared, k: int, window: lw.Window, rates: np.ndarray, report: Report) -> Channel | None:

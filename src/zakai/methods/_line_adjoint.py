@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zakai.methods._line_figures import state_moments
 from zakai.methods._line_gauge import Gauge, gauge_of
 from zakai.methods._line_grids import grid_of
 from zakai.methods._line_loop import TOGETHER
 from zakai.methods._line_message import LOWEST, PAD, SURE, Message, support, taper
-from zakai.methods._line_system import Prepared, State, covariance_at, state_moments
+from zakai.methods._line_system import Prepared, State
+from zakai.methods._line_tables import covariance_at
 from zakai.methods._line_update import factor_at_end
 from zakai.methods._line_way import negligible, smoothing_tolerance
 from zakai.methods._protocol import Infos

@@ -17,11 +17,12 @@ import numpy as np
 from zakai.densities import Density
 from zakai.methods import _line
 from zakai.methods._line_adjoint import back
+from zakai.methods._line_figures import state_moments
 from zakai.methods._line_loop import joined
 from zakai.methods._line_message import Message, points_of, reliable, support
 from zakai.methods._line_parts import cut
 from zakai.methods._line_paths import draw
-from zakai.methods._line_system import Prepared, State, state_moments
+from zakai.methods._line_system import Prepared, State
 from zakai.methods._line_update import exponential_factor, factor_at_end
 from zakai.methods._line_way import Way, negligible, smoothing_tolerance
 from zakai.methods._protocol import Backward, Info, Infos

@@ -15,7 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from zakai.methods._line_system import Prepared, covariance_at, figures, spectral
+from zakai.methods._line_figures import figures
+from zakai.methods._line_system import Prepared
+from zakai.methods._line_tables import covariance_at, spectral
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from zakai.methods._line_cross import with_cross_noise
 from zakai.methods._line_model import within
-from zakai.methods._line_system import Prepared, covariance_at, drift_at, finite, tables
+from zakai.methods._line_system import Prepared
+from zakai.methods._line_tables import covariance_at, drift_at, finite, tables
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_panels import Panels, panels
 

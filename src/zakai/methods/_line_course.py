@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.methods._line_coefficients import resolved_parts
-from zakai.methods._line_system import Prepared, covariance_at, finite
+from zakai.methods._line_system import Prepared
+from zakai.methods._line_tables import covariance_at, finite
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_panels import Panels
 from zakai.numerics.line_volumes import Volumes, ends_of_steps, volumes

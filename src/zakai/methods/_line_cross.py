@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from zakai.methods._line_system import Prepared, finite
+from zakai.methods._line_system import Prepared
+from zakai.methods._line_tables import finite
 from zakai.numerics import line_window as lw
 
 Array = Any

@@ -14,7 +14,8 @@ import numpy as np
 from scipy.special import erfc, erfcx
 
 from zakai.methods._line_message import FALL, HALF, PAD
-from zakai.methods._line_system import Prepared, covariance_at, covariance_between, drift_at, finite
+from zakai.methods._line_system import Prepared
+from zakai.methods._line_tables import covariance_at, covariance_between, drift_at, finite
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_operator import Spectral, derivatives, symmetric
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from zakai.methods._line_steps import parts_needed, probed
-from zakai.methods._line_system import Prepared, spectral, tables
+from zakai.methods._line_system import Prepared
+from zakai.methods._line_tables import spectral, tables
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_panels import GAUSS_NODES
 from zakai.numerics.line_segment import MARGIN, Grid

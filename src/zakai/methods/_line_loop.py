@@ -11,18 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zakai.methods._line_figures import edge_of_moments, figures, outside_tables, resampled, state_moments
 from zakai.methods._line_grids import grid_of, known
-from zakai.methods._line_system import (
-    FINEST,
-    Prepared,
-    State,
-    edge_of_moments,
-    figures,
-    outside_tables,
-    resampled,
-    state_moments,
-    tables,
-)
+from zakai.methods._line_system import FINEST, Prepared, State
+from zakai.methods._line_tables import tables
 from zakai.methods._protocol import Info, Infos
 from zakai.methods._states import Joined, StackedStates
 from zakai.numerics import line_window as lw

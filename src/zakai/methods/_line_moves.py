@@ -11,7 +11,9 @@ import numpy as np
 
 from zakai.methods._line_coarse import EDGE, coarsened
 from zakai.methods._line_coefficients import coefficients, offset_of, potential_of, precision_of, resolved_parts
-from zakai.methods._line_system import Prepared, refitted, spectral, tables
+from zakai.methods._line_figures import refitted
+from zakai.methods._line_system import Prepared
+from zakai.methods._line_tables import spectral, tables
 from zakai.methods._line_yau import moved
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel

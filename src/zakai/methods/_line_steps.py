@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from zakai.methods._line_system import Coefficients, Prepared, finite
+from zakai.methods._line_system import Coefficients, Prepared
+from zakai.methods._line_tables import finite
 from zakai.models.prior import GaussianPrior
 from zakai.numerics.line_filters import kernel_size
 from zakai.numerics.line_panels import GAUSS_NODES, interpolation

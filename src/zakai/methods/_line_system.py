@@ -9,17 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods._line_domain import variable_of
 from zakai.methods._line_model import System
 from zakai.methods._line_yau import Kernels, YauLine
 from zakai.methods._series_kernel import PowerSeries
 from zakai.models.model import Model
 from zakai.numerics import line_window as lw
-from zakai.numerics.line_density import support
-from zakai.numerics.line_operator import Spectral, symmetric
-from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line_segment import Limits, Mechanisms, Steps
-from zakai.numerics.line_weak import PARTS, at_nodes, nodes, weak
 from zakai.records.schedule import Schedule
 
 Array = Any
@@ -28,7 +23,6 @@ NOISE = 3e-15  # error of a density relative to its maximum, which matters in it
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
 FINEST = 1024  # points of the largest grid for Gaussian kernels and splitting
-UNRESOLVED = 1e-6  # spectrum at the highest frequencies from which waves around a density hide where it ends
 KEPT_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are kept for a model
 
 
@@ -263,171 +257,3 @@ class Parts(NamedTuple):
 
     prepared: Prepared
     first: Array
-
-
-def resampled(prepared: Prepared, values: Array, window: lw.Window, new: lw.Window) -> Array:
-    """Return probabilities on another grid, in the weak sense on a coarser one where densities have kinks."""
-    if not prepared.weak or new.spacing <= window.spacing:
-        return lw.resampled(values, window, new)
-    density = at_nodes(lw.density_at(values, window, nodes(new.offsets, new.spacing)))
-    found = weak(density, new.spacing)[0] * (new.spacing / window.spacing)
-    return np.where(found > 0, found, 0.0)
-
-
-def figures(prepared: Prepared, values: Array, window: lw.Window) -> lw.Figures:
-    """Return the figures of a density.
-
-    A spectrum that falls slowly, of kinks and of what the largest grid does not resolve, does not tell where a density ends.  Of
-    kinks of likelihoods a coarser grid would fold it, and a finer one has no more of it.
-    """
-    look = lw.figures(values, window.closed, prepared.negligible, prepared.cut)
-    if prepared.kinked or look.aliasing > UNRESOLVED:
-        noise = 0.0 if prepared.weak else 1e-2 * look.aliasing  # of waves that the transition leaves everywhere
-        first, last = support(np.ascontiguousarray(values.real), max(prepared.cut, noise))
-        look = look._replace(first=first, last=last)
-    return look._replace(resolving=1.0) if prepared.weak else look
-
-
-def refitted(
-    prepared: Prepared, values: Array, window: lw.Window, look: lw.Figures, generous: int = 64
-) -> tuple[Array, lw.Window]:
-    """Return a density on the grid for its next substep, and this grid.
-
-    Args:
-        prepared: what is known without data.
-        values: probabilities (N,).
-        window: their grid.
-        look: figures of the density by its spectrum.
-        generous: a grid of up to so many points is kept though fewer would do.
-    """
-    if not prepared.smoothing:
-        new = lw.fitted(look, window, lw.LARGEST, generous)
-        return lw.resampled(values, window, new), new
-    new = lw.fitted(look._replace(resolving=1.0), window, lw.LARGEST, generous)
-    moved = resampled(prepared, values, window, new)
-    return moved / np.sum(moved), new
-
-
-class Tables(NamedTuple):
-    """f and h at the points of a grid where they do not depend on t: (N,), (m, N); and G, (N,) where it depends on x."""
-
-    drift: Array
-    observation: Array
-    covariance: Any
-
-
-def outside_tables(prepared: Prepared, values: Array, window: lw.Window, t: float) -> float:
-    """Return the share of the mass where a table is constant beyond its range."""
-    return float(values.real @ prepared.system.outside(window.points, t, prepared.theta) / np.sum(values.real))
-
-
-def state_moments(prepared: Prepared, values: Array, window: lw.Window, mean: Any, variance: Any) -> tuple[Any, Any]:
-    """Return the mean and variance of the state from those of the variable of the grid, relative to its origin."""
-    variable = variable_of(prepared.model)
-    if variable is None:
-        return window.origin + mean, variance
-    offsets = variable.offset(window.points)
-    mean = offsets @ values
-    apart = offsets - mean
-    return variable.end + mean, (apart * apart) @ values
-
-
-def edge_of_moments(prepared: Prepared, values: Array, window: lw.Window) -> float:
-    """Return the share of the second moment of the state at the ends of the grid, where the state has a domain."""
-    variable = variable_of(prepared.model)
-    if variable is None:
-        return 0.0
-    offsets = variable.offset(window.points)
-    parts = (offsets - offsets[int(np.argmax(values.real))]) ** 2 * values.real
-    return float(max(parts[0], parts[-1]) / np.sum(parts))
-
-
-def finite(values: Array) -> Array:
-    """Return the values with zero where a formula has no value."""
-    return np.where(np.isfinite(values.real), values, 0.0)
-
-
-def tables(prepared: Prepared, window: lw.Window) -> Tables:
-    """Return the tables of a grid."""
-    system, theta, start = prepared.system, prepared.theta, prepared.model.start
-
-    def make() -> Tables:
-        points = window.points[:, None]
-        drift = drift_at(system, window, start, theta)
-        observation = system.observation(points, start, theta).T
-        return Tables(drift, observation, covariance_at(system, window.points, start, theta))
-
-    found: Tables = prepared.once(window, make)
-    return found
-
-
-def spectral(prepared: Prepared, window: lw.Window) -> Spectral | None:
-    """Return the decomposition of the operator on a grid, if it has one."""
-    found: tuple[Spectral | None] = prepared.once(("spectral", window), lambda: (_decomposed(prepared, window),))
-    return found[0]
-
-
-_MIDPOINTS = (np.arange(32) + 0.5) / 32.0 - 0.5
-
-
-def drift_at(system: System, window: lw.Window, t: Array, theta: Array) -> Array:
-    """Return f at the points of a grid and times (...), (..., N).
-
-    Of an f with jumps it is the mean over the spacing around a point, less the second difference that a smooth f adds to it.
-    """
-    times = np.asarray(t)[..., None]
-    if system.slope is not None or not isinstance(window, lw.Window):
-        return finite(system.drift(window.points[:, None], times, theta)[..., 0])
-    around = window.origin + window.centre + window.spacing * (np.arange(-1, window.size + 1) - window.size // 2)
-    nodes = (around[:, None] + window.spacing * _MIDPOINTS).reshape(-1, 1)
-    means = finite(system.drift(nodes, times, theta)[..., 0]).reshape(*times.shape[:-1], window.size + 2, -1).mean(axis=-1)
-    return means[..., 1:-1] - (means[..., 2:] - 2.0 * means[..., 1:-1] + means[..., :-2]) / 24.0
-
-
-def covariance_at(system: System, points: Array, t: Array, theta: Array) -> Array:
-    """Return G at points (N,) and times (...): (..., N) where it depends on the state, else (...)."""
-    if system.state_dependent:
-        return finite(system.covariance(points[:, None], np.asarray(t)[..., None], theta)[..., 0, 0])
-    return system.covariance(np.zeros((*np.shape(t), 1)), t, theta)[..., 0, 0]
-
-
-def covariance_between(system: System, window: lw.Window, t: Array, theta: Array) -> Array:
-    """Return G half a spacing below each point of a grid, on the line also above the last one."""
-    ends = np.concatenate([window.points - 0.5 * window.spacing, window.points[-1:] + 0.5 * window.spacing])
-    return covariance_at(system, ends[:-1] if window.closed else ends, t, theta)
-
-
-def _decomposed(prepared: Prepared, window: lw.Window) -> Spectral | None:
-    known = tables(prepared, window)
-    drift, covariance = known.drift, known.covariance
-    system, theta, start = prepared.system, prepared.theta, prepared.model.start
-    if system.moving or system.slope is None or system.spread is None or window.size > lw.LARGEST:
-        return None
-    if not (covariance.real > 0).all():
-        return None
-    points, parts, spread, curvature, scale = window.points[:, None], PARTS if system.rough else 1, 0.0, 0.0, 1.0
-    within = (points + window.spacing / parts * (np.arange(parts)[:, None] + GAUSS_NODES).reshape(-1)).reshape(-1, 1)
-    inner = system.drift(within, start, theta)[:, 0] / covariance_at(system, within[:, 0], start, theta)
-    steps = window.spacing / parts * (inner.reshape(window.size, parts, -1) @ GAUSS_WEIGHTS).sum(axis=1)
-    if system.rough and not window.closed:
-        x = nodes(window.points, window.spacing)
-        drift, covariance = system.drift(x[:, None], start, theta)[:, 0], covariance_at(system, x, start, theta)
-        drift = drift - (0.5 * system.spread(x[:, None], start, theta)[:, 0] if system.state_dependent else 0.0)
-        drift, covariance = at_nodes(drift), at_nodes(np.broadcast_to(covariance, x.shape))
-        potential = 0.5 * (weak(drift**2 / covariance, window.spacing)[0] + weak(drift, window.spacing)[1])
-    else:
-        slope = system.slope(points, start, theta)[:, 0]
-        if system.state_dependent:
-            spread, curvature = np.moveaxis(system.spread(points, start, theta), -1, 0)
-        potential = 0.5 * ((drift - 0.5 * spread) ** 2 / covariance + slope - 0.5 * curvature)
-    covariance = known.covariance
-    if system.state_dependent:
-        scale = 1.0 / np.sqrt(covariance)
-        covariance = covariance_between(system, window, start, theta)
-    if not np.isfinite(potential.real).all() or not np.isfinite(steps.real).all():
-        return None
-    if window.closed and abs(np.sum(steps).real) > 1e-12 * max(1.0, float(np.sum(np.abs(steps.real)))):
-        return None
-    gauge = np.concatenate([np.zeros(1), np.cumsum(steps[:-1])])
-    modes = spectral(prepared.real, window) if np.iscomplexobj(theta) else None
-    return Spectral(symmetric(window.closed, window.spacing, covariance, potential), gauge, scale, modes)

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from zakai.methods._line_figures import figures
 from zakai.methods._line_model import System
-from zakai.methods._line_system import Prepared, figures, tables
+from zakai.methods._line_system import Prepared
+from zakai.methods._line_tables import tables
 from zakai.methods._observation import log_likelihood
 from zakai.numerics import line_window as lw
 from zakai.numerics.complex_step import log_determinant

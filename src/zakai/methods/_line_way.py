@@ -17,7 +17,8 @@ from zakai.methods._line_course import course_of, ends_of
 from zakai.methods._line_gauge import Gauge, derivative, gauge_of, generator
 from zakai.methods._line_message import FEWEST, PAD, Message, covering, points_of, reliable, support, taper
 from zakai.methods._line_moves import MAGNUS, Report
-from zakai.methods._line_system import Prepared, State, covariance_at
+from zakai.methods._line_system import Prepared, State
+from zakai.methods._line_tables import covariance_at
 from zakai.methods._line_volumes import pulled_back
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_adjoint import EXCURSION

@@ -15,8 +15,9 @@ import numpy as np
 from zakai.densities import IntervalDensity
 from zakai.errors import InputError
 from zakai.methods._line import forgetting, spread
+from zakai.methods._line_figures import outside_tables
 from zakai.methods._line_moves import Report
-from zakai.methods._line_system import NOISE, Prepared, outside_tables
+from zakai.methods._line_system import NOISE, Prepared
 from zakai.methods._line_update import factor_at_end
 from zakai.methods._protocol import Info
 from zakai.methods._reflecting_elements import (

@@ -15,7 +15,8 @@ from zakai.methods import _reflecting
 from zakai.methods._line_backward import accuracy
 from zakai.methods._line_course import course_of
 from zakai.methods._line_message import SURE, Message, points_of, support
-from zakai.methods._line_system import NOISE, Prepared, covariance_at
+from zakai.methods._line_system import NOISE, Prepared
+from zakai.methods._line_tables import covariance_at
 from zakai.methods._line_update import factor_at_end
 from zakai.methods._line_volumes import pulled_back
 from zakai.methods._line_way import negligible, smoothing_tolerance

@@ -10,7 +10,8 @@ import numpy as np
 from zakai.errors import InputError
 from zakai.methods._line_coefficients import offset_of, potential_of, precision_of
 from zakai.methods._line_course import kinks_between
-from zakai.methods._line_system import Prepared, covariance_at, tables
+from zakai.methods._line_system import Prepared
+from zakai.methods._line_tables import covariance_at, tables
 from zakai.models.domain import Interval
 from zakai.numerics.line_operator import Spectral
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS

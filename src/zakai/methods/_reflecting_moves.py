@@ -16,7 +16,8 @@ import numpy as np
 
 from zakai.methods._line_course import course_of
 from zakai.methods._line_moves import Report
-from zakai.methods._line_system import Prepared, covariance_at
+from zakai.methods._line_system import Prepared
+from zakai.methods._line_tables import covariance_at
 from zakai.methods._line_volumes import SHARE, advanced_by
 from zakai.methods._reflecting_elements import (
     CUT,

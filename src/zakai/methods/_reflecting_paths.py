@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from zakai.methods._line_coefficients import coefficients, resolved_parts
-from zakai.methods._line_system import Prepared, covariance_at
+from zakai.methods._line_system import Prepared
+from zakai.methods._line_tables import covariance_at
 from zakai.methods._reflecting import State
 from zakai.methods._reflecting_elements import SIZES, domain_of, element_of, operator_at
 from zakai.numerics.lobatto import Element
