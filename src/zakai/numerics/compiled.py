@@ -47,7 +47,7 @@ _compilation = _Compilation()
 
 
 def working_time() -> float:
-    """Return a clock in seconds that stands still while kernels are compiled."""
+    """Return a clock in seconds that does not count the compilation of kernels."""
     return time.monotonic() - _compilation.seconds()
 
 
