@@ -159,14 +159,6 @@ def read_prior(
                     'periodic, give it a [domain] with lower and upper, or write kind = "gaussian" with a large variance'
                 )
         return DensityPrior(sympy.Integer(0)), {"kind": kind}
-    elif kind == "uniform":
-        for state, angle, between in zip(states, periodic, bounded, strict=True):
-            if not (angle or between):
-                raise InputError(
-                    f"kind: uniform is for angles and domains with two ends, and {str(state)!r} has neither; list it in "
-                    'periodic, give [domain] its lower and upper, or write kind = "gaussian" with a large variance'
-                )
-        return DensityPrior(sympy.Integer(0)), {"kind": kind}
     elif kind == "grid":
         log_density, grid = read_grid(keys, states, periodic)
         return DensityPrior(log_density), grid
