@@ -9,22 +9,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zakai.methods._line_attempt import MAGNUS, attempted, by_modes
 from zakai.methods._line_coarse import EDGE, coarsened
-from zakai.methods._line_coefficients import coefficients, offset_of, potential_of, precision_of, resolved_parts
+from zakai.methods._line_coefficients import resolved_parts
 from zakai.methods._line_figures import refitted
 from zakai.methods._line_system import Prepared
-from zakai.methods._line_tables import spectral, tables
 from zakai.methods._line_yau import moved
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel
 from zakai.numerics.line_filters import WIDE, wrapped
-from zakai.numerics.line_operator import Exponential, exponential_action
-from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 
 Array = Any
 
 GROSS = 1e-4  # spectrum at the highest frequencies from which a shorter substep is taken at once
-MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
 MOST_SUBSTEPS = 4000
 
 
@@ -83,7 +80,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
         return _normalised(*carried, report, negligible)
     known, begin = lw.figures(values, window.closed, negligible).aliasing, window
     while window.size <= lw.LARGEST:
-        found = _by_modes(prepared, values, window, length)
+        found = by_modes(prepared, values, window, length)
         if found is None or not abs(float(np.sum(found[0].real)) - 1.0) < 1e-3:
             return None
         look = lw.figures(found[0], window.closed, negligible)
@@ -100,21 +97,6 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
             return None
         values, window = lw.resampled(values, window, new), new
     return None
-
-
-def _by_modes(prepared: Prepared, values: Array, window: lw.Window, length: float) -> tuple[Array, float] | None:
-    """Return the density after a time and its error by the decomposition on a grid, None where it does not serve."""
-    decomposed = spectral(prepared, window)
-    if decomposed is None:
-        return None
-    found, error = decomposed(values, length)
-    # Tails that were cut off are jumps in the gauge of the decomposition, which show at the highest frequencies, as does a
-    # density that reaches the ends of the grid: that one needs another grid, not another transition.
-    allowed = 1e-5 * prepared.tolerance
-    look = lw.figures(found, window.closed, prepared.negligible)
-    aliased = look.aliasing > max(allowed, 30.0 * prepared.negligible)
-    ended = max(look.left, look.right) > max(EDGE, 4.0 * look.aliasing)
-    return (found, error) if error < max(1e-11, allowed) and (ended or not aliased) else None
 
 
 def by_substeps(
@@ -146,7 +128,7 @@ def by_substeps(
         begin = window
         known = lw.figures(values, window.closed, negligible).aliasing
         while True:
-            attempt = _attempt(prepared, values, window, start, first, last, inside, rates)
+            attempt = attempted(prepared, values, window, start, first, last, inside, rates)
             report.decomposed = attempt.decomposed
             total = float(np.sum(attempt.values.real))
             lost = not 1e-250 < total < 1e6 or (not inside.any() and abs(total - 1.0) > 1e-3)
@@ -227,91 +209,3 @@ def _around(prepared: Prepared, values: Array, window: lw.Window, kernel: Channe
     moved = np.array(values, float)
     wrapped(moved, np.empty_like(moved), kernel.shift / window.spacing, variance, 8.0 - np.log(prepared.cut))
     return moved
-
-
-class _Attempt(NamedTuple):
-    """The density after a substep, times exp(-offset); its error; whether a shorter substep is needed.
-
-    `decomposed` tells whether the decomposition of the operator gave it.
-    """
-
-    values: Array
-    offset: Any
-    error: float
-    split: bool
-    decomposed: bool = False
-
-
-def _attempt(
-    prepared: Prepared,
-    values: Array,
-    window: lw.Window,
-    start: float,
-    first: float,
-    last: float,
-    inside: np.ndarray,
-    rates: np.ndarray,
-) -> _Attempt:
-    """Return the density after the part from start + first to start + last of an interval."""
-    system, length = prepared.system, last - first
-    if not system.varying:
-        known = tables(prepared, window)
-        if not inside.any():
-            modes = _by_modes(prepared, values, window, length)
-            if modes is not None:
-                return _Attempt(modes[0], 0.0, modes[1], False, True)
-            key = ("exponential", window, length)
-            transition = prepared.once(key, lambda: Exponential(length * window.generator(known.covariance, known.drift)))
-            found, error = transition(values)
-            return _Attempt(found, 0.0, error, False)
-        potential, constant = potential_of(known.observation, precision_of(prepared, start, inside), rates, values)
-        potential, constant = length * potential, length * constant
-        offset, split = offset_of(potential, values)
-        if split:
-            return _Attempt(values, 0.0, 0.0, True)
-        matrix = window.generator(length * known.covariance, length * known.drift, potential - offset)
-        found, error = exponential_action(matrix, values)
-        return _Attempt(found, offset + constant, error, False)
-    return _magnus(prepared, values, window, start, first, last, inside, rates)
-
-
-def _magnus(
-    prepared: Prepared,
-    values: Array,
-    window: lw.Window,
-    start: float,
-    first: float,
-    last: float,
-    inside: np.ndarray,
-    rates: np.ndarray,
-) -> _Attempt:
-    """Advance a substep by two exponentials: the commutator-free Magnus integrator of order four.
-
-        exp(B0 / 2 + 2 B1 / tau) exp(B0 / 2 - 2 B1 / tau),   B0 = int L dt,   B1 = int (t - middle) L dt.
-    """
-    length = last - first
-    times = start + first + length * GAUSS_NODES
-    drift, covariance, potential, constant = coefficients(prepared, window, times, inside, rates, values)
-    zeroth, moment = length * GAUSS_WEIGHTS, 2.0 * length * GAUSS_WEIGHTS * (GAUSS_NODES - 0.5)
-    early, late = 0.5 * zeroth - moment, 0.5 * zeroth + moment
-    offset, split = offset_of(zeroth @ potential, values)
-    if split or np.any((early @ covariance).real < 0) or np.any((late @ covariance).real < 0):
-        return _Attempt(values, 0.0, 0.0, True)
-    if prepared.system.steady:
-        matrix = window.generator(zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset)
-        found, error = exponential_action(matrix, values)
-        return _Attempt(found, offset + zeroth @ constant, error, False)
-    shift = np.full(window.size, offset / 2)
-    first_half, second_half = (
-        window.generator(w @ covariance, w @ drift, w @ potential - shift) for w in (early, late)
-    )
-    total, difference = (first_half + second_half).real, (second_half - first_half).real
-    now = values.real
-    # The part of third order that two exponentials contain; what they omit is of fifth order, with a factor that was measured.
-    commutator = 0.25 * (total @ (difference @ now) - difference @ (total @ now))
-    error = 5.0 * float(np.sum(np.abs(commutator))) ** (5.0 / 3.0)
-    if error > MAGNUS * prepared.tolerance:
-        return _Attempt(values, 0.0, error, True)
-    middle, one = exponential_action(first_half, values)
-    found, two = exponential_action(second_half, middle)
-    return _Attempt(found, offset + zeroth @ constant, error + one + two, False)

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from zakai.methods import _line
+from zakai.methods._line_attempt import MAGNUS
 from zakai.methods._line_coefficients import coefficients, offset_of, resolved_parts
 from zakai.methods._line_course import course_of, ends_of
 from zakai.methods._line_gauge import Gauge, derivative, gauge_of, generator
 from zakai.methods._line_message import FEWEST, PAD, Message, covering, points_of, reliable, support, taper
-from zakai.methods._line_moves import MAGNUS, Report
+from zakai.methods._line_moves import Report
 from zakai.methods._line_system import Prepared, State
 from zakai.methods._line_tables import covariance_at
 from zakai.methods._line_volumes import pulled_back
