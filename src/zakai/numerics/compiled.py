@@ -18,7 +18,7 @@ R = TypeVar("R")
 _compiler: Any = partial(njit, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 
 
-# Sums may be taken in any order, so that several terms are added at once; the order depends on the processor and the size alone.
+# Sums may be taken in any order, so that several terms are added at once.
 _REORDERED: Any = frozenset({"reassoc", "nsz", "contract"})
 
 
@@ -60,7 +60,8 @@ def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -
     Args:
         signature: the types of the arguments and of the result.
         derivative: those of complex arguments, for which the function is compiled when it first receives one.
-        reordered: whether its sums may be taken in any order.
+        reordered: whether its sums may be taken in any order.  The order depends on how the kernel was compiled, so that only one
+            compilation, that of the cache, may serve all who need equal bits: a `helper` must not have such sums.
     """
     fastmath = set(_REORDERED) if reordered else False
 
@@ -101,11 +102,6 @@ def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -
 def helper(function: F) -> F:
     """Compile a function that only kernels call, as a part of each of them; it has no entry for Python."""
     return cast(F, _compiler(no_cpython_wrapper=True)(function))
-
-
-def summing(function: F) -> F:
-    """Compile a function that only kernels call, as a part of each of them; its sums may be taken in any order."""
-    return cast(F, _compiler(no_cpython_wrapper=True, fastmath=set(_REORDERED))(function))
 
 
 def inlined(function: F) -> F:

@@ -9,12 +9,14 @@ import numpy as np
 from numba import boolean, float64, int64, types
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import helper, kernel, summing
+from zakai.numerics.compiled import helper, kernel
 
 Array = NDArray[Any]
 
+_F = float64
 
-@summing
+
+@helper
 def moments(values: Array) -> tuple[float, float, float]:
     """Return the sum of values, and their mean and variance as an index from the middle."""
     mass, mean, square = 0.0, 0.0, 0.0
@@ -28,7 +30,7 @@ def moments(values: Array) -> tuple[float, float, float]:
     return mass, mean, square / mass
 
 
-@summing
+@kernel(types.UniTuple(_F, 2)(_F[::1], _F[:, ::1], _F[:, ::1]), reordered=True)  # type: ignore[no-untyped-call]
 def circular_moments(values: Array, cosines: Array, sines: Array) -> tuple[float, float]:
     """Return the argument of E exp(i x) as an index from the middle, and the variance in squares of the spacing.
 
@@ -92,9 +94,6 @@ def waves(size: int) -> tuple[Array, Array]:
     angle = 2.0 * np.pi / size * (np.outer(np.arange(size // 2 + 1), np.arange(size)) % size)
     cosine, sine = np.cos(angle), np.sin(angle)
     return cosine, sine
-
-
-_F = float64
 
 
 @kernel(types.UniTuple(_F, 9)(_F[::1], _F, _F, _F[:, ::1], _F[:, ::1], boolean), reordered=True)  # type: ignore[no-untyped-call]

@@ -15,7 +15,7 @@ from numba import complex128, float64, int64
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from zakai.numerics.compiled import helper, inlined, kernel, summing
+from zakai.numerics.compiled import helper, inlined, kernel
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line_density import highest_of
 from zakai.numerics.line_terms import Transition, failed
@@ -33,7 +33,7 @@ _COSINES[[0, -1]] *= 0.5
 _PASSED = 0.5 * erfc((_FREQUENCIES - np.pi) * 5.2 / ((1.0 - BAND) * np.pi))  # one up to the band, and one half at the end
 
 
-@summing
+@helper
 def taps_of(variance: float, depth: float, most: int, narrow: bool) -> Array:
     """Return the filter (T,) of a Gaussian kernel, at distances 0 .. T - 1.
 

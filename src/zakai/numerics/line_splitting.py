@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import helper, inlined, summing
+from zakai.numerics.compiled import helper, inlined
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line_averages import EARLY, IMPOSSIBLE, LATE, MEAN, MOST_MAGNUS, averaged, averaging, operators
 from zakai.numerics.line_density import highest_of, moments
@@ -141,7 +141,7 @@ def differences(b: Array, spacing: float, closed: bool, first: Array, second: Ar
             second[j] = two * (b[above] - 2.0 * b[j] + b[below])
 
 
-@summing
+@helper
 def residual(
     values: Array, b: Array, first: Array, second: Array, drift: Array, spread: float, spacing: float, tau: float
 ) -> float:
