@@ -164,3 +164,23 @@ def test_the_order_of_the_papers_is_refused():
     model = zakai.Model(state=["x", "y"], drift=["-x + y", "-y"], observation=["x"], prior=prior)
     with pytest.raises(zakai.InputError, match='"lie" has no backward pass'):
         zakai.smooth(model, zakai.Record([0.1], [[0.1]], "increments"), "limited-direct", splitting="lie")
+
+
+def test_an_angle_that_turns_is_smoothed_as_in_a_frame_that_turns_with_it():
+    times = np.cumsum(np.random.default_rng(2).exponential(0.2, 50) + 0.01)
+
+    def model(drift, angle):
+        return zakai.Model(
+            state=["a", "b"], drift=[drift, "-0.1*b"], observation=[f"cos({angle})", f"sin({angle})"], observation_kind="samples",
+            diffusion=[["0.05", "0"], ["0", "0.05"]], observation_noise=[[0.05, 0], [0, 0.05]], periodic=["a"],
+            prior={"kind": "gaussian", "mean": [0, 0], "cov": [[0.3, 0], [0, 0.1]]},
+        )  # fmt: skip
+
+    still, turning = model("b", "a + 1.4*t"), model("1.4 + b", "a")
+    _, record = zakai.simulate(turning, times, seed=5)
+    expected, found = zakai.smooth(still, record), zakai.smooth(turning, record)
+    assert not found.warnings and not expected.warnings
+    deviation = np.sqrt(expected.variance)
+    apart = found.mean - expected.mean - np.stack([1.4 * np.concatenate([[0], times]), np.zeros(len(times) + 1)], 1)
+    apart[:, 0] = (apart[:, 0] + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(apart / deviation).max() < 2e-3 and np.abs(np.sqrt(found.variance) / deviation - 1).max() < 2e-3

@@ -122,7 +122,9 @@ def _refined(own: Field, other: Grid, bounds: Bounds) -> Field:
     if ratios.max() <= COARSE:
         return own
     half = 0.5 * np.array(grid.sizes)
-    middle = grid.inverse @ (other.centre - grid.centre)
+    apart = other.centre - grid.centre
+    apart = np.where(bounds.periodic, (apart + np.pi) % (2 * np.pi) - np.pi, apart)
+    middle = grid.inverse @ apart
     reach = 0.5 * np.abs(grid.inverse @ other.basis) @ np.array(other.sizes) + 1.0
     low, high = np.maximum(middle - reach, -half), np.minimum(middle + reach, half)
     whole = circle | np.array(bounds.periodic) | (high <= low)
