@@ -140,3 +140,18 @@ def test_a_grid_and_a_gaussian_smoother_agree():
     grid, exact = (zakai.smooth(model, record, method) for method in ("yau-yau", "kalman-bucy"))
     np.testing.assert_allclose(grid.mean, exact.mean, atol=1e-6)
     np.testing.assert_allclose(grid.variance, exact.variance, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [10, 11])
+def test_a_message_that_is_lost_is_said_and_stops_nothing(count):
+    # A reactor that ignites: the drift grows from .1 to 100 within a few readings.
+    model = zakai.Model(
+        state=["T"], drift=["2*exp(5 - 15/(T + 2)) - 1.5*(T - 1)"], observation=["T"], observation_kind="samples",
+        diffusion=[["0.2"]], observation_noise=[[0.01]], prior={"kind": "gaussian", "mean": [1], "cov": [[0.05]]},
+    )  # fmt: skip
+    rng = np.random.default_rng(3)
+    times = np.cumsum(rng.exponential(0.1, 120) + 0.005)
+    _, record = zakai.simulate(model, times, seed=5)
+    values = np.where(rng.random((120, 1)) < 0.15, np.nan, record.values)
+    result = zakai.smooth(model, zakai.Record(times[:count], values[:count], "samples"))
+    assert np.isfinite(result.mean).all() or any("no moments were found" in line for line in result.warnings)

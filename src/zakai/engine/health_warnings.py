@@ -59,6 +59,14 @@ def warnings_of_run(result: FilterResult) -> list[str]:
         said.append(
             f"the density was lost at t = {time:g}: nothing after that time can be trusted; check that observation and its noise"
         )
+    else:
+        lost = ~np.isfinite(result.mean).all(axis=1) | ~np.isfinite(result.cov).all(axis=(1, 2))
+        if lost.any():
+            first = result.times[np.argmax(lost)]
+            said.append(
+                f"no moments were found at {int(lost.sum())} of {len(lost)} times, first at t = {first:g}: "
+                f"nothing there can be trusted; {_OTHER_METHOD}"
+            )
     for name, (bound, what) in result.bounds.items():
         over = result.health[name] > bound if name in result.health else np.zeros(0, bool)
         if over.any():

@@ -213,7 +213,8 @@ class Way:
         steady = not prepared.system.varying
         if gauge.modes is not None and not inside.any():
             moved, noise = _decayed(values, gauge.modes, length)
-            return moved, 0.0, noise / float(np.max(moved))
+            highest = float(np.max(moved))
+            return (moved, 0.0, noise / highest) if highest > 0.0 else None
         times = self.start + first + length * (np.full(1, 0.5) if steady else GAUSS_NODES)
         drift, covariance, potential, constant = coefficients(prepared, window, times, inside, self.rates, values)
         zeroth, moment = length * GAUSS_WEIGHTS, 2.0 * length * GAUSS_WEIGHTS * (GAUSS_NODES - 0.5)
@@ -264,7 +265,7 @@ class Way:
                 now = edge * now
                 noise = max(noise, one, two)
             if before is not None:
-                error = float(at_start @ np.abs(now - before)) / (15.0 * float(at_start @ now))
+                error = float(at_start @ np.abs(now - before) / (15.0 * (at_start @ now)))
                 if error < DIVIDED * self.tolerance:
                     self.error += error
                     now = now + (now - before) / 15.0
