@@ -155,3 +155,13 @@ def test_a_message_that_is_lost_is_said_and_stops_nothing(count):
     values = np.where(rng.random((120, 1)) < 0.15, np.nan, record.values)
     result = zakai.smooth(model, zakai.Record(times[:count], values[:count], "samples"))
     assert np.isfinite(result.mean).all() or any("no moments were found" in line for line in result.warnings)
+
+
+def test_a_sensor_with_a_kink_is_smoothed_by_both_methods():
+    model = zakai.Model(
+        state=["x"], drift=["-x"], observation=["abs(x)"], prior={"kind": "gaussian", "mean": [0.4], "cov": [[0.2]]}
+    )
+    record = zakai.Record([0.1, 0.25], [[0.05], [0.1]], "increments")
+    one, other = (zakai.smooth(model, record, method, tolerance=1e-5) for method in ("yau-yau", "limited-direct"))
+    np.testing.assert_allclose(one.mean, other.mean, atol=1e-5)
+    assert one.warnings == other.warnings == []

@@ -35,9 +35,9 @@ class Setting(NamedTuple):
 
     @classmethod
     def of(cls, model: Model, prior: Any, method: Method[Any, Any], options: Mapping[str, Any]) -> Setting:
-        """Return the setting with the model's own parameters."""
-        depends = model.depends_on_time or (method.absolute is not None and method.absolute(options))
-        return cls(model, prior, method, options, model.theta(), not depends)
+        """Return the setting with the model's own parameters, and the variant of the method for the model and the options."""
+        method = method if method.variant is None else method.variant(model, options)
+        return cls(model, prior, method, options, model.theta(), not (model.depends_on_time or method.absolute))
 
     def prepared(self, schedule: Schedule) -> Any:
         """Return what the method prepares for a schedule, kept for the last schedules of each model.

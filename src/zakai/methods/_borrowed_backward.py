@@ -6,17 +6,14 @@ forward.  The evidence therefore compares two solutions that share no operator.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
-
 from zakai.densities import GridDensity
 from zakai.methods import yau_yau
-from zakai.methods._grid_backward import BACKWARD as GRID
 from zakai.methods._line_system import State as LineState
-from zakai.methods._protocol import Backward, Info, Infos
+from zakai.methods._protocol import Backward, through
 from zakai.numerics import line_window as lw
 from zakai.numerics.space_field import Field
 from zakai.numerics.space_grid import Grid
@@ -27,9 +24,12 @@ ROUNDING = -30.0  # logarithm of the error of the small values of a density, rel
 
 
 @lru_cache(maxsize=8)
-def _grid(prepared: Any) -> Any:
-    """Return what `yau-yau` prepares for the same schedule."""
-    return yau_yau.prepare(prepared.system.model, prepared.schedule, prepared.system.theta)
+def _of_grid(prepared: Any) -> tuple[Backward[Any, Any, Any], Any]:
+    """Return the backward pass of `yau-yau`, and what it prepares for the same schedule."""
+    model = prepared.system.model
+    method = yau_yau.variant(model, {})
+    assert method.backward is not None
+    return method.backward, method.prepare(model, prepared.schedule, prepared.system.theta)
 
 
 def _on_line(density: GridDensity) -> LineState:
@@ -47,7 +47,7 @@ def _state(prepared: Any, density: GridDensity) -> Any:
     if prepared.system.model.n == 1:
         return _on_line(density)
     grid = Grid(density.centre, density.basis, density.log_values.shape, (False,) * len(density.centre))
-    return _grid(prepared).started(Field(density.weights / grid.cell, grid, 0.0), 0.0)
+    return _of_grid(prepared)[1].started(Field(density.weights / grid.cell, grid, 0.0), 0.0)
 
 
 def borrowed(density: Callable[[Any, Any], GridDensity], accuracy: Callable[[Any], float]) -> Backward[Any, Any, Any]:
@@ -57,38 +57,9 @@ def borrowed(density: Callable[[Any, Any], GridDensity], accuracy: Callable[[Any
         density: the method's own; what it prepares has a `schedule`, and a `system` with `model` and `theta`.
         accuracy: the error of the evidence that one of its intervals may leave, for what is prepared.
     """
-
-    def state_of(prepared: Any, state: Any) -> Any:
-        return _state(prepared, density(prepared, state))
-
-    def message(prepared: Any, state: Any) -> Any:
-        return GRID.message(_grid(prepared), state_of(prepared, state))
-
-    def step(prepared: Any, k: int, later: Any, values: np.ndarray, state: Any) -> Any:
-        return GRID.step(_grid(prepared), k, later, values, state_of(prepared, state))
-
-    def smoothed(prepared: Any, state: Any, later: Any) -> tuple[Any, Info]:
-        own, info = GRID.smoothed(_grid(prepared), state_of(prepared, state), later)
-        return own, info._replace(health={name: info.health[name] for name in FIGURES})
-
-    def segment(prepared: Any, rows: slice, states: Sequence[Any], later: Any, values: np.ndarray) -> tuple[Any, Infos] | None:
-        if prepared.system.model.n > 1:
-            return None
-        assert GRID.segment is not None
-        found = GRID.segment(_grid(prepared), rows, [state_of(prepared, state) for state in states], later, values)
-        assert found is not None
-        return found[0], found[1]._replace(health={name: found[1].health[name] for name in FIGURES})
-
-    def smoothed_density(prepared: Any, state: Any, later: Any) -> Any:
-        return GRID.density(_grid(prepared), state_of(prepared, state), later)
-
-    def draw(
-        prepared: Any, k: int, later: np.ndarray, values: np.ndarray, state: Any, rng: np.random.Generator
-    ) -> tuple[np.ndarray, float]:
-        assert GRID.draw is not None
-        return GRID.draw(_grid(prepared), k, later, values, state_of(prepared, state), rng)
-
-    def allowed(prepared: Any) -> float:
-        return max(accuracy(prepared), GRID.accuracy(_grid(prepared)))
-
-    return Backward(message, step, smoothed, smoothed_density, segment, draw, allowed)
+    return through(
+        _of_grid,
+        lambda prepared, state: _state(prepared, density(prepared, state)),
+        lambda prepared, state, health: {name: health[name] for name in FIGURES},
+        accuracy,
+    )

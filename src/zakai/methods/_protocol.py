@@ -32,6 +32,7 @@ import numpy as np
 
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
+from zakai.errors import InputError
 from zakai.models.model import Model
 
 
@@ -110,6 +111,53 @@ class Backward(Generic[P, S, M]):
     accuracy: Callable[[P], float] = lambda prepared: 1e-6
 
 
+def through(
+    of: Callable[[Any], tuple[Backward[Any, Any, Any], Any]],
+    state_of: Callable[[Any, Any], Any],
+    reported: Callable[[Any, Any, Mapping[str, Any]], Mapping[str, Any]],
+    accuracy: Callable[[Any], float] = lambda prepared: 0.0,
+) -> Backward[Any, Any, Any]:
+    """Return the backward pass of a method by that of another one.
+
+    Args:
+        of: what is prepared to the other backward pass and what is prepared for it.
+        state_of: what is prepared and a state to the other method's state.
+        reported: what is prepared, a state and the health figures of the other one to those that are reported.
+        accuracy: the error of the evidence that an interval of the method itself may leave.
+    """
+
+    def message(prepared: Any, state: Any) -> Any:
+        other, own = of(prepared)
+        return other.message(own, state_of(prepared, state))
+
+    def step(prepared: Any, k: int, later: Any, values: np.ndarray, state: Any) -> Any:
+        other, own = of(prepared)
+        return other.step(own, k, later, values, state_of(prepared, state))
+
+    def smoothed(prepared: Any, state: Any, later: Any) -> tuple[Any, Info]:
+        other, own = of(prepared)
+        later, info = other.smoothed(own, state_of(prepared, state), later)
+        return later, info._replace(health=reported(prepared, state, info.health))
+
+    def density(prepared: Any, state: Any, later: Any) -> Density:
+        other, own = of(prepared)
+        return other.density(own, state_of(prepared, state), later)
+
+    def draw(
+        prepared: Any, k: int, later: np.ndarray, values: np.ndarray, state: Any, rng: np.random.Generator
+    ) -> tuple[np.ndarray, float]:
+        other, own = of(prepared)
+        if other.draw is None:
+            raise InputError("sample_paths: a method on a grid draws paths of one state only; take another method")
+        return other.draw(own, k, later, values, state_of(prepared, state), rng)
+
+    def allowed(prepared: Any) -> float:
+        other, own = of(prepared)
+        return max(accuracy(prepared), other.accuracy(own))
+
+    return Backward(message, step, smoothed, density, None, draw, allowed)
+
+
 @dataclass(frozen=True)
 class Method(Generic[P, S]):
     """One filter: its functions, and what is said of it.
@@ -121,8 +169,10 @@ class Method(Generic[P, S]):
     `handles` names the features of a model (`models/features.py`) that the method handles; a model with another one is refused
     before `theorem` is asked.
 
-    Optional: `absolute(options)` says whether what is prepared for an interval depends on where it begins, although the model
-    does not depend on t.
+    `absolute` says that what is prepared for an interval depends on where it begins, although the model does not depend on t.
+
+    Optional: `variant(model, options)` returns the method with the functions for this model and these options, where those above
+    are not for all of them.
 
     Optional: `valid(prepared, state)` says whether the arrays of a state fit together; it is asked of a state that was read from
     a file, before any kernel receives it.
@@ -147,7 +197,8 @@ class Method(Generic[P, S]):
     differentiable: bool = True
     handles: frozenset[str] = frozenset()
     shorter: str = "give fewer observations"
-    absolute: Callable[[Mapping[str, Any]], bool] | None = None
+    absolute: bool = False
+    variant: Callable[[Model, Mapping[str, Any]], Method[Any, Any]] | None = None
     valid: Callable[[P, S], bool] | None = None
     segment: Callable[[P, slice, S, np.ndarray], tuple[Sequence[S], Infos] | None] | None = None
     backward: Backward[P, S, Any] | None = None

@@ -1,7 +1,7 @@
 """Filters on density grids for two to four states: `yau-yau` for any smooth system, `limited-direct` for Yau systems.
 
-`prepare`, `init`, `step` and `density` dispatch on the method.  Both keep a density on a uniform affine grid that follows the
-mass; they differ in what moves it between observations.
+Both keep a density on a uniform affine grid that follows the mass; they differ in what moves it between observations, which is
+what their `Prepared` does.
 """
 
 from __future__ import annotations
@@ -13,15 +13,6 @@ import numpy as np
 from zakai.densities.grid import GridDensity
 from zakai.methods._protocol import Info
 from zakai.models.model import Model
-from zakai.records.schedule import Schedule
-
-BOUNDS: dict[str, tuple[float, str]] = {
-    "tolerance_ratio": (
-        1.0,
-        "the error of a step exceeds the tolerance by this factor. Give more frequent observations, or a larger tolerance",
-    ),
-    "tail_depth": (1.0, "depth in the tails of the prediction to which an observation leads, divided by the accurate depth"),
-}
 
 
 class State(NamedTuple):
@@ -41,38 +32,6 @@ class State(NamedTuple):
     deviations: np.ndarray
     error: float
     kept: float
-
-
-def prepare(
-    model: Model,
-    schedule: Schedule,
-    theta: np.ndarray,
-    tolerance: float | None = None,
-    *,
-    method: str = "yau-yau",
-    **options: Any,
-) -> Any:
-    """Return what is known without data; `options` are those of the method."""
-    if method == "limited-direct":
-        return prepare_direct(model, schedule, theta, tolerance=tolerance, **options)
-    from zakai.methods import _space_kolmogorov
-
-    return _space_kolmogorov.prepare(model, schedule, theta, tolerance=tolerance, **options)
-
-
-def prepare_direct(
-    model: Model,
-    schedule: Schedule,
-    theta: np.ndarray,
-    *,
-    splitting: str = "strang",
-    tolerance: float | None = None,
-    **options: Any,
-) -> Any:
-    """Return what `limited-direct` knows without data."""
-    from zakai.methods import _space_direct
-
-    return _space_direct.prepare(model, schedule, theta, splitting=splitting, tolerance=tolerance, **options)
 
 
 def init(prepared: Any, prior: Any) -> State:

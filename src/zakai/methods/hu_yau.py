@@ -13,7 +13,8 @@ stable over any time; Theorems 4 and 5 then are one method, for e^F cancels.  `f
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -21,14 +22,13 @@ import sympy as sp
 from zakai.algebra.exact_theorems import hu_yau as condition
 from zakai.algebra.gauges import affine_system
 from zakai.algebra.identities import all_zero
-from zakai.densities import Density
 from zakai.errors import InputError
 from zakai.methods import _gaussian_families as families
 from zakai.methods import _one_shot as one_shot
 from zakai.methods._affine_system import AffineSystem
 from zakai.methods._gaussian_backward import BACKWARD, Message
 from zakai.methods._options import one_of, real_number
-from zakai.methods._protocol import Backward, Info, Method
+from zakai.methods._protocol import Info, Method, through
 from zakai.models.features import INPUTS
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
@@ -37,7 +37,6 @@ from zakai.numerics.transition import Array, symmetric, transposed
 from zakai.records.schedule import Schedule
 
 THEOREMS = ("theorem-4", "theorem-5", "theorem-6", "survey-1")
-Prepared = families.Prepared | one_shot.Prepared
 
 
 class WithoutDrift(AffineSystem):
@@ -71,7 +70,7 @@ class WithoutDrift(AffineSystem):
 
 def prepare(
     model: Model, schedule: Schedule, theta: Array, *, form: str = "stepwise", theorem: str = "theorem-4", tolerance: float = 1e-6
-) -> Prepared:
+) -> Any:
     """Return the transition of every interval.
 
     Args:
@@ -119,60 +118,21 @@ def _check_theorem(model: Model, theorem: str, theta: Array) -> None:
             )
 
 
-def init(prepared: Prepared, prior: Any) -> Any:
-    """Return the state at the model's start."""
-    return one_shot.init(prepared, prior) if isinstance(prepared, one_shot.Prepared) else families.init(prepared, prior)
-
-
-def step(prepared: Prepared, k: int, state: Any, values: Array) -> tuple[Any, Info]:
+def step(prepared: families.Prepared, k: int, state: families.State, values: Array) -> tuple[families.State, Info]:
     """Advance one interval; nothing cancels in the stepwise form."""
-    if isinstance(prepared, one_shot.Prepared):
-        return one_shot.step(prepared, k, state, values)
     state, info = families.step(prepared, k, state, values)
     return state, info._replace(health={"lost_digits": 0.0, **info.health})
 
 
-def density(prepared: Prepared, state: Any) -> Density:
-    """Return the posterior."""
-    if isinstance(prepared, one_shot.Prepared):
-        return one_shot.density(prepared, state)
-    return families.density(prepared, state)
-
-
-def _stepwise(prepared: Any, state: Any) -> tuple[Any, Any]:
-    """Return what the stepwise form prepares, and the state in that form."""
-    if isinstance(prepared, one_shot.Prepared):
-        return prepared.base, one_shot.stepwise(prepared, state)
-    return prepared, state
-
-
-def message(prepared: Any, state: Any) -> Message:
-    """Return the message of the backward pass at the last time."""
-    return BACKWARD.message(*_stepwise(prepared, state))
-
-
-def backward(prepared: Any, k: int, later: Message, values: Array, state: Any) -> Message:
-    """Return the message at the start of interval k, which needs no state."""
-    return BACKWARD.step(prepared.base if isinstance(prepared, one_shot.Prepared) else prepared, k, later, values, state)
-
-
-def smoothed(prepared: Any, state: Any, later: Message) -> tuple[Message, Info]:
+def smoothed(prepared: families.Prepared, state: families.State, later: Message) -> tuple[Message, Info]:
     """Return the message normalised, and the smoothed moments."""
-    lost = one_shot.rounding(prepared, state) if isinstance(prepared, one_shot.Prepared) else 0.0
-    own, info = BACKWARD.smoothed(*_stepwise(prepared, state), later)
-    return own, info._replace(health={"lost_digits": lost, **info.health})
+    later, info = BACKWARD.smoothed(prepared, state, later)
+    return later, info._replace(health={"lost_digits": 0.0, **info.health})
 
 
-def smoothed_density(prepared: Any, state: Any, later: Message) -> Density:
-    """Return the smoothed density."""
-    return BACKWARD.density(*_stepwise(prepared, state), later)
-
-
-def draw(prepared: Any, k: int, later: Array, values: Array, state: Any, rng: np.random.Generator) -> tuple[Array, float]:
-    """Return draws of the state at the start of interval k given those at its end."""
-    assert BACKWARD.draw is not None
-    base, own = _stepwise(prepared, state)
-    return BACKWARD.draw(base, k, later, values, own, rng)
+def variant(model: Model, options: Mapping[str, Any]) -> Method[Any, Any]:
+    """Return the method in the form of its options."""
+    return ONE_SHOT if options["form"] == "one-shot" else METHOD
 
 
 BOUNDS: Mapping[str, tuple[float, str]] = {
@@ -180,21 +140,29 @@ BOUNDS: Mapping[str, tuple[float, str]] = {
     "lost_digits": (1e-6, 'rounding of the evidence in nats, as the statistics of one shot cancel; take form="stepwise"'),
 }
 
-# An online filter needs the stepwise form, whose state is that of the families.
-METHOD: Method[Prepared, Any] = Method(
+STEPWISE = replace(BACKWARD, smoothed=smoothed, segment=None)
+METHOD: Method[Any, Any] = Method(
     name="hu-yau",
     source="Hu and Yau 2002, Theorems 3 to 6, corrected; any prior: Makowski 1986",
     exactness="exact for y that is linear between observations, and for samples; the prior to 1e-12",
     theorem=condition,
     options={"form": "stepwise", "theorem": "theorem-4", "tolerance": 1e-6},
     prepare=prepare,
-    init=init,
+    init=families.init,
     step=step,
-    density=density,
+    density=families.density,
     state=families.State,
     bounds=BOUNDS,
-    absolute=lambda options: bool(options["form"] == "one-shot"),
-    valid=cast(Any, families.valid),
+    variant=variant,
+    valid=families.valid,
     handles=frozenset({INPUTS}),
-    backward=Backward(message, backward, smoothed, smoothed_density, draw=draw),
+    backward=STEPWISE,
 )
+ONE_SHOT = replace(
+    METHOD, init=one_shot.init, step=one_shot.step, density=one_shot.density, state=one_shot.State, absolute=True, valid=None,
+    backward=through(
+        lambda prepared: (STEPWISE, prepared.base),
+        one_shot.stepwise,
+        lambda prepared, state, health: {**health, "lost_digits": one_shot.rounding(prepared, state)},
+    ),
+)  # fmt: skip

@@ -6,6 +6,7 @@ gauge u = e^phi v makes the Kolmogorov equation linear-quadratic, so that its ke
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,13 @@ import numpy as np
 from zakai.algebra.theorems import limited_direct
 from zakai.errors import InputError
 from zakai.methods import _line
-from zakai.methods._grid_backward import BACKWARD
+from zakai.methods._line_backward import BACKWARD as LINE
+from zakai.methods._line_model import in_pieces
 from zakai.methods._line_system import State
 from zakai.methods._line_yau import power_series_of, yau_line_of
 from zakai.methods._options import one_of
 from zakai.methods._protocol import Method
-from zakai.methods.yau_yau import BOUNDS, density, init, segment, step, valid
+from zakai.methods.yau_yau import BOUNDS, in_space, on_line
 from zakai.models import features
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior, MixturePrior
@@ -62,11 +64,11 @@ def prepare(
     if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1 or not series):
         raise InputError(f'option order: {order!r} must be a whole number from 1, and needs kernel="power-series"')
     if model.n > 1:
-        from zakai.methods import _space
+        from zakai.methods import _space_direct
 
         options: dict[str, Any] = {"splitting": splitting, "tolerance": tolerance, "kernel": kernel, "order": order}
-        return _space.prepare_direct(model, schedule, theta, **options)
-    prepared = _line.prepare(model, schedule, theta, 1e-9 if tolerance is None else tolerance)
+        return _space_direct.prepare(model, schedule, theta, **options)
+    prepared = _line.prepare(model, schedule, theta, 1e-9 if tolerance is None else tolerance, in_pieces(model))
     prepared.promised = 1e-7 if tolerance is None else prepared.tolerance
     yau, lie = yau_line_of(model), splitting == "lie"
     prior = model.prior
@@ -79,6 +81,11 @@ def prepare(
     return prepared
 
 
+def variant(model: Model, options: Mapping[str, Any]) -> Method[Any, Any]:
+    """Return the method for the model's number of states and its kinks."""
+    return on_line(METHOD, model) if model.n == 1 else in_space(METHOD, prepare)
+
+
 METHOD: Method[Any, Any] = Method(
     name="limited-direct",
     source="Chen, Luo and Yau 2017, Theorems 1-3, corrected; x-coordinate form",
@@ -87,14 +94,15 @@ METHOD: Method[Any, Any] = Method(
     theorem=limited_direct,
     options={"kernel": "flow", "splitting": "strang", "order": None, "tolerance": None},
     prepare=prepare,
-    init=init,
-    step=step,
-    density=density,
+    init=_line.init,
+    step=_line.step,
+    density=_line.density,
     state=State,
     bounds=BOUNDS,
     shorter="raise the option tolerance (command: --option tolerance=...)",
-    valid=valid,
+    variant=variant,
+    valid=_line.valid,
     handles=features.OF_OBSERVATION | {features.INPUTS, features.JUMPS, features.KINKS, features.SINC, features.TABLES},
-    segment=segment,
-    backward=BACKWARD,
+    segment=_line.segment,
+    backward=LINE,
 )

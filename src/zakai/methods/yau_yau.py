@@ -6,17 +6,19 @@ for increments with y linear between observations, acts inside of the equation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from zakai.algebra.theorems import any_smooth_system
 from zakai.methods import _line, _reflecting
-from zakai.methods._grid_backward import BACKWARD
+from zakai.methods._line_backward import BACKWARD as LINE
 from zakai.methods._line_model import in_pieces
-from zakai.methods._line_system import State
-from zakai.methods._protocol import Info, Infos, Method
+from zakai.methods._line_system import Prepared, State
+from zakai.methods._protocol import Method
+from zakai.methods._reflecting_backward import BACKWARD as REFLECTING
 from zakai.models import features
 from zakai.models.model import Model
 from zakai.records.schedule import Schedule
@@ -42,20 +44,11 @@ HANDLES = features.OF_OBSERVATION | {
 }
 
 
-def module_of(model: Model) -> Any:
-    """Return the module with `init`, `step`, `density` and `valid` for the model's number of states and its domain."""
-    if model.n == 1:
-        return _reflecting if in_pieces(model) else _line
-    from zakai.methods import _space
-
-    return _space
-
-
-def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: float | None = None) -> Any:
-    """Return what is prepared for a schedule.
+def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: float | None = None) -> Prepared:
+    """Return what is prepared for a schedule, for one state.
 
     Args:
-        model: one to four states.
+        model: one state.
         schedule: the intervals.
         theta: parameters (p,).
         tolerance: bound on the error of a step: of the mean in standard deviations and of the log-likelihood; by default 1e-5
@@ -64,35 +57,37 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: f
     Raises:
         InputError: the tolerance is out of range.
     """
-    if model.n > 1:
-        return module_of(model).prepare(model, schedule, theta, tolerance=tolerance)
     return _line.prepare(model, schedule, theta, 1e-5 if tolerance is None else tolerance, in_pieces(model))
 
 
-def init(prepared: Any, prior: Any) -> Any:
-    """Return the prior on a grid."""
-    return module_of(prepared.model).init(prepared, prior)
+def variant(model: Model, options: Mapping[str, Any]) -> Method[Any, Any]:
+    """Return the method for the model's number of states and its domain."""
+    if model.n == 1:
+        return on_line(METHOD, model)
+    from zakai.methods import _space_kolmogorov
+
+    return in_space(METHOD, _space_kolmogorov.prepare)
 
 
-def step(prepared: Any, k: int, state: Any, values: np.ndarray) -> tuple[Any, Info]:
-    """Return the state after interval k and its observation, and the report."""
-    result: tuple[Any, Info] = module_of(prepared.model).step(prepared, k, state, values)
-    return result
+def on_line(method: Method[Any, Any], model: Model) -> Method[Any, Any]:
+    """Return a method of one state with the functions for the domain and the kinks of a model."""
+    if not in_pieces(model):
+        return method
+    return replace(
+        method, init=_reflecting.init, step=_reflecting.step, density=_reflecting.density, state=_reflecting.State,
+        valid=_reflecting.valid, segment=None, backward=REFLECTING,
+    )  # fmt: skip
 
 
-def segment(prepared: Any, rows: slice, state: Any, values: np.ndarray) -> tuple[Sequence[Any], Infos] | None:
-    """Return the states after the intervals of a slice, and their reports, for one state without reflecting ends."""
-    return _line.segment(prepared, rows, state, values) if module_of(prepared.model) is _line else None
+def in_space(method: Method[Any, Any], prepare: Callable[..., Any]) -> Method[Any, Any]:
+    """Return a method with the functions for several states."""
+    from zakai.methods import _space
+    from zakai.methods._space_backward import BACKWARD as SPACE
 
-
-def density(prepared: Any, state: Any) -> Any:
-    """Return the density of a state."""
-    return module_of(prepared.model).density(prepared, state)
-
-
-def valid(prepared: Any, state: Any) -> bool:
-    """Return whether the arrays of a state fit together."""
-    return bool(module_of(prepared.model).valid(prepared, state))
+    return replace(
+        method, prepare=prepare, init=_space.init, step=_space.step, density=_space.density, state=_space.State,
+        valid=_space.valid, segment=None, backward=SPACE,
+    )  # fmt: skip
 
 
 METHOD: Method[Any, Any] = Method(
@@ -103,14 +98,15 @@ METHOD: Method[Any, Any] = Method(
     theorem=any_smooth_system,
     options={"tolerance": None},
     prepare=prepare,
-    init=init,
-    step=step,
-    density=density,
+    init=_line.init,
+    step=_line.step,
+    density=_line.density,
     state=State,
     bounds=BOUNDS,
     shorter="raise the option tolerance (command: --option tolerance=...)",
-    valid=valid,
+    variant=variant,
+    valid=_line.valid,
     handles=HANDLES,
-    segment=segment,
-    backward=BACKWARD,
+    segment=_line.segment,
+    backward=LINE,
 )
