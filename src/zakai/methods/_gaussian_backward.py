@@ -1,8 +1,7 @@
 """The backward pass of the Gaussian families: what the observations after t say of the state at t.
 
-With u = e^phi v, the density of the later observations given x, times e^phi, obeys the adjoint of the equation of v, and stays
-
-    e^{-(x - a)'Lambda (x - a) / 2} sum_e e^{c_e + q_e.(x - a)}.
+With u = e^phi v, the density of the later observations given x, times e^phi, obeys the adjoint of the equation of v, and stays a
+sum of exponentials, `numerics/gaussian_exponents.py`, all of one quadratic part.
 
 It begins as e^phi at the last time.  The smoothed density is v times this message: a mixture of Gaussians.
 """
@@ -10,7 +9,6 @@ It begins as e^phi at the last time.  The smoothed density is v times this messa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -31,28 +29,12 @@ from zakai.methods._gaussian_paths import draw
 from zakai.methods._protocol import Backward, Info, Infos
 from zakai.methods._states import field_of
 from zakai.numerics import gaussian_backward
-from zakai.numerics.families import Family, solve, weigh
-from zakai.numerics.transition import Array, at, symmetric
+from zakai.numerics.families import Family, weigh
+from zakai.numerics.gaussian_exponents import Exponents, adjoint
+from zakai.numerics.transition import Array, at
 
 
-class Message(NamedTuple):
-    """The message above: `centre` a (n,), `information` Lambda (n, n), `slopes` q (E, n) and `logs` c (E,)."""
-
-    centre: Array
-    information: Array
-    slopes: Array
-    logs: Array
-
-    def around(self, centre: Array) -> Message:
-        """Return the same message with another centre."""
-        away = centre - self.centre
-        push = self.information @ away
-        return Message(
-            centre, self.information, self.slopes - push, self.logs + self.slopes @ away - 0.5 * away @ push
-        )
-
-
-def message(prepared: Prepared, state: State) -> Message:
+def message(prepared: Prepared, state: State) -> Exponents:
     """Return the message at the last time.
 
     Raises:
@@ -70,56 +52,36 @@ def message(prepared: Prepared, state: State) -> Message:
         assert tilts.slopes is not None and tilts.logs is not None
         slopes, logs = tilts.slopes, tilts.logs
     matrix, slope = (np.zeros((n, n)), np.zeros(n)) if setup.quadratic is None else setup.quadratic
-    return Message(np.zeros(n), -matrix, slopes + slope, logs)
+    return Exponents(np.zeros(n), logs, slopes + slope, np.broadcast_to(-matrix, (len(logs), n, n)))
 
 
 @np.errstate(all="ignore")
-def backward(prepared: Prepared, k: int, later: Message, values: Array, state: State) -> Message:
+def backward(prepared: Prepared, k: int, later: Exponents, values: Array, state: State) -> Exponents:
     """Return the message at the start of interval k from that at its end; `values` (m,) are what is observed."""
     ends, rows = prepared.ends, prepared.ends.observed[k]
-    centre, information, slopes, logs = later
+    centre, logs, slopes, information = later
     if rows.any():
         white, H = (ends.whiten[k] @ values)[rows], ends.slope[k][rows]
         residual = white - ends.intercept[k][rows] - H @ centre
-        information, slopes = information + H.T @ H, slopes + residual @ H
         constant = ends.constant[k] - 0.5 * residual @ residual + (0.5 * white @ white if ends.relative else 0.0)
-        logs = logs + constant
+        later = Exponents(centre, logs + constant, slopes + residual @ H, information + H.T @ H)
     if prepared.lengths[k] == 0:
-        return Message(centre, information, slopes, logs)
-    own, inputs = at(prepared.transitions, k), inputs_of(prepared, k, values)
-    # The average over x -> Psi x + b + N(0, Gamma): with W = (I + Gamma Lambda)^-1,
-    # Psi'Lambda W Psi, Psi'(W'q - Lambda W b), q'W b - b'Lambda W b / 2 + q'W Gamma q / 2 - log |I + Gamma Lambda| / 2.
-    system = np.eye(len(centre)) + own.noise @ information
-    start, n = own.map @ centre + own.offset @ inputs - centre, len(centre)
-    both, log_volume = solve(system[None], np.column_stack([own.map, start, own.noise])[None])
-    solved = both[0]
-    moved, offset, noise = solved[:, :n], solved[:, n], symmetric(solved[:, n + 1 :])
-    push = own.information @ centre
-    pull = own.vector @ inputs - push
-    constant = (
-        inputs @ own.constant @ inputs + pull @ centre + 0.5 * push @ centre
-        - 0.5 * start @ information @ offset - 0.5 * log_volume[0]
-    )  # fmt: skip
-    return Message(
-        centre,
-        symmetric(own.map.T @ information @ moved) + own.information,
-        slopes @ moved - offset @ information @ own.map + pull,
-        logs + slopes @ offset + 0.5 * np.sum((slopes @ noise) * slopes, axis=1) + constant,
-    )
+        return later
+    return adjoint(at(prepared.transitions, k), later, inputs_of(prepared, k, values), centre)
 
 
-def _product(state: State, later: Message) -> tuple[Message, Family, Tilts]:
+def _product(state: State, later: Exponents) -> tuple[Exponents, Family, Tilts]:
     """Return the message about the state's mean, the families weighed by its largest exponential, and the others' excess."""
     families = state.families
     own = later.around(families.mean[np.argmax(families.log_mass)])
     first = np.argmax(own.logs)
     shifted = families._replace(mean=families.mean - own.centre)
-    weighed = weigh(shifted, own.information, own.slopes[first], own.logs[first])
+    weighed = weigh(shifted, own.information[first], own.slopes[first], own.logs[first])
     return own, weighed, Tilts(own.slopes[:0], own.slopes - own.slopes[first], own.logs - own.logs[first])
 
 
 @np.errstate(all="ignore")
-def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message, Info]:
+def smoothed(prepared: Prepared, state: State, later: Exponents) -> tuple[Exponents, Info]:
     """Return the message, normalised so that its product with the state has mass one, and the moments of the product.
 
     The `log_likelihood_increment` is the logarithm of the mass before: the evidence of the observations that the message has
@@ -136,7 +98,7 @@ def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message,
     return own._replace(logs=own.logs - log_mass), Info(log_mass, mean + origin, cov, health)
 
 
-def density(prepared: Prepared, state: State, later: Message) -> GaussianMixture:
+def density(prepared: Prepared, state: State, later: Exponents) -> GaussianMixture:
     """Return the smoothed density."""
     own, families, tilts = _product(state, later)
     found = posterior(prepared.gauge, tilts, state.time, families)
@@ -144,19 +106,19 @@ def density(prepared: Prepared, state: State, later: Message) -> GaussianMixture
 
 
 def segment(
-    prepared: Prepared, rows: slice, states: Sequence[State], later: Message, values: Array
-) -> tuple[Message, Infos] | None:
+    prepared: Prepared, rows: slice, states: Sequence[State], later: Exponents, values: Array
+) -> tuple[Exponents, Infos] | None:
     """Take a message from the end of a slice of intervals to its start by the compiled loop, where there is one Gaussian."""
     if not is_single(prepared, states[0]) or len(later.logs) > 1:
         return None
     assert prepared.loop is not None
     means, covs = (np.array(field_of(states, name)[1:, 0]) for name in ("mean", "cov"))
-    moved, masses = Message(*(np.array(field, order="C") for field in later)), np.empty(len(values))
+    moved, masses = Exponents(*(np.array(field, order="C") for field in later)), np.empty(len(values))
     gaussian_backward.segment(
-        rows.start, moved.centre, moved.information, moved.slopes[0], moved.logs, *prepared.loop, np.ascontiguousarray(values),
-        means, covs, masses,
+        rows.start, moved.centre, moved.information[0], moved.slopes[0], moved.logs, *prepared.loop,
+        np.ascontiguousarray(values), means, covs, masses,
     )  # fmt: skip
     return moved, Infos(masses, means + prepared.setup.origin, covs, health_of_gaussians(covs))
 
 
-BACKWARD: Backward[Prepared, State, Message] = Backward(message, backward, smoothed, density, segment, draw)
+BACKWARD: Backward[Prepared, State, Exponents] = Backward(message, backward, smoothed, density, segment, draw)

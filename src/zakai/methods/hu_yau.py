@@ -26,13 +26,14 @@ from zakai.errors import InputError
 from zakai.methods import _gaussian_families as families
 from zakai.methods import _one_shot as one_shot
 from zakai.methods._affine_system import AffineSystem
-from zakai.methods._gaussian_backward import BACKWARD, Message
+from zakai.methods._gaussian_backward import BACKWARD
 from zakai.methods._options import one_of, real_number
 from zakai.methods._protocol import Info, Method, through
 from zakai.models.features import INPUTS
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.flow import Coefficients
+from zakai.numerics.gaussian_exponents import Exponents
 from zakai.numerics.transition import Array, symmetric, transposed
 from zakai.records.schedule import Schedule
 
@@ -124,7 +125,7 @@ def step(prepared: families.Prepared, k: int, state: families.State, values: Arr
     return state, info._replace(health={"lost_digits": 0.0, **info.health})
 
 
-def smoothed(prepared: families.Prepared, state: families.State, later: Message) -> tuple[Message, Info]:
+def smoothed(prepared: families.Prepared, state: families.State, later: Exponents) -> tuple[Exponents, Info]:
     """Return the message normalised, and the smoothed moments."""
     later, info = BACKWARD.smoothed(prepared, state, later)
     return later, info._replace(health={"lost_digits": 0.0, **info.health})
