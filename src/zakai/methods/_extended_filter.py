@@ -35,8 +35,8 @@ from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info
 from zakai.models.model import Model
 from zakai.numerics.complex_step import cholesky, is_complex
-from zakai.numerics.linear_flow import linear_flow
-from zakai.numerics.transition import Array
+from zakai.numerics.flow import Coefficients, integrate
+from zakai.numerics.transition import Array, at
 from zakai.records.schedule import Schedule
 
 
@@ -197,8 +197,14 @@ def _linearised(
         drift = drift + a @ gain @ (observed[0].values - h) - own
         slope, covariance = slope - a @ gain @ H, covariance - a @ gain @ a.T
         gained = -0.5 * length * (gain * (H @ a)).sum()
-    matrix, drifted, spread = linear_flow(slope, change, drift, covariance, length, part.start - clock)
-    return centre + matrix @ (mean - centre) + drifted, matrix, spread, gained
+    # dx = (A x + a s + b) ds + dv, with the time s as one more state.
+    n, kind = len(mean), np.result_type(slope, change, drift, covariance)
+    matrix, noise, offset = np.zeros((1, n + 1, n + 1), kind), np.zeros((1, n + 1, n + 1), kind), np.ones((1, n + 1, 1), kind)
+    matrix[0, :n, :n], matrix[0, :n, n], noise[0, :n, :n], offset[0, :n, 0] = slope, change, covariance, drift
+    system = Coefficients(matrix, offset, noise, 0.0 * noise, 0.0 * offset, np.zeros((1, 1)))
+    flow = at(integrate(lambda times, rows: system, np.zeros(1), np.array([length]), True).transition, 0)
+    matrix, drifted = flow.map[:n, :n], flow.map[:n, n] * (part.start - clock) + flow.offset[:n, 0]
+    return centre + matrix @ (mean - centre) + drifted, matrix, flow.noise[:n, :n], gained
 
 
 def _euler(prepared: Prepared, state: State, observed: list[_Observed] | None, part: Part) -> tuple[State, Any]:
