@@ -15,7 +15,7 @@ from zakai.methods._gauge import Gauge
 from zakai.methods._gaussian_nodes import MOST_NODES, TOLERANCE, GaussianPlan, Nodes, edge_of, represented
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-from zakai.models.prior import DensityPrior, GaussianPrior
+from zakai.models.prior import DensityPrior
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.families import Family, gaussians
 from zakai.numerics.nodes import NodeGrid, resolve
@@ -40,10 +40,7 @@ def prior_families(gauge: Gauge, model: Model, prior: Any) -> Prior:
     """Return the families of a prior; the real parts of the parameters alone decide the places of the nodes."""
     if isinstance(prior, DensityPrior):
         return _from_density(gauge, model, prior)
-    if isinstance(prior, GaussianPrior):
-        weights, means, covs = np.ones(1), prior.mean[None], prior.cov[None]
-    else:
-        weights, means, covs = prior.weights, prior.means, prior.covs
+    weights, means, covs = prior.components
     means = means - gauge.origin
     if gauge.trivial:
         nothing = np.zeros((len(weights), 1))

@@ -11,7 +11,7 @@ from zakai.errors import InputError
 from zakai.methods._line_domain import variable_of
 from zakai.methods._line_system import Prepared, State
 from zakai.models.numeric import numpy_function
-from zakai.models.prior import DensityPrior, GaussianPrior
+from zakai.models.prior import DensityPrior
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_window import Window
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
@@ -52,10 +52,7 @@ def init(prepared: Prepared, prior: Any) -> State:
             return function(points if variable is None else variable.x(points), model.start, prepared.theta)[..., 0]
 
     else:
-        if isinstance(prior, GaussianPrior):
-            weights, means, covs = np.ones(1), prior.mean[None], prior.cov[None]
-        else:
-            weights, means, covs = prior.weights, prior.means, prior.covs
+        weights, means, covs = prior.components
         deviations = np.sqrt(covs[:, 0, 0])
         if np.any(deviations <= 1e-14 * np.abs(means[:, 0])):
             raise InputError("prior: a variance is zero; a grid needs a density, so give it a small variance")

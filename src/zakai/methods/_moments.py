@@ -12,6 +12,7 @@ from zakai.errors import InputError
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import GaussianPrior, MixturePrior
+from zakai.numerics.complex_step import angle
 from zakai.numerics.prior_grid import prior_grid
 
 _FINER = {1: 32, 2: 4}  # factor of the points of an angle, by the number of states
@@ -53,19 +54,10 @@ def prior_moments(model: Model, prior: Any, theta: np.ndarray) -> tuple[np.ndarr
     turned = np.where(periodic, points, 0.0)
     cosine, sine = weights @ np.cos(turned), weights @ np.sin(turned)
     directed = np.hypot(cosine.real, sine.real) > NO_DIRECTION
-    circular = np.where(directed, _angle(sine, np.where(directed, cosine, 1.0)), 0.0)
+    circular = np.where(directed, angle(sine, np.where(directed, cosine, 1.0)), 0.0)
     mean = np.where(periodic, circular, weights @ points)
     deviation = wrapped(model, points - mean)
     return mean, (deviation * weights[:, None]).T @ deviation
-
-
-def _angle(sine: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-    """Return the angle of (cosine, sine), with its derivative by the complex step."""
-    angle = np.arctan2(sine.real, cosine.real)
-    if not np.iscomplexobj(sine):
-        return np.asarray(angle)
-    turn = cosine.real * sine.imag - sine.real * np.imag(cosine)
-    return np.asarray(angle + 1j * turn / (cosine.real**2 + sine.real**2))
 
 
 def wrapped(model: Model, points: np.ndarray) -> np.ndarray:

@@ -51,7 +51,6 @@ class State(NamedTuple):
 class Constants(NamedTuple):
     """The letters of the equations, h whitened: c_h is `intercept`, `whiten` takes y to it."""
 
-    D: Array
     d: Array
     inverse: Array
     N: Array
@@ -70,7 +69,7 @@ def constants(system: AffineSystem, theta: Array, origin: Array) -> Constants:
     inverse = np.linalg.inv(G)
     M, m = C.T @ C - 2.0 * Q, C.T @ c - p
     N, e = M + D.T @ inverse @ D, 2.0 * (m + D.T @ inverse @ d)
-    return Constants(D, d, inverse, N, e, np.block([[D, G], [M, -D.T]]), C, c, whiten)
+    return Constants(d, inverse, N, e, np.block([[D, G], [M, -D.T]]), C, c, whiten)
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,7 @@ from zakai.methods._reflecting_elements import (
 )
 from zakai.methods._reflecting_moves import propagated
 from zakai.models.numeric import numpy_function
-from zakai.models.prior import DensityPrior, GaussianPrior
+from zakai.models.prior import DensityPrior
 from zakai.numerics.line_posterior import General, Likelihood, place
 from zakai.numerics.line_segment import RELIABLE
 from zakai.numerics.lobatto import Element
@@ -79,10 +79,7 @@ def init(prepared: Prepared, prior: Any) -> State:
 
         lower, upper = _ends_of(prepared, lambda x: logs(x).real)
     else:
-        single = isinstance(prior, GaussianPrior)
-        weights, means, covs = (
-            (np.ones(1), prior.mean[None], prior.cov[None]) if single else (prior.weights, prior.means, prior.covs)
-        )
+        weights, means, covs = prior.components
         if np.any(covs[:, 0, 0] <= 1e-28 * means[:, 0] ** 2):
             raise InputError("prior: a variance is zero; a grid needs a density, so give it a small variance")
         mixture = mixture_log_density(weights, means, covs, [False])

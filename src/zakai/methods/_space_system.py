@@ -16,7 +16,7 @@ from zakai.models.features import OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
 from zakai.models.functions import TableFunction
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-from zakai.models.prior import DensityPrior, GaussianPrior
+from zakai.models.prior import DensityPrior
 from zakai.numerics.prior_grid import PriorGrid, mixture_grid, prior_grid
 from zakai.numerics.space_average import average
 from zakai.numerics.space_grid import Grid, weighted_products
@@ -156,10 +156,7 @@ def prior_on_grid(model: Model, prior: Any, theta: Array, tolerance: float, peri
             lambda x: function(x, model.start, theta), model.n, periodic, tolerance=tolerance, aligned=aligned,
             source=f"{source}: log_density",
         )  # fmt: skip
-    if isinstance(prior, GaussianPrior):
-        weights, means, covs = np.ones(1), prior.mean[None], prior.cov[None]
-    else:
-        weights, means, covs = prior.weights, prior.means, prior.covs
+    weights, means, covs = prior.components
     return mixture_grid(weights, means, covs, periodic, tolerance=tolerance, aligned=aligned, source=source)
 
 

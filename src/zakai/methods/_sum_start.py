@@ -15,7 +15,7 @@ import numpy as np
 from zakai.errors import InputError
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-from zakai.models.prior import DensityPrior, GaussianPrior
+from zakai.models.prior import DensityPrior
 from zakai.numerics.gaussian_sum import Array, Components, components, joined, moments, regression, selected, shares
 from zakai.numerics.prior_grid import prior_grid
 from zakai.numerics.sum_quadrature import refit
@@ -201,9 +201,8 @@ def given(model: Model, prior: Any, origin: Array) -> Components:
         logs = grid.log_values.real.ravel() + np.log(abs(np.linalg.det(grid.basis)))
         means = grid.points.reshape(-1, model.n)
         return components(logs, means - origin, np.zeros((len(means), model.n, model.n)))
-    if isinstance(prior, GaussianPrior):
-        return components(np.zeros(1), (prior.mean - origin)[None], prior.cov[None])
-    return components(np.log(prior.weights), prior.means - origin, prior.covs)
+    weights, means, covs = prior.components
+    return components(np.log(weights), means - origin, covs)
 
 
 def difference(start: Components, prior: Components, angles: tuple[int, ...]) -> float:

@@ -122,12 +122,9 @@ def check_prior(model: Model, prior: Any) -> None:
 
 
 def _mass_outside(prior: GaussianPrior | MixturePrior, column: int, interval: Interval) -> float:
-    if isinstance(prior, GaussianPrior):
-        weights, means, variances = np.ones(1), prior.mean[None, column], prior.cov[None, column, column]
-    else:
-        weights, means, variances = prior.weights, prior.means[:, column], prior.covs[:, column, column]
+    weights, means, covs = prior.components
     total = 0.0
-    for weight, mean, variance in zip(weights, means, variances, strict=True):
+    for weight, mean, variance in zip(weights, means[:, column], covs[:, column, column], strict=True):
         if variance == 0:
             total += weight * float(not interval.contains(mean))
             continue

@@ -40,6 +40,11 @@ class GaussianPrior:
     mean: np.ndarray
     cov: np.ndarray
 
+    @property
+    def components(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The prior as a mixture of one: the weights (1,), means (1, n) and covariances (1, n, n)."""
+        return np.ones(1), self.mean[None], self.cov[None]
+
     def log_density(self, x: np.ndarray) -> np.ndarray:
         """The logarithm of the density at `x` (..., n); InputError where the covariance is singular."""
         return _gaussian_log_density(x, self.mean, self.cov)
@@ -60,6 +65,11 @@ class MixturePrior:
     weights: np.ndarray
     means: np.ndarray
     covs: np.ndarray
+
+    @property
+    def components(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The weights (k,), means (k, n) and covariances (k, n, n)."""
+        return self.weights, self.means, self.covs
 
     @property
     def mean(self) -> np.ndarray:

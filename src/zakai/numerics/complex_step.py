@@ -30,15 +30,13 @@ def absolute(values: Any) -> Array:
     return np.where(values.real < 0, -values, values) if is_complex(values) else np.abs(values)
 
 
-def erf(values: Any) -> Array:
-    """Return the error function."""
-    from scipy.special import erf as real_erf
-
-    values = np.asarray(values)
-    if not is_complex(values):
-        return np.asarray(real_erf(values))
-    slope = 2.0 / np.sqrt(np.pi) * np.exp(-(values.real**2))
-    return np.asarray(real_erf(values.real) + 1j * slope * values.imag)
+def angle(sine: Any, cosine: Any) -> Array:
+    """Return the angle of (cosine, sine) in (-pi, pi]."""
+    found = np.arctan2(np.real(sine), np.real(cosine))
+    if not is_complex(sine, cosine):
+        return np.asarray(found)
+    turn = np.imag(sine) * np.real(cosine) - np.imag(cosine) * np.real(sine)
+    return np.asarray(found + 1j * (turn / (np.real(sine) ** 2 + np.real(cosine) ** 2)))
 
 
 def log_sum_exp(logs: Any, axis: int = -1) -> Array:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.numerics.complex_step import absolute, log_determinant
+from zakai.numerics.complex_step import absolute, angle, log_determinant
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -60,14 +60,8 @@ def moments(share: Array, means: Array, covs: Array, angles: tuple[int, ...] = (
     for i in angles:
         size = share * np.exp(-0.5 * covs[:, i, i])
         sine, cosine = size @ np.sin(means[:, i]), size @ np.cos(means[:, i])
-        radius = sine**2 + cosine**2
-        angle = np.arctan2(sine.real, cosine.real)
-        if radius.real <= 1e-18:  # a uniform angle has no direction
-            mean[i] = 0.0
-        elif np.iscomplexobj(mean):
-            mean[i] = angle + 1j * ((sine.imag * cosine.real - cosine.imag * sine.real) / radius.real)
-        else:
-            mean[i] = angle
+        # A uniform angle has no direction.
+        mean[i] = 0.0 if sine.real**2 + cosine.real**2 <= 1e-18 else angle(sine, cosine)
     deviation = wrapped(means - mean, angles)
     n = means.shape[1]
     within = (share @ covs.reshape(len(share), n * n)).reshape(n, n)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zakai.numerics.complex_step import angle
 from zakai.numerics.line_density import spectrum, waves
 from zakai.numerics.line_operator import generator
 from zakai.numerics.line_polynomial import interpolated_logs
@@ -266,15 +267,8 @@ def moments(values: Array, window: Window) -> tuple[Any, Any]:
     x = window.points
     cosine, sine = np.cos(x) @ values, np.sin(x) @ values
     length = np.sqrt(cosine**2 + sine**2)
-    mean: Any = 0.0 * cosine if length.real < 1e-9 else _angle(sine, cosine)
+    mean: Any = 0.0 * cosine if length.real < 1e-9 else angle(sine, cosine)
     # The square of a wrapped deviation d is pi^2 / 3 + 4 sum (-1)^k cos(k d) / k^2.
     k = np.arange(1, window.size // 2)
     waves = np.cos(k[:, None] * (x - mean)) @ values
     return mean - window.origin, np.pi**2 / 3 + 4.0 * np.sum(np.where(k % 2 == 0, 1.0, -1.0) / k**2 * waves)
-
-
-def _angle(sine: Any, cosine: Any) -> Any:
-    angle = np.arctan2(sine.real, cosine.real)
-    if np.iscomplexobj(sine):
-        return angle + 1j * (sine.imag * cosine.real - cosine.imag * sine.real) / (sine.real**2 + cosine.real**2)
-    return angle
