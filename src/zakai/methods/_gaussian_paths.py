@@ -1,4 +1,4 @@
-"""Draws of the state at the start of an interval given that at its end, for the Gaussian families.
+"""Draws of the state at the start of an interval given that at its end, for families and sums of Gaussians.
 
 Of v, which is u without the gauge, the kernel of an interval is Gaussian (`numerics/transition.py`, equation 2).  Given z at the
 end, the state x at the start has a density proportional to v(x) times this kernel, and the gauge at z is a constant.  With a
@@ -18,14 +18,15 @@ import numpy as np
 from zakai.errors import InputError
 from zakai.methods._gaussian_families import Prepared, State, inputs_of
 from zakai.numerics.families import log_terms, weigh
-from zakai.numerics.transition import Array, at
+from zakai.numerics.gaussian_sum import wrapped
+from zakai.numerics.transition import Array, Transition, at
 
 SINGULAR = 1e-13  # of the largest eigenvalue of a correlation matrix: an eigenvalue that is zero
 FEWEST = 1e-3  # share of the proposals that a density with negative weights must accept
 
 
 class Gaussians(NamedTuple):
-    """The Gaussians of a family given z: log |weights| (P, N), means (P, N, n), and a square root (n, n) of the covariance."""
+    """Gaussians of one covariance given z: log |weights| (P, N), means (P, N, n), and a square root (n, n) of the covariance."""
 
     logs: Array
     means: Array
@@ -40,12 +41,13 @@ def draw(prepared: Prepared, k: int, later: Array, values: Array, state: State, 
     families = weigh(state.families, own.information, own.vector @ inputs, 0.0)
     logs, z = log_terms(families), later - origin - own.offset @ inputs
     moved = families.nodes @ families.response.swapaxes(1, 2)
-    parts = [_given(logs[j], families.mean[j] + moved[j], families.cov[j], own.map, own.noise, z) for j in range(len(logs))]
-    return _drawn(prepared, parts, state.signs, rng) + origin, 0.0
+    parts = [given_end(logs[j], families.mean[j] + moved[j], families.cov[j], own, z) for j in range(len(logs))]
+    return drawn(prepared.model.source, parts, state.signs, rng) + origin, 0.0
 
 
-def _given(logs: Array, means: Array, cov: Array, matrix: Array, noise: Array, z: Array) -> Gaussians:
-    """Return the Gaussians of one family given z (P, n)."""
+def given_end(logs: Array, means: Array, cov: Array, own: Transition, z: Array, angles: tuple[int, ...] = ()) -> Gaussians:
+    """Return Gaussians of one covariance given z (P, n) after a transition without inputs; z has some `angles`."""
+    matrix, noise = own.map, own.noise
     total = matrix @ cov @ matrix.T + noise
     scale = np.sqrt(np.maximum(np.diag(total), 0.0))
     scale = np.where(scale > 0, scale, 1.0)
@@ -54,7 +56,7 @@ def _given(logs: Array, means: Array, cov: Array, matrix: Array, noise: Array, z
     whiten = (axes[:, used] / np.sqrt(sizes[used])).T / scale
     gain = cov @ matrix.T @ whiten.T @ whiten
     keep = np.eye(len(cov)) - gain @ matrix
-    away = z[:, None] - means @ matrix.T
+    away = wrapped(z[:, None] - means @ matrix.T, angles)
     white = away @ whiten.T
     volume = np.sum(np.log(np.sqrt(sizes[used]))) + np.sum(np.log(scale))
     return Gaussians(
@@ -72,8 +74,11 @@ def _root(cov: Array) -> Array:
     return np.asarray(scale[:, None] * axes * np.sqrt(np.maximum(sizes, 0.0)))
 
 
-def _drawn(prepared: Prepared, parts: list[Gaussians], signs: Array, rng: np.random.Generator) -> Array:
-    """Return a draw for each z; where weights are negative, proposals are accepted by the share of the density in them."""
+def drawn(source: str, parts: list[Gaussians], signs: Array, rng: np.random.Generator) -> Array:
+    """Return a draw for each z, for the model of a source.
+
+    Where weights are negative, proposals are accepted by the share of the density in them.
+    """
     count, n = len(parts[0].means), parts[0].means.shape[2]
     logs = np.concatenate([part.logs for part in parts], axis=1)
     means = np.concatenate([part.means for part in parts], axis=1)
@@ -90,7 +95,7 @@ def _drawn(prepared: Prepared, parts: list[Gaussians], signs: Array, rng: np.ran
         rest, tried = rest[~accepted], tried + 1
         if tried > 1.0 / FEWEST:
             raise InputError(
-                f"{prepared.model.source}: sample_paths: the negative weights of the prior's nodes nearly cancel the positive "
+                f"{source}: sample_paths: the negative weights of the prior's nodes nearly cancel the positive "
                 "ones; take another method, such as yau-yau"
             )
     return found

@@ -20,6 +20,7 @@ import numpy as np
 from zakai.densities import GaussianMixture
 from zakai.errors import InputError
 from zakai.methods import _sum_start as start
+from zakai.methods._gaussian_paths import drawn, given_end
 from zakai.methods._protocol import Backward, Info
 from zakai.methods._sum_intervals import Prepared, inputs_of
 from zakai.methods._sum_update import move
@@ -33,13 +34,11 @@ from zakai.numerics.gaussian_sum import (
     moments,
     selected,
     shares,
-    symmetric,
     weighed,
     wrapped,
 )
 
 WIDER = 3.0  # variance of g relative to that of the filter's density
-SINGULAR = 1e-13  # eigenvalue of a correlation matrix that is zero
 FLAT = 2  # directions in which a Gaussian is cut into many
 NEGLIGIBLE = 1e-14  # share of a Gaussian of a smoothed density that is left out
 LEAST = 1e-9  # variance of g along an axis relative to that of the prior
@@ -215,14 +214,8 @@ def density(prepared: Prepared, state: Any, later: Message) -> GaussianMixture:
 
 
 @np.errstate(all="ignore")
-def draw(
-    prepared: Prepared, k: int, later: Array, values: Array, state: Any, rng: np.random.Generator
-) -> tuple[Array, float]:
-    """Return draws (P, n) of the state at the start of interval k given those at its end: exact for the filtered sum.
-
-    Given x' = Psi x + b + N(0, Gamma), a weighed Gaussian N(m, P) of v becomes N(m + J (x' - Psi m - b), P - J Psi P) with
-    J = P Psi' (Psi P Psi' + Gamma)^+, and its weight is multiplied by its density of x'.
-    """
+def draw(prepared: Prepared, k: int, later: Array, values: Array, state: Any, rng: np.random.Generator) -> tuple[Array, float]:
+    """Return draws (P, n) of the state at the start of interval k given those at its end: exact for the filtered sum."""
     static, schedule, factor = prepared.static, prepared.whole.schedule, prepared.whole.factors[k]
     if schedule.lengths[k] == 0:
         return later, 0.0
@@ -231,24 +224,9 @@ def draw(
         v = prepared.moment(k, float(schedule.starts[k])).multiply(v, factor, values, start=True).sum
     inputs = inputs_of(static, schedule, k, values)
     v = weighed(v, 0.0, own.vector @ inputs, own.information)
-    total = own.map @ v.covs @ own.map.T + own.noise
-    scale = np.sqrt(np.maximum(np.diagonal(total, axis1=1, axis2=2), 1e-300))
-    both = scale[:, :, None] * scale[:, None, :]
-    sizes, axes = np.linalg.eigh(total / both)
-    used = sizes > SINGULAR
-    inverse = (axes * np.where(used, 1.0 / np.where(used, sizes, 1.0), 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2) / both
-    away = wrapped(later[:, None] - origin - v.means @ own.map.T - own.offset @ inputs, static.angles)
-    volumes = np.log(np.where(used, sizes, 1.0)).sum(axis=1) + 2.0 * np.log(scale).sum(axis=1)
-    logs = v.log_weights - 0.5 * volumes - 0.5 * np.einsum("pki,kij,pkj->pk", away, inverse, away)
-    weights = np.exp(logs - logs.max(axis=1, keepdims=True))
-    chosen = (weights.cumsum(axis=1) < rng.random((len(later), 1)) * weights.sum(axis=1, keepdims=True)).sum(axis=1)
-    gain = v.covs @ own.map.T @ inverse
-    left = v.covs - gain @ own.map @ v.covs
-    spread, turns = np.linalg.eigh(symmetric(left))
-    root = turns * np.sqrt(np.maximum(spread, 0.0))[:, None, :]
-    pull = np.einsum("pij,pj->pi", gain[chosen], away[np.arange(len(later)), chosen])
-    noise = np.einsum("pij,pj->pi", root[chosen], rng.standard_normal(later.shape))
-    return wrapped(origin + v.means[chosen] + pull + noise, static.angles), 0.0
+    z = later - origin - own.offset @ inputs
+    parts = [given_end(v.log_weights[[i]], v.means[[i]], v.covs[i], own, z, static.angles) for i in range(len(v.signs))]
+    return wrapped(origin + drawn(static.model.source, parts, v.signs, rng), static.angles), 0.0
 
 
 def accuracy(prepared: Prepared) -> float:
