@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zakai.numerics import line_window as lw
+
 SUPPORT = 36.0  # nats below the maximum at which a density is negligible
 Array = NDArray[Any]
 
@@ -72,35 +74,14 @@ class Field(NamedTuple):
         return int(used[0]), int(used[-1])
 
     def on(self, grid: Grid) -> Field:
-        """Interpolate on another grid with the same origin; zero outside.
-
-        The sinc interpolant is exact where the density is resolved; in the tails, below its rounding, a polynomial of the
-        logarithm is used.
-        """
+        """Interpolate on another grid with the same origin; zero outside."""
         if grid == self.grid:
             return self
-        ratio = 2.0 ** (self.grid.level - grid.level)
-        at = ratio * (grid.first + np.arange(grid.size)) - self.grid.first
-        size, logs = self.grid.size, np.full(grid.size, -np.inf, self.logs.dtype)
-        exact = (at == np.round(at)) & (at >= 0) & (at <= size - 1)
-        logs[exact] = self.logs[at[exact].astype(int)]
-        between = np.flatnonzero(~exact & (at > 0) & (at < size - 1))
-        if not len(between):
-            return Field(grid, logs)
-        at = at[between]
-        top = np.max(self.logs.real)
-        values = np.sinc(at[:, None] - np.arange(size)) @ np.exp(self.logs - top)
-        left = np.clip(np.floor(at).astype(int) - 2, 0, size - 6)
-        stencil = left[:, None] + np.arange(6)
-        weights = np.prod(
-            [np.where(np.arange(6) == j, 1.0, (at[:, None] - left[:, None] - j) / (np.arange(6) - j + (np.arange(6) == j)))
-             for j in range(6)], axis=0)  # fmt: skip
-        near = self.logs[stencil]
-        finite = np.isfinite(near).all(axis=1)
-        tail = np.where(finite, np.sum(weights * np.where(finite[:, None], near, 0.0), axis=1), -np.inf)
-        good = values.real > 1e-11
-        logs[between] = np.where(good, np.log(np.where(good, values, 1.0)) + top, tail)
-        return Field(grid, logs)
+        own, top = self.grid, np.max(self.logs.real)
+        window = lw.Window(0.0, own.spacing * (own.first + own.size // 2), own.spacing, own.size, False, own.spacing)
+        values = lw.density_at(np.exp(self.logs - top), window, grid.offsets)
+        with np.errstate(divide="ignore"):
+            return Field(grid, np.log(values) + top)
 
 
 def edge_masses(logs: Array) -> tuple[float, float]:
