@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -33,18 +33,13 @@ class System:
         self.sensors = Sensors.of(model)
         self.drift = numpy_function(model.drift, model)
         self.G = float(numpy_function(model.covariance, model, (1, 1))(np.zeros(1), model.start, theta)[0, 0].real)
-        self._kernels: OrderedDict[Grid, Kernels] = OrderedDict()
+        self.kernels = lru_cache(KEPT)(self._kernels_on)
 
-    def kernels(self, grid: Grid) -> Kernels:
+    def _kernels_on(self, grid: Grid) -> Kernels:
         """Return the kernels on a grid, which depend on it alone."""
-        kernels = self._kernels.get(grid)
-        if kernels is None:
-            with np.errstate(all="ignore"):
-                heat = heat_series(self.model, grid.points, self.order, theta=self.theta, potential=False)
-            kernels = self._kernels[grid] = Kernels(heat, grid, self.form)
-            while len(self._kernels) > KEPT:
-                self._kernels.popitem(last=False)
-        return kernels
+        with np.errstate(all="ignore"):
+            heat = heat_series(self.model, grid.points, self.order, theta=self.theta, potential=False)
+        return Kernels(lambda t: heat.banded(grid.spacing, t, self.form), self.G, grid, self.form == "log")
 
 
 @dataclass(frozen=True, eq=False)
