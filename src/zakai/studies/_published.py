@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from zakai.errors import InputError
 from zakai.records.writing import atomic_write
 
 WIDTH = 118
@@ -178,10 +177,3 @@ class Progress:
         self.done += count
         if self.report is not None:
             self.report(self.done, self.total)
-
-
-def whole_number(option: str, value: Any, least: int, most: int) -> int:
-    """The value of an option that counts something; InputError for another one."""
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise InputError(f"option {option}: {value!r} is not a whole number from {least} to {most}")
-    return value

@@ -18,11 +18,12 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from zakai.engine.driver import filter as filter_record
+from zakai.methods._options import whole_number
 from zakai.models.model import Model
 from zakai.models.simulate import simulate
 from zakai.records import Record
 from zakai.studies._drawing import INK, OURS, SERIES, new_figure, plain
-from zakai.studies._published import Comparison, Pictures, Progress, Reproduction, Table, by_computation, whole_number
+from zakai.studies._published import Comparison, Pictures, Progress, Reproduction, Table, by_computation
 
 DECAY, PROCESS, NOISE, STEP = 0.9, 0.4, 0.1, 0.1
 WIDTH = 32.0  # of the kernel

@@ -23,13 +23,14 @@ from scipy.special import ndtr
 
 from zakai.engine.driver import filter_from
 from zakai.errors import InputError
+from zakai.methods._options import whole_number
 from zakai.models.files import load_model
 from zakai.models.prior import GaussianPrior
 from zakai.records import Record
 from zakai.studies._chen_luo_yau_2017_text import text_of
 from zakai.studies._extended_kalman import extended_kalman
 from zakai.studies._grid_optimal import grid_optimal
-from zakai.studies._published import Comparison, Pictures, Progress, by_chance, comparison_lines, whole_number, write_figures
+from zakai.studies._published import Comparison, Pictures, Progress, by_chance, comparison_lines, write_figures
 
 STEP = 0.01
 START = 0.1

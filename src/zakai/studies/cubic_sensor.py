@@ -16,6 +16,7 @@ import numpy as np
 
 from zakai.engine.driver import filter as filter_record
 from zakai.errors import InputError
+from zakai.methods._options import whole_number
 from zakai.models.files import load_model
 from zakai.models.simulate import simulate
 from zakai.records import Record
@@ -27,7 +28,6 @@ from zakai.studies._published import (
     Reproduction,
     Table,
     by_chance,
-    whole_number,
 )
 from zakai.studies._reference_density import crank_nicolson
 from zakai.studies.metrics import over_runs

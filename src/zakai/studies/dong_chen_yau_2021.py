@@ -17,13 +17,14 @@ from scipy.integrate import solve_ivp
 
 from zakai.algebra.analysis import analyze
 from zakai.engine.driver import filter as filter_record
+from zakai.methods._options import whole_number
 from zakai.models.files import load_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.simulate import simulate
 from zakai.records import Record
 from zakai.studies._drawing import OURS, PALE, new_figure, plain
-from zakai.studies._published import Comparison, Pictures, Progress, Reproduction, by_computation, whole_number
+from zakai.studies._published import Comparison, Pictures, Progress, Reproduction, by_computation
 
 BASIS = "L0, D1, x1, 1"
 STEP, TIME, FAR = 1e-3, 1.0, 1e3

@@ -19,11 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.engine.driver import filter as filter_record
+from zakai.methods._options import whole_number
 from zakai.models.model import Model
 from zakai.models.simulate import simulate
 from zakai.records import Record
 from zakai.studies._drawing import INK, OURS, SERIES, new_figure, plain
-from zakai.studies._published import CHANCE, Comparison, Pictures, Progress, Reproduction, Table, by_computation, whole_number
+from zakai.studies._published import CHANCE, Comparison, Pictures, Progress, Reproduction, Table, by_computation
 
 NOISE = 0.25  # the standard deviation s of an observation
 EULER = 0.02

@@ -18,10 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.engine.driver import filter as filter_record
+from zakai.methods._options import whole_number
 from zakai.models.model import Model
 from zakai.records import Record
 from zakai.studies._drawing import INK, SERIES, TRUTH, new_figure, plain
-from zakai.studies._published import Pictures, Progress, Reproduction, Table, by_chance, whole_number
+from zakai.studies._published import Pictures, Progress, Reproduction, Table, by_chance
 from zakai.studies.metrics import over_runs
 
 STEP, EACH, NOISE = 0.01, 25, 2.0

@@ -19,11 +19,12 @@ from scipy.integrate import solve_ivp
 from zakai.algebra.analysis import analyze
 from zakai.engine.driver import filter as filter_record
 from zakai.methods._heat_series import HeatSeries, heat_series
+from zakai.methods._options import whole_number
 from zakai.models.files import load_model
 from zakai.models.model import Model
 from zakai.models.simulate import simulate
 from zakai.studies._drawing import SERIES, new_figure, plain
-from zakai.studies._published import Comparison, Pictures, Progress, Reproduction, Table, by_computation, whole_number
+from zakai.studies._published import Comparison, Pictures, Progress, Reproduction, Table, by_computation
 from zakai.studies._reference_density import conditional_densities
 from zakai.studies._yau_kernels import parametrix, transition
 
