@@ -13,10 +13,9 @@ import numpy as np
 from zakai.models.model import Model
 from zakai.models.numeric import NumericFunction, numpy_function
 from zakai.numerics.complex_step import cholesky, log_determinant
+from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS, panels
 from zakai.records.schedule import Schedule
 
-MOST_NODES = 256
-CLOSE = 1e-8  # relative change of an integral over time from which more nodes are taken
 Array = np.ndarray
 
 
@@ -91,72 +90,56 @@ class Sensors(NamedTuple):
         if not self.varies[1]:
             return np.asarray(self.noise_at(np.array([stop]), theta, which)[0])
 
-        def mean(count: int) -> Array:
-            s, w = _gauss(count)
-            times = stop - spans[..., None] * s
-            blocks = np.stack([self.noise_at(row, theta, which) for row in times.reshape(-1, count)])
-            return np.asarray(np.einsum("q,ijqij->ij", w, blocks.reshape(*times.shape, len(which), len(which))))
+        def entries(times: Array) -> Array:
+            return self.noise_at(times, theta, which).reshape(len(times), -1)
 
-        return _converged(mean)[0]
+        found = np.zeros(spans.shape, np.result_type(theta, float))
+        for span in np.unique(spans):
+            times, weights, _ = _quadrature(entries, stop - span, stop)
+            found = np.where(spans == span, (weights @ entries(times)).reshape(spans.shape) / span, found)
+        return found
 
     def inside(self, schedule: Schedule, k: int, values: Array, theta: Array, probe: Array) -> tuple[Factor, Factor, float]:
         """Return the factors at the two ends of interval k for increments with y linear inside of it, and an error in nats.
 
             log factors = int (1 - s) l dt,  int s l dt,      l = h'S^-1 dy/dt - h'S^-1 h / 2
 
-        at a fixed x, with nodes added until two rules agree at the points `probe` (count, n).
+        at a fixed x, in parts of the interval in which few nodes resolve the rate at the points `probe` (count, n).
         """
-        which, start = np.flatnonzero(schedule.inside[k]), schedule.starts[k]
+        which, start = np.flatnonzero(schedule.inside[k]), float(schedule.starts[k])
         span, m = float(schedule.lengths[k]), schedule.inside.shape[1]
         target = np.zeros(m, values.dtype)
         target[which] = values[which] / span
 
-        def precision(s: Array, w: Array) -> Array:
-            inverse: Array = np.linalg.inv(self.noise_at(start + span * s, theta, which))
-            return np.asarray(inverse * (span * w)[:, None, None])
+        def precision(times: Array) -> Array:
+            return np.asarray(np.linalg.inv(self.noise_at(times, theta, which)))
+
+        def energies(times: Array) -> Array:
+            """Return (h - y')'S^-1 (h - y') (T, count) at the probes."""
+            apart = (self.observed(probe, times[:, None], theta) - target)[..., which].real
+            return np.asarray(np.sum((apart @ precision(times).real) * apart, axis=-1))
 
         def factor(times: Array, weights: Array, constant: Any) -> Factor:
             full = np.zeros((len(weights), len(which), m), weights.dtype)
             full[:, :, which] = np.swapaxes(cholesky(weights), -1, -2)
             return Factor(times, full, target, constant)
 
-        def both(count: int) -> tuple[Array, Array, Array]:
-            s, w = _gauss(count)
-            P = precision(s, w)
-            early, late = P * (1 - s)[:, None, None], P * s[:, None, None]
-            if self.varies[0]:
-                return start + span * s, early, late
-            return np.array([start + 0.5 * span]), early.sum(axis=0)[None], late.sum(axis=0)[None]
-
-        def logs(count: int) -> Array:
-            times, early, late = both(count)
-            pair = [factor(times, P, 0.0).residuals(self.observed, probe, theta) for P in (early, late)]
-            return np.stack([0.5 * np.sum(e * e, axis=0) for e in pair])
-
-        count, error = 1, 0.0
+        times, weights, error = np.array([start + 0.5 * span]), np.array([span]), 0.0
         if any(self.varies):
-            _, error, count = _converged(logs)
-        times, early, late = both(count)
+            times, weights, relative = _quadrature(lambda t: np.nan_to_num(energies(t), posinf=0.0), start, start + span)
+            found = weights @ energies(times)
+            error = 0.5 * relative * float(np.max(found, initial=0.0)) if np.isfinite(found).all() else np.inf
+        whole, share = precision(times) * weights[:, None, None], ((times - start) / span)[:, None, None]
+        early, late = whole * (1.0 - share), whole * share
+        if not self.varies[0]:
+            times, early, late = times[:1], early.sum(axis=0)[None], late.sum(axis=0)[None]
         rate = target[which]
         constant = 0.5 * rate @ (early + late).sum(axis=0) @ rate
         return factor(times, early, 0.0), factor(times, late, constant), error
 
 
-def _gauss(count: int) -> tuple[Array, Array]:
-    x, w = np.polynomial.legendre.leggauss(count)
-    return 0.5 * (x + 1), 0.5 * w
-
-
-def _converged(rule: Callable[[int], Array]) -> tuple[Array, float, int]:
-    """Return an integral by a rule of more and more nodes until two agree twice; the last change; and the number of nodes."""
-    count, last, agreed = 4, rule(4), 0
-    while True:
-        count *= 2
-        value = rule(count)
-        change = np.abs(value - last).real
-        fine = bool(np.all(change <= CLOSE * (1 + np.abs(value))))
-        agreed = agreed + 1 if fine else 0
-        if agreed == 2 or count >= MOST_NODES:
-            error = 0.0 if fine else float(np.max(np.where(np.isfinite(change), change, np.inf)))
-            return value, error, count // 2 if agreed == 2 else count
-        last = value
+def _quadrature(coefficients: Callable[[Array], Array], start: float, stop: float) -> tuple[Array, Array, float]:
+    """Return times and weights that integrate functions of times (T,) with values (T, C), and the relative error that remains."""
+    found = panels(coefficients, start, stop)
+    first, last = np.array(found.bounds).T[:, :, None]
+    return (first + (last - first) * GAUSS_NODES).ravel(), ((last - first) * GAUSS_WEIGHTS).ravel(), found.error
