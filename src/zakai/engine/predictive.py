@@ -20,6 +20,7 @@ from zakai.algebra.systems import affine_observation
 from zakai.densities import Density, GaussianMixture, GridDensity, IntervalDensity
 from zakai.densities.mapped import MappedDensity
 from zakai.engine.setting import Setting
+from zakai.methods._residuals import Sensors
 from zakai.models.checks import depends_on_state
 from zakai.models.numeric import numpy_function
 from zakai.numerics.complex_step import STEP
@@ -102,8 +103,8 @@ class PredictiveSums:
         self.possible = model.log_density is None if self.samples else fixed
         gaussian = not self.samples or model.observation_law.is_gaussian
         self.gaussian = gaussian and not depends_on_state(model.observation_noise, model)
-        self.h = numpy_function(model.observation, model)
-        self.noise = numpy_function(model.observation_noise, model, (model.m, model.m))
+        self.sensors = Sensors.of(model)
+        self.h, self.noise = self.sensors.observed, self.sensors.noise
         self.spread = numpy_function(model.covariance, model, (model.n, model.n))
 
     @cached_property
@@ -125,14 +126,7 @@ class PredictiveSums:
     def noise_of_increments(self, k: int) -> Array:
         """Return the covariance (m, m) of the noise of the increments at the end of interval k, over the time they share."""
         elapsed, stop = self.schedule.elapsed[k], float(self.schedule.stops[k])
-        common = np.minimum.outer(elapsed, elapsed)
-        origin = np.zeros(self.model.n)
-        if not self.model.observation_noise.has(self.model.t):
-            return np.asarray(common * self.noise(origin, stop, self.theta))
-        times = stop - common[..., None] * _NODES
-        row, column = np.indices(common.shape)
-        values = self.noise(origin, times, self.theta)[row, column, :, row, column]
-        return np.asarray(common * (values @ _WEIGHTS))
+        return self.sensors.shared_noise(stop, elapsed, self.theta, np.arange(self.model.m))
 
     @cached_property
     def unobserved(self) -> Schedule:
@@ -182,10 +176,6 @@ class PredictiveSums:
         if mixture.covs is not None:
             covs = covs + slopes @ mixture.covs @ back
         return _gaussian(which, values - span * self.h(points, t, self.theta, inputs), covs)
-
-
-_NODES, _WEIGHTS = (0.5 * part for part in np.polynomial.legendre.leggauss(4))
-_NODES = _NODES + 0.5
 
 
 def _gaussian(which: Array, apart: Array, covs: Array) -> tuple[Array, Array, Array] | None:

@@ -74,10 +74,7 @@ class Sensors(NamedTuple):
             root, scale = np.linalg.inv(cholesky(S)), np.ones(len(which))
             constant = -0.5 * (log_determinant(S) + len(which) * np.log(2 * np.pi))
         else:
-            # Increments that end together share the noise of the time that they have in common.
-            shared = np.minimum(spans[:, None], spans)
-            cov = self._mean_noise(stop, shared, theta, which) * shared
-            root, scale = np.linalg.inv(cholesky(cov)), spans
+            root, scale = np.linalg.inv(cholesky(self.shared_noise(stop, spans, theta, which))), spans
             white = root @ v
             constant = 0.5 * white @ white
         target[which] = v / scale
@@ -85,18 +82,22 @@ class Sensors(NamedTuple):
         full[:, which] = root * scale
         return Factor(np.array([stop]), full[None], target, constant)
 
-    def _mean_noise(self, stop: float, spans: Array, theta: Array, which: Array) -> Array:
-        """Return the mean of S_ij over the time `spans` (k, k) before the stop."""
+    def shared_noise(self, stop: float, spans: Array, theta: Array, which: Array) -> Array:
+        """Return the covariance (k, k) of the noise of increments over `spans` (k,) that end together.
+
+        It is the integral of S over the time that two of them have in common.
+        """
+        shared = np.minimum(spans[:, None], spans)
         if not self.varies[1]:
-            return np.asarray(self.noise_at(np.array([stop]), theta, which)[0])
+            return np.asarray(shared * self.noise_at(np.array([stop]), theta, which)[0])
 
         def entries(times: Array) -> Array:
             return self.noise_at(times, theta, which).reshape(len(times), -1)
 
-        found = np.zeros(spans.shape, np.result_type(theta, float))
-        for span in np.unique(spans):
+        found = np.zeros(shared.shape, np.result_type(theta, float))
+        for span in np.unique(shared[shared > 0]):
             times, weights, _ = _quadrature(entries, stop - span, stop)
-            found = np.where(spans == span, (weights @ entries(times)).reshape(spans.shape) / span, found)
+            found = np.where(shared == span, (weights @ entries(times)).reshape(shared.shape), found)
         return found
 
     def inside(self, schedule: Schedule, k: int, values: Array, theta: Array, probe: Array) -> tuple[Factor, Factor, float]:
