@@ -59,25 +59,32 @@ def gauge(model: Model) -> Gauge | None:
     """The gauge of a model with a Yau form, or None where phi depends on more than two directions."""
     system = affine_system(model)
     assert system is not None
-    potential, x = system[0].potential, model.x
+    potential = system[0].potential
     if potential == 0:
         none, flat = sp.ImmutableMatrix.zeros(0, model.n), sp.ImmutableMatrix.zeros(1, model.n)
         return Gauge(potential, none, sp.ImmutableMatrix([0]), flat)
-    terms = _exponentials(potential, x)
+    terms = exponential_terms(potential, model)
     if terms is not None:
-        slopes = sp.ImmutableMatrix([list(slope) for slope in terms])
-        factors = [_without_exponential(coefficient) for coefficient in terms.values()]
-        if _positive(sp.ImmutableMatrix([number for number, _ in factors]), model):
-            rows = _independent(slopes, model)
-            if len(rows) > 2:
-                return None
-            logs = sp.ImmutableMatrix([sp.log(number) + exponent for number, exponent in factors])
-            return Gauge(potential, slopes.extract(rows, range(model.n)), logs, slopes)
+        logs, slopes = terms
+        rows = _independent(slopes, model)
+        return None if len(rows) > 2 else Gauge(potential, slopes.extract(rows, range(model.n)), logs, slopes)
     directions = _directions(system[0], model)
     return None if directions is None else Gauge(potential, directions, None, None)
 
 
 Terms = dict[tuple[sp.Expr, ...], sp.Expr]
+
+
+def exponential_terms(potential: sp.Expr, model: Model) -> tuple[sp.ImmutableMatrix, sp.ImmutableMatrix] | None:
+    """Return c (K, 1) and q (K, n) with e^phi = sum_j e^{c_j + q_j.x}, None where it is no such sum of positive terms."""
+    terms = _exponentials(potential, model.x)
+    if terms is None:
+        return None
+    factors = [_without_exponential(coefficient) for coefficient in terms.values()]
+    if not _positive(sp.ImmutableMatrix([number for number, _ in factors]), model):
+        return None
+    logs = sp.ImmutableMatrix([sp.log(number) + exponent for number, exponent in factors])
+    return logs, sp.ImmutableMatrix([list(slope) for slope in terms])
 
 
 def _exponentials(potential: sp.Expr, x: tuple[sp.Symbol, ...]) -> Terms | None:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 import sympy as sp
 
-from zakai.algebra.exponential_sum import exponential_sum
+from zakai.algebra.gauges import exponential_terms
 from zakai.models.features import JUMP_FUNCTIONS
 from zakai.models.functions import Maximum, Minimum, TableFunction
 from zakai.models.model import Model
@@ -81,15 +81,12 @@ class SumGauge:
         self.n, self.none, self.origin = model.n, phi == 0, origin
         self.directions = directions_of([phi], model)
         self._potential = numpy_function(phi, model)
-        terms = exponential_sum(phi, model.x)
-        self.exact = terms is not None
-        self.count = len(terms) if terms is not None else 1
+        terms = exponential_terms(phi, model)
+        self.exact, self.count = terms is not None, 1 if terms is None else terms[0].rows
         if terms is not None:
-            shift = [sp.Rational(float(value)) for value in origin]
-            flat = []
-            for constant, slopes in terms:
-                flat += [constant + sum(q * c for q, c in zip(slopes, shift, strict=True)), *slopes]
-            self._numbers = numpy_function(flat, model, (self.count, 1 + model.n))
+            logs, slopes = terms
+            shift = sp.Matrix([sp.Rational(float(value)) for value in origin])
+            self._numbers = numpy_function(sp.Matrix.hstack(logs + slopes * shift, slopes), model, (self.count, 1 + model.n))
 
     def potential(self, z: Array, t: float, theta: Array) -> Array:
         """Return phi at the points z (..., n)."""
