@@ -55,7 +55,7 @@ def test_a_record_is_checked_against_its_model():
     record = Record([1.0], [[1.0, 2.0]], "path")
     record.check(SimpleNamespace(m=2, observation_kind="path", start=0.5, inputs=()))
     for m, kind, start, says in [
-        (1, "path", 0.5, r"shape \(1, 2\); expected \(1, 1\)"),
+        (1, "path", 0.5, r"shape \(1, 2\); the model needs \(1, 1\)"),
         (2, "rates", 0.5, "holds path; the model observes rates"),
         (2, "path", 1.0, "must be after the model's start 1.0"),
     ]:

@@ -154,7 +154,8 @@ def check_records(model: Model, record: Record | Sequence[Record]) -> None:
             if not isinstance(given, kind):
                 raise InputError(f"filter: expected a {kind.__name__}, got a {type(given).__name__}; {how} reads one from a file")
         with named(f"records[{index}]") if isinstance(record, list | tuple) else nullcontext():
-            _check(model, one)
+            check_model(model)
+            one.check(model)
 
 
 def check_model(model: Model) -> None:
@@ -165,18 +166,3 @@ def check_model(model: Model) -> None:
         raise InputError(f"{model.source}: prior: the table is missing; it is needed to filter")
     if model.functions:
         raise InputError(f"{model.source}: functions: a model with undetermined functions can be analysed and not filtered")
-
-
-def _check(model: Model, record: Record) -> None:
-    check_model(model)
-    if record.kind != model.observation_kind:
-        raise InputError(
-            f"record: its kind is {record.kind}, but {model.source} observes {model.observation_kind} (observation_kind)"
-        )
-    if record.values.shape[1] != model.m:
-        raise InputError(f"record: it has {record.values.shape[1]} columns of observations, but {model.source} has {model.m}")
-    first = record.times[0]
-    if first < model.start or (first == model.start and record.kind != "samples"):
-        hint = "" if record.unit is None else "; give the date at which t = 0 as origin"
-        raise InputError(f"record: row 1: time {first:g} is not after the start {model.start:g} of {model.source}{hint}")
-    record.check_law(model)

@@ -17,10 +17,10 @@ from zakai.models._errors import named
 from zakai.records.dates import Clock, date_of, unit_name
 from zakai.records.header import LONGEST_LINE, cells_of, columns_fault, columns_with_inputs, header_names, header_of, quoted
 from zakai.records.inputs import Inputs
+from zakai.records.numbers import NUMBER
 from zakai.records.record import Record, early, first_fault
 from zakai.records.writing import shown
 
-_NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 _AT_ONCE = 1 << 18  # characters
 _NO_TEXT = re.compile("[\ud800-\udfff]")
 
@@ -212,7 +212,7 @@ def _header(source: str, line: str, m: int, what: str, expected: Sequence[str] |
         raise InputError(f"{source}: row 1: {fault}")
     names = header_names(line)
     if names[0] != "time":
-        hint = " (is the header missing?)" if _NUMBER.fullmatch(names[0]) else ""
+        hint = " (is the header missing?)" if NUMBER.fullmatch(names[0]) else ""
         fault = f"the first column is {quoted(names[0])}; the header must begin with time{hint}"
         raise InputError(f"{source}: row 1: {fault}")
     if (fault := columns_fault(names, m, what, expected)) is not None:
@@ -255,7 +255,7 @@ def _not_numbers(cells: list[str], names: list[str], whole: bool) -> str | None:
         cut = "" if whole else " (the file ends in this row; was it cut off?)"
         return f"{len(cells)} columns; expected {len(names)}: {quoted(','.join(names))}{cut}"
     for name, cell in zip(names, cells):
-        if cell and not _NUMBER.fullmatch(cell):
+        if cell and not NUMBER.fullmatch(cell):
             what = f"{quoted(cell)} in column {quoted(name)} is not a number"
             if name == "time" and date_of(cell) is not None:
                 return f"{what}; for dates give the model's unit of time, as in unit='h' (command: --unit h)"

@@ -14,7 +14,7 @@ from zakai import _display
 from zakai.errors import InputError
 from zakai.models._errors import echo
 from zakai.records.dates import Clock, read_times
-from zakai.records.numbers import LARGEST, real_numbers
+from zakai.records.numbers import LARGEST, numbers_in_time, real_numbers
 
 if TYPE_CHECKING:
     from zakai.models.model import Model
@@ -48,13 +48,7 @@ class Inputs:
 
     def __post_init__(self) -> None:
         given, clock, _ = read_times(self.times, self.unit, self.origin, "inputs")
-        times, values = real_numbers(given, "times", "inputs"), real_numbers(self.values, "values", "inputs")
-        if values.ndim == 1:
-            values = values[:, np.newaxis]
-        if times.ndim != 1 or times.size == 0:
-            raise InputError(f"inputs: times has shape {times.shape}; expected (k,) with at least one time")
-        if values.ndim != 2 or len(values) != len(times) or values.shape[1] == 0:
-            raise InputError(f"inputs: values has shape {values.shape}; expected ({len(times)}, number of inputs)")
+        times, values = numbers_in_time(given, self.values, "inputs", "(k,)", "number of inputs")
         for name, part in (("times", times[:, None]), ("values", values)):
             wrong = ~(np.abs(part) <= LARGEST).all(axis=1)
             if wrong.any():

@@ -13,11 +13,10 @@ from zakai import _display
 from zakai.errors import InputError
 from zakai.records.dates import Clock, read_times
 from zakai.records.inputs import Inputs, check_inputs
-from zakai.records.numbers import LARGEST, real_numbers
+from zakai.records.numbers import LARGEST, numbers_in_time, real_numbers
 from zakai.records.writing import default_names, write_table
 
 KINDS = ("increments", "path", "rates", "samples")
-
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,13 +64,7 @@ class Record:
         if self.kind not in KINDS:
             raise InputError(f"record: kind is {self.kind!r}; it must be one of {', '.join(KINDS)}")
         given, clock, dates = read_times(self.times, self.unit, self.origin)
-        times, values = real_numbers(given, "times"), real_numbers(self.values, "values")
-        if values.ndim == 1:
-            values = values[:, np.newaxis]
-        if times.ndim != 1 or times.size == 0:
-            raise InputError(f"record: times has shape {times.shape}; expected (K,) with at least one time")
-        if values.ndim != 2 or len(values) != len(times) or values.shape[1] == 0:
-            raise InputError(f"record: values has shape {values.shape}; expected ({len(times)}, m)")
+        times, values = numbers_in_time(given, self.values, "record", "(K,)", "m")
         fault = first_fault(times, values)
         if fault is not None:
             raise InputError(f"record: row {fault[0]}, counted from 0: {fault[1]}")
@@ -113,20 +106,18 @@ class Record:
         return self.clock.dates(self.times)
 
     def check(self, model: Any) -> None:
-        """Refuse a record that `model` cannot have made: another kind or m, or too early times."""
-        if self.kind != model.observation_kind:
-            raise InputError(f"record: holds {self.kind}; the model observes {model.observation_kind}")
-        if self.values.shape[1] != model.m:
-            expected = f"expected ({len(self)}, {model.m})"
-            raise InputError(f"record: values has shape {self.values.shape}; {expected}")
-        fault = early(self.times[0], self.kind, model.start)
-        if fault is not None:
-            hint = "" if self.unit is None else "; give the date at which t = 0 as origin"
-            raise InputError(f"record: row 0: {fault}{hint}")
-        self.check_law(model)
+        """Refuse a record that `model` cannot have made.
 
-    def check_law(self, model: Any) -> None:
-        """Refuse a record without the model's inputs, or with values that its observation family cannot have."""
+        It has another kind or m, too early times, not the model's inputs, or values that the observation family cannot have.
+        """
+        if self.kind != model.observation_kind:
+            raise InputError(f"record: holds {self.kind}; the model observes {model.observation_kind} (observation_kind)")
+        if self.values.shape[1] != model.m:
+            raise InputError(f"record: values has shape {self.values.shape}; the model needs ({len(self)}, {model.m})")
+        too_early = early(self.times[0], self.kind, model.start)
+        if too_early is not None:
+            hint = "" if self.unit is None else "; give the date at which t = 0 as origin"
+            raise InputError(f"record: row 0, counted from 0: {too_early}{hint}")
         if self.inputs is not None or model.inputs:
             check_inputs(model, self.inputs, float(self.times[-1]))
         fault = self.fault_of_law(model)

@@ -14,12 +14,12 @@ from zakai.errors import InputError
 from zakai.models._errors import named
 from zakai.records.dates import Clock, date_of
 from zakai.records.header import columns_with_inputs, header_names, quoted
+from zakai.records.numbers import NUMBER
 
 LONGEST = 2**20  # bytes of a line
 MOST_DIGITS = 640  # of an integer: what Python always reads, however it is set
 _WORD = re.compile(r"[^\W\d][\w.-]*")
 _SEPARATOR = re.compile(r"[,;\t]")
-_NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 
 
 class Line(NamedTuple):
@@ -165,7 +165,7 @@ def _csv(
     if clock is not None and cells[0]:
         cells[0] = repr(_date(cells[0].strip('"'), clock))
     for cell in cells:
-        if cell and not _NUMBER.fullmatch(cell):
+        if cell and not NUMBER.fullmatch(cell):
             raise ValueError(f"{quoted(cell)} is not a number; leave the cell empty if nothing was observed")
     if not cells[0]:
         raise ValueError("the time is missing")
@@ -201,4 +201,4 @@ def _columns(text: str, number: int, m: int, inputs: Sequence[str]) -> tuple[lis
 def _looks_like_csv(text: str) -> bool:
     """Whether a line is several words or numbers with separators between: no part of a line of JSON ends so, nor does prose."""
     cells = [cell.strip().strip('"') for cell in _SEPARATOR.split(text.strip())]
-    return len(cells) > 1 and all(_WORD.fullmatch(cell) or _NUMBER.fullmatch(cell) for cell in cells)
+    return len(cells) > 1 and all(_WORD.fullmatch(cell) or NUMBER.fullmatch(cell) for cell in cells)
