@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from zakai.errors import InputError
+from zakai.methods._moments import density_grid
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior
 from zakai.numerics.gaussian_sum import Array, Components, components, joined, moments, regression, selected, shares
-from zakai.numerics.prior_grid import prior_grid
 from zakai.numerics.sum_quadrature import refit
 from zakai.numerics.sum_reduction import PRUNED, gathered, groups
 
@@ -149,10 +149,7 @@ def _cut_density(model: Model, prior: DensityPrior, origin: Array, theta: Array)
     if n > 2:
         raise InputError(f"{model.source}: prior: a density in {n} coordinates is not cut into Gaussians; give a mixture")
     density = numpy_function(prior.log_density, model)
-    turning = tuple(name in model.periodic for name in model.state)
-    grid = prior_grid(
-        lambda x: density(x, model.start, theta.real), n, turning, source=f"{model.source}: prior: log_density"
-    )
+    grid = density_grid(model, prior, theta)
     logs = grid.log_values.real
     used = np.argwhere(logs > logs.max() - _DEPTH) - np.array(logs.shape) // 2
     low, high = used.min(axis=0) - 0.5, used.max(axis=0) + 0.5
@@ -195,10 +192,8 @@ def merged(sum_: Components, share: Array, loss: Array, most: int, angles: tuple
 def given(model: Model, prior: Any, origin: Array) -> Components:
     """Return the prior as it is given, in z = x - origin; a density as the points of a grid."""
     if isinstance(prior, DensityPrior):
-        density, theta = numpy_function(prior.log_density, model), model.theta()
-        turning = tuple(name in model.periodic for name in model.state)
-        grid = prior_grid(lambda x: density(x, model.start, theta), model.n, turning)
-        logs = grid.log_values.real.ravel() + np.log(abs(np.linalg.det(grid.basis)))
+        grid = density_grid(model, prior, model.theta())
+        logs = grid.log_values.ravel() + np.log(abs(np.linalg.det(grid.basis)))
         means = grid.points.reshape(-1, model.n)
         return components(logs, means - origin, np.zeros((len(means), model.n, model.n)))
     weights, means, covs = prior.components

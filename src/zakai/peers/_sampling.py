@@ -8,14 +8,14 @@ import numpy as np
 
 from zakai.densities import GridDensity
 from zakai.errors import InputError
-from zakai.methods._moments import wrapped
+from zakai.methods._moments import density_grid, wrapped
 from zakai.methods._options import whole_number
 from zakai.models._definite import square_root
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import GaussianPrior, MixturePrior
 from zakai.peers import _float64  # noqa: F401
-from zakai.peers._translation import Interval, Prepared, System, grid_of, system_of
+from zakai.peers._translation import Interval, Prepared, System, system_of
 from zakai.records.schedule import Schedule
 
 import jax  # isort: skip
@@ -63,7 +63,7 @@ def draws(prepared: Prepared, prior: Any, count: int) -> np.ndarray:
     elif model.n > 2:
         raise InputError(f"{model.source}: prior: a density in {model.n} coordinates cannot be drawn from; give a gaussian")
     else:
-        grid = grid_of(model, prior, prepared.theta)
+        grid = density_grid(model, prior, prepared.theta, 1e-9)
         drawn = GridDensity(grid.log_values, grid.centre, grid.basis, model.state, (False,) * model.n).sample(seed, count)
     return wrapped(model, drawn)
 

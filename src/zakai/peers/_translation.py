@@ -24,8 +24,6 @@ from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info, Infos
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-from zakai.models.prior import DensityPrior
-from zakai.numerics.prior_grid import PriorGrid, prior_grid
 from zakai.peers import _float64  # noqa: F401
 from zakai.peers._jax_functions import jax_function
 from zakai.records.schedule import Schedule
@@ -176,14 +174,6 @@ class Prepared:
         if self.model.observation_kind == "samples":
             constants = constants - 0.5 * (white[:, None, :] @ white[:, :, None])[:, 0, 0]
         return Observation(white, whiten, self.schedule.seen[rows].sum(axis=1).astype(float), constants)
-
-
-def grid_of(model: Model, prior: DensityPrior, theta: np.ndarray) -> PriorGrid:
-    """Return a grid that resolves a prior given by the logarithm of its density."""
-    log_density = numpy_function([prior.log_density], model, ())
-    periodic = [name in model.periodic for name in model.state]
-    source = f"{model.source}: prior: log_density"
-    return prior_grid(lambda x: log_density(x, model.start, theta), model.n, periodic, tolerance=1e-9, source=source)
 
 
 Advance = Callable[[System, Interval, Any, Observation], tuple[Any, Info]]
