@@ -124,22 +124,6 @@ def _block(given: Any) -> Any:
     return values
 
 
-@kernel("void(int64[:, ::1], float64[::1], int64[::1], int64[::1], float64[:, ::1], float64[:, ::1])")
-def _evaluate(code: Any, given: Any, coordinates: Any, outputs: Any, x: Any, out: Any) -> None:
-    """Write the outputs of a program (k, J) at points x (n, J)."""
-    values = _block(given)
-    for first in range(0, x.shape[1], BLOCK):
-        size = min(BLOCK, x.shape[1] - first)
-        for s in range(given.size):
-            if coordinates[s] >= 0:
-                for i in range(size):
-                    values[s, i] = x[coordinates[s], first + i]
-        _run(code, values, size)
-        for k in range(outputs.size):
-            for i in range(size):
-                out[k, first + i] = values[outputs[k], i]
-
-
 @kernel(
     "void(int64[:, ::1], float64[::1], int64[::1], int64[::1], float64[:, ::1], float64, float64, int64, float64[::1],"
     " float64[:, ::1], float64[::1], float64[:, ::1])"
@@ -150,24 +134,28 @@ def _flow(
 ) -> None:  # fmt: skip
     """Write the change (k, J) of points x (n, J), the first n outputs being their velocity: Runge-Kutta steps of order four.
 
-    A point that after a step has an index beyond a limit (n,), relative to a centre, is given up: its change is NaN.
+    A point that after a step has an index beyond a limit (n,), relative to a centre, is given up: its change is NaN.  Without
+    steps the outputs at t0 are written.
     """
     n, count = x.shape
     values = _block(given)
     slopes, total = np.zeros((outputs.size, BLOCK)), np.zeros((outputs.size, BLOCK))
-    h = (t1 - t0) / steps
+    h = (t1 - t0) / max(steps, 1)
     for first in range(0, count, BLOCK):
         size = min(BLOCK, count - first)
         change = out[:, first : first + size]
         for k in range(outputs.size):
             for i in range(size):
                 change[k, i] = slopes[k, i] = 0.0
-        for step in range(steps):
-            for stage in range(4):
+        for step in range(max(steps, 1)):
+            for stage in range(4 if steps else 1):
                 share = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
                 for s in range(given.size):
                     d = coordinates[s]
-                    if d >= 0:
+                    if d >= 0 and steps == 0:
+                        for i in range(size):
+                            values[s, i] = x[d, first + i]
+                    elif d >= 0:
                         for i in range(size):
                             values[s, i] = x[d, first + i] + change[d, i] + share * h * slopes[d, i]
                     elif d == CLOCK:
@@ -179,6 +167,11 @@ def _flow(
                     for i in range(size):
                         slopes[k, i] = values[outputs[k], i]
                         total[k, i] = weight * slopes[k, i] + (total[k, i] if stage else 0.0)
+            if steps == 0:
+                for k in range(outputs.size):
+                    for i in range(size):
+                        change[k, i] = slopes[k, i]
+                break
             for k in range(outputs.size):
                 for i in range(size):
                     change[k, i] += total[k, i]
@@ -218,10 +211,8 @@ class Formulas:
 
     def at(self, x: Array, t: float) -> Array:
         """Return the results (J, k) at points x (J, n) and one time, with the values of each result contiguous."""
-        out = np.empty((self.outputs.size, len(x)))
-        given = np.where(self.coordinates == CLOCK, t, self.given)
-        _evaluate(self.code, given, self.coordinates, self.outputs, np.array(x.T, order="C"), out)
-        return out.T
+        n = x.shape[1]
+        return self.flow(x, t, t, 0, np.zeros(n), np.zeros((n, n)), np.zeros(n))
 
     def flow(self, x: Array, t0: float, t1: float, steps: int, centre: Array, inverse: Array, limits: Array) -> Array:
         """Return the change (J, k) of points x (J, n) from t0 to t1, the first n results being their velocity.
@@ -236,6 +227,6 @@ class Formulas:
             limits: components in this basis, relative to the centre, beyond which a point is given up: its change is NaN (n,).
         """
         out = np.empty((self.outputs.size, len(x)))
-        points = np.array(x.T, order="C")
+        points = np.ascontiguousarray(x.T)
         _flow(self.code, self.given, self.coordinates, self.outputs, points, t0, t1, steps, centre, inverse, limits, out)
         return out.T
