@@ -37,7 +37,8 @@ def test_points_of_a_fixed_grid_move_as_the_flow_does(share):
 
     noise = (np.zeros((2, 2)), np.zeros((2, 2)))
     dynamics = Dynamics(drift, lambda x, t: np.broadcast_to(matrix, (len(x), 2, 2)), lambda a, b: noise, False)
-    moved = motion(dynamics, grid, 0.5)
+    moved = motion(dynamics, grid, 0.26)
+    assert moved.unit == 0.5
     found = (share ** np.arange(1, 6) @ moved.coefficients).reshape(3, -1)
     exact = grid.points @ (expm(-0.5 * share * matrix) - np.eye(2)).T
     np.testing.assert_allclose(grid.basis @ found[:2], exact.T, atol=2e-6)

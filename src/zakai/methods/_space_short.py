@@ -109,5 +109,7 @@ def motion_of(prepared: Prepared, grid: Grid, length: float) -> Motion:
     if kept is None:
         if len(prepared.motions) >= MOST_TABLES:
             prepared.motions.clear()
-        kept = prepared.motions[key] = motion(dynamics, grid, length)
+        kept = motion(dynamics, grid, length)
+        if kept.longest:
+            prepared.motions[key] = kept
     return kept

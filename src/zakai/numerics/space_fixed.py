@@ -49,7 +49,7 @@ class Motion(NamedTuple):
 
 
 def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
-    """Return the motion of a grid for lengths up to the power of two that is not below tau, without points if it is too long."""
+    """Return the motion of a grid for lengths up to the power of two that is not below tau, without points if tau is too long."""
     unit = math.ldexp(1.0, math.ceil(math.log2(tau)))
     n, inverse = grid.n, grid.inverse
     away = STEEP_AT * grid.basis * grid.shape
@@ -60,7 +60,7 @@ def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
     variances = inverse @ dynamics.noise(0.0, 1.0)[0] @ inverse.T
     noise = float((np.diagonal(variances).real / (grid.shape / 11.0) ** 2).max())
     longest = 1.0 / max(rate / STEEPEST, noise / LARGEST_NOISE, 1e-300)
-    if not np.isfinite(rate) or longest <= 0.5 * unit:
+    if not np.isfinite(rate) or longest < tau:
         return Motion(np.zeros((5, 0)), unit, np.zeros((n, 0)), variances, 0.0)
     points = np.asfortranarray(grid.points)
     with np.errstate(all="ignore"):
