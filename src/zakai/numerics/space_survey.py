@@ -111,7 +111,9 @@ def _survey(u: Any, sizes: Any, closed: Any, basis: Any, edge: float, tail: floa
                 start = (o * size + i) * inner
                 for q in range(inner):
                     marginal[i] += u[start + q]
-        top = marginal.max()
+        top = -np.inf
+        for i in range(size):
+            top = max(top, marginal[i])
         if not closed[d]:
             lower, upper = max(abs(marginal[0]), abs(marginal[1])), max(abs(marginal[size - 2]), abs(marginal[size - 1]))
             if edge > ROUNDING:
@@ -127,16 +129,15 @@ def _survey(u: Any, sizes: Any, closed: Any, basis: Any, edge: float, tail: floa
         axes[d, 2] = low if high >= 0 else 0
         axes[d, 3] = high if high >= 0 else size - 1
         work = np.zeros((2, inner))
-        k = size // 2
-        wave = _wave(u, outer, size, inner, k, work) / total
-        below = _wave(u, outer, size, inner, k - 1, work) / total
-        axes[d, 1] = max(wave, below)
-        while k > 1 and wave <= tail and tail < 1.0:
+        half, highest, k = size // 2, 0, size // 2
+        while k > 0 and (highest == 0 or k >= half - 1):
+            wave = _wave(u, outer, size, inner, k, work) / total
+            if k >= half - 1:
+                axes[d, 1] = max(axes[d, 1], wave)
+            if highest == 0 and (not wave <= tail or tail >= 1.0 or k == 1):
+                highest = k
             k -= 1
-            wave = below
-            if k > 1:
-                below = _wave(u, outer, size, inner, k - 1, work) / total
-        axes[d, 4] = min((k + 1.0) / (size // 2), 1.0)
+        axes[d, 4] = min((highest + 1.0) / half, 1.0)
         inner *= size
     if not (math.isfinite(total) and total > 0.0):
         for d in range(n):
