@@ -21,7 +21,10 @@ Array = NDArray[Any]
 
 def is_complex(*arrays: Any) -> bool:
     """Return whether any argument carries a derivative."""
-    return any(np.iscomplexobj(array) for array in arrays)
+    for array in arrays:
+        if array.dtype.kind == "c" if isinstance(array, np.ndarray) else np.iscomplexobj(array):
+            return True
+    return False
 
 
 def absolute(values: Any) -> Array:

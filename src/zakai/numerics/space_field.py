@@ -87,6 +87,8 @@ def refinable(tails: Array, before: Array, ratio: Array, start: Any, bounds: Bou
 
     Small tails that the density had at the `start` need none.  `ratio` is that of the spacings of the last grid to those of this.
     """
+    if tails.max() <= 3 * bounds.tail:
+        return np.zeros(len(tails), bool)
     return np.asarray((tails > 3 * np.clip(start, bounds.tail, ACCEPTED * bounds.tail)) & better(tails, before, ratio, bounds))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,13 +34,13 @@ class Bounds(NamedTuple):
     @property
     def reach(self) -> float:
         """Deviations at which a Gaussian has fallen to `edge`."""
-        return float(np.sqrt(-2 * np.log(self.edge)))
+        return math.sqrt(-2 * math.log(self.edge))
 
     @property
     def spacings(self) -> float:
         """Spacings in a standard deviation that leave `tail` with a margin."""
         margin = 30 if self.band_limited else 100
-        return float(np.sqrt(-2 * np.log(self.tail / margin)) / np.pi)
+        return math.sqrt(-2 * math.log(self.tail / margin)) / math.pi
 
 
 def fitted_grid(
@@ -109,24 +110,24 @@ def adjusted(grid: Grid, below: Array, above: Array, finer: Array, bounds: Bound
 
 def padded_sizes(grid: Grid, noise: Array, bounds: Bounds) -> tuple[int, ...]:
     """Return the sizes that a density needs to be spread by N(0, noise) without running over the ends of its grid."""
-    inverse = grid.inverse
-    variances = np.diagonal(inverse @ noise @ inverse.T)
-    sizes = []
-    for d, size in enumerate(grid.sizes):
-        half = 0.5 * size
-        needed = bounds.reach * np.sqrt((half / bounds.reach) ** 2 + variances[d])
-        larger = max(rounded_size(2 * needed, LEAST[grid.n], 4 * bounds.most), size)
-        sizes.append(size if grid.closed[d] or needed < half + 1 else larger)
+    halves, sizes = _spread_halves(grid, noise, bounds), list(grid.sizes)
+    for d, size in enumerate(sizes):
+        if not grid.closed[d] and halves[d] >= 0.5 * size + 1:
+            sizes[d] = max(rounded_size(2 * halves[d], LEAST[grid.n], 4 * bounds.most), size)
     return tuple(sizes)
+
+
+def _spread_halves(grid: Grid, noise: Array, bounds: Bounds) -> list[float]:
+    """Return half of the widths in spacings that a density that fills its grid needs after spreading by N(0, noise)."""
+    inverse, reach = grid.inverse, bounds.reach
+    variances = ((inverse @ noise) * inverse).sum(axis=1).tolist()
+    return [math.sqrt(0.25 * size**2 + reach**2 * variance) for size, variance in zip(grid.sizes, variances, strict=True)]
 
 
 def enlargement(grid: Grid, noise: Array, bounds: Bounds) -> float:
     """Return the ratio of the volume that a density needs to be spread by N(0, noise) to that of its grid."""
-    inverse = grid.inverse
-    variances = np.diagonal(inverse @ noise @ inverse.T)
-    half = 0.5 * grid.shape
-    ratios = bounds.reach * np.sqrt((half / bounds.reach) ** 2 + variances) / half
-    return float(np.prod(np.where(grid.closed, 1.0, ratios)))
+    halves = _spread_halves(grid, noise, bounds)
+    return math.prod(1.0 if grid.closed[d] else halves[d] / (0.5 * size) for d, size in enumerate(grid.sizes))
 
 
 def whitened_grid(offsets: Array, logs: Array, noise: Array, narrowness: Array, bounds: Bounds, grid: Grid) -> Grid:
