@@ -17,7 +17,7 @@ UNARY = (
     "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "erf", "sign", "abs", "floor", "sqrt",
     "log1p", "expm1", "logcosh",
 )  # fmt: skip
-BLOCK = 128  # points that are evaluated together
+BLOCK = 256  # points that are evaluated together
 LARGE = 4096  # points for which NumPy is as fast
 CLOCK, NEITHER = -1, -2  # what a slot holds that holds no coordinate
 
