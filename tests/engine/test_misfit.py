@@ -7,28 +7,55 @@ import pytest
 import zakai
 
 PRIOR = {"kind": "gaussian", "mean": [0.3], "cov": [[0.4]]}
+GAUSSIAN = {"observation": ["x"], "observation_noise": [["0.1"]]}
+VALUES = [0.1, 0.3, 0.2]
 
 
-def warned(method, observation, value, kind="samples", **keys):
-    model = zakai.Model(
-        state=["x"], drift=["0"], observation=[observation], observation_kind=kind, observation_noise=[["0.1"]], prior=PRIOR,
-        **keys,
-    )  # fmt: skip
-    result = zakai.filter(model, zakai.Record([0.1, 0.2, 0.3], [[0.1], [value], [0.2]], kind), method)
-    return [warning for warning in result.warnings if "cannot be explained" in warning]
+def warned(method, value, kind="samples", values=VALUES, law=GAUSSIAN, **keys):
+    """Return what a record warns of the observation at t = 0.2; an online filter must do the same."""
+    model = zakai.Model(state=["x"], drift=["0"], observation_kind=kind, prior=PRIOR, **law, **keys)
+    times, values = [0.1, 0.2, 0.3], [values[0], value, values[2]]
+    result = zakai.filter(model, zakai.Record(times, [[z] for z in values], kind), method)
+    found = [warning for warning in result.warnings if "cannot be explained" in warning]
+    online = zakai.online(model, method)
+    said = ["cannot be explained" in str(online.update(time, [z]).warnings) for time, z in zip(times, values, strict=True)]
+    assert said[:2] == [False, bool(found)]
+    return found
 
 
 @pytest.mark.parametrize("method", ["yau-yau", "limited-direct", "general-direct"])
 def test_a_sample_beyond_every_value_of_h_warns_on_a_circle(method):
-    (warning,) = warned(method, "sin(x)", 45.0, periodic=["x"])
+    sine = {**GAUSSIAN, "observation": ["sin(x)"], "periodic": ["x"]}
+    (warning,) = warned(method, 45.0, law=sine)
     assert "at t = 0.2 (1.4e+02 standard deviations)" in warning  # 44 / sqrt(0.1)
-    assert not warned(method, "sin(x)", 2.5, periodic=["x"])
+    assert not warned(method, 2.5, law=sine)
 
 
 @pytest.mark.parametrize("kind", ["samples", "increments"])
 def test_a_fill_value_of_a_linear_system_warns_and_ten_deviations_do_not(kind):
-    assert warned("kalman-bucy", "x", 9.97e36, kind)
-    assert not warned("kalman-bucy", "x", 7.0 if kind == "samples" else 1.0, kind)
+    assert warned("kalman-bucy", 9.97e36, kind)
+    assert not warned("kalman-bucy", 7.0 if kind == "samples" else 1.0, kind)
+
+
+# Values that each law makes, one that is an outlier, and one with a probability below e^-200.
+LAWS = {
+    "counts": ({"observation": ["exp(x)"], "observation_family": "poisson"}, [1, 2, 1], 40, 1e6),
+    "student-t": ({**GAUSSIAN, "observation_family": "student-t", "degrees_of_freedom": 5}, VALUES, 1e4, 9.97e36),
+    "noise of the state": ({"observation": ["x"], "observation_noise": [["0.1 + 0.1*sin(x)**2"]]}, VALUES, 4.0, 60.0),
+    "log density": (
+        {"observed": ["z"], "observation_log_density": "-abs(z - x - 7)/0.01 - log(0.02)"}, [7.1, 7.3, 7.2], 8.0, 20.0
+    ),
+    "two peaks": (
+        {"observed": ["z"], "observation_log_density": "log(cosh(30*z*x)) - 5*z**2 - 45*x**2"}, VALUES, 4.0, 60.0
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_every_law_of_a_sample_is_judged_by_its_probability(law):
+    keys, values, outlier, impossible = LAWS[law]
+    assert not warned("yau-yau", outlier, values=values, law=keys)
+    assert warned("yau-yau", impossible, values=values, law=keys)
 
 
 def test_a_fill_value_that_a_grid_rejects_is_in_the_evidence():
@@ -38,4 +65,5 @@ def test_a_fill_value_that_a_grid_rejects_is_in_the_evidence():
     )  # fmt: skip
     result = zakai.filter(model, zakai.Record([0.2, 0.4, 0.6], [0.2, 1e8, 0.1], "samples"), "yau-yau")
     # No state within 60 deviations explains the value: |z - h| > 9e7, S < 4000.
-    assert result.log_likelihood < -(9e7**2) / 2 / 4000 and result.warnings
+    assert result.log_likelihood < -(9e7**2) / 2 / 4000
+    assert any("cannot be explained" in warning for warning in result.warnings)

@@ -96,7 +96,7 @@ class Estimate:
         """A sentence for every bound that this step exceeded, and for what else is to be known of it."""
         said: dict[str, None] = {}
         for feed, moment in zip(self._online.feeds, self._moments, strict=True):
-            said.update(dict.fromkeys(moment.notes))
+            said.update(dict.fromkeys(feed.notes(moment)))
             if moment.info is not None:
                 said.update(dict.fromkeys(warnings_of_step(moment.info.health, feed.setting.method.bounds)))
         return tuple(said)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from math import isfinite
 from typing import Any, NamedTuple
@@ -9,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities import Density
+from zakai.engine.misfit import misfits, note_on_misfits
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
-from zakai.methods._protocol import Info
+from zakai.methods._protocol import Info, stacked
 from zakai.records.inputs import Inputs
 from zakai.records.noise import noise_varies, notes_on_noise
 from zakai.records.schedule import ROUNDING, Schedule, length_of
@@ -27,7 +29,8 @@ class Moment(NamedTuple):
     """Everything that decides what a filter reports next; it never changes, the next observation makes another.
 
     `length` is that of the last interval.  `info` is what the last step reported, None at the start.  `values` and `times` (m,)
-    are the last values of a path and when they were observed.  `inputs` are the known inputs from `time` on.
+    are the last values of a path and when they were observed.  `inputs` are the known inputs from `time` on.  `observed` is what
+    the last step received: samples or increments, which of them were seen, and over what time they were gathered.
     """
 
     time: float
@@ -38,6 +41,7 @@ class Moment(NamedTuple):
     times: tuple[float, ...]
     notes: tuple[str, ...]
     inputs: Inputs | None = None
+    observed: tuple[Sequence[float], tuple[bool, ...], tuple[float, ...]] | None = None
 
 
 class Feed:
@@ -63,7 +67,7 @@ class Feed:
         Raises:
             InputError: the observation leaves nothing of the density.
         """
-        start, _, state, _, last_values, last_times, _, _ = self.now
+        start, _, state, _, last_values, last_times, *_ = self.now
         span, length, late = time - start, length_of(start, time), False
         seen = tuple([value == value for value in values])
         if self.kind == "path":
@@ -92,7 +96,18 @@ class Feed:
                 "that time as unobserved, and go on from there"
             )
         notes = (AFTER_GAP, *notes) if late else notes
-        return Moment(time, span, state, info, last_values, last_times, notes, None if inputs is None else inputs.part(time))
+        known = None if inputs is None else inputs.part(time)
+        return Moment(time, span, state, info, last_values, last_times, notes, known, (values, seen, elapsed))
+
+    def notes(self, moment: Moment) -> tuple[str, ...]:
+        """Return what is to be reported of a moment beside its health figures."""
+        if moment.info is None or moment.observed is None:
+            return moment.notes
+        (values, seen, elapsed), stop = moment.observed, np.array([moment.time])
+        schedule = Schedule(stop - moment.length, stop, np.array([seen]), np.array([elapsed]), moment.inputs)
+        setting = self.setting
+        short = misfits(setting.model, setting.theta.real, schedule, np.array([values]), stacked([moment.info]))
+        return (*moment.notes, *note_on_misfits(short, stop))
 
     def density(self, moment: Moment) -> Density:
         """Return the density at a moment."""

@@ -10,7 +10,8 @@ import numpy as np
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.health_warnings import warnings_of_run
-from zakai.engine.notes import notes_on_angles, notes_on_formulas, notes_on_misfit, notes_on_tables, why_not_finite
+from zakai.engine.misfit import misfits, note_on_misfits
+from zakai.engine.notes import notes_on_angles, notes_on_formulas, notes_on_tables, why_not_finite
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import KEPT, Setting
 from zakai.engine.versions import versions
@@ -199,7 +200,7 @@ class Run:
         )
         theta = self.setting.theta.real
         undefined = notes_on_formulas(model, theta, self.record, result.mean, result.variance)
-        misfit = notes_on_misfit(model, theta, self.schedule, self.values, infos.log_likelihood_increment)
+        misfit = note_on_misfits(misfits(model, theta, self.schedule, self.values, infos), self.schedule.stops)
         result.warnings.extend([*undefined, *self.notes, *misfit, *warnings_of_run(result)])
         return result
 

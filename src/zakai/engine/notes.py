@@ -1,4 +1,4 @@
-"""What a result warns of beside its health figures: formulas without a value, angles in degrees, observations that do not fit."""
+"""What a result warns of beside its health figures: formulas without a value, angles in degrees, tables that end."""
 
 from __future__ import annotations
 
@@ -7,24 +7,16 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from zakai import _display
 from zakai.models._entries import formula
-from zakai.models.features import (
-    OBSERVATION_FAMILY,
-    OBSERVATION_LOG_DENSITY,
-    STATE_DEPENDENT_OBSERVATION_NOISE,
-    formulas_of,
-)
+from zakai.models.features import formulas_of
 from zakai.models.functions import TableFunction
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import explain_nonfinite, numpy_function
 from zakai.records import Inputs, Record
-from zakai.records.schedule import Schedule
 
 _KEYS = ("drift", "diffusion", "observation")
 _REACH, _TIMES = 3.0, 32  # deviations from the mean, and number of times, that are checked
-_MISFIT = 200.0  # nats of a coordinate: 20 standard deviations
 
 
 def notes_on_formulas(model: Model, theta: np.ndarray, record: Record, mean: np.ndarray, variance: np.ndarray) -> list[str]:
@@ -89,47 +81,6 @@ def notes_on_tables(model: Model, theta: np.ndarray, record: Record) -> list[str
             when = f"at {int(beyond.sum())} of {len(times)} times, first at t = {times[beyond][0]:g}"
             notes.append(f"{formula(call)} is beyond the range of the table, where that is constant, {when}; extend the table")
     return notes
-
-
-def notes_on_misfit(
-    model: Model, theta: np.ndarray, schedule: Schedule, values: np.ndarray, increments: np.ndarray
-) -> list[str]:
-    """Return a sentence where an observation is far from all that the model predicts.
-
-    The evidence of an observation is compared with the largest that its noise allows for any state: of a sample with covariance C
-    that is log N(0; 0, C), of an increment dy, relative to noise alone, dy'C^-1 dy / 2.
-
-    Args:
-        model: The model.
-        theta: The parameters (p,).
-        schedule: The K intervals.
-        values: Samples or increments (K, m), zero where there is none.
-        increments: Those of the log-likelihood (K,).
-    """
-    known = {OBSERVATION_FAMILY, OBSERVATION_LOG_DENSITY, STATE_DEPENDENT_OBSERVATION_NOISE}
-    if not len(schedule) or known & model.features.keys():
-        return []
-    sampled, seen, m = model.observation_kind == "samples", schedule.seen, model.m
-    inputs, stops = schedule.inputs, schedule.stops
-    u = None if inputs is None else inputs.at(stops, model.input_hold, before=not sampled)
-    noise = numpy_function(model.observation_noise, model, (m, m))(np.zeros(model.n), stops, theta, u)
-    spans = np.ones(seen.shape) if sampled else schedule.elapsed
-    both = seen[:, :, None] & seen[:, None, :]
-    cov = np.where(both, noise * np.minimum(spans[:, :, None], spans[:, None, :]), np.eye(m) * ~seen[:, None, :])
-    with np.errstate(all="ignore"):
-        if sampled:
-            largest = -0.5 * (np.linalg.slogdet(cov)[1] + np.log(2 * np.pi) * seen.sum(axis=1))
-        else:
-            largest = 0.5 * (values * np.linalg.solve(cov, values[:, :, None])[:, :, 0]).sum(axis=1)
-        short = np.where(np.isfinite(increments), largest - increments.real, 0.0)
-        far = short > _MISFIT * np.maximum(seen.sum(axis=1), 1)
-    if not far.any():
-        return []
-    worst = int(np.argmax(np.where(far, short, -np.inf)))
-    return [
-        f"{_display.counted(int(far.sum()), 'observation')} of {len(far)} cannot be explained by the model, most at "
-        f"t = {stops[worst]:g} ({np.sqrt(2 * short[worst]):.2g} standard deviations); check that observation and its noise"
-    ]
 
 
 def _is_partial(formulas: Any, model: Model) -> bool:

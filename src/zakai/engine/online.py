@@ -136,7 +136,7 @@ class Online:
             InputError: the file cannot be written.
         """
         with self.lock:
-            parts = [stored(feed.now) for feed in self.feeds]
+            parts = [stored(feed.now._replace(notes=feed.notes(feed.now))) for feed in self.feeds]
         arrays = {f"{i}/{k}": array for i, (_, own) in enumerate(parts) for k, array in enumerate(own)}
         write_checkpoint(path, {**self._bound, "filters": [said for said, _ in parts], "more": dict(more or {})}, arrays)
 

@@ -35,6 +35,10 @@ class Family(Protocol):
         """Return where z is a possible value."""
 
     @staticmethod
+    def mode(h: Array) -> Array:
+        """Return the most probable value."""
+
+    @staticmethod
     def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
         """Return the log density, or the log mass of a count."""
 
@@ -48,11 +52,15 @@ class Family(Protocol):
 
 
 class _Continuous:
-    """A law of any number."""
+    """A law of any number, symmetric about its location."""
 
     @staticmethod
     def inside(z: Array) -> Array:
         return np.isfinite(z)
+
+    @staticmethod
+    def mode(h: Array) -> Array:
+        return h
 
 
 class Gaussian(_Continuous):
@@ -110,6 +118,10 @@ class Poisson:
         return (z >= 0) & (z == np.floor(z)) & (z <= 2.0**53)
 
     @staticmethod
+    def mode(h: Array) -> Array:
+        return np.floor(h)
+
+    @staticmethod
     def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
         from scipy.special import gammaln
 
@@ -137,6 +149,10 @@ class Bernoulli:
     @staticmethod
     def inside(z: Array) -> Array:
         return (z == 0) | (z == 1)
+
+    @staticmethod
+    def mode(h: Array) -> Array:
+        return np.round(h)
 
     @staticmethod
     def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:

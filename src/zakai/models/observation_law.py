@@ -78,6 +78,20 @@ class ObservationLaw:
         terms = [FAMILIES[name].log_density(*part) for name, part in zip(self.families, parts, strict=True)]
         return np.where(seen, np.stack(np.broadcast_arrays(*terms), axis=-1), 0.0)
 
+    def largest(self, seen: Array, x: Any, t: Any, theta: Any, u: Any = None) -> Array:
+        """Return the log density (...) of the most probable row at many points, of the coordinates `seen` (..., m).
+
+        Raises:
+            InputError: a law given by its log density has no such row here.
+        """
+        if self._model.log_density is not None:
+            raise InputError("observation_log_density: a law given by its log density has no most probable row here")
+        h, *rest = (function(x, t, theta, u) for function in self._functions)
+        modes = np.stack([FAMILIES[name].mode(h[..., j]) for j, name in enumerate(self.families)], axis=-1)
+        parts = self._conditional(np.where(seen, modes, np.nan), h, *rest)
+        terms = [FAMILIES[name].log_density(*part) for name, part in zip(self.families, parts, strict=True)]
+        return np.sum(np.where(seen, np.stack(terms, axis=-1), 0.0), axis=-1)
+
     def cdf(self, values: Any, x: Any, t: Any, theta: Any, u: Any = None) -> tuple[Array, Array]:
         """Return P(Z_j < z_j) and P(Z_j <= z_j) (..., m) given the coordinates before; NaN where nothing is observed.
 
@@ -95,7 +109,9 @@ class ObservationLaw:
 
     def _parts(self, values: Array, x: Any, t: Any, theta: Any, u: Any) -> list[tuple[Any, Any, Any, Any]]:
         """Return for every coordinate z, location, variance and shape, given the coordinates before it."""
-        h, S, shape = (function(x, t, theta, u) for function in self._functions)
+        return self._conditional(values, *(function(x, t, theta, u) for function in self._functions))
+
+    def _conditional(self, values: Array, h: Array, S: Array, shape: Array) -> list[tuple[Any, Any, Any, Any]]:
         seen = ~np.isnan(values)
         z = np.where(seen, values, 0.0)
         if not self._coupled:

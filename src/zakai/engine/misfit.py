@@ -1,0 +1,114 @@
+"""Observations that no state of a model explains.
+
+The evidence of an observation is compared with the largest density that its own law allows: of a sample that of p(z | x) at its
+mode, for x near the filtered mean; of an increment dy that for the best h, dy'C^-1 dy / 2 relative to noise alone.  Whatever the
+family, the difference is the negative logarithm of a probability, up to a few nats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai import _display
+from zakai.methods._protocol import Infos
+from zakai.models.kept import kept
+from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
+from zakai.records.schedule import Schedule
+
+Array = NDArray[np.float64]
+LARGEST = 200.0  # nats of a coordinate: 20 standard deviations
+AT_ONCE = 32  # rows in which the mode of a log density is searched together
+ROUNDS, CLOSE = 60, 0.5  # of that search: the most rounds, and the gain in nats that ends it
+STEPS = np.concatenate([[0.0], *(sign * 2.0 ** np.arange(-40, 41) for sign in (-1.0, 1.0))])
+
+
+def misfits(model: Model, theta: Array, schedule: Schedule, values: Array, infos: Infos) -> Array:
+    """Return the nats (K,) by which the evidence of each observation falls short, zero up to 200 nats a coordinate.
+
+    Args:
+        model: The model.
+        theta: The parameters (p,).
+        schedule: The K intervals.
+        values: Samples or increments (K, m), zero where there is none.
+        infos: What the filter reports after each observation.
+    """
+    short = np.zeros(len(schedule))
+    seen, evidence = schedule.seen, np.real(infos.log_likelihood_increment)
+    with np.errstate(all="ignore"):
+        if model.observation_kind != "samples":
+            short = _largest_of_increments(model, theta, schedule, values) - evidence
+        elif model.log_density is None:
+            short = _largest_of_samples(model, theta, schedule, values, infos, slice(None)) - evidence
+        else:  # the mode is searched: from the smallest evidence on, as long as a row falls short
+            order = np.argsort(np.where(np.isfinite(evidence), evidence, np.inf), kind="stable")
+            for start in range(0, len(order), AT_ONCE):
+                rows = order[start : start + AT_ONCE]
+                short[rows] = _largest_of_samples(model, theta, schedule, values, infos, rows) - evidence[rows]
+                if not (short[rows] > LARGEST).any():
+                    break
+        return np.where(np.isfinite(short) & (short > LARGEST * np.maximum(seen.sum(axis=1), 1)), short, 0.0)
+
+
+def note_on_misfits(short: Array, times: Array) -> list[str]:
+    """Return a sentence on the observations at these times (K,) that fall short, if any do."""
+    if not short.any():
+        return []
+    worst, count = int(np.argmax(short)), int(np.count_nonzero(short))
+    which = f"{_display.counted(count, 'observation')} of {len(short)} cannot be explained by the model, most at "
+    which = which if len(short) > 1 else "the observation cannot be explained by the model, at "
+    deviations = f"t = {times[worst]:g} ({np.sqrt(2 * short[worst]):.2g} standard deviations)"
+    return [f"{which}{deviations}; check that observation and its noise"]
+
+
+def _largest_of_increments(model: Model, theta: Array, schedule: Schedule, values: Array) -> Array:
+    seen, spans, m = schedule.seen, schedule.elapsed, model.m
+    function = kept(model, _largest_of_increments, lambda: numpy_function(model.observation_noise, model, (m, m)))
+    noise = function(np.zeros(model.n), schedule.stops, theta)
+    both = seen[:, :, None] & seen[:, None, :]
+    cov = np.where(both, noise * np.minimum(spans[:, :, None], spans[:, None, :]), np.eye(m) * ~seen[:, None, :])
+    return np.asarray(0.5 * (values * np.linalg.solve(cov, values[:, :, None])[:, :, 0]).sum(axis=1))
+
+
+def _largest_of_samples(
+    model: Model, theta: Array, schedule: Schedule, values: Array, infos: Infos, rows: NDArray[np.intp] | slice
+) -> Array:
+    """Return the largest log density (R,) of the samples of some rows given a state near the filtered mean."""
+    times, seen, law = schedule.stops[rows], schedule.seen[rows], model.observation_law
+    u = None if schedule.inputs is None else schedule.inputs.at(times, model.input_hold)
+
+    def largest(x: Array) -> Array:
+        if model.log_density is None:
+            return law.largest(seen, x, times, theta, u)
+        inputs = None if u is None else u[:, None]
+        return _at_mode(lambda z: law.log_density(z, x[:, None], times[:, None], theta, inputs), values[rows])
+
+    mean = infos.mean[rows]
+    found = largest(mean)
+    if not np.isfinite(found).all():  # no law at the mean, as between two modes
+        reach = np.sqrt(np.diagonal(infos.cov[rows], axis1=1, axis2=2))
+        for step in np.concatenate([np.eye(model.n), -np.eye(model.n)]):
+            found = np.fmax(found, largest(mean + reach * step))
+    return np.where(seen.any(axis=1), found, 0.0)
+
+
+def _at_mode(log_density: Callable[[Array], Array], z: Array) -> Array:
+    """Return the largest log density (R,) that a search at all scales finds from z (R, m); `log_density` takes (R, P, m)."""
+    z, value, index = z.copy(), np.full(len(z), -np.inf), np.arange(len(z))
+    for _ in range(ROUNDS):
+        before = value
+        for j in range(z.shape[1]):
+            trials = np.repeat(z[:, None], 2 * len(STEPS), axis=1)
+            trials[:, :, j] = np.concatenate([z[:, j, None] + STEPS, np.tile(STEPS, (len(z), 1))], axis=1)
+            logs = log_density(trials)
+            logs = np.where(np.isnan(logs) | (logs == np.inf), -np.inf, logs)
+            choice = np.argmax(logs, axis=1)
+            better = logs[index, choice] > value
+            value = np.where(better, logs[index, choice], value)
+            z = np.where(better[:, None], trials[index, choice], z)
+        if not (value > before + CLOSE).any():
+            break
+    return value
