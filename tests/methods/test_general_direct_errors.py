@@ -325,3 +325,23 @@ def test_the_error_at_a_kink_of_a_sample_is_reported():
     error = abs(result.log_likelihood - log_likelihood)
     assert error > 0.04 and result.warnings
     assert error < 4.0 * np.nanmax(result.health["evidence_error"])
+
+
+def test_a_prior_that_is_cut_in_three_directions_keeps_its_shape():
+    """The posterior of one sample in the tails, by Bayes' rule at 81^3 points."""
+    model = zakai.Model(
+        state=["x", "y", "z"], drift=["0"] * 3, diffusion=(0.01 * np.eye(3)).tolist(),
+        observation=["x + y**2/4", "y + z**2/4", "z + x**2/4"], observation_kind="samples", observation_noise=np.eye(3).tolist(),
+        prior={"kind": "gaussian", "mean": [0.0] * 3, "cov": np.eye(3).tolist()},
+    )  # fmt: skip
+    value = np.array([3.0, -0.5, 3.5])
+    result = zakai.filter(model, zakai.Record([0.1], value[None], "samples"), "general-direct")
+    line = np.linspace(-6.0, 6.0, 81)
+    points = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
+    apart = value - points - np.roll(points, -1, axis=1) ** 2 / 4
+    weights = np.exp(-0.5 * (points**2).sum(axis=1) / (1 + 1e-5) - 0.5 * (apart**2).sum(axis=1))
+    weights /= weights.sum()
+    mean = weights @ points
+    deviation = np.sqrt(weights @ (points - mean) ** 2)
+    assert np.all(np.abs(result.mean[1] - mean) < 0.01 * deviation)
+    assert np.allclose(np.sqrt(result.variance[1]), deviation, rtol=0.01)
