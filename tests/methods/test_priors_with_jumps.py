@@ -55,6 +55,20 @@ def test_a_jump_of_the_prior_costs_little_and_is_in_the_estimate(name, method):
     assert worst < 10 * np.nanmax(result.health["error_estimate"])
 
 
+@pytest.mark.parametrize("jump", ["log(heaviside(x))", "3*heaviside(x)"])
+def test_auto_leaves_the_sums_of_gaussians_at_a_jump_and_a_named_one_names_another(jump):
+    model = zakai.Model(
+        state=["x"], drift=["-x"], observation=["x"], observation_kind="samples", observation_noise=[["0.1"]],
+        prior={"kind": "density", "log_density": f"-x**2/2 + {jump}"},
+    )  # fmt: skip
+    record = zakai.Record(TIMES, np.array(VALUES)[:, None], "samples")
+    result, other = zakai.filter(model, record), zakai.filter(model, record, "yau-yau")
+    assert result.method == "limited-direct" and not result.warnings
+    assert np.allclose(result.mean, other.mean, rtol=0, atol=1e-4)
+    with pytest.raises(zakai.InputError, match='jump; give method="yau-yau"'):
+        zakai.filter(model, record, "kalman-bucy")
+
+
 def test_a_function_that_does_not_decay_is_still_no_density():
     model = zakai.Model(
         state=["x"], drift=["-x**3"], observation=["x"], prior={"kind": "density", "log_density": "log(heaviside(x)) - atan(x)"}

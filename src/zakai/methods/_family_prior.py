@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zakai.errors import InputError
 from zakai.methods._gauge import Gauge
 from zakai.methods._gaussian_nodes import MOST_NODES, TOLERANCE, GaussianPlan, Nodes, edge_of, represented
 from zakai.models.model import Model
@@ -21,6 +22,8 @@ from zakai.numerics.families import Family, gaussians
 from zakai.numerics.nodes import NodeGrid, resolve
 from zakai.numerics.prior_grid import prior_grid
 from zakai.numerics.transition import Array
+
+ROUGH = 0.05  # error of the nodes, relative to the maximum of the prior, that only a jump leaves
 
 
 class Prior(NamedTuple):
@@ -118,17 +121,26 @@ def _from_density(gauge: Gauge, model: Model, prior: DensityPrior) -> Prior:
     # The smallest standard deviation along an axis decides the number of points.
     finer = np.clip(_narrowest(found.log_values.real) / 2.5, 0.1, 1e3)
     spacings = np.maximum(np.ceil((sizes - 1) / finer), 8).astype(int)
+    if np.prod(spacings + 1.0) > MOST_NODES[model.n]:
+        raise _too_rough(name)
     grid = NodeGrid(centre - basis @ (sizes // 2), basis * ((sizes - 1) / spacings), tuple(int(c) + 1 for c in spacings))
     real = gauge.real()
     grid, error = resolve(
         lambda z: log_u(z, theta.real) - phi(z, real), lambda z: phi(z, real), grid, TOLERANCE, MOST_NODES[model.n]
     )
+    if error > ROUGH:
+        raise _too_rough(name)
     z = grid.points()
     nodes = represented(grid, z, log_u(z, theta), phi(z, gauge), error, edge_of(grid.sizes))
     n, middle = model.n, z[len(z) // 2]
     none = np.zeros(n), np.zeros((n, n)), np.zeros(())
     family = Family(z - middle, nodes.log_weights, nodes.signs, middle, grid.covariance, np.eye(n), *none)
     return _joined([(family, nodes)], max(error, found.error))
+
+
+def _too_rough(name: str) -> InputError:
+    what = "changes too fast somewhere for a sum of Gaussians, as at a jump"
+    return InputError(f'{name}: {what}; give method="yau-yau", which takes it')
 
 
 def _narrowest(log_values: Array) -> Array:
