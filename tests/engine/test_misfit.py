@@ -67,3 +67,14 @@ def test_a_fill_value_that_a_grid_rejects_is_in_the_evidence():
     # No state within 60 deviations explains the value: |z - h| > 9e7, S < 4000.
     assert result.log_likelihood < -(9e7**2) / 2 / 4000
     assert any("cannot be explained" in warning for warning in result.warnings)
+
+
+def test_a_fill_value_beyond_the_reach_of_a_grid_of_one_state_leaves_the_prediction():
+    model = zakai.Model(
+        state=["x"], drift=["x - x**3"], observation=["x"], observation_kind="samples", observation_noise=[["1/10 + x**2"]],
+        prior={"kind": "gaussian", "mean": [0.0], "cov": [1.0]},
+    )  # fmt: skip
+    records = [zakai.Record([0.2, 0.4, 0.6], [0.2, value, 0.1], "samples") for value in (1e8, float("nan"))]
+    filled, missing = zakai.filter(model, records, "yau-yau")
+    assert filled.mean == pytest.approx(missing.mean, abs=1e-6)
+    assert any("cannot be explained" in warning for warning in filled.warnings)

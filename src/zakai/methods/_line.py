@@ -48,6 +48,7 @@ Array = Any
 SLOW = 1e-2  # of the tolerance: the spectrum that need not be resolved where f has kinks
 SLOW_GENEROUS = 256  # points of a grid that is kept though fewer would do
 GENEROUS = 96  # points of a grid that is kept though fewer would do
+PILED = 0.5  # density at an end of the grid, relative to the maximum, of a product that is cut off there
 
 
 def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: float, pieces: bool = False) -> Prepared:
@@ -169,6 +170,10 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
             result, look = sampled_weakly(prepared, k, values, window, observed)
         else:
             result = multiplied(values, window, likelihood, max(1e-10, 1e-3 * prepared.tolerance))
+            ends = lw.figures(result.values, result.window.closed)
+            if max(ends.left, ends.right) > PILED and result.depth > prepared.deepest(floor):
+                # No state within reach explains the observation: it counts in the evidence alone.
+                result = result._replace(values=values, window=window, depth=np.inf)
             look = figures(prepared, result.values, result.window)
         values, window, gained = result.values, result.window, gained + result.log_mass
         report.depth, report.growth = result.depth, result.growth
