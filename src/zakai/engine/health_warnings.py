@@ -37,6 +37,7 @@ ADVICE = {
     "quadrature_error": _OTHER_METHOD,
     "time_quadrature_error": _MORE_OBSERVATIONS,
     "unfinished": _MORE_OBSERVATIONS,
+    "linearisation": _OTHER_METHOD,
     "indefinite_cov": _MORE_OBSERVATIONS,
 }
 

@@ -22,7 +22,10 @@ METHOD: Method[Prepared, State] = Method(
     step=step,
     density=density,
     state=State,
-    bounds={"indefinite_cov": (1e-9, "the covariance has a negative eigenvalue (its share of the largest), or is not finite")},
+    bounds={
+        "indefinite_cov": (1e-9, "the covariance has a negative eigenvalue (its share of the largest), or is not finite"),
+        "linearisation": (0.05, "deviations, or a share of a variance, by which a prediction of the linearised system is off"),
+    },
     valid=valid,
     backward=Backward(message, step_back, smoothed, smoothed_density),
     handles=frozenset({CROSS_NOISE, INPUTS, KINKS, SINC, STATE_DEPENDENT_DIFFUSION, TABLES}),
