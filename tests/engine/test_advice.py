@@ -36,6 +36,22 @@ def test_a_warning_has_the_time_the_size_and_the_count():
     assert f"exceeds 1 at {count} of 3 times" in sentence and sentence.endswith("; check that observation and its noise")
 
 
+@pytest.mark.parametrize(
+    ("observation", "kind", "states", "method"),
+    [
+        ("abs(x)", "increments", 2, "yau-yau"),
+        ("abs(x)", "samples", 2, "limited-direct"),
+        ("abs(x)", "increments", 1, "limited-direct"),
+        ("sqrt(1 + x**2)", "increments", 2, "limited-direct"),
+    ],
+)
+def test_auto_leaves_the_direct_method_where_a_kink_of_h_needs_many_substeps(observation, kind, states, method):
+    keys = {"state": ["x", "y"][:states], "drift": ["-x + y/2", "-y"] if states == 2 else ["-x"]}
+    prior = {"kind": "gaussian", "mean": [0.5] * states, "cov": [0.5] * states}
+    model = zakai.Model(**keys, observation=[observation], observation_kind=kind, observation_noise=[["0.1"]], prior=prior)
+    assert zakai.online(model).method == method
+
+
 def test_auto_goes_on_where_a_method_loses_the_prior():
     certain = zakai.load_model("gallery:spiral-sensor").with_prior({"kind": "gaussian", "mean": [0.3], "cov": [[0]]})
     record = zakai.Record([0.01, 0.02], [[0.001, 0.002], [0.0, 0.1]])

@@ -222,10 +222,12 @@ def in_order(model: Model) -> tuple[str, ...]:
     """Return the methods that "auto" tries for a model, in order.
 
     Of a sample with a law of its own a Gaussian sum is less accurate than a density on a grid, which takes up to four states.
+    For increments of an h with a kink in several states, the tolerance of "limited-direct" needs hundreds of times the substeps.
     """
-    if not model.features:
-        return _registry.AUTO
-    return (*(name for name in _registry.AUTO if name != "general-direct"), "general-direct")
+    last: tuple[str, ...] = ("general-direct",) if model.features else ()
+    if model.n > 1 and model.observation_kind != "samples" and model.observation.has(sp.Abs, sp.sign):
+        last = ("limited-direct", "general-direct")
+    return (*(name for name in _registry.AUTO if name not in last), *last)
 
 
 def conditions_of(name: str, model: Model) -> tuple[Condition, ...]:
