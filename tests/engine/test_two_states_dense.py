@@ -1,0 +1,87 @@
+"""Smoothing and residuals of a coupled system of two states, against finite volumes on a fixed grid and Bayes' rule there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_matrix
+from scipy.sparse.linalg import expm_multiply
+from scipy.stats import norm, poisson
+
+import zakai
+
+TIMES = np.array([0.2, 0.3, 0.55, 0.9])
+LAWS = {
+    "samples": (
+        {"observation": ["x + y/5"], "observation_noise": [["0.09"]]},
+        [0.6, np.nan, 0.1, 0.2],
+        lambda z, x, y: norm.pdf(z, x + y / 5, 0.3),
+        lambda z, x, y: np.array([norm.cdf(z, x + y / 5, 0.3)] * 2),
+    ),
+    "counts": (
+        {"observation": ["exp(4*x/5)"], "observation_family": "poisson"},
+        [2, np.nan, 0, 1],
+        lambda z, x, y: poisson.pmf(z, np.exp(0.8 * x)),
+        lambda z, x, y: np.array([poisson.cdf(z - 1, np.exp(0.8 * x)), poisson.cdf(z, np.exp(0.8 * x))]),
+    ),
+}
+
+
+def generator(size):
+    """Points (N, 2) of a grid, and the matrix of dx = y dt + dv/2, dy = ((1 - x^2) y - x) dt + 0.7 dw, of second order."""
+    low, high = np.array([-4.5, -5.5]), np.array([4.5, 5.5])
+    space = (high - low) / size
+    index = np.arange(size * size).reshape(size, size)
+    points = low + space * (np.stack(np.unravel_index(index.ravel(), (size, size)), axis=1) + 0.5)
+    entries = []
+    for axis, spread in enumerate((0.25, 0.49)):
+        i, j = (np.delete(index, end, axis=axis).ravel() for end in (-1, 0))
+        x, y = 0.5 * (points[i] + points[j]).T
+        f = y if axis == 0 else (1 - x**2) * y - x
+        forth, back = (0.5 * (sign * f + spread / space[axis]) / space[axis] for sign in (1, -1))
+        entries += [(j, i, forth), (i, i, -forth), (i, j, back), (j, j, -back)]
+    rows, columns, values = (np.concatenate(part) for part in zip(*entries, strict=True))
+    return points, csr_matrix((values, (rows, columns)))
+
+
+def dense(size, values, likelihood, cdf):
+    """Smoothed means and covariances, and P(Z < z), P(Z <= z) for each row that is observed."""
+    points, matrix = generator(size)
+    x, y = points.T
+    forward, laws, starts = [np.exp(-0.5 * ((x - 0.5) ** 2 + y**2) / 0.3)], [], [0.0, *TIMES]
+    factors = [np.ones(len(x)) if np.isnan(z) else likelihood(z, x, y) for z in values]
+    for k, z in enumerate(values):
+        predicted = expm_multiply(matrix * (TIMES[k] - starts[k]), forward[-1])
+        if not np.isnan(z):
+            laws.append(cdf(z, x, y) @ predicted / predicted.sum())
+        forward.append(predicted * factors[k] / (predicted * factors[k]).sum())
+    message, rows = np.ones(len(x)), []
+    for k in range(len(values), -1, -1):
+        weights = forward[k] * message / (forward[k] @ message)
+        mean = weights @ points
+        rows.append(np.column_stack([mean, (points - mean).T @ (weights[:, None] * (points - mean))]))
+        if k:
+            message = expm_multiply(matrix.T.tocsr() * (TIMES[k - 1] - starts[k - 1]), factors[k - 1] * message)
+    return np.array(rows[::-1]), np.array(laws)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_smoothing_and_residuals_are_those_of_a_dense_grid(law):
+    keys, values, likelihood, cdf = LAWS[law]
+    model = zakai.Model(
+        state=["x", "y"], drift=["y", "(1 - x**2)*y - x"], diffusion=[["1/2", "0"], ["0", "7/10"]], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [0.5, 0.0], "cov": [0.3, 0.3]}, **keys,
+    )  # fmt: skip
+    smoothed = zakai.smooth(model, zakai.Record(TIMES, np.array(values)[:, None], "samples"), "yau-yau")
+    coarse, fine = (dense(size, values, likelihood, cdf) for size in (60, 90))
+    moments, laws = (b + 0.8 * (b - a) for a, b in zip(coarse, fine, strict=True))  # of second order
+    deviation = np.sqrt(moments[:, [0, 1], [1, 2]])
+    assert not smoothed.warnings
+    assert np.all(np.abs(smoothed.mean - moments[:, :, 0]) < 2e-3 * deviation)
+    assert np.all(np.abs(smoothed.cov - moments[:, :, 1:]) < 4e-3 * deviation[:, :, None] * deviation[:, None])
+    found = smoothed.filtered.residuals(seed=5)
+    draws = np.random.default_rng(5).uniform(size=found.shape)
+    seen = ~np.isnan(values)
+    assert np.isnan(found[~seen]).all()
+    expected = laws[:, 0] + draws[seen, 0] * (laws[:, 1] - laws[:, 0])
+    assert found[seen, 0] == pytest.approx(expected, abs=5e-4)
