@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
 Bounds = Mapping[str, tuple[float, str]]
 _MORE_OBSERVATIONS = "give more frequent observations"
-_MORE_COMPONENTS = "raise the option components"
-_WIDER_PRIOR = "give a wider prior, if it is not meant so narrow"
 _OTHER_METHOD = "take another method that holds"
+_MORE_COMPONENTS = f"{_OTHER_METHOD}, or raise the option components"
+_WIDER_PRIOR = "give a wider prior, if it is not meant so narrow"
 # What to change, for the figures whose words do not say it.
 ADVICE = {
     "negative_variance": "give variances of the noise and of the prior that are nearer in size",
