@@ -158,6 +158,16 @@ def test_a_drift_that_jumps_is_refused():
         zakai.filter(model, record, "yau-yau")
 
 
+def test_a_drift_of_one_state_that_jumps_is_refused_where_no_noise_spreads_the_point_that_it_makes():
+    keys = {**LINEAR, "state": ["x"], "drift": ["-sign(x)"], "observation": ["x"], "observation_noise": [["0.1"]]}
+    keys |= {"diffusion": [["0"]], "process_noise": [["1"]], "prior": {"kind": "gaussian", "mean": [1.0], "cov": [[0.2]]}}
+    with pytest.raises(ConditionError, match=r"write tanh\(x/w\) for sign\(x\)"):
+        zakai.online(zakai.Model(**keys))
+    with pytest.raises(ConditionError, match="do not jump .*there is no noise"):
+        zakai.online(zakai.Model(**keys), "yau-yau")
+    assert zakai.online(zakai.Model(**{**keys, "diffusion": [["1/10"]]})).method == "yau-yau"
+
+
 def test_the_advice_for_a_drift_that_jumps_converges():
     """In one state the jump itself is filtered, to an error of the grid."""
     keys = {**LINEAR, "state": ["x"], "process_noise": [["0.3"]], "prior": {"kind": "gaussian", "mean": [0.3], "cov": [[0.5]]}}

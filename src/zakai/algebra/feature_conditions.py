@@ -42,13 +42,15 @@ def inputs_of_increments(model: Model) -> tuple[Condition, ...]:
     return (Condition("h is affine where increments depend on inputs", affine, words, "the integral of h'S^-1 dy"),)
 
 
-def in_many_states(model: Model) -> tuple[Condition, ...]:
-    """Return what fails in two or more states, where the density moves along the characteristics of the drift."""
-    parts = [] if model.n == 1 else [*model.drift, *model.covariance]
+def on_characteristics(model: Model) -> tuple[Condition, ...]:
+    """Return what fails where the density moves along the characteristics of the drift: without noise, or in several states."""
+    noiseless = model.n == 1 and model.covariance.is_zero_matrix
+    parts = [*model.drift, *model.covariance] if model.n > 1 or noiseless else []
     jumps = [call for part in parts for call in part.atoms(*features.JUMP_FUNCTIONS) if call.has(*model.x)]
     source, found = "the grid of this method in two or more states", []
     if jumps:
-        words = f"a formula contains {short(str(jumps[0]))}"
+        words = f"a formula contains {short(str(jumps[0]))}{', and there is no noise' if noiseless else ''}"
+        source = "a density on a grid, which has no point of positive probability" if noiseless else source
         found.append(Condition("f and g do not jump where the state changes", False, words, source))
     if model.n > 3 and features.STATE_DEPENDENT_DIFFUSION in model.features:
         words = f"n = {model.n}, and {model.features[features.STATE_DEPENDENT_DIFFUSION]}"

@@ -19,8 +19,8 @@ from zakai.algebra.feature_conditions import (
     correlated,
     features_beside_inputs,
     features_of_samples,
-    in_many_states,
     inputs_of_increments,
+    on_characteristics,
     reflecting_ends,
 )
 from zakai.algebra.identities import all_zero
@@ -160,7 +160,7 @@ def any_smooth_system(model: Model) -> tuple[Condition, ...]:
     return (
         determined(model),
         _fits_on_a_grid(model, 4, "four"),
-        *in_many_states(model),
+        *on_characteristics(model),
         *correlated(model),
         *reflecting_ends(model),
     )

@@ -29,7 +29,7 @@ from zakai.densities import GaussianMixture
 from zakai.errors import InputError
 from zakai.methods._input_pieces import Pieces, pieces_of
 from zakai.methods._line_cross import OMITTED
-from zakai.methods._linearisation import of_motion, of_sensor
+from zakai.methods._linearisation import linearisation
 from zakai.methods._linearised_system import Formulas, Part, formulas_of, part_of, rate_noise_of, subdivided
 from zakai.methods._moments import prior_moments, wrapped
 from zakai.methods._options import one_of, whole_number
@@ -154,32 +154,13 @@ def step(
                 state, more = _stable(prepared, state, observed, part, keep)
             log_factor = log_factor + more
     at_end = prepared.at_end[k]
-    curved = _linearisation(prepared, k, before, state)
+    curved = linearisation(prepared, k, before, state)
     if at_end.any():
         observed_end = _Observed(np.where(at_end, values, 0.0), prepared.spans[k], prepared.end_noise[k])
         state, more = _update(prepared, state, observed_end, stop, prepared.end_inputs[k])
         log_factor = log_factor + more
     info = info_of(state, log_factor)
     return state, info._replace(health={**info.health, "linearisation": curved})
-
-
-def _linearisation(prepared: Prepared, k: int, before: State, predicted: State) -> float:
-    """Return how far the system is from linear over the density, in the motion of interval k and what is observed then."""
-    formulas, theta, schedule = prepared.formulas, prepared.theta.real, prepared.schedule
-    (mean, cov), (later, after) = (State(one.mean.real, one.cov.real) for one in (before, predicted))
-    if not np.isfinite(cov).all() or not np.isfinite(after).all():
-        return np.inf
-    curved, j = 0.0, prepared.first[k]
-    if schedule.stops[k] > schedule.starts[k]:
-        part = part_of(prepared.parts, j)
-        curved = of_motion(formulas, mean, cov, after, part, float(schedule.lengths[k]), theta)
-        if prepared.inside[k].any():
-            spans, noise = prepared.inside[k].astype(float), 0.5 * prepared.rate_noise[j][0].real
-            curved = max(curved, of_sensor(formulas, mean, cov, spans, noise, part.start, theta, part.u))
-    if prepared.at_end[k].any():
-        spans, noise, u = prepared.spans[k], prepared.end_noise[k].real, prepared.end_inputs[k]
-        curved = max(curved, of_sensor(formulas, later, after, spans, noise, float(schedule.stops[k]), theta, u))
-    return curved
 
 
 def _stable(
