@@ -77,4 +77,4 @@ def _points(mean: Array, cov: Array) -> Array:
 def _largest(shift: Array, spread: Array, variance: Array) -> float:
     wide = variance > 0
     changes = np.concatenate([np.abs(shift[wide]) / np.sqrt(variance[wide]), np.abs(spread[wide]) / variance[wide]])
-    return float(np.max(changes, initial=0.0))
+    return float(np.max(np.nan_to_num(changes, nan=np.inf), initial=0.0))
