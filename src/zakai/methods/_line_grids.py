@@ -6,7 +6,7 @@ import numpy as np
 
 from zakai.methods._line_steps import parts_needed, probed
 from zakai.methods._line_system import Prepared
-from zakai.methods._line_tables import spectral, tables
+from zakai.methods._line_tables import lattice_of, spectral
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_panels import GAUSS_NODES
 from zakai.numerics.line_segment import MARGIN, Grid
@@ -16,13 +16,8 @@ from zakai.numerics.line_weak import at_nodes, nodes
 BLOCK = 2048  # points by which the tables of a spacing are apart; a table has twice as many
 SHARED = 128  # points of the largest grid on which many steps share a decomposition
 LOBATTO = np.array([0.0, 0.5 - 0.5 / np.sqrt(5.0), 0.5 + 0.5 / np.sqrt(5.0)])  # nodes within a spacing
-_NONE = np.zeros(0)
+_NONE, _NOWHERE = np.zeros(0), np.zeros((3, 1))
 
-
-
-def known(prepared: Prepared, window: lw.Window) -> bool:
-    """Return whether the decomposition on a grid, or that there is none, has been computed already."""
-    return ("grid", window) in prepared.kept
 
 
 def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
@@ -45,7 +40,8 @@ def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
         table = _mixed(prepared, window, x, rows) if prepared.mixed else _separated(prepared, window, x)
         offset, fine = window.origin - prepared.origin + float(offsets[0]), _fine(prepared, window, x)
         missing = ~np.isfinite(table[:, :, OBSERVED:]).all(axis=(0, 1, 2))
-        return Grid(_NONE[None], _NONE, table, 0.0, 0, offset, window.spacing, fine), np.append(0, np.cumsum(missing))
+        grid = Grid(_NONE[None], _NONE, table, _NOWHERE, 0, offset, window.spacing, window.unit, fine)
+        return grid, np.append(0, np.cumsum(missing))
 
     key = ("table", window.origin, window.spacing, begin, length)
     grid, missing = make() if prepared.mixed else prepared.once(key, make)
@@ -63,9 +59,9 @@ def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
     table[0, 0, PHI] = np.log(decomposed.scale)
     if not np.isfinite(table[0, 0, [PHI, *range(OBSERVED, table.shape[2])]]).all():
         return None
-    modes, covariance = np.ascontiguousarray(decomposed.modes.T), float(np.max(tables(prepared, window).covariance))
+    modes, lattice = np.ascontiguousarray(decomposed.modes.T), lattice_of(prepared, window)
     fine = _fine(prepared, window, window.points)
-    return Grid(modes, decomposed.rates, table, covariance, 0, 0.0, window.spacing, fine)
+    return Grid(modes, decomposed.rates, table, lattice, 0, window.centre, window.spacing, window.unit, fine)
 
 
 def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:

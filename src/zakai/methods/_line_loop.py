@@ -11,18 +11,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zakai.methods import _line_sharp as sharp
 from zakai.methods._line_figures import edge_of_moments, figures, outside_tables, resampled, state_moments
-from zakai.methods._line_grids import grid_of, known
+from zakai.methods._line_grids import grid_of
 from zakai.methods._line_system import FINEST, Prepared, State
-from zakai.methods._line_tables import tables
 from zakai.methods._protocol import Info, Infos
 from zakai.methods._states import Joined, StackedStates
 from zakai.numerics import line_window as lw
-from zakai.numerics.line_density import support
 from zakai.numerics.line_filters import BAND
 from zakai.numerics.line_loop import advance
-from zakai.numerics.line_modes import narrow
-from zakai.numerics.line_segment import AFTER, COLUMNS, FACTOR, FAILED, RANGE, Segment
+from zakai.numerics.line_segment import AFTER, COLUMNS, FAILED, OK, RANGE, UNRESOLVED, Segment
+
+Array = Any
 
 LARGER = 0.2  # margin of a new grid, relative to the range of the density
 TOGETHER = 32  # intervals whose tables of coefficients in time are computed together
@@ -38,25 +38,36 @@ HEALTH = {
 
 
 class Piece(NamedTuple):
-    """Steps on one grid that begin with interval `first`; `last` is the state after them, on the grid of the next step."""
+    """Steps that begin with interval `first`, from the state `before` on.
+
+    The densities (K, N) have grids with these centres and spacings (K,); `last` is the state after them, on the grid of the next
+    step.
+    """
 
     first: int
     before: State
-    grid_start: int
-    segment: Segment
+    densities: Array
+    centres: Array
+    spacings: Array
+    reports: Array
     last: State
-
-    def centre(self, start: Any) -> Any:
-        """Return the centres of grids that begin at points of the table: multiples of the spacing, however they came there."""
-        return self.before.spacing * (round(self.before.centre / self.before.spacing) + (start - self.grid_start))
 
     @property
     def states(self) -> Sequence[State]:
         """The states after the steps."""
-        reports = self.segment.reports
-        centres = self.centre(reports[:, START])
-        fields = {"values": self.segment.densities, "centre": centres, "error": reports[:, ERROR], "log_floor": reports[:, FLOOR]}
+        errors, floors = self.reports[:, ERROR], self.reports[:, FLOOR]
+        fields = {
+            "values": self.densities, "centre": self.centres, "spacing": self.spacings, "error": errors, "log_floor": floors
+        }  # fmt: skip
         return Joined([StackedStates[State](self.before, fields)[:-1], [self.last]])
+
+    @classmethod
+    def of(cls, first: int, before: State, densities: Array, centres: Array, spacings: Array, reports: Array) -> Piece:
+        """Return steps after which the grid stays."""
+        *_, error, log_floor, _ = reports[-1].tolist()
+        centre, spacing = float(centres[-1]), float(spacings[-1])
+        last = before._replace(values=densities[-1], centre=centre, spacing=spacing, error=error, log_floor=log_floor)
+        return cls(first, before, densities, centres, spacings, reports, last)
 
 
 START, ERROR, FLOOR = (COLUMNS.index(name) for name in ("start", "error", "log_floor"))
@@ -79,45 +90,47 @@ def one(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple
 def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> list[Piece]:
     """Return the first steps of `rows`, as many as the loop takes."""
     pieces: list[Piece] = []
-    attempts, first, observed = 0, rows.start, np.ascontiguousarray(observed, float)
+    attempts, first, own, observed = 0, rows.start, False, np.ascontiguousarray(observed, float)
     while first < rows.stop and attempts < ATTEMPTS:
-        window = state.window
-        if not prepared.gaussian and not known(prepared, window) and _narrow(prepared, first, state):
+        attempts, why, answer, piece = attempts + 1, OK, np.zeros(3), None
+        if own or sharp.is_sharp(prepared, first, state):
+            if prepared.kinked:
+                break
+            found = sharp.advanced(prepared, first, rows.stop, state, observed[first - rows.start :], own)
+            piece = None if found is None else Piece.of(first, state, *found)
+        else:
+            here = slice(first, min(rows.stop, first + TOGETHER) if prepared.mixed else rows.stop)
+            grid = grid_of(prepared, state.window, here)
+            if grid is None:
+                break
+            segment = advance(
+                prepared.mechanisms, np.ascontiguousarray(state.values), grid, prepared.steps, first,
+                observed[first - rows.start : here.stop - rows.start], float(state.error), float(state.log_floor),
+                prepared.limits,
+            )  # fmt: skip
+            why, answer = segment.why, segment.answer
+            if len(segment.reports):
+                piece = _piece(first, state, grid.start, segment)
+        if piece is not None:
+            last = regridded(prepared, piece.last) if why == AFTER else piece.last
+            pieces.append(piece._replace(last=last))
+            attempts, state, first = 1, last, first + len(piece.reports)
+        if why == FAILED or (why == OK and piece is None and not own):
             break
-        here = slice(first, min(rows.stop, first + TOGETHER) if prepared.mixed else rows.stop)
-        grid = grid_of(prepared, window, here)
-        if grid is None:
-            break
-        found = advance(
-            prepared.mechanisms, np.ascontiguousarray(state.values), grid, prepared.steps, first,
-            observed[first - rows.start : here.stop - rows.start], float(state.error), float(state.log_floor), prepared.limits,
-        )  # fmt: skip
-        attempts += 1
-        if len(found.reports):
-            attempts, piece = 1, Piece(first, state, grid.start, found, state)
-            *_, error, log_floor, start = found.reports[-1].tolist()
-            state = state._replace(values=found.densities[-1], centre=piece.centre(start), error=error, log_floor=log_floor)
-            state = regridded(prepared, state) if found.why == AFTER else state
-            pieces.append(piece._replace(last=state))
-            first += len(found.reports)
-        if found.why == RANGE:
-            larger = _covering(prepared, state, *found.answer.tolist())
+        if why == RANGE:
+            larger = _covering(prepared, state, *answer.tolist())
             if larger is None:
                 break
             state = larger
-        elif found.why == FAILED:
-            break
+        own = why == UNRESOLVED
     return pieces
 
 
-def _narrow(prepared: Prepared, k: int, state: State) -> bool:
-    """Return whether the loop leaves interval k to another grid, before the present one is decomposed."""
-    if prepared.kinds[k] != FACTOR or state.closed:
-        return False
-    covariance = float(np.max(tables(prepared, state.window).covariance))
-    cut = max(prepared.cut, min(30.0 * np.exp(state.log_floor), lw.CUT))
-    low, high = support(np.ascontiguousarray(state.values), cut)
-    return narrow(high - low, state.spacing, covariance * prepared.lengths[k])
+def _piece(first: int, before: State, start: int, segment: Segment) -> Piece:
+    """Return the steps of a grid that begins at a point of its table: centres are multiples of the spacing."""
+    spacing = before.spacing
+    centres = spacing * (round(before.centre / spacing) + (segment.reports[:, START] - start))
+    return Piece.of(first, before, segment.densities, centres, np.full(len(centres), spacing), segment.reports)
 
 
 def joined(parts: list[Infos]) -> Infos:
@@ -169,7 +182,7 @@ def _infos(prepared: Prepared, piece: Piece) -> Infos:
     def each(function: Callable[[State, float], Any]) -> np.ndarray:
         return np.array([function(*pair) for pair in zip(states, stops)])
 
-    columns = dict(zip(COLUMNS, piece.segment.reports.T))
+    columns = dict(zip(COLUMNS, piece.reports.T)) | {"centre": piece.centres, "spacing": piece.spacings}
     mean, variance, health = _report(prepared, piece, columns, each)
     return Infos(columns["gained"], mean[:, None], variance[:, None, None], health)
 
@@ -180,7 +193,8 @@ def _info(prepared: Prepared, piece: Piece) -> Info:
     def each(function: Callable[[State, float], Any]) -> np.ndarray:
         return np.asarray(function(piece.states[0], float(prepared.schedule.stops[piece.first])))
 
-    columns = dict(zip(COLUMNS, piece.segment.reports[0].tolist()))
+    columns = dict(zip(COLUMNS, piece.reports[0].tolist()))
+    columns |= {"centre": float(piece.centres[0]), "spacing": float(piece.spacings[0])}
     mean, variance, health = _report(prepared, piece, columns, each)
     return Info(columns["gained"], np.array([mean]), np.array([[variance]]), health)
 
@@ -192,8 +206,8 @@ def _report(
 
     `each` applies a function to the state after every step and the time.
     """
-    origin, spacing = piece.before.origin, piece.before.spacing
-    mean = origin + (piece.centre(columns["start"]) + spacing * columns["mean"])
+    spacing = columns["spacing"]
+    mean = piece.before.origin + (columns["centre"] + spacing * columns["mean"])
     variance = spacing**2 * columns["variance"]
     health = {name: columns[source] for name, source in HEALTH.items()}
     health["tolerance_ratio"] = columns["made"] / prepared.promised

@@ -10,7 +10,9 @@ from zakai.methods._line_model import System
 from zakai.methods._line_system import Prepared
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_operator import Spectral, symmetric
+from zakai.numerics.line_outlook import LATTICE
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
+from zakai.numerics.line_place import PER
 from zakai.numerics.line_weak import PARTS, at_nodes, nodes, weak
 
 Array = Any
@@ -49,6 +51,19 @@ def spectral(prepared: Prepared, window: lw.Window) -> Spectral | None:
     """Return the decomposition of the operator on a grid, if it has one."""
     found: tuple[Spectral | None] = prepared.once(("spectral", window), lambda: (_decomposed(prepared, window),))
     return found[0]
+
+
+def lattice_of(prepared: Prepared, window: lw.Window) -> Array:
+    """Return f, f' and G (3, L) at offsets from the origin that are unit / PER apart."""
+
+    def make() -> Array:
+        system, start, theta = prepared.system, prepared.model.start, prepared.theta
+        x = window.origin + window.unit / PER * (np.arange(LATTICE) - LATTICE // 2.0)
+        f = finite(system.drift(x[:, None], start, theta)[:, 0])
+        return np.stack([f, np.gradient(f, x), covariance_at(system, x, start, theta) * np.ones(len(x))])
+
+    found: Array = prepared.once(("lattice", window.origin, window.unit), make)
+    return found
 
 
 def drift_at(system: System, window: lw.Window, t: Array, theta: Array) -> Array:

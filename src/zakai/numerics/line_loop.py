@@ -21,7 +21,8 @@ from zakai.numerics.compiled import kernel
 from zakai.numerics.line_averages import AVERAGES
 from zakai.numerics.line_density import circular_moments, highest_of, moments, separated, spectrum, support, waves
 from zakai.numerics.line_filters import BAND, convolved, kernel_of
-from zakai.numerics.line_modes import LOG_NOISE, decayed, decomposed, narrow
+from zakai.numerics.line_modes import LOG_NOISE, decayed, decomposed
+from zakai.numerics.line_outlook import is_sharp
 from zakai.numerics.line_segment import (
     AFTER,
     COLUMNS,
@@ -33,6 +34,7 @@ from zakai.numerics.line_segment import (
     RELIABLE,
     SPLIT,
     TABLE,
+    UNRESOLVED,
     Grid,
     Mechanisms,
     Segment,
@@ -56,15 +58,15 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
 
     @kernel(
         types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]
-            _V, int64, _Q, float64, _M, _V, _T, _M, _M, float64, float64, int64, _M, int64[::1], _V, _V, _Q, _V, _M, _T, _T, _M,
-            float64, float64, _V, _M, _M, _M
+            _V, int64, _Q, _M, _M, _V, _T, _M, _M, float64, float64, float64, int64, _M, int64[::1], _V, _V, _Q, _V, _M, _T,
+            _T, _M, float64, float64, _V, _M, _M, _M
         )
     )  # fmt: skip
     def advance(
-        values: Array, start: int, table: Array, covariance: float, modes: Array, rates: Array, averages: Array, cosines: Array,
-        sines: Array, offset: float, spacing: float, begin: int, observed: Array, kinds: Array, lengths: Array, shares: Array,
-        precisions: Array, constants: Array, kernel_parameters: Array, drifts: Array, outputs: Array, covariances: Array,
-        error: float, log_floor: float, limits: Array, densities: Array, out: Array, fine: Array,
+        values: Array, start: int, table: Array, lattice: Array, modes: Array, rates: Array, averages: Array, cosines: Array,
+        sines: Array, offset: float, spacing: float, unit: float, begin: int, observed: Array, kinds: Array, lengths: Array,
+        shares: Array, precisions: Array, constants: Array, kernel_parameters: Array, drifts: Array, outputs: Array,
+        covariances: Array, error: float, log_floor: float, limits: Array, densities: Array, out: Array, fine: Array,
     ) -> tuple[int, int]:  # fmt: skip
         """Return the number of steps, and why the loop ended; the last row of `out` receives the answer."""
         negligible, most, generous, size, length = limits[0], limits[1], limits[4], values.size, table.shape[3]
@@ -79,6 +81,9 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
             if samples:
                 for j in range(observed.shape[1]):
                     seen |= precisions[k, 0, j, j] != 0.0
+            if modal and not closed and i > 0 and is_sharp(now, offset, spacing, unit, tau, lattice):
+                status = TABLE  # the steps of `line_sharp` may take this one
+                break
             cut = max(limits[3], min(30.0 * np.exp(log_floor), CUT))
             low, high = support(now, cut)
             if place != start or timed:
@@ -116,11 +121,10 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
             depth, finest = 8.0 - np.log(cut), (high - low) * 1.2 * spacing / (limits[5] - 2 * ALIGNMENT)
             move = failed(0.0, 0.0)
             if modal:
-                if closed or not narrow(high - low, spacing, covariance * tau):
-                    if tau != last_tau:
-                        decay, last_tau = decayed(rates, tau), tau
-                    rounding = decomposed(now, local[0, PHI], modes, decay, 0.1 * most, closed)
-                    move = Transition(0.0, rounding, 0.0, 0.0, 1.0, 0.0, 0.0)
+                if tau != last_tau:
+                    decay, last_tau = decayed(rates, tau), tau
+                rounding = decomposed(now, local[0, PHI], modes, decay, 0.1 * most, closed)
+                move = Transition(0.0, rounding, 0.0, 0.0, 1.0, 0.0, 0.0)
             elif kernels and not np.isnan(channel[0]):
                 middle = offset + spacing * (start + half)
                 move = convolved(now, local[0, PHI], channel, middle, spacing, finest, depth, closed)
@@ -166,7 +170,9 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
                     highest = top
                 if not (aliasing <= limit):
                     answer[0], answer[1], answer[2] = float(low), float(high), 0.6 * spacing
-                    status = RANGE if (positive or modal) and not weak and aliasing < np.inf else FAILED
+                    status = FAILED if weak or not (positive or modal) or not (aliasing < np.inf) else RANGE
+                    if modal and not closed and status == RANGE:
+                        status = UNRESOLVED
                     break
                 if np.isnan(added) or not (closed or max(left, right) < 1e-10):
                     status = FAILED
@@ -213,7 +219,7 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
                 status = TABLE
             if status != OK:
                 break
-        if status == RANGE:  # the step is tried again on another grid, from that of the last state
+        if status == RANGE or status == UNRESOLVED:  # the step is tried again on another grid, from that of the last state
             for j in range(2):
                 answer[j] = spacing * (answer[j] + start - home - half)
         return done, status
@@ -244,7 +250,7 @@ def advance(
     densities, out = np.empty((count, size)), np.empty((count + 1, len(COLUMNS)))
     averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
     done, why = _loop(*mechanisms)(
-        values, grid.start, grid.table, grid.covariance, grid.modes, grid.rates, averages, *waves(size), grid.offset,
-        grid.spacing, first, observed, *steps, error, log_floor, limits, densities, out, grid.fine,
+        values, grid.start, grid.table, grid.lattice, grid.modes, grid.rates, averages, *waves(size), grid.offset,
+        grid.spacing, grid.unit, first, observed, *steps, error, log_floor, limits, densities, out, grid.fine,
     )  # fmt: skip
     return Segment(densities[:done], out[:done], why, out[-1, :3])

@@ -5,27 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import boolean, float64
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.compiled import helper
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line_density import highest_of
 
 Array = NDArray[Any]
 
 LOG_NOISE = -33.4  # logarithm of the error of a decomposition relative to the maximum
-_NARROW = 7.0  # support of a density, in standard deviations of the noise, below which a step is left to another grid
 _SUPPORT = 1e-13  # values relative to the maximum beyond which a density counts as ended
 _NEGLIGIBLE = 42.0  # -log of the factor of a mode that is negligible
 _SPREAD = 0.01  # of the value at an abrupt end that the interpolant spreads to the middle of the grid
-
-
-@kernel(boolean(float64, float64, float64))
-def narrow(points: float, spacing: float, variance: float) -> bool:
-    """Return whether noise of a variance makes the support of a density far wider: its grid cannot serve after the interval."""
-    within: bool = points * spacing < _NARROW * np.sqrt(variance)
-    return within
 
 
 @helper

@@ -14,7 +14,7 @@ COLUMNS = (
 )  # fmt: skip
 # The transition: whole with a sample after it, split with increments inside, whole with increments inside, split with a sample.
 FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = 0, 1, 2, 3
-OK, FAILED, RANGE, AFTER, TABLE = 0, 1, 2, 3, 4  # why the loop ends
+OK, FAILED, RANGE, AFTER, TABLE, UNRESOLVED = range(6)  # why the loop ends; the last where a product needs a finer grid
 RELIABLE = 1e-3  # of the promised error: smaller estimates are not reported
 MARGIN = 96  # points of a table of coefficients in time beyond the grid, of which a third may be used before it is made again
 
@@ -37,18 +37,20 @@ class Mechanisms(NamedTuple):
 class Grid(NamedTuple):
     """The data of a grid: the rows of `modes` (N, N), `rates` (N,), and terms `table` (K, R, 4 + m, T) as in `line_terms`.
 
-    K = 1 where the terms do not depend on the interval.  With modes the table is that of the grid, and `covariance` the largest
-    G.  Else it is longer than the grid, which begins at `start`; the first point of the table is `offset` away from the origin of
-    the kernels.  `fine` (m, F) are the values of an h with kinks at the nodes of `line_weak`, else empty.
+    K = 1 where the terms do not depend on the interval.  With modes the table is that of the grid, of which `offset` is the
+    centre, and `lattice` is that of `line_outlook.outlook`.  Else it is longer than the grid, which begins at `start`; the first
+    point of the table is `offset` away from the origin of the kernels.  `unit` is the scale of spacings.  `fine` (m, F) are the
+    values of an h with kinks at the nodes of `line_weak`, else empty.
     """
 
     modes: Array
     rates: Array
     table: Array
-    covariance: float
+    lattice: Array
     start: int
     offset: float
     spacing: float
+    unit: float
     fine: Array
 
 

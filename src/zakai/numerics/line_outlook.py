@@ -1,0 +1,95 @@
+"""The grid for a density after an interval, out of few."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import boolean, float64
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.line_density import support
+from zakai.numerics.line_place import PER
+from zakai.numerics.line_window import CUT, SIZES
+
+Array = NDArray[Any]
+
+LATTICE = 4096  # offsets at which f and G are known without a grid
+REACH = 7.6  # standard deviations of the noise by which the support grows
+_SPACING = 0.34  # spacing in standard deviations of the noise, at most: the shortest wave decays by exp(-42)
+_MARGIN = 7.2  # of them beyond the support: the waves that R' leaves everywhere end there, and spread from the ends
+_APART = 32  # the centres of coarse grids are multiples of so many spacings
+_SIZES = np.array(SIZES)
+_V, _M = float64[::1], float64[:, ::1]
+
+
+class Outlook(NamedTuple):
+    """The spacing and the ends of a grid for the density after an interval, and the margin beyond these."""
+
+    spacing: float
+    left: float
+    right: float
+    margin: float
+
+
+@helper
+def outlook(low: float, high: float, tau: float, unit: float, lattice: Array) -> Outlook:
+    """Return what grid a density between two offsets needs after an interval, by the linear equation around its middle.
+
+    Args:
+        low, high: the ends of the support.
+        tau: the length of the interval.
+        unit: the scale of spacings.
+        lattice: f, f' and G (3, L) at offsets that are unit / PER apart.
+    """
+    middle, per, last = lattice.shape[1] // 2, PER / unit, lattice.shape[1] - 1.0
+    first, stop = int(min(max(np.floor(low * per) + middle, 0.0), last)), int(min(max(np.ceil(high * per) + middle, 0.0), last))
+    least, most = lattice[2, first], lattice[2, first]
+    for i in range(first, stop + 1):
+        least, most = min(least, lattice[2, i]), max(most, lattice[2, i])
+    wide = np.sqrt(most * tau)
+    at = (first + stop) // 2
+    here = -tau * lattice[1, at]
+    shift = tau * lattice[0, at] * relative(here)
+    there = -tau * lattice[1, int(min(max(at + shift * per, 0.0), last))]
+    fast, slow = max(here, there, 0.0), max(min(here, there), -1.0)
+    spacing = _SPACING * np.sqrt(least * tau * relative(2.0 * fast))
+    spacing = unit * 2.0 ** (0.5 * np.floor(2.0 * np.log2(spacing / unit) + 1e-9))
+    half, centre = 0.5 * (high - low) * np.exp(-slow) + REACH * wide * np.sqrt(relative(2.0 * slow)), 0.5 * (low + high)
+    return Outlook(spacing, centre - half + min(shift, 0.0), centre + half + max(shift, 0.0), _MARGIN * wide)
+
+
+@helper
+def relative(x: float) -> float:
+    """Return (1 - exp(-x)) / x."""
+    return (1.0 - np.exp(-max(x, -5.0))) / max(x, -5.0) if abs(x) > 1e-8 else 1.0
+
+
+@kernel(boolean(_V, float64, float64, float64, float64, _M))
+def is_sharp(values: Array, centre: float, spacing: float, unit: float, tau: float, lattice: Array) -> bool:
+    """Return whether an interval allows a grid that is not finer than that of a density."""
+    low, high = support(values, CUT)
+    half = values.size // 2
+    found = outlook(centre + spacing * (low - half), centre + spacing * (high - half), tau, unit, lattice)
+    sharp: bool = found.spacing >= 0.999 * spacing
+    return sharp
+
+
+@helper
+def wanted(low: float, high: float, spacing: float, margin: float, answer: Array) -> None:
+    """Write the centre, the spacing and the size of a grid from `low` to `high` with a margin on both sides."""
+    apart = _APART * spacing
+    answer[0], answer[1], answer[2] = apart * np.floor(0.5 * (low + high) / apart + 0.5), spacing, np.inf
+    for known in _SIZES[::-1]:
+        if known >= (high - low + 2.0 * margin) / spacing + _APART + 2:
+            answer[2] = float(known)
+
+
+@helper
+def place_of(index: Array, answer: Array) -> int:
+    """Return which of the known grids is wanted, -1 for none."""
+    for g in range(index.shape[0]):
+        if index[g, 0] == answer[0] and index[g, 1] == answer[1] and index[g, 2] == answer[2]:
+            return g
+    return -1
