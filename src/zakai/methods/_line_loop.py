@@ -91,15 +91,18 @@ def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -
     """Return the first steps of `rows`, as many as the loop takes."""
     pieces: list[Piece] = []
     attempts, first, own, observed = 0, rows.start, False, np.ascontiguousarray(observed, float)
+    general = prepared.system.general and not prepared.gaussian
     while first < rows.stop and attempts < ATTEMPTS:
         attempts, why, answer, piece = attempts + 1, OK, np.zeros(3), None
-        if own or sharp.is_sharp(prepared, first, state):
-            if prepared.kinked:
+        is_sharp = sharp.is_sharp(prepared, first, state)
+        own = own or (not is_sharp and general and bool(prepared.schedule.seen[first].any()))
+        if own or is_sharp:
+            if prepared.kinked or state.closed:
                 break
             found = sharp.advanced(prepared, first, rows.stop, state, observed[first - rows.start :], own)
             piece = None if found is None else Piece.of(first, state, *found)
         else:
-            here = slice(first, min(rows.stop, first + TOGETHER) if prepared.mixed else rows.stop)
+            here = slice(first, min(rows.stop, first + (1 if general else TOGETHER if prepared.mixed else len(observed))))
             grid = grid_of(prepared, state.window, here)
             if grid is None:
                 break
@@ -115,7 +118,7 @@ def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -
             last = regridded(prepared, piece.last) if why == AFTER else piece.last
             pieces.append(piece._replace(last=last))
             attempts, state, first = 1, last, first + len(piece.reports)
-        if why == FAILED or (why == OK and piece is None and not own):
+        if why == FAILED or (why == OK and piece is None):
             break
         if why == RANGE:
             larger = _covering(prepared, state, *answer.tolist())

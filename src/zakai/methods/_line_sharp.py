@@ -16,12 +16,13 @@ from zakai.numerics import line_window as lw
 from zakai.numerics.line_density import waves
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line_place import PER
+from zakai.numerics.line_posterior import General
 from zakai.numerics.line_segment import COLUMNS, FACTOR
 
 Array = Any
 
 NEW = 8  # coarse grids that are made for one step
-SIZES = (80, 160, 384)  # points of fine grids
+SIZES = (80, 160, 384, 1024)  # points of fine grids
 NUMBERS = 2**21  # of the coarse grids that are known together
 
 
@@ -106,6 +107,8 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
             if special:
                 owner = int(np.flatnonzero((coarse.index[:, :3] == places[-1]).all(axis=1))[0])
                 rows = _rows(prepared, k, grid, observed[0])
+                if np.isnan(rows).any():
+                    return None
         else:
             return None
     return None
@@ -130,15 +133,17 @@ def _parts(prepared: Prepared, grid: lw.Window) -> list[Array] | None:
 
 
 def _rows(prepared: Prepared, k: int, grid: lw.Window, observed: np.ndarray) -> Array:
-    """Return h, or the log-likelihood of what is observed, at PER points in a spacing of a grid, for interval k."""
+    """Return h, or the log-likelihood of what is observed, at PER points in a spacing of a grid, for interval k; NaN for none."""
     seen, x = prepared.schedule.seen[k], _points(grid)
     if not prepared.system.general:
         found = prepared.system.observation(x[:, None], float(prepared.schedule.stops[k]), prepared.theta).T
     elif seen.any():
-        found = factor_at_end(prepared, k, seen, observed, None).logs(x)[None]
+        likelihood = factor_at_end(prepared, k, seen, observed, None)
+        assert isinstance(likelihood, General)
+        found = likelihood.log_density(x)[None]
     else:
         found = np.zeros((1, len(x)))
-    return np.ascontiguousarray(found)
+    return np.array(found, float, order="C")
 
 
 def _points(grid: lw.Window) -> Array:

@@ -113,7 +113,7 @@ def kinds_of(prepared: Prepared) -> np.ndarray:
     regular = positive & np.all(schedule.seen == prepared.inside, axis=1)
     if not prepared.gaussian:
         usable = system.samples and not system.moving and system.separated is not None
-        return np.where(positive & (silent | (not system.general)), FACTOR, -1) if usable else none
+        return np.where(positive, FACTOR, -1) if usable else none
     if system.separated is None and not prepared.mixed:
         return none
     whole = np.zeros(len(schedule), bool)

@@ -174,7 +174,7 @@ def symmetric(closed: bool, spacing: float, covariance: Any, potential: Array) -
         potential: V at the points (N,).
     """
     size = len(potential)
-    unit = 1.0 if closed else spacing
+    unit = np.float64(1.0 if closed else spacing)  # whose powers may overflow
     if np.ndim(covariance) == 0:
         return np.asarray(-0.5 * covariance * derivatives(size, closed)[1] / unit**2 + np.diag(potential))
     slope = derivative_between(size, closed) / unit

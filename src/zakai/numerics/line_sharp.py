@@ -158,9 +158,10 @@ def sharpened(
         tau, alone = lengths[k], own and i == 0
         begins, ends = support(now, CUT)
         low, high = centre + spacing * (begins - now.size // 2), centre + spacing * (ends - now.size // 2)
-        coarse, left, right, margin = outlook(low, high, tau, unit, lattice)
+        coarse, left, right, beyond = outlook(low, high, tau, unit, lattice)
+        margin = 0.0 if alone else beyond
         if alone:
-            coarse, margin = spacing, 0.0
+            coarse = spacing
         elif not coarse >= 0.999 * spacing:
             return i, BROAD
         answer[0], answer[1], answer[2] = centre, spacing, now.size
@@ -189,8 +190,9 @@ def sharpened(
                 return i, FAILED
             if edge <= bound and aliasing <= max(30.0 * negligible, 1e-5 * allowed):
                 break
-            if alone or attempt == _ATTEMPTS - 1:
+            if attempt == _ATTEMPTS - 1:
                 return i, FAILED
+            alone, margin = False, beyond
             left -= (last - first) * coarse / 3.0 if on_left > bound * top else 0.0
             right += (last - first) * coarse / 3.0 if on_right > bound * top else 0.0
             if edge <= bound:  # the spectrum of a Gaussian falls as exp(-c k^2)
