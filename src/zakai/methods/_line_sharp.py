@@ -21,7 +21,7 @@ from zakai.numerics.line_segment import COLUMNS, FACTOR
 
 Array = Any
 
-NEW = 8  # coarse grids that are made for one step
+NEW = 12  # coarse grids and rows that are made for one step
 SIZES = (80, 160, 384, 1024)  # points of fine grids
 NUMBERS = 2**21  # of the coarse grids that are known together
 
@@ -96,19 +96,19 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
         elif why == ls.GRID:
             centre, spacing, size = places[-1].tolist()
             grid = window._replace(centre=centre, spacing=spacing, size=int(size))
-            if not (coarse.index[:, :3] == places[-1]).all(axis=1).any():
-                parts = _parts(prepared, grid)
-                if parts is None:
-                    return None
-                if not coarse.add(grid, parts):  # the others are left to threads that read them
-                    prepared.kept.pop(key, None)
-                    coarse = prepared.once(key, Coarse)
-                    coarse.add(grid, parts)
-            if special:
-                owner = int(np.flatnonzero((coarse.index[:, :3] == places[-1]).all(axis=1))[0])
-                rows = _rows(prepared, k, grid, observed[0])
+            places_of = np.flatnonzero((coarse.index[:, :3] == places[-1]).all(axis=1))
+            if len(places_of):  # what is missing is what is observed
+                owner, rows = int(places_of[0]), _rows(prepared, k, grid, observed[0])
                 if np.isnan(rows).any():
                     return None
+                continue
+            parts = _parts(prepared, grid)
+            if parts is None:
+                return None
+            if not coarse.add(grid, parts):  # the others are left to threads that read them
+                prepared.kept.pop(key, None)
+                coarse = prepared.once(key, Coarse)
+                coarse.add(grid, parts)
         else:
             return None
     return None

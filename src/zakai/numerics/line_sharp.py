@@ -12,6 +12,7 @@ which `line_place` finds.  Fine grids need no decomposition, and one coarse grid
 
 from __future__ import annotations
 
+from math import erfc
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ Array = NDArray[Any]
 
 DONE, BROAD, GRID, SIZE, FAILED = range(5)  # why the loop ends
 _EDGE = 1e-11  # density at the outermost points, relative to the maximum
+_FALL = 4.2  # half of the range of erfc(y) / 2 from one to zero
 _ATTEMPTS = 6  # coarse grids on which a step is tried
 _V, _M, _T = float64[::1], float64[:, ::1], float64[:, :, ::1]
 
@@ -102,6 +104,10 @@ def carried(
     else:
         coefficients = np.empty(moved.size)
         gathered(inner, at, coefficients)
+        for j in range(first):  # the waves that R' leaves everywhere; where they end abruptly, the derivatives spread that
+            fall = 0.5 * erfc(_FALL * (2.0 * (first - j) / first - 1.0))
+            coefficients[j] *= fall
+            coefficients[coefficients.size - 1 - j] *= fall
     reach = np.sqrt(np.sum(coefficients * coefficients))
     decay = decayed(rates, tau)
     coefficients = np.dot(modes[: decay.size], coefficients)
@@ -170,7 +176,7 @@ def sharpened(
             if not alone:
                 wanted(left, right, coarse, margin, answer)
             place = place_of(index, answer)
-            if place < 0 or (owner >= -1 and place != owner):
+            if place < 0:
                 return i, GRID if answer[2] <= LARGEST else FAILED
             size, offset = int(index[place, 2]), int(index[place, 3])
             begin_at, length = index[place, 0] - coarse * (size // 2), PER * (size - 1) + 1
@@ -213,6 +219,8 @@ def sharpened(
         floor = np.exp(LOG_NOISE) + aliasing + edge + rounding
         # The sample.
         if owner >= -1:
+            if place != owner:
+                return i, GRID
             rows = special
         else:
             rows = known[offset : offset + length * observed.shape[1]].reshape((observed.shape[1], length))
