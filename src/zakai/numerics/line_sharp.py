@@ -16,7 +16,7 @@ from math import erfc
 from typing import Any
 
 import numpy as np
-from numba import boolean, float64, int64, types
+from numba import boolean, float64, int64, types, void
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
@@ -71,7 +71,27 @@ def gathered(values: Array, at: Array, found: Array) -> None:
         found[j] = -found[j]
 
 
-@helper
+@kernel(void(_V, _V, _V), reordered=True)
+def by_modes(modes: Array, decay: Array, values: Array) -> None:
+    """Replace values (N,) by U decay U' of them, with the rows of U' one after the other and the decay of the first M."""
+    size = values.size
+    found = np.zeros(size)
+    for n in range(decay.size):
+        row, coefficient = modes[n * size : (n + 1) * size], 0.0
+        for j in range(size):
+            coefficient += row[j] * values[j]
+        coefficient *= decay[n]
+        for j in range(size):
+            found[j] += coefficient * row[j]
+    for j in range(size):
+        values[j] = found[j]
+
+
+@kernel(
+    types.UniTuple(float64, 2)(  # type: ignore[no-untyped-call]
+        _V, _V, boolean, _V, _V, _V, float64, int64, int64, _V
+    )
+)
 def carried(
     now: Array, at: Array, same: bool, scale: Array, modes: Array, rates: Array, tau: float, first: int, last: int, moved: Array
 ) -> tuple[float, float]:  # fmt: skip
@@ -82,7 +102,7 @@ def carried(
         at: its points as indices of the coarse grid.
         same: whether these are the points of the coarse grid.
         scale: log s (T,) at the points of rows.
-        modes, rates: U' and lambda.
+        modes, rates: the rows of U' and lambda.
         tau: the length of the interval.
         first, last: the points of the coarse grid between which the density is kept.
         moved: receives the density.
@@ -100,7 +120,7 @@ def carried(
     for i in range(now.size):
         inner[i] = now[i] * logs[i] if now[i] > CUT * now[top] else 0.0
     if same:
-        coefficients = inner
+        coefficients = inner.copy()
     else:
         coefficients = np.empty(moved.size)
         gathered(inner, at, coefficients)
@@ -110,10 +130,7 @@ def carried(
             coefficients[coefficients.size - 1 - j] *= fall
     reach = np.sqrt(np.sum(coefficients * coefficients))
     decay = decayed(rates, tau)
-    coefficients = np.dot(modes[: decay.size], coefficients)
-    for n in range(decay.size):
-        coefficients[n] *= decay[n]
-    coefficients = np.dot(coefficients, modes[: decay.size])
+    by_modes(modes, decay, coefficients)
     after, most, largest = np.empty(moved.size), 0.0, 0.0
     for j in range(moved.size):
         after[j] = scale[PER * j] - reference
@@ -181,7 +198,7 @@ def sharpened(
             size, offset = int(index[place, 2]), int(index[place, 3])
             begin_at, length = index[place, 0] - coarse * (size // 2), PER * (size - 1) + 1
             rates, offset = known[offset : offset + size], offset + size
-            modes, offset = known[offset : offset + size * size].reshape((size, size)), offset + size * size
+            modes, offset = known[offset : offset + size * size], offset + size * size
             cosine, sine, offset = known[offset : offset + size], known[offset + size : offset + 2 * size], offset + 2 * size
             scale, offset = known[offset : offset + length], offset + length
             at, moved, inset = np.empty(now.size), np.empty(size), int(np.ceil(margin / coarse))
@@ -223,7 +240,10 @@ def sharpened(
                 return i, GRID
             rows = special
         else:
-            rows = known[offset : offset + length * observed.shape[1]].reshape((observed.shape[1], length))
+            rows = np.empty((observed.shape[1], length))
+            for r in range(rows.shape[0]):
+                for j in range(length):
+                    rows[r, j] = known[offset + r * length + j]
         now, b = np.empty(n), np.empty(n)
         centre, spacing, constant, more, enough = sampled(
             moved, max(begins - 1, first), min(ends + 1, last), rows, general, precisions[k], observed[i], begin_at, coarse, unit,
