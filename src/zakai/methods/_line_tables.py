@@ -54,7 +54,9 @@ def spectral(prepared: Prepared, window: lw.Window) -> Spectral | None:
 
 
 def lattice_of(prepared: Prepared, window: lw.Window) -> Array:
-    """Return f, f' and G (3, L) at offsets from the origin that are unit / PER apart."""
+    """Return f, f' and G (3, L) at offsets from the origin that are unit / PER apart, of kinked systems the largest G alone."""
+    if prepared.kinked:
+        return np.full((3, 1), np.max(tables(prepared, window).covariance))
 
     def make() -> Array:
         system, start, theta = prepared.system, prepared.model.start, prepared.theta

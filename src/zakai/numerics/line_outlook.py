@@ -19,6 +19,7 @@ LATTICE = 4096  # offsets at which f and G are known without a grid
 REACH = 7.6  # standard deviations of the noise by which the support grows
 _SPACING = 0.34  # spacing in standard deviations of the noise, at most: the shortest wave decays by exp(-42)
 _MARGIN = 7.2  # of them beyond the support: the waves that R' leaves everywhere end there, and spread from the ends
+_NARROW = 7.0  # support of a density in standard deviations of the noise
 _APART = 32  # the centres of coarse grids are multiples of so many spacings
 _SIZES = np.array(SIZES)
 _V, _M = float64[::1], float64[:, ::1]
@@ -68,9 +69,14 @@ def relative(x: float) -> float:
 
 @kernel(boolean(_V, float64, float64, float64, float64, _M))
 def is_sharp(values: Array, centre: float, spacing: float, unit: float, tau: float, lattice: Array) -> bool:
-    """Return whether an interval allows a grid that is not finer than that of a density."""
+    """Return whether an interval allows a grid that is not finer than that of a density.
+
+    With a `lattice` of one point, of which only G is read, whether it makes the support of the density far wider.
+    """
     low, high = support(values, CUT)
     half = values.size // 2
+    if lattice.shape[1] == 1:
+        return bool((high - low) * spacing < _NARROW * np.sqrt(lattice[2, 0] * tau))
     found = outlook(centre + spacing * (low - half), centre + spacing * (high - half), tau, unit, lattice)
     sharp: bool = found.spacing >= 0.999 * spacing
     return sharp
