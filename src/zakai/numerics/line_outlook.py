@@ -78,7 +78,7 @@ def is_sharp(values: Array, centre: float, spacing: float, unit: float, tau: flo
     if lattice.shape[1] == 1:
         return bool((high - low) * spacing < _NARROW * np.sqrt(lattice[2, 0] * tau))
     found = outlook(centre + spacing * (low - half), centre + spacing * (high - half), tau, unit, lattice)
-    sharp: bool = found.spacing >= 0.999 * spacing
+    sharp: bool = found.spacing >= 1.41 * spacing
     return sharp
 
 
