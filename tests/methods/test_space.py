@@ -11,17 +11,18 @@ import zakai
 from references.kolmogorov import Box, filter_system, propagate
 from references.systems import planar
 from zakai.errors import InputError
-from zakai.methods import _space
+from zakai.methods import _space, _space_direct, _space_kolmogorov
 from zakai.numerics.prior_grid import mixture_grid, prior_grid
 from zakai.records.schedule import schedule_of
 
 L, H = np.array([[-0.3, 1.0], [-1.0, -0.2]]), np.array([[1.0, 0.0]])
 
 
-def steps(model, record, theta=None, **options):
+def steps(model, record, theta=None, method="yau-yau", **options):
     """The reports and states of all steps."""
     schedule, values = schedule_of(model, record)
-    prepared = _space.prepare(model, schedule, model.theta() if theta is None else theta, **options)
+    prepare = _space_direct.prepare if method == "limited-direct" else _space_kolmogorov.prepare
+    prepared = prepare(model, schedule, model.theta() if theta is None else theta, **options)
     state, infos, states = _space.init(prepared, model.prior), [], []
     for k in range(len(schedule)):
         state, info = _space.step(prepared, k, state, values[k])
@@ -212,10 +213,10 @@ def test_units_and_offsets_change_nothing_but_rounding():
 def test_an_interval_depends_on_itself_alone():
     model = linear([["1", "0"], ["0", "1"]])
     schedule, values = schedule_of(model, IRREGULAR)
-    whole = _space.prepare(model, schedule, model.theta())
+    whole = _space_kolmogorov.prepare(model, schedule, model.theta())
     one = other = _space.init(whole, model.prior)
     for k in range(len(schedule)):
-        single = _space.prepare(model, schedule.part(slice(k, k + 1)), model.theta())
+        single = _space_kolmogorov.prepare(model, schedule.part(slice(k, k + 1)), model.theta())
         one, first = _space.step(whole, k, one, values[k])
         other, second = _space.step(single, 0, other, values[k])
         assert first.log_likelihood_increment == second.log_likelihood_increment
