@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import is_complex
-from zakai.numerics.space_field import HARMFUL, Field, better, finer_by, positive, refinable
+from zakai.numerics.space_field import ACCEPTED, Field, better, finer_by, positive, refinable
 from zakai.numerics.space_grid import Grid, filtered, rounded_size
 from zakai.numerics.space_resample import refined, triangular_resampled
 from zakai.numerics.space_spline import gather, relative_index
@@ -187,7 +187,7 @@ def _interpolable(field: Field, depth: float, bounds: Bounds) -> tuple[Field, fl
     deviations, growth = deviations_in_spacings(tails), 1.0 + (2.0 * depth) ** 3 / 15.0
     finer = np.clip((SPLINE * growth / (ACCURATE * bounds.edge)) ** (1 / 6) / deviations, 1.0, MOST_REFINED)
     # The waves of a grid that does not resolve a density are less accurate than splines.
-    finer = np.where(tails > HARMFUL * bounds.tail, 1.0, finer)
+    finer = np.where(tails > ACCEPTED * bounds.tail, 1.0, finer)
     sizes = tuple(
         size if r == 1.0 else rounded_size(size * r, size, 2 * bounds.most) for size, r in zip(grid.sizes, finer, strict=True)
     )
