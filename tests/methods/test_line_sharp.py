@@ -134,16 +134,15 @@ LAWS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("h", LAWS)
-def test_an_online_filter_and_a_smoother_take_the_same_sharp_steps(h: str) -> None:
+def test_an_online_filter_takes_the_same_sharp_steps(h: str) -> None:
     model = model_of(h, **LAWS[h])
-    times = np.cumsum(np.random.default_rng(1).uniform(0.02, 0.4, 30))
+    times = np.cumsum(np.random.default_rng(1).uniform(0.02, 0.4, 12))
     _, record = zakai.simulate(model, times, seed=3)
     values = record.values.copy()
-    values[[7, 8, 20]] = np.nan
+    values[[7, 8]] = np.nan
     record = zakai.Record(times, values, "samples")
     whole = zakai.filter(model, record, "yau-yau")
     online = zakai.online(model, "yau-yau")
     rows = [online.update(t, row) for t, row in zip(times, values)]
-    assert np.array_equal(whole.mean[-30:], [row.mean for row in rows])
-    assert np.array_equal(whole.cov[-30:], [row.cov for row in rows])
-    assert np.array_equal(zakai.smooth(model, record, "yau-yau").filtered.mean, whole.mean)
+    assert np.array_equal(whole.mean[-12:], [row.mean for row in rows])
+    assert np.array_equal(whole.cov[-12:], [row.cov for row in rows])
