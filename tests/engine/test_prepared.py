@@ -88,7 +88,7 @@ def test_a_file_of_another_model_or_that_is_none_is_refused(tmp_path):
 
 def test_times_that_are_none_are_refused():
     model = zakai.Model(**LINEAR)
-    wrong = {"a vector": [3.0, []], "of numbers": ["x"], "not after the start": [[0.0, 1.0]], "increas": [[2.0, 1.0]]}
+    wrong = {"a vector": [3.0, []], "of numbers": ["x"], "after the model.s start": [[0.0, 1.0]], "increas": [[2.0, 1.0]]}
     for times, words in [(times, words) for words, every in wrong.items() for times in every]:
         with pytest.raises(zakai.InputError, match=words):
             zakai.prepare(model, times)

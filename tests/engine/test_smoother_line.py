@@ -144,7 +144,7 @@ def test_a_grid_and_a_gaussian_smoother_agree():
 
 @pytest.mark.parametrize("count", [10, 11])
 def test_a_message_that_is_lost_is_said_and_stops_nothing(count):
-    # A reactor that ignites: the drift grows from .1 to 100 within a few readings.
+    # A reactor that ignites: the drift grows from .1 to 100 within a few observations.
     model = zakai.Model(
         state=["T"], drift=["2*exp(5 - 15/(T + 2)) - 1.5*(T - 1)"], observation=["T"], observation_kind="samples",
         diffusion=[["0.2"]], observation_noise=[[0.01]], prior={"kind": "gaussian", "mean": [1], "cov": [[0.05]]},

@@ -126,8 +126,8 @@ def test_the_running_code_has_the_wrong_evidence_with_14_as_printed(monkeypatch)
     assert good.log_likelihood == pytest.approx(exact.log_likelihood, abs=1e-12)
 
     def printed_rate(k, b, a, b_rate):
-        inner = k.inverse @ b_rate
-        return -0.5 * b_rate @ inner + a @ b_rate - (k.D.T @ inner).sum() + 0.5 * b @ k.N @ b + 0.5 * k.e @ b
+        inner, matrix = k.inverse @ b_rate, k.hamiltonian[: len(b), : len(b)]
+        return -0.5 * b_rate @ inner + a @ b_rate - (matrix.T @ inner).sum() + 0.5 * b @ k.N @ b + 0.5 * k.e @ b
 
     monkeypatch.setattr(_one_shot, "c_rate", printed_rate)
     wrong = zakai.filter(model, record, "hu-yau", form="one-shot")

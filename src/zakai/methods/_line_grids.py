@@ -6,7 +6,7 @@ import numpy as np
 
 from zakai.methods._line_steps import parts_needed, probed
 from zakai.methods._line_system import Prepared
-from zakai.methods._line_tables import lattice_of, spectral
+from zakai.methods._line_tables import profile_of, spectral
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_panels import GAUSS_NODES
 from zakai.numerics.line_segment import MARGIN, Grid
@@ -59,9 +59,9 @@ def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
     table[0, 0, PHI] = np.log(decomposed.scale)
     if not np.isfinite(table[0, 0, [PHI, *range(OBSERVED, table.shape[2])]]).all():
         return None
-    modes, lattice = np.ascontiguousarray(decomposed.modes.T), lattice_of(prepared, window)
+    modes, profile = np.ascontiguousarray(decomposed.modes.T), profile_of(prepared, window)
     fine = _fine(prepared, window, window.points)
-    return Grid(modes, decomposed.rates, table, lattice, 0, window.centre, window.spacing, window.unit, fine)
+    return Grid(modes, decomposed.rates, table, profile, 0, window.centre, window.spacing, window.unit, fine)
 
 
 def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:

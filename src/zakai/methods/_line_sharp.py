@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.methods._line_system import Prepared, State
-from zakai.methods._line_tables import covariance_at, lattice_of, spectral
+from zakai.methods._line_tables import covariance_at, profile_of, spectral
 from zakai.methods._line_update import factor_at_end
 from zakai.numerics import line_outlook as outlook
 from zakai.numerics import line_sharp as ls
@@ -42,11 +42,11 @@ class Coarse:
     """
 
     def __init__(self) -> None:
-        """Make room for grids."""
+        """Begin without grids."""
         self.numbers, self.used, self.index, self.lock = np.empty(NUMBERS), 0, np.empty((0, 4)), Lock()
 
     def add(self, grid: lw.Window, parts: list[Array]) -> bool:
-        """Add a grid, and return whether there was room for it."""
+        """Add a grid, and return whether it fits beside the others."""
         with self.lock:
             stop = self.used + sum(part.size for part in parts)
             if stop <= len(self.numbers):
@@ -60,8 +60,8 @@ def is_sharp(prepared: Prepared, k: int, state: State) -> bool:
     """Return whether interval k makes a density so wide that its grid does not serve."""
     if prepared.kinds[k] != FACTOR or prepared.gaussian or state.closed:
         return False
-    values, lattice = np.ascontiguousarray(state.values), lattice_of(prepared, state.window)
-    interval = state.unit, float(prepared.lengths[k]), lattice
+    values, profile = np.ascontiguousarray(state.values), profile_of(prepared, state.window)
+    interval = state.unit, float(prepared.lengths[k]), profile
     return bool(outlook.is_sharp(values, float(state.centre), float(state.spacing), *interval))
 
 
@@ -78,14 +78,14 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
     system, window, steps = prepared.system, state.window, prepared.steps
     special = system.general or not system.steady_observation
     values, limits = np.ascontiguousarray(state.values), (prepared.negligible, prepared.promised)
-    key, lattice = ("coarse grids", window.origin, window.unit), lattice_of(prepared, window)
+    key, profile = ("coarse grids", window.origin, window.unit), profile_of(prepared, window)
     coarse, rows, at = prepared.once(key, Coarse), np.empty((0, 0)), 0
     owner, count = (-1, 1) if special else (-2, stop - k)
     for _ in range(NEW):
         n = SIZES[at]
         densities, places, out = np.empty((count, n)), np.empty((count + 1, 3)), np.empty((count, len(COLUMNS)))
         done, why = ls.sharpened(
-            values, float(state.centre), float(state.spacing), window.unit, lattice, coarse.numbers, coarse.index, rows, owner,
+            values, float(state.centre), float(state.spacing), window.unit, profile, coarse.numbers, coarse.index, rows, owner,
             system.general, own, k, observed[:count], steps.lengths, steps.precisions[:, 0], steps.constants,
             float(state.error), *limits, *waves(n), densities, places, out,
         )  # fmt: skip

@@ -10,7 +10,7 @@ from zakai.methods._line_model import System
 from zakai.methods._line_system import Prepared
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_operator import Spectral, symmetric
-from zakai.numerics.line_outlook import LATTICE
+from zakai.numerics.line_outlook import PROFILE
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line_place import PER
 from zakai.numerics.line_weak import PARTS, at_nodes, nodes, weak
@@ -53,18 +53,18 @@ def spectral(prepared: Prepared, window: lw.Window) -> Spectral | None:
     return found[0]
 
 
-def lattice_of(prepared: Prepared, window: lw.Window) -> Array:
+def profile_of(prepared: Prepared, window: lw.Window) -> Array:
     """Return f, f' and G (3, L) at offsets from the origin that are unit / PER apart, of kinked systems the largest G alone."""
     if prepared.kinked:
         return np.full((3, 1), np.max(tables(prepared, window).covariance))
 
     def make() -> Array:
         system, start, theta = prepared.system, prepared.model.start, prepared.theta
-        x = window.origin + window.unit / PER * (np.arange(LATTICE) - LATTICE // 2.0)
+        x = window.origin + window.unit / PER * (np.arange(PROFILE) - PROFILE // 2.0)
         f = finite(system.drift(x[:, None], start, theta)[:, 0])
         return np.stack([f, np.gradient(f, x), covariance_at(system, x, start, theta) * np.ones(len(x))])
 
-    found: Array = prepared.once(("lattice", window.origin, window.unit), make)
+    found: Array = prepared.once(("profile", window.origin, window.unit), make)
     return found
 
 

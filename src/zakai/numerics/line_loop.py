@@ -63,7 +63,7 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
         )
     )  # fmt: skip
     def advance(
-        values: Array, start: int, table: Array, lattice: Array, modes: Array, rates: Array, averages: Array, cosines: Array,
+        values: Array, start: int, table: Array, profile: Array, modes: Array, rates: Array, averages: Array, cosines: Array,
         sines: Array, offset: float, spacing: float, unit: float, begin: int, observed: Array, kinds: Array, lengths: Array,
         shares: Array, precisions: Array, constants: Array, kernel_parameters: Array, drifts: Array, outputs: Array,
         covariances: Array, error: float, log_floor: float, limits: Array, densities: Array, out: Array, fine: Array,
@@ -81,7 +81,7 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
             if samples:
                 for j in range(observed.shape[1]):
                     seen |= precisions[k, 0, j, j] != 0.0
-            if modal and not closed and i > 0 and is_sharp(now, offset, spacing, unit, tau, lattice):
+            if modal and not closed and i > 0 and is_sharp(now, offset, spacing, unit, tau, profile):
                 status = TABLE  # the steps of `line_sharp` may take this one
                 break
             cut = max(limits[3], min(30.0 * np.exp(log_floor), CUT))
@@ -250,7 +250,7 @@ def advance(
     densities, out = np.empty((count, size)), np.empty((count + 1, len(COLUMNS)))
     averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
     done, why = _loop(*mechanisms)(
-        values, grid.start, grid.table, grid.lattice, grid.modes, grid.rates, averages, *waves(size), grid.offset,
+        values, grid.start, grid.table, grid.profile, grid.modes, grid.rates, averages, *waves(size), grid.offset,
         grid.spacing, grid.unit, first, observed, *steps, error, log_floor, limits, densities, out, grid.fine,
     )  # fmt: skip
     return Segment(densities[:done], out[:done], why, out[-1, :3])

@@ -15,7 +15,7 @@ from zakai.numerics.line_window import CUT, SIZES
 
 Array = NDArray[Any]
 
-LATTICE = 4096  # offsets at which f and G are known without a grid
+PROFILE = 4096  # offsets at which f and G are known without a grid
 REACH = 7.6  # standard deviations of the noise by which the support grows
 _SPACING = 0.34  # spacing in standard deviations of the noise, at most: the shortest wave decays by exp(-42)
 _MARGIN = 7.2  # of them beyond the support: the waves that R' leaves everywhere end there, and spread from the ends
@@ -35,25 +35,25 @@ class Outlook(NamedTuple):
 
 
 @helper
-def outlook(low: float, high: float, tau: float, unit: float, lattice: Array) -> Outlook:
+def outlook(low: float, high: float, tau: float, unit: float, profile: Array) -> Outlook:
     """Return what grid a density between two offsets needs after an interval, by the linear equation around its middle.
 
     Args:
         low, high: the ends of the support.
         tau: the length of the interval.
         unit: the scale of spacings.
-        lattice: f, f' and G (3, L) at offsets that are unit / PER apart.
+        profile: f, f' and G (3, L) at offsets that are unit / PER apart.
     """
-    middle, per, last = lattice.shape[1] // 2, PER / unit, lattice.shape[1] - 1.0
+    middle, per, last = profile.shape[1] // 2, PER / unit, profile.shape[1] - 1.0
     first, stop = int(min(max(np.floor(low * per) + middle, 0.0), last)), int(min(max(np.ceil(high * per) + middle, 0.0), last))
-    least, most = lattice[2, first], lattice[2, first]
+    least, most = profile[2, first], profile[2, first]
     for i in range(first, stop + 1):
-        least, most = min(least, lattice[2, i]), max(most, lattice[2, i])
+        least, most = min(least, profile[2, i]), max(most, profile[2, i])
     wide = np.sqrt(most * tau)
     at = (first + stop) // 2
-    here = -tau * lattice[1, at]
-    shift = tau * lattice[0, at] * relative(here)
-    there = -tau * lattice[1, int(min(max(at + shift * per, 0.0), last))]
+    here = -tau * profile[1, at]
+    shift = tau * profile[0, at] * relative(here)
+    there = -tau * profile[1, int(min(max(at + shift * per, 0.0), last))]
     fast, slow = max(here, there, 0.0), max(min(here, there), -1.0)
     spacing = _SPACING * np.sqrt(least * tau * relative(2.0 * fast))
     spacing = unit * 2.0 ** (0.5 * np.floor(2.0 * np.log2(spacing / unit) + 1e-9))
@@ -68,16 +68,16 @@ def relative(x: float) -> float:
 
 
 @kernel(boolean(_V, float64, float64, float64, float64, _M))
-def is_sharp(values: Array, centre: float, spacing: float, unit: float, tau: float, lattice: Array) -> bool:
+def is_sharp(values: Array, centre: float, spacing: float, unit: float, tau: float, profile: Array) -> bool:
     """Return whether an interval allows a grid that is not finer than that of a density.
 
-    With a `lattice` of one point, of which only G is read, whether it makes the support of the density far wider.
+    With a `profile` of one point, of which only G is read, whether it makes the support of the density far wider.
     """
     low, high = support(values, CUT)
     half = values.size // 2
-    if lattice.shape[1] == 1:
-        return bool((high - low) * spacing < _NARROW * np.sqrt(lattice[2, 0] * tau))
-    found = outlook(centre + spacing * (low - half), centre + spacing * (high - half), tau, unit, lattice)
+    if profile.shape[1] == 1:
+        return bool((high - low) * spacing < _NARROW * np.sqrt(profile[2, 0] * tau))
+    found = outlook(centre + spacing * (low - half), centre + spacing * (high - half), tau, unit, profile)
     sharp: bool = found.spacing >= 1.41 * spacing
     return sharp
 

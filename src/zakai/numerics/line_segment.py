@@ -38,7 +38,7 @@ class Grid(NamedTuple):
     """The data of a grid: the rows of `modes` (N, N), `rates` (N,), and terms `table` (K, R, 4 + m, T) as in `line_terms`.
 
     K = 1 where the terms do not depend on the interval.  With modes the table is that of the grid, of which `offset` is the
-    centre, and `lattice` is that of `line_outlook.outlook`.  Else it is longer than the grid, which begins at `start`; the first
+    centre, and `profile` is that of `line_outlook.outlook`.  Else it is longer than the grid, which begins at `start`; the first
     point of the table is `offset` away from the origin of the kernels.  `unit` is the scale of spacings.  `fine` (m, F) are the
     values of an h with kinks at the nodes of `line_weak`, else empty.
     """
@@ -46,7 +46,7 @@ class Grid(NamedTuple):
     modes: Array
     rates: Array
     table: Array
-    lattice: Array
+    profile: Array
     start: int
     offset: float
     spacing: float

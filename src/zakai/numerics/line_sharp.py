@@ -150,7 +150,7 @@ def carried(
     )
 )  # fmt: skip
 def sharpened(
-    values: Array, centre: float, spacing: float, unit: float, lattice: Array, known: Array, index: Array, special: Array,
+    values: Array, centre: float, spacing: float, unit: float, profile: Array, known: Array, index: Array, special: Array,
     owner: int, general: bool, own: bool, begin: int, observed: Array, lengths: Array, precisions: Array, constants: Array,
     error: float, negligible: float, allowed: float, cosines: Array, sines: Array, densities: Array, places: Array, out: Array,
 ) -> tuple[int, int]:  # fmt: skip
@@ -160,7 +160,7 @@ def sharpened(
 
     Args:
         values, centre, spacing: the density (n,) and its grid, relative to the origin; `unit` is the scale of spacings.
-        lattice: as in `outlook`.
+        profile: as in `outlook`.
         known, index: coarse grids one after the other, and the centre, spacing, size and first number of each (G, 4).  There are
             lambda (N,), U' (N, N), a cosine and a sine (N,) of the lowest frequency, log s and h (1 + m, T) at PER points in a
             spacing.
@@ -181,7 +181,7 @@ def sharpened(
         tau, alone = lengths[k], own and i == 0
         begins, ends = support(now, CUT)
         low, high = centre + spacing * (begins - now.size // 2), centre + spacing * (ends - now.size // 2)
-        coarse, left, right, beyond = outlook(low, high, tau, unit, lattice)
+        coarse, left, right, beyond = outlook(low, high, tau, unit, profile)
         margin = 0.0 if alone else beyond
         if alone:
             coarse = spacing
