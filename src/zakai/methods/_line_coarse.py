@@ -1,7 +1,7 @@
 """The transition of a density that is much sharper than it is after the interval.
 
-After an interval tau no wave shorter than the standard deviation (tau G)^(1/2) of the noise is left.  The modes of the operator
-on a coarse grid that resolves this deviation carry the density,
+After an interval tau no wave shorter than the standard deviation of the noise is left, (tau G)^(1/2) where the drift does not
+contract it.  The modes of the operator on a coarse grid that resolves this deviation carry the density,
 
     u(tau) = s U exp(-tau lambda) U' R' (u / s),
 
@@ -44,7 +44,7 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
     inner = slice(look.first, look.last + 1)
     points, kept = window.points[inner], values[inner]
     covariance = covariance_at(prepared.system, points, prepared.model.start, prepared.theta)
-    deviation = float(np.sqrt(max(np.min(covariance.real), 0.0) * length))
+    deviation = float(np.sqrt(max(np.min(covariance.real), 0.0) * _remembered(prepared, points, length)))
     if window.closed or SPACING * deviation < SHARP * window.spacing:
         return None
     spacing = window.unit * 2.0 ** np.floor(np.log2(SPACING * deviation / window.unit) + 1e-9)
@@ -77,6 +77,15 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
         else:
             return found, coarse, error
     return None
+
+
+def _remembered(prepared: Prepared, points: Array, length: float) -> float:
+    """Return the time for which noise at the end of an interval has not been contracted by the drift at points (J,)."""
+    slope = prepared.system.slope
+    if slope is None:
+        return length
+    rate = -2.0 * float(np.min(slope(points[:, None], prepared.model.start, prepared.theta).real))
+    return float(-np.expm1(-rate * length) / rate) if rate > 0.0 else length
 
 
 def _grid(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:
