@@ -17,6 +17,7 @@ from zakai.methods._line_system import Prepared
 from zakai.methods._line_yau import moved
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_channel import Channel
+from zakai.numerics.line_density import support
 from zakai.numerics.line_filters import WIDE, wrapped
 
 Array = Any
@@ -125,13 +126,13 @@ def by_substeps(
         substeps += 1
         if not np.isfinite(values.real).all():
             return Moved(values, window, np.float64(np.nan), look)
-        begin = window
+        begin, grown = window, False
         known = lw.figures(values, window.closed, negligible).aliasing
         while True:
             attempt = attempted(prepared, values, window, start, first, last, inside, rates)
             report.decomposed = attempt.decomposed
             total = float(np.sum(attempt.values.real))
-            lost = not 1e-250 < total < 1e6 or (not inside.any() and abs(total - 1.0) > 1e-3)
+            lost = not 1e-100 < total < 1e6 or (not inside.any() and abs(total - 1.0) > 1e-3)
             split = (attempt.split or lost) and last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
             if split:
                 break
@@ -147,9 +148,9 @@ def by_substeps(
             if look.aliasing > GROSS and smooth:
                 new = window  # what such an attempt shows of the edges is not the density
             elif left or right:
-                new = lw.enlarged(new, left, right)
+                new, grown = lw.enlarged(new, left, right), True
             if coarse and window.size < lw.LARGEST and not (look.aliasing > GROSS and smooth):
-                new = lw.refined(new)
+                new = lw.refined(new) if grown else _finer(values, window, look)
             if new.size <= lw.LARGEST and new != window:
                 values = lw.resampled(values, window, new)
                 window = new
@@ -197,6 +198,15 @@ def _normalised(
     found = np.where(found.real > 0, found, 0.0)
     mass = np.sum(found)
     return Moved(found / mass, window, np.log(mass), look)
+def _finer(values: Array, window: lw.Window, look: lw.Figures) -> lw.Window:
+    """Return a finer grid around a density, of which what is seen after a substep has the figures `look`."""
+    factor = float(np.clip(1.0 / look.resolving, 2**0.5, 4.0))
+    if window.closed:
+        return lw.refined(window, factor)
+    low, high = window.offsets[list(support(np.ascontiguousarray(values.real), lw.CUT))]
+    return lw.quantized(window, low, high, 1.001 * window.spacing / factor, most=lw.SIZES[-1])
+
+
 
 
 def _around(prepared: Prepared, values: Array, window: lw.Window, kernel: Channel) -> Array | None:
