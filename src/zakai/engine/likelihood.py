@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.engine.driver import check_noise, check_records, planned
-from zakai.engine.loop import Run, segments
+from zakai.engine.loop import CHUNK, Run, segments
 from zakai.engine.setting import Setting
 from zakai.errors import ConditionError, InputError
 from zakai.models._errors import did_you_mean, listing
@@ -132,31 +132,19 @@ class LogLikelihood:
             if not np.isfinite(given).all() or any(check(self._times, theta) for check in self._checks):
                 return missing
 
-        def evidence(job: tuple[_Part, int | None]) -> Any:
-            part, direction = job
-            if direction is None:
-                return part.evidence(theta)
-            shifted = theta.astype(complex)
-            shifted[self._where[direction]] += 1j * STEP
-            return part.evidence(shifted)
+        def shifted(direction: int) -> np.ndarray:
+            found = theta.astype(complex)
+            found[self._where[direction]] += 1j * STEP
+            return found
 
-        work: list[tuple[_Part, int | None]] = []
-        for part in self._parts:
-            directions = [i for i, name in enumerate(self.names) if derivatives and name in part.depends]
-            work += [(part, None)] if own or not directions else []
-            work += [(part, i) for i in directions]
+        value, gradient = 0.0, np.zeros(len(given))
         try:
-            found = _each(evidence, work)
+            for part in self._parts:
+                directions = [i for i, name in enumerate(self.names) if derivatives and name in part.depends]
+                gained, slopes = part.derivatives(theta, [shifted(i) for i in directions], own)
+                value, gradient[directions] = value + gained, gradient[directions] + slopes
         except InputError:
             return missing
-        value, gradient = 0.0, np.zeros(len(given))
-        counted: set[int] = set()
-        for (part, direction), total in zip(work, found, strict=True):
-            if id(part) not in counted:  # the first of its evaluations
-                value += float(total.real)
-                counted.add(id(part))
-            if direction is not None:
-                gradient[direction] += total.imag / STEP
         return value, gradient
 
     @cached_property
@@ -180,7 +168,42 @@ class _Part(NamedTuple):
     def evidence(self, theta: np.ndarray) -> Any:
         """Return the log-likelihood at the parameters, complex where they are."""
         found = segments(self.setting._replace(theta=theta), self.schedule, None, self.values)
-        return np.sum(np.concatenate([segment.infos.log_likelihood_increment for segment in found]))
+        return _total([segment.infos.log_likelihood_increment for segment in found])
+
+    def derivatives(self, theta: np.ndarray, shifted: Sequence[np.ndarray], own: bool) -> tuple[float, np.ndarray]:
+        """Return the log-likelihood and its derivatives (p,) in complex directions; `own`: it is the filter's."""
+        carried = self._carried(theta, shifted) if shifted else None
+        if carried is not None:
+            return carried
+        found = _each(self.evidence, [theta, *shifted] if own or not shifted else shifted)
+        return float(found[0].real), np.array([total.imag / STEP for total in found[len(found) - len(shifted) :]])
+
+    def _carried(self, theta: np.ndarray, shifted: Sequence[np.ndarray]) -> tuple[float, np.ndarray] | None:
+        """Return the same where the method carries all derivatives in one pass, else None."""
+        method, prior = self.setting.method, self.setting.prior
+        if method.tangents is None:
+            return None
+        states: list[Any] = []
+        increments, slopes = [], np.zeros(len(shifted))
+        for start in range(0, len(self.schedule), CHUNK):
+            rows = slice(start, min(start + CHUNK, len(self.schedule)))
+            chunk = self.schedule.part(rows)
+            prepared = [self.setting._replace(theta=one).prepared(chunk) for one in (theta, *shifted)]
+            states = states or [method.init(one, prior) for one in prepared]
+            with np.errstate(all="ignore"):
+                found = method.tangents(
+                    prepared[0], prepared[1:], slice(0, len(chunk)), states[0], states[1:], self.values[rows]
+                )
+            if found is None:
+                return None
+            increments.append(found.infos.log_likelihood_increment)
+            slopes, states = slopes + found.slopes, [found.states[-1], *found.shifted]
+        return float(_total(increments)), slopes
+
+
+def _total(increments: list[np.ndarray]) -> Any:
+    """Return the sum of what consecutive steps gained, to the bit as in a result, whose first entry is zero."""
+    return np.sum(np.concatenate([[0.0], *increments]))
 
 
 def _each(function: Callable[[Any], Any], arguments: Sequence[Any]) -> list[Any]:

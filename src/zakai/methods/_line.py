@@ -12,8 +12,8 @@ Magnus' series of fourth order in adaptive substeps elsewhere.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from zakai.methods._line_domain import on_the_line, variable_of
 from zakai.methods._line_figures import edge_of_moments, figures, outside_tables, refitted, resampled, state_moments
 from zakai.methods._line_grids import SHARED
 from zakai.methods._line_model import system_of
-from zakai.methods._line_moves import Report, by_decomposition, by_kernel, by_substeps
+from zakai.methods._line_moves import Passage, Report, by_decomposition, by_kernel, by_substeps
 from zakai.methods._line_parts import segment_of_parts
 from zakai.methods._line_prior import init as init
 from zakai.methods._line_prior import state_of
@@ -86,7 +86,8 @@ def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tupl
             return found
     # Attempts that overflow are taken again in shorter substeps.
     with np.errstate(all="ignore"):
-        return _step(prepared, k, state, observed)
+        stepped = _step(prepared, k, state, observed)
+    return stepped.state, stepped.info
 
 
 def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos]:
@@ -96,42 +97,69 @@ def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray)
     return segment_of_whole(prepared, rows, state, observed)
 
 
-def segment_of_whole(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos]:
-    """Return the same of intervals that are not cut into parts."""
+class Stepped(NamedTuple):
+    """The state after an interval that the compiled loop does not take, its report, and how the density came about.
+
+    That is the passage of a transition by modes, if it was one, and the density after the observation on its own grid.
+    """
+
+    state: State
+    info: Info
+    passage: Passage | None
+    values: Array
+    window: lw.Window
+
+
+Taken = list[loop.Piece] | Stepped
+
+
+def segment_of_whole(
+    prepared: Prepared,
+    rows: slice,
+    state: State,
+    observed: np.ndarray,
+    noted: Callable[[int, State, Taken], None] | None = None,
+) -> tuple[Sequence[State], Infos]:
+    """Return the same of intervals that are not cut into parts.
+
+    `noted` receives the steps as they are taken: the first interval, the state before it, and the pieces of the compiled loop or
+    the single step.
+    """
     states: Joined[State] = Joined()
     parts: list[Infos] = []
     k = rows.start
     while k < rows.stop:
-        last = k
+        last, before = k, state
         while last < rows.stop and prepared.fast[last]:
             last += 1
-        found = None
-        if last > k:
-            found = loop.run(prepared, slice(k, last), state, observed[k - rows.start : last - rows.start])
-        if found is not None:
-            states.append(found[0])
-            parts.append(found[1])
+        pieces = loop.taken(prepared, slice(k, last), state, observed[k - rows.start : last - rows.start]) if last > k else []
+        if pieces:
+            found: Taken = pieces
+            states.append(Joined([piece.states for piece in pieces]))
+            parts.append(loop.infos_of(prepared, pieces))
         else:
             with np.errstate(all="ignore"):
-                state, info = _step(prepared, k, state, observed[k - rows.start])
-            states.append([state])
-            parts.append(_alone(info))
+                found = _step(prepared, k, state, observed[k - rows.start])
+            states.append([found.state])
+            parts.append(alone(found.info))
+        if noted is not None:
+            noted(k, before, found)
         k, state = rows.start + len(states), states[-1]
     return states, loop.joined(parts)
 
 
-def _alone(info: Info) -> Infos:
+def alone(info: Info) -> Infos:
     health = {name: np.array([value]) for name, value in info.health.items()}
     return Infos(np.array([info.log_likelihood_increment]), info.mean[None], info.cov[None], health)
 
 
-def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
+def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Stepped:
     schedule, length = prepared.schedule, float(prepared.lengths[k])
     values, window, report, look = np.asarray(state.values), state.window, Report(), None
     inside = prepared.inside[k]
     if prepared.lie and not inside.all():
         inside = np.zeros_like(inside)
-    before, gained, contraction = lw.moments(values, window), 0.0, 1.0
+    before, gained, contraction, passage = lw.moments(values, window), 0.0, 1.0, None
     if length > 0:
         rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
         start = float(schedule.starts[k])
@@ -148,7 +176,7 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
                 found = by_decomposition(prepared, values, window, length, report)
             if found is None:
                 found = contracted(prepared, values, window, *interval) or by_substeps(prepared, values, window, *interval)
-        values, window, gained, look = found
+        values, window, gained, look, passage = found
     predicted, log_floor = lw.moments(values, window), float(state.log_floor)
     if report.positive:
         # A positive kernel fills the tails again.
@@ -214,7 +242,8 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
     if window.closed:
         mean = mean - 2 * np.pi * np.ceil((mean.real - np.pi) / (2 * np.pi))
     log_floor = min(log_floor + max(report.depth - 1.0, 0.0), 0.0)
-    return state_of(moved, new, float(error), log_floor), Info(gained, np.array([mean]), np.array([[variance]]), health)
+    info = Info(gained, np.array([mean]), np.array([[variance]]), health)
+    return Stepped(state_of(moved, new, float(error), log_floor), info, passage, values, window)
 
 
 def kernel_of(prepared: Prepared, k: int, window: lw.Window, rates: np.ndarray, report: Report) -> Channel | None:

@@ -102,7 +102,7 @@ def _taken(
             return None
         start = table.start
         filtered, ends = filtered._replace(starts=filtered.starts + start), np.append(centres[1:], window.centre)
-        logs = _likelihoods(prepared, here, observed, window.origin + ends[:, None] + window.spacing * lw.index(window.size))
+        logs = log_likelihoods(prepared, here, observed, window.origin + ends[:, None] + window.spacing * lw.index(window.size))
         message, steps = _on(later, window, start, now), prepared.steps.part(here)
         taken = by_adjoints(message, filtered, table, logs, steps, np.ascontiguousarray(observed, float), window.closed, limits)
     else:
@@ -111,7 +111,7 @@ def _taken(
         gauged = _gauged(prepared, window, stride, longer)
         if gauged is None:
             return None
-        logs, gauge = _likelihoods(prepared, here, observed, longer.points[None]), gauged.gauge
+        logs, gauge = log_likelihoods(prepared, here, observed, longer.points[None]), gauged.gauge
         taken = lb.by_modes(_psi(later, longer, gauge, now), filtered, gauged, logs, lengths, window.closed, limits)
     if not taken.number:
         return None
@@ -136,9 +136,9 @@ def _before(states: Sequence[State], window: lw.Window) -> tuple[lb.Filtered, Ar
     return lb.Filtered(values, np.round((centres - window.centre) / window.spacing).astype(int), floors), centres
 
 
-def _likelihoods(prepared: Prepared, here: slice, observed: Array, points: Array) -> Array:
+def log_likelihoods(prepared: Prepared, here: slice, observed: Array, points: Array) -> Array:
     """Return the log-likelihoods of what is observed at the ends of intervals at points (K, N), or (1, N), zero for none."""
-    system, logs = prepared.system, np.zeros((len(observed), points.shape[1]))
+    system, logs = prepared.system, np.zeros((len(observed), points.shape[1]), prepared.theta.dtype)
     at_end = prepared.schedule.seen[here] & ~prepared.inside[here]
     if system.general or (at_end.any() and system.separated is None):
         for i in np.flatnonzero(at_end.any(axis=1)):
@@ -148,7 +148,7 @@ def _likelihoods(prepared: Prepared, here: slice, observed: Array, points: Array
         rest = observed[:, None] - system.observation(points[..., None], stops, prepared.theta)
         rest = np.where(np.abs(rest) < 1e150, rest, 1e150)
         logs = c.constants[here, None] - 0.5 * np.einsum("kni,kij,knj->kn", rest, c.precisions[here, 0], rest)
-    return np.maximum(logs, -1e8)
+    return np.where(logs.real > -1e8, logs, -1e8)
 
 
 def _shared(state: State, after: lw.Window, later: Message, product: Array, grid: lw.Window) -> list[lw.Window]:

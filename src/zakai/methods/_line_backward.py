@@ -96,7 +96,7 @@ def _of_whole(
         place = stop - rows.start
         found = _product(states[place], later)
         later, info = _smoothed(prepared, states[place], later, found)
-        parts.append(_line._alone(info))
+        parts.append(_line.alone(info))
         taken = back(prepared, slice(rows.start, stop), states, later, found.values, found.window, observed)
         if taken is None:
             stop -= 1

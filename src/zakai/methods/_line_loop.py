@@ -53,6 +53,11 @@ class Piece(NamedTuple):
     last: State
 
     @property
+    def number(self) -> int:
+        """The number of steps."""
+        return len(self.segment.reports)
+
+    @property
     def states(self) -> Sequence[State]:
         """The states after the steps."""
         errors, floors = self.reports[:, ERROR], self.reports[:, FLOOR]
@@ -73,12 +78,9 @@ class Piece(NamedTuple):
 START, ERROR, FLOOR = (COLUMNS.index(name) for name in ("start", "error", "log_floor"))
 
 
-def run(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos] | None:
-    """Return the states after the first intervals of `rows`, as many as the loop takes, and their reports; None for none."""
-    pieces = taken(prepared, rows, state, observed)
-    if not pieces:
-        return None
-    return Joined([piece.states for piece in pieces]), joined([_infos(prepared, piece) for piece in pieces])
+def infos_of(prepared: Prepared, pieces: Sequence[Piece]) -> Infos:
+    """Return the reports of the steps of pieces."""
+    return joined([_infos(prepared, piece) for piece in pieces])
 
 
 def one(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info] | None:

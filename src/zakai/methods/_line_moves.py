@@ -41,13 +41,22 @@ class Report:
         self.edge = max(self.edge, look.left, look.right)
 
 
+class Passage(NamedTuple):
+    """A transition by modes: the density and the grid before it, and the grid whose modes were taken."""
+
+    values: Array
+    window: lw.Window
+    of_modes: lw.Window
+
+
 class Moved(NamedTuple):
-    """The density after an interval, its grid, the logarithm of its mass, and its figures."""
+    """The density after an interval, its grid, the logarithm of its mass, its figures, and how modes moved it, if they did."""
 
     values: Array
     window: lw.Window
     gained: Any
     look: lw.Figures | None
+    passage: Passage | None = None
 
 
 def by_kernel(
@@ -78,7 +87,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
     negligible, rough = prepared.negligible, max(1e-10, 1e-3 * prepared.tolerance)
     carried = coarsened(prepared, values, window, length)
     if carried is not None:
-        return _normalised(*carried, report, negligible)
+        return _normalised(*carried, report, negligible, Passage(values, window, carried[1]))
     known, begin = lw.figures(values, window.closed, negligible).aliasing, window
     while window.size <= lw.LARGEST:
         found = by_modes(prepared, values, window, length)
@@ -92,7 +101,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
         if not (left or right):
             if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
                 report.aliasing = max(report.aliasing, lw.figures(values, window.closed, negligible).aliasing - known)
-            return _normalised(found[0], window, found[1], report, negligible)
+            return _normalised(found[0], window, found[1], report, negligible, Passage(values, window, window))
         new = lw.enlarged(window, left, right)
         if new == window:
             return None
@@ -189,15 +198,6 @@ def by_substeps(
     return Moved(values, window, gained, look)
 
 
-def _normalised(
-    found: Array, window: lw.Window, error: float, report: Report, negligible: float
-) -> Moved:
-    look = lw.figures(found, window.closed, negligible)
-    report.density(look)
-    report.time, report.decomposed = report.time + error, True
-    found = np.where(found.real > 0, found, 0.0)
-    mass = np.sum(found)
-    return Moved(found / mass, window, np.log(mass), look)
 def _finer(values: Array, window: lw.Window, look: lw.Figures) -> lw.Window:
     """Return a finer grid around a density, of which what is seen after a substep has the figures `look`."""
     factor = float(np.clip(1.0 / look.resolving, 2**0.5, 4.0))
@@ -207,6 +207,15 @@ def _finer(values: Array, window: lw.Window, look: lw.Figures) -> lw.Window:
     return lw.quantized(window, low, high, 1.001 * window.spacing / factor, most=lw.SIZES[-1])
 
 
+def _normalised(
+    found: Array, window: lw.Window, error: float, report: Report, negligible: float, passage: Passage
+) -> Moved:
+    look = lw.figures(found, window.closed, negligible)
+    report.density(look)
+    report.time, report.decomposed = report.time + error, True
+    found = np.where(found.real > 0, found, 0.0)
+    mass = np.sum(found)
+    return Moved(found / mass, window, np.log(mass), look, passage)
 
 
 def _around(prepared: Prepared, values: Array, window: lw.Window, kernel: Channel) -> Array | None:

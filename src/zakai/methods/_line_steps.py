@@ -9,6 +9,7 @@ import numpy as np
 from zakai.methods._line_system import Coefficients, Prepared
 from zakai.methods._line_tables import finite
 from zakai.models.prior import GaussianPrior
+from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.line_filters import kernel_size
 from zakai.numerics.line_panels import GAUSS_NODES, interpolation
 from zakai.numerics.line_segment import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Steps
@@ -46,7 +47,7 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
         block = np.where(both, noise, 0.0) + np.eye(m) * ~seen[:, None, :, None]
         constant = np.zeros(count)
         if system.samples:
-            constant = -0.5 * (np.linalg.slogdet(block[:, 0])[1] + np.log(2 * np.pi) * seen.sum(axis=1))
+            constant = -0.5 * (log_determinant(block[:, 0]) + np.log(2 * np.pi) * seen.sum(axis=1))
         return np.where(both, np.linalg.inv(block), 0.0), constant
 
     if prepared.mixed:  # the terms of the table are those at the nodes and at the end

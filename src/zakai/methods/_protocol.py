@@ -54,6 +54,9 @@ class Infos(NamedTuple):
     health: Mapping[str, np.ndarray]
 
 
+S = TypeVar("S")
+
+
 def stacked(infos: Sequence[Info]) -> Infos:
     """Return the reports of single steps as arrays with a leading axis."""
     return Infos(
@@ -62,6 +65,15 @@ def stacked(infos: Sequence[Info]) -> Infos:
         np.array([info.cov for info in infos]),
         {name: np.array([info.health[name] for info in infos]) for name in infos[0].health},
     )
+
+
+class Tangents(NamedTuple, Generic[S]):
+    """The states after K steps, what they report, the derivatives (p,) of the sum of what they gained, and the shifted states."""
+
+    states: Sequence[S]
+    infos: Infos
+    slopes: np.ndarray
+    shifted: Sequence[S]
 
 
 class Prepared(Protocol):
@@ -73,7 +85,6 @@ class Prepared(Protocol):
 
 
 P = TypeVar("P", bound=Prepared)
-S = TypeVar("S")
 M = TypeVar("M")
 
 
@@ -180,6 +191,11 @@ class Method(Generic[P, S]):
     Optional: `segment(prepared, rows, state, values)` advances the intervals of a slice in one compiled loop that calls the same
     kernel as `step`, and returns the states after each step and their Infos; or None, where the single steps are to be taken.
 
+    Optional: `tangents(prepared, shifted, rows, state, shifted_states, values)` advances the intervals of a slice and carries the
+    derivatives with respect to p parameters; `shifted` and `shifted_states` (p) are what is prepared and the states at parameters
+    of which one has an infinitesimal imaginary part.  It returns the states after each step, their Infos, the derivatives (p,) of
+    the sum of what they gained, and the last shifted states; or None, where `step` is to carry them.
+
     Optional: `backward` is the backward pass of `zakai.smooth`.
     """
 
@@ -201,4 +217,5 @@ class Method(Generic[P, S]):
     variant: Callable[[Model, Mapping[str, Any]], Method[Any, Any]] | None = None
     valid: Callable[[P, S], bool] | None = None
     segment: Callable[[P, slice, S, np.ndarray], tuple[Sequence[S], Infos] | None] | None = None
+    tangents: Callable[[P, Sequence[P], slice, S, Sequence[S], np.ndarray], Tangents[S] | None] | None = None
     backward: Backward[P, S, Any] | None = None

@@ -13,7 +13,7 @@ import numpy as np
 
 from zakai.algebra.theorems import limited_direct
 from zakai.errors import InputError
-from zakai.methods import _line
+from zakai.methods import _line, _line_tangents
 from zakai.methods._line_backward import BACKWARD as LINE
 from zakai.methods._line_model import in_pieces
 from zakai.methods._line_system import State
@@ -104,5 +104,6 @@ METHOD: Method[Any, Any] = Method(
     valid=_line.valid,
     handles=features.OF_OBSERVATION | {features.INPUTS, features.JUMPS, features.KINKS, features.SINC, features.TABLES},
     segment=_line.segment,
+    tangents=_line_tangents.tangents,
     backward=LINE,
 )

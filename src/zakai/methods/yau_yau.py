@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from zakai.algebra.theorems import any_smooth_system
-from zakai.methods import _line, _reflecting
+from zakai.methods import _line, _line_tangents, _reflecting
 from zakai.methods._line_backward import BACKWARD as LINE
 from zakai.methods._line_model import in_pieces
 from zakai.methods._line_system import Prepared, State
@@ -75,7 +75,7 @@ def on_line(method: Method[Any, Any], model: Model) -> Method[Any, Any]:
         return method
     return replace(
         method, init=_reflecting.init, step=_reflecting.step, density=_reflecting.density, state=_reflecting.State,
-        valid=_reflecting.valid, segment=None, backward=REFLECTING,
+        valid=_reflecting.valid, segment=None, tangents=None, backward=REFLECTING,
     )  # fmt: skip
 
 
@@ -86,7 +86,7 @@ def in_space(method: Method[Any, Any], prepare: Callable[..., Any]) -> Method[An
 
     return replace(
         method, prepare=prepare, init=_space.init, step=_space.step, density=_space.density, state=_space.State,
-        valid=_space.valid, segment=None, backward=SPACE,
+        valid=_space.valid, segment=None, tangents=None, backward=SPACE,
     )  # fmt: skip
 
 
@@ -108,5 +108,6 @@ METHOD: Method[Any, Any] = Method(
     valid=_line.valid,
     handles=HANDLES,
     segment=_line.segment,
+    tangents=_line_tangents.tangents,
     backward=LINE,
 )

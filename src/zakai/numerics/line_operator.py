@@ -181,6 +181,14 @@ def symmetric(closed: bool, spacing: float, covariance: Any, potential: Array) -
     return np.asarray(0.5 * (slope.T * covariance) @ slope + np.diag(potential))
 
 
+def quotients(rates: Array, decay: Array, length: float) -> Array:
+    """Return the divided differences (N, N) of exp(-length rates), which is `decay`."""
+    apart = rates[:, None] - rates
+    same = np.abs(apart) * length < 1e-6
+    equal = -length * np.sqrt(np.outer(decay, decay))
+    return np.asarray(np.where(same, equal, (decay[:, None] - decay) / np.where(same, 1.0, apart)))
+
+
 class Spectral:
     """The operators exp(tau L), for every tau, where L is similar to a symmetric operator.
 
@@ -225,11 +233,5 @@ class Spectral:
         coefficients = self.modes.T @ inner
         moved = decay * coefficients
         if self.change is not None:
-            # First order in the change of H: the divided differences of the exponential.
-            apart = self.rates[:, None] - self.rates
-            same = np.abs(apart) * length < 1e-6
-            quotient = np.where(
-                same, -length * np.sqrt(np.outer(decay, decay)), (decay[:, None] - decay) / np.where(same, 1.0, apart)
-            )
-            moved = moved + 1j * ((quotient * self.change) @ coefficients.real)
+            moved = moved + 1j * ((quotients(self.rates, decay, length) * self.change) @ coefficients.real)
         return np.asarray(self.modes @ moved)
