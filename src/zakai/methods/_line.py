@@ -100,12 +100,12 @@ def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray)
 class Stepped(NamedTuple):
     """The state after an interval that the compiled loop does not take, its report, and how the density came about.
 
-    That is the passage of a transition by modes, if it was one, and the density after the observation on its own grid.
+    That is how its transition moved it, where that is known, and the density after the observation on its own grid.
     """
 
     state: State
     info: Info
-    passage: Passage | None
+    passages: tuple[Passage, ...]
     values: Array
     window: lw.Window
 
@@ -159,7 +159,8 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Ste
     inside = prepared.inside[k]
     if prepared.lie and not inside.all():
         inside = np.zeros_like(inside)
-    before, gained, contraction, passage = lw.moments(values, window), 0.0, 1.0, None
+    passages: tuple[Passage, ...] = ()
+    before, gained, contraction = lw.moments(values, window), 0.0, 1.0
     if length > 0:
         rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
         start = float(schedule.starts[k])
@@ -176,7 +177,7 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Ste
                 found = by_decomposition(prepared, values, window, length, report)
             if found is None:
                 found = contracted(prepared, values, window, *interval) or by_substeps(prepared, values, window, *interval)
-        values, window, gained, look, passage = found
+        values, window, gained, look, passages = found
     predicted, log_floor = lw.moments(values, window), float(state.log_floor)
     if report.positive:
         # A positive kernel fills the tails again.
@@ -243,7 +244,7 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Ste
         mean = mean - 2 * np.pi * np.ceil((mean.real - np.pi) / (2 * np.pi))
     log_floor = min(log_floor + max(report.depth - 1.0, 0.0), 0.0)
     info = Info(gained, np.array([mean]), np.array([[variance]]), health)
-    return Stepped(state_of(moved, new, float(error), log_floor), info, passage, values, window)
+    return Stepped(state_of(moved, new, float(error), log_floor), info, passages, values, window)
 
 
 def kernel_of(prepared: Prepared, k: int, window: lw.Window, rates: np.ndarray, report: Report) -> Channel | None:

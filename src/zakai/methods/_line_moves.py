@@ -42,21 +42,26 @@ class Report:
 
 
 class Passage(NamedTuple):
-    """A transition by modes: the density and the grid before it, and the grid whose modes were taken."""
+    """A transition without coefficients in time: the density and the grid before it, its length and the logarithm of its mass.
+
+    `of_modes` is the grid whose modes were taken, None for the exponential of the operator on the grid.
+    """
 
     values: Array
     window: lw.Window
-    of_modes: lw.Window
+    length: float
+    log_mass: Any
+    of_modes: lw.Window | None
 
 
 class Moved(NamedTuple):
-    """The density after an interval, its grid, the logarithm of its mass, its figures, and how modes moved it, if they did."""
+    """The density after an interval, its grid, the logarithm of its mass, its figures, and how it was moved, where known."""
 
     values: Array
     window: lw.Window
     gained: Any
     look: lw.Figures | None
-    passage: Passage | None = None
+    passages: tuple[Passage, ...] = ()
 
 
 def by_kernel(
@@ -87,7 +92,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
     negligible, rough = prepared.negligible, max(1e-10, 1e-3 * prepared.tolerance)
     carried = coarsened(prepared, values, window, length)
     if carried is not None:
-        return _normalised(*carried, report, negligible, Passage(values, window, carried[1]))
+        return _normalised(*carried, report, negligible, Passage(values, window, length, 0.0, carried[1]))
     known, begin = lw.figures(values, window.closed, negligible).aliasing, window
     while window.size <= lw.LARGEST:
         found = by_modes(prepared, values, window, length)
@@ -101,7 +106,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
         if not (left or right):
             if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
                 report.aliasing = max(report.aliasing, lw.figures(values, window.closed, negligible).aliasing - known)
-            return _normalised(found[0], window, found[1], report, negligible, Passage(values, window, window))
+            return _normalised(found[0], window, found[1], report, negligible, Passage(values, window, length, 0.0, window))
         new = lw.enlarged(window, left, right)
         if new == window:
             return None
@@ -129,7 +134,7 @@ def by_substeps(
         parts = resolved_parts(prepared, values, window, start, length, inside)
         bounds, report.time = parts.bounds, report.time + parts.error
     stack = bounds[::-1]
-    substeps = 0
+    substeps, passages = 0, []
     while stack:
         first, last = stack.pop()
         substeps += 1
@@ -187,15 +192,16 @@ def by_substeps(
             brought = lw.figures(values, window.closed, negligible).aliasing
             report.aliasing = max(report.aliasing, brought - known)
         report.time += attempt.error
-        values = np.where(attempt.values.real > 0, attempt.values, 0.0)
+        before, values = values, np.where(attempt.values.real > 0, attempt.values, 0.0)
         mass = np.sum(values)
+        passages.append(Passage(before, window, last - first, np.log(mass), window if attempt.decomposed else None))
         values = values / mass
         gained = gained + np.log(mass) + attempt.offset
         if stack:
             values, window = refitted(prepared, values, window, look)
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
-    return Moved(values, window, gained, look)
+    return Moved(values, window, gained, look, () if system.varying or inside.any() else tuple(passages))
 
 
 def _finer(values: Array, window: lw.Window, look: lw.Figures) -> lw.Window:
@@ -215,7 +221,7 @@ def _normalised(
     report.time, report.decomposed = report.time + error, True
     found = np.where(found.real > 0, found, 0.0)
     mass = np.sum(found)
-    return Moved(found / mass, window, np.log(mass), look, passage)
+    return Moved(found / mass, window, np.log(mass), look, (passage._replace(log_mass=np.log(mass)),))
 
 
 def _around(prepared: Prepared, values: Array, window: lw.Window, kernel: Channel) -> Array | None:

@@ -7,25 +7,27 @@ one parameter after the other (`numerics/complex_step.py`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from sympy import sympify
 
 from zakai.methods import _line
 from zakai.methods._line_adjoint import log_likelihoods
 from zakai.methods._line_coarse import coarsened
 from zakai.methods._line_loop import Piece, infos_of
-from zakai.methods._line_moves import Passage
 from zakai.methods._line_system import Prepared, State
-from zakai.methods._line_tables import spectral
+from zakai.methods._line_tables import spectral, tables
 from zakai.methods._line_update import factor_at_end
 from zakai.methods._protocol import Infos, Tangents
 from zakai.numerics import line_window as lw
 from zakai.numerics.complex_step import STEP
-from zakai.numerics.line_tangents import Varied
+from zakai.numerics.line_tangents import Varied, exponential_derivatives
 
 Array = Any
+
+INACCURATE = 1e-4  # difference of quadratures of orders ten and six from which they do not serve
 
 
 def tangents(
@@ -54,6 +56,12 @@ class _Walk:
 
     def __init__(self, shifted: Sequence[Prepared], tangents: Array):
         self.shifted, self.tangents, self.slopes = shifted, tangents, np.zeros(len(shifted))
+        self.known: dict[lw.Window, Varied] = {}
+        model = shifted[0].model
+        own = [list(model.parameters)[int(np.argmax(one.theta.imag))] for one in shifted]
+        parts = [*model.observation, *model.observation_noise, *model.family_parameters.values(), model.log_density or 0]
+        symbols = {symbol.name for part in parts for symbol in sympify(part).free_symbols}
+        self.observing = [i for i, name in enumerate(own) if name in symbols]  # parameters of likelihoods
 
     def over(self, prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos]:
         """Take the intervals of a slice; return the states and the reports."""
@@ -61,10 +69,8 @@ class _Walk:
         def noted(k: int, before: State, found: _line.Taken) -> None:
             values = observed[k - rows.start :]
             if isinstance(found, _line.Stepped):
-                if found.passage is None:
+                if not (found.passages and self._passed(prepared, k, before, found, values[0])):
                     self._singly(k, before, found.state, values[0])
-                else:
-                    self._passed(prepared, k, before, found, found.passage, values[0])
                 return
             for piece in found:
                 place = piece.first - k
@@ -89,38 +95,61 @@ class _Walk:
         """Take the steps of a piece by the modes of its grid."""
         window, own, density = piece.before.window, slice(piece.first, piece.first + piece.number), piece.before.values
         varied = self._varied(prepared, window)
-        logs = np.array([log_likelihoods(one, own, observed, window.points[None]) for one in self.shifted])
+        logs = self._logs(lambda one: log_likelihoods(one, own, observed, window.points[None]), prepared)
         for i, gained in enumerate(infos_of(prepared, [piece]).log_likelihood_increment):
             after = piece.segment.densities[i]
             _, self.tangents = varied.through(density, self.tangents, prepared.lengths[piece.first + i])
             self._multiply(after, logs[:, i], gained)
             density = after
 
-    def _passed(
-        self, prepared: Prepared, k: int, before: State, step: _line.Stepped, passage: Passage, observed: np.ndarray
-    ) -> None:
-        """Take a single step whose transition was by modes."""
-        length, (values, window, of_modes) = float(prepared.lengths[k]), passage
-        self._regrid(before.values, before.window, window)
-        if of_modes == window:
-            values, self.tangents = self._varied(prepared, window).through(values, self.tangents, length)
-        else:
-            pairs = zip(self.shifted, values + 1j * STEP * self.tangents, strict=True)
-            carried = [coarsened(one, own, window, length) for one, own in pairs]
-            found = np.array([one[0] for one in carried if one is not None])
-            values, self.tangents = found[0].real, found.imag / STEP
-        self._regrid(values, of_modes, step.window)
+    def _passed(self, prepared: Prepared, k: int, before: State, step: _line.Stepped, observed: np.ndarray) -> bool:
+        """Take a single step whose transition is known; return whether the derivatives are accurate."""
+        values, own, tangents, gained = before.values, before.window, self.tangents, 0.0
+        for start, window, length, log_mass, of_modes in step.passages:
+            self._regrid(values, own, window)
+            own = of_modes or window
+            if of_modes is None:
+                values, self.tangents, error = self._exponential(prepared, window, length, start)
+                if not error < INACCURATE:
+                    self.tangents = tangents
+                    return False
+            elif of_modes == window:
+                values, self.tangents = self._varied(prepared, window).through(start, self.tangents, length)
+            else:
+                pairs = zip(self.shifted, start + 1j * STEP * self.tangents, strict=True)
+                carried = [coarsened(one, given, window, length) for one, given in pairs]
+                found = np.array([one[0] for one in carried if one is not None])
+                values, self.tangents = found[0].real, found.imag / STEP
+            values, gained = np.maximum(values, 0.0) / np.exp(log_mass), gained + log_mass
+            self.tangents = self.tangents / np.exp(log_mass)
+        self._regrid(values, own, step.window)
         at_end = prepared.schedule.seen[k] & ~prepared.inside[k]
         logs = np.zeros((len(self.shifted), step.window.size), complex)
         if at_end.any():
-            logs[:] = [factor_at_end(one, k, at_end, observed, None).logs(step.window.points) for one in self.shifted]
-        self._multiply(step.values, logs, step.info.log_likelihood_increment)
+            logs = self._logs(lambda one: factor_at_end(one, k, at_end, observed, None).logs(step.window.points), prepared)
+        self._multiply(step.values, logs, step.info.log_likelihood_increment - gained)
         self._regrid(step.values, step.window, step.state.window)
+        return True
+
+    def _exponential(self, prepared: Prepared, window: lw.Window, length: float, values: Array) -> tuple[Array, Array, float]:
+        """Take a density over a time by the exponential of the operator; return it, its derivatives and their relative error."""
+        known = [tables(one, window) for one in (prepared, *self.shifted)]
+        operator, *shifted = (length * window.generator(one.covariance, one.drift) for one in known)
+        return exponential_derivatives(operator, np.array([one.imag for one in shifted]) / STEP, values, self.tangents)
+
+    def _logs(self, function: Callable[[Prepared], Array], prepared: Prepared) -> Array:
+        """Return the logarithms (p, ...) of likelihoods, with imaginary parts where a likelihood depends on the parameter."""
+        found = {i: function(self.shifted[i]) for i in self.observing}
+        real = next(iter(found.values())).real if found else function(prepared)
+        return np.array([found.get(i, real) for i in range(len(self.shifted))], complex)
 
     def _varied(self, prepared: Prepared, window: lw.Window) -> Varied:
-        modes, shifted = spectral(prepared, window), [spectral(one, window) for one in self.shifted]
-        assert modes is not None
-        return Varied.of(modes, [one for one in shifted if one is not None])
+        """Return the decomposition on a grid with its derivatives."""
+        if window not in self.known:
+            modes, shifted = spectral(prepared, window), [spectral(one, window) for one in self.shifted]
+            assert modes is not None
+            self.known[window] = Varied.of(modes, [one for one in shifted if one is not None])
+        return self.known[window]
 
     def _multiply(self, after: Array, logs: Array, gained: float) -> None:
         """Multiply the derivatives of a prediction by a likelihood.
