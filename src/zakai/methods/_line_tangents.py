@@ -45,7 +45,7 @@ def tangents(
     """
     if prepared.weak or prepared.gaussian:
         return None
-    walk = _Walk(shifted, np.array([_moved(one, state.window).imag / STEP for one in shifted_states]))
+    walk = _Walk(shifted, np.array([_on(state.window, one.values.imag / STEP, one.window) for one in shifted_states]))
     states, infos = walk.over(prepared, rows, state, observed)
     last = states[-1]
     return Tangents(states, infos, walk.slopes, [last._replace(values=last.values + 1j * STEP * one) for one in walk.tangents])
@@ -74,9 +74,14 @@ class _Walk:
                 return
             for piece in found:
                 place = piece.first - k
-                self._regrid(before.values, before.window, piece.before.window)
-                self._by_modes(prepared, piece, values[place : place + piece.number])
-                self._regrid(piece.segment.densities[-1], piece.before.window, piece.last.window)
+                if prepared.gaussian:
+                    for i, after in enumerate(piece.states):
+                        self._singly(piece.first + i, before, after, values[place + i])
+                        before = after
+                else:
+                    self._regrid(before.window, piece.before.window)
+                    self._by_modes(prepared, piece, values[place : place + piece.number])
+                    self._regrid(piece.before.window, piece.last.window)
                 before = piece.last
 
         return _line.segment_of_whole(prepared, rows, state, observed, noted)
@@ -84,10 +89,12 @@ class _Walk:
     def _singly(self, k: int, before: State, after: State, observed: np.ndarray) -> None:
         """Take one interval, for one parameter after the other."""
         found = []
+        # Beyond that, ratios of rounding errors would spread with interpolated logarithms.
+        known = np.where(before.values > lw.CUT * np.max(before.values), self.tangents, 0.0)
         for i, prepared in enumerate(self.shifted):
-            state = before._replace(values=before.values + 1j * STEP * self.tangents[i])
+            state = before._replace(values=before.values + 1j * STEP * known[i])
             state, info = _line.step(prepared, k, state, observed)
-            found.append(_moved(state, after.window).imag / STEP)
+            found.append(_on(after.window, state.values.imag / STEP, state.window))
             self.slopes[i] += info.log_likelihood_increment.imag / STEP
         self.tangents = np.array(found)
 
@@ -98,41 +105,39 @@ class _Walk:
         logs = self._logs(lambda one: log_likelihoods(one, own, observed, window.points[None]), prepared)
         for i, gained in enumerate(infos_of(prepared, [piece]).log_likelihood_increment):
             after = piece.segment.densities[i]
-            _, self.tangents = varied.through(density, self.tangents, prepared.lengths[piece.first + i])
+            self.tangents = varied.through(density, self.tangents, prepared.lengths[piece.first + i])
             self._multiply(after, logs[:, i], gained)
             density = after
 
     def _passed(self, prepared: Prepared, k: int, before: State, step: _line.Stepped, observed: np.ndarray) -> bool:
         """Take a single step whose transition is known; return whether the derivatives are accurate."""
-        values, own, tangents, gained = before.values, before.window, self.tangents, 0.0
+        own, tangents, gained = before.window, self.tangents, 0.0
         for start, window, length, log_mass, of_modes in step.passages:
-            self._regrid(values, own, window)
+            self._regrid(own, window)
             own = of_modes or window
             if of_modes is None:
-                values, self.tangents, error = self._exponential(prepared, window, length, start)
+                self.tangents, error = self._exponential(prepared, window, length, start)
                 if not error < INACCURATE:
                     self.tangents = tangents
                     return False
             elif of_modes == window:
-                values, self.tangents = self._varied(prepared, window).through(start, self.tangents, length)
+                self.tangents = self._varied(prepared, window).through(start, self.tangents, length)
             else:
                 pairs = zip(self.shifted, start + 1j * STEP * self.tangents, strict=True)
                 carried = [coarsened(one, given, window, length) for one, given in pairs]
-                found = np.array([one[0] for one in carried if one is not None])
-                values, self.tangents = found[0].real, found.imag / STEP
-            values, gained = np.maximum(values, 0.0) / np.exp(log_mass), gained + log_mass
-            self.tangents = self.tangents / np.exp(log_mass)
-        self._regrid(values, own, step.window)
+                self.tangents = np.array([one[0].imag for one in carried if one is not None]) / STEP
+            self.tangents, gained = self.tangents / np.exp(log_mass), gained + log_mass
+        self._regrid(own, step.window)
         at_end = prepared.schedule.seen[k] & ~prepared.inside[k]
         logs = np.zeros((len(self.shifted), step.window.size), complex)
         if at_end.any():
             logs = self._logs(lambda one: factor_at_end(one, k, at_end, observed, None).logs(step.window.points), prepared)
         self._multiply(step.values, logs, step.info.log_likelihood_increment - gained)
-        self._regrid(step.values, step.window, step.state.window)
+        self._regrid(step.window, step.state.window)
         return True
 
-    def _exponential(self, prepared: Prepared, window: lw.Window, length: float, values: Array) -> tuple[Array, Array, float]:
-        """Take a density over a time by the exponential of the operator; return it, its derivatives and their relative error."""
+    def _exponential(self, prepared: Prepared, window: lw.Window, length: float, values: Array) -> tuple[Array, float]:
+        """Return the derivatives of a density after a time by the exponential of the operator, and their relative error."""
         known = [tables(one, window) for one in (prepared, *self.shifted)]
         operator, *shifted = (length * window.generator(one.covariance, one.drift) for one in known)
         return exponential_derivatives(operator, np.array([one.imag for one in shifted]) / STEP, values, self.tangents)
@@ -165,13 +170,12 @@ class _Walk:
         self.slopes += slopes
         self.tangents = product - after * slopes[:, None]
 
-    def _regrid(self, values: Array, window: lw.Window, new: lw.Window) -> None:
-        """Take the derivatives of a density to another grid."""
+    def _regrid(self, window: lw.Window, new: lw.Window) -> None:
+        """Take the derivatives to another grid."""
         if new != window:
-            moved = [lw.resampled(one, window, new).imag for one in values + 1j * STEP * self.tangents]
-            self.tangents = np.array(moved) / STEP
+            self.tangents = np.array([_on(new, tangent, window) for tangent in self.tangents])
 
 
-def _moved(state: State, window: lw.Window) -> Array:
-    """Return the density of a state at parameters with imaginary parts, on a grid."""
-    return lw.resampled(np.asarray(state.values, complex), state.window, window)
+def _on(new: lw.Window, tangent: Array, window: lw.Window) -> Array:
+    """Return the derivative of a density on another grid: linear in it, so that the rounding of small values does not spread."""
+    return lw.interpolated(tangent, window, new.offsets) * (new.spacing / window.spacing) if new != window else tangent

@@ -45,8 +45,8 @@ class Varied(NamedTuple):
         still = np.zeros((len(modes.rates), len(modes.rates)))
         return cls(modes, scales, np.array([still if one.change is None else one.change / STEP for one in shifted]))
 
-    def through(self, values: Array, tangents: Array, length: float) -> tuple[Array, Array]:
-        """Return a density (N,) and its derivatives (p, N) after a time.
+    def through(self, values: Array, tangents: Array, length: float) -> Array:
+        """Return the derivatives (p, N) of a density after a time.
 
         Args:
             values: the density; its derivatives count where it is positive.
@@ -60,11 +60,11 @@ class Varied(NamedTuple):
         decay, coefficients = np.exp(-length * self.modes.rates), inner @ U
         turned = (self.operators * quotients(self.modes.rates, decay, length)) @ coefficients
         after = scale * (U @ (decay * coefficients))
-        return after, scale * (((changes @ U) * decay + turned) @ U.T) + after * self.scales
+        return scale * (((changes @ U) * decay + turned) @ U.T) + after * self.scales
 
 
-def exponential_derivatives(matrix: Array, changes: Array, vector: Array, tangents: Array) -> tuple[Array, Array, float]:
-    """Return exp(A) u and its derivatives, and the relative difference of quadratures of orders ten and six.
+def exponential_derivatives(matrix: Array, changes: Array, vector: Array, tangents: Array) -> tuple[Array, float]:
+    """Return the derivatives (p, N) of exp(A) u, and the relative difference of quadratures of orders ten and six.
 
     Args:
         matrix: A (N, N).
@@ -92,7 +92,7 @@ def exponential_derivatives(matrix: Array, changes: Array, vector: Array, tangen
             source = 0.5**halvings * (changes @ found[0])
             found[1 : count + 1] += _TENTH[i] * source
             found[count + 1 :] += (_TENTH[i] - _SIXTH[i]) * source
-    after, derivatives, rest = found[0], found[1 : count + 1], found[count + 1 :]
+    derivatives, rest = found[1 : count + 1], found[count + 1 :]
     scale = np.sum(np.abs(derivatives), axis=1)
     error = np.max(np.sum(np.abs(rest), axis=1) / np.where(scale > 0, scale, 1.0), initial=0.0)
-    return after, derivatives, float(error)
+    return derivatives, float(error)
