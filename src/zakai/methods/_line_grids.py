@@ -69,7 +69,7 @@ def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarr
     system, start, theta = prepared.system, prepared.model.start, prepared.theta
     assert system.separated is not None
     parts = np.moveaxis(system.separated[1](_nodes(window, x), start, theta), 0, -1)
-    table = np.zeros((1, len(parts), OBSERVED + system.m, len(x)))
+    table = np.zeros((1, len(parts), OBSERVED + system.m, len(x)), theta.dtype)
     table[0, :, CELL] = _cells(window, parts[:, 0])
     table[0, :, DRIFT:] = parts[..., :-1:3]
     if prepared.yau is not None:
@@ -111,7 +111,7 @@ def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) ->
     starts, stops = prepared.schedule.starts[rows, None], prepared.schedule.stops[rows, None]
     inner = np.clip(starts + prepared.lengths[rows, None] * GAUSS_NODES, starts, np.nextafter(stops, starts))
     times = np.concatenate([inner, stops], axis=1)
-    table = np.zeros((*times.shape, OBSERVED + system.m, len(x)))
+    table = np.zeros((*times.shape, OBSERVED + system.m, len(x)), theta.dtype)
     f = system.drift(_nodes(window, x), times[..., None], theta)[..., 0]
     table[..., CELL, :], table[..., DRIFT, :] = _cells(window, f), f[..., :-1:3]
     assert system.slope is not None

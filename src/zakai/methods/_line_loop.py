@@ -41,7 +41,7 @@ class Piece(NamedTuple):
     """Steps that begin with interval `first`, from the state `before` on.
 
     The densities (K, N) have grids with these centres and spacings (K,); `last` is the state after them, on the grid of the next
-    step.
+    step.  `placed` tells that every step has placed a grid of its own (`line_sharp`).
     """
 
     first: int
@@ -51,11 +51,12 @@ class Piece(NamedTuple):
     spacings: Array
     reports: Array
     last: State
+    placed: bool = False
 
     @property
     def number(self) -> int:
         """The number of steps."""
-        return len(self.segment.reports)
+        return len(self.reports)
 
     @property
     def states(self) -> Sequence[State]:
@@ -69,13 +70,14 @@ class Piece(NamedTuple):
     @classmethod
     def of(cls, first: int, before: State, densities: Array, centres: Array, spacings: Array, reports: Array) -> Piece:
         """Return steps after which the grid stays."""
-        *_, error, log_floor, _ = reports[-1].tolist()
+        error, log_floor = reports[-1, [ERROR, FLOOR]].tolist()
         centre, spacing = float(centres[-1]), float(spacings[-1])
         last = before._replace(values=densities[-1], centre=centre, spacing=spacing, error=error, log_floor=log_floor)
         return cls(first, before, densities, centres, spacings, reports, last)
 
 
 START, ERROR, FLOOR = (COLUMNS.index(name) for name in ("start", "error", "log_floor"))
+DIVIDED = [COLUMNS.index(name) for name in ("pairs", "substeps", "needed")]  # what a splitting was
 
 
 def infos_of(prepared: Prepared, pieces: Sequence[Piece]) -> Infos:
@@ -102,7 +104,7 @@ def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -
             if prepared.kinked or state.closed:
                 break
             found = sharp.advanced(prepared, first, rows.stop, state, observed[first - rows.start :], own)
-            piece = None if found is None else Piece.of(first, state, *found)
+            piece = None if found is None else Piece.of(first, state, *found)._replace(placed=True)
         else:
             here = slice(first, min(rows.stop, first + (1 if general else TOGETHER if prepared.mixed else len(observed))))
             grid = grid_of(prepared, state.window, here)

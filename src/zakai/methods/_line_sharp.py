@@ -83,7 +83,7 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
     owner, count = (-1, 1) if special else (-2, stop - k)
     for _ in range(NEW):
         n = SIZES[at]
-        densities, places, out = np.empty((count, n)), np.empty((count + 1, 3)), np.empty((count, len(COLUMNS)))
+        densities, places, out = np.empty((count, n)), np.empty((count + 1, 3)), np.zeros((count, len(COLUMNS)))
         done, why = ls.sharpened(
             values, float(state.centre), float(state.spacing), window.unit, profile, coarse.numbers, coarse.index, rows, owner,
             system.general, own, k, observed[:count], steps.lengths, steps.precisions[:, 0], steps.constants,

@@ -8,6 +8,7 @@ one parameter after the other (`numerics/complex_step.py`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,24 +17,29 @@ from sympy import sympify
 from zakai.methods import _line
 from zakai.methods._line_adjoint import log_likelihoods
 from zakai.methods._line_coarse import coarsened
-from zakai.methods._line_loop import Piece, infos_of
+from zakai.methods._line_grids import grid_of
+from zakai.methods._line_loop import DIVIDED, START, Piece, infos_of
+from zakai.methods._line_parts import segment_of_parts
 from zakai.methods._line_system import Prepared, State
 from zakai.methods._line_tables import spectral, tables
 from zakai.methods._line_update import factor_at_end
 from zakai.methods._protocol import Infos, Tangents
 from zakai.numerics import line_window as lw
 from zakai.numerics.complex_step import STEP
+from zakai.numerics.line_segment import SPLIT
+from zakai.numerics.line_split_tangents import Coefficients, Interval, shifted_by, through
 from zakai.numerics.line_tangents import Varied, exponential_derivatives
 
 Array = Any
 
+IN_TIME = "drifts", "outputs", "covariances", "precisions"
 INACCURATE = 1e-4  # difference of quadratures of orders ten and six from which they do not serve
 
 
 def tangents(
     prepared: Prepared, shifted: Sequence[Prepared], rows: slice, state: State, shifted_states: Sequence[State], observed: Array
 ) -> Tangents[State] | None:
-    """Return what `_line.segment` returns, with derivatives; None for kernels, splittings and weak likelihoods.
+    """Return what `_line.segment` returns, with derivatives; None where likelihoods act in the weak sense.
 
     Args:
         prepared: what is known without data.
@@ -43,10 +49,15 @@ def tangents(
         shifted_states: the same at the p parameters.
         observed: what is observed (K, m).
     """
-    if prepared.weak or prepared.gaussian:
+    if prepared.weak:
         return None
     walk = _Walk(shifted, np.array([_on(state.window, one.values.imag / STEP, one.window) for one in shifted_states]))
-    states, infos = walk.over(prepared, rows, state, observed)
+    if prepared.parts is None:
+        states, infos = walk.over(prepared, rows, state, observed)
+    else:
+        inner = prepared.parts.prepared
+        walk.shifted = [replace(inner, theta=one.theta) for one in shifted]
+        states, infos = segment_of_parts(prepared.parts, rows, state, observed, walk.over)
     last = states[-1]
     return Tangents(states, infos, walk.slopes, [last._replace(values=last.values + 1j * STEP * one) for one in walk.tangents])
 
@@ -74,14 +85,13 @@ class _Walk:
                 return
             for piece in found:
                 place = piece.first - k
-                if prepared.gaussian:
-                    for i, after in enumerate(piece.states):
-                        self._singly(piece.first + i, before, after, values[place + i])
-                        before = after
+                self._regrid(before.window, piece.before.window)
+                own = values[place : place + piece.number]
+                if piece.placed:
+                    window = self._one_by_one(piece, own)
                 else:
-                    self._regrid(before.window, piece.before.window)
-                    self._by_modes(prepared, piece, values[place : place + piece.number])
-                    self._regrid(piece.before.window, piece.last.window)
+                    window = (self._by_splitting if prepared.gaussian else self._by_modes)(prepared, piece, own)
+                self._regrid(window, piece.last.window)
                 before = piece.last
 
         return _line.segment_of_whole(prepared, rows, state, observed, noted)
@@ -98,16 +108,59 @@ class _Walk:
             self.slopes[i] += info.log_likelihood_increment.imag / STEP
         self.tangents = np.array(found)
 
-    def _by_modes(self, prepared: Prepared, piece: Piece, observed: np.ndarray) -> None:
-        """Take the steps of a piece by the modes of its grid."""
+    def _one_by_one(self, piece: Piece, observed: np.ndarray) -> lw.Window:
+        """Take the steps of a piece singly; return the last grid."""
+        states = [piece.before, *piece.states]
+        for i in range(piece.number):
+            self._singly(piece.first + i, states[i], states[i + 1], observed[i])
+        return states[-1].window
+
+    def _by_modes(self, prepared: Prepared, piece: Piece, observed: np.ndarray) -> lw.Window:
+        """Take the steps of a piece by the modes of its grid; return the grid."""
         window, own, density = piece.before.window, slice(piece.first, piece.first + piece.number), piece.before.values
         varied = self._varied(prepared, window)
         logs = self._logs(lambda one: log_likelihoods(one, own, observed, window.points[None]), prepared)
         for i, gained in enumerate(infos_of(prepared, [piece]).log_likelihood_increment):
-            after = piece.segment.densities[i]
+            after = piece.densities[i]
             self.tangents = varied.through(density, self.tangents, prepared.lengths[piece.first + i])
             self._multiply(after, logs[:, i], gained)
             density = after
+        return window
+
+    def _by_splitting(self, prepared: Prepared, piece: Piece, observed: np.ndarray) -> lw.Window:
+        """Take the steps of a piece by splittings, or singly; return the last grid."""
+        window, own, states = piece.before.window, slice(piece.first, piece.first + piece.number), [piece.before, *piece.states]
+        grids = [grid_of(one, window, own) for one in self.shifted]
+        table = np.array([grid.table for grid in grids if grid is not None])
+        cells = np.rint(np.append(window.centre, piece.centres) / window.spacing).astype(int)
+        starts = cells + int(piece.reports[0, START]) - cells[1]  # in the table
+        centres, gains = piece.centres, infos_of(prepared, [piece]).log_likelihood_increment
+        points = window.origin + centres[:, None] + window.spacing * lw.index(window.size)
+        logs = self._logs(lambda one: log_likelihoods(one, own, observed, points), prepared)
+        for i in range(piece.number):
+            shift = int(starts[i + 1] - starts[i])
+            interval, coefficients = self._divided(prepared, piece, i, observed[i]), None
+            if interval is not None and len(table) == len(self.shifted):
+                own_table = table[:, i if table.shape[1] > 1 else 0, :, :, starts[i + 1] : starts[i + 1] + window.size]
+                time = [np.array([getattr(one.coefficients, name)[piece.first + i] for one in self.shifted]) for name in IN_TIME]
+                coefficients = Coefficients(own_table, *time)
+            if interval is None or coefficients is None:
+                self._singly(piece.first + i, states[i], states[i + 1], observed[i])
+                window = states[i + 1].window
+            else:
+                before, tangents = shifted_by(states[i].values, shift), shifted_by(self.tangents, shift)
+                _, self.tangents, log_factor = through(interval, coefficients, before, tangents)
+                self._multiply(piece.densities[i], logs[:, i] + log_factor[:, None], gains[i])
+                window = window._replace(centre=float(centres[i]))
+        return window
+
+    def _divided(self, prepared: Prepared, piece: Piece, i: int, observed: Array) -> Interval | None:
+        """Return what the filter did in a step that was split, None for another one."""
+        k, (pairs, substeps, needed) = piece.first + i, piece.reports[i, DIVIDED]
+        if substeps == 0.0:
+            return None
+        length, inside, closed = float(prepared.lengths[k]), bool(prepared.kinds[k] == SPLIT), piece.before.closed
+        return Interval(length, piece.before.spacing, closed, observed, inside, int(pairs), int(substeps), bool(needed > 0.0))
 
     def _passed(self, prepared: Prepared, k: int, before: State, step: _line.Stepped, observed: np.ndarray) -> bool:
         """Take a single step whose transition is known; return whether the derivatives are accurate."""

@@ -59,6 +59,13 @@ def taps_of(variance: float, depth: float, most: int, narrow: bool) -> Array:
     return taps
 
 
+def narrow_taps(variance: float) -> tuple[Array, Array]:
+    """Return the filter (T,) of a narrow kernel, as `taps_of`, and its derivative with respect to the variance."""
+    squares, others = 0.5 * _FREQUENCIES**2, 0.5 * (2.0 * np.pi - _FREQUENCIES) ** 2
+    passed, beyond = np.exp(-variance * squares) * _PASSED, np.exp(-variance * others) * (1.0 - _PASSED)
+    return (passed + beyond) @ _COSINES, -(squares * passed + others * beyond) @ _COSINES
+
+
 @helper
 def filtered(now: Array, taps: Array, after: Array, scale: Array, narrow: bool) -> tuple[float, float]:
     """Replace values by after times their convolution with a Gaussian, whose filter is given.
@@ -214,7 +221,7 @@ def convolved(
             now[j] *= early[j] / gauge[j]
             late[j], early[j] = late[j] * gauge[j], 1.0
         rounding, clipped = filtered(now, taps_of(width, depth, size, narrow), late, early, narrow)
-    return Transition(0.0, rounding, clipped, variance, a, needed, log_factor)
+    return Transition(0.0, rounding, clipped, variance, a, needed, log_factor, 0.0, 0.0)
 
 
 _APPLIED = [

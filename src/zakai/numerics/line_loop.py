@@ -124,7 +124,7 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
                 if tau != last_tau:
                     decay, last_tau = decayed(rates, tau), tau
                 rounding = decomposed(now, local[0, PHI], modes, decay, 0.1 * most, closed)
-                move = Transition(0.0, rounding, 0.0, 0.0, 1.0, 0.0, 0.0)
+                move = Transition(0.0, rounding, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
             elif kernels and not np.isnan(channel[0]):
                 middle = offset + spacing * (start + half)
                 move = convolved(now, local[0, PHI], channel, middle, spacing, finest, depth, closed)
@@ -201,7 +201,8 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
             row[8], row[9], row[10], row[11] = growth, made, error, log_floor
             for j in range(size):
                 densities[i, j] = now[j]
-            row[12], home, done = start, start, i + 1
+            row[12], row[13], row[14], row[15] = start, move.pairs, move.substeps, move.needed
+            home, done = start, i + 1
             # Whether the same grid serves for the next step: as in `line_window.fitted`.
             low, high = int(answer[0]), int(answer[1])
             if filters or weak:

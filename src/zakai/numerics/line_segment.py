@@ -10,7 +10,7 @@ Array = NDArray[Any]
 
 COLUMNS = (
     "gained", "mean", "variance", "aliasing", "edge", "negative", "time", "depth", "growth", "made", "error", "log_floor",
-    "start",
+    "start", "pairs", "substeps", "needed",
 )  # fmt: skip
 # The transition: whole with a sample after it, split with increments inside, whole with increments inside, split with a sample.
 FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = 0, 1, 2, 3
@@ -100,8 +100,8 @@ class Limits(NamedTuple):
 class Segment(NamedTuple):
     """The densities (K, N) after the first steps and their reports (K, len(COLUMNS)).
 
-    The last column of a report is the first point of the grid in the table.  `why` is why the loop ended, and `answer` the range
-    of the grid that it needs, relative to the centre of the present one, and its spacing.
+    The column `start` of a report is the first point of the grid in the table.  `why` is why the loop ended, and `answer` the
+    range of the grid that it needs, relative to the centre of the present one, and its spacing.
     """
 
     densities: Array

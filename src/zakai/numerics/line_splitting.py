@@ -33,8 +33,8 @@ from zakai.numerics.line_terms import Transition, failed
 Array = NDArray[Any]
 
 MOST_SUBSTEPS = 64
-_OVERFLOW = 690.0
-_STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
+OVERFLOW = 690.0
+STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
 
 
 @inlined
@@ -108,7 +108,7 @@ def divided(
             if not (splitting < np.inf):
                 break
         if splitting <= most and time <= most:
-            return Transition(splitting + time, rounding, clipped, spread, 1.0, needed, constant)
+            return Transition(splitting + time, rounding, clipped, spread, 1.0, needed, constant, magnus, substeps)
         if not (splitting + time < np.inf):
             substeps *= 4.0
         else:
@@ -201,18 +201,18 @@ def split(
     correction, negligible, clipped = spread / (72.0 * substeps**3), 1e-13 * now[highest_of(now)], 0.0
     early, middle, joint, late, work = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     for j in range(1, size):
-        if narrow and not (abs(phi[j] - phi[j - 1]) + 5.0 * weight * abs(b[j] - b[j - 1]) < _STEEPEST):
+        if narrow and not (abs(phi[j] - phi[j - 1]) + 5.0 * weight * abs(b[j] - b[j - 1]) < STEEPEST):
             for i in (j - 1, j):
                 if now[i] > negligible:
                     return np.inf, 1.0
                 clipped, now[i] = max(clipped, now[i]), 0.0
     for j in range(size):
         outer, gauge = weight * b[j], phi[j]
-        if not (abs(gauge) < _OVERFLOW and outer - gauge < _OVERFLOW):
+        if not (abs(gauge) < OVERFLOW and outer - gauge < OVERFLOW):
             if now[j] > negligible or not (gauge < 0.0 or b[j] == IMPOSSIBLE):
                 return np.inf, 1.0
             clipped = max(clipped, now[j])
-            now[j], outer, gauge = 0.0, -_OVERFLOW, 0.0
+            now[j], outer, gauge = 0.0, -OVERFLOW, 0.0
         early[j], late[j], joint[j], work[j] = outer - gauge, outer + gauge, 2.0 * outer, gauge
         middle[j] = 4.0 * outer - correction * first[j] * first[j]
     for exponents in (early, middle, late):

@@ -24,7 +24,7 @@ class Transition(NamedTuple):
     `error` is that of a splitting, infinite where the transition failed; `rounding` the rounding error and `clipped` the largest
     value that may have become zero, relative to the maximum; `spread` the variance of its noise and `contraction` the factor of
     deviations; `needed` the spacing that filters of positive numbers need, where that of the grid is larger, else zero;
-    `log_factor` a constant of the logarithm of the mass.
+    `log_factor` a constant of the logarithm of the mass; `pairs` of averages and `substeps` of a splitting.
     """
 
     error: float
@@ -34,12 +34,14 @@ class Transition(NamedTuple):
     contraction: float
     needed: float
     log_factor: float
+    pairs: float
+    substeps: float
 
 
 @helper
 def failed(spread: float, needed: float) -> Transition:
     """Return the figures of a transition that failed."""
-    return Transition(np.inf, np.inf, 1.0, spread, 1.0, needed, 0.0)
+    return Transition(np.inf, np.inf, 1.0, spread, 1.0, needed, 0.0, 0.0, 0.0)
 
 
 @helper
