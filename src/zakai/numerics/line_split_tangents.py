@@ -125,12 +125,14 @@ def _split(interval: Interval, average: _Average, v: Array, dv: Array) -> tuple[
     outer, phi, middle = (np.where(lost, low, one) for one, low in ((outer, -OVERFLOW), (phi, 0.0), (middle, -OVERFLOW)))
     exponents = [outer - phi, middle, 2.0 * outer, outer + phi]
     factors, slopes = np.exp([one[0].real for one in exponents]), np.array([one.imag for one in exponents]) / STEP
+    order = np.array([0, *[1, 2] * count])
+    order[-1] = 3
     variances, shifts = spread / (2.0 * count * spacing**2), shift / (2.0 * count * spacing)
     if interval.closed:
-        return _around(v, dv, factors, slopes, variances, shifts, 2 * count)
+        return _around(v, dv, factors, slopes, variances, shifts, order)
     variance, turned = float(variances[0].real), np.ascontiguousarray(variances.imag) / STEP
     taps = narrow_taps(variance) if interval.narrow else _samples(variance, len(v))
-    _along(v, dv, factors, slopes, *(np.ascontiguousarray(one[: len(v)]) for one in taps), turned, 2 * count)
+    _along(v, dv, factors, slopes, *(np.ascontiguousarray(one[: len(v)]) for one in taps), turned, order)
     return v, dv
 
 
@@ -149,26 +151,19 @@ def _slope(b: Array, spacing: float, closed: bool) -> Array:
 
 
 def _around(
-    v: Array, dv: Array, factors: Array, slopes: Array, variances: Array, shifts: Array, count: int
+    v: Array, dv: Array, factors: Array, slopes: Array, variances: Array, shifts: Array, order: Array
 ) -> tuple[Array, Array]:
     """Return what `_along` gives, on the circle: the kernels have variances and shifts (p,)."""
     size = len(v)
     waves = 2.0 * np.pi / size * np.arange(size // 2 + 1)
     transfer = np.exp(-0.5 * variances[0].real * waves**2 - 1j * waves * shifts[0].real)
     change = (-0.5 * waves**2 * variances.imag[:, None] - 1j * waves * shifts.imag[:, None]) / STEP
-    for i in range(count + 1):
+    for i, which in enumerate(order):
         if i:
             spectrum = np.fft.rfft(v)
             v, dv = np.fft.irfft(transfer * spectrum, size), np.fft.irfft(transfer * (np.fft.rfft(dv) + spectrum * change), size)
-        which = _which(i, count)
         v, dv = factors[which] * v, factors[which] * (dv + v * slopes[which])
     return v, dv
-
-
-@helper
-def _which(i: int, count: int) -> int:
-    """Return which factor stands after i convolutions of `count`."""
-    return 0 if i == 0 else (3 if i == count else (1 if i % 2 == 1 else 2))
 
 
 @helper
@@ -184,23 +179,23 @@ def _convolve(row: Array, taps: Array, padded: Array, to: Array) -> None:
             to[j] += weight * (below[j] + above[j])
 
 
-@kernel(void(_V, _M, _M, _T, _V, _V, _V, int64))
+@kernel(void(_V, _M, _M, _T, _V, _V, _V, int64[::1]))
 def _along(
-    v: Array, dv: Array, factors: Array, slopes: Array, taps: Array, changes: Array, turned: Array, count: int
+    v: Array, dv: Array, factors: Array, slopes: Array, taps: Array, changes: Array, turned: Array, order: Array
 ) -> None:
     """Replace a density and its derivatives (p, N) by those after convolutions and factors.
 
     Args:
         v, dv: the density and the derivatives.
-        factors: those before all, after the first and every second one, after each between these, and after the last (4, N).
+        factors: exponentials (4, N).
         slopes: the derivatives of their logarithms (4, p, N).
         taps, changes: the filter of a convolution and its derivative with respect to the variance (T,).
         turned: the derivatives of the variance (p,).
-        count: the number of convolutions.
+        order: which factor stands before, between and after the convolutions.
     """
     size, padded = v.size, np.zeros(v.size + 2 * taps.size)
     moved, changed, row = np.empty(size), np.empty(size), np.empty(size)
-    for i in range(count + 1):
+    for i in range(order.size):
         if i > 0:
             moved[:], changed[:] = 0.0, 0.0
             _convolve(v, taps, padded, moved)
@@ -211,7 +206,7 @@ def _along(
                 _convolve(dv[l], taps, padded, row)
                 dv[l, :] = row
             v[:] = moved
-        which = _which(i, count)
+        which = order[i]
         for l in range(turned.size):
             for j in range(size):
                 dv[l, j] = factors[which, j] * (dv[l, j] + v[j] * slopes[which, l, j])
