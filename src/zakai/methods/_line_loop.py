@@ -41,7 +41,7 @@ class Piece(NamedTuple):
     """Steps that begin with interval `first`, from the state `before` on.
 
     The densities (K, N) have grids with these centres and spacings (K,); `last` is the state after them, on the grid of the next
-    step.  `placed` tells that every step has placed a grid of its own (`line_sharp`).
+    step.  Where every step has placed a grid of its own, `coarse` are the grids of the transitions (`_line_sharp`).
     """
 
     first: int
@@ -51,7 +51,7 @@ class Piece(NamedTuple):
     spacings: Array
     reports: Array
     last: State
-    placed: bool = False
+    coarse: Array | None = None
 
     @property
     def number(self) -> int:
@@ -104,7 +104,7 @@ def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -
             if prepared.kinked or state.closed:
                 break
             found = sharp.advanced(prepared, first, rows.stop, state, observed[first - rows.start :], own)
-            piece = None if found is None else Piece.of(first, state, *found)._replace(placed=True)
+            piece = None if found is None else Piece.of(first, state, *found[:-1])._replace(coarse=found.coarse)
         else:
             here = slice(first, min(rows.stop, first + (1 if general else TOGETHER if prepared.mixed else len(observed))))
             grid = grid_of(prepared, state.window, here)

@@ -27,12 +27,16 @@ NUMBERS = 2**21  # of the coarse grids that are known together
 
 
 class Sharp(NamedTuple):
-    """Steps of which each has a grid of its own: densities (K, n), centres and spacings (K,), and reports (K, .)."""
+    """Steps of which each has a grid of its own: densities (K, n), centres and spacings (K,), and reports (K, .).
+
+    The transitions were those of `coarse` grids, with centres, spacings and sizes (K, 3).
+    """
 
     densities: Array
     centres: Array
     spacings: Array
     reports: Array
+    coarse: Array
 
 
 class Coarse:
@@ -90,7 +94,8 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
             float(state.error), *limits, *waves(n), densities, places, out,
         )  # fmt: skip
         if done:
-            return Sharp(densities[:done], places[:done, 0], places[:done, 1], out[:done])
+            taken = coarse.index[places[:done, 2].astype(int), :3]
+            return Sharp(densities[:done], places[:done, 0], places[:done, 1], out[:done], taken)
         if why == ls.SIZE and at + 1 < len(SIZES):
             at, count = at + 1, 1
         elif why == ls.GRID:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -87,8 +88,8 @@ class _Walk:
                 place = piece.first - k
                 self._regrid(before.window, piece.before.window)
                 own = values[place : place + piece.number]
-                if piece.placed:
-                    window = self._one_by_one(piece, own)
+                if piece.coarse is not None:
+                    window = self._placed(prepared, piece, piece.coarse, own)
                 else:
                     window = (self._by_splitting if prepared.gaussian else self._by_modes)(prepared, piece, own)
                 self._regrid(window, piece.last.window)
@@ -108,11 +109,21 @@ class _Walk:
             self.slopes[i] += info.log_likelihood_increment.imag / STEP
         self.tangents = np.array(found)
 
-    def _one_by_one(self, piece: Piece, observed: np.ndarray) -> lw.Window:
-        """Take the steps of a piece singly; return the last grid."""
+    def _placed(self, prepared: Prepared, piece: Piece, coarse: Array, observed: np.ndarray) -> lw.Window:
+        """Take the steps of a piece by the modes of coarse grids (K, 3), to grids of their own; return the last one."""
         states = [piece.before, *piece.states]
-        for i in range(piece.number):
-            self._singly(piece.first + i, states[i], states[i + 1], observed[i])
+        for i, gained in enumerate(infos_of(prepared, [piece]).log_likelihood_increment):
+            k, window, after = piece.first + i, states[i].window, piece.densities[i]
+            centre, spacing, size = coarse[i].tolist()
+            wide = window._replace(centre=centre, spacing=spacing, size=int(size))
+            varied = self._varied(prepared, wide)
+            self.tangents = varied.through(states[i].values, self.tangents, prepared.lengths[k], window, wide)
+            new = window._replace(centre=float(piece.centres[i]), spacing=float(piece.spacings[i]), size=len(after))
+            self._regrid(wide, new)
+            seen, logs = prepared.schedule.seen[k], np.zeros((len(self.shifted), len(after)), complex)
+            if seen.any():
+                logs = self._logs(partial(_logs_of, k=k, observed=observed[i], points=new.points), prepared)
+            self._multiply(after, logs, gained)
         return states[-1].window
 
     def _by_modes(self, prepared: Prepared, piece: Piece, observed: np.ndarray) -> lw.Window:
@@ -184,7 +195,7 @@ class _Walk:
         at_end = prepared.schedule.seen[k] & ~prepared.inside[k]
         logs = np.zeros((len(self.shifted), step.window.size), complex)
         if at_end.any():
-            logs = self._logs(lambda one: factor_at_end(one, k, at_end, observed, None).logs(step.window.points), prepared)
+            logs = self._logs(partial(_logs_of, k=k, observed=observed, points=step.window.points), prepared)
         self._multiply(step.values, logs, step.info.log_likelihood_increment - gained)
         self._regrid(step.window, step.state.window)
         return True
@@ -227,6 +238,14 @@ class _Walk:
         """Take the derivatives to another grid."""
         if new != window:
             self.tangents = np.array([_on(new, tangent, window) for tangent in self.tangents])
+
+
+def _logs_of(prepared: Prepared, k: int, observed: Array, points: Array) -> Array:
+    """Return the log-likelihood of an observation at points (N,)."""
+    likelihood = factor_at_end(prepared, k, prepared.schedule.seen[k], observed, None)
+    assert likelihood is not None
+    found: Array = likelihood.logs(points)
+    return found
 
 
 def _on(new: lw.Window, tangent: Array, window: lw.Window) -> Array:

@@ -173,7 +173,8 @@ def sharpened(
         error: the estimate of the relative error of `values`.
         negligible, allowed: the spectrum that need not be resolved, and the largest error.
         cosines, sines: `waves` of the size of fine grids.
-        densities, places, out: receive the densities (K, n), the centres and spacings (K + 1, 3), and the reports.
+        densities, places, out: receive the densities (K, n), the centres, the spacings and which coarse grid was
+            taken (K + 1, 3), and the reports.
     """
     now, n, answer = values.copy(), densities.shape[1], places[-1]
     for i in range(observed.shape[0]):
@@ -269,7 +270,7 @@ def sharpened(
         row[0], row[3], row[4] = np.log(mass) + constants[k] + constant + added, aliasing, edge
         row[5], row[6], row[7] = negative, rounding + unsure, below / max(np.log(allowed) - np.log(floor), 2.3)
         row[8], row[9], row[10], row[11], row[12] = growth, made, error, min(LOG_NOISE + max(below - 1.0, 0.0), 0.0), 0.0
-        places[i, 0], places[i, 1], places[i, 2] = centre, spacing, n
+        places[i, 0], places[i, 1], places[i, 2] = centre, spacing, place
         for j in range(n):
             densities[i, j] = now[j]
     return observed.shape[0], DONE

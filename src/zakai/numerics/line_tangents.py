@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line_operator import Spectral, exponential, norm_of, quotients
+from zakai.numerics.line_polynomial import local_polynomial
+from zakai.numerics.line_window import CUT, Window, gathered
 
 Array = NDArray[Any]
 
@@ -41,22 +43,34 @@ class Varied(NamedTuple):
     @classmethod
     def of(cls, modes: Spectral, shifted: Sequence[Spectral]) -> Varied:
         """Return it from the decompositions at parameters with infinitesimal imaginary parts."""
-        scales = np.array([one.scale.imag / one.scale.real for one in shifted]) / STEP
+        scales = np.array([one.scale.imag / np.where(one.scale.real > 0, one.scale.real, 1.0) for one in shifted]) / STEP
         still = np.zeros((len(modes.rates), len(modes.rates)))
         return cls(modes, scales, np.array([still if one.change is None else one.change / STEP for one in shifted]))
 
-    def through(self, values: Array, tangents: Array, length: float) -> Array:
+    def through(
+        self, values: Array, tangents: Array, length: float, window: Window | None = None, own: Window | None = None
+    ) -> Array:
         """Return the derivatives (p, N) of a density after a time.
 
         Args:
-            values: the density; its derivatives count where it is positive.
-            tangents: its derivatives (p, N).
+            values: the density (J,); its derivatives count where it is positive.
+            tangents: its derivatives (p, J).
             length: the time.
+            window, own: the grid of the density and that of the decomposition, where they differ.
         """
-        U, used = self.modes.modes, values > 0
-        scale = self.modes.scale / self.modes.scale[int(np.argmax(values))]
-        inner = np.where(used, values / scale, 0.0)
-        changes = np.where(used, (tangents - values * self.scales) / scale, 0.0)
+        U, used, scale, scales = self.modes.modes, values > 0, self.modes.scale, self.scales
+        if window is not None and own is not None and window != own:
+            logs, points, used = np.log(np.maximum(scale, 1e-300)), window.offsets, values > CUT * np.max(values)
+            top = float(local_polynomial(logs, own, points[[int(np.argmax(values))]])[0])
+            scale, at = np.exp(logs - top), np.exp(local_polynomial(logs, own, points) - top)
+            scales = np.array([local_polynomial(one, own, points) for one in scales])
+        else:
+            at = scale = scale / scale[int(np.argmax(values))]
+        inner = np.where(used, values / at, 0.0)
+        changes = np.where(used, (tangents - values * scales) / at, 0.0)
+        if at is not scale and window is not None and own is not None:
+            inner = gathered(inner, window.offsets, own)
+            changes = np.array([gathered(one, window.offsets, own) for one in changes])
         decay, coefficients = np.exp(-length * self.modes.rates), inner @ U
         turned = (self.operators * quotients(self.modes.rates, decay, length)) @ coefficients
         after = scale * (U @ (decay * coefficients))
