@@ -181,3 +181,17 @@ def test_the_likelihood_of_a_double_well_and_its_gradient_are_right():
     assert np.isclose(slope, (reference(1 + 1e-4) - reference(1 - 1e-4)) / 2e-4, rtol=1e-5)
     fitted = zakai.fit(model, record)
     assert fitted.converged and reference(fitted.estimates["k"]) >= value - 1e-6
+
+
+@pytest.mark.parametrize("jump", ["sign(x - b)", "heaviside(x - b)", "floor(x - b)"])
+def test_the_place_of_a_jump_has_no_gradient(jump):
+    model = zakai.Model(
+        state=["x"], drift=[f"-k*x + {jump}/2"], observation=["x"], observation_kind="samples", observation_noise=[[0.1]],
+        prior={"kind": "gaussian", "mean": [0.2], "cov": [[0.2]]}, parameters={"k": 1.0, "b": 0.1},
+    )  # fmt: skip
+    record = zakai.Record([0.1, 0.3], [[0.1], [0.3]], "samples")
+    for refused in (lambda: zakai.fit(model, record), lambda: zakai.log_likelihood(model, record).value_and_gradient([1, 0.1])):
+        with pytest.raises(zakai.InputError, match="place of a jump.* depends on b"):
+            refused()
+    assert np.isfinite(zakai.log_likelihood(model, record)([1.0, 0.1]))
+    assert np.isfinite(zakai.log_likelihood(model, record, parameters=["k"]).value_and_gradient([1.0])[1]).all()

@@ -11,13 +11,17 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+import sympy as sp
 
 from zakai.engine.driver import check_noise, check_records, planned
 from zakai.engine.loop import CHUNK, Run, segments
 from zakai.engine.setting import Setting
 from zakai.errors import ConditionError, InputError
+from zakai.models._entries import formula
 from zakai.models._errors import did_you_mean, listing
 from zakai.models.checks import COEFFICIENTS, depends_on_state, noise_check
+from zakai.models.features import formulas_of
+from zakai.models.functions import Floor
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
 from zakai.numerics.complex_step import STEP
@@ -25,6 +29,7 @@ from zakai.records import Record
 from zakai.records.schedule import Schedule
 
 SHORT = 0.02  # seconds of one evaluation below which threads do not pay
+JUMPS = sp.sign, Floor
 DIFFERENCE = 1e-5  # relative step of the differences of gradients that give second derivatives
 
 
@@ -59,6 +64,20 @@ def log_likelihood(
         value, gradient = l.value_and_gradient([0.5])
     """
     return LogLikelihood(model, record, method, chosen_parameters(model, parameters), options)
+
+
+def _jump_of(model: Model, names: tuple[str, ...]) -> str:
+    """Return that the place of a jump depends on one of the parameters, or nothing."""
+    chosen = {symbol for symbol in model.parameter_symbols if symbol.name in names}
+    for expression in formulas_of(model):
+        for call in expression.atoms(*JUMPS):
+            for symbol in call.free_symbols & chosen:
+                return (
+                    f"{model.source}: parameters: the place of a jump, {formula(call)}, depends on {symbol.name}, in which the "
+                    "log-likelihood has no derivative that a gradient could give; leave it out of the parameters and compare "
+                    "log-likelihoods at several of its values"
+                )
+    return ""
 
 
 def chosen_parameters(model: Model, names: Sequence[str] | None) -> tuple[str, ...]:
@@ -98,6 +117,7 @@ class LogLikelihood:
         self._parts = [_Part.of(run) for run in plan.runs(record, "moments")]
         self._times = np.concatenate([[model.start], record.times])
         keys = [key for key in COEFFICIENTS if not depends_on_state(getattr(model, key), model)]
+        self._jump = _jump_of(model, names)
         self._checks = [check for key in keys if (check := noise_check(model, key)) is not None]
 
     def __repr__(self) -> str:
@@ -110,7 +130,11 @@ class LogLikelihood:
         return self._evaluated(values, False)[0]
 
     def value_and_gradient(self, values: Any) -> tuple[float, np.ndarray]:
-        """Return l and its gradient (p,) at the values (p,)."""
+        """Return l and its gradient (p,) at the values (p,).
+
+        Raises:
+            InputError: sign, heaviside or floor of an expression with one of the parameters.
+        """
         return self._evaluated(values, True)
 
     def consistent_pair(self, values: Any) -> tuple[float, np.ndarray]:
@@ -125,6 +149,8 @@ class LogLikelihood:
         given = np.asarray(values, dtype=float)
         if given.shape != (len(self.names),):
             raise InputError(f"log_likelihood: the values have shape {given.shape}; expected ({len(self.names)},)")
+        if derivatives and self._jump:
+            raise InputError(self._jump)
         theta = self.model.theta()
         theta[self._where] = given
         missing = np.nan, np.full(len(given), np.nan)
