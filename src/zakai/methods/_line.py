@@ -86,7 +86,7 @@ def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tupl
             return found
     # Attempts that overflow are taken again in shorter substeps.
     with np.errstate(all="ignore"):
-        stepped = _step(prepared, k, state, observed)
+        stepped = single(prepared, k, state, observed)
     return stepped.state, stepped.info
 
 
@@ -139,7 +139,7 @@ def segment_of_whole(
             parts.append(loop.infos_of(prepared, pieces))
         else:
             with np.errstate(all="ignore"):
-                found = _step(prepared, k, state, observed[k - rows.start])
+                found = single(prepared, k, state, observed[k - rows.start])
             states.append([found.state])
             parts.append(alone(found.info))
         if noted is not None:
@@ -153,7 +153,7 @@ def alone(info: Info) -> Infos:
     return Infos(np.array([info.log_likelihood_increment]), info.mean[None], info.cov[None], health)
 
 
-def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Stepped:
+def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Stepped:
     schedule, length = prepared.schedule, float(prepared.lengths[k])
     values, window, report, look = np.asarray(state.values), state.window, Report(), None
     inside = prepared.inside[k]
