@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-from scipy.stats import norm
 
 import zakai
 
@@ -38,29 +36,3 @@ def test_a_density_that_no_grid_of_three_states_holds_ends_with_a_warning():
     result = zakai.filter(model, zakai.Record([0.2], [[6.0]], "samples"), "yau-yau")
     assert any("tolerance_ratio exceeds 1" in text for text in result.warnings)
     assert result.density(1).log_values.size < 500_000 and np.isfinite(result.mean).all()
-
-
-@pytest.mark.parametrize("surprise", [0.0, 0.05, 0.1])
-def test_an_observation_in_the_tails_of_a_prediction_has_the_error_that_is_estimated(surprise):
-    # Two independent linear states; the second observation of y is 2, 5 and 7 standard deviations from its prediction.
-    model = zakai.Model(
-        state=["x", "y"], drift=["-x", "-y"], observation=["x", "y"], observation_kind="samples",
-        observation_noise=[[1e-4, 0], [0, 1e-4]], process_noise=[[1e-3, 0], [0, 1e-3]],
-        prior={"kind": "gaussian", "mean": [0, 0], "cov": [1, 1]},
-    )  # fmt: skip
-    times, values = [0.01, 2.0], np.array([[0.7, -0.4], [0.1, surprise]])
-    mean, variance, evidence = np.zeros(2), np.ones(2), 0.0
-    for length, value in zip(np.diff(times, prepend=0.0), values, strict=True):
-        kept = np.exp(-length)
-        mean, variance = kept * mean, kept**2 * variance + 1e-3 * (1 - kept**2) / 2
-        evidence += norm.logpdf(value, mean, np.sqrt(variance + 1e-4)).sum()
-        gain = variance / (variance + 1e-4)
-        mean, variance = mean + gain * (value - mean), variance * (1 - gain)
-    result = zakai.filter(model, zakai.Record(times, values, "samples"), "yau-yau")
-    errors = [
-        result.log_likelihood - evidence,
-        *((result.mean[-1] - mean) / np.sqrt(variance)),
-        *(result.variance[-1] / variance - 1),
-    ]
-    assert np.abs(errors).max() < result.health["error_estimate"][-1] < 5e-4
-    assert result.warnings == []

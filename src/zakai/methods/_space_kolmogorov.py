@@ -195,8 +195,8 @@ class Prepared:
         if not report.splitting + report.of_grid(self.bounds.reach) < LOST and np.isfinite(update.depth):
             result, mass = self._gaussian(result, mean, cov), 1.0
         edge, tails = max(report.edges, update.edges), max(report.tails, update.tails)
-        made = (report.splitting + report.interpolation) * (1 + update.depth) + update.interpolation
-        made = made + 1e-15 * np.exp(min(update.depth, 40.0)) + self.bounds.reach**2 * edge * 0.1 + tails
+        made = (report.splitting + report.interpolation) * (1 + update.depth) + 1e-15 * np.exp(min(update.depth, 40.0))
+        made = made + self.bounds.reach**2 * edge * 0.1 + tails
         left = kept * state.error
         error = float(np.sqrt(left**2 + 2 * ALIKE * left * made + made**2))
         if update.truncated or not np.isfinite(gained):
@@ -240,8 +240,9 @@ class Prepared:
 
     def _kept(self, begin: Field, predicted: Field, result: Field) -> float:
         """Return the share of an error of the mean, in deviations, that an interval leaves."""
-        volumes = np.linalg.det(np.stack([f.survey(self.bounds).cov for f in (begin, predicted, result)]))
-        before, between, after = np.maximum(volumes, 1e-300).tolist()
+        before, between, after = (
+            max(float(np.linalg.det(f.survey(self.bounds).cov)), 1e-300) for f in (begin, predicted, result)
+        )
         contracted = (min(before, between) / between * min(after, between) / between) ** (0.5 / self.model.n)
         return float(np.clip(contracted, 0.0, KEPT))
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import is_complex
-from zakai.numerics.space_field import ACCEPTED, Field, better, finer_by, positive, refinable
-from zakai.numerics.space_grid import Grid, filtered, rounded_size
+from zakai.numerics.space_field import Field, better, finer_by, positive, refinable
+from zakai.numerics.space_grid import Grid, filtered
 from zakai.numerics.space_resample import refined, triangular_resampled
 from zakai.numerics.space_spline import gather, relative_index
 from zakai.numerics.space_survey import Survey, deviations_in_spacings, narrowest
@@ -23,16 +23,14 @@ _STEEP = 4.0  # change of the log-likelihood between neighbours that a grid may 
 _TRIES = 16
 LOWEST = -100.0  # logarithm of a product, relative to its largest, below which it is zero
 MOST_REFINED = 2.0  # ratio of spacings by which a grid is refined at once
-SPLINE = 5e-4  # error of the spline of a Gaussian, times the sixth power of its standard deviation in spacings
-ACCURATE = 10.0  # times the bound on edges, for the error of the spline
 POINT = 0.1  # deviations in spacings of a product that is one point: rounding of the likelihood
 
 
 class Update(NamedTuple):
     """The product of a prediction and a likelihood, and its errors.
 
-    The edges and tails of its grid, how many nats below its maximum the prediction is where the product is largest, whether the
-    product reaches the end of the predicted window, and the relative error of the interpolation between the grids.
+    The edges and tails of its grid, how many nats below its maximum the prediction is where the product is largest, and whether
+    the product reaches the end of the predicted window.
     """
 
     field: Field
@@ -40,7 +38,6 @@ class Update(NamedTuple):
     tails: float
     depth: float
     truncated: bool
-    interpolation: float = 0.0
 
 
 class _Product(NamedTuple):
@@ -59,7 +56,9 @@ class _Product(NamedTuple):
     steepest: float
 
 
-@kernel("Tuple((float64, int64, float64))(float64[::1], float64[::1], int64[::1], boolean[::1], float64[::1], float64[::1])")
+@kernel(
+    "Tuple((float64, int64, float64))(float64[::1], float64[::1], int64[::1], boolean[::1], float64[::1], float64[::1])"
+)
 def _multiply(values: Any, logs: Any, sizes: Any, closed: Any, levels: Any, product: Any) -> tuple[float, int, float]:
     """Write the logarithms of a product, but for the largest, and the product; return the largest, its place, and the change.
 
@@ -106,7 +105,6 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
     """
     grid, values = field.grid, field.values
     coefficients, last, before = None, grid, np.ones(grid.n)
-    between, interpolation = grid, 0.0
     sparse = False
     best: tuple[float, _Product, Survey] | None = None  # the smallest edges and tails so far: a later grid may be worse
     for attempt in range(_TRIES):
@@ -145,15 +143,16 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
             values = triangular_resampled(field.values, field.grid, grid)
             continue
         if coefficients is None:
-            finer, interpolation = _interpolable(field, _depth(field, product), bounds)
-            coefficients, between = filtered(finer.values, np.zeros((grid.n, grid.n)), spline=True), finer.grid
-        values = gather(coefficients, relative_index(grid, between, bounds.periodic), between).reshape(grid.sizes)
+            coefficients = filtered(field.values, np.zeros((grid.n, grid.n)), spline=True)
+        at = relative_index(grid, field.grid, bounds.periodic)
+        values = gather(coefficients, at, field.grid).reshape(grid.sizes)
         values = positive(Field(values, grid, 0.0), bounds).values
     _, product, found = best or (0.0, product, product.field.survey(bounds))
     grid, values = product.field.grid, product.values
     inverse = grid.inverse
     if not np.diagonal(inverse @ found.cov @ inverse.T).min() > POINT**2:
         return _unchanged(field, log_factor)
+    ratio = float(values.real.flat[product.peak] / max(field.values.real.max(), values.real.max()))
     result = product.field.values
     if is_complex(values, product.logs):  # the derivative of the logarithm of the product
         change = values.imag / np.where(result > 0, values.real, 1.0) + product.logs.imag
@@ -165,35 +164,9 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
         positive(new_field, bounds),
         float(found.edges.max()),
         float(found.tails.max()),
-        _depth(field, product),
+        max(-math.log(max(ratio, 1e-300)), 0.0),
         _at_end(product.field, field.grid, bounds),
-        0.0 if grid.refines(field.grid) else interpolation,
     )
-
-
-def _depth(field: Field, product: _Product) -> float:
-    """Return how many nats a density is below its maximum where its product is largest."""
-    highest = max(field.values.real.max(), product.values.real.max())
-    return max(-math.log(max(float(product.values.real.flat[product.peak] / highest), 1e-300)), 0.0)
-
-
-def _interpolable(field: Field, depth: float, bounds: Bounds) -> tuple[Field, float]:
-    """Return a density on a grid on which its spline is accurate at some depth, and the relative error of the spline there.
-
-    The error is that of a Gaussian whose standard deviation is s spacings: it is proportional to the sixth derivative, which
-    relative to the Gaussian itself is He_6(x) at x deviations, x^2 / 2 nats below the maximum.
-    """
-    grid, tails = field.grid, field.survey(bounds).tails
-    deviations, growth = deviations_in_spacings(tails), 1.0 + (2.0 * depth) ** 3 / 15.0
-    finer = np.clip((SPLINE * growth / (ACCURATE * bounds.edge)) ** (1 / 6) / deviations, 1.0, MOST_REFINED)
-    # The waves of a grid that does not resolve a density are less accurate than splines.
-    finer = np.where(tails > ACCEPTED * bounds.tail, 1.0, finer)
-    sizes = tuple(
-        size if r == 1.0 else rounded_size(size * r, size, 2 * bounds.most) for size, r in zip(grid.sizes, finer, strict=True)
-    )
-    values, wide = refined(field.values, grid, sizes)
-    error = float((SPLINE * growth / (deviations * wide.shape / grid.shape) ** 6).sum())
-    return Field(values, wide, field.log_scale), min(error, 1.0)
 
 
 def _unchanged(field: Field, log_factor: Callable[[Grid], Array]) -> Update:
