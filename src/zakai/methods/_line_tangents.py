@@ -72,7 +72,7 @@ class _Walk:
         model = shifted[0].model
         own = [list(model.parameters)[int(np.argmax(one.theta.imag))] for one in shifted]
         parts = [*model.observation, *model.observation_noise, *model.family_parameters.values(), model.log_density or 0]
-        symbols = {symbol.name for part in parts for symbol in sympify(part).free_symbols}
+        symbols = {symbol.name for part in parts for symbol in sympify(part, strict=True).free_symbols}
         self.observing = [i for i, name in enumerate(own) if name in symbols]  # parameters of likelihoods
 
     def over(self, prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos]:
