@@ -125,7 +125,9 @@ def _smoothed(prepared: Prepared, state: State, later: Message, found: _Product)
     }
     first, last = support(found.values, negligible(prepared))
     needed = min(later.needed, window.spacing * max(look.resolving, 1.0), float(state.spacing))
-    kept = later.between(float(window.offsets[first]), float(window.offsets[last]))
+    low, high = float(window.offsets[first]), float(window.offsets[last])
+    finer = later.spacing > 2.0 * needed  # few points hold more than the product
+    kept = later.on(points_of(later.window, low, high, needed)) if finer else later.between(low, high)
     kept = kept._replace(logs=kept.logs - found.log_mass, needed=needed)
     return kept, Info(found.log_mass, np.array([mean]), np.array([[variance]]), health)
 

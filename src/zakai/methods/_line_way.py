@@ -10,12 +10,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.special import logsumexp
 
 from zakai.methods import _line
 from zakai.methods._line_attempt import MAGNUS
 from zakai.methods._line_coefficients import coefficients, offset_of, resolved_parts
 from zakai.methods._line_course import course_of, ends_of
-from zakai.methods._line_gauge import Gauge, derivative, gauge_of, generator
+from zakai.methods._line_gauge import Gauge, gauge_of, generator
 from zakai.methods._line_message import FEWEST, PAD, Message, covering, points_of, reliable, support, taper
 from zakai.methods._line_moves import Report
 from zakai.methods._line_system import Prepared, State
@@ -32,10 +33,11 @@ Array = Any
 MOST_SUBSTEPS = 500
 ROUNDING = 1e-15  # of the maximum: smaller values of psi are not kept
 NOISE = 1e-11  # of the maximum: what is rounding in psi
+LAST = 1.0 / 64.0  # part of an interval over which a narrow message is taken back by itself
 RESOLVED = 0.25  # spacing in standard deviations of the noise
-DIVISIONS = (1, 2, 4, 8, 16, 32)  # parts of an interval in which an increment acts
-DIVIDED = 1e-2  # of the tolerance that they may leave
 WIDTH = 0.8  # spacing in standard deviations of a Gaussian kernel at which sums are integrals
+TAIL = 4.0  # standard deviations of the noise beyond EXCURSION to where such a message matters
+BEYOND = 200.0  # logarithm of the maximum over the values of a message beyond its ends
 MOST_POINTS = 4000  # of such sums
 
 
@@ -74,7 +76,7 @@ class Way:
             found = self._by_kernel(later)
             if found is None and not self.prepared.system.varying:
                 found = self._substep(later, 0.0, self.length, False)
-            found = self._by_volumes(later) if found is None else found
+            found = self._by_volumes(self._eased(later)) if found is None else found
             if found is not None:
                 return found
         return self._in_parts(later)
@@ -101,9 +103,25 @@ class Way:
             self.error = np.inf
         return later
 
-    def _substep(self, later: Message, first: float, last: float, forced: bool) -> Message | None:
-        """Return the message at the start of a substep; None where a shorter one, or another way, is needed."""
-        low, high = min(later.ends[0], self.ends[0]), max(later.ends[1], self.ends[1])
+    def _eased(self, later: Message) -> Message:
+        """Take a message that is far narrower than the noise of the interval back over the last part, which is left out then."""
+        part, (low, high) = LAST * self.length, later.ends
+        least, most = self._noise(low, high, part)
+        if self.prepared.system.varying or high - low > least:
+            return later
+        found = self._substep(later, self.length - part, self.length, False, (low - TAIL * most, high + TAIL * most))
+        self.length -= 0.0 if found is None else part
+        return later if found is None else found
+
+    def _substep(
+        self, later: Message, first: float, last: float, forced: bool, ends: tuple[float, float] | None = None
+    ) -> Message | None:
+        """Return the message at the start of a substep; None where a shorter one, or another way, is needed.
+
+        The message there is wanted between `ends`, those of the density at the start of the interval by default.
+        """
+        begins = self.ends if ends is None else ends
+        low, high = min(later.ends[0], begins[0]), max(later.ends[1], begins[1])
         least, most = self._noise(low, high, last - first)
         low, high = low - EXCURSION * most, high + EXCURSION * most  # paths from one support to the other leave both
         spacing = later.needed if self.inside.any() or later.closed else max(later.needed, RESOLVED * least)
@@ -117,7 +135,7 @@ class Way:
             if found is None or not np.isfinite(found[0]).all() or not found[0].any():
                 return later._replace(logs=np.full(len(later.logs), np.nan)) if forced else None
             moved, offset, error = found
-            if gauge.modes is not None and not self._exact(moved, gauge, window, error):
+            if gauge.modes is not None and not self._exact(moved, gauge, window, error, ends):
                 if not forced:
                     return None
                 error = np.inf
@@ -138,8 +156,8 @@ class Way:
         if first == 0.0:
             return kept.between(*self.ends)
         counts = np.flatnonzero(moved > NOISE * np.max(moved))[[0, -1]]
-        ends = window.offsets[counts]
-        return kept.between(max(low, float(ends[0])), min(high, float(ends[1])))
+        reach = window.offsets[counts]
+        return kept.between(max(low, float(reach[0])), min(high, float(reach[1])))
 
     def _psi(self, later: Message, window: lw.Window, gauge: Array) -> tuple[Array, float]:
         """Return the values of psi on a grid times its spacing, divided by the exponential of the second number."""
@@ -188,15 +206,21 @@ class Way:
         def density(offsets: Array) -> Array:
             return lw.density_at(values, window, offsets)
 
-        found = pulled_back(self.prepared, later.at, density, course, self.start, self.inside, self.rates)
+        def log_worth(offsets: Array) -> Array:
+            low, high = later.ends
+            return np.where((offsets >= low) & (offsets <= high), later.at(offsets), later.logs.max() - BEYOND)
+
+        found = pulled_back(self.prepared, log_worth, density, course, self.start, self.inside, self.rates)
         if found is None:
             return None
-        new = points_of(later.window, *self.ends, min(later.needed, window.spacing))
+        least, _ = self._noise(*self.ends, self.length)
+        needed = min(max(later.needed, 0.5 * RESOLVED * least), window.spacing)
+        new = points_of(later.window, *self.ends, needed)
         values = found.at(new.offsets)
         self.error = found.error
         logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + found.log_scale
         origin, centre, spacing, _, closed, unit = new
-        return Message(logs, origin, centre, spacing, unit, closed, later.needed, later.error)
+        return Message(logs, origin, centre, spacing, unit, closed, needed, later.error)
 
     def _noise(self, low: float, high: float, length: float) -> tuple[float, float]:
         """Return the smallest and the largest standard deviation of the noise of a substep between two offsets."""
@@ -222,10 +246,6 @@ class Way:
         offset, split = offset_of(sum(weights) @ potential, values)
         if split or any(np.any(w @ covariance < 0) for w in weights):
             return None
-        if gauge.modes is not None:
-            divided = self._divided(values, window, gauge, length, length * potential[0] - offset, covariance[0])
-            if divided is not None:
-                return divided[0], offset + length * float(constant[0]), divided[1]
         parts = [generator(window, gauge, drift, covariance, w) + np.diag(w @ potential - offset / len(weights)) for w in weights]
         error = 0.0
         if not steady:  # what the commutator-free integrator of order four omits, as in the filter
@@ -241,47 +261,29 @@ class Way:
             error += more
         return moved, offset + float(sum(weights) @ constant), error
 
-    def _divided(
-        self, values: Array, window: lw.Window, gauge: Gauge, length: float, weight: Array, covariance: Array
-    ) -> tuple[Array, float] | None:
-        """Return psi at the start and its rounding; the logarithm b of the weight of the increment acts in parts.
+    def _exact(
+        self, psi: Array, gauge: Gauge, window: lw.Window, error: float, ends: tuple[float, float] | None = None
+    ) -> bool:
+        """Return whether the error of psi, relative to its maximum, is small in the product with the density at the start.
 
-            e^(b / 6) D e^(2 b / 3 - tau G b'^2 / 72) D e^(b / 6),    D = exp(tau A / 2)
-
-        in each of s parts, of fourth order in tau (Chin 1997, scheme A), with more parts until they agree.
+        With `ends`, whether it is small in the message itself between these.
         """
-        modes, at_start = gauge.modes, self._weights(window, gauge)
-        assert modes is not None
-        curved = covariance * derivative(weight, window.spacing, window.closed) ** 2
-        before, noise = None, 0.0
-        for count in DIVISIONS:
-            part = length / count
-            edge = np.exp(weight / (6.0 * count))
-            middle = np.exp(2.0 * weight / (3.0 * count) - part * curved / (72.0 * count**2))
-            now = values
-            for _ in range(count):
-                half, one = _decayed(edge * now, modes, 0.5 * part)
-                now, two = _decayed(middle * half, modes, 0.5 * part)
-                now = edge * now
-                noise = max(noise, one, two)
-            if before is not None:
-                error = float(at_start @ np.abs(now - before) / (15.0 * (at_start @ now)))
-                if error < DIVIDED * self.tolerance:
-                    self.error += error
-                    now = now + (now - before) / 15.0
-                    return now, count * noise / float(np.max(now))
-            before = now
-        return None
-
-    def _weights(self, window: lw.Window, gauge: Gauge) -> Array:
-        """Return what psi is multiplied by in the product with the density at the start (N,)."""
-        density = reliable(self.state, window)
-        return np.where(density > 0.0, np.exp(np.log(density) - gauge.values), 0.0)
-
-    def _exact(self, psi: Array, gauge: Gauge, window: lw.Window, error: float) -> bool:
-        """Return whether the error of psi, relative to its maximum, is small in the product with the density at the start."""
-        weights, top = self._weights(window, gauge), float(np.max(psi))
-        return bool(max(error, 1e-15) * top * np.sum(weights) < 1e-2 * self.tolerance * (weights @ psi))
+        own, top = self.state.window, float(np.max(psi))
+        if ends is not None:
+            between = (window.offsets >= ends[0]) & (window.offsets <= ends[1])
+            return bool(max(error, 1e-15) * np.exp(np.ptp(gauge.values[between])) < 1e-2 * self.tolerance)
+        if own.spacing < window.spacing:  # of which the grid may have no point
+            density = reliable(self.state, own)
+            density, offsets = density[density > 0.0], own.offsets[density > 0.0]
+            log_gauge = local_polynomial(gauge.values, window, offsets)
+            log_psi = local_polynomial(np.log(np.maximum(psi, ROUNDING * top) / top), window, offsets)
+        else:
+            density = reliable(self.state, window)
+            inside = density > 0.0
+            density, log_gauge, log_psi = density[inside], gauge.values[inside], np.log(np.maximum(psi[inside], 0.0) / top)
+        log_density = np.log(density) - log_gauge
+        wrong, whole = logsumexp(log_density) + np.log(max(error, 1e-15)), logsumexp(log_density + log_psi)
+        return bool(wrong < whole + np.log(1e-2 * self.tolerance))
 
     def _gauge(self, window: lw.Window) -> Gauge:
         """Return the gauge of the interval on a grid."""
