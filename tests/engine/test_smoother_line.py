@@ -65,6 +65,26 @@ def test_sharp_samples_hold_the_paths_between_them():
     assert result.warnings == []
 
 
+@pytest.mark.parametrize("noise", [1e-6, 1e-4])
+def test_samples_that_are_far_sharper_than_the_noise(noise):
+    model = zakai.Model(
+        state=["x"], drift=["-x"], diffusion=[["0.6"]], observation=["x"], observation_noise=[[str(noise)]],
+        observation_kind="samples", prior={"kind": "gaussian", "mean": [0.0], "cov": [4.0]},
+    )  # fmt: skip
+    times = np.cumsum([0.3, 0.02, 0.4, 0.9, 0.1])
+    values = np.array([0.4, 0.45, np.nan, 0.1, 0.2])
+    smoothed = zakai.smooth(model, zakai.Record(times, values[:, None], "samples"), method="yau-yau")
+    # The joint normal law of the states at the start and at the times, given the samples.
+    t = np.append(0.0, times)
+    joint = np.exp(-(t[:, None] + t)) * (4.0 + 0.18 * np.expm1(2.0 * np.minimum(t[:, None], t)))
+    seen = np.flatnonzero(np.isfinite(values)) + 1
+    gain = joint[:, seen] @ np.linalg.inv(joint[np.ix_(seen, seen)] + noise * np.eye(len(seen)))
+    deviation = np.sqrt(np.diag(joint - gain @ joint[seen]))
+    assert not smoothed.warnings
+    assert np.all(np.abs(smoothed.mean[:, 0] - gain @ values[seen - 1]) < 1e-6 * deviation)
+    assert np.all(np.abs(np.sqrt(smoothed.variance[:, 0]) - deviation) < 1e-6 * deviation)
+
+
 @pytest.mark.parametrize("kind", ["samples", "increments"])
 def test_a_broad_prior_is_smoothed_as_its_evidence_says(kind):
     # The derivative of the evidence for the mean of a prior N(mean, 1) is the smoothed mean less the prior's.

@@ -159,8 +159,9 @@ def _shared(state: State, after: lw.Window, later: Message, product: Array, grid
     found = []
     for window in sorted({own, after}, key=lambda window: window.spacing, reverse=True):
         if _holds(window, low, high):
-            look = lw.figures(lw.resampled(product, grid, window), window.closed)
-            found += [window] if look.aliasing <= lb.UNRESOLVED else []
+            on_it = lw.resampled(product, grid, window)
+            whole = abs(float(np.sum(on_it)) - 1.0) <= lb.UNRESOLVED  # or it stands between the points
+            found += [window] if whole and lw.figures(on_it, window.closed).aliasing <= lb.UNRESOLVED else []
     return found
 
 

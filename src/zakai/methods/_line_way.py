@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.special import logsumexp
 
 from zakai.methods import _line
 from zakai.methods._line_attempt import MAGNUS
@@ -76,7 +75,9 @@ class Way:
             found = self._by_kernel(later)
             if found is None and not self.prepared.system.varying:
                 found = self._substep(later, 0.0, self.length, False)
-            found = self._by_volumes(self._eased(later)) if found is None else found
+            if found is None:
+                later = self._eased(later)
+                found = self._by_volumes(later)
             if found is not None:
                 return found
         return self._in_parts(later)
@@ -198,7 +199,7 @@ class Way:
 
     def _by_volumes(self, later: Message) -> Message | None:
         """Return the message at the start of the interval from finite volumes, None where they do not serve."""
-        state, window = self.state, self.state.window
+        narrow, state, window = self.length < self.prepared.lengths[self.k], self.state, self.state.window
         values = np.asarray(state.values).real
         interval = self.start, self.length, self.inside, float(np.sqrt(later.variance))
         course = course_of(self.prepared, values, window, ends_of(values, window), *interval)
@@ -207,8 +208,8 @@ class Way:
             return lw.density_at(values, window, offsets)
 
         def log_worth(offsets: Array) -> Array:
-            low, high = later.ends
-            return np.where((offsets >= low) & (offsets <= high), later.at(offsets), later.logs.max() - BEYOND)
+            (low, high), logs = later.ends, later.at(offsets)
+            return np.where((offsets >= low) & (offsets <= high), logs, logs - BEYOND) if narrow else logs
 
         found = pulled_back(self.prepared, log_worth, density, course, self.start, self.inside, self.rates)
         if found is None:
@@ -217,7 +218,7 @@ class Way:
         needed = min(max(later.needed, 0.5 * RESOLVED * least), window.spacing)
         new = points_of(later.window, *self.ends, needed)
         values = found.at(new.offsets)
-        self.error = found.error
+        self.error += found.error
         logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + found.log_scale
         origin, centre, spacing, _, closed, unit = new
         return Message(logs, origin, centre, spacing, unit, closed, needed, later.error)
@@ -281,9 +282,9 @@ class Way:
             density = reliable(self.state, window)
             inside = density > 0.0
             density, log_gauge, log_psi = density[inside], gauge.values[inside], np.log(np.maximum(psi[inside], 0.0) / top)
-        log_density = np.log(density) - log_gauge
-        wrong, whole = logsumexp(log_density) + np.log(max(error, 1e-15)), logsumexp(log_density + log_psi)
-        return bool(wrong < whole + np.log(1e-2 * self.tolerance))
+        logs, product = np.log(density) - log_gauge, np.log(density) - log_gauge + log_psi
+        shift = np.max(product)
+        return bool(max(error, 1e-15) * np.sum(np.exp(logs - shift)) < 1e-2 * self.tolerance * np.sum(np.exp(product - shift)))
 
     def _gauge(self, window: lw.Window) -> Gauge:
         """Return the gauge of the interval on a grid."""
