@@ -26,10 +26,10 @@ from zakai.methods._line_figures import edge_of_moments, figures, outside_tables
 from zakai.methods._line_grids import SHARED
 from zakai.methods._line_model import system_of
 from zakai.methods._line_moves import Passage, Report, by_decomposition, by_kernel, by_substeps
-from zakai.methods._line_parts import segment_of_parts
+from zakai.methods._line_parts import parts_of_step, segment_of_parts
 from zakai.methods._line_prior import init as init
 from zakai.methods._line_prior import state_of
-from zakai.methods._line_system import NOISE, Prepared, State
+from zakai.methods._line_system import NOISE, Parts, Prepared, State
 from zakai.methods._line_tables import covariance_at
 from zakai.methods._line_update import exponential_factor, factor_at_end, sampled_weakly
 from zakai.methods._line_volumes import contracted
@@ -77,9 +77,7 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
 def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
     """Return the state after interval k and the observation at its stop, and the report."""
     if prepared.parts is not None:
-        states, infos = segment_of_parts(prepared.parts, slice(k, k + 1), state, observed[None], segment_of_whole)
-        figures = {name: float(values[0]) for name, values in infos.health.items()}
-        return states[0], Info(infos.log_likelihood_increment[0], infos.mean[0], infos.cov[0], figures)
+        return _of_parts(prepared.parts, k, state, observed)
     if prepared.fast[k]:
         found = loop.one(prepared, k, state, observed)
         if found is not None:
@@ -88,6 +86,12 @@ def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tupl
     with np.errstate(all="ignore"):
         stepped = single(prepared, k, state, observed)
     return stepped.state, stepped.info
+
+
+def _of_parts(parts: Parts, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
+    states, infos = segment_of_parts(parts, slice(k, k + 1), state, observed[None], segment_of_whole)
+    health = {name: float(values[0]) for name, values in infos.health.items()}
+    return states[0], Info(infos.log_likelihood_increment[0], infos.mean[0], infos.cov[0], health)
 
 
 def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos]:
@@ -159,6 +163,10 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> St
     inside = prepared.inside[k]
     if prepared.lie and not inside.all():
         inside = np.zeros_like(inside)
+    parts = parts_of_step(prepared, k, values, window)
+    if parts is not None:
+        after, info = _of_parts(parts, 0, state, observed)
+        return Stepped(after, info, (), np.asarray(after.values), after.window)
     passages: tuple[Passage, ...] = ()
     before, gained, contraction = lw.moments(values, window), 0.0, 1.0
     if length > 0:

@@ -20,9 +20,9 @@ from zakai.methods._line_adjoint import back
 from zakai.methods._line_figures import state_moments
 from zakai.methods._line_loop import joined
 from zakai.methods._line_message import Message, points_of, reliable, support
-from zakai.methods._line_parts import cut
+from zakai.methods._line_parts import cut, parts_of_step
 from zakai.methods._line_paths import draw
-from zakai.methods._line_system import Prepared, State
+from zakai.methods._line_system import Parts, Prepared, State
 from zakai.methods._line_update import exponential_factor, factor_at_end
 from zakai.methods._line_way import Way, negligible, smoothing_tolerance
 from zakai.methods._protocol import Backward, Info, Infos
@@ -74,11 +74,14 @@ def segment(
     """Return the message at the start of the intervals of a slice, and the reports after each."""
     if prepared.parts is None:
         return _of_whole(prepared, rows, states, later, observed)
+    return _of_parts(prepared.parts, rows, states[0], later, observed)
+
+
+def _of_parts(parts: Parts, rows: slice, state: State, later: Message, observed: np.ndarray) -> tuple[Message, Infos]:
     # What a report says of the step after it belongs to that interval's gain.
-    parts = prepared.parts
     inner, values, last = cut(parts, rows, observed)
-    between, _ = _line.segment_of_whole(parts.prepared, inner, states[0], values)
-    found, infos = _of_whole(parts.prepared, inner, Joined([[states[0]], between]), later, values)
+    between, _ = _line.segment_of_whole(parts.prepared, inner, state, values)
+    found, infos = _of_whole(parts.prepared, inner, Joined([[state], between]), later, values)
     gained = infos.log_likelihood_increment
     health = {name: np.fmax.reduceat(figures, last) for name, figures in infos.health.items()}
     reports = Infos(np.add.reduceat(gained, last), infos.mean[last], infos.cov[last], health)
@@ -135,6 +138,9 @@ def _smoothed(prepared: Prepared, state: State, later: Message, found: _Product)
 @np.errstate(all="ignore")
 def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state: State) -> Message:
     """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
+    parts = parts_of_step(prepared, k, np.asarray(state.values), state.window)
+    if parts is not None:
+        return _of_parts(parts, slice(0, 1), state, later, observed[None])[0]
     length = float(prepared.lengths[k])
     later = later.on(points_of(later.window, *later.ends, later.needed))
     before = later.variance

@@ -101,12 +101,12 @@ def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -
         is_sharp = sharp.is_sharp(prepared, first, state)
         own = own or (not is_sharp and general and bool(prepared.schedule.seen[first].any()))
         if own or is_sharp:
-            if prepared.kinked or state.closed:
+            if prepared.kinked or prepared.gaussian or state.closed:
                 break
             found = sharp.advanced(prepared, first, rows.stop, state, observed[first - rows.start :], own)
             piece = None if found is None else Piece.of(first, state, *found[:-1])._replace(coarse=found.coarse)
         else:
-            here = slice(first, min(rows.stop, first + (1 if general else TOGETHER if prepared.mixed else len(observed))))
+            here = slice(first, min(rows.stop, first + (1 if general or prepared.cut_up else TOGETHER if prepared.mixed else len(observed))))
             grid = grid_of(prepared, state.window, here)
             if grid is None:
                 break
@@ -119,7 +119,7 @@ def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -
             if len(segment.reports):
                 piece = _piece(first, state, grid.start, segment)
         if piece is not None:
-            last = regridded(prepared, piece.last) if why == AFTER else piece.last
+            last = regridded(prepared, piece.last) if why == AFTER or prepared.cut_up else piece.last
             pieces.append(piece._replace(last=last))
             attempts, state, first = 1, last, first + len(piece.reports)
         if why == FAILED or (why == OK and piece is None):

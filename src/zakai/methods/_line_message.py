@@ -17,6 +17,7 @@ FALL = 3.3  # spacings over which F falls
 HALF = 14.0  # spacings from where F is one to where it is one half
 PAD = 28  # spacings over which F falls to zero
 FEWEST = 12  # points of a message
+FEW = 16  # larger grids have a multiple of so many points: few different sizes
 SURE = 10.0  # errors of a density from which its small values count
 LOWEST = -30.0  # logarithm of the largest error of small values, relative to the largest value
 
@@ -99,6 +100,7 @@ def points_of(window: lw.Window, low: float, high: float, spacing: float) -> lw.
     spacing = lw.quantized(window, low, high, spacing).spacing
     first, last = np.floor(low / spacing + 1e-9), np.ceil(high / spacing - 1e-9)
     size = max(int(last - first) + 1, FEWEST)
+    size = size if size < 4 * FEW else FEW * -(-size // FEW)
     return window._replace(centre=float((first + size // 2) * spacing), spacing=spacing, size=size)
 
 

@@ -1,4 +1,4 @@
-"""Intervals in which few nodes do not resolve the coefficients, cut into parts in which they do.
+"""Intervals cut into parts: where few nodes do not resolve the coefficients, or where noise makes a density far wider.
 
 The observation is linear in time within an interval, so that each part has its share of an increment; a sample, or an increment
 that was gathered over more than the interval, belongs to the last part.
@@ -14,8 +14,12 @@ import numpy as np
 
 from zakai.methods._line_system import Parts, Prepared, State
 from zakai.methods._protocol import Infos
+from zakai.numerics.line_density import support
+from zakai.numerics.line_window import CUT, Window
 from zakai.records.schedule import Schedule, lengths_of
 
+WIDER = 2.0  # ranges of a density by which the noise of a part moves its ends
+REACH = 8.6  # standard deviations to the end of a density
 ROUNDS = 2  # of cutting, after which what is not resolved is left to adaptive substeps
 SUMS = ("time_error", "tolerance_ratio")  # figures of parts that add up
 
@@ -79,6 +83,38 @@ def parts_of(prepared: Prepared) -> Parts | None:
     shares = np.where(found.lengths < prepared.lengths[owner], found.lengths / prepared.lengths[owner], 1.0)
     found.shares = shares
     return Parts(found, first)
+
+
+def parts_of_step(prepared: Prepared, k: int, values: np.ndarray, window: Window) -> Parts | None:
+    """Return the parts of interval k over which a density grows by a few times each, and its sample; None where it needs none.
+
+    Args:
+        prepared: a system whose transitions the compiled loop splits.
+        k: an interval without increments inside.
+        values, window: the density before it, and its grid.
+    """
+    start, stop, length = (float(part[k]) for part in (prepared.schedule.starts, prepared.schedule.stops, prepared.lengths))
+    if prepared.cut_up or not (prepared.gaussian and prepared.divides and length > 0) or window.closed or prepared.inside[k].any():
+        return None
+    if prepared.kernels is not None or np.iscomplexobj(values) or np.iscomplexobj(prepared.theta):
+        return None
+    t = np.linspace(start, stop, 9)
+    most = float(np.max(prepared.system.covariance(np.zeros((9, 1)), t, prepared.theta)[..., 0, 0]))
+    first, last = support(np.ascontiguousarray(values), CUT)
+    width, bounds = (last - first) * window.spacing, [start]
+    while not most * (stop - bounds[-1]) <= (WIDER * width / REACH) ** 2:
+        bounds.append(bounds[-1] + (WIDER * width / REACH) ** 2 / most)
+        width *= 1.0 + 2.0 * WIDER
+    count, schedule = len(bounds) + 1, prepared.schedule
+    if count == 2 and not schedule.seen[k].any():
+        return None
+    seen = np.zeros((count, prepared.system.m), bool)
+    seen[-1] = schedule.seen[k]
+    starts, stops = np.array([*bounds, stop]), np.array([*bounds[1:], stop, stop])
+    found = Schedule(starts, stops, seen, np.where(seen, schedule.elapsed[k], 0.0), schedule.inputs)
+    shares = np.append(found.lengths[:-1] / length, 1.0)
+    own = replace(prepared, schedule=found, lengths=found.lengths, inside=found.inside, shares=shares, cut_up=True)
+    return Parts(own, np.array([0, count]))
 
 
 def _bounds(prepared: Prepared, k: int, count: int) -> list[Any]:

@@ -75,7 +75,7 @@ class Prepared:
     `tolerance` is what substeps are chosen for, `promised` the error of a step above which a result warns; `negligible` the
     spectrum that need not be resolved; `generous` the size of a grid that is kept though fewer points would do; `pieces` whether
     densities are polynomials between ends and kinks; `kept` holds what was computed for single grids; `shares` (K,) are those of
-    parts in the time of their intervals.
+    parts in the time of their intervals, and `cut_up` whether these are parts of one interval.
     """
 
     model: Model
@@ -96,6 +96,7 @@ class Prepared:
     notes: tuple[str, ...] = ()
     shares: np.ndarray | None = None
     pieces: bool = False
+    cut_up: bool = False
 
     @cached_property
     def kept(self) -> dict[Any, Any]:

@@ -108,7 +108,7 @@ class Way:
         """Take a message that is far narrower than the noise of the interval back over the last part, which is left out then."""
         part, (low, high) = LAST * self.length, later.ends
         least, most = self._noise(low, high, part)
-        if self.prepared.system.varying or high - low > least:
+        if high - low > least:
             return later
         found = self._substep(later, self.length - part, self.length, False, (low - TAIL * most, high + TAIL * most))
         self.length -= 0.0 if found is None else part

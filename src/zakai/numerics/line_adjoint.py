@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line_averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, averaged, averaging, operators
 from zakai.numerics.line_backward import ERROR, LOG_MASS, SMALLEST, Filtered, Limits, Message, Taken, kept, multiplied, spread
-from zakai.numerics.line_density import highest_of, support, waves
+from zakai.numerics.line_density import highest_of, moments, support, waves
 from zakai.numerics.line_segment import SPLIT, Grid, Steps
 from zakai.numerics.line_splitting import differences, residual, split
 
@@ -34,6 +34,20 @@ def _shifted(values: Array, by: int) -> Array:
     for j in range(max(0, by), min(values.size, by + values.size)):
         found[j - by] = values[j]
     return found
+
+
+@helper
+def held(before: Array, by: int, after: Array, noise: float) -> bool:
+    """Return whether a grid holds the paths between two densities on it, with this deviation of the noise in spacings.
+
+    The first density begins `by` points later.  Halfway a path deviates by half of the noise.
+    """
+    low, high = np.inf, -np.inf
+    for values, shift in ((before, by), (after, 0)):
+        _, mean, variance = moments(values)
+        middle, reach = mean + values.size // 2 + shift, 5.0 * np.sqrt(variance)
+        low, high = min(low, middle - reach), max(high, middle + reach)
+    return low - 2.5 * noise >= 0.0 and high + 2.5 * noise <= before.size - 1.0
 
 
 @helper
@@ -105,7 +119,10 @@ def _adjoint(
             return taken, first, last, start, error
         if not closed:  # the paths from one support to the other
             begins, ends = support(densities[i], SMALLEST)
-            margin = int(EXCURSION * np.sqrt(max(covariances[i].max(), 0.0) * lengths[i]) / spacing) + 1
+            noise = np.sqrt(max(covariances[i].max(), 0.0) * lengths[i]) / spacing
+            if not held(densities[i], starts[i] - start, product, noise):
+                return taken, first, last, start, error
+            margin = int(EXCURSION * noise) + 1
             low = max(min(first, begins + starts[i] - start) - margin, low)
             high = min(max(last, ends + starts[i] - start) + margin, high)
         points = high - low + 1

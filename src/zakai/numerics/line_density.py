@@ -91,9 +91,8 @@ def separated(values: Array) -> bool:
 @lru_cache(maxsize=16)
 def waves(size: int) -> tuple[Array, Array]:
     """Return cos(2 pi k i / size) and the sines (size // 2 + 1, size)."""
-    angle = 2.0 * np.pi / size * (np.outer(np.arange(size // 2 + 1), np.arange(size)) % size)
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return cosine, sine
+    turns, angle = np.outer(np.arange(size // 2 + 1), np.arange(size)) % size, 2.0 * np.pi / size * np.arange(size)
+    return np.cos(angle)[turns], np.sin(angle)[turns]
 
 
 @kernel(types.UniTuple(_F, 9)(_F[::1], _F, _F, _F[:, ::1], _F[:, ::1], boolean), reordered=True)  # type: ignore[no-untyped-call]

@@ -48,6 +48,7 @@ from zakai.numerics.line_window import ALIGNMENT, CUT
 
 Array = NDArray[Any]
 
+COARSE = 1e-5  # spectrum of a product at the highest frequencies from which a somewhat finer grid does not serve
 _V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1]
 
 
@@ -171,7 +172,7 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
                 if not (aliasing <= limit):
                     answer[0], answer[1], answer[2] = float(low), float(high), 0.6 * spacing
                     status = FAILED if weak or not (positive or modal) or not (aliasing < np.inf) else RANGE
-                    if modal and not closed and status == RANGE:
+                    if not closed and status == RANGE and (modal or aliasing > COARSE):
                         status = UNRESOLVED
                     break
                 if np.isnan(added) or not (closed or max(left, right) < 1e-10):
