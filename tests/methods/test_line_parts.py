@@ -90,3 +90,28 @@ def test_a_forced_angle_around_the_end_of_its_grid():
     result = zakai.filter(model, zakai.Record(times, values[:, None], "samples"), method="yau-yau")
     assert not result.warnings
     assert abs(result.log_likelihood - total) < 1e-6
+
+
+def test_a_forced_state_and_a_sharp_sensor():
+    # The linear equation, by the joint normal law of the states at the start and at the times.
+    model = zakai.Model(
+        state=["x"], drift=["cos(9*t) - x"], diffusion=[["0.6"]], observation=["x"], observation_noise=[["1e-6"]],
+        observation_kind="samples", prior={"kind": "gaussian", "mean": [0.2], "cov": [0.3]},
+    )  # fmt: skip
+    times = np.cumsum([0.2, 0.02, 0.3, 0.5, 0.05])
+    values = np.array([0.5, 0.48, np.nan, 0.2, 0.3])
+    smoothed = zakai.smooth(model, zakai.Record(times, values[:, None], "samples"), method="yau-yau")
+    t = np.append(0.0, times)
+    mean = np.exp(-t) * 0.2 + (9.0 * np.sin(9.0 * t) + np.cos(9.0 * t) - np.exp(-t)) / 82.0
+    joint = np.exp(-(t[:, None] + t)) * (0.3 + 0.18 * np.expm1(2.0 * np.minimum(t[:, None], t)))
+    seen = np.flatnonzero(np.isfinite(values)) + 1
+    covariance = joint[np.ix_(seen, seen)] + 1e-6 * np.eye(len(seen))
+    rest = values[seen - 1] - mean[seen]
+    gain = joint[:, seen] @ np.linalg.inv(covariance)
+    deviation = np.sqrt(np.diag(joint - gain @ joint[seen]))
+    assert not smoothed.filtered.warnings and np.all(smoothed.health["evidence_error"] < 1e-6)
+    assert np.all(np.abs(smoothed.mean[:, 0] - mean - gain @ rest) < 1e-6 * deviation)
+    assert np.all(np.abs(np.sqrt(smoothed.variance[:, 0]) - deviation) < 1e-6 * deviation)
+    _, log_det = np.linalg.slogdet(2.0 * np.pi * covariance)
+    evidence = -0.5 * (log_det + rest @ np.linalg.solve(covariance, rest))
+    assert abs(smoothed.filtered.log_likelihood - evidence) < 1e-6

@@ -22,7 +22,16 @@ from zakai.errors import InputError
 from zakai.methods import _line_loop as loop
 from zakai.methods._line_cross import OMITTED
 from zakai.methods._line_domain import on_the_line, variable_of
-from zakai.methods._line_figures import edge_of_moments, figures, outside_tables, refitted, resampled, state_moments
+from zakai.methods._line_figures import (
+    edge_of_moments,
+    figures,
+    forgetting,
+    outside_tables,
+    refitted,
+    resampled,
+    spread,
+    state_moments,
+)
 from zakai.methods._line_grids import SHARED
 from zakai.methods._line_model import system_of
 from zakai.methods._line_moves import Passage, Report, by_decomposition, by_kernel, by_substeps
@@ -30,7 +39,6 @@ from zakai.methods._line_parts import parts_of_step, segment_of_parts
 from zakai.methods._line_prior import init as init
 from zakai.methods._line_prior import state_of
 from zakai.methods._line_system import NOISE, Parts, Prepared, State
-from zakai.methods._line_tables import covariance_at
 from zakai.methods._line_update import exponential_factor, factor_at_end, sampled_weakly
 from zakai.methods._line_volumes import contracted
 from zakai.methods._protocol import Info, Infos
@@ -165,8 +173,8 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> St
         inside = np.zeros_like(inside)
     parts = parts_of_step(prepared, k, values, window)
     if parts is not None:
-        after, info = _of_parts(parts, 0, state, observed)
-        return Stepped(after, info, (), np.asarray(after.values), after.window)
+        state, info = _of_parts(parts, 0, state, observed)
+        return Stepped(state, info, (), np.asarray(state.values), state.window)
     passages: tuple[Passage, ...] = ()
     before, gained, contraction = lw.moments(values, window), 0.0, 1.0
     if length > 0:
@@ -263,23 +271,6 @@ def kernel_of(prepared: Prepared, k: int, window: lw.Window, rates: np.ndarray, 
     place = int(kernels.place[k])
     report.time += float(kernels.errors[place])
     return around(chosen(kernels.channels, place, np.concatenate([np.ones(1), rates])), window.origin - kernels.origin)
-
-
-def forgetting(before: Any, predicted: Any, after: Any, spread: float) -> float:
-    """Return the remainder of an old relative error after a step, from the variances: that of an error of the mean in deviations.
-
-    `spread` is the integral of G over the interval, which counts where the observation acts inside.
-    """
-    ratio = np.sqrt(max(before.real * after.real, 0.0)) / max(predicted.real, 1e-300)
-    return float(np.clip(ratio * np.exp(-min(0.5 * spread / max(before.real, 1e-300), 5.0)), 0.3, 1.0))
-
-
-def spread(prepared: Prepared, k: int, length: float, mean: float) -> float:
-    """Return about the integral of G over interval k where increments act inside."""
-    if not prepared.inside[k].any():
-        return 0.0
-    middle = float(prepared.schedule.starts[k]) + 0.5 * length
-    return length * float(np.max(covariance_at(prepared.system, np.array([mean]), middle, prepared.theta).real))
 
 
 def valid(prepared: Prepared, state: State) -> bool:

@@ -31,6 +31,7 @@ from zakai.numerics import line_window as lw
 
 Array = Any
 
+KINKED = 16.0  # points of a likelihood with kinks in the spacing that a message needs
 SMALLEST = 1e-13  # value of a smoothed density relative to its maximum that is not rounding
 
 
@@ -51,7 +52,10 @@ class _Product(NamedTuple):
 def _product(state: State, later: Message) -> _Product:
     finer = state.window
     if later.spacing < 0.9999 * finer.spacing:
-        finer = points_of(finer, float(finer.offsets[0]), float(finer.offsets[-1]), later.spacing)
+        low, high = float(finer.offsets[0]), float(finer.offsets[-1])
+        if not finer.closed and later.spacing < 0.25 * finer.spacing:  # a message that is far narrower than the density
+            low, high = max(low, later.ends[0]), min(high, later.ends[1])
+        finer = points_of(finer, low, high, later.spacing)
     density = reliable(state, finer)
     logs = np.where(density > 0, np.log(density) + later.at(finer.offsets), -np.inf)
     top = float(np.max(logs))
@@ -142,7 +146,8 @@ def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state
     if parts is not None:
         return _of_parts(parts, slice(0, 1), state, later, observed[None])[0]
     length = float(prepared.lengths[k])
-    later = later.on(points_of(later.window, *later.ends, later.needed))
+    finer = KINKED if prepared.weak and prepared.schedule.seen[k].any() else 1.0
+    later = later.on(points_of(later.window, *later.ends, later.needed / finer))
     before = later.variance
     inside = prepared.inside[k]
     if prepared.lie and not inside.all():

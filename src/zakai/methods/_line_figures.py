@@ -8,6 +8,7 @@ import numpy as np
 
 from zakai.methods._line_domain import variable_of
 from zakai.methods._line_system import Prepared
+from zakai.methods._line_tables import covariance_at
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_density import support
 from zakai.numerics.line_weak import at_nodes, nodes, weak
@@ -84,3 +85,20 @@ def edge_of_moments(prepared: Prepared, values: Array, window: lw.Window) -> flo
     offsets = variable.offset(window.points)
     parts = (offsets - offsets[int(np.argmax(values.real))]) ** 2 * values.real
     return float(max(parts[0], parts[-1]) / np.sum(parts))
+
+
+def forgetting(before: Any, predicted: Any, after: Any, spread: float) -> float:
+    """Return the remainder of an old relative error after a step, from the variances: that of an error of the mean in deviations.
+
+    `spread` is the integral of G over the interval, which counts where the observation acts inside.
+    """
+    ratio = np.sqrt(max(before.real * after.real, 0.0)) / max(predicted.real, 1e-300)
+    return float(np.clip(ratio * np.exp(-min(0.5 * spread / max(before.real, 1e-300), 5.0)), 0.3, 1.0))
+
+
+def spread(prepared: Prepared, k: int, length: float, mean: float) -> float:
+    """Return about the integral of G over interval k where increments act inside."""
+    if not prepared.inside[k].any():
+        return 0.0
+    middle = float(prepared.schedule.starts[k]) + 0.5 * length
+    return length * float(np.max(covariance_at(prepared.system, np.array([mean]), middle, prepared.theta).real))

@@ -106,7 +106,8 @@ def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -
             found = sharp.advanced(prepared, first, rows.stop, state, observed[first - rows.start :], own)
             piece = None if found is None else Piece.of(first, state, *found[:-1])._replace(coarse=found.coarse)
         else:
-            here = slice(first, min(rows.stop, first + (1 if general or prepared.cut_up else TOGETHER if prepared.mixed else len(observed))))
+            together = 1 if general or prepared.cut_up else TOGETHER if prepared.mixed else len(observed)
+            here = slice(first, min(rows.stop, first + together))
             grid = grid_of(prepared, state.window, here)
             if grid is None:
                 break

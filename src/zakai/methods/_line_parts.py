@@ -94,14 +94,15 @@ def parts_of_step(prepared: Prepared, k: int, values: np.ndarray, window: Window
         values, window: the density before it, and its grid.
     """
     start, stop, length = (float(part[k]) for part in (prepared.schedule.starts, prepared.schedule.stops, prepared.lengths))
-    if prepared.cut_up or not (prepared.gaussian and prepared.divides and length > 0) or window.closed or prepared.inside[k].any():
+    split = prepared.gaussian and prepared.divides and prepared.kernels is None and length > 0
+    if prepared.cut_up or not split or window.closed or prepared.inside[k].any():
         return None
-    if prepared.kernels is not None or np.iscomplexobj(values) or np.iscomplexobj(prepared.theta):
+    if np.iscomplexobj(values) or np.iscomplexobj(prepared.theta):
         return None
     t = np.linspace(start, stop, 9)
     most = float(np.max(prepared.system.covariance(np.zeros((9, 1)), t, prepared.theta)[..., 0, 0]))
     first, last = support(np.ascontiguousarray(values), CUT)
-    width, bounds = (last - first) * window.spacing, [start]
+    width, bounds = max(last - first, 1) * window.spacing, [start]
     while not most * (stop - bounds[-1]) <= (WIDER * width / REACH) ** 2:
         bounds.append(bounds[-1] + (WIDER * width / REACH) ** 2 / most)
         width *= 1.0 + 2.0 * WIDER

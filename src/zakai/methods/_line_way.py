@@ -73,7 +73,7 @@ class Way:
         """Return the message at the start of the interval."""
         if not later.closed:
             found = self._by_kernel(later)
-            if found is None and not self.prepared.system.varying:
+            if found is None and not (self.prepared.system.varying or self.prepared.system.rough):
                 found = self._substep(later, 0.0, self.length, False)
             if found is None:
                 later = self._eased(later)
@@ -184,7 +184,7 @@ class Way:
         if (high - low) > MOST_POINTS * WIDTH * deviation:
             return None
         spacing = min(max(later.needed, RESOLVED * deviation) / max(abs(kernel.scale), 1e-3), (begins[1] - begins[0]) / FEWEST)
-        fine = points_of(later.window, low, high, min(later.needed, WIDTH * deviation))
+        fine = points_of(later.window, low, high, min(later.spacing, WIDTH * deviation))
         new = points_of(later.window, *begins, spacing)
         x, y, theta = fine.offsets, new.offsets, prepared.theta.real
         after = later.at(x) + prepared.yau.potential(fine.points, self.start + self.length, theta)

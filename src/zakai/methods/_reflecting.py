@@ -14,8 +14,7 @@ import numpy as np
 
 from zakai.densities import IntervalDensity
 from zakai.errors import InputError
-from zakai.methods._line import forgetting, spread
-from zakai.methods._line_figures import outside_tables
+from zakai.methods._line_figures import forgetting, outside_tables, spread
 from zakai.methods._line_moves import Report
 from zakai.methods._line_system import NOISE, Prepared
 from zakai.methods._line_update import factor_at_end
