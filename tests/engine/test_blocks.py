@@ -336,3 +336,14 @@ def test_features_of_models_are_those_of_their_blocks(smooth):
         alone = run(model([part]), zakai.Record(record.times, values[:, [i]], "samples"))
         assert np.array_equal(result.mean[:, i], alone.mean[:, 0])
         assert np.array_equal(result.variance[:, i], alone.variance[:, 0])
+
+
+def test_a_stored_result_of_a_smoother_says_so_when_it_is_read(tmp_path):
+    model = pairs(2, np.zeros(4))
+    result = zakai.smooth(model, record_of(model))
+    result.save(tmp_path / "smoothed.nc")
+    again = zakai.load_result(tmp_path / "smoothed.nc")
+    assert isinstance(again, zakai.SmoothingResult) and again.to_dataset().attrs["kind"] == "smoothed"
+    assert np.array_equal(again.mean, result.mean)
+    with pytest.raises(InputError, match="sample_paths: a result that was read from a file"):
+        again.sample_paths(2)

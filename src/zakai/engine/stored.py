@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from zakai.engine.results import FilterResult
+from zakai.engine.smoother import SmoothingResult
 from zakai.engine.variables import DIMENSIONS
 from zakai.errors import InputError
 from zakai.models._errors import named
@@ -18,6 +19,7 @@ from zakai.records.netcdf import load_variables
 from zakai.records.writing import shown
 
 _LONGEST_NAME = 64  # of a state, or a method
+_KINDS = ("smoothed", "forecast")  # of results, beside those of filters
 # Names that health figures had in version 0.1.
 _RENAMED = {
     "missed": "tolerance_ratio",
@@ -31,13 +33,13 @@ _RENAMED = {
 
 
 def load_result(path: str | os.PathLike[str]) -> FilterResult:
-    """Read a result that `FilterResult.save` wrote; densities are not stored.
+    """Read a result that its `save` wrote; densities are not stored.
 
     Args:
         path: the file.
 
     Returns:
-        The result.
+        The result, a `SmoothingResult` where one was saved.
 
     Raises:
         InputError: the file is not such a result.
@@ -63,7 +65,8 @@ def result_of(variables: Mapping[str, Any], attributes: Mapping[str, Any], sourc
             raise InputError(f"{source}: {fault}; give a result written by zakai filter")
     text = str(attributes.get("model", ""))
     known = {*DIMENSIONS, "log_likelihood_increment"}
-    return FilterResult(
+    kind = str(attributes.get("kind", ""))
+    return (SmoothingResult if kind == "smoothed" else FilterResult)(
         times=arrays["time"],
         mean=arrays["mean"],
         variance=arrays["variance"],
@@ -74,7 +77,7 @@ def result_of(variables: Mapping[str, Any], attributes: Mapping[str, Any], sourc
         why=str(attributes.get("why", "")),
         model=read_model(text, source) if text else None,
         state=state,
-        attributes=_clock_attributes(attributes, source),
+        attributes=_clock_attributes(attributes, source) | ({"kind": kind} if kind in _KINDS else {}),
         _cov=arrays.get("cov"),
         _no_density=f"{source}: a stored result has no densities; filter again to have them",
     )

@@ -111,7 +111,8 @@ class Record:
         It has another kind or m, too early times, not the model's inputs, or values that the observation family cannot have.
         """
         if self.kind != model.observation_kind:
-            raise InputError(f"record: holds {self.kind}; the model observes {model.observation_kind} (observation_kind)")
+            wanted = model.observation_kind
+            raise InputError(f"record: holds {self.kind}; the model observes {wanted}; give the record kind={wanted!r}")
         if self.values.shape[1] != model.m:
             raise InputError(f"record: values has shape {self.values.shape}; the model needs ({len(self)}, {model.m})")
         too_early = early(self.times[0], self.kind, model.start)
