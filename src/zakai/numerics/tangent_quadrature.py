@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import inf, isfinite, log, nan, pi
+from math import atan, inf, isfinite, log, nan, pi
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,9 @@ Array = NDArray[Any]
 NODES, MOST_NODES = 12, 1536  # of the quadrature: doubled until it has converged
 CHANGE = 3e-3  # between two numbers of nodes; the error of the larger is about its square
 NEGLIGIBLE = 11.0  # nats below the maximum of the density
-MASS_ERROR = 0.02  # of the mass, in nats, from which no node is left out
+HOPELESS = 60.0  # nats below the maximum of two nodes, between which none is taken even where mass is missing
+FARTHEST = atan(3.0)  # likewise; at a scale of three deviations, at most 1/81 of the mass lies beyond (Chebyshev)
+MASS_ERROR = 0.02  # of the mass, in nats, from which nodes beyond the negligible are taken
 
 
 def distribution(
@@ -40,9 +42,10 @@ def distribution(
         top = logs.max()
         if isfinite(top):
             found, mass = _integrated(np.exp(logs - top), places)
-            log_mass = log(mass) + top if mass > 0 else -inf
+            before, log_mass = log_mass, log(mass) + top if mass > 0 else -inf
             if np.abs(found - previous).max() < CHANGE:
-                if abs(log_mass) < MASS_ERROR or count >= 16 * NODES:
+                settled = not skip and abs(log_mass - before) < CHANGE  # the density itself is not normalised
+                if abs(log_mass) < MASS_ERROR or settled or count >= 16 * NODES:
                     break
                 skip = False
         if count >= MOST_NODES:
@@ -52,8 +55,10 @@ def distribution(
         finer[::2] = logs
         near = np.maximum(finer, np.maximum(np.roll(finer, 1), np.roll(finer, -1)))
         for j in np.flatnonzero(np.isneginf(finer)):
-            if (j % 2 and near[j] > top - NEGLIGIBLE) or not (skip and isfinite(top)):
-                finer[j] = log_value(pi * (j / count - 0.5)) if j or angle else -inf
+            u = pi * (j / count - 0.5)
+            empty = -inf < near[j] < top - HOPELESS or (abs(u) > FARTHEST and not angle)
+            if (j % 2 and near[j] > top - NEGLIGIBLE) or not (isfinite(top) and (skip or empty)):
+                finer[j] = log_value(u) if j or angle else -inf
         logs = finer
     return [float(np.clip(value, 0.0, 1.0)) for value in found], log_mass
 
