@@ -13,6 +13,7 @@ from zakai.models._errors import listing
 from zakai.models.model import Model
 
 ITERATIONS = 200
+GAIN = 1e-6  # nats, by which an iteration of L-BFGS-B must raise the log-likelihood; Newton's steps do the rest
 NEAR = 1e-3  # the distance to the maximum, in standard errors, that counts as none
 SINGULAR = 1e-6  # the smallest eigenvalue of the information scaled to a unit diagonal; differences leave 1e-8
 
@@ -75,7 +76,8 @@ def maximum(function: Function, values: np.ndarray, box: np.ndarray, names: tupl
         at = ", ".join(f"{name} = {float(number):g}" for name, number in zip(names, values, strict=True))
         raise InputError(f"{model.source}: start: the log-likelihood does not exist at {at}; give another start")
     limits = (box - values[:, None]) / scale[:, None]
-    settings = {"maxiter": ITERATIONS, "ftol": 1e-13, "gtol": 1e-7 * max(1.0, np.abs(gradient).max() * 1e-3)}
+    gtol = 1e-7 * max(1.0, np.abs(gradient).max() * 1e-3)
+    settings = {"maxiter": ITERATIONS, "ftol": GAIN / max(1.0, abs(value)), "gtol": gtol}
     search = minimize(objective, np.zeros(len(values)), jac=True, method="L-BFGS-B", bounds=limits, options=settings)
     assert objective.best is not None
     # The search may have moved far: the best point gives the new units.
