@@ -29,6 +29,8 @@ def test_other_records_and_other_noises_of_increments_are_refused():
     results = [zakai.filter(model, zakai.simulate(model, np.arange(1, 6), seed=seed)[1]) for seed in (0, 1)]
     with pytest.raises(zakai.InputError, match="different observations"):
         zakai.compare(results)
+    with pytest.raises(zakai.InputError, match="give a list of at least two"):
+        zakai.compare(results[0])
     _, record = zakai.simulate(_model(0.5, kind="increments"), np.arange(1, 6) / 10, seed=0)
     results = [zakai.filter(_model(0.5, noise, "increments"), record) for noise in ("0.2", "0.4")]
     with pytest.raises(zakai.InputError, match="different observation noises"):

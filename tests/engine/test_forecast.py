@@ -29,6 +29,7 @@ def test_a_forecast_of_a_linear_system_is_its_closed_form():
     found = result.forecast(AHEAD)
     assert np.allclose(found.mean[1:, 0], decay * result.mean[-1, 0], atol=1e-12)
     assert np.allclose(found.variance[1:, 0], decay**2 * result.variance[-1, 0] + 1 - decay**2, atol=1e-12)
+    assert np.array_equal(result.forecast(AHEAD[0]).mean, found.mean[:2])
 
 
 def test_a_time_before_the_end_and_a_stored_result_are_refused(tmp_path):
@@ -36,6 +37,8 @@ def test_a_time_before_the_end_and_a_stored_result_are_refused(tmp_path):
     result = zakai.filter(model, zakai.simulate(model, TIMES, seed=1)[1])
     with pytest.raises(zakai.InputError, match="not after the end of the record"):
         result.forecast([TIMES[-1]])
+    with pytest.raises(zakai.InputError, match="forecast: no times"):
+        result.forecast([])
     result.save(tmp_path / "result.nc")
     with pytest.raises(zakai.InputError, match="filter the record again"):
         zakai.load_result(tmp_path / "result.nc").forecast(AHEAD)

@@ -82,6 +82,8 @@ def compare(results: Sequence[FilterResult] | Mapping[str, FilterResult]) -> Com
     Example:
         print(zakai.compare({"linear": zakai.filter(a, record), "cubic": zakai.filter(b, record)}))
     """
+    if isinstance(results, FilterResult):
+        raise InputError("compare: 1 result; give a list of at least two for the same record")
     named = dict(results) if isinstance(results, Mapping) else None
     listed: list[FilterResult] = list(results if named is None else named.values())  # type: ignore[arg-type]
     for result in listed:

@@ -32,6 +32,9 @@ def origin_of(result: FilterResult, what: str) -> tuple[Plan, tuple[Any, ...], R
 def forecast(result: FilterResult, times: Any, inputs: Inputs | None = None) -> FilterResult:
     """Return the density of the state at times after a record; see `FilterResult.forecast`."""
     plan, states, record = origin_of(result, "forecast")
+    times = [times] if np.ndim(times) == 0 else times
+    if not np.size(times):
+        raise InputError("forecast: no times; give at least one time after the end of the record")
     values = np.full((np.size(times), record.values.shape[1]), np.nan)
     known = record.inputs if inputs is None or record.inputs is None else record.inputs.followed_by(inputs)
     future = Record(times, values, record.kind, known, record.unit, record.origin)

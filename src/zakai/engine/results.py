@@ -202,7 +202,7 @@ class FilterResult:
         goes on with unobserved rows.
 
         Args:
-            times: (K,), increasing, after the last time of the record.
+            times: (K,), or one time, increasing, after the last time of the record.
             inputs: for a model with known inputs; they replace those of the record from their first time on.
 
         Raises:
