@@ -96,6 +96,9 @@ def test_a_log_density_is_drawn_from_and_evaluated():
     )
     with pytest.raises(InputError, match="no distribution function"):
         model.observation_law.cdf([0.3], X, 0.0, model.theta())
+    improper = zakai.Model(**KEYS, observation_log_density="z*exp(x) - 5*x", observed=["z"])
+    with pytest.raises(InputError, match="no finite mass over 'z'"):
+        zakai.simulate(improper, [0.5, 1.0])
 
 
 @pytest.mark.parametrize(

@@ -182,9 +182,9 @@ class ObservationLaw:
                 grid = np.linspace(low, high, _DRAW_POINTS)
                 logs = self._log_density(at, t[k], theta, own, grid[:, None])
                 logs = np.where(np.isnan(logs), -np.inf, logs)
-                used = np.flatnonzero(logs > logs.max() - 40.0) if np.isfinite(logs.max()) else np.arange(_DRAW_POINTS)
+                used = np.flatnonzero(logs >= logs.max() - 40.0) if np.isfinite(logs.max()) else np.arange(_DRAW_POINTS)
                 width = high - low
-                if used[0] == 0 and logs[0] > -np.inf or used[-1] == _DRAW_POINTS - 1 and logs[-1] > -np.inf or not len(used):
+                if used[0] == 0 and logs[0] > -np.inf or used[-1] == _DRAW_POINTS - 1 and logs[-1] > -np.inf:
                     low, high = low - width / 2, high + width / 2
                 elif len(used) < _DRAW_POINTS / 8:
                     margin = 4 * width / _DRAW_POINTS
@@ -192,7 +192,9 @@ class ObservationLaw:
                 else:
                     break
             else:
-                raise InputError("observation_log_density: cannot be drawn from: it is no density of z on an interval")
+                name = self._model.observed[0]
+                fault = f"has no finite mass over {name!r}, so that nothing can be drawn; give a density of {name!r}"
+                raise InputError(f"{self._model.source}: observation_log_density: {fault}")
             weights = np.exp(logs - logs.max())
             total = np.concatenate([[0.0], np.cumsum((weights[1:] + weights[:-1]) / 2)])
             draws[k, 0] = np.interp(rng.uniform() * total[-1], total, grid)
