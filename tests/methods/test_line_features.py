@@ -340,3 +340,12 @@ def test_a_fill_value_that_is_no_observation_warns(observation, value):
     )  # fmt: skip
     record = zakai.Record([0.1, 0.2, 0.9], [[0.1], [value], [0.2]], "samples")
     assert any("tail_depth" in warning for warning in zakai.filter(model, record, "limited-direct").warnings)
+
+
+def test_an_end_that_is_reached_is_not_natural():
+    prior = {"kind": "density", "log_density": "-x"}
+    model = model_of(domain={"x": {"lower": 0.0}}, prior=prior)
+    with pytest.raises(zakai.InputError, match="reaches the end 0 of 'x'.*reflecting"):
+        zakai.filter(model, zakai.Record([0.5], [0.3], "samples"))
+    entered = model_of("1/x", domain={"x": {"lower": 0.0}}, prior={"kind": "density", "log_density": "2*log(x) - x**2"})
+    assert zakai.filter(entered, zakai.Record([0.5], [0.3], "samples")).mean[-1, 0] > 0
