@@ -114,7 +114,7 @@ class Prepared:
             if quick is not None:
                 (predicted, report, after), found, quick = quick[:3], quick[3] if factor is None else None, None
             else:
-                predicted, report, after = self._predicted(begin, parts, inside, rates, control, allowed, bounds)
+                predicted, report, after = self.predicted(begin, parts, inside, rates, control, allowed, bounds)
             update = Update(predicted, report.edges, report.tails, 0.0, False)
             if factor is not None:
                 update = updated(predicted, factor, bounds, report.tails)
@@ -141,7 +141,7 @@ class Prepared:
             health["outside_tables"] = float(new.values.real.reshape(-1)[beyond].sum() / new.values.real.sum())
         return new, info._replace(health=health)
 
-    def _predicted(
+    def predicted(
         self,
         begin: Field,
         parts: list[tuple[float, float]],
@@ -150,8 +150,9 @@ class Prepared:
         control: Control,
         allowed: float,
         bounds: Bounds,
+        steppers: list[Stepper] | None = None,
     ) -> tuple[Field, Report, Control]:
-        """Return the density at the end of an interval, advanced over its parts one after the other."""
+        """Return the density at the end of an interval, advanced over its parts one after the other by `steppers`."""
         result, report = begin, NOTHING
         for start, length in parts:
             observations = self.observations.over(start, length)
@@ -171,6 +172,8 @@ class Prepared:
                 points = mean + np.concatenate([np.zeros((1, len(mean))), np.diag(np.sqrt(np.diagonal(cov)))])
                 least = observations.least(points, start, length, inside)
             stepper = Stepper(observations.dynamics, bounds, self.tolerance)
+            if steppers is not None:
+                steppers.append(stepper)
             result, more, control = advance(stepper, result, start, length, potential, control, allowed / len(parts), least)
             unresolved = least >= MOST_PANELS
             if observations.system.state_dependent:

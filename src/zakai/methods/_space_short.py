@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, Protocol
 
 import numpy as np
@@ -54,8 +53,7 @@ def predicted_on(
         return None
     known, singles, pairs = control.known(length, allowed), MOST_FIXED, 1
     if known:
-        singles = max(1, math.ceil(math.sqrt(control.rate * length**3 / allowed)))
-        pairs = max(1, math.ceil((control.extrapolated(length) / allowed) ** 0.25))
+        singles, pairs = control.parts(length, allowed)
     if min(singles, 3 * pairs) > MOST_FIXED:
         return None
     moved = motion_of(prepared, grid, length)

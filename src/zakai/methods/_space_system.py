@@ -52,12 +52,6 @@ class System:
         self.general = model.observation_kind == "samples" and bool(model.u or OF_OBSERVATION & model.features.keys())
         self.tables = [(call.table, numpy_function(list(call.args), model, (len(call.args),))) for call in _table_calls(model)]
         self.state_dependent = STATE_DEPENDENT_DIFFUSION in model.features
-        # The divergence of G and its own divergence, for the backward pass.
-        self.spreading: Callable[..., Array] | None = None
-        if self.state_dependent:
-            spread = [sum((without_jumps(model.covariance[i, j], x[j]) for j in range(n)), start=sympy.S.Zero) for i in range(n)]
-            twice = sum((without_jumps(d, s) for d, s in zip(spread, x, strict=True)), start=sympy.S.Zero)
-            self.spreading = PointFunction([*spread, twice], model, (n + 1,))
         self._caches: dict[bytes, Caches] = {}
 
     def over(self, inputs: Inputs | None, start: float, stop: float) -> System:
@@ -72,9 +66,8 @@ class System:
 
             return with_inputs
 
-        for name in ("drift", "jacobian", "covariance", "observe", "slopes", "noise", "spreading"):
-            if getattr(self, name) is not None:
-                setattr(bound, name, bind(getattr(self, name)))
+        for name in ("drift", "jacobian", "covariance", "observe", "slopes", "noise"):
+            setattr(bound, name, bind(getattr(self, name)))
         return bound
 
     def outside(self, points: Array, t: float, theta: Array, u: Array | None) -> Array:

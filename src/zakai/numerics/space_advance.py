@@ -5,6 +5,7 @@ Short intervals whose error is known to be small from earlier ones are taken in 
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,6 +44,11 @@ class Control(NamedTuple):
         error = self.rate * tau**3
         fresh = np.isfinite(error) and self.age * (1 + 4 * error / allowed) < CHECKED
         return bool(fresh and tau <= 2 * self.measured)
+
+    def parts(self, tau: float, allowed: float) -> tuple[int, int]:
+        """Return how many substeps keep an interval's error in time, if known: single ones, and extrapolated ones."""
+        singles = max(1, math.ceil(math.sqrt(self.rate * tau**3 / allowed)))
+        return singles, max(1, math.ceil((self.extrapolated(tau) / allowed) ** 0.25))
 
     def extrapolated(self, tau: float) -> float:
         """Return the error that extrapolation leaves of a substep of length tau."""

@@ -36,8 +36,10 @@ def _multipliers(sizes: tuple[int, ...]) -> dict[tuple[int, int], Array]:
     return {(i, j): -(waves[i] ** 2) if i == j else -2.0 * first[i] * first[j] for i in range(n) for j in range(i + 1)}
 
 
-def diffused(values: Array, grid: Grid, noise: Array, tau: float) -> Array:
+def diffused(values: Array, grid: Grid, noise: Array, tau: float, adjoint: bool = False) -> Array:
     """Return a density after spreading over a time by noise that depends on the state.
+
+    With `adjoint` the values are a function of the state after the time, whose mean given the state before it is returned.
 
     Args:
         values: the density (*sizes); an imaginary part is a derivative.
@@ -67,6 +69,11 @@ def diffused(values: Array, grid: Grid, noise: Array, tau: float) -> Array:
 
     def moved(u: Array) -> Array:
         """Return (1 + 2 L / radius) u."""
+        if adjoint:
+            waves = np.fft.rfftn(u)
+            for entry, multiplier in parts:
+                u = u + (2.0 / radius) * entry * np.fft.irfftn(waves * multiplier, grid.sizes, axes)
+            return u
         fields = [entry * u for entry, _ in parts]
         change = transformed([field.real for field in fields])
         if np.iscomplexobj(fields[0]):

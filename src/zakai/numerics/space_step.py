@@ -55,11 +55,22 @@ class _Move(NamedTuple):
     target: Grid
 
 
+class Substep(NamedTuple):
+    """A substep between two `times`, with the density at its start."""
+
+    begin: Field
+    times: tuple[float, float]
+    linear: Linearisation
+    steps: int
+    potential: Potential | None
+
+
 class Stepper:
     """Substeps of one interval."""
 
     def __init__(self, dynamics: Dynamics, bounds: Bounds, tolerance: float):
         self.dynamics, self.bounds, self.tolerance = dynamics, bounds, tolerance
+        self.taken: list[tuple[Substep, ...]] = []  # single substeps, and the two halves of extrapolated ones
         self._linearised: tuple[Array, tuple[float, ...], list[Linearisation]] | None = None
 
     def _linear(self, field: Field, times: tuple[float, ...]) -> list[Linearisation]:
@@ -166,16 +177,11 @@ class Stepper:
         sizes = padded_sizes(field.grid, move.linear.before.real, self.bounds)
         field = Field(*padded(field.values, field.grid, sizes), field.log_scale)
         moved = characteristics(self.dynamics, field.grid, goal, t0, t1, move.steps, self.bounds.periodic, begun)
-        moved = self._within(moved, goal, t0)
         before = potential(field.grid, t0, t1, False) if potential else None
         after = potential(goal, t0, t1, True) if potential else None
         noises = self._noises(field.grid, goal, t0, t1)
         values, top = transported(field.values, field.grid, goal, moved, move.linear, self.bounds.periodic, before, after, noises)
         return Field(values, goal, field.log_scale + top), moved
-
-    def _within(self, moved: Array, goal: Grid, t0: float) -> Array:
-        """Return displacements without those that begin where the density is unknown: of a density they all count."""
-        return moved
 
     def limit(self, field: Field, t0: float, t1: float) -> float:
         """Return the end, at most t1, of the longest substep by whose noise a density can be spread on a few times its grid."""
@@ -217,10 +223,26 @@ class Stepper:
         assert best is not None
         return best
 
+    def _take(self, *substeps: Substep) -> None:
+        """Keep substeps, instead of earlier ones that were longer."""
+        while self.taken and self.taken[-1][0].times[0] >= substeps[0].times[0]:
+            self.taken.pop()
+        self.taken.append(substeps)
+
+    def equal(self, field: Field, times: Array, potential: Potential | None, extrapolated: bool) -> None:
+        """Take substeps of a density that stays as it is."""
+        moves = self._moves(field, tuple(times.tolist()))
+        ends = list(pairwise(times.tolist()))
+        substeps = [Substep(field, end, move.linear, move.steps, potential) for move, end in zip(moves, ends, strict=True)]
+        count = 2 if extrapolated else 1
+        for first in range(0, len(substeps), count):
+            self._take(*substeps[first : first + count])
+
     def single(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report]:
         """Return the density after one substep, on a grid that fits it."""
-        tails = field.survey(self.bounds).tails
-        result, _, report = self._moved(field, t0, t1, self._moves(field, (t0, t1))[0], potential, tails)
+        tails, move = field.survey(self.bounds).tails, self._moves(field, (t0, t1))[0]
+        result, _, report = self._moved(field, t0, t1, move, potential, tails)
+        self._take(Substep(field, (t0, t1), move.linear, move.steps, potential))
         return result, report
 
     def resolved(self, field: Field, report: Report) -> tuple[Field, float]:
@@ -242,7 +264,12 @@ class Stepper:
         one, two = self._moves(field, (t0, middle, t1))
         tails = field.survey(self.bounds).tails
         half, _, first = self._moved(field, t0, middle, one, potential, tails)
-        fine, moved, second = self._moved(positive(half, self.bounds), middle, t1, two, potential, tails)
+        half = positive(half, self.bounds)
+        fine, moved, second = self._moved(half, middle, t1, two, potential, tails)
+        self._take(
+            Substep(field, (t0, middle), one.linear, one.steps, potential),
+            Substep(half, (middle, t1), two.linear, two.steps, potential),
+        )
         whole = _Move(one.linear.then(two.linear), one.steps, fine.grid)
         coarse, _ = self._apply(field, t0, t1, whole, potential, (middle, moved))
         fine = positive(fine, self.bounds)

@@ -96,12 +96,15 @@ def _multiplied(values: Array, grid: Grid, log_factor: Callable[[Grid], Array]) 
     return _Product(values, logs, levels, Field(product, grid, 0.0), *found)
 
 
-def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, tails: float) -> Update:
+def updated(
+    field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, tails: float, shrink: bool = True
+) -> Update:
     """Return the product of a density and a factor that is given by its logarithm at the points of a grid (J,).
 
     A factor that is narrower than the grid's spacing is found on a sequence of finer grids, with a power of it below one as long
-    as neighbours differ by many nats.  `tails` are those of the spectrum of the density.  A product that is zero, or one point,
-    leaves the density as it is; its mass on the grid of the density is that of the result.
+    as neighbours differ by many nats.  `tails` are those of the spectrum of the density.  With `shrink`, a product that
+    fills a small part of the grid goes to a smaller one.  A product that is zero, or one point, leaves the density as it is; its
+    mass on the grid of the density is that of the result.
     """
     grid, values = field.grid, field.values
     coefficients, last, before = None, grid, np.ones(grid.n)
@@ -126,7 +129,7 @@ def updated(field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, t
                 best = worst, product, found
             before, last = np.where(coarse & (attempt > 0), found.tails, before), grid
             span = (found.used[:, 1] - found.used[:, 0] + 4) / grid.shape
-            sparse = bool(attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1)
+            sparse = bool(shrink and attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1)
             if not (wide.any() or coarse.any() or sparse):
                 break
         if attempt == _TRIES - 1:

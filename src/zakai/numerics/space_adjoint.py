@@ -1,0 +1,264 @@
+"""One substep of the backward Kolmogorov equation on grids: the adjoint of the splitting of `space_transport`.
+
+    -b_t = f . grad b + G : Hess b / 2 + V b
+
+    exp(v/6) D exp(v/3 - tau g/144) T exp(v/3 - tau g/144) D' exp(v/6),     v = integral of V,  g = grad v . G grad v
+
+T evaluates a function where the characteristics of f end that begin in the points of the target grid.  D' and D spread by the
+two halves of the noise.  A function need not decrease to the ends of its grid: beyond them its logarithm is continued by a
+straight line that does not increase.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai.numerics.space_diffusion import diffused
+from zakai.numerics.space_field import Field
+from zakai.numerics.space_grid import Grid, filtered, rounded_size
+from zakai.numerics.space_spline import gather, relative_index
+from zakai.numerics.space_step import Potential
+from zakai.numerics.space_transport import Dynamics, Factor, Linearisation, moved_points
+
+Array = NDArray[Any]
+TINY = 1e-300
+LEAST = 1e-30  # of the maximum, below which values count as equal
+REACH = 5.0  # deviations of the noise that a continued function covers at each end
+MARGIN = 8  # points of a continued function, without noise
+LARGEST = 2.0  # ratio of its points to those of a function
+COARSENED = 1.3  # conditional deviations, in spacings, that every second point resolves
+ROUNDING = 1e-14  # of the maximum, of interpolated values
+STEEPEST = 4.0  # nats between the largest value and its neighbours, above which a grid does not resolve a function
+FALL = 0.5  # nats a spacing by which a function decreases beyond the points to which it is continued
+MOST = 2048  # points along an axis
+SMALL = 0.3  # share of a grid that noise reaches within which a function is continued by its slopes
+RESOLVED = 1.9  # spacings in a deviation of what is interpolated
+TOGETHER = 2**15  # points that are moved together
+
+
+def continued(values: Array, sizes: tuple[int, ...]) -> Array:
+    """Return positive values (*sizes) in the middle of an array of larger sizes that is smooth around its ends."""
+    for d, new in enumerate(sizes):
+        old = values.shape[d]
+        gap, first = new - old, new // 2 - old // 2
+        if not gap:
+            continue
+        low, high = (np.log(np.maximum(np.take(values, places, d), TINY)) for places in ([0, 1], [old - 1, old - 2]))
+        (left, inner_left), (right, inner_right) = (np.split(part, 2, axis=d) for part in (low, high))
+        shape = [-1 if axis == d else 1 for axis in range(len(sizes))]
+        steps = np.arange(1, gap + 1)
+        share = (steps / (gap + 1)).reshape(shape)
+        share = share * share * (3 - 2 * share)
+        left = left + np.minimum(left - inner_left, 0.0) * steps[::-1].reshape(shape)
+        right = right + np.minimum(right - inner_right, 0.0) * steps.reshape(shape)
+        between = np.exp((1 - share) * right + share * left)
+        before, after = np.split(between, [gap - first], axis=d)[::-1]
+        values = np.concatenate([before, values, after], axis=d)
+    return values
+
+
+def _margins(grid: Grid, cov: Array) -> tuple[int, ...]:
+    """Return the sizes that a function needs to be spread by N(0, cov), cov in index units, and interpolated."""
+    deviations = np.sqrt(np.maximum(np.diagonal(cov), 0.0))
+    return tuple(
+        size if closed else rounded_size(size + MARGIN + 2 * REACH * deviation, size, MOST)
+        for size, closed, deviation in zip(grid.sizes, grid.closed, deviations, strict=True)
+    )
+
+
+def _least(values: Array) -> Array:
+    return np.maximum(values, max(LEAST * float(values.max()), TINY))
+
+
+def _coarser(values: Array, grid: Grid, axes: Array) -> tuple[Array, Grid]:
+    """Return every second value along some axes."""
+    basis, sizes = grid.basis.copy(), list(grid.sizes)
+    for d in np.flatnonzero(axes):
+        start = sizes[d] // 2 % 2
+        values = np.take(values, np.arange(start, sizes[d], 2), d)
+        basis[:, d], sizes[d] = 2 * basis[:, d], values.shape[d]
+    return values, Grid(grid.centre, basis, tuple(sizes), grid.closed)
+
+
+def _narrow_spread(values: Array, grid: Grid, cov: Array) -> tuple[Array, Grid, Array]:
+    """Return a function that is much narrower than a noise spread by a part of it, on a coarser grid, and the rest."""
+    for _ in range(40):
+        sizes = _margins(grid, cov)
+        if all(new - MARGIN <= LARGEST * old for new, old in zip(sizes, grid.sizes, strict=True)):
+            break
+        with np.errstate(divide="ignore"):
+            share = float(((0.5 * (LARGEST - 1) / REACH * grid.shape) ** 2 / np.diagonal(cov))[~grid.circles].min())
+        part = min(share, 1.0) * cov
+        effective = part + COARSENED**2 * np.eye(grid.n)
+        axes = ~grid.circles & (1.0 / np.diagonal(np.linalg.inv(effective)) > (2 * COARSENED) ** 2)
+        if not axes.any():
+            break
+        sizes = _margins(grid, part)
+        values = _least(filtered(continued(values, sizes), part))
+        values, grid = _coarser(values, grid._replace(sizes=sizes), axes)
+        scale = np.where(axes, 0.5, 1.0)
+        cov = (1 - min(share, 1.0)) * cov * np.outer(scale, scale)
+    return values, grid, cov
+
+
+def _blurred(
+    values: Array, grid: Grid, cov: Array, spline: bool, noise: tuple[Array, float] | None, whole: bool = False
+) -> tuple[Array, Grid]:
+    """Return a function spread by N(0, cov), or by noise at the points of its grid; with `spline`, its coefficients.
+
+    The result is on the grid, continued, or, unless it is wanted as a `whole`, on a coarser one where the noise is much wider.
+    """
+    inverse, values = grid.inverse, _least(values)
+    if noise is not None:
+        at, time = noise
+        largest = at[np.argmax(np.trace(inverse @ at @ inverse.T, axis1=1, axis2=2))]
+        sizes = _margins(grid, (0.0 if whole and spline else time) * inverse @ largest @ inverse.T)
+        first = [new // 2 - old // 2 for old, new in zip(grid.sizes, sizes, strict=True)]
+        ends = [(a, new - old - a) for a, old, new in zip(first, grid.sizes, sizes, strict=True)]
+        wide = np.pad(at.reshape(*grid.sizes, grid.n, grid.n), [*ends, (0, 0), (0, 0)], mode="edge")
+        grid, cov = grid._replace(sizes=sizes), np.zeros_like(cov)
+        values = diffused(continued(values, sizes), grid, wide.reshape(-1, grid.n, grid.n), time, adjoint=True)
+        return (filtered(values, cov, spline=True) if spline else values), grid
+    cov = inverse @ cov @ inverse.T
+    if not spline and not np.any(cov):
+        return values, grid
+    if not whole:
+        values, grid, cov = _narrow_spread(values, grid, cov)
+    sizes = _margins(grid, 0.0 * cov if whole and spline else cov)
+    return filtered(continued(values, sizes), cov, spline), grid._replace(sizes=sizes)
+
+
+def _cropped(values: Array, sizes: tuple[int, ...]) -> Array:
+    first = [new // 2 - old // 2 for old, new in zip(sizes, values.shape, strict=True)]
+    return values[tuple(slice(a, a + size) for a, size in zip(first, sizes, strict=True))]
+
+
+def _weighed(values: Array, logs: Array) -> tuple[Array, float]:
+    """Return positive values times exp(logs), of maximum one, and the logarithm of what was taken out."""
+    logs = np.log(_least(values)) + np.where(np.isnan(logs), -np.inf, logs)
+    top = float(logs.max())
+    return (np.exp(logs - top), top) if np.isfinite(top) else (np.zeros_like(values), 0.0)
+
+
+def _evaluated(coefficients: Array, grid: Grid, core: tuple[int, ...], z: Array) -> Array:
+    """Return a spline at indices; beyond half of the points by which the `core` is continued it decreases."""
+    beyond = 0.25 * (grid.shape - core)
+    low = grid.shape // 2 - np.array(core) // 2 - beyond
+    high = low + np.array(core) - 1 + 2 * beyond
+    inside = np.where(grid.circles, z, np.clip(z, low, high))
+    apart = np.abs(z - inside).sum(axis=1)
+    found = gather(coefficients, np.where(np.isfinite(inside), inside, 0.0), grid)
+    found = np.maximum(found, ROUNDING * float(np.max(coefficients)))
+    return np.where(np.isfinite(apart), found * np.exp(-FALL * np.minimum(apart, 1e3)), 0.0)
+
+
+def _resolved(values: Array) -> bool:
+    """Return whether values do not change by many nats beside the largest."""
+    peak, logs = np.unravel_index(np.argmax(values), values.shape), np.log(_least(values))
+    beside = [
+        logs[(*peak[:d], peak[d] + step, *peak[d + 1 :])]
+        for d in range(values.ndim) for step in (-1, 1) if 0 <= peak[d] + step < values.shape[d]
+    ]  # fmt: skip
+    return bool(logs[peak] - min(beside) <= STEEPEST)
+
+
+def wide_grid(target: Grid, cov: Array) -> Grid:
+    """Return a grid around a target, for functions that are spread by N(0, cov) and then wanted there.
+
+    It is the target itself where the noise reaches a small share of its width.
+    """
+    noise = target.inverse @ cov @ target.inverse.T
+    reach = 2 * REACH * np.sqrt(np.maximum(np.diagonal(noise), 0.0)) * ~target.circles
+    if np.all(reach <= SMALL * target.shape):
+        return target
+    effective = np.diagonal(np.linalg.inv(noise + RESOLVED**2 * np.eye(target.n)))
+    coarser = np.where(target.circles, 1.0, 1.0 / (RESOLVED * np.sqrt(effective)))
+    sizes = tuple(
+        rounded_size((size + more) / ratio, 1, MOST) for size, more, ratio in zip(target.sizes, reach, coarser, strict=True)
+    )
+    return Grid(target.centre, target.basis * coarser, sizes, target.closed)
+
+
+def pulled_back(
+    function: Field,
+    target: Grid,
+    linear: Linearisation,
+    times: tuple[float, float],
+    steps: int,
+    dynamics: Dynamics,
+    potential: Potential | None,
+    periodic: tuple[bool, ...],
+) -> tuple[Array, float]:
+    """Return the values (*sizes) of E[c(X(t1)) exp(int V dt) | X(t0) = x] at the points of a grid, but for a logarithm.
+
+    Args:
+        function: c, positive, on a grid.
+        target: the grid of the points x.
+        linear: the noise of the substep.
+        times: t0 and t1.
+        steps: Runge-Kutta steps of the characteristics.
+        dynamics: the drift, and the noise where it depends on the state.
+        potential: V.
+        periodic: which coordinates are angles.
+    """
+    values, grid, top = function.values, function.grid, 0.0
+    t0, t1 = times
+    diffusion = dynamics.diffusion
+
+    def factor(where: Grid, end: bool) -> Factor | None:
+        return None if potential is None else potential(where, t0, t1, end)
+
+    def noise(where: Grid) -> tuple[Array, float] | None:
+        return None if diffusion is None else (diffusion(where.points, 0.5 * (t0 + t1)), 0.5 * (t1 - t0))
+
+    after, core = factor(grid, True), grid
+    if after is not None:
+        values, gained = _weighed(values, after.log / 6)
+        top += gained
+        values, grid = _blurred(values, core, 0.5 * linear.noise, False, noise(core))
+        if np.array_equal(grid.basis, core.basis):
+            values, grid = _cropped(values, core.sizes), core
+        else:
+            after, core = factor(grid, True), grid
+        assert after is not None
+        values, gained = _weighed(values, after.log / 3 + after.correction)
+        top += gained
+        coefficients, grid = _blurred(values, core, 0.0 * linear.noise, True, None)
+    else:
+        coefficients, grid = _blurred(values, core, 0.5 * linear.noise, True, noise(core))
+    sizes = core.sizes if np.array_equal(core.basis, grid.basis) else grid.sizes
+    wide = wide_grid(target, linear.before)
+    points = np.array_split(wide.points, -(-math.prod(wide.sizes) // TOGETHER))
+    with np.errstate(all="ignore"):
+        moved = np.concatenate([moved_points(dynamics, part, t0, t1, steps) for part in points])
+    z = relative_index(wide, grid, periodic, np.asfortranarray(moved[:, : grid.n]))
+    values = _evaluated(coefficients, grid, sizes, z).reshape(wide.sizes)
+    before = factor(wide, False)
+    if before is not None:
+        values, gained = _weighed(values, before.log / 3 + before.correction)
+        top += gained
+    same = np.array_equal(wide.basis, target.basis)
+    if same and not _resolved(values):  # nor is the noise within a spacing: the values show where a finer grid must be
+        return values, top
+    values, wide = _blurred(values, wide, linear.before, not same, noise(wide), whole=True)
+    if same:
+        values = _cropped(values, target.sizes)
+    else:
+        values = gather(values, relative_index(target, wide, periodic), wide).reshape(target.sizes)
+    before = factor(target, False)
+    if before is not None:
+        values, gained = _weighed(values, before.log / 6)
+        top += gained
+    return values, top
+
+
+def interpolated(function: Field, target: Grid, periodic: tuple[bool, ...]) -> Array:
+    """Return the values (*sizes) of a positive function at the points of another grid."""
+    grid = function.grid
+    coefficients, wide = _blurred(function.values, grid, np.zeros((grid.n, grid.n)), True, None)
+    z = relative_index(target, wide, periodic)
+    return _evaluated(coefficients, wide, grid.sizes, z).reshape(target.sizes)
