@@ -9,7 +9,7 @@ is the smoothed density.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,12 +21,12 @@ from zakai.methods._protocol import Backward, Info
 from zakai.methods._space import State
 from zakai.methods._space_short import predicted_on
 from zakai.methods._space_system import moments_of
-from zakai.numerics.space_adjoint import interpolated, pulled_back
+from zakai.numerics.space_adjoint import Function, function_of, interpolated, pulled_back
 from zakai.numerics.space_advance import Control
-from zakai.numerics.space_field import NOTHING, Field, Report, extrapolated, grid_report, positive
+from zakai.numerics.space_field import NOTHING, Field, Report, grid_report, positive
 from zakai.numerics.space_grid import Grid, rounded_size
 from zakai.numerics.space_step import Stepper, Substep
-from zakai.numerics.space_transport import Dynamics
+from zakai.numerics.space_transport import Dynamics, Linearisation
 from zakai.numerics.space_update import Update, updated
 from zakai.numerics.space_window import LEAST, Bounds
 
@@ -35,7 +35,7 @@ FINEST = 1e-4  # tolerance to which a method that is more accurate than splines 
 TAIL = 2 / 3  # power of the bound on tails of a density for those of a product with the message, which is smoother
 SMOOTHER = 1 / 8  # error of the interpolation of a message as wide as a density, to that of their product
 SPARE = 2  # points of a grid beyond those that a product uses
-HIGHEST = 25.0  # nats by which the message may be above its value where the product is largest
+LARGEST = 0.5  # nats by which extrapolation may change the message
 FIGURES = (
     "error_estimate", "tolerance_ratio", "splitting_error", "tail_depth", "edge_mass", "negative_mass", "std_in_spacings",
 )  # fmt: skip
@@ -47,7 +47,7 @@ class Message(NamedTuple):
     The estimate of its relative error, and what the grids since the last time showed.
     """
 
-    function: Field
+    function: Function
     product: Update
     error: float
     report: Report
@@ -72,7 +72,8 @@ def message(prepared: base.Prepared, state: State) -> Message:
         raise InputError(f'{source}: smooth: splitting="lie" has no backward pass for several states; take "strang"')
     density = _density(prepared, state)
     product = Update(density, 0.0, 0.0, 0.0, False)
-    return Message(density._replace(values=np.ones(density.grid.sizes)), product, 0.0, NOTHING)
+    one = function_of(np.zeros(density.grid.sizes), density.grid, density.values, False)
+    return Message(one, product, 0.0, NOTHING)
 
 
 def _density(prepared: base.Prepared, state: State) -> Field:
@@ -109,12 +110,14 @@ def step(prepared: base.Prepared, k: int, later: Message, values: np.ndarray, st
     general, begin = _general(prepared), _density(prepared, state)
     observations, bounds = general.observations, general.bounds._replace(tail=general.bounds.tail**TAIL)
     function, product, report = later.function, later.product, NOTHING
+    tilted = not observations.system.state_dependent
     factor, constant = observations.factor(k, observations.inside[k], values)
     if factor is not None:
-        logs = np.log(np.maximum(function.values, 1e-300)) + factor(function.grid).real.reshape(function.grid.sizes)
-        function = _rescaled(logs, function.grid, function.log_scale + float(np.real(constant)), product.field)
+        logs = function.logs() + factor(function.grid).real.reshape(function.grid.sizes) + float(np.real(constant))
+        function = function_of(logs, function.grid, product.field.values, tilted)
     if observations.lengths[k] == 0:
-        function, product = _back(begin, bounds, function, lambda grid: (interpolated(function, grid, bounds.periodic), 0.0))
+        later_function = function
+        function, product = _back(begin, bounds, tilted, lambda grid: interpolated(later_function, grid, bounds.periodic))
     else:
         for dynamics, group in reversed(_substeps(general, k, begin, state, values)):
             function, product, more = _through(dynamics, group, function, bounds)
@@ -155,33 +158,19 @@ def _control(state: State) -> Control:
     return Control(state.rate, state.measured, state.age, state.fixed)
 
 
-def _rescaled(logs: Array, grid: Grid, log_scale: float, product: Field) -> Field:
-    """Return a function with these logarithms, one where a product with it is largest, without much larger values elsewhere."""
-    logs = np.where(np.isnan(logs), -np.inf, logs)
-    top = float(logs.flat[np.argmax(product.values)])
-    if not np.isfinite(top):
-        top = float(logs.max()) if np.isfinite(logs.max()) else 0.0
-    return Field(np.exp(np.minimum(logs - top, HIGHEST)), grid, log_scale + top)
-
-
-def _back(
-    density: Field, bounds: Bounds, function: Field, evaluate: Callable[[Grid], tuple[Array, float]]
-) -> tuple[Field, Update]:
-    """Return the function that is evaluated on grids, on the grid of its product with a density, and that product."""
+def _back(density: Field, bounds: Bounds, tilted: bool, evaluate: Callable[[Grid], Array]) -> tuple[Function, Update]:
+    """Return the function whose logarithm is evaluated on grids, on that of its product with a density, and that product."""
     found: list[tuple[Grid, Array]] = []
 
     def log_factor(grid: Grid) -> Array:
-        values, top = evaluate(grid)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            found.append((grid, np.where(values > 0, np.log(values) + top, -np.inf)))
+        found.append((grid, evaluate(grid)))
         return found[-1][1].reshape(-1)
 
     update = updated(density, log_factor, bounds, 0.0, shrink=False)
     grid, logs = next((grid, logs) for grid, logs in found if grid is update.field.grid)
-    product = update.field._replace(log_scale=update.field.log_scale + function.log_scale)
-    part, grid = _used(product, bounds)
-    product = product._replace(values=np.ascontiguousarray(product.values[part]), grid=grid)
-    return _rescaled(logs[part], grid, function.log_scale, product), update._replace(field=product)
+    part, grid = _used(update.field, bounds)
+    product = update.field._replace(values=np.ascontiguousarray(update.field.values[part]), grid=grid)
+    return function_of(logs[part], grid, product.values, tilted), update._replace(field=product)
 
 
 def _used(product: Field, bounds: Bounds) -> tuple[tuple[slice, ...], Grid]:
@@ -199,30 +188,27 @@ def _used(product: Field, bounds: Bounds) -> tuple[tuple[slice, ...], Grid]:
 
 
 def _through(
-    dynamics: Dynamics, group: tuple[Substep, ...], later: Field, bounds: Bounds
-) -> tuple[Field, Update, Report]:
+    dynamics: Dynamics, group: tuple[Substep, ...], later: Function, bounds: Bounds
+) -> tuple[Function, Update, Report]:
     """Return the function before a substep, its product with the density there, and the errors."""
-    function = later
-    for substep in reversed(group):
+    function, tilted = later, dynamics.diffusion is None
 
-        def evaluate(grid: Grid, substep: Substep = substep, after: Field = function) -> tuple[Array, float]:
-            return pulled_back(
-                after, grid, substep.linear, substep.times, substep.steps, dynamics, substep.potential, bounds.periodic
-            )
+    def pulled(function: Function, grid: Grid, linear: Linearisation, times: tuple[float, float], steps: int) -> Array:
+        return pulled_back(function, grid, linear, times, steps, dynamics, group[0].potential, bounds.periodic)
 
-        begin = substep.begin._replace(log_scale=0.0)
-        function, product = _back(begin, bounds, function, evaluate)
+    for one in reversed(group):
+        after = partial(pulled, function, linear=one.linear, times=one.times, steps=one.steps)
+        function, product = _back(one.begin._replace(log_scale=0.0), bounds, tilted, after)
     difference = 0.0
     if len(group) == 2:
         one, two = group
-        times, linear, grid = (one.times[0], two.times[1]), one.linear.then(two.linear), function.grid
-        values, top = pulled_back(later, grid, linear, times, 2 * one.steps, dynamics, one.potential, bounds.periodic)
-        ratio = later.log_scale + top - function.log_scale
-        better, _ = extrapolated(function.values, np.maximum(values, 0.0), ratio)
-        share = better / np.where(function.values > 0, function.values, 1.0)
-        field = product.field._replace(values=product.field.values * share)
+        times, grid, logs = (one.times[0], two.times[1]), function.grid, function.logs()
+        with np.errstate(invalid="ignore"):
+            gained = (logs - pulled(later, grid, one.linear.then(two.linear), times, 2 * one.steps)) / 3
+        gained = np.where(np.abs(gained) < LARGEST, gained, 0.0)
+        field = product.field._replace(values=product.field.values * np.exp(gained))
         difference = float(3 * np.abs(field.values - product.field.values).sum() / field.values.sum())
-        function, product = function._replace(values=better), product._replace(field=field)
+        function, product = function_of(logs + gained, grid, field.values, tilted), product._replace(field=field)
     shown = grid_report(product.field.survey(bounds))
     shown = shown._replace(splitting=difference ** (5 / 3), interpolation=SMOOTHER * shown.interpolation)
     return function, product, shown

@@ -5,20 +5,19 @@
     exp(v/6) D exp(v/3 - tau g/144) T exp(v/3 - tau g/144) D' exp(v/6),     v = integral of V,  g = grad v . G grad v
 
 T evaluates a function where the characteristics of f end that begin in the points of the target grid.  D' and D spread by the
-two halves of the noise.  A function need not decrease to the ends of its grid: beyond them its logarithm is continued by a
-straight line that does not increase.
+two halves of the noise.  A function need not decrease to the ends of its grid: it is c = exp(tilt.(x - middle)) c', and beyond
+the ends log c' is continued by a straight line that does not increase.  Spreading by N(0, C) moves c' by C tilt.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.space_diffusion import diffused
-from zakai.numerics.space_field import Field
 from zakai.numerics.space_grid import Grid, filtered, rounded_size
 from zakai.numerics.space_spline import gather, relative_index
 from zakai.numerics.space_step import Potential
@@ -27,17 +26,53 @@ from zakai.numerics.space_transport import Dynamics, Factor, Linearisation, move
 Array = NDArray[Any]
 TINY = 1e-300
 LEAST = 1e-30  # of the maximum, below which values count as equal
+HIGHEST = 12.0  # nats by which a function may be above its value where it counts most
 REACH = 5.0  # deviations of the noise that a continued function covers at each end
 MARGIN = 8  # points of a continued function, without noise
 LARGEST = 2.0  # ratio of its points to those of a function
 COARSENED = 1.3  # conditional deviations, in spacings, that every second point resolves
 ROUNDING = 1e-14  # of the maximum, of interpolated values
-STEEPEST = 4.0  # nats between the largest value and its neighbours, above which a grid does not resolve a function
+FARTHEST = 3.0  # deviations between neighbours up to which a grid resolves a function
 FALL = 0.5  # nats a spacing by which a function decreases beyond the points to which it is continued
 MOST = 2048  # points along an axis
 SMALL = 0.3  # share of a grid that noise reaches within which a function is continued by its slopes
 RESOLVED = 1.9  # spacings in a deviation of what is interpolated
 TOGETHER = 2**15  # points that are moved together
+
+
+class Function(NamedTuple):
+    """c = exp(`log_scale` + `tilt` . (x - `middle`)) times positive `values` (*sizes) on a grid."""
+
+    values: Array
+    grid: Grid
+    log_scale: float
+    tilt: Array
+    middle: Array
+
+    def logs(self) -> Array:
+        """Return log c at the points of the grid (*sizes)."""
+        sloping = (self.grid.points - self.middle) @ self.tilt
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.log(self.values) + self.log_scale + sloping.reshape(self.grid.sizes))
+
+
+def function_of(logs: Array, grid: Grid, weights: Array, tilted: bool) -> Function:
+    """Return the function with these logarithms (*sizes), with the tilt that fits them best under weights (*sizes).
+
+    The values are one where the weights are largest, and much larger nowhere.
+    """
+    logs, share = np.where(np.isnan(logs), -np.inf, logs), weights.reshape(-1) / weights.sum()
+    middle, tilt, n = grid.centre + share @ grid.offsets, np.zeros(grid.n), ~grid.circles
+    if tilted and n.any():
+        flat = logs.reshape(-1)
+        used = (share > 0) & np.isfinite(flat)
+        z, share, flat = (grid.points[used] - middle)[:, n], share[used], flat[used]
+        tilt[n] = np.linalg.lstsq((z * share[:, None]).T @ z, share * (flat - share @ flat) @ z, rcond=1e-8)[0]
+    values = logs - ((grid.points - middle) @ tilt).reshape(grid.sizes)
+    top = float(values.flat[np.argmax(weights)])
+    if not np.isfinite(top):
+        top = float(values.max()) if np.isfinite(values.max()) else 0.0
+    return Function(np.exp(np.minimum(values - top, HIGHEST)), grid, top, tilt, middle)
 
 
 def continued(values: Array, sizes: tuple[int, ...]) -> Array:
@@ -61,12 +96,12 @@ def continued(values: Array, sizes: tuple[int, ...]) -> Array:
     return values
 
 
-def _margins(grid: Grid, cov: Array) -> tuple[int, ...]:
+def _margins(grid: Grid, cov: Array, shift: Array | float = 0.0) -> tuple[int, ...]:
     """Return the sizes that a function needs to be spread by N(0, cov), cov in index units, and interpolated."""
-    deviations = np.sqrt(np.maximum(np.diagonal(cov), 0.0))
+    reach = MARGIN + 2 * REACH * np.sqrt(np.maximum(np.diagonal(cov), 0.0)) + 2 * np.abs(shift)
     return tuple(
-        size if closed else rounded_size(size + MARGIN + 2 * REACH * deviation, size, MOST)
-        for size, closed, deviation in zip(grid.sizes, grid.closed, deviations, strict=True)
+        size if closed else rounded_size(size + more, size, MOST)
+        for size, closed, more in zip(grid.sizes, grid.closed, reach.tolist(), strict=True)
     )
 
 
@@ -106,9 +141,9 @@ def _narrow_spread(values: Array, grid: Grid, cov: Array) -> tuple[Array, Grid, 
 
 
 def _blurred(
-    values: Array, grid: Grid, cov: Array, spline: bool, noise: tuple[Array, float] | None, whole: bool = False
+    values: Array, grid: Grid, cov: Array, tilt: Array, spline: bool, noise: tuple[Array, float] | None, whole: bool = False
 ) -> tuple[Array, Grid]:
-    """Return a function spread by N(0, cov), or by noise at the points of its grid; with `spline`, its coefficients.
+    """Return c' spread by N(0, cov), or by noise at the points of its grid; with `spline`, its coefficients.
 
     The result is on the grid, continued, or, unless it is wanted as a `whole`, on a coarser one where the noise is much wider.
     """
@@ -123,13 +158,14 @@ def _blurred(
         grid, cov = grid._replace(sizes=sizes), np.zeros_like(cov)
         values = diffused(continued(values, sizes), grid, wide.reshape(-1, grid.n, grid.n), time, adjoint=True)
         return (filtered(values, cov, spline=True) if spline else values), grid
-    cov = inverse @ cov @ inverse.T
+    shift, cov = cov @ tilt, inverse @ cov @ inverse.T
     if not spline and not np.any(cov):
         return values, grid
     if not whole:
         values, grid, cov = _narrow_spread(values, grid, cov)
-    sizes = _margins(grid, 0.0 * cov if whole and spline else cov)
-    return filtered(continued(values, sizes), cov, spline), grid._replace(sizes=sizes)
+    shift = grid.inverse @ shift
+    sizes = _margins(grid, 0.0 * cov if whole and spline else cov, shift)
+    return filtered(continued(values, sizes), cov, spline, shift), grid._replace(sizes=sizes)
 
 
 def _cropped(values: Array, sizes: tuple[int, ...]) -> Array:
@@ -144,26 +180,31 @@ def _weighed(values: Array, logs: Array) -> tuple[Array, float]:
     return (np.exp(logs - top), top) if np.isfinite(top) else (np.zeros_like(values), 0.0)
 
 
-def _evaluated(coefficients: Array, grid: Grid, core: tuple[int, ...], z: Array) -> Array:
-    """Return a spline at indices; beyond half of the points by which the `core` is continued it decreases."""
+def _evaluated(coefficients: Array, grid: Grid, core: tuple[int, ...], z: Array, function: Function) -> Array:
+    """Return log c, but for its scale, at indices of a spline of c'.
+
+    Beyond half of the points by which the `core` is continued it decreases.
+    """
     beyond = 0.25 * (grid.shape - core)
     low = grid.shape // 2 - np.array(core) // 2 - beyond
     high = low + np.array(core) - 1 + 2 * beyond
+    known = np.asarray(np.isfinite(z).all(axis=1))
+    z = np.where(known[:, None], z, 0.0)
     inside = np.where(grid.circles, z, np.clip(z, low, high))
     apart = np.abs(z - inside).sum(axis=1)
-    found = gather(coefficients, np.where(np.isfinite(inside), inside, 0.0), grid)
-    found = np.maximum(found, ROUNDING * float(np.max(coefficients)))
-    return np.where(np.isfinite(apart), found * np.exp(-FALL * np.minimum(apart, 1e3)), 0.0)
+    tilt = function.tilt @ grid.basis
+    middle = grid.shape // 2 + grid.inverse @ (function.middle - grid.centre)
+    found = gather(coefficients, inside, grid)
+    logs = np.log(np.maximum(found, ROUNDING * float(np.max(coefficients)))) - FALL * np.minimum(apart, 1e3)
+    logs += np.minimum((z - middle) * tilt, (inside - middle) * tilt).sum(axis=1)
+    return np.where(known, logs, -np.inf)
 
 
-def _resolved(values: Array) -> bool:
-    """Return whether values do not change by many nats beside the largest."""
-    peak, logs = np.unravel_index(np.argmax(values), values.shape), np.log(_least(values))
-    beside = [
-        logs[(*peak[:d], peak[d] + step, *peak[d + 1 :])]
-        for d in range(values.ndim) for step in (-1, 1) if 0 <= peak[d] + step < values.shape[d]
-    ]  # fmt: skip
-    return bool(logs[peak] - min(beside) <= STEEPEST)
+def _resolves(target: Grid, grid: Grid, linear: Linearisation) -> bool:
+    """Return whether neighbours on a target lead to points of a function's grid that are a few deviations apart at most."""
+    steps, noise = grid.inverse @ linear.map @ target.basis, grid.inverse @ linear.noise @ grid.inverse.T
+    apart = (steps * np.linalg.solve(noise + RESOLVED**2 * np.eye(grid.n), steps)).sum(axis=0)
+    return bool(np.all((apart <= FARTHEST**2) | target.circles))
 
 
 def wide_grid(target: Grid, cov: Array) -> Grid:
@@ -184,7 +225,7 @@ def wide_grid(target: Grid, cov: Array) -> Grid:
 
 
 def pulled_back(
-    function: Field,
+    function: Function,
     target: Grid,
     linear: Linearisation,
     times: tuple[float, float],
@@ -192,11 +233,11 @@ def pulled_back(
     dynamics: Dynamics,
     potential: Potential | None,
     periodic: tuple[bool, ...],
-) -> tuple[Array, float]:
-    """Return the values (*sizes) of E[c(X(t1)) exp(int V dt) | X(t0) = x] at the points of a grid, but for a logarithm.
+) -> Array:
+    """Return log E[c(X(t1)) exp(int V dt) | X(t0) = x] at the points of a grid (*sizes).
 
     Args:
-        function: c, positive, on a grid.
+        function: c.
         target: the grid of the points x.
         linear: the noise of the substep.
         times: t0 and t1.
@@ -205,9 +246,9 @@ def pulled_back(
         potential: V.
         periodic: which coordinates are angles.
     """
-    values, grid, top = function.values, function.grid, 0.0
+    values, grid, tilt, top = function.values, function.grid, function.tilt, function.log_scale
     t0, t1 = times
-    diffusion = dynamics.diffusion
+    diffusion, cov = dynamics.diffusion, 0.5 * linear.noise
 
     def factor(where: Grid, end: bool) -> Factor | None:
         return None if potential is None else potential(where, t0, t1, end)
@@ -219,7 +260,7 @@ def pulled_back(
     if after is not None:
         values, gained = _weighed(values, after.log / 6)
         top += gained
-        values, grid = _blurred(values, core, 0.5 * linear.noise, False, noise(core))
+        values, grid = _blurred(values, core, cov, tilt, False, noise(core))
         if np.array_equal(grid.basis, core.basis):
             values, grid = _cropped(values, core.sizes), core
         else:
@@ -227,38 +268,43 @@ def pulled_back(
         assert after is not None
         values, gained = _weighed(values, after.log / 3 + after.correction)
         top += gained
-        coefficients, grid = _blurred(values, core, 0.0 * linear.noise, True, None)
+        core = grid
+        coefficients, grid = _blurred(values, core, 0.0 * cov, tilt, True, None)
     else:
-        coefficients, grid = _blurred(values, core, 0.5 * linear.noise, True, noise(core))
+        coefficients, grid = _blurred(values, core, cov, tilt, True, noise(core))
+    top += float(0.5 * tilt @ cov @ tilt)
     sizes = core.sizes if np.array_equal(core.basis, grid.basis) else grid.sizes
     wide = wide_grid(target, linear.before)
     points = np.array_split(wide.points, -(-math.prod(wide.sizes) // TOGETHER))
     with np.errstate(all="ignore"):
         moved = np.concatenate([moved_points(dynamics, part, t0, t1, steps) for part in points])
     z = relative_index(wide, grid, periodic, np.asfortranarray(moved[:, : grid.n]))
-    values = _evaluated(coefficients, grid, sizes, z).reshape(wide.sizes)
+    tilt = np.where(target.circles, 0.0, linear.map.T @ tilt)
+    logs = _evaluated(coefficients, grid, sizes, z, function).reshape(wide.sizes)
+    same = np.array_equal(wide.basis, target.basis)
+    if same and not _resolves(target, function.grid, linear):  # the logarithms show where a finer grid must be
+        return logs + top
+    sloping = (wide.offsets @ tilt).reshape(wide.sizes)
     before = factor(wide, False)
     if before is not None:
-        values, gained = _weighed(values, before.log / 3 + before.correction)
-        top += gained
-    same = np.array_equal(wide.basis, target.basis)
-    if same and not _resolved(values):  # nor is the noise within a spacing: the values show where a finer grid must be
-        return values, top
-    values, wide = _blurred(values, wide, linear.before, not same, noise(wide), whole=True)
+        logs = logs + before.log / 3 + before.correction
+    values, gained = _weighed(np.ones(wide.sizes), logs - sloping)
+    top += gained
+    values, wide = _blurred(values, wide, linear.before, tilt, not same, noise(wide), whole=True)
+    top += float(0.5 * tilt @ linear.before @ tilt)
     if same:
         values = _cropped(values, target.sizes)
     else:
         values = gather(values, relative_index(target, wide, periodic), wide).reshape(target.sizes)
     before = factor(target, False)
-    if before is not None:
-        values, gained = _weighed(values, before.log / 6)
-        top += gained
-    return values, top
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.where(values > 0, np.log(values), -np.inf)
+    return logs + top + (target.offsets @ tilt).reshape(target.sizes) + (0.0 if before is None else before.log / 6)
 
 
-def interpolated(function: Field, target: Grid, periodic: tuple[bool, ...]) -> Array:
-    """Return the values (*sizes) of a positive function at the points of another grid."""
+def interpolated(function: Function, target: Grid, periodic: tuple[bool, ...]) -> Array:
+    """Return log c at the points of another grid (*sizes)."""
     grid = function.grid
-    coefficients, wide = _blurred(function.values, grid, np.zeros((grid.n, grid.n)), True, None)
+    coefficients, wide = _blurred(function.values, grid, np.zeros((grid.n, grid.n)), function.tilt, True, None)
     z = relative_index(target, wide, periodic)
-    return _evaluated(coefficients, wide, grid.sizes, z).reshape(target.sizes)
+    return (_evaluated(coefficients, wide, grid.sizes, z, function) + function.log_scale).reshape(target.sizes)

@@ -186,15 +186,18 @@ def gaussian_response(cov: Array, sizes: tuple[int, ...], spline: bool = False) 
     return np.asarray(response.real * (1.0 - 1j * exponent))
 
 
-def filtered(values: Array, cov: Array, spline: bool = False) -> Array:
+def filtered(values: Array, cov: Array, spline: bool = False, shift: Array | None = None) -> Array:
     """Return values (*sizes) after spreading by N(0, cov), cov (n, n) in index units; with `spline`, their spline's coefficients.
 
-    Complex ones carry a derivative in the imaginary part.
+    Complex ones carry a derivative in the imaginary part; real ones may be those at other indices, by a `shift` (n,).
     """
     sizes = values.shape
     if not (np.iscomplexobj(values) or np.iscomplexobj(cov)):
         spectrum = rfftn(values)
         _respond(spectrum.reshape(-1), np.array(sizes), np.ascontiguousarray(cov), spline)
+        if shift is not None and np.any(shift):
+            for waves, distance in zip(_frequencies(sizes), shift, strict=True):
+                spectrum *= np.exp(1j * distance * waves)
         return np.asarray(irfftn(spectrum, sizes, overwrite_x=True))
     response, spectrum = gaussian_response(cov, sizes, spline), rfftn(values.real)
     change = rfftn(np.ascontiguousarray(values.imag)) * response.real + spectrum * response.imag
