@@ -6,7 +6,7 @@
 
 T evaluates a function where the characteristics of f end that begin in the points of the target grid.  D' and D spread by the
 two halves of the noise.  A function need not decrease to the ends of its grid: it is c = exp(tilt.(x - middle)) c', and beyond
-the ends log c' is continued by a straight line that does not increase.  Spreading by N(0, C) moves c' by C tilt.
+the ends log c' is continued by a straight line, or by a curve that rises a little.  Spreading by N(0, C) moves c' by C tilt.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ LEAST = 1e-30  # of the maximum, below which values count as equal
 HIGHEST = 12.0  # nats by which a function may be above its value where it counts most
 REACH = 5.0  # deviations of the noise that a continued function covers at each end
 MARGIN = 8  # points of a continued function, without noise
-LARGEST = 2.0  # ratio of its points to those of a function
+LARGEST, SPREAD_AT_ONCE = 2.0, 2**16  # ratio of its points along an axis to those of a function, and points for any ratio
 COARSENED = 1.3  # conditional deviations, in spacings, that every second point resolves
 ROUNDING = 1e-14  # of the maximum, of interpolated values
 FARTHEST = 3.0  # deviations between neighbours up to which a grid resolves a function
+STEEPEST, RISE = 2.0, 2.0  # nats a spacing, and spacings, of a logarithm that rises beyond a grid
 FALL = 0.5  # nats a spacing by which a function decreases beyond the points to which it is continued
 MOST = 2048  # points along an axis
 SMALL = 0.3  # share of a grid that noise reaches within which a function is continued by its slopes
@@ -85,15 +86,20 @@ def continued(values: Array, sizes: tuple[int, ...]) -> Array:
         low, high = (np.log(np.maximum(np.take(values, places, d), TINY)) for places in ([0, 1], [old - 1, old - 2]))
         (left, inner_left), (right, inner_right) = (np.split(part, 2, axis=d) for part in (low, high))
         shape = [-1 if axis == d else 1 for axis in range(len(sizes))]
-        steps = np.arange(1, gap + 1)
-        share = (steps / (gap + 1)).reshape(shape)
+        steps = np.arange(1, gap + 1).reshape(shape)
+        share = steps / (gap + 1)
         share = share * share * (3 - 2 * share)
-        left = left + np.minimum(left - inner_left, 0.0) * steps[::-1].reshape(shape)
-        right = right + np.minimum(right - inner_right, 0.0) * steps.reshape(shape)
+        left = left + _risen(left - inner_left, gap + 1 - steps)
+        right = right + _risen(right - inner_right, steps)
         between = np.exp((1 - share) * right + share * left)
         before, after = np.split(between, [gap - first], axis=d)[::-1]
         values = np.concatenate([before, values, after], axis=d)
     return values
+
+
+def _risen(slope: Array, steps: Array) -> Array:
+    """Return the change of a logarithm that continues with a slope, whose rise ends after a few steps."""
+    return np.asarray(np.minimum(slope, 0.0) * steps + np.clip(slope, 0.0, STEEPEST) * RISE * (1 - np.exp(-steps / RISE)))
 
 
 def _margins(grid: Grid, cov: Array, shift: Array | float = 0.0) -> tuple[int, ...]:
@@ -123,7 +129,8 @@ def _narrow_spread(values: Array, grid: Grid, cov: Array) -> tuple[Array, Grid, 
     """Return a function that is much narrower than a noise spread by a part of it, on a coarser grid, and the rest."""
     for _ in range(40):
         sizes = _margins(grid, cov)
-        if all(new - MARGIN <= LARGEST * old for new, old in zip(sizes, grid.sizes, strict=True)):
+        wide = any(new - MARGIN > LARGEST * old for new, old in zip(sizes, grid.sizes, strict=True))
+        if not wide or math.prod(sizes) <= SPREAD_AT_ONCE:
             break
         with np.errstate(divide="ignore"):
             share = float(((0.5 * (LARGEST - 1) / REACH * grid.shape) ** 2 / np.diagonal(cov))[~grid.circles].min())
