@@ -21,19 +21,22 @@ from zakai.methods._protocol import Backward, Info
 from zakai.methods._space import State
 from zakai.methods._space_short import predicted_on
 from zakai.methods._space_system import moments_of
-from zakai.numerics.space_adjoint import Function, function_of, interpolated, pulled_back
+from zakai.numerics.space_adjoint import Adjoint, Function, function_of, interpolated
 from zakai.numerics.space_advance import Control
 from zakai.numerics.space_field import NOTHING, Field, Report, grid_report, positive
 from zakai.numerics.space_grid import Grid, rounded_size
+from zakai.numerics.space_spline import resampled
 from zakai.numerics.space_step import Stepper, Substep
 from zakai.numerics.space_transport import Dynamics, Linearisation
 from zakai.numerics.space_update import Update, updated
-from zakai.numerics.space_window import LEAST, Bounds
+from zakai.numerics.space_window import LEAST, Bounds, fitted_grid
 
 Array = Any
 FINEST = 1e-4  # tolerance to which a method that is more accurate than splines is smoothed
 TAIL = 2 / 3  # power of the bound on tails of a density for those of a product with the message, which is smoother
 SMOOTHER = 1 / 8  # error of the interpolation of a message as wide as a density, to that of their product
+WORTH, FINER = 0.7, 1.3  # ratio of points to those of another grid below which it is taken, and of spacings above which it is
+WIDE = 3.0  # times the bound on edges, above which a grid was too narrow
 SPARE = 2  # points of a grid beyond those that a product uses
 LARGEST = 0.5  # nats by which extrapolation may change the message
 FIGURES = (
@@ -116,8 +119,8 @@ def step(prepared: base.Prepared, k: int, later: Message, values: np.ndarray, st
         logs = function.logs() + factor(function.grid).real.reshape(function.grid.sizes) + float(np.real(constant))
         function = function_of(logs, function.grid, product.field.values, tilted)
     if observations.lengths[k] == 0:
-        later_function = function
-        function, product = _back(begin, bounds, tilted, lambda grid: interpolated(later_function, grid, bounds.periodic))
+        before = partial(interpolated, function, periodic=bounds.periodic)
+        function, product = _back(begin, bounds, tilted, before, before)
     else:
         for dynamics, group in reversed(_substeps(general, k, begin, state, values)):
             function, product, more = _through(dynamics, group, function, bounds)
@@ -158,19 +161,49 @@ def _control(state: State) -> Control:
     return Control(state.rate, state.measured, state.age, state.fixed)
 
 
-def _back(density: Field, bounds: Bounds, tilted: bool, evaluate: Callable[[Grid], Array]) -> tuple[Function, Update]:
-    """Return the function whose logarithm is evaluated on grids, on that of its product with a density, and that product."""
+def _back(
+    density: Field, bounds: Bounds, tilted: bool, evaluate: Callable[[Grid], Array], rough: Callable[[Grid], Array]
+) -> tuple[Function, Update]:
+    """Return the function whose logarithm is evaluated on grids, on that of its product with a density, and that product.
+
+    `rough` evaluates it approximately, on every second point along each axis, which shows where the product is.
+    """
     found: list[tuple[Grid, Array]] = []
 
     def log_factor(grid: Grid) -> Array:
         found.append((grid, evaluate(grid)))
         return found[-1][1].reshape(-1)
 
-    update = updated(density, log_factor, bounds, 0.0, shrink=False)
+    part = _part(density, bounds, rough)
+    update = updated(part or density, log_factor, bounds, 0.0, shrink=False)
+    if part is not None and (update.truncated or update.edges > WIDE * bounds.edge):
+        update = updated(density, log_factor, bounds, 0.0, shrink=False)
+    elif part is not None:
+        update = update._replace(depth=update.depth + float(np.log(density.values.max() / part.values.max())))
     grid, logs = next((grid, logs) for grid, logs in found if grid is update.field.grid)
-    part, grid = _used(update.field, bounds)
-    product = update.field._replace(values=np.ascontiguousarray(update.field.values[part]), grid=grid)
-    return function_of(logs[part], grid, product.values, tilted), update._replace(field=product)
+    used, grid = _used(update.field, bounds)
+    product = update.field._replace(values=np.ascontiguousarray(update.field.values[used]), grid=grid)
+    return function_of(logs[used], grid, product.values, tilted), update._replace(field=product)
+
+
+def _part(density: Field, bounds: Bounds, rough: Callable[[Grid], Array]) -> Field | None:
+    """Return a density on a smaller or finer grid for its product with a function, or None where its own will do."""
+    grid = density.grid
+    every = tuple(slice(size // 2 % 2, None, 2) for size in grid.sizes)
+    values = density.values[every]
+    coarse = Grid(grid.centre, 2 * grid.basis, values.shape, grid.closed)
+    with np.errstate(divide="ignore"):
+        levels = (np.log(values) + rough(coarse)).reshape(-1)
+    if not np.isfinite(levels.max()):
+        return None
+    levels -= levels.max()
+    noise, narrow = 0.25 * grid.basis @ grid.basis.T, np.ones(grid.n)
+    new = fitted_grid(coarse.offsets, levels, grid.centre, noise, narrow, bounds, grid, least=float(np.log(bounds.edge)))
+    finer = np.linalg.norm(grid.basis, axis=0) / np.linalg.norm(new.basis, axis=0)
+    if new.closed != grid.closed or (np.prod(new.sizes) > WORTH * np.prod(grid.sizes) and finer.max() < FINER):
+        return None
+    values = resampled(density.values, grid, new, bounds.periodic)
+    return positive(Field(values, new, density.log_scale), bounds)
 
 
 def _used(product: Field, bounds: Bounds) -> tuple[tuple[slice, ...], Grid]:
@@ -193,18 +226,18 @@ def _through(
     """Return the function before a substep, its product with the density there, and the errors."""
     function, tilted = later, dynamics.diffusion is None
 
-    def pulled(function: Function, grid: Grid, linear: Linearisation, times: tuple[float, float], steps: int) -> Array:
-        return pulled_back(function, grid, linear, times, steps, dynamics, group[0].potential, bounds.periodic)
+    def adjoint(function: Function, linear: Linearisation, times: tuple[float, float], steps: int) -> Adjoint:
+        return Adjoint(function, linear, times, steps, dynamics, group[0].potential, bounds.periodic)
 
     for one in reversed(group):
-        after = partial(pulled, function, linear=one.linear, times=one.times, steps=one.steps)
-        function, product = _back(one.begin._replace(log_scale=0.0), bounds, tilted, after)
+        before = adjoint(function, one.linear, one.times, one.steps)
+        function, product = _back(one.begin._replace(log_scale=0.0), bounds, tilted, before.logs, before.rough)
     difference = 0.0
     if len(group) == 2:
         one, two = group
         times, grid, logs = (one.times[0], two.times[1]), function.grid, function.logs()
         with np.errstate(invalid="ignore"):
-            gained = (logs - pulled(later, grid, one.linear.then(two.linear), times, 2 * one.steps)) / 3
+            gained = (logs - adjoint(later, one.linear.then(two.linear), times, 2 * one.steps).logs(grid)) / 3
         gained = np.where(np.abs(gained) < LARGEST, gained, 0.0)
         field = product.field._replace(values=product.field.values * np.exp(gained))
         difference = float(3 * np.abs(field.values - product.field.values).sum() / field.values.sum())

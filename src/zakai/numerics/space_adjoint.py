@@ -231,21 +231,11 @@ def wide_grid(target: Grid, cov: Array) -> Grid:
     return Grid(target.centre, target.basis * coarser, sizes, target.closed)
 
 
-def pulled_back(
-    function: Function,
-    target: Grid,
-    linear: Linearisation,
-    times: tuple[float, float],
-    steps: int,
-    dynamics: Dynamics,
-    potential: Potential | None,
-    periodic: tuple[bool, ...],
-) -> Array:
-    """Return log E[c(X(t1)) exp(int V dt) | X(t0) = x] at the points of a grid (*sizes).
+class Adjoint:
+    """log E[c(X(t1)) exp(int V dt) | X(t0) = x] over one substep, at the points of any grid.
 
     Args:
         function: c.
-        target: the grid of the points x.
         linear: the noise of the substep.
         times: t0 and t1.
         steps: Runge-Kutta steps of the characteristics.
@@ -253,60 +243,75 @@ def pulled_back(
         potential: V.
         periodic: which coordinates are angles.
     """
-    values, grid, tilt, top = function.values, function.grid, function.tilt, function.log_scale
-    t0, t1 = times
-    diffusion, cov = dynamics.diffusion, 0.5 * linear.noise
 
-    def factor(where: Grid, end: bool) -> Factor | None:
-        return None if potential is None else potential(where, t0, t1, end)
-
-    def noise(where: Grid) -> tuple[Array, float] | None:
-        return None if diffusion is None else (diffusion(where.points, 0.5 * (t0 + t1)), 0.5 * (t1 - t0))
-
-    after, core = factor(grid, True), grid
-    if after is not None:
-        values, gained = _weighed(values, after.log / 6)
-        top += gained
-        values, grid = _blurred(values, core, cov, tilt, False, noise(core))
-        if np.array_equal(grid.basis, core.basis):
-            values, grid = _cropped(values, core.sizes), core
+    def __init__(
+        self,
+        function: Function,
+        linear: Linearisation,
+        times: tuple[float, float],
+        steps: int,
+        dynamics: Dynamics,
+        potential: Potential | None,
+        periodic: tuple[bool, ...],
+    ):
+        self.function, self.linear, self.times, self.steps = function, linear, times, steps
+        self.dynamics, self.potential, self.periodic = dynamics, potential, periodic
+        values, core, tilt, cov = function.values, function.grid, function.tilt, 0.5 * linear.noise
+        self.top = function.log_scale + float(0.5 * tilt @ cov @ tilt)
+        after = self._factor(core, True)
+        if after is not None:
+            values, gained = _weighed(values, after.log / 6)
+            self.top += gained
+            values, grid = _blurred(values, core, cov, tilt, False, self._noise(core))
+            if np.array_equal(grid.basis, core.basis):
+                values = _cropped(values, core.sizes)
+            else:
+                after, core = self._factor(grid, True), grid
+            assert after is not None
+            values, gained = _weighed(values, after.log / 3 + after.correction)
+            self.top += gained
+            self.coefficients, self.grid = _blurred(values, core, 0.0 * cov, tilt, True, None)
         else:
-            after, core = factor(grid, True), grid
-        assert after is not None
-        values, gained = _weighed(values, after.log / 3 + after.correction)
-        top += gained
-        core = grid
-        coefficients, grid = _blurred(values, core, 0.0 * cov, tilt, True, None)
-    else:
-        coefficients, grid = _blurred(values, core, cov, tilt, True, noise(core))
-    top += float(0.5 * tilt @ cov @ tilt)
-    sizes = core.sizes if np.array_equal(core.basis, grid.basis) else grid.sizes
-    wide = wide_grid(target, linear.before)
-    points = np.array_split(wide.points, -(-math.prod(wide.sizes) // TOGETHER))
-    with np.errstate(all="ignore"):
-        moved = np.concatenate([moved_points(dynamics, part, t0, t1, steps) for part in points])
-    z = relative_index(wide, grid, periodic, np.asfortranarray(moved[:, : grid.n]))
-    tilt = np.where(target.circles, 0.0, linear.map.T @ tilt)
-    logs = _evaluated(coefficients, grid, sizes, z, function).reshape(wide.sizes)
-    same = np.array_equal(wide.basis, target.basis)
-    if same and not _resolves(target, function.grid, linear):  # the logarithms show where a finer grid must be
-        return logs + top
-    sloping = (wide.offsets @ tilt).reshape(wide.sizes)
-    before = factor(wide, False)
-    if before is not None:
-        logs = logs + before.log / 3 + before.correction
-    values, gained = _weighed(np.ones(wide.sizes), logs - sloping)
-    top += gained
-    values, wide = _blurred(values, wide, linear.before, tilt, not same, noise(wide), whole=True)
-    top += float(0.5 * tilt @ linear.before @ tilt)
-    if same:
-        values = _cropped(values, target.sizes)
-    else:
-        values = gather(values, relative_index(target, wide, periodic), wide).reshape(target.sizes)
-    before = factor(target, False)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        logs = np.where(values > 0, np.log(values), -np.inf)
-    return logs + top + (target.offsets @ tilt).reshape(target.sizes) + (0.0 if before is None else before.log / 6)
+            self.coefficients, self.grid = _blurred(values, core, cov, tilt, True, self._noise(core))
+        self.core = core.sizes if np.array_equal(core.basis, self.grid.basis) else self.grid.sizes
+
+    def _factor(self, grid: Grid, end: bool) -> Factor | None:
+        return None if self.potential is None else self.potential(grid, *self.times, end)
+
+    def _noise(self, grid: Grid) -> tuple[Array, float] | None:
+        diffusion, (t0, t1) = self.dynamics.diffusion, self.times
+        return None if diffusion is None else (diffusion(grid.points, 0.5 * (t0 + t1)), 0.5 * (t1 - t0))
+
+    def rough(self, grid: Grid) -> Array:
+        """Return the logarithms (*sizes) without the first half of the noise and of the potential."""
+        points = np.array_split(grid.points, -(-math.prod(grid.sizes) // TOGETHER))
+        with np.errstate(all="ignore"):
+            moved = np.concatenate([moved_points(self.dynamics, part, *self.times, self.steps) for part in points])
+        z = relative_index(grid, self.grid, self.periodic, np.asfortranarray(moved[:, : grid.n]))
+        return self.top + _evaluated(self.coefficients, self.grid, self.core, z, self.function).reshape(grid.sizes)
+
+    def logs(self, target: Grid) -> Array:
+        """Return the logarithms at the points of a grid (*sizes)."""
+        cov = self.linear.before
+        wide = wide_grid(target, cov)
+        logs = self.rough(wide)
+        same = np.array_equal(wide.basis, target.basis)
+        if same and not _resolves(target, self.function.grid, self.linear):  # they show where a finer grid must be
+            return logs
+        tilt = np.where(target.circles, 0.0, self.linear.map.T @ self.function.tilt)
+        before = self._factor(wide, False)
+        if before is not None:
+            logs = logs + before.log / 3 + before.correction
+        values, top = _weighed(np.ones(wide.sizes), logs - (wide.offsets @ tilt).reshape(wide.sizes))
+        values, wide = _blurred(values, wide, cov, tilt, not same, self._noise(wide), whole=True)
+        if same:
+            values = _cropped(values, target.sizes)
+        else:
+            values = gather(values, relative_index(target, wide, self.periodic), wide).reshape(target.sizes)
+        before = self._factor(target, False)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logs = np.where(values > 0, np.log(values), -np.inf) + top + float(0.5 * tilt @ cov @ tilt)
+        return logs + (target.offsets @ tilt).reshape(target.sizes) + (0.0 if before is None else before.log / 6)
 
 
 def interpolated(function: Function, target: Grid, periodic: tuple[bool, ...]) -> Array:
