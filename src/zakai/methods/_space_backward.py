@@ -8,6 +8,7 @@ is the smoothed density.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -35,6 +36,7 @@ Array = Any
 FINEST = 1e-4  # tolerance to which a method that is more accurate than splines is smoothed
 TAIL = 2 / 3  # power of the bound on tails of a density for those of a product with the message, which is smoother
 SMOOTHER = 1 / 8  # error of the interpolation of a message as wide as a density, to that of their product
+TRIES = 3  # of the substeps of an interval
 WORTH, FINER = 0.7, 1.3  # ratio of points to those of another grid below which it is taken, and of spacings above which it is
 WIDE = 3.0  # times the bound on edges, above which a grid was too narrow
 SPARE = 2  # points of a grid beyond those that a product uses
@@ -122,9 +124,19 @@ def step(prepared: base.Prepared, k: int, later: Message, values: np.ndarray, st
         before = partial(interpolated, function, periodic=bounds.periodic)
         function, product = _back(begin, bounds, tilted, before, before)
     else:
-        for dynamics, group in reversed(_substeps(general, k, begin, state, values)):
-            function, product, more = _through(dynamics, group, function, bounds)
-            report = report.worst(more)
+        control = Control(np.inf, 0.0, 0)
+        if general is prepared:  # else another splitting was measured
+            control = Control(state.rate, state.measured, state.age, state.fixed)
+        ahead, bound, fewest = function, base.SHARE * general.tolerance, 1
+        for _ in range(TRIES):
+            function, report = ahead, NOTHING
+            for dynamics, group in reversed(_substeps(general, k, begin, control, values, general.allowed(state), fewest)):
+                function, product, more = _through(dynamics, group, function, bounds)
+                report = report.worst(more)
+            if not bound < report.splitting < np.inf:
+                break
+            # The message may be sharper than the density.
+            fewest = fewest * math.ceil((report.splitting / bound) ** 0.25)
     made = report.splitting + report.interpolation + bounds.reach**2 * report.edges * 0.1 + float(product.truncated)
     left = state.kept * later.error
     error = float(np.sqrt(left**2 + 2 * base.ALIKE * left * made + made**2))
@@ -132,33 +144,32 @@ def step(prepared: base.Prepared, k: int, later: Message, values: np.ndarray, st
 
 
 def _substeps(
-    general: base.Prepared, k: int, begin: Field, state: State, values: Array
+    general: base.Prepared, k: int, begin: Field, control: Control, values: Array, allowed: float, fewest: int
 ) -> list[tuple[Dynamics, tuple[Substep, ...]]]:
-    """Return the substeps by which the filter predicts over interval k, the two halves of an extrapolated one together."""
+    """Return the substeps by which the filter predicts over interval k, the two halves of an extrapolated one together.
+
+    If more than one, at least `fewest` extrapolated ones are taken.
+    """
     observations, inside, parts = general.observations, general.observations.inside[k], general.observations.parts(k)
-    length, allowed = float(observations.lengths[k]), general.allowed(state)
+    length = float(observations.lengths[k])
     if not (general.correlated and inside.any()):
-        control = _control(state)
         last = observations.over(*parts[-1])
         potential = last.potential(inside, values, *parts[-1]) if inside.any() else None
+        fixed = control
         if not (control.fixed and control.known(length, allowed)):
             quick = predicted_on(general, begin, control, allowed, length, potential)
-            control = Control(np.inf, 0.0, 0) if quick is None else quick[2]
-        if control.fixed:
+            fixed = Control(np.inf, 0.0, 0) if quick is None else quick[2]
+        if fixed.fixed:
             stepper = Stepper(observations.dynamics, general.bounds, general.tolerance)
-            singles, pairs = control.parts(length, allowed)
-            extrapolated = singles > 3 * pairs
+            singles, pairs = fixed.parts(length, allowed)
+            extrapolated, pairs = singles > 3 * pairs or fewest > 1, max(pairs, fewest)
             times = np.linspace(0.0, length, 1 + (2 * pairs if extrapolated else singles))
             stepper.equal(begin, times, potential, extrapolated)
             return [(stepper.dynamics, group) for group in stepper.taken]
     steppers: list[Stepper] = []
     rates = values / max(length, 1e-300)
-    general.predicted(begin, parts, inside, rates, _control(state), allowed, general.bounds, steppers)
+    general.predicted(begin, parts, inside, rates, control, allowed, general.bounds, steppers, fewest)
     return [(stepper.dynamics, group) for stepper in steppers for group in stepper.taken]
-
-
-def _control(state: State) -> Control:
-    return Control(state.rate, state.measured, state.age, state.fixed)
 
 
 def _back(

@@ -151,8 +151,9 @@ class Prepared:
         allowed: float,
         bounds: Bounds,
         steppers: list[Stepper] | None = None,
+        fewest: int = 1,
     ) -> tuple[Field, Report, Control]:
-        """Return the density at the end of an interval, advanced over its parts one after the other by `steppers`."""
+        """Return the density at the end of an interval, advanced over its parts by `steppers` in at least `fewest` substeps."""
         result, report = begin, NOTHING
         for start, length in parts:
             observations = self.observations.over(start, length)
@@ -166,11 +167,11 @@ class Prepared:
                 potential = potential_of(observations, start, length)
             elif acts:
                 potential = observations.potential(inside, rates * length, start, length)
-            least = 1
+            least = fewest
             if observations.system.varies and length > 0:
                 mean, cov = moments_of(result.values.real, result.grid, bounds.periodic)
                 points = mean + np.concatenate([np.zeros((1, len(mean))), np.diag(np.sqrt(np.diagonal(cov)))])
-                least = observations.least(points, start, length, inside)
+                least = max(fewest, observations.least(points, start, length, inside))
             stepper = Stepper(observations.dynamics, bounds, self.tolerance)
             if steppers is not None:
                 steppers.append(stepper)

@@ -83,16 +83,16 @@ def continued(values: Array, sizes: tuple[int, ...]) -> Array:
         gap, first = new - old, new // 2 - old // 2
         if not gap:
             continue
-        low, high = (np.log(np.maximum(np.take(values, places, d), TINY)) for places in ([0, 1], [old - 1, old - 2]))
-        (left, inner_left), (right, inner_right) = (np.split(part, 2, axis=d) for part in (low, high))
         shape = [-1 if axis == d else 1 for axis in range(len(sizes))]
+        ends = np.log(np.maximum(values.take([0, 1, old - 2, old - 1], d), TINY))
+        left, inner_left, inner_right, right = (ends.take([i], d) for i in range(4))
         steps = np.arange(1, gap + 1).reshape(shape)
         share = steps / (gap + 1)
         share = share * share * (3 - 2 * share)
         left = left + _risen(left - inner_left, gap + 1 - steps)
         right = right + _risen(right - inner_right, steps)
         between = np.exp((1 - share) * right + share * left)
-        before, after = np.split(between, [gap - first], axis=d)[::-1]
+        before, after = between.take(range(gap - first, gap), d), between.take(range(gap - first), d)
         values = np.concatenate([before, values, after], axis=d)
     return values
 
