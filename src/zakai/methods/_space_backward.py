@@ -26,8 +26,8 @@ from zakai.numerics.space_adjoint import Adjoint, Function, function_of, interpo
 from zakai.numerics.space_advance import Control
 from zakai.numerics.space_field import NOTHING, Field, Report, grid_report, positive
 from zakai.numerics.space_grid import Grid, rounded_size
-from zakai.numerics.space_spline import resampled
 from zakai.numerics.space_step import Stepper, Substep
+from zakai.numerics.space_survey import survey
 from zakai.numerics.space_transport import Dynamics, Linearisation
 from zakai.numerics.space_update import Update, updated
 from zakai.numerics.space_window import LEAST, Bounds, fitted_grid
@@ -37,9 +37,8 @@ FINEST = 1e-4  # tolerance to which a method that is more accurate than splines 
 TAIL = 2 / 3  # power of the bound on tails of a density for those of a product with the message, which is smoother
 SMOOTHER = 1 / 8  # error of the interpolation of a message as wide as a density, to that of their product
 TRIES = 3  # of the substeps of an interval
-WORTH, FINER = 0.7, 1.3  # ratio of points to those of another grid below which it is taken, and of spacings above which it is
-WIDE = 3.0  # times the bound on edges, above which a grid was too narrow
-SPARE = 2  # points of a grid beyond those that a product uses
+FINER = 2.0  # ratio of spacings above which the axes of a product need not be those of the density
+AROUND, SPARE = 3, 2  # points beyond those that a product uses, of a grid for it and of its grid
 LARGEST = 0.5  # nats by which extrapolation may change the message
 FIGURES = (
     "error_estimate", "tolerance_ratio", "splitting_error", "tail_depth", "edge_mass", "negative_mass", "std_in_spacings",
@@ -185,36 +184,37 @@ def _back(
         found.append((grid, evaluate(grid)))
         return found[-1][1].reshape(-1)
 
-    part = _part(density, bounds, rough)
-    update = updated(part or density, log_factor, bounds, 0.0, shrink=False)
-    if part is not None and (update.truncated or update.edges > WIDE * bounds.edge):
-        update = updated(density, log_factor, bounds, 0.0, shrink=False)
-    elif part is not None:
-        update = update._replace(depth=update.depth + float(np.log(density.values.max() / part.values.max())))
+    update = updated(density, log_factor, bounds, 0.0, _start(density, bounds, rough))
     grid, logs = next((grid, logs) for grid, logs in found if grid is update.field.grid)
     used, grid = _used(update.field, bounds)
     product = update.field._replace(values=np.ascontiguousarray(update.field.values[used]), grid=grid)
     return function_of(logs[used], grid, product.values, tilted), update._replace(field=product)
 
 
-def _part(density: Field, bounds: Bounds, rough: Callable[[Grid], Array]) -> Field | None:
-    """Return a density on a smaller or finer grid for its product with a function, or None where its own will do."""
+def _start(density: Field, bounds: Bounds, rough: Callable[[Grid], Array]) -> Grid:
+    """Return a grid for the product of a density with a function: a part of that of the density, or a finer one."""
     grid = density.grid
-    every = tuple(slice(size // 2 % 2, None, 2) for size in grid.sizes)
-    values = density.values[every]
+    values = density.values[tuple(slice(size // 2 % 2, None, 2) for size in grid.sizes)]
     coarse = Grid(grid.centre, 2 * grid.basis, values.shape, grid.closed)
     with np.errstate(divide="ignore"):
-        levels = (np.log(values) + rough(coarse)).reshape(-1)
+        levels = np.log(values) + rough(coarse)
     if not np.isfinite(levels.max()):
-        return None
+        return grid
     levels -= levels.max()
-    noise, narrow = 0.25 * grid.basis @ grid.basis.T, np.ones(grid.n)
-    new = fitted_grid(coarse.offsets, levels, grid.centre, noise, narrow, bounds, grid, least=float(np.log(bounds.edge)))
-    finer = np.linalg.norm(grid.basis, axis=0) / np.linalg.norm(new.basis, axis=0)
-    if new.closed != grid.closed or (np.prod(new.sizes) > WORTH * np.prod(grid.sizes) and finer.max() < FINER):
-        return None
-    values = resampled(density.values, grid, new, bounds.periodic)
-    return positive(Field(values, new, density.log_scale), bounds)
+    found = survey(np.exp(levels), coarse, bounds.edge)
+    finer = np.where(grid.circles, 1.0, np.maximum(bounds.spacings / (2 * found.conditional), 1.0))
+    if finer.max() > FINER:
+        noise, narrow = 0.25 * grid.basis @ grid.basis.T, np.ones(grid.n)
+        least = float(np.log(bounds.edge))
+        return fitted_grid(coarse.offsets, levels.reshape(-1), grid.centre, noise, narrow, bounds, grid, least=least)
+    low, high = 2 * (found.used.T - coarse.shape // 2) + np.array([[-AROUND], [AROUND]])
+    sizes = tuple(
+        rounded_size((b - a + 1) * ratio, LEAST[grid.n], 2 * bounds.most)
+        for a, b, ratio in zip(low.tolist(), high.tolist(), finer.tolist(), strict=True)
+    )
+    sizes = tuple(old if closed else new for old, new, closed in zip(grid.sizes, sizes, grid.closed, strict=True))
+    middle = np.where(grid.circles, 0.0, np.round(0.5 * (low + high)))
+    return Grid(grid.centre + grid.basis @ middle, grid.basis / finer, sizes, grid.closed)
 
 
 def _used(product: Field, bounds: Bounds) -> tuple[tuple[slice, ...], Grid]:
@@ -259,10 +259,15 @@ def _through(
 
 
 def density(prepared: base.Prepared, state: State, later: Message) -> GridDensity:
-    """Return the smoothed density."""
-    found = later.product.field
+    """Return the smoothed density, on a grid that resolves it as those of the filter do."""
+    bounds = _general(prepared).bounds
+
+    def log_factor(grid: Grid) -> Array:
+        return interpolated(later.function, grid, bounds.periodic).reshape(-1)
+
+    found = updated(_density(prepared, state), log_factor, bounds, 0.0, later.function.grid).field
     with np.errstate(divide="ignore"):
-        logs = np.log(np.maximum(found.values, 0.0))
+        logs = np.log(found.values)
     return GridDensity(logs, found.grid.centre, found.grid.basis, prepared.model.state, prepared.angles)
 
 

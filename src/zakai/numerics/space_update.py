@@ -14,13 +14,14 @@ from zakai.numerics.complex_step import is_complex
 from zakai.numerics.space_field import Field, better, finer_by, positive, refinable
 from zakai.numerics.space_grid import Grid, filtered
 from zakai.numerics.space_resample import refined, triangular_resampled
-from zakai.numerics.space_spline import gather, relative_index
+from zakai.numerics.space_spline import gather, relative_index, resampled
 from zakai.numerics.space_survey import Survey, deviations_in_spacings, narrowest
 from zakai.numerics.space_window import Bounds, adjusted, fitted_grid, whitened_grid
 
 Array = NDArray[Any]
 _STEEP = 4.0  # change of the log-likelihood between neighbours that a grid may have before it is refined
 _TRIES = 16
+_RESOLVED = 3  # grids on which neighbours differ by few nats that are tried from a grid that was chosen for the product
 LOWEST = -100.0  # logarithm of a product, relative to its largest, below which it is zero
 MOST_REFINED = 2.0  # ratio of spacings by which a grid is refined at once
 POINT = 0.1  # deviations in spacings of a product that is one point: rounding of the likelihood
@@ -97,18 +98,20 @@ def _multiplied(values: Array, grid: Grid, log_factor: Callable[[Grid], Array]) 
 
 
 def updated(
-    field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, tails: float, shrink: bool = True
+    field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, tails: float, start: Grid | None = None
 ) -> Update:
     """Return the product of a density and a factor that is given by its logarithm at the points of a grid (J,).
 
     A factor that is narrower than the grid's spacing is found on a sequence of finer grids, with a power of it below one as long
-    as neighbours differ by many nats.  `tails` are those of the spectrum of the density.  With `shrink`, a product that
-    fills a small part of the grid goes to a smaller one.  A product that is zero, or one point, leaves the density as it is; its
-    mass on the grid of the density is that of the result.
+    as neighbours differ by many nats.  `tails` are those of the spectrum of the density.  `start` is the first grid, which the
+    product may fill as it will; without it that is the grid of the density.  A product that is zero, or one point, leaves the
+    density as it is; its mass on the grid of the density is that of the result.
     """
     grid, values = field.grid, field.values
+    if start is not None:
+        grid, values = start, positive(Field(resampled(values, grid, start, bounds.periodic), start, 0.0), bounds).values
     coefficients, last, before = None, grid, np.ones(grid.n)
-    sparse = False
+    sparse, resolved = False, 0
     best: tuple[float, _Product, Survey] | None = None  # the smallest edges and tails so far: a later grid may be worse
     for attempt in range(_TRIES):
         product = _multiplied(values, grid, log_factor)
@@ -129,8 +132,9 @@ def updated(
                 best = worst, product, found
             before, last = np.where(coarse & (attempt > 0), found.tails, before), grid
             span = (found.used[:, 1] - found.used[:, 0] + 4) / grid.shape
-            sparse = bool(shrink and attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1)
-            if not (wide.any() or coarse.any() or sparse):
+            sparse = bool(start is None and attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1)
+            resolved += 1
+            if not (wide.any() or coarse.any() or sparse) or (start is not None and resolved > _RESOLVED):
                 break
         if attempt == _TRIES - 1:
             break
