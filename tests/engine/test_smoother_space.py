@@ -184,3 +184,20 @@ def test_an_angle_that_turns_is_smoothed_as_in_a_frame_that_turns_with_it():
     apart = found.mean - expected.mean - np.stack([1.4 * np.concatenate([[0], times]), np.zeros(len(times) + 1)], 1)
     apart[:, 0] = (apart[:, 0] + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(apart / deviation).max() < 2e-3 and np.abs(np.sqrt(found.variance) / deviation - 1).max() < 2e-3
+
+
+def test_correlated_noise_that_depends_on_the_state_is_smoothed_as_without_a_follower():
+    shared = {"observation": ["x"], "observation_noise": [["0.1"]], "observation_kind": "increments"}
+    one = zakai.Model(
+        state=["x"], drift=["-x"], diffusion=[["0.6 + 0.2*sin(x)"]], cross_noise=[["0.15"]],
+        prior={"kind": "gaussian", "mean": [0.3], "cov": [[0.2]]}, **shared,
+    )  # fmt: skip
+    two = zakai.Model(
+        state=["x", "y"], drift=["-x", "x - y"], diffusion=[["0.6 + 0.2*sin(x)", 0], [0, "0.5"]], cross_noise=[["0.15"], [0]],
+        prior={"kind": "gaussian", "mean": [0.3, 0], "cov": [0.2, 0.3]}, **shared,
+    )  # fmt: skip
+    record = zakai.Record([0.1, 0.25, 0.5], [[0.12], [-0.05], [0.2]], "increments")
+    expected, result = zakai.smooth(one, record, "yau-yau"), zakai.smooth(two, record, "yau-yau")
+    assert not result.warnings and result.health["evidence_error"].max() < 5e-4
+    np.testing.assert_allclose(result.mean[:, 0], expected.mean[:, 0], atol=1e-3)
+    np.testing.assert_allclose(result.variance[:, 0], expected.variance[:, 0], rtol=2e-3)

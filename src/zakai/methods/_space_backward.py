@@ -20,11 +20,13 @@ from zakai.errors import InputError
 from zakai.methods import _space_kolmogorov as base
 from zakai.methods._protocol import Backward, Info
 from zakai.methods._space import State
+from zakai.methods._space_cross import cross_formulas
 from zakai.methods._space_short import predicted_on
 from zakai.methods._space_system import moments_of
-from zakai.numerics.space_adjoint import Adjoint, Function, function_of, interpolated
+from zakai.numerics.space_adjoint import Adjoint
 from zakai.numerics.space_advance import Control
 from zakai.numerics.space_field import NOTHING, Field, Report, grid_report, positive
+from zakai.numerics.space_function import Function, function_of, interpolated
 from zakai.numerics.space_grid import Grid, rounded_size
 from zakai.numerics.space_step import Stepper, Substep
 from zakai.numerics.space_survey import survey
@@ -115,6 +117,7 @@ def step(prepared: base.Prepared, k: int, later: Message, values: np.ndarray, st
     observations, bounds = general.observations, general.bounds._replace(tail=general.bounds.tail**TAIL)
     function, product, report = later.function, later.product, NOTHING
     tilted = not observations.system.state_dependent
+    tilted = tilted and not (general.correlated and cross_formulas(general.model).state_dependent)
     factor, constant = observations.factor(k, observations.inside[k], values)
     if factor is not None:
         logs = function.logs() + factor(function.grid).real.reshape(function.grid.sizes) + float(np.real(constant))
