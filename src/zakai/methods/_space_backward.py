@@ -113,6 +113,8 @@ def smoothed(prepared: base.Prepared, state: State, later: Message) -> tuple[Mes
 
 def step(prepared: base.Prepared, k: int, later: Message, values: np.ndarray, state: State) -> Message:
     """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
+    if not state.error < base.LOST:  # of the filter nothing is known here
+        return message(prepared, state)._replace(error=1.0)
     general, begin = _general(prepared), _density(prepared, state)
     observations, bounds = general.observations, general.bounds._replace(tail=general.bounds.tail**TAIL)
     function, product, report = later.function, later.product, NOTHING
@@ -130,7 +132,7 @@ def step(prepared: base.Prepared, k: int, later: Message, values: np.ndarray, st
         if general is prepared:  # else another splitting was measured
             control = Control(state.rate, state.measured, state.age, state.fixed)
         ahead, bound, fewest = function, base.SHARE * general.tolerance, 1
-        for _ in range(TRIES):
+        for _ in range(TRIES if later.error < base.LOST else 1):
             function, report = ahead, NOTHING
             for dynamics, group in reversed(_substeps(general, k, begin, control, values, general.allowed(state), fewest)):
                 function, product, more = _through(dynamics, group, function, bounds)
