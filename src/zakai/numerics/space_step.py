@@ -42,6 +42,7 @@ from zakai.numerics.space_window import LEAST, Bounds, adjusted, enlargement, fi
 Array = NDArray[Any]
 Potential = Callable[[Grid, float, float, bool], Factor]  # at the start (False) or the end (True) of a substep
 SUPPORT = 400  # points that are moved to see where a density goes
+FEW = 64  # points that show how many Runge-Kutta steps a short substep needs
 TRIES = 7
 MARGIN = 0.03  # of the bounds, for a grid of short steps
 MOST_ENLARGED = 8.0  # times its own volume that a grid may need for the noise of a substep
@@ -231,9 +232,13 @@ class Stepper:
 
     def equal(self, field: Field, times: Array, potential: Potential | None, extrapolated: bool) -> None:
         """Take substeps of a density that stays as it is."""
-        moves = self._moves(field, tuple(times.tolist()))
-        ends = list(pairwise(times.tolist()))
-        substeps = [Substep(field, end, move.linear, move.steps, potential) for move, end in zip(moves, ends, strict=True)]
+        ends, grid, real = list(pairwise(times.tolist())), field.grid, field.values.real
+        used = np.flatnonzero(real > MARGIN * self.bounds.edge * real.max())
+        used = used[:: max(1, len(used) // FEW)]
+        tolerance = 0.05 * self.tolerance * np.sqrt(real.max() / real.reshape(-1)[used])
+        steps, _ = steps_needed(self._deciding(), grid.points[used], *ends[0], grid.inverse, tolerance)
+        linears = self._linear(field, tuple(times.tolist()))
+        substeps = [Substep(field, end, linear, steps, potential) for linear, end in zip(linears, ends, strict=True)]
         count = 2 if extrapolated else 1
         for first in range(0, len(substeps), count):
             self._take(*substeps[first : first + count])
