@@ -1,5 +1,6 @@
 """Compilation of kernels."""
 
+import gc
 import time
 
 import numpy as np
@@ -18,6 +19,7 @@ def test_the_clock_of_work_stands_still_while_a_kernel_is_compiled():
     time.sleep(0.02)
     worked, spent = working_time() - worked, time.monotonic() - began
     assert 0.02 <= worked < 0.5 * spent
+    assert gc.isenabled()  # a compilation turns the collection of garbage off
 
 
 def test_exponentials_of_arrays_are_those_of_numpy():
