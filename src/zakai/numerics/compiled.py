@@ -140,8 +140,3 @@ class _PartCompiler(CompilerBase):  # type: ignore[misc]
 def helper(function: F) -> F:
     """Compile a function that only kernels call, as a part of each of them; it has no entry for Python."""
     return cast(F, _compiler(no_cpython_wrapper=True, pipeline_class=_PartCompiler)(function))
-
-
-def inlined(function: F) -> F:
-    """Copy a function into the one kernel that calls it before that is compiled, so that it is not optimised twice."""
-    return cast(F, _compiler(inline="always")(function))

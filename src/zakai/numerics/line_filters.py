@@ -15,7 +15,7 @@ from numba import complex128, float64, int64
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from zakai.numerics.compiled import helper, inlined, kernel
+from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line_density import highest_of
 from zakai.numerics.line_terms import Transition, failed
@@ -170,7 +170,7 @@ def kernel_of(parameters: Array, observed: Array, length: float, to: Array) -> N
             to[3] += constant[i * count + j] * one * other
 
 
-@inlined
+@helper
 def convolved(
     now: Array, phi: Array, channel: Array, middle: float, spacing: float, finest: float, depth: float, closed: bool
 ) -> Transition:

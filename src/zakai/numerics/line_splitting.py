@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import helper, inlined
+from zakai.numerics.compiled import helper
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line_averages import EARLY, IMPOSSIBLE, LATE, MEAN, MOST_MAGNUS, averaged, averaging, operators
 from zakai.numerics.line_density import highest_of, moments
@@ -37,7 +37,7 @@ OVERFLOW = 690.0
 STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
 
 
-@inlined
+@helper
 def divided(
     now: Array, table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, averages: Array,
     observed: Array, inside: bool, tau: float, spacing: float, closed: bool, depth: float, most: float, finest: float,
