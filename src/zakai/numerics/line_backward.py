@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line_density import circular_moments, highest_of, moments, spectrum, support, waves
+from zakai.numerics.line_modes import propagate
 from zakai.numerics.line_window import CUT
 
 Array = NDArray[Any]
@@ -147,7 +148,7 @@ def kept(before: float, between: float, after: float) -> float:
 
 @kernel(
     types.Tuple((int64, float64, float64, float64))(  # type: ignore[no-untyped-call]
-        _V, float64, float64, _V, _M, _V, _M, _V, _V, int64, int64, _M, _V, boolean, float64, float64, _M, _M, _M, _M, _M, _M
+        _V, float64, float64, _V, _M, _V, _V, _V, _V, int64, int64, _M, _V, boolean, float64, float64, _M, _M, _M, _M, _M, _M
     )
 )  # fmt: skip
 def _decomposed(
@@ -175,10 +176,10 @@ def _decomposed(
         between, count = spread(b, first, last), 1
         while count < longer and tau * (rates[count] - rates[0]) < NEGLIGIBLE_MODES:
             count += 1
-        coefficients = np.dot(modes[:count], now)
+        decay = np.empty(count)
         for n in range(count):
-            coefficients[n] *= np.exp(-tau * (rates[n] - rates[0]))
-        now = np.dot(coefficients, modes[:count])
+            decay[n] = np.exp(-tau * (rates[n] - rates[0]))
+        propagate(modes, decay, now)
         highest = now[highest_of(now)]
         noise = NOISE * np.sqrt(norm) * max(1.0, np.exp(min(tau * rates[0], 600.0)))
         left, right, _, _, _, aliasing, _, _, _ = spectrum(now, CUT, SMALLEST, long_cosines, long_sines, False)
@@ -232,8 +233,8 @@ def by_modes(
     count, size = len(lengths), len(message.product)
     psi, products, out = message.values.copy(), np.empty((count, size)), np.zeros((count, 6))
     taken, error, scale, least = _decomposed(
-        psi, message.scale, message.error, message.product, before.densities, before.floors, *gauged, logs, lengths, closed,
-        limits.error, limits.negligible, *waves(size), *waves(len(gauged.rates)), products, out,
+        psi, message.scale, message.error, message.product, before.densities, before.floors, gauged.modes.ravel(), *gauged[1:],
+        logs, lengths, closed, limits.error, limits.negligible, *waves(size), *waves(len(gauged.rates)), products, out,
     )  # fmt: skip
     first, last = 0, len(psi) - 1
     if taken and not closed:

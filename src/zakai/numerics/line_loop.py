@@ -59,7 +59,7 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
 
     @kernel(
         types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]
-            _V, int64, _Q, _M, _M, _V, _T, _M, _M, float64, float64, float64, int64, _M, int64[::1], _V, _V, _Q, _V, _M, _T,
+            _V, int64, _Q, _M, _V, _V, _T, _M, _M, float64, float64, float64, int64, _M, int64[::1], _V, _V, _Q, _V, _M, _T,
             _T, _M, float64, float64, _V, _M, _M, _M
         )
     )  # fmt: skip
@@ -252,7 +252,7 @@ def advance(
     densities, out = np.empty((count, size)), np.empty((count + 1, len(COLUMNS)))
     averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
     done, why = _loop(*mechanisms)(
-        values, grid.start, grid.table, grid.profile, grid.modes, grid.rates, averages, *waves(size), grid.offset,
+        values, grid.start, grid.table, grid.profile, grid.modes.ravel(), grid.rates, averages, *waves(size), grid.offset,
         grid.spacing, grid.unit, first, observed, *steps, error, log_floor, limits, densities, out, grid.fine,
     )  # fmt: skip
     return Segment(densities[:done], out[:done], why, out[-1, :3])

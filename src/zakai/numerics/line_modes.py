@@ -5,13 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numba import float64, void
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import helper
+from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line_density import highest_of
 
 Array = NDArray[Any]
+_V = float64[::1]
 
 LOG_NOISE = -33.4  # logarithm of the error of a decomposition relative to the maximum
 _SUPPORT = 1e-13  # values relative to the maximum beyond which a density counts as ended
@@ -32,6 +34,22 @@ def decayed(rates: Array, time: float) -> Array:
     return decay
 
 
+@kernel(void(_V, _V, _V), reordered=True)
+def propagate(modes: Array, decay: Array, values: Array) -> None:
+    """Replace values (N,) by U decay U' of them, with the rows of U' one after the other (N^2,) and the decay of the first M."""
+    size = values.size
+    found = np.zeros(size)
+    for n in range(decay.size):
+        row, coefficient = modes[n * size : (n + 1) * size], 0.0
+        for j in range(size):
+            coefficient += row[j] * values[j]
+        coefficient *= decay[n]
+        for j in range(size):
+            found[j] += coefficient * row[j]
+    for j in range(size):
+        values[j] = found[j]
+
+
 @helper
 def decomposed(
     now: Array, phi: Array, modes: Array, decay: Array, most: float, closed: bool
@@ -44,7 +62,7 @@ def decomposed(
     Args:
         now: the density (N,).
         phi: the logarithm of the gauge (N,).
-        modes: U' (N, N).
+        modes: the rows of U' one after the other (N^2,).
         decay: exp(-time rates) (M,) of the modes that are not negligible.
         most: the largest error.
         closed: whether the grid goes around the circle.
@@ -60,21 +78,18 @@ def decomposed(
         reach += inner[j] * inner[j]
         if not closed and (now[j] <= limit or j < 2 or j >= now.size - 2):
             end = max(end, inner[j])
-    coefficients = np.dot(modes[: decay.size], inner)
-    for j in range(decay.size):
-        coefficients[j] *= decay[j]
-    moved = np.dot(coefficients, modes[: decay.size])
+    propagate(modes, decay, inner)
     # Beyond the support there is only rounding, which must not be amplified.
     noise = 4e-16 * np.sqrt(reach)
     left, right = 0, now.size - 1
-    while left < right and not moved[left] > noise:
+    while left < right and not inner[left] > noise:
         now[left] = 0.0
         left += 1
-    while right > left and not moved[right] > noise:
+    while right > left and not inner[right] > noise:
         now[right] = 0.0
         right -= 1
     for j in range(left, right + 1):
-        now[j] = after[j] * moved[j]
+        now[j] = after[j] * inner[j]
         top = max(top, now[j])
         highest = max(highest, after[j])
     outside = max(after[0], after[now.size - 1])

@@ -16,13 +16,13 @@ from math import erfc
 from typing import Any
 
 import numpy as np
-from numba import boolean, float64, int64, types, void
+from numba import boolean, float64, int64, types
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line_density import highest_of, moments, separated, spectrum, support
-from zakai.numerics.line_modes import LOG_NOISE, decayed
+from zakai.numerics.line_modes import LOG_NOISE, decayed, propagate
 from zakai.numerics.line_outlook import outlook, place_of, wanted
 from zakai.numerics.line_place import PER, sampled, weigh, weighed
 from zakai.numerics.line_segment import RELIABLE
@@ -71,22 +71,6 @@ def gathered(values: Array, at: Array, found: Array) -> None:
         found[j] = -found[j]
 
 
-@kernel(void(_V, _V, _V), reordered=True)
-def by_modes(modes: Array, decay: Array, values: Array) -> None:
-    """Replace values (N,) by U decay U' of them, with the rows of U' one after the other and the decay of the first M."""
-    size = values.size
-    found = np.zeros(size)
-    for n in range(decay.size):
-        row, coefficient = modes[n * size : (n + 1) * size], 0.0
-        for j in range(size):
-            coefficient += row[j] * values[j]
-        coefficient *= decay[n]
-        for j in range(size):
-            found[j] += coefficient * row[j]
-    for j in range(size):
-        values[j] = found[j]
-
-
 @kernel(
     types.UniTuple(float64, 2)(  # type: ignore[no-untyped-call]
         _V, _V, boolean, _V, _V, _V, float64, int64, int64, _V
@@ -130,7 +114,7 @@ def carried(
             coefficients[coefficients.size - 1 - j] *= fall
     reach = np.sqrt(np.sum(coefficients * coefficients))
     decay = decayed(rates, tau)
-    by_modes(modes, decay, coefficients)
+    propagate(modes, decay, coefficients)
     after, most, largest = np.empty(moved.size), 0.0, 0.0
     for j in range(moved.size):
         after[j] = scale[PER * j] - reference
