@@ -11,7 +11,6 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import erfc, erfcx
 
 from zakai.methods._line_message import FALL, HALF, PAD
 from zakai.methods._line_system import Prepared
@@ -28,6 +27,8 @@ def fall(size: int, closed: bool) -> tuple[Array, Array, Array]:
     """Return F, F'/F and its derivative at the points of a grid (size,) with the spacing one."""
     if closed:
         return np.ones(size), np.zeros(size), np.zeros(size)
+    from scipy.special import erfc, erfcx
+
     i = np.arange(size)
     y = (np.maximum(PAD - i, PAD - i[::-1]) - HALF) / FALL
     side = np.where(i < size / 2, -1.0, 1.0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import erfc
 
 from zakai.methods._line_system import State
 from zakai.numerics import line_window as lw
@@ -76,6 +75,8 @@ class Message(NamedTuple):
 
 def taper(offsets: Array, ends: tuple[float, float], spacing: float) -> Array:
     """Return F of a grid that ends `PAD` spacings beyond two offsets."""
+    from scipy.special import erfc
+
     beyond = np.maximum(ends[0] - offsets, offsets - ends[1]) / spacing
     return 0.5 * erfc((beyond - HALF) / FALL)
 

@@ -8,12 +8,12 @@ that is exact for band-limited densities, which is accurate relative to the maxi
 
 from __future__ import annotations
 
+from math import erfc
 from typing import Any
 
 import numpy as np
 from numba import complex128, float64, int64
 from numpy.typing import NDArray
-from scipy.special import erfc
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.exponentials import exponentiate
@@ -30,7 +30,8 @@ _FREQUENCIES = 2.0 * np.pi / _NODES * np.arange(_NODES // 2 + 1)
 # From values at the frequencies to coefficients, by the rule of trapezoids.
 _COSINES = 2.0 / _NODES * np.cos(_FREQUENCIES[:, None] * np.arange(_TAPS))
 _COSINES[[0, -1]] *= 0.5
-_PASSED = 0.5 * erfc((_FREQUENCIES - np.pi) * 5.2 / ((1.0 - BAND) * np.pi))  # one up to the band, and one half at the end
+# One up to the band, and one half at the end.
+_PASSED = np.array([0.5 * erfc((one - np.pi) * 5.2 / ((1.0 - BAND) * np.pi)) for one in _FREQUENCIES])
 
 
 @helper
