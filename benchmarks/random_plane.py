@@ -1,7 +1,7 @@
 """Random systems with two states, and an independent solution: sinc collocation on windows that follow the density.
 
 The derivatives are dense matrices along the axes, the time steps those of Runge and Kutta. Before every few steps the window and
-the spacings are chosen anew from the support and the spectrum of the density. Nothing here is shared with zakai but the model.
+the spacings are chosen again from the support and the spectrum of the density. Nothing here is shared with zakai but the model.
 """
 
 from __future__ import annotations
