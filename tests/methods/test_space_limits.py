@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from scipy.stats import norm
 
 import zakai
 
@@ -10,6 +12,9 @@ CUBIC = {
     "state": ["x", "y"], "drift": ["-x + y/2", "-y**3"], "observation": ["x", "y"], "observation_kind": "samples",
     "observation_noise": [["1/10", "0"], ["0", "1/10"]], "prior": {"kind": "gaussian", "mean": [0, 0], "cov": [1, 1]},
 }  # fmt: skip
+# Means and variances of logarithms of predator and prey, by sinc collocation (benchmarks/random_plane.py).
+MEANS = np.array([[1.6447937, -1.4853879], [1.51148608, -0.9406271], [1.69740427, -1.02735927], [1.78780556, -0.14415499]])
+VARIANCES = np.array([[0.0014583647, 0.5714787], [0.0013449831, 1.2089443], [0.001196541, 0.4405235], [0.0010564343, 0.2940649]])
 
 
 def test_a_fill_value_in_two_states_warns_with_its_time_and_does_not_end_the_filter():
@@ -36,3 +41,44 @@ def test_a_density_that_no_grid_of_three_states_holds_ends_with_a_warning():
     result = zakai.filter(model, zakai.Record([0.2], [[6.0]], "samples"), "yau-yau")
     assert any("tolerance_ratio exceeds 1" in text for text in result.warnings)
     assert result.density(1).log_values.size < 500_000 and np.isfinite(result.mean).all()
+
+
+@pytest.mark.parametrize("surprise", [0.0, 0.05, 0.1])
+def test_an_observation_in_the_tails_of_a_prediction_has_the_error_that_is_estimated(surprise):
+    # Two independent linear states; the second observation of y is 2, 5 and 7 standard deviations from its prediction.
+    model = zakai.Model(
+        state=["x", "y"], drift=["-x", "-y"], observation=["x", "y"], observation_kind="samples",
+        observation_noise=[[1e-4, 0], [0, 1e-4]], process_noise=[[1e-3, 0], [0, 1e-3]],
+        prior={"kind": "gaussian", "mean": [0, 0], "cov": [1, 1]},
+    )  # fmt: skip
+    times, values = [0.01, 2.0], np.array([[0.7, -0.4], [0.1, surprise]])
+    mean, variance, evidence = np.zeros(2), np.ones(2), 0.0
+    for length, value in zip(np.diff(times, prepend=0.0), values, strict=True):
+        kept = np.exp(-length)
+        mean, variance = kept * mean, kept**2 * variance + 1e-3 * (1 - kept**2) / 2
+        evidence += norm.logpdf(value, mean, np.sqrt(variance + 1e-4)).sum()
+        gain = variance / (variance + 1e-4)
+        mean, variance = mean + gain * (value - mean), variance * (1 - gain)
+    result = zakai.filter(model, zakai.Record(times, values, "samples"), "yau-yau")
+    errors = [
+        result.log_likelihood - evidence,
+        *((result.mean[-1] - mean) / np.sqrt(variance)),
+        *(np.sqrt(result.variance[-1] / variance) - 1),
+    ]
+    assert np.abs(errors).max() < result.health["error_estimate"][-1] < 5e-4
+    assert result.warnings == []
+
+
+def test_logarithms_of_predator_and_prey_keep_the_error_that_is_estimated():
+    # The drift grows as exp: grids for the tails of a density may have to be far wider than the density.
+    model = zakai.Model(
+        state=["u", "v"], drift=["1 - exp(v)", "exp(u) - 1"], process_noise=[["1/20", "0"], ["0", "1/20"]],
+        observation=["exp(u)"], observation_kind="samples", observation_noise=[["1/25"]],
+        prior={"kind": "gaussian", "mean": [0.3, 0.0], "cov": [0.1, 0.1]},
+    )  # fmt: skip
+    gaps = np.random.default_rng(1).exponential(0.2, 200)
+    _, record = zakai.simulate(model, np.cumsum(np.maximum(gaps, 0.004)), seed=2)
+    result = zakai.filter(model, zakai.Record(record.times[:71], record.values[:71], "samples"), "yau-yau")
+    errors = np.abs(np.hstack([(result.mean[68:] - MEANS) / np.sqrt(VARIANCES), np.sqrt(result.variance[68:] / VARIANCES) - 1]))
+    assert np.isfinite(result.mean).all() and result.warnings == []
+    assert (errors.max(axis=1) < 10 * result.health["error_estimate"][68:]).all()

@@ -40,6 +40,8 @@ DEFAULT_TOLERANCE = 1e-3
 OUTLIER_EDGE = 1e-15
 ACCURATE_DEPTH = 27.0  # nats below the maximum that rounding leaves accurate
 ALIKE = 0.5  # how much the errors of different intervals have in common
+FINER = 2.0  # ratio of the spacings of a grid to those of its splines, where these make more than a share of the tolerance
+COARSE = 0.1
 SHARE = 0.2  # of the tolerance, for the error in time of one interval
 LOST = 0.5  # error of a density relative to itself
 KEPT = 0.98  # largest share of an error that an interval is taken to leave
@@ -110,7 +112,8 @@ class Prepared:
         if not (self.correlated and inside.any()):
             quick = predicted_on(self, begin, control, allowed, length, potential)
         bounds, rates = self.bounds, values / max(length, 1e-300)
-        for _ in range(3):
+        before: tuple[Field, Report, Control, Update] | None = None
+        for _ in range(4):
             if quick is not None:
                 (predicted, report, after), found, quick = quick[:3], quick[3] if factor is None else None, None
             else:
@@ -118,6 +121,16 @@ class Prepared:
             update = Update(predicted, report.edges, report.tails, 0.0, False)
             if factor is not None:
                 update = updated(predicted, factor, bounds, report.tails)
+            if before is not None and not report.splitting + report.of_grid(bounds.reach) < LOST:
+                predicted, report, after, update = before
+                break
+            before = predicted, report, after, update
+            of_splines = report.interpolation * update.growth
+            if length > 0 and bounds.finer == 1.0 and (update.truncated or of_splines > COARSE * self.tolerance):
+                # The error of waves is as large in the tails as elsewhere.
+                if float(begin.survey(bounds).tails.max()) * np.exp(min(update.depth, 40.0)) < of_splines:
+                    bounds = bounds._replace(finer=FINER)
+                    continue
             if not update.truncated or length == 0 or bounds.edge <= OUTLIER_EDGE:
                 break
             # The observation is where the prediction was cut off; so wide a grid leaves rounding, which no substep makes smaller.
@@ -199,8 +212,8 @@ class Prepared:
         if not report.splitting + report.of_grid(self.bounds.reach) < LOST and np.isfinite(update.depth):
             result, mass = self._gaussian(result, mean, cov), 1.0
         edge, tails = max(report.edges, update.edges), max(report.tails, update.tails)
-        made = (report.splitting + report.interpolation) * (1 + update.depth) + 1e-15 * np.exp(min(update.depth, 40.0))
-        made = made + self.bounds.reach**2 * edge * 0.1 + tails
+        made = (report.splitting + report.interpolation) * update.growth + update.interpolation
+        made = made + 1e-15 * np.exp(min(update.depth, 40.0)) + self.bounds.reach**2 * edge * 0.1 + tails
         left = kept * state.error
         error = float(np.sqrt(left**2 + 2 * ALIKE * left * made + made**2))
         if update.truncated or not np.isfinite(gained):
@@ -244,9 +257,8 @@ class Prepared:
 
     def _kept(self, begin: Field, predicted: Field, result: Field) -> float:
         """Return the share of an error of the mean, in deviations, that an interval leaves."""
-        before, between, after = (
-            max(float(np.linalg.det(f.survey(self.bounds).cov)), 1e-300) for f in (begin, predicted, result)
-        )
+        volumes = np.linalg.det(np.stack([f.survey(self.bounds).cov for f in (begin, predicted, result)]))
+        before, between, after = np.maximum(volumes, 1e-300).tolist()
         contracted = (min(before, between) / between * min(after, between) / between) ** (0.5 / self.model.n)
         return float(np.clip(contracted, 0.0, KEPT))
 

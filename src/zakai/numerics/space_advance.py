@@ -24,6 +24,7 @@ MOST_PARTS, MOST_WORK = 512, 2**22  # substeps of an interval, and substeps time
 BALANCED = 0.5  # of the error that the grid makes, below which shorter substeps do not make that in time
 CHECKED = 64  # intervals after which the error of single substeps is measured again
 WORTH, SMALL = 1.5, 0.05  # least order in its length of a small error of a substep for which shorter ones are tried
+VANISHED = Report(1.0, 0.0, 1.0, 1.0, 0.0)
 _EXTRAPOLATED = 1.0  # the error that extrapolation leaves, as a multiple of difference^(5/3)
 
 
@@ -55,6 +56,11 @@ class Control(NamedTuple):
         return float(_EXTRAPOLATED * (0.75 * min(self.rate * tau**3, 1.0)) ** (5 / 3))
 
 
+def _vanished(field: Field) -> bool:
+    """Return whether nothing is left of a density, as where the grid that its tails need does not resolve it."""
+    return not 0.0 < field.values.real.max() < np.inf
+
+
 def advance(
     stepper: Stepper,
     field: Field,
@@ -79,7 +85,10 @@ def advance(
     if singles < 2 * doubles and stepper.limit(field, t0, t0 + tau / singles) >= t0 + tau / singles:
         parts, report = int(singles), NOTHING
         for i in range(parts):
+            before = field
             field, more = stepper.single(field, t0 + tau * i / parts, t0 + tau * (i + 1) / parts, potential)
+            if _vanished(field):
+                return before, report.worst(VANISHED), Control(np.inf, 0.0, 0)
             field, spread = stepper.resolved(field, more)
             field, report = positive(field, stepper.bounds), report.worst(more._replace(splitting=spread))
         return field, report._replace(splitting=report.splitting + error / parts**2), control._replace(age=control.age + 1)
@@ -108,6 +117,8 @@ def _adaptively(
         if limit < end:
             end, length = limit, (limit - begin) / tau
         result, more, difference = stepper.double(field, begin, end, potential)
+        if _vanished(result):
+            return field, report.worst(VANISHED), Control(np.inf, 0.0, 0)
         work += result.values.size
         difference = min(difference, 10.0) if np.isfinite(difference) else 10.0
         error = _EXTRAPOLATED * difference ** (5 / 3)

@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.space_field import (
+    ACCEPTED,
     Field,
     Report,
     better,
     extrapolated,
     finer_by,
+    finer_field,
     grid_report,
     moments_difference,
     positive,
@@ -176,7 +178,10 @@ class Stepper:
         """
         goal = move.target
         sizes = padded_sizes(field.grid, move.linear.before.real, self.bounds)
+        tails = field.survey(self.bounds).tails
         field = Field(*padded(field.values, field.grid, sizes), field.log_scale)
+        if self.bounds.finer > 1.0:
+            field = finer_field(field, np.where(tails > ACCEPTED * self.bounds.tail, 1.0, self.bounds.finer), self.bounds)
         moved = characteristics(self.dynamics, field.grid, goal, t0, t1, move.steps, self.bounds.periodic, begun)
         before = potential(field.grid, t0, t1, False) if potential else None
         after = potential(goal, t0, t1, True) if potential else None
@@ -205,7 +210,7 @@ class Stepper:
         for attempt in range(TRIES):
             result, moved = self._apply(field, t0, t1, move, potential)
             found = result.survey(self.bounds)
-            report, wide = grid_report(found), found.edges > 3 * self.bounds.edge
+            report, wide = grid_report(found, self.bounds.finer), found.edges > 3 * self.bounds.edge
             # A finer grid may have the same tails, and a wider one that has no more points the noise of its spacings.
             same = coarse.any() and not better(found.tails, before, ratio, self.bounds)[coarse].any()
             if best is not None and (same or report.of_grid(reach) >= smallest):

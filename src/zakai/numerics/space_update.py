@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import is_complex
-from zakai.numerics.space_field import Field, better, finer_by, positive, refinable
+from zakai.numerics.space_field import ACCEPTED, Field, better, finer_by, finer_field, positive, refinable
 from zakai.numerics.space_grid import Grid, filtered
 from zakai.numerics.space_resample import refined, triangular_resampled
 from zakai.numerics.space_spline import gather, relative_index, resampled
@@ -24,14 +24,18 @@ _TRIES = 16
 _RESOLVED = 3  # grids on which neighbours differ by few nats that are tried from a grid that was chosen for the product
 LOWEST = -100.0  # logarithm of a product, relative to its largest, below which it is zero
 MOST_REFINED = 2.0  # ratio of spacings by which a grid is refined at once
+SPLINE = 5e-4  # error of the spline of a Gaussian, times the sixth power of its standard deviation in spacings
+ACCURATE = 10.0  # times the bound on edges, for the error of the spline
+FAR = 3.0  # deviations from the mean beyond which mass counts by its distance
 POINT = 0.1  # deviations in spacings of a product that is one point: rounding of the likelihood
 
 
 class Update(NamedTuple):
     """The product of a prediction and a likelihood, and its errors.
 
-    The edges and tails of its grid, how many nats below its maximum the prediction is where the product is largest, and whether
-    the product reaches the end of the predicted window.
+    The edges and tails of its grid, how many nats below its maximum the prediction is where the product is largest, whether the
+    product reaches the end of the predicted window, by how much an error of the prediction may be larger in the moments of the
+    product, and the error of these by the interpolation between the grids.
     """
 
     field: Field
@@ -39,6 +43,8 @@ class Update(NamedTuple):
     tails: float
     depth: float
     truncated: bool
+    growth: float = 1.0
+    interpolation: float = 0.0
 
 
 class _Product(NamedTuple):
@@ -57,9 +63,7 @@ class _Product(NamedTuple):
     steepest: float
 
 
-@kernel(
-    "Tuple((float64, int64, float64))(float64[::1], float64[::1], int64[::1], boolean[::1], float64[::1], float64[::1])"
-)
+@kernel("Tuple((float64, int64, float64))(float64[::1], float64[::1], int64[::1], boolean[::1], float64[::1], float64[::1])")
 def _multiply(values: Any, logs: Any, sizes: Any, closed: Any, levels: Any, product: Any) -> tuple[float, int, float]:
     """Write the logarithms of a product, but for the largest, and the product; return the largest, its place, and the change.
 
@@ -111,7 +115,7 @@ def updated(
     if start is not None:
         grid, values = start, positive(Field(resampled(values, grid, start, bounds.periodic), start, 0.0), bounds).values
     coefficients, last, before = None, grid, np.ones(grid.n)
-    sparse, resolved = False, 0
+    between, sparse, resolved = grid, False, 0
     best: tuple[float, _Product, Survey] | None = None  # the smallest edges and tails so far: a later grid may be worse
     for attempt in range(_TRIES):
         product = _multiplied(values, grid, log_factor)
@@ -150,16 +154,15 @@ def updated(
             values = triangular_resampled(field.values, field.grid, grid)
             continue
         if coefficients is None:
-            coefficients = filtered(field.values, np.zeros((grid.n, grid.n)), spline=True)
-        at = relative_index(grid, field.grid, bounds.periodic)
-        values = gather(coefficients, at, field.grid).reshape(grid.sizes)
+            finer = _interpolable(field, product, bounds)
+            coefficients, between = filtered(finer.values, np.zeros((grid.n, grid.n)), spline=True), finer.grid
+        values = gather(coefficients, relative_index(grid, between, bounds.periodic), between).reshape(grid.sizes)
         values = positive(Field(values, grid, 0.0), bounds).values
     _, product, found = best or (0.0, product, product.field.survey(bounds))
     grid, values = product.field.grid, product.values
     inverse = grid.inverse
     if not np.diagonal(inverse @ found.cov @ inverse.T).min() > POINT**2:
         return _unchanged(field, log_factor)
-    ratio = float(values.real.flat[product.peak] / max(field.values.real.max(), values.real.max()))
     result = product.field.values
     if is_complex(values, product.logs):  # the derivative of the logarithm of the product
         change = values.imag / np.where(result > 0, values.real, 1.0) + product.logs.imag
@@ -167,13 +170,50 @@ def updated(
     new_field = product.field._replace(log_scale=field.log_scale + product.top)
     if result is not product.field.values:
         new_field = new_field._replace(values=result)
+    depth, growth, of_spline = _growths(field, product)
+    between = grid if grid.refines(field.grid) else between
     return Update(
         positive(new_field, bounds),
         float(found.edges.max()),
         float(found.tails.max()),
-        max(-math.log(max(ratio, 1e-300)), 0.0),
+        depth,
         _at_end(product.field, field.grid, bounds),
+        growth,
+        0.0 if between is grid else min(float(_of_spline(field, between, bounds).sum()) * of_spline, 1.0),
     )
+
+
+def _growths(field: Field, product: _Product) -> tuple[float, float, float]:
+    """Return the depth of a product, and by how much errors of the density and of its spline are larger in its moments.
+
+    At x deviations a Gaussian is d = x^2 / 2 nats below its maximum, in the mean n / 2, and the error of its spline, relative to
+    itself, is as the sixth derivative He_6(x), where other errors grow as d.  Mass far from the mean counts by its distance.
+    """
+    values, result, grid = product.values.real.reshape(-1), product.field.values.reshape(-1), product.field.grid
+    highest = max(field.values.real.max(), values.max())
+    peak = max(-math.log(max(float(values[product.peak] / highest), 1e-300)), 0.0)
+    used = np.flatnonzero((result > 1e-9) & (values > 0.0))
+    depths, weights = np.maximum(np.log(highest / values[used]) - 0.5 * grid.n, 0.0), result[used] / result[used].sum()
+    z = grid.offsets[used] - weights @ grid.offsets[used]
+    z = np.abs(z) / np.sqrt(np.maximum(weights @ z**2, 1e-300))
+    weights = weights * np.maximum(z.max(axis=1) / FAR, 1.0)
+    return peak, float(weights @ (1.0 + depths)), float(weights @ (1.0 + (2.0 * depths) ** 3 / 15.0))
+
+
+def _of_spline(field: Field, grid: Grid, bounds: Bounds) -> Array:
+    """Return the error along each axis (n,) of the spline of a Gaussian with the spectrum of a density, on a finer grid."""
+    deviations = deviations_in_spacings(field.survey(bounds).tails)
+    return np.asarray(SPLINE / (deviations * grid.shape / field.grid.shape) ** 6)
+
+
+def _interpolable(field: Field, product: _Product, bounds: Bounds) -> Field:
+    """Return a density on a grid on which its spline is accurate where its product is."""
+    grid, tails = field.grid, field.survey(bounds).tails
+    finer = _of_spline(field, grid, bounds) * _growths(field, product)[2] / (ACCURATE * bounds.edge)
+    finer = np.clip(finer ** (1 / 6), 1.0, MOST_REFINED)
+    # The waves of a grid that does not resolve a density are less accurate than splines.
+    finer = np.where(tails > ACCEPTED * bounds.tail, 1.0, finer)
+    return finer_field(field, finer, bounds)
 
 
 def _unchanged(field: Field, log_factor: Callable[[Grid], Array]) -> Update:
@@ -188,6 +228,7 @@ def _next(product: _Product, bounds: Bounds, sparse: bool, late: bool) -> Grid |
     """Return the next grid: around the product with a power of the factor, or one that mends what the checks found."""
     grid, levels = product.field.grid, product.levels.reshape(-1)
     noise, narrow = np.zeros((grid.n, grid.n)), np.ones(grid.n)
+    least = math.log(bounds.edge)
     if product.steepest > _STEEP:
         logs = product.logs.real.reshape(-1)
         with np.errstate(invalid="ignore"):
@@ -203,10 +244,24 @@ def _next(product: _Product, bounds: Bounds, sparse: bool, late: bool) -> Grid |
         if near and (found.tails > bounds.tail).any() and not (found.edges > 3 * bounds.edge).any():
             finer = np.where(found.tails > bounds.tail, np.clip(ratio, 1.1, MOST_REFINED), 1.0)
             return adjusted(grid, np.zeros(grid.n), np.zeros(grid.n), finer, bounds)
+        # The spectrum of a product that its window cuts off is not that of the product.
+        narrow = np.where(found.edges > 3 * bounds.edge, 1.0, narrow)
+    # The product falls below the bound between two points.
+    levels = np.where(_beside(levels.reshape(grid.sizes) >= least).reshape(-1), np.maximum(levels, least), -np.inf)
     if bounds.band_limited:
-        used = np.flatnonzero(levels >= math.log(bounds.edge))
+        used = np.flatnonzero(levels >= least)
         return whitened_grid(grid.offsets[used], levels[used], noise, narrow, bounds, grid)
-    return fitted_grid(grid.offsets, levels, grid.centre, noise, narrow, bounds, grid, least=math.log(bounds.edge))
+    return fitted_grid(grid.offsets, levels, grid.centre, noise, narrow, bounds, grid, least=least)
+
+
+def _beside(used: Array) -> Array:
+    """Return which points of a grid are used or beside one that is."""
+    out = used.copy()
+    for d in range(used.ndim):
+        lines, of_used = np.moveaxis(out, d, 0), np.moveaxis(used, d, 0)
+        lines[1:] |= of_used[:-1]
+        lines[:-1] |= of_used[1:]
+    return out
 
 
 def _at_end(product: Field, predicted: Grid, bounds: Bounds) -> bool:

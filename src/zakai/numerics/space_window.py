@@ -22,7 +22,8 @@ class Bounds(NamedTuple):
 
     `edge` is the share of the maximum that counts as zero; `tail` the share of the mass in the spectrum at the highest
     frequencies with which a grid is used; `most` points along an axis; which coordinates are `periodic`. With `band_limited`
-    interpolation is exact for a density that its grid resolves, and what remains is rounding.
+    interpolation is exact for a density that its grid resolves, and what remains is rounding. Splines of a motion are those of
+    a grid that is `finer`.
     """
 
     edge: float
@@ -30,6 +31,7 @@ class Bounds(NamedTuple):
     most: int
     periodic: tuple[bool, ...]
     band_limited: bool = False
+    finer: float = 1.0
 
     @property
     def reach(self) -> float:
