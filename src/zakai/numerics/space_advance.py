@@ -25,6 +25,7 @@ BALANCED = 0.5  # of the error that the grid makes, below which shorter substeps
 CHECKED = 64  # intervals after which the error of single substeps is measured again
 WORTH, SMALL = 1.5, 0.05  # least order in its length of a small error of a substep for which shorter ones are tried
 VANISHED = Report(1.0, 0.0, 1.0, 1.0, 0.0)
+UNALIKE = 4.0  # times the error of a single substep that was measured on another density, which may have another shape
 _EXTRAPOLATED = 1.0  # the error that extrapolation leaves, as a multiple of difference^(5/3)
 
 
@@ -79,7 +80,7 @@ def advance(
         return field, NOTHING, control
     known = not control.fixed and control.known(tau, allowed)
     error = control.rate * tau**3 if known else np.inf
-    singles = np.ceil(np.sqrt(error / allowed)) if np.isfinite(error) else np.inf
+    singles = np.ceil(np.sqrt(UNALIKE * error / allowed)) if np.isfinite(error) else np.inf
     doubles = max(1.0, np.ceil((control.extrapolated(tau) / allowed) ** 0.25)) if known else 1.0
     singles, doubles = max(singles, 2.0 * least if least > 1 else 1.0), max(doubles, least)
     if singles < 2 * doubles and stepper.limit(field, t0, t0 + tau / singles) >= t0 + tau / singles:
