@@ -244,10 +244,11 @@ def _next(product: _Product, bounds: Bounds, sparse: bool, late: bool) -> Grid |
         if near and (found.tails > bounds.tail).any() and not (found.edges > 3 * bounds.edge).any():
             finer = np.where(found.tails > bounds.tail, np.clip(ratio, 1.1, MOST_REFINED), 1.0)
             return adjusted(grid, np.zeros(grid.n), np.zeros(grid.n), finer, bounds)
-        # The spectrum of a product that its window cuts off is not that of the product.
-        narrow = np.where(found.edges > 3 * bounds.edge, 1.0, narrow)
-    # The product falls below the bound between two points.
-    levels = np.where(_beside(levels.reshape(grid.sizes) >= least).reshape(-1), np.maximum(levels, least), -np.inf)
+        cut = found.edges > 3 * bounds.edge
+        if cut.any():
+            # The product falls below the bound between two points, and the spectrum of what its window cuts off is not its own.
+            narrow = np.where(cut, 1.0, narrow)
+            levels = np.where(_beside(levels.reshape(grid.sizes) >= least).reshape(-1), np.maximum(levels, least), -np.inf)
     if bounds.band_limited:
         used = np.flatnonzero(levels >= least)
         return whitened_grid(grid.offsets[used], levels[used], noise, narrow, bounds, grid)
