@@ -6,12 +6,9 @@ import gc
 import time
 from collections.abc import Callable
 from functools import partial
-from types import SimpleNamespace
 from typing import Any, TypeVar, cast
 
 from numba import njit, types
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.sigutils import normalize_signature
 
@@ -106,37 +103,6 @@ def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -
     return decorate
 
 
-class _Part(JITCodeLibrary):  # type: ignore[misc]
-    """The code of a helper, which is optimised and translated to machine code in the kernels only."""
-
-    def _optimize_final_module(self) -> None:
-        pass
-
-    def _finalize_final_module(self) -> None:
-        self._finalize_dynamic_globals()
-        self._finalized = True
-
-    def get_pointer_to_function(self, name: str) -> int:
-        """Return 0: there is no entry."""
-        return 0
-
-    @property
-    def codegen(self) -> Any:
-        """Return an object that accepts the environment of an entry."""
-        return SimpleNamespace(set_env=lambda name, environment: None)
-
-
-class _PartCompiler(CompilerBase):  # type: ignore[misc]
-    """Numba's compiler with a `_Part` to hold the code."""
-
-    def define_pipelines(self) -> list[Any]:
-        """Return the passes of Numba."""
-        state = self.state
-        state.library = _Part(state.targetctx.codegen(), state.func_id.func_qualname)
-        state.library.enable_object_caching()
-        return [DefaultPassBuilder.define_nopython_pipeline(state)]
-
-
 def helper(function: F) -> F:
     """Compile a function that only kernels call, as a part of each of them; it has no entry for Python."""
-    return cast(F, _compiler(no_cpython_wrapper=True, pipeline_class=_PartCompiler)(function))
+    return cast(F, _compiler(no_cpython_wrapper=True)(function))
