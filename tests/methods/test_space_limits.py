@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.stats import norm
 
 import zakai
@@ -82,3 +83,28 @@ def test_logarithms_of_predator_and_prey_keep_the_error_that_is_estimated():
     errors = np.abs(np.hstack([(result.mean[68:] - MEANS) / np.sqrt(VARIANCES), np.sqrt(result.variance[68:] / VARIANCES) - 1]))
     assert np.isfinite(result.mean).all() and result.warnings == []
     assert (errors.max(axis=1) < 10 * result.health["error_estimate"][68:]).all()
+
+
+@pytest.mark.parametrize("outlier", [0.4, 3.0])
+def test_an_outlying_increment_has_the_error_that_is_estimated_where_noise_does_not_reach_the_state(outlier):
+    # A linear oscillator whose velocity alone is driven; the last increment of the position is ordinary or outlying.
+    model = zakai.Model(
+        state=["x", "y"], drift=["y", "-x - 3/10*y"], diffusion=[["0"], ["1/2"]], observation=["x"],
+        observation_kind="increments", observation_noise=[["1/5"]], prior={"kind": "gaussian", "mean": [0, 0], "cov": [0.1, 0.1]},
+    )  # fmt: skip
+    times, values = [0.1, 0.4, 0.5, 0.8], [0.02, -0.05, 0.01, outlier]
+    result = zakai.filter(model, zakai.Record(times, np.array(values)[:, None], "increments"), "yau-yau")
+    A, noise, mean, cov = np.array([[0, 1], [-1, -0.3]]), np.diag([0, 0.25]), np.zeros(2), 0.1 * np.eye(2)
+    for k, (length, value) in enumerate(zip(np.diff(times, prepend=0.0), values, strict=True)):
+
+        def kalman_bucy(_, z, rate=value / length):
+            m, P = z[:2], z[2:].reshape(2, 2)
+            gain = P[:, 0] / 0.2
+            return np.concatenate([A @ m + gain * (rate - m[0]), (A @ P + P @ A.T + noise - np.outer(gain, P[0])).ravel()])
+
+        end = solve_ivp(kalman_bucy, (0, length), [*mean, *cov.ravel()], rtol=1e-10, atol=1e-12).y[:, -1]
+        mean, cov = end[:2], end[2:].reshape(2, 2)
+        variance = np.diagonal(cov)
+        errors = np.abs(result.mean[k + 1] - mean) / np.sqrt(variance), np.abs(np.sqrt(result.variance[k + 1] / variance) - 1)
+        assert np.max(errors) < 10 * result.health["error_estimate"][k + 1]
+    assert bool(result.warnings) == (outlier > 2)

@@ -135,6 +135,9 @@ class Prepared:
                 break
             # The observation is where the prediction was cut off; so wide a grid leaves rounding, which no substep makes smaller.
             bounds, allowed = bounds._replace(edge=max(bounds.edge**2, OUTLIER_EDGE)), 10 * self.tolerance
+        if potential is not None:
+            cut = last.cut_off(begin, potential, *parts[-1], self.bounds)
+            update = update._replace(interpolation=update.interpolation + cut)
         kept = state.kept if factor is None and after.age else self._kept(begin, predicted, update.field)
         new, info = self._reported(state, update, report, after, constant, kept, found)
         health = dict(info.health)

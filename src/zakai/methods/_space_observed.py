@@ -15,8 +15,10 @@ from zakai.methods._space_system import System
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex, log_determinant
 from zakai.numerics.space_average import average, panel_rule
+from zakai.numerics.space_field import Field, cut_off
 from zakai.numerics.space_grid import Grid
-from zakai.numerics.space_transport import Dynamics, Factor
+from zakai.numerics.space_transport import Dynamics, Factor, weighed
+from zakai.numerics.space_window import Bounds
 from zakai.records.schedule import Schedule
 
 Array = Any
@@ -156,6 +158,26 @@ class Observations:
             return Factor(log.reshape(grid.sizes), ((a - b) / 144 * steep).reshape(grid.sizes))
 
         return potential
+
+    def cut_off(self, begin: Field, potential: Any, start: float, length: float, bounds: Bounds) -> float:
+        """Return the error of the moments after an interval because a density is zero beyond its support.
+
+        The potential acts on the density as it is until the drift or the noise has changed it as much as it is wide.
+        """
+        found, grid, dynamics = begin.survey(bounds), begin.grid, self.dynamics
+        mean, inverse = grid.centre + found.mean, grid.inverse
+        deviations = np.sqrt(np.maximum(np.diagonal(inverse @ found.cov @ inverse.T), 1e-12))
+        inverse = inverse / deviations[:, None]
+        if dynamics.diffusion is None:
+            noise = dynamics.noise(start, start + length)[0].real
+        else:
+            noise = dynamics.diffusion(mean[None], start)[0].real
+        with np.errstate(all="ignore"):
+            motion = np.nan_to_num(inverse @ dynamics.jacobian(mean[None], start)[0].real @ (grid.basis * deviations))
+        rate = max(float(np.abs(motion).sum(axis=1).max()), float(np.diagonal(inverse @ noise @ inverse.T).max()))
+        logs = potential(grid, start, start + min(length, 1.0 / max(rate, 1e-300)), False).log.real
+        product = weighed(begin.values.real, logs)[0]
+        return min(cut_off(begin.values, product, grid.closed), 1.0)
 
     def _panels(self, grid: Grid, a: float, b: float, precision: Any) -> int:
         """Return the panels that resolve S^-1 and h at some points of the grid over an interval."""

@@ -92,6 +92,22 @@ def finer_field(field: Field, finer: Array, bounds: Bounds) -> Field:
 NOTHING = Report(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
+def cut_off(values: Array, product: Array, closed: tuple[bool, ...]) -> float:
+    """Return the largest of a product with a density at the border of its support, relative to the largest of all.
+
+    It shows what the product lacks because the density is zero beyond, where its values were too small to be known.
+    """
+    support, inner = values.real > 0.0, np.ones(values.shape, bool)
+    for d, circle in enumerate(closed):
+        lines, known = np.moveaxis(inner, d, 0), np.moveaxis(support, d, 0)
+        lines[1:] &= known[:-1]
+        lines[:-1] &= known[1:]
+        lines[0] &= known[-1] & circle
+        lines[-1] &= known[0] & circle
+    real = product.real
+    return float(np.max(real, where=support & ~inner, initial=0.0) / np.max(real, initial=1e-300))
+
+
 def refinable(tails: Array, before: Array, ratio: Array, start: Any, bounds: Bounds) -> Array:
     """Return along which axes (n,) a finer grid leaves smaller tails of the spectrum; `before` are those of the last grid.
 
