@@ -136,7 +136,9 @@ class Prepared:
             # The observation is where the prediction was cut off; so wide a grid leaves rounding, which no substep makes smaller.
             bounds, allowed = bounds._replace(edge=max(bounds.edge**2, OUTLIER_EDGE)), 10 * self.tolerance
         if potential is not None:
-            cut = last.cut_off(begin, potential, *parts[-1], self.bounds)
+            end, first = found or predicted.survey(self.bounds), begin.survey(self.bounds)
+            moved = predicted.grid.centre + end.mean - begin.grid.centre - first.mean
+            cut = last.cut_off(begin, moved, potential, *parts[-1], self.bounds)
             update = update._replace(interpolation=update.interpolation + cut)
         kept = state.kept if factor is None and after.age else self._kept(begin, predicted, update.field)
         new, info = self._reported(state, update, report, after, constant, kept, found)

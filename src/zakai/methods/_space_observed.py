@@ -23,6 +23,7 @@ from zakai.records.schedule import Schedule
 
 Array = Any
 CACHED = 2_000_000  # numbers of tables that are kept
+UNMOVED = 0.5  # deviations by which an increment moves the mean of a density that hardly reaches the end of its support
 MOST_PANELS = 1024  # substeps for the variation of coefficients within an interval
 
 
@@ -159,15 +160,19 @@ class Observations:
 
         return potential
 
-    def cut_off(self, begin: Field, potential: Any, start: float, length: float, bounds: Bounds) -> float:
+    def cut_off(self, begin: Field, moved: Array, potential: Any, start: float, length: float, bounds: Bounds) -> float:
         """Return the error of the moments after an interval because a density is zero beyond its support.
 
-        The potential acts on the density as it is until the drift or the noise has changed it as much as it is wide.
+        The potential acts on the density as it is until the drift or the noise has changed it as much as it is wide.  An interval
+        over which the mean has `moved` (n,) by a small share of the deviations does not count.
         """
         found, grid, dynamics = begin.survey(bounds), begin.grid, self.dynamics
-        mean, inverse = grid.centre + found.mean, grid.inverse
+        inverse = grid.inverse
         deviations = np.sqrt(np.maximum(np.diagonal(inverse @ found.cov @ inverse.T), 1e-12))
         inverse = inverse / deviations[:, None]
+        if np.abs(inverse @ moved).max() < UNMOVED:
+            return 0.0
+        mean = grid.centre + found.mean
         if dynamics.diffusion is None:
             noise = dynamics.noise(start, start + length)[0].real
         else:
@@ -176,8 +181,8 @@ class Observations:
             motion = np.nan_to_num(inverse @ dynamics.jacobian(mean[None], start)[0].real @ (grid.basis * deviations))
         rate = max(float(np.abs(motion).sum(axis=1).max()), float(np.diagonal(inverse @ noise @ inverse.T).max()))
         logs = potential(grid, start, start + min(length, 1.0 / max(rate, 1e-300)), False).log.real
-        product = weighed(begin.values.real, logs)[0]
-        return min(cut_off(begin.values, product, grid.closed), 1.0)
+        before, after = (cut_off(begin.values, u, grid.closed) for u in (begin.values, weighed(begin.values.real, logs)[0]))
+        return max(min(after, 1.0) - before, 0.0)  # what was cut off before was counted then
 
     def _panels(self, grid: Grid, a: float, b: float, precision: Any) -> int:
         """Return the panels that resolve S^-1 and h at some points of the grid over an interval."""
