@@ -108,3 +108,26 @@ def test_an_outlying_increment_has_the_error_that_is_estimated_where_noise_does_
         errors = np.abs(result.mean[k + 1] - mean) / np.sqrt(variance), np.abs(np.sqrt(result.variance[k + 1] / variance) - 1)
         assert np.max(errors) < 10 * result.health["error_estimate"][k + 1]
     assert bool(result.warnings) == (outlier > 2)
+
+
+def test_a_distant_mode_with_a_small_weight_keeps_it_over_an_interval():
+    # Two independent linear states; the noise of the interval is far wider than the modes, and the sample allows both of them.
+    weights, means, noise = np.array([1 - 2e-4, 2e-4]), np.array([0.4, 1.9]), 0.3
+    model = zakai.Model(
+        state=["x", "y"], drift=["-x", "-y"], process_noise=[[noise, 0], [0, noise]], observation=["(x - 0.4)*(x - 1.5)"],
+        observation_kind="samples", observation_noise=[["0.002"]],
+        prior={
+            "kind": "mixture", "weights": weights.tolist(), "means": [[m, 0] for m in means],
+            "covs": [[[0.004, 0], [0, 0.05]]] * 2,
+        },
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record([0.2], [[0.0]], "samples"), "yau-yau")
+    kept = np.exp(-0.2)
+    x = np.linspace(-1, 4, 20001)
+    modes = norm.pdf(x[:, None], kept * means, np.sqrt(0.004 * kept**2 + noise * (1 - kept**2) / 2))
+    density = (modes @ weights) * norm.pdf((x - 0.4) * (x - 1.5), 0, np.sqrt(0.002))
+    mean = density @ x / density.sum()
+    deviation = np.sqrt(density @ (x - mean) ** 2 / density.sum())
+    error = max(abs(result.mean[1, 0] - mean) / deviation, abs(np.sqrt(result.variance[1, 0]) / deviation - 1))
+    assert error < 10 * result.health["error_estimate"][1]
+    assert error < 3e-4

@@ -142,7 +142,7 @@ class Stepper:
         return float(max(found.edges.max() / self.bounds.edge, found.tails.max() / self.bounds.tail))
 
     def _prepared(self, source: Field, t0: float, t1: float) -> Field:
-        sizes = padded_sizes(source.grid, self.flow(t0, t1).spread.real, self.bounds)
+        sizes = padded_sizes(source.values, source.grid, self.flow(t0, t1).spread.real, self.bounds)
         return Field(*padded(source.values, source.grid, sizes), source.log_scale)
 
     def single(self, source: Field, t0: float, t1: float, potential: Any) -> tuple[Field, Report]:

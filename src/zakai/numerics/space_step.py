@@ -177,7 +177,7 @@ class Stepper:
         `begun` is their displacement from the end to a time in between.
         """
         goal = move.target
-        sizes = padded_sizes(field.grid, move.linear.before.real, self.bounds)
+        sizes = padded_sizes(field.values, field.grid, move.linear.before.real, self.bounds)
         tails = field.survey(self.bounds).tails
         field = Field(*padded(field.values, field.grid, sizes), field.log_scale)
         if self.bounds.finer > 1.0:

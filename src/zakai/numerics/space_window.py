@@ -110,20 +110,33 @@ def adjusted(grid: Grid, below: Array, above: Array, finer: Array, bounds: Bound
     return Grid(centre, basis, tuple(sizes), grid.closed) if changed else None
 
 
-def padded_sizes(grid: Grid, noise: Array, bounds: Bounds) -> tuple[int, ...]:
+def padded_sizes(values: Array, grid: Grid, noise: Array, bounds: Bounds) -> tuple[int, ...]:
     """Return the sizes that a density needs to be spread by N(0, noise) without running over the ends of its grid."""
-    halves, sizes = _spread_halves(grid, noise, bounds), list(grid.sizes)
+    halves, variances, sizes = _spread_halves(grid, noise, bounds), _variances(grid, noise), list(grid.sizes)
+    least = bounds.edge * values.real.max()
     for d, size in enumerate(sizes):
-        if not grid.closed[d] and halves[d] >= 0.5 * size + 1:
-            sizes[d] = max(rounded_size(2 * halves[d], LEAST[grid.n], 4 * bounds.most), size)
+        if grid.closed[d] or not variances[d] > 0:
+            continue
+        # A second mode at an end is spread farther than the end of a Gaussian that fills the grid.
+        highest = np.maximum(np.moveaxis(values.real, d, 0).reshape(size, -1).max(axis=1), least)
+        ends = np.abs(np.arange(size) - size // 2) + np.sqrt(2 * np.log(highest / least) * variances[d])
+        half = max(halves[d], float(np.max(ends, where=highest > least, initial=0.0)))
+        if half >= 0.5 * size + 1:
+            sizes[d] = max(rounded_size(2 * half, LEAST[grid.n], 4 * bounds.most), size)
     return tuple(sizes)
+
+
+def _variances(grid: Grid, noise: Array) -> list[float]:
+    """Return the variances of N(0, noise) along the axes, in squared spacings."""
+    inverse = grid.inverse
+    variances: list[float] = ((inverse @ noise) * inverse).sum(axis=1).tolist()
+    return variances
 
 
 def _spread_halves(grid: Grid, noise: Array, bounds: Bounds) -> list[float]:
     """Return half of the widths in spacings that a density that fills its grid needs after spreading by N(0, noise)."""
-    inverse, reach = grid.inverse, bounds.reach
-    variances = ((inverse @ noise) * inverse).sum(axis=1).tolist()
-    return [math.sqrt(0.25 * size**2 + reach**2 * variance) for size, variance in zip(grid.sizes, variances, strict=True)]
+    pairs = zip(grid.sizes, _variances(grid, noise), strict=True)
+    return [math.sqrt(0.25 * size**2 + bounds.reach**2 * variance) for size, variance in pairs]
 
 
 def enlargement(grid: Grid, noise: Array, bounds: Bounds) -> float:
