@@ -179,7 +179,7 @@ def updated(
         depth,
         _at_end(product.field, field.grid, bounds),
         growth,
-        0.0 if between is grid else min(float(_of_spline(field, between, bounds).sum()) * of_spline, 1.0),
+        0.0 if between is grid or bounds.band_limited else min(float(_of_spline(field, between, bounds).sum()) * of_spline, 1.0),
     )
 
 
@@ -248,7 +248,7 @@ def _next(product: _Product, bounds: Bounds, sparse: bool, late: bool) -> Grid |
         if cut.any():
             # The product falls below the bound between two points, and the spectrum of what its window cuts off is not its own.
             narrow = np.where(cut, 1.0, narrow)
-            levels = np.where(_beside(levels.reshape(grid.sizes) >= least).reshape(-1), np.maximum(levels, least), -np.inf)
+    levels = np.where(_beside(levels.reshape(grid.sizes) >= least).reshape(-1), np.maximum(levels, least), -np.inf)
     if bounds.band_limited:
         used = np.flatnonzero(levels >= least)
         return whitened_grid(grid.offsets[used], levels[used], noise, narrow, bounds, grid)
