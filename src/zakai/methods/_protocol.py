@@ -32,7 +32,6 @@ import numpy as np
 
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
-from zakai.errors import InputError
 from zakai.models.model import Model
 
 
@@ -158,8 +157,7 @@ def through(
         prepared: Any, k: int, later: np.ndarray, values: np.ndarray, state: Any, rng: np.random.Generator
     ) -> tuple[np.ndarray, float]:
         other, own = of(prepared)
-        if other.draw is None:
-            raise InputError("sample_paths: a method on a grid draws paths of one state only; take another method")
+        assert other.draw is not None
         return other.draw(own, k, later, values, state_of(prepared, state), rng)
 
     def allowed(prepared: Any) -> float:

@@ -21,6 +21,7 @@ from zakai.methods import _space_kolmogorov as base
 from zakai.methods._protocol import Backward, Info
 from zakai.methods._space import State
 from zakai.methods._space_cross import cross_formulas
+from zakai.methods._space_paths import drawn
 from zakai.methods._space_short import predicted_on
 from zakai.methods._space_system import moments_of
 from zakai.numerics.space_adjoint import Adjoint
@@ -128,14 +129,12 @@ def step(prepared: base.Prepared, k: int, later: Message, values: np.ndarray, st
         before = partial(interpolated, function, periodic=bounds.periodic)
         function, product = _back(begin, bounds, tilted, before, before)
     else:
-        control = Control(np.inf, 0.0, 0)
-        if general is prepared:  # else another splitting was measured
-            control = Control(state.rate, state.measured, state.age, state.fixed)
+        control = _control(prepared, state)
         ahead, bound, fewest = function, base.SHARE * general.tolerance, 1
         for _ in range(TRIES if later.error < base.LOST else 1):
             function, report = ahead, NOTHING
-            for dynamics, group in reversed(_substeps(general, k, begin, control, values, general.allowed(state), fewest)):
-                function, product, more = _through(dynamics, group, function, bounds)
+            for stepper, group in reversed(_substeps(general, k, begin, control, values, general.allowed(state), fewest)):
+                function, product, more = _through(stepper.dynamics, group, function, bounds)
                 report = report.worst(more)
             if not bound < report.splitting < np.inf:
                 break
@@ -147,9 +146,16 @@ def step(prepared: base.Prepared, k: int, later: Message, values: np.ndarray, st
     return Message(function, product, error, report)
 
 
+def _control(prepared: base.Prepared, state: State) -> Control:
+    """Return the error of a substep that the filter measured; one of another method measured that of another splitting."""
+    if _general(prepared) is not prepared:
+        return Control(np.inf, 0.0, 0)
+    return Control(state.rate, state.measured, state.age, state.fixed)
+
+
 def _substeps(
     general: base.Prepared, k: int, begin: Field, control: Control, values: Array, allowed: float, fewest: int
-) -> list[tuple[Dynamics, tuple[Substep, ...]]]:
+) -> list[tuple[Stepper, tuple[Substep, ...]]]:
     """Return the substeps by which the filter predicts over interval k, the two halves of an extrapolated one together.
 
     If more than one, at least `fewest` extrapolated ones are taken.
@@ -169,11 +175,11 @@ def _substeps(
             extrapolated, pairs = singles > 3 * pairs or fewest > 1, max(pairs, fewest)
             times = np.linspace(0.0, length, 1 + (2 * pairs if extrapolated else singles))
             stepper.equal(begin, times, potential, extrapolated)
-            return [(stepper.dynamics, group) for group in stepper.taken]
+            return [(stepper, group) for group in stepper.taken]
     steppers: list[Stepper] = []
     rates = values / max(length, 1e-300)
     general.predicted(begin, parts, inside, rates, control, allowed, general.bounds, steppers, fewest)
-    return [(stepper.dynamics, group) for stepper in steppers for group in stepper.taken]
+    return [(stepper, group) for stepper in steppers for group in stepper.taken]
 
 
 def _back(
@@ -276,9 +282,21 @@ def density(prepared: base.Prepared, state: State, later: Message) -> GridDensit
     return GridDensity(logs, found.grid.centre, found.grid.basis, prepared.model.state, prepared.angles)
 
 
+@np.errstate(all="ignore")
+def draw(
+    prepared: base.Prepared, k: int, later: Array, values: np.ndarray, state: State, rng: np.random.Generator
+) -> tuple[Array, float]:
+    """Return draws (P, n) of the state at the start of interval k given those at its end, and how far from normal their law is."""
+    general, begin = _general(prepared), _density(prepared, state)
+    if general.observations.lengths[k] == 0:
+        return later, 0.0
+    taken = _substeps(general, k, begin, _control(prepared, state), values, general.allowed(state), 1)
+    return drawn([(stepper, one) for stepper, group in taken for one in group], begin, later, rng)
+
+
 def accuracy(prepared: base.Prepared) -> float:
     """Return the error of the evidence of an interval that the tolerance allows."""
     return max(_general(prepared).tolerance, 1e-6)
 
 
-BACKWARD: Backward[Any, State, Message] = Backward(message, step, smoothed, density, accuracy=accuracy)
+BACKWARD: Backward[Any, State, Message] = Backward(message, step, smoothed, density, None, draw, accuracy)

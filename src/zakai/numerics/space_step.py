@@ -59,13 +59,14 @@ class _Move(NamedTuple):
 
 
 class Substep(NamedTuple):
-    """A substep between two `times`, with the density at its start."""
+    """A substep between two `times`, with the density at its start and the grid at its end."""
 
     begin: Field
     times: tuple[float, float]
     linear: Linearisation
     steps: int
     potential: Potential | None
+    end: Grid
 
 
 class Stepper:
@@ -243,16 +244,21 @@ class Stepper:
         tolerance = 0.05 * self.tolerance * np.sqrt(real.max() / real.reshape(-1)[used])
         steps, _ = steps_needed(self._deciding(), grid.points[used], *ends[0], grid.inverse, tolerance)
         linears = self._linear(field, tuple(times.tolist()))
-        substeps = [Substep(field, end, linear, steps, potential) for linear, end in zip(linears, ends, strict=True)]
+        substeps = [Substep(field, end, linear, steps, potential, grid) for linear, end in zip(linears, ends, strict=True)]
         count = 2 if extrapolated else 1
         for first in range(0, len(substeps), count):
             self._take(*substeps[first : first + count])
+
+    def replayed(self, field: Field, one: Substep) -> Field:
+        """Return the density after a substep that was taken, from another one at its start."""
+        result, _ = self._apply(field, *one.times, _Move(one.linear, one.steps, one.end), one.potential)
+        return positive(result, self.bounds)
 
     def single(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report]:
         """Return the density after one substep, on a grid that fits it."""
         tails, move = field.survey(self.bounds).tails, self._moves(field, (t0, t1))[0]
         result, _, report = self._moved(field, t0, t1, move, potential, tails)
-        self._take(Substep(field, (t0, t1), move.linear, move.steps, potential))
+        self._take(Substep(field, (t0, t1), move.linear, move.steps, potential, result.grid))
         return result, report
 
     def resolved(self, field: Field, report: Report) -> tuple[Field, float]:
@@ -277,8 +283,8 @@ class Stepper:
         half = positive(half, self.bounds)
         fine, moved, second = self._moved(half, middle, t1, two, potential, tails)
         self._take(
-            Substep(field, (t0, middle), one.linear, one.steps, potential),
-            Substep(half, (middle, t1), two.linear, two.steps, potential),
+            Substep(field, (t0, middle), one.linear, one.steps, potential, half.grid),
+            Substep(half, (middle, t1), two.linear, two.steps, potential, fine.grid),
         )
         whole = _Move(one.linear.then(two.linear), one.steps, fine.grid)
         coarse, _ = self._apply(field, t0, t1, whole, potential, (middle, moved))

@@ -1,0 +1,141 @@
+"""Draws of the state at the start of an interval given that at its end, for two to four states on a grid.
+
+They go back through the substeps of the filter (`numerics/space_transport.py`).  A characteristic leads back without noise.  Of
+y in z = y + N(0, C), z with density w, the conditional mean and covariance are (Tweedie's formula)
+
+    E[y | z] = z + C grad log w(z),      Cov[y | z] = C + C (Hess log w)(z) C,
+
+and the third cumulant is the third derivative of log w times C^3, which falls with the length of a substep.
+
+References:
+    Efron 2011, Tweedie's formula and selection bias.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from zakai.densities._density import wrap
+from zakai.numerics.space_diffusion import diffused
+from zakai.numerics.space_field import Field
+from zakai.numerics.space_grid import filtered, spread
+from zakai.numerics.space_spline import gather
+from zakai.numerics.space_step import Stepper, Substep
+from zakai.numerics.space_transport import moved_points, weighed
+from zakai.numerics.space_window import Bounds
+
+Array = Any
+NEAR = 0.5  # spacings between the points at which a logarithm is differentiated
+
+
+def drawn(
+    substeps: list[tuple[Stepper, Substep]], begin: Field, z: Array, rng: np.random.Generator
+) -> tuple[Array, float]:
+    """Return draws (P, n) of the state at the start of substeps given those at their end, and how far from normal the law is."""
+    fields = [begin]
+    for stepper, one in substeps:
+        fields.append(stepper.replayed(fields[-1], one))
+    departure = 0.0
+    for number in reversed(range(len(substeps))):
+        z, more = _through(*substeps[number], fields[number], fields[number + 1], z, rng)
+        departure = max(departure, more)
+    return z, departure
+
+
+def _through(
+    stepper: Stepper, one: Substep, begin: Field, end: Field, z: Array, rng: np.random.Generator
+) -> tuple[Array, float]:
+    """Return draws at the start of a substep between two densities given those at its end."""
+    dynamics, (t0, t1), grid, bounds = stepper.dynamics, one.times, begin.grid, stepper.bounds
+    values, after = begin.values, end.values
+    if one.potential is not None:
+        after, _ = weighed(after, -one.potential(end.grid, t0, t1, True).log / 6)
+        values, _ = weighed(values, one.potential(grid, t0, t1, False).log / 6)
+    if dynamics.diffusion is None:
+        before = spread(values, grid, one.linear.before)
+    else:
+        before = diffused(values, grid, dynamics.diffusion(grid.points, 0.5 * (t0 + t1)), 0.5 * (t1 - t0))
+    z, last = _without_noise(stepper, one, 0.5 * one.linear.noise, end._replace(values=after), z, bounds, rng)
+    with np.errstate(all="ignore"):
+        moved = moved_points(dynamics, z, t1, t0, one.steps)[:, : grid.n]
+    moved = np.where(np.isfinite(moved).all(axis=1)[:, None], moved, 0.0)
+    z, first = _without_noise(stepper, one, one.linear.before, begin._replace(values=before), z + moved, bounds, rng)
+    return z, max(first, last)
+
+
+def _without_noise(
+    stepper: Stepper, one: Substep, cov: Array, w: Field, z: Array, bounds: Bounds, rng: np.random.Generator
+) -> tuple[Array, float]:
+    """Return draws of y (P, n) given z = y + noise of density w, and the root mean square of their skewness."""
+    z, change, shift = wrapped(z, bounds.periodic), 0.0, np.zeros_like(z)
+    diffusion, (t0, t1) = stepper.dynamics.diffusion, one.times
+    if diffusion is None:
+        root = np.broadcast_to(_root(cov), (len(z), *cov.shape))
+    else:
+        middle, half = 0.5 * (t0 + t1), 0.5 * (t1 - t0)
+        noise = half * diffusion(z, middle).real
+        root = _root(noise)
+        steps = np.diag(NEAR * np.linalg.norm(w.grid.basis, axis=1))
+        slopes = np.stack([(diffusion(z + h, middle) - diffusion(z - h, middle)).real / (2 * h.sum()) for h in steps], axis=-1)
+        shift, inverse = half * np.einsum("pijj->pi", slopes), np.linalg.pinv(root, rcond=1e-6)
+        change = np.sum((half * np.einsum("pki,pijd,pdk,pkj->pk", inverse, slopes, root, inverse)) ** 2, axis=1)
+    slope, curvature, third = _derivatives(w, z, root, bounds)
+    values, vectors = np.linalg.eigh(np.eye(z.shape[1]) + curvature)
+    e = rng.standard_normal(z.shape)
+    e = slope + np.einsum("pij,pj,pj->pi", vectors, np.sqrt(np.maximum(values, 0.0)), e)
+    skewness = np.sum(np.minimum(third**2, 1.0), axis=1) + np.minimum(change, 1.0)
+    return wrapped(z + shift + np.einsum("pij,pj->pi", root, e), bounds.periodic), float(np.sqrt(np.mean(skewness)))
+
+
+def _root(cov: Array) -> Array:
+    """Return R with R R' = cov for matrices (..., n, n) that may be singular."""
+    values, vectors = np.linalg.eigh(cov)
+    return vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+
+
+def _derivatives(w: Field, z: Array, root: Array, bounds: Bounds) -> tuple[Array, Array, Array]:
+    """Return the first (P, n), second (P, n, n) and third (P, n) derivatives of log w at z along the columns of a root.
+
+    Where w is not known they are those of the Gaussian with its moments.
+    """
+    grid, n = w.grid, w.grid.n
+    coefficients = filtered(w.values, np.zeros((n, n)), spline=True)
+    index = wrapped(z - grid.centre, bounds.periodic) @ grid.inverse.T + grid.shape // 2
+    along = grid.inverse @ root
+    length = np.maximum(np.linalg.norm(along, axis=1), 1e-300) / NEAR  # (P, n)
+    unit = np.swapaxes(along / length[:, None, :], 1, 2)  # (P, columns, n)
+    least, lowest = bounds.edge * w.values.max(), np.full(len(z), np.inf)
+
+    def log(offset: Array) -> Array:
+        nonlocal lowest
+        found = gather(coefficients, index + offset, grid)
+        lowest = np.minimum(lowest, found)
+        return np.log(np.maximum(found, least))
+
+    middle = log(0.0)
+    ends = [[log(s * unit[:, i]) for s in (-2, -1, 1, 2)] for i in range(n)]
+    slope = np.stack([(c - b) * 2 / 3 - (d - a) / 12 for a, b, c, d in ends], axis=1) * length
+    third = np.stack([0.5 * (d - a) - (c - b) for a, b, c, d in ends], axis=1) * length**3
+    curvature = np.empty((len(z), n, n))
+    for i, (a, b, c, d) in enumerate(ends):
+        curvature[:, i, i] = (4 * (b + c) / 3 - (a + d) / 12 - 2.5 * middle) * length[:, i] ** 2
+        for j in range(i):
+            signs = (1, 1), (-1, -1), (1, -1), (-1, 1)
+            corners = [log(s * unit[:, i] + t * unit[:, j]) for s, t in signs]
+            mixed = (corners[0] + corners[1] - corners[2] - corners[3]) / 4
+            curvature[:, i, j] = curvature[:, j, i] = mixed * length[:, i] * length[:, j]
+    found = w.survey(bounds)
+    precision = np.linalg.pinv(found.cov)
+    offset = wrapped(z - grid.centre - found.mean, bounds.periodic)
+    unknown = ~(lowest > least)
+    slope[unknown] = -np.einsum("pij,pi->pj", root[unknown], offset[unknown] @ precision)
+    curvature[unknown] = -np.swapaxes(root[unknown], 1, 2) @ precision @ root[unknown]
+    third[unknown] = 0.0
+    return slope, curvature, third
+
+
+def wrapped(x: Array, periodic: tuple[bool, ...]) -> Array:
+    """Return points (P, n) with angles in (-pi, pi]."""
+    return np.where(periodic, wrap(x), x)
