@@ -27,6 +27,8 @@ from zakai.numerics.space_transport import moved_points, weighed
 from zakai.numerics.space_window import Bounds
 
 Array = Any
+TRIES = 20  # of a draw to which a characteristic leads from the grid
+RELIABLE = 0.999  # share of the draws for which one is found
 NEAR = 0.5  # spacings between the points at which a logarithm is differentiated
 
 
@@ -57,36 +59,48 @@ def _through(
         before = spread(values, grid, one.linear.before)
     else:
         before = diffused(values, grid, dynamics.diffusion(grid.points, 0.5 * (t0 + t1)), 0.5 * (t1 - t0))
-    z, last = _without_noise(stepper, one, 0.5 * one.linear.noise, end._replace(values=after), z, bounds, rng)
-    with np.errstate(all="ignore"):
-        moved = moved_points(dynamics, z, t1, t0, one.steps)[:, : grid.n]
-    moved = np.where(np.isfinite(moved).all(axis=1)[:, None], moved, 0.0)
-    z, first = _without_noise(stepper, one, one.linear.before, begin._replace(values=before), z + moved, bounds, rng)
-    return z, max(first, last)
+    inside, moved = np.zeros(len(z), bool), np.zeros_like(z)
+    centre, root, last = _law(stepper, one, 0.5 * one.linear.noise, end._replace(values=after), z)
+    for _ in range(TRIES):  # no characteristic leads from the grid to the others
+        rest = np.flatnonzero(~inside)
+        z[rest] = _drawn(centre[rest], root[rest], rng)
+        moved[rest] = z[rest] + moved_points(dynamics, z[rest], t1, t0, one.steps)[:, : grid.n]
+        index = wrapped(moved[rest] - grid.centre, bounds.periodic) @ grid.inverse.T
+        inside[rest] = ((np.abs(index) <= 0.5 * grid.shape) | grid.circles).all(axis=1)
+        if inside.all():
+            break
+    moved[~inside] = grid.centre + begin.survey(bounds).mean
+    centre, root, first = _law(stepper, one, one.linear.before, begin._replace(values=before), moved)
+    departure = max(first, last) if np.mean(inside) > RELIABLE else np.inf
+    return wrapped(_drawn(centre, root, rng), bounds.periodic), departure
 
 
-def _without_noise(
-    stepper: Stepper, one: Substep, cov: Array, w: Field, z: Array, bounds: Bounds, rng: np.random.Generator
-) -> tuple[Array, float]:
-    """Return draws of y (P, n) given z = y + noise of density w, and the root mean square of their skewness."""
+def _drawn(centre: Array, root: Array, rng: np.random.Generator) -> Array:
+    return centre + np.einsum("pij,pj->pi", root, rng.standard_normal(centre.shape))
+
+
+def _law(stepper: Stepper, one: Substep, cov: Array, w: Field, z: Array) -> tuple[Array, Array, float]:
+    """Return the means (P, n) and the roots of the covariances (P, n, n) of y given z = y + noise of density w.
+
+    The third is the root mean square of the skewness.
+    """
+    bounds = stepper.bounds
     z, change, shift = wrapped(z, bounds.periodic), 0.0, np.zeros_like(z)
     diffusion, (t0, t1) = stepper.dynamics.diffusion, one.times
     if diffusion is None:
         root = np.broadcast_to(_root(cov), (len(z), *cov.shape))
     else:
         middle, half = 0.5 * (t0 + t1), 0.5 * (t1 - t0)
-        noise = half * diffusion(z, middle).real
-        root = _root(noise)
+        root = _root(half * diffusion(z, middle).real)
         steps = np.diag(NEAR * np.linalg.norm(w.grid.basis, axis=1))
         slopes = np.stack([(diffusion(z + h, middle) - diffusion(z - h, middle)).real / (2 * h.sum()) for h in steps], axis=-1)
         shift, inverse = half * np.einsum("pijj->pi", slopes), np.linalg.pinv(root, rcond=1e-6)
         change = np.sum((half * np.einsum("pki,pijd,pdk,pkj->pk", inverse, slopes, root, inverse)) ** 2, axis=1)
     slope, curvature, third = _derivatives(w, z, root, bounds)
     values, vectors = np.linalg.eigh(np.eye(z.shape[1]) + curvature)
-    e = rng.standard_normal(z.shape)
-    e = slope + np.einsum("pij,pj,pj->pi", vectors, np.sqrt(np.maximum(values, 0.0)), e)
     skewness = np.sum(np.minimum(third**2, 1.0), axis=1) + np.minimum(change, 1.0)
-    return wrapped(z + shift + np.einsum("pij,pj->pi", root, e), bounds.periodic), float(np.sqrt(np.mean(skewness)))
+    conditional = root @ (vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])
+    return z + shift + np.einsum("pij,pj->pi", root, slope), conditional, float(np.sqrt(np.mean(skewness)))
 
 
 def _root(cov: Array) -> Array:
