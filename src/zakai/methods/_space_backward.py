@@ -286,7 +286,7 @@ def density(prepared: base.Prepared, state: State, later: Message) -> GridDensit
 def draw(
     prepared: base.Prepared, k: int, later: Array, values: np.ndarray, state: State, rng: np.random.Generator
 ) -> tuple[Array, float]:
-    """Return draws (P, n) of the state at the start of interval k given those at its end, and how far from normal their law is."""
+    """Return draws (P, n) of the state at the start of interval k given those at its end, and how far the law is from normal."""
     general, begin = _general(prepared), _density(prepared, state)
     if general.observations.lengths[k] == 0:
         return later, 0.0

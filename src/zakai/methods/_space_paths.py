@@ -120,30 +120,25 @@ def _derivatives(w: Field, z: Array, root: Array, bounds: Bounds) -> tuple[Array
     along = grid.inverse @ root
     length = np.maximum(np.linalg.norm(along, axis=1), 1e-300) / NEAR  # (P, n)
     unit = np.swapaxes(along / length[:, None, :], 1, 2)  # (P, columns, n)
-    least, lowest = bounds.edge * w.values.max(), np.full(len(z), np.inf)
-
-    def log(offset: Array) -> Array:
-        nonlocal lowest
-        found = gather(coefficients, index + offset, grid)
-        lowest = np.minimum(lowest, found)
-        return np.log(np.maximum(found, least))
-
-    middle = log(0.0)
-    ends = [[log(s * unit[:, i]) for s in (-2, -1, 1, 2)] for i in range(n)]
-    slope = np.stack([(c - b) * 2 / 3 - (d - a) / 12 for a, b, c, d in ends], axis=1) * length
-    third = np.stack([0.5 * (d - a) - (c - b) for a, b, c, d in ends], axis=1) * length**3
+    # Along each axis at -2, -1, 1 and 2 steps, then on the diagonals of each pair.
+    pairs = [(i, j) for i in range(n) for j in range(i)]
+    offsets = [np.zeros_like(z)] + [t * unit[:, i] for i in range(n) for t in (-2, -1, 1, 2)]
+    for i, j in pairs:
+        plus, minus = unit[:, i] + unit[:, j], unit[:, i] - unit[:, j]
+        offsets += [plus, -plus, minus, -minus]
+    least = bounds.edge * w.values.max()
+    values = gather(coefficients, (index + np.stack(offsets)).reshape(-1, n), grid).reshape(-1, len(z))
+    middle, *logs = np.log(np.maximum(values, least))
+    a, b, c, d = (np.stack(logs[first : 4 * n : 4], axis=1) for first in range(4))
+    slope, third = ((c - b) * 2 / 3 - (d - a) / 12) * length, (0.5 * (d - a) - (c - b)) * length**3
     curvature = np.empty((len(z), n, n))
-    for i, (a, b, c, d) in enumerate(ends):
-        curvature[:, i, i] = (4 * (b + c) / 3 - (a + d) / 12 - 2.5 * middle) * length[:, i] ** 2
-        for j in range(i):
-            signs = (1, 1), (-1, -1), (1, -1), (-1, 1)
-            corners = [log(s * unit[:, i] + t * unit[:, j]) for s, t in signs]
-            mixed = (corners[0] + corners[1] - corners[2] - corners[3]) / 4
-            curvature[:, i, j] = curvature[:, j, i] = mixed * length[:, i] * length[:, j]
+    curvature[:, range(n), range(n)] = (4 * (b + c) / 3 - (a + d) / 12 - 2.5 * middle[:, None]) * length**2
+    for (i, j), (a, b, c, d) in zip(pairs, np.reshape(logs[4 * n :], (-1, 4, len(z))), strict=True):
+        curvature[:, i, j] = curvature[:, j, i] = (a + b - c - d) / 4 * length[:, i] * length[:, j]
     found = w.survey(bounds)
     precision = np.linalg.pinv(found.cov)
     offset = wrapped(z - grid.centre - found.mean, bounds.periodic)
-    unknown = ~(lowest > least)
+    unknown = ~(values.min(axis=0) > least)
     slope[unknown] = -np.einsum("pij,pi->pj", root[unknown], offset[unknown] @ precision)
     curvature[unknown] = -np.swapaxes(root[unknown], 1, 2) @ precision @ root[unknown]
     third[unknown] = 0.0
