@@ -68,6 +68,47 @@ def test_paths_have_the_means_covariances_and_lagged_covariances_of_a_smoother()
     assert_near(apart[:, :-1, :, None] * apart[:, 1:, None, :], lagged)
 
 
+def test_paths_on_grids_of_two_states_have_the_law_of_a_smoother():
+    times = np.array([0.0, 0.02, 0.05, 0.3, 0.4, 0.9, 1.6])
+    values = np.array([[1.2], [0.7], [np.nan], [0.6], [0.1], [0.3], [-0.6]])
+    paths = zakai.smooth(OSCILLATOR, zakai.Record(times, values, "samples"), "yau-yau").sample_paths(COUNT, seed=3)
+    means, covs, lagged = rauch_tung_striebel(times, values)
+    apart = paths - means
+    assert_near(paths, means)
+    assert_near(apart[..., :, None] * apart[..., None, :], covs)
+    assert_near(apart[:, :-1, :, None] * apart[:, 1:, None, :], lagged)
+
+
+NOISE_OF_STATE = [["0.6*sqrt(1 + x**2)", "0"], ["0.2", "0.5 + 0.3*sin(2*y)"]]
+SPACE = {
+    "wells": (["4*x - 4*x**3 + (y - x)/2", "4*y - 4*y**3 + (x - y)/2"], [["0.8", 0], [0, "0.8"]], "x + y", "samples", []),
+    "noise that depends on the state": (["-x + y/2", "-y"], NOISE_OF_STATE, "x", "increments", []),
+    "pendulum": (["y", "-4*sin(x) - y/5"], [["0"], ["2"]], "sin(x)", "samples", ["x"]),
+}
+
+
+@pytest.mark.parametrize("case", SPACE)
+def test_paths_on_grids_of_two_states_have_the_smoothed_moments(case):
+    drift, diffusion, observation, kind, angles = SPACE[case]
+    model = zakai.Model(
+        state=["x", "y"], drift=drift, diffusion=diffusion, observation=[observation], observation_kind=kind,
+        observation_noise=[["0.2"]], periodic=angles,
+        prior={"kind": "gaussian", "mean": [2.5 if angles else 0.5, 0.2], "cov": [[0.2, 0], [0, 0.3]]},
+    )  # fmt: skip
+    values = np.array([[0.4], [np.nan], [-0.3]]) * (0.2 if kind == "increments" else 1.0)
+    result = zakai.smooth(model, zakai.Record([0.1, 0.25, 0.3], values, kind), "yau-yau")
+    paths = result.sample_paths(COUNT, seed=1)
+    np.testing.assert_array_equal(paths, result.sample_paths(COUNT, seed=1))
+    apart = paths - result.mean
+    if angles:
+        assert np.abs(paths[..., 0]).max() <= np.pi
+        assert (np.diff(paths[..., 0]) < -np.pi).any()
+        apart[..., 0] = np.angle(np.exp(1j * apart[..., 0]))
+    assert_near(apart[..., 1], 0.0)
+    assert_near(np.sin(apart[..., 0]) if angles else apart[..., 0], 0.0)
+    assert_near(apart**2, result.variance)
+
+
 LINE, CIRCLE = np.linspace(-3.4, 3.4, 241), np.linspace(-np.pi, np.pi, 96, endpoint=False)
 TIMES, VALUES = np.array([0.05, 0.1, 0.9, 1.0, 2.5]), np.array([0.6, np.nan, -0.3, 0.8, 0.2])
 CASES = {

@@ -127,6 +127,9 @@ def test_both_grids_agree_with_the_smoother_of_a_linear_system(kind):
         np.testing.assert_allclose(result.mean, exact.mean, atol=bound)
         np.testing.assert_allclose(result.cov, exact.cov, atol=bound)
         assert result.warnings == []
+        apart = (result.sample_paths(4000, seed=1) - exact.mean) / np.sqrt(exact.variance)
+        np.testing.assert_allclose(apart.mean(axis=0), 0.0, atol=4 / np.sqrt(4000))
+        np.testing.assert_allclose(apart.var(axis=0), 1.0, atol=4 * np.sqrt(2 / 4000))
 
 
 def test_a_sharp_observation_narrows_a_wide_prior_before_it():
@@ -142,6 +145,9 @@ def test_a_sharp_observation_narrows_a_wide_prior_before_it():
     np.testing.assert_allclose(result.variance / exact.variance, 1, atol=2e-3)
     np.testing.assert_allclose(result.density(0).mean(), exact.mean[0], atol=1e-4)
     assert result.warnings == []
+    apart = (result.sample_paths(4000, seed=1) - exact.mean) / np.sqrt(exact.variance)
+    np.testing.assert_allclose(apart.mean(axis=0), 0.0, atol=4 / np.sqrt(4000))
+    np.testing.assert_allclose(apart.var(axis=0), 1.0, atol=4 * np.sqrt(2 / 4000))
 
 
 def test_blocks_on_grids_are_smoothed_one_by_one():

@@ -1,4 +1,4 @@
-"""Smoothing and residuals of coupled systems of two states, against finite volumes on a fixed grid and Bayes' rule there."""
+"""Smoothing, paths and residuals of coupled systems of two states, against finite volumes and Bayes' rule on a fixed grid."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def generator(size, ends, drift, noise):
 
 
 def dense(size, system, prior, times, values, likelihood, cdf=None):
-    """Smoothed means and covariances, and P(Z < z), P(Z <= z) for each row that is observed."""
+    """Smoothed means and covariances, P(Z < z), P(Z <= z) for each row that is observed, and E[x_k x_(k+1)']."""
     points, matrix = generator(size, *system)
     x, y = points.T
     forward, laws, starts = [np.exp(-0.5 * ((points - prior["mean"]) ** 2 / prior["cov"]).sum(axis=1))], [], [0.0, *times]
@@ -55,14 +55,18 @@ def dense(size, system, prior, times, values, likelihood, cdf=None):
         if cdf and not np.isnan(z):
             laws.append(cdf(z, x, y) @ predicted / predicted.sum())
         forward.append(predicted * factors[k] / (predicted * factors[k]).sum())
-    message, rows = np.ones(len(x)), []
+    message, rows, lagged = np.ones(len(x)), [], []
     for k in range(len(values), -1, -1):
         weights = forward[k] * message / (forward[k] @ message)
         mean = weights @ points
         rows.append(np.column_stack([mean, (points - mean).T @ (weights[:, None] * (points - mean))]))
         if k:
+            ahead = expm_multiply(matrix * (times[k - 1] - starts[k - 1]), forward[k - 1][:, None] * points)
+            joint = (factors[k - 1] * message)[:, None] * ahead
+            total = factors[k - 1] * message @ expm_multiply(matrix * (times[k - 1] - starts[k - 1]), forward[k - 1])
+            lagged.append(joint.T @ points / total)
             message = expm_multiply(matrix.T.tocsr() * (times[k - 1] - starts[k - 1]), factors[k - 1] * message)
-    return np.array(rows[::-1]), np.array(laws)
+    return np.array(rows[::-1]), np.array(laws), np.array(lagged[::-1])
 
 
 def extrapolated(*arguments):
@@ -79,7 +83,7 @@ def assert_smoothed(smoothed, moments):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_smoothing_and_residuals_are_those_of_a_dense_grid(law):
+def test_smoothing_paths_and_residuals_are_those_of_a_dense_grid(law):
     keys, values, likelihood, cdf = LAWS[law]
     prior = {"kind": "gaussian", "mean": [0.5, 0.0], "cov": [0.3, 0.3]}
     model = zakai.Model(
@@ -88,8 +92,11 @@ def test_smoothing_and_residuals_are_those_of_a_dense_grid(law):
     )  # fmt: skip
     smoothed = zakai.smooth(model, zakai.Record(TIMES, np.array(values)[:, None], "samples"), "yau-yau")
     system = ((-4.5, -5.5), (4.5, 5.5)), lambda x, y: (y, (1 - x**2) * y - x), (0.25, 0.49)
-    moments, laws = extrapolated(system, prior, TIMES, values, likelihood, cdf)
+    moments, laws, lagged = extrapolated(system, prior, TIMES, values, likelihood, cdf)
     assert_smoothed(smoothed, moments)
+    paths = smoothed.sample_paths(4000, seed=1)
+    products = paths[:, :-1, :, None] * paths[:, 1:, None, :]
+    assert np.all(np.abs(products.mean(axis=0) - lagged) < 4 * products.std(axis=0) / np.sqrt(len(paths)))
     found = smoothed.filtered.residuals(seed=5)
     draws = np.random.default_rng(5).uniform(size=found.shape)
     seen = ~np.isnan(values)
@@ -107,5 +114,5 @@ def test_an_excitable_neuron_is_smoothed_while_it_fires():
     )  # fmt: skip
     smoothed = zakai.smooth(model, zakai.Record(times, np.array(counts, float)[:, None], "samples"), "yau-yau")
     system = ((-3.0, -1.2), (3.2, 1.6)), lambda v, w: (10 * (v - v**3 / 3 - w + 0.5), (v + 0.7 - 0.8 * w) / 10), (0.9, 0.04)
-    moments, _ = extrapolated(system, prior, times, counts, lambda z, v, w: poisson.pmf(z, np.exp(v)))
+    moments, *_ = extrapolated(system, prior, times, counts, lambda z, v, w: poisson.pmf(z, np.exp(v)))
     assert_smoothed(smoothed, moments)

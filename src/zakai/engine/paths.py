@@ -45,8 +45,8 @@ def sample_paths(runs: Sequence[SmoothingRun], places: Sequence[Sequence[int]], 
     for run in runs:
         if run.backward.draw is None:
             raise InputError(
-                f"sample_paths: the method {run.setting.method.name} does not draw paths for this model; take yau-yau for one "
-                "state, or kalman-bucy, benes, hu-yau or general-direct, where one holds"
+                f"sample_paths: the method {run.setting.method.name} does not draw paths; take yau-yau for up to four "
+                "states, or kalman-bucy, benes, hu-yau or general-direct, where one holds"
             )
     found = np.empty((count, times, n))
     generators = np.random.default_rng(seed).spawn(len(runs))

@@ -21,10 +21,11 @@ from zakai.densities._density import wrap
 from zakai.numerics.space_diffusion import diffused
 from zakai.numerics.space_field import Field
 from zakai.numerics.space_grid import filtered, spread
+from zakai.numerics.space_resample import padded
 from zakai.numerics.space_spline import gather
 from zakai.numerics.space_step import Stepper, Substep
 from zakai.numerics.space_transport import moved_points, weighed
-from zakai.numerics.space_window import Bounds
+from zakai.numerics.space_window import Bounds, padded_sizes
 
 Array = Any
 TRIES = 20  # of a draw to which a characteristic leads from the grid
@@ -50,8 +51,9 @@ def _through(
     stepper: Stepper, one: Substep, begin: Field, end: Field, z: Array, rng: np.random.Generator
 ) -> tuple[Array, float]:
     """Return draws at the start of a substep between two densities given those at its end."""
-    dynamics, (t0, t1), grid, bounds = stepper.dynamics, one.times, begin.grid, stepper.bounds
-    values, after = begin.values, end.values
+    dynamics, (t0, t1), bounds = stepper.dynamics, one.times, stepper.bounds
+    values, grid = padded(begin.values, begin.grid, padded_sizes(begin.grid, one.linear.before.real, bounds))
+    after = end.values
     if one.potential is not None:
         after, _ = weighed(after, -one.potential(end.grid, t0, t1, True).log / 6)
         values, _ = weighed(values, one.potential(grid, t0, t1, False).log / 6)
@@ -70,7 +72,7 @@ def _through(
         if inside.all():
             break
     moved[~inside] = grid.centre + begin.survey(bounds).mean
-    centre, root, first = _law(stepper, one, one.linear.before, begin._replace(values=before), moved)
+    centre, root, first = _law(stepper, one, one.linear.before, Field(before, grid, 0.0), moved)
     departure = max(first, last) if np.mean(inside) > RELIABLE else np.inf
     return wrapped(_drawn(centre, root, rng), bounds.periodic), departure
 
