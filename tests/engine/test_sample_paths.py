@@ -235,6 +235,21 @@ def test_what_cannot_be_drawn_is_refused_in_one_line():
         result.sample_paths(10**9)
 
 
+def test_laws_that_are_not_near_to_normal_warn(monkeypatch, caplog):
+    monkeypatch.setattr("zakai.engine.paths.MOST_PARTS", 1)
+    model = zakai.Model(
+        state=["x", "y"], drift=["4*x - 4*x**3 + y", "-y"], observation=["x"], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [0, 0], "cov": [[0.5, 0], [0, 0.5]]},
+    )  # fmt: skip
+    record = zakai.Record([0.1], [[0.3]], "samples")
+    result = zakai.smooth(model, record, "yau-yau")
+    result.sample_paths(100)
+    assert not caplog.records
+    monkeypatch.setattr("zakai.engine.paths.NORMAL", 1e-6)
+    result.sample_paths(100)
+    assert "not near to normal in 1 of 1 intervals" in caplog.text
+
+
 def test_beyond_a_bound_the_memory_of_a_smoothed_record_does_not_grow_with_the_densities(monkeypatch):
     monkeypatch.setattr("zakai.engine.smoother.KEPT_BYTES", 0)
     model = zakai.Model(

@@ -10,6 +10,7 @@ References:
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ from zakai.records.schedule import Schedule
 if TYPE_CHECKING:
     from zakai.engine.smoother import SmoothingRun
 
+_LOG = logging.getLogger("zakai")
 LARGEST_BYTES = 16 * 2**30  # of paths that are returned together
 NORMAL = 0.25  # skewness and kurtosis of a conditional law up to which its expansion is accurate
 MOST_PARTS = 256  # of an interval
@@ -67,6 +69,7 @@ class _Paths:
     def __init__(self, run: SmoothingRun, count: int, rng: np.random.Generator):
         self.run, self.count, self.rng = run, count, rng
         self.parts = 1  # into which the next interval is divided
+        self.inaccurate = 0  # intervals whose laws are not near to normal in the smallest parts
 
     def __iter__(self) -> Any:
         run = self.run
@@ -77,6 +80,11 @@ class _Paths:
             for k in reversed(rows):
                 paths = self._before(prepared, k - begin, k, paths, states[k - rows.start])
                 yield k, paths
+        if self.inaccurate:
+            _LOG.warning(
+                "sample_paths: the law of the state given the next one is not near to normal in %d of %d intervals: the paths "
+                "are inaccurate there; give more frequent observations", self.inaccurate, len(run.schedule),
+            )  # fmt: skip
 
     def _before(self, prepared: Any, number: int, k: int, later: np.ndarray, state: Any) -> np.ndarray:
         """Return the draws at the start of interval k, which has this number in what is prepared."""
@@ -92,6 +100,7 @@ class _Paths:
             if departure <= NORMAL or self.parts >= MOST_PARTS:
                 break
             self.parts *= 2
+        self.inaccurate += departure > NORMAL
         if departure <= 0.5 * NORMAL:
             self.parts //= 2
         return paths

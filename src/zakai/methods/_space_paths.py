@@ -33,9 +33,7 @@ RELIABLE = 0.999  # share of the draws for which one is found
 NEAR = 0.5  # spacings between the points at which a logarithm is differentiated
 
 
-def drawn(
-    substeps: list[tuple[Stepper, Substep]], begin: Field, z: Array, rng: np.random.Generator
-) -> tuple[Array, float]:
+def drawn(substeps: list[tuple[Stepper, Substep]], begin: Field, z: Array, rng: np.random.Generator) -> tuple[Array, float]:
     """Return draws (P, n) of the state at the start of substeps given those at their end, and how far from normal the law is."""
     fields = [begin]
     for stepper, one in substeps:
@@ -114,7 +112,7 @@ def _root(cov: Array) -> Array:
 def _derivatives(w: Field, z: Array, root: Array, bounds: Bounds) -> tuple[Array, Array, Array]:
     """Return the first (P, n), second (P, n, n) and third (P, n) derivatives of log w at z along the columns of a root.
 
-    Where w is not known they are those of the Gaussian with its moments.
+    Where w is not known they are those of the Gaussian with its moments, and the third ones, of which nothing is known, are one.
     """
     grid, n = w.grid, w.grid.n
     coefficients = filtered(w.values, np.zeros((n, n)), spline=True)
@@ -143,7 +141,7 @@ def _derivatives(w: Field, z: Array, root: Array, bounds: Bounds) -> tuple[Array
     unknown = ~(values.min(axis=0) > least)
     slope[unknown] = -np.einsum("pij,pi->pj", root[unknown], offset[unknown] @ precision)
     curvature[unknown] = -np.swapaxes(root[unknown], 1, 2) @ precision @ root[unknown]
-    third[unknown] = 0.0
+    third[unknown] = 1.0
     return slope, curvature, third
 
 
