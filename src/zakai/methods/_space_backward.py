@@ -283,9 +283,7 @@ def density(prepared: base.Prepared, state: State, later: Message) -> GridDensit
 
 
 @np.errstate(all="ignore")
-def draw(
-    prepared: base.Prepared, k: int, later: Array, values: np.ndarray, state: State, rng: np.random.Generator
-) -> tuple[Array, float]:
+def draw(prepared: base.Prepared, k: int, later: Array, values: Array, state: State, rng: Any) -> tuple[Array, float]:
     """Return draws (P, n) of the state at the start of interval k given those at its end, and how far the law is from normal."""
     general, begin = _general(prepared), _density(prepared, state)
     if general.observations.lengths[k] == 0:
