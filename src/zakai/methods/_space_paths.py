@@ -50,7 +50,8 @@ def _through(
 ) -> tuple[Array, float]:
     """Return draws at the start of a substep between two densities given those at its end."""
     dynamics, (t0, t1), bounds = stepper.dynamics, one.times, stepper.bounds
-    values, grid = padded(begin.values, begin.grid, padded_sizes(begin.grid, one.linear.before.real, bounds))
+    sizes = padded_sizes(begin.values, begin.grid, one.linear.before.real, bounds)
+    values, grid = padded(begin.values, begin.grid, sizes)
     after = end.values
     if one.potential is not None:
         after, _ = weighed(after, -one.potential(end.grid, t0, t1, True).log / 6)
