@@ -135,13 +135,17 @@ class PredictiveSums:
         times = stops if self.samples else np.where(self.inside.any(axis=1), 0.5 * (starts + stops), stops)
         return Schedule(starts, times, np.zeros_like(seen), np.zeros_like(elapsed), inputs)
 
+    def predicted(self, k: int, state: Any) -> tuple[Any, Any]:
+        """Return what is prepared for predictions, and the state at the time of the law of interval k."""
+        prepared = self.setting.prepared(self.unobserved)
+        return prepared, self.setting.method.step(prepared, k, state, np.zeros(self.model.m))[0]
+
     def row(self, k: int, state: Any, values: Array) -> Pair | None:
         """Return P(Z_j < z_j) and P(Z_j <= z_j) (m,) of the observations at the end of interval k, from the state before it."""
         which, inside = np.flatnonzero(self.schedule.seen[k]), self.inside[k].any()
         if not self.possible or (inside and np.any(self.inside[k] != self.schedule.seen[k])):
             return None
-        prepared = self.setting.prepared(self.unobserved)
-        predicted, _ = self.setting.method.step(prepared, k, state, np.zeros(len(values)))
+        prepared, predicted = self.predicted(k, state)
         mixture = Mixture.of(self.setting.method.density(prepared, predicted))
         if mixture is None or (mixture.covs is not None and not (self.gaussian and self.affine)):
             return None

@@ -1,4 +1,7 @@
-"""The law of the observations of a row by quadrature over the evidence of the filter's own step, for every method."""
+"""The law of the observations of a row by quadrature over the evidence of the filter's own step, for every method.
+
+Samples are predicted once: the steps of the quadrature begin at the time of the row.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ class PredictiveEvidence:
         self.setting, self.model, self.sums, self.spread = setting, setting.model, sums, spread
         self.samples = self.model.observation_kind == "samples"
         self.families = self.model.observation_law.families if self.samples else ("gaussian",) * self.model.m
-        self.prefixes = _prefixes(schedule)
+        self.prefixes = _prefixes(schedule, schedule.stops if self.samples else schedule.starts)
         self.prepared: dict[int, Any] = {}
         self.mass_error = 0.0
 
@@ -44,6 +47,8 @@ class PredictiveEvidence:
         """Return P(Z_j < z_j) and P(Z_j <= z_j) (m,) of the observations at the end of interval k, from the state before it."""
         seen = np.flatnonzero(self.prefixes[-1].seen[k])
         below, upto = np.full((2, len(values)), np.nan)
+        if self.samples:
+            state = self.sums.predicted(k, state)[1]
         for i, j in enumerate(map(int, seen)):
             known = seen[:i]
             earlier = np.where(np.isin(range(len(values)), known), values, 0.0)
@@ -112,12 +117,12 @@ class PredictiveEvidence:
         return found[0], found[-1]
 
 
-def _prefixes(schedule: Schedule) -> list[Schedule]:
-    """Return the schedules in which only the first 0, 1, ..., m of the observed coordinates of each row are observed."""
+def _prefixes(schedule: Schedule, starts: Array) -> list[Schedule]:
+    """Return the schedules from `starts` in which only the first 0, 1, ..., m observed coordinates of each row are observed."""
     order = np.cumsum(schedule.seen, axis=1)
     found = []
     for count in range(schedule.seen.shape[1] + 1):
         seen = schedule.seen & (order <= count)
         elapsed = np.where(seen, schedule.elapsed, 0.0)
-        found.append(Schedule(schedule.starts, schedule.stops, seen, elapsed, schedule.inputs))
+        found.append(Schedule(starts, schedule.stops, seen, elapsed, schedule.inputs))
     return found
