@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities import Density
+from zakai.engine.lengths import distances, note_on_lengths
 from zakai.engine.misfit import misfits, note_on_misfits
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
@@ -105,9 +106,9 @@ class Feed:
             return moment.notes
         (values, seen, elapsed), stop = moment.observed, np.array([moment.time])
         schedule = Schedule(stop - moment.length, stop, np.array([seen]), np.array([elapsed]), moment.inputs)
-        setting = self.setting
-        short = misfits(setting.model, setting.theta.real, schedule, np.array([values]), stacked([moment.info]))
-        return (*moment.notes, *note_on_misfits(short, stop))
+        model, theta, infos = self.setting.model, self.setting.theta.real, stacked([moment.info])
+        apart, short = distances(model, theta, schedule, infos), misfits(model, theta, schedule, np.array([values]), infos)
+        return (*moment.notes, *note_on_lengths(apart, stop), *note_on_misfits(short, stop))
 
     def density(self, moment: Moment) -> Density:
         """Return the density at a moment."""

@@ -10,6 +10,7 @@ import numpy as np
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.health_warnings import warnings_of_run
+from zakai.engine.lengths import distances, note_on_lengths
 from zakai.engine.misfit import misfits, note_on_misfits
 from zakai.engine.notes import notes_on_angles, notes_on_formulas, notes_on_tables, why_not_finite
 from zakai.engine.results import FilterResult
@@ -200,8 +201,9 @@ class Run:
         )
         theta = self.setting.theta.real
         undefined = notes_on_formulas(model, theta, self.record, result.mean, result.variance)
+        lengths = note_on_lengths(distances(model, theta, self.schedule, infos), self.schedule.stops)
         misfit = note_on_misfits(misfits(model, theta, self.schedule, self.values, infos), self.schedule.stops)
-        result.warnings.extend([*undefined, *self.notes, *misfit, *warnings_of_run(result)])
+        result.warnings.extend([*undefined, *self.notes, *lengths, *misfit, *warnings_of_run(result)])
         return result
 
     def _no_density(self) -> str:

@@ -1,0 +1,61 @@
+"""Increments over long intervals: their exact law differs from that of y linear between observations, and results say so."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import zakai
+
+RATE = 0.5  # dx = -x/2 dt + dv, x ~ N(0, 1) at the start
+
+
+def simulated(slope, noise, length, count, parts=100):
+    """Increments (count,) of dy = slope x dt + dw."""
+    rng, x, d = np.random.default_rng(3), 0.4, length / parts
+    path = np.empty((count, parts))
+    for place in np.ndindex(path.shape):
+        path[place] = x
+        x += -RATE * x * d + np.sqrt(d) * rng.normal()
+    return slope * d * path.sum(axis=1) + np.sqrt(noise * length) * rng.normal(size=count)
+
+
+def exact(slope, noise, length, values):
+    """Filtered means and standard deviations: Bayes' rule for the joint normal law of the state and the increment."""
+    drift, zero = np.array([[-RATE, 0.0], [slope, 0.0]]), np.zeros((2, 2))
+    both = expm(length * np.block([[-drift, np.diag([1.0, noise])], [zero, drift.T]]))  # Van Loan
+    move = both[2:, 2:].T
+    added = move @ both[:2, 2:]
+    mean, variance, found = 0.0, 1.0, []
+    for z in values:
+        law, cov = move @ [mean, 0.0], move @ np.diag([variance, 0.0]) @ move.T + added
+        gain = cov[0, 1] / cov[1, 1]
+        mean, variance = law[0] + gain * (z - law[1]), cov[0, 0] - gain * cov[0, 1]
+        found.append((mean, np.sqrt(variance)))
+    return np.array(found).T
+
+
+@pytest.mark.parametrize(
+    ("slope", "noise", "length", "warns"),
+    [(2.0, 0.01, 0.1, True), (1.3, 0.05, 0.36, True), (1.0, 0.1, 0.1, False), (1.0, 1.0, 0.4, False)],
+)
+@pytest.mark.parametrize("method", ["kalman-bucy", "yau-yau"])
+def test_the_distance_from_the_exact_law_of_increments_is_said(method, slope, noise, length, warns):
+    values = simulated(slope, noise, length, 60)
+    times = length * np.arange(1, 61)
+    model = zakai.Model(
+        state=["x"], drift=[f"-{RATE}*x"], observation=[f"{slope}*x"], observation_noise=[[str(noise)]],
+        prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record(times, values[:, None]), method)
+    mean, deviation = exact(slope, noise, length, values)
+    apart = np.abs(result.mean[1:, 0] - mean) / deviation
+    said = [float(found[1]) for warning in result.warnings if (found := re.search(r"up to about (\S+) standard", warning))]
+    assert (apart.max() > 0.05) == bool(said) == warns
+    online = zakai.online(model, method)
+    assert bool(online.update(times[0], values[:1]).warnings) == warns
+    if warns:
+        assert 0.25 * said[0] < apart.max() < 1.1 * said[0]
