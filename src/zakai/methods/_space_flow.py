@@ -232,7 +232,7 @@ def regridded(field: Field, bounds: Bounds) -> Field:
     """Return the density on a grid with as many points as it needs, where its own has many more or its axes are skew."""
     grid = field.grid
     real = np.where(field.values.real > 0, field.values.real, 0.0)
-    narrow, _ = narrowest(survey(real, grid, bounds.edge, bounds.tail), bounds.tail)
+    narrow, _ = narrowest(survey(real, grid, bounds.edge), real, bounds.tail)
     used = np.flatnonzero(real > bounds.edge * real.max())
     with np.errstate(divide="ignore"):
         logs = np.log(real.reshape(-1)[used] / real.max())

@@ -31,12 +31,11 @@ class Field(_Fields):
     """A density `values` (*sizes), but for exp(`log_scale`), on a grid."""
 
     def survey(self, bounds: Bounds) -> Survey:
-        """Return the survey with the limits of some bounds, which is kept."""
+        """Return the survey with the limit of some bounds, which is kept."""
         kept: dict[Any, Survey] = self.__dict__
-        key = bounds.edge, bounds.tail
-        if key not in kept:
-            kept[key] = survey(self.values, self.grid, *key)
-        return kept[key]
+        if bounds.edge not in kept:
+            kept[bounds.edge] = survey(self.values, self.grid, bounds.edge)
+        return kept[bounds.edge]
 
     @property
     def log_mass(self) -> Any:

@@ -139,7 +139,7 @@ def refitted(field: Field, bounds: Bounds) -> Field:
     """
     grid, real = field.grid, field.values.real
     found = field.survey(bounds)
-    narrow, _ = narrowest(found, bounds.tail, bounds.spacings)
+    narrow, _ = narrowest(found, real, bounds.tail, bounds.spacings)
     used = np.flatnonzero(real > 0.3 * bounds.edge * real.max())
     logs = np.log(real.reshape(-1)[used] / real.max())
     new = fitted_grid(grid.offsets[used], logs, grid.centre, np.zeros((grid.n, grid.n)), narrow, bounds, grid, MARGIN)

@@ -120,7 +120,7 @@ class Stepper:
         """Choose the target grids of substeps that follow each other by moving points of the density."""
         grid, real, bounds, dynamics = field.grid, field.values.real, self.bounds, self._deciding()
         found, linears = field.survey(self.bounds), self._linear(field, times)
-        narrow, widths = narrowest(found, bounds.tail, bounds.spacings)
+        narrow, widths = narrowest(found, real, bounds.tail, bounds.spacings)
         holds = bool(np.all(found.edges <= 0.5 * bounds.edge) and np.all(found.tails <= 0.5 * bounds.tail))
         holds = holds and self._fits(found.used, widths, grid)
         support = self._support(real)

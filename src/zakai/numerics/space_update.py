@@ -238,7 +238,7 @@ def _next(product: _Product, bounds: Bounds, sparse: bool, late: bool) -> Grid |
         noise = 0.25 * grid.basis @ grid.basis.T
     else:
         found = product.field.survey(bounds)
-        narrow, _ = narrowest(found, bounds.tail)
+        narrow, _ = narrowest(found, product.field.values, bounds.tail)
         ratio = bounds.spacings / deviations_in_spacings(found.tails)
         near = late or (not sparse and ratio.max() < MOST_REFINED)
         if near and (found.tails > bounds.tail).any() and not (found.edges > 3 * bounds.edge).any():
