@@ -18,6 +18,7 @@ from zakai.numerics.space_grid import Grid, filtered
 
 Array = NDArray[Any]
 BLOCK = 5  # points of a block along each axis, of which the six taps of a spline reach two at most
+TOGETHER = 64  # points whose weights are found together
 PAD = 3  # zeros, or the other end of a circle, around the coefficients of a spline
 
 
@@ -57,12 +58,12 @@ def _gather(values: Any, sizes: Any, closed: Any, least: Any, z: Any, out: Any) 
                     c[first - 1 - i] = values[source + last - 1 - i]
                     c[first + last + i] = values[source + i]
     # The largest coefficient of each block.
-    blocks = (padded + BLOCK - 1) // BLOCK
+    blocks = (padded + BLOCK - 1) // BLOCK if least > 0.0 else 0 * padded
     steps = np.ones(n, np.int64)
     for d in range(n - 2, -1, -1):
         steps[d] = steps[d + 1] * blocks[d + 1]
     largest = np.zeros(steps[0] * blocks[0])
-    for line in range(c.size // padded[n - 1]):
+    for line in range(c.size // padded[n - 1] if least > 0.0 else 0):
         rest, block = line, 0
         for d in range(n - 2, -1, -1):
             block += rest % padded[d] // BLOCK * steps[d]
@@ -71,74 +72,74 @@ def _gather(values: Any, sizes: Any, closed: Any, least: Any, z: Any, out: Any) 
         for i in range(padded[n - 1]):
             at = block + i // BLOCK
             largest[at] = max(largest[at], abs(c[first + i].real))
-    scaling = 120.0**-n
-    outer = 1
-    for _ in range(n - 1):
-        outer *= 6
-    offsets = np.zeros(outer, np.int64)
-    weights = np.zeros(outer, z.dtype)
-    w = np.zeros((n, 6), z.dtype)
-    blocks_at = np.zeros(2**n, np.int64)
+    # The taps along all axes but the last, as distances in memory; unsigned indices are not checked for negative ones.
+    outer = 6 ** (n - 1)
+    offsets, weights = np.zeros(outer, np.uint64), np.zeros(outer, z.dtype)
+    one, two, three, four, five = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4), np.uint64(5)
+    for i in range(outer):
+        rest, offset = i, 0
+        for d in range(n - 2, -1, -1):
+            offset += rest % 6 * strides[d]
+            rest //= 6
+        offsets[i] = np.uint64(offset)
+    w, firsts, blocks_at = np.zeros(n * 6 * TOGETHER, z.dtype), np.zeros(n, np.int64), np.zeros(2**n, np.int64)
     for j in range(count):
-        base = 0
-        inside = True
-        used = 1
-        blocks_at[0] = 0
+        k = j % TOGETHER
+        if k == 0:
+            for d in range(n):
+                at, rows = z[d, j : j + TOGETHER], w[6 * TOGETHER * d : 6 * TOGETHER * (d + 1)]
+                for i in range(at.size):
+                    t = at[i] - np.floor(at[i].real)
+                    s = 1.0 - t
+                    t2 = t * t
+                    s2 = s * s
+                    rows[i] = s2 * s2 * s
+                    rows[TOGETHER + i] = 26.0 + t * (-50.0 + t * (20.0 + t * (20.0 + t * (-20.0 + 5.0 * t))))
+                    rows[2 * TOGETHER + i] = 66.0 + t2 * (-60.0 + t2 * (30.0 - 10.0 * t))
+                    rows[3 * TOGETHER + i] = 66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s))
+                    rows[4 * TOGETHER + i] = 26.0 + s * (-50.0 + s * (20.0 + s * (20.0 + s * (-20.0 + 5.0 * s))))
+                    rows[5 * TOGETHER + i] = t2 * t2 * t
+        base, inside = 0, True
         for d in range(n):
-            floor = math.floor(z[d, j].real) if math.isfinite(z[d, j].real) else -1e9
-            if not closed[d] and (floor < -1 or floor >= sizes[d]) or abs(floor) > 1e8:
+            x = z[d, j].real
+            if not (abs(x) < 1e8 and (closed[d] or -1.0 <= x < sizes[d])):
                 inside = False
                 break
-            cell = int(floor)
+            cell = int(np.floor(x))
             if closed[d]:
                 cell = cell % sizes[d]
-            first = cell + PAD - 2
-            base += first * strides[d]
-            low, high = first // BLOCK, (first + 5) // BLOCK
-            for i in range(used):
-                blocks_at[used + i] = blocks_at[i] + high * steps[d]
-                blocks_at[i] += low * steps[d]
-            used *= 2
-        if inside:
-            inside = False
+            firsts[d] = cell + (PAD - 2)
+            base += firsts[d] * strides[d]
+        if inside and least > 0.0:
+            used, inside = 1, False
+            blocks_at[0] = 0
+            for d in range(n):
+                low, high = firsts[d] // BLOCK, (firsts[d] + 5) // BLOCK
+                for i in range(used):
+                    blocks_at[used + i] = blocks_at[i] + high * steps[d]
+                    blocks_at[i] += low * steps[d]
+                used *= 2
             for i in range(used):
                 inside = inside or largest[blocks_at[i]] >= least
         if not inside:
             out[j] = 0.0
             continue
-        for d in range(n):
-            t = z[d, j] - math.floor(z[d, j].real)
-            s = 1.0 - t
-            t2 = t * t
-            s2 = s * s
-            w[d, 0] = s2 * s2 * s
-            w[d, 5] = t2 * t2 * t
-            w[d, 1] = 26.0 + t * (-50.0 + t * (20.0 + t * (20.0 + t * (-20.0 + 5.0 * t))))
-            w[d, 2] = 66.0 + t2 * (-60.0 + t2 * (30.0 - 10.0 * t))
-            w[d, 3] = 66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s))
-            w[d, 4] = 26.0 + s * (-50.0 + s * (20.0 + s * (20.0 + s * (-20.0 + 5.0 * s))))
         size = 1
-        offsets[0] = base
-        weights[0] = 1.0
+        weights[0] = 120.0**-n
         for d in range(n - 1):
-            for tap in range(5, -1, -1):
-                for i in range(size):
-                    offsets[tap * size + i] = offsets[i] + tap * strides[d]
-                    weights[tap * size + i] = weights[i] * w[d, tap]
+            for i in range(size - 1, -1, -1):
+                for tap in range(5, -1, -1):
+                    weights[6 * i + tap] = weights[i] * w[(6 * d + tap) * TOGETHER + k]
             size *= 6
-        total = 0.0 * w[0, 0]
-        for i in range(size):
-            o = offsets[i]
-            row = (
-                c[o] * w[n - 1, 0]
-                + c[o + 1] * w[n - 1, 1]
-                + c[o + 2] * w[n - 1, 2]
-                + c[o + 3] * w[n - 1, 3]
-                + c[o + 4] * w[n - 1, 4]
-                + c[o + 5] * w[n - 1, 5]
-            )
+        last_weights = w[6 * TOGETHER * (n - 1) + k :]
+        w0, w1, w2 = last_weights[0], last_weights[TOGETHER], last_weights[2 * TOGETHER]
+        w3, w4, w5 = last_weights[3 * TOGETHER], last_weights[4 * TOGETHER], last_weights[5 * TOGETHER]
+        total = 0.0 * w0
+        for i in range(outer):
+            o = np.uint64(base) + offsets[i]
+            row = c[o] * w0 + c[o + one] * w1 + c[o + two] * w2 + c[o + three] * w3 + c[o + four] * w4 + c[o + five] * w5
             total += weights[i] * row
-        out[j] = total * scaling
+        out[j] = total
 
 
 def gather(coefficients: Array, z: Array, grid: Grid, least: float = 0.0) -> Array:
