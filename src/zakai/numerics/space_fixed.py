@@ -38,7 +38,7 @@ class Motion(NamedTuple):
 
     `coefficients` (5, (n + 1) J) of tau / `unit`, ... of the displacement in spacings and of the log of the change of volume; the
     indices `start` (n, J) of the points; the noise `variances` (n, n) per unit of time, in spacings; the `longest` time for which
-    a density that fills the grid can stay on it.
+    a density that fills the grid can stay on it. What `over` returned last is `kept`.
     """
 
     coefficients: Array
@@ -46,6 +46,17 @@ class Motion(NamedTuple):
     start: Array
     variances: Array
     longest: float
+    kept: dict[float, tuple[Array, Array]]
+
+    def over(self, tau: float) -> tuple[Array, Array]:
+        """Return where the characteristics begin that end in the points after a time (J, n), and the change of volume (J,)."""
+        found = self.kept.get(tau)
+        if found is None:
+            change = ((tau / self.unit) ** np.arange(1, 6) @ self.coefficients).reshape(len(self.start) + 1, -1)
+            found = (self.start + change[:-1]).T, np.exp(change[-1])
+            self.kept.clear()
+            self.kept[tau] = found
+        return found
 
 
 def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
@@ -61,7 +72,7 @@ def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
     noise = float((np.diagonal(variances).real / (grid.shape / 11.0) ** 2).max())
     longest = 1.0 / max(rate / STEEPEST, noise / LARGEST_NOISE, 1e-300)
     if not np.isfinite(rate) or longest < tau:
-        return Motion(np.zeros((5, 0)), unit, np.zeros((n, 0)), variances, 0.0)
+        return Motion(np.zeros((5, 0)), unit, np.zeros((n, 0)), variances, 0.0, {})
     points = np.asfortranarray(grid.points)
     with np.errstate(all="ignore"):
         steps = math.ceil(0.5 * unit * rate / SHORT) or 1
@@ -72,7 +83,7 @@ def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
     moved[:, :n] = inverse @ moved[:, :n]
     moved[:, n] = np.where(np.abs(moved[:, n].real) < LARGEST_RANGE, moved[:, n], 0.0)
     start = indices(grid.sizes).T + (grid.shape // 2)[:, None]
-    return Motion(EXTENSION @ moved.reshape(5, -1), unit, start, variances, longest)
+    return Motion(EXTENSION @ moved.reshape(5, -1), unit, start, variances, longest, {})
 
 
 @lru_cache(maxsize=64)
@@ -98,6 +109,8 @@ def _spread(values: Array, cov: Array, separate: bool, spline: bool = False) -> 
     if not separate:
         return filtered(values, cov, spline)
     for d, size in enumerate(shape):
+        if not spline and cov[d, d] == 0.0:
+            continue
         matrix = _circulant(cov[d, d].item(), size, spline)
         if d == values.ndim - 1:
             values = values.reshape(-1, size) @ matrix
@@ -110,15 +123,13 @@ def fixed_step(values: Array, grid: Grid, moved: Motion, tau: float, factors: tu
     """Return the density after a substep; `factors` are exp(b / 6) and exp(b / 3 - tau g / 144)."""
     half = 0.5 * tau * moved.variances
     separate = np.count_nonzero(half) == np.count_nonzero(half.diagonal())
-    s = tau / moved.unit
-    change = (s ** np.arange(1, 6) @ moved.coefficients).reshape(grid.n + 1, -1)
-    at, volume = (moved.start + change[:-1]).T, np.exp(change[-1]).reshape(grid.sizes)
+    at, volume = moved.over(tau)
     if factors is None:
-        values = gather(_spread(values, half, separate, True), at, grid).reshape(grid.sizes)
-        return _spread(values * volume, half, separate)
+        values = gather(_spread(values, half, separate, True), at, grid) * volume
+        return _spread(values.reshape(grid.sizes), half, separate)
     outer, inner = factors
     values = _spread(_spread(values * outer, half, separate) * inner, 0.0 * half, True, True)
-    values = gather(values, at, grid).reshape(grid.sizes) * volume
+    values = (gather(values, at, grid) * volume).reshape(grid.sizes)
     return _spread(values * inner, half, separate) * outer
 
 
