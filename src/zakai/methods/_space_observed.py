@@ -106,14 +106,14 @@ class Observations:
         return self._kept(grid, None, lambda: (self.system.observe(grid.points, t, self.theta),))[0]
 
     def fields(self, grid: Grid, t: float) -> tuple[Array, Array]:
-        """Return h and its derivatives (m, n + 1, J) at the points of a grid, zero at those (J,) where h is not finite."""
+        """Return h and its derivatives (m, n + 1, J) at the points of a grid, zero where h is not finite, and the numbers of those."""
 
         def make() -> tuple[Array, Array]:
             points = grid.points
             h = self.system.observe(points, t, self.theta).T
             slopes = np.moveaxis(self.system.slopes(points, t, self.theta), 0, -1)
             fields = np.concatenate([h[:, None], slopes], axis=1)
-            lost = ~np.isfinite(fields.real).all(axis=(0, 1))
+            lost = np.flatnonzero(~np.isfinite(fields.real).all(axis=(0, 1)))
             fields[:, :, lost] = 0.0
             return fields, lost
 
@@ -148,12 +148,16 @@ class Observations:
             slope: Array = 0.0
             for weight, t, P in parts(grid, a, b):
                 fields, lost = self.fields(grid, t)
-                h, slopes = fields[inside, 0], fields[inside, 1:]
-                log = log + (h * (P @ (rates - 0.5 * h))).sum(axis=0) * weight
-                log = np.where(lost, -1e300, log)  # the density ends where h is not finite
-                slope = slope + np.einsum("mdj,mj->dj", slopes, (weight * P) @ (rates - h))
+                fields = fields if inside.all() else fields[inside]
+                h = fields[:, 0]
+                residual = (weight * P) @ (rates - h)
+                log = log + (h * (residual + (0.5 * weight * P) @ h)).sum(axis=0)
+                if lost.size:  # the density ends where h is not finite
+                    log[lost] = -1e300
+                slope = slope + (fields[:, 1:] * residual[:, None]).sum(axis=0)
             if dynamics.diffusion is None:
-                steep = ((dynamics.noise(a, b)[0] @ slope) * slope).sum(axis=0)
+                noise = dynamics.noise(a, b)[0]
+                steep = sum((noise[d, e] * slope[d] * slope[e] for d, e in np.argwhere(noise)), np.zeros(len(log)))
             else:
                 steep = np.einsum("jde,dj,ej->j", dynamics.diffusion(grid.points, 0.5 * (a + b)), slope, slope)
             return Factor(log.reshape(grid.sizes), ((a - b) / 144 * steep).reshape(grid.sizes))
