@@ -27,7 +27,6 @@ from zakai.numerics.complex_step import is_complex
 from zakai.numerics.prior_grid import mixture_grid
 from zakai.numerics.space_advance import CHECKED, Control, advance
 from zakai.numerics.space_field import NOTHING, Field, Report, positive
-from zakai.numerics.space_fixed import fits, refitted
 from zakai.numerics.space_grid import Grid
 from zakai.numerics.space_step import Stepper
 from zakai.numerics.space_survey import Survey
@@ -211,9 +210,6 @@ class Prepared:
         mean, cov = moments_of(result.values.real, result.grid, self.angles, found or result.survey(self.bounds))
         mass = result.values.sum() * result.grid.cell
         gained = np.log(mass) + (result.log_scale + constant)
-        if found is not None and not fits(found, result.grid, self.bounds):
-            result = positive(refitted(result, self.bounds), self.bounds)
-            mass = result.values.sum() * result.grid.cell
         if not report.splitting + report.of_grid(self.bounds.reach) < LOST and np.isfinite(update.depth):
             result, mass = self._gaussian(result, mean, cov), 1.0
         edge, tails = max(report.edges, update.edges), max(report.tails, update.tails)

@@ -106,7 +106,7 @@ class Observations:
         return self._kept(grid, None, lambda: (self.system.observe(grid.points, t, self.theta),))[0]
 
     def fields(self, grid: Grid, t: float) -> tuple[Array, Array]:
-        """Return h and its derivatives (m, n + 1, J) at the points of a grid, zero where h is not finite, and the numbers of those."""
+        """Return h and its derivatives (m, n + 1, J) at the points of a grid, zero where h is not finite, and those numbers."""
 
         def make() -> tuple[Array, Array]:
             points = grid.points

@@ -10,7 +10,7 @@ from zakai.methods._space_system import System
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.space_advance import Control
 from zakai.numerics.space_field import Field, Report, extrapolated, grid_report, moments_difference, positive
-from zakai.numerics.space_fixed import LARGEST_RANGE, Motion, fixed_step, motion
+from zakai.numerics.space_fixed import LARGEST_RANGE, Motion, fits, fixed_step, motion, refitted
 from zakai.numerics.space_grid import Grid
 from zakai.numerics.space_survey import Survey
 from zakai.numerics.space_window import Bounds
@@ -57,6 +57,9 @@ def predicted_on(
     if min(singles, 3 * pairs) > MOST_FIXED:
         return None
     moved = motion_of(prepared, grid, length)
+    if length <= moved.longest and not fits(begin.survey(prepared.bounds), grid, prepared.bounds):
+        begin = positive(refitted(begin, prepared.bounds), prepared.bounds)
+        grid, moved = begin.grid, motion_of(prepared, begin.grid, length)
     if not length <= moved.longest:
         return None
     factor = None if potential is None else potential(grid, 0.0, length, True)

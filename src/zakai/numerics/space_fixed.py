@@ -144,17 +144,17 @@ def fits(found: Survey, grid: Grid, bounds: Bounds) -> bool:
 
 
 def refitted(field: Field, bounds: Bounds) -> Field:
-    """Return a density on a grid that fits it, with a margin for many short substeps.
+    """Return a density, of the same mass, on a grid that fits it with a margin for many short substeps.
 
     Along other axes a density may need smaller spacings than along its own; where it does, it stays on its grid.
     """
     grid, real = field.grid, field.values.real
     found = field.survey(bounds)
-    narrow, _ = narrowest(found, real, bounds.tail, bounds.spacings)
+    narrow, _ = narrowest(found, real, bounds.tail)
     used = np.flatnonzero(real > 0.3 * bounds.edge * real.max())
     logs = np.log(real.reshape(-1)[used] / real.max())
     new = fitted_grid(grid.offsets[used], logs, grid.centre, np.zeros((grid.n, grid.n)), narrow, bounds, grid, MARGIN)
     values = resampled(field.values, grid, new, bounds.periodic)
     if survey(values, new).tails.max() > max(3 * bounds.tail, found.tails.max()):
         return field
-    return Field(values, new, field.log_scale)
+    return Field(values * (field.values.sum() * grid.cell / (values.sum() * new.cell)), new, field.log_scale)
