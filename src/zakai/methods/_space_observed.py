@@ -123,13 +123,11 @@ class Observations:
     def potential(self, inside: Array, values: Array, start: float, length: float) -> Any:
         """Return the factor of the increments `inside` over a substep, as a function of a grid."""
         system, theta, n, m = self.system, self.theta, self.model.n, self.model.m
-        rates, rows = (values[inside] / length)[:, None], np.ix_(inside, inside)
-        origin, stop = np.zeros(n), start + length
-        dynamics = self.dynamics
+        rates, stop, every, dynamics = (values[inside] / length)[:, None], start + length, bool(inside.all()), self.dynamics
 
         def precision(times: Array) -> Array:
-            noise = np.broadcast_to(system.noise(origin, times, theta), (len(times), m, m))
-            return np.linalg.inv(noise[:, rows[0], rows[1]])
+            noise = np.broadcast_to(system.noise(np.zeros(n), times, theta), (len(times), m, m))
+            return np.linalg.inv(noise[:, inside][:, :, inside])
 
         fixed = None if system.noise_varies else self._precisions.get(inside.tobytes())
         if fixed is None and not system.noise_varies:
@@ -148,7 +146,7 @@ class Observations:
             slope: Array = 0.0
             for weight, t, P in parts(grid, a, b):
                 fields, lost = self.fields(grid, t)
-                fields = fields if inside.all() else fields[inside]
+                fields = fields if every else fields[inside]
                 h = fields[:, 0]
                 residual = (weight * P) @ (rates - h)
                 log = log + (h * (residual + (0.5 * weight * P) @ h)).sum(axis=0)
@@ -157,7 +155,8 @@ class Observations:
                 slope = slope + (fields[:, 1:] * residual[:, None]).sum(axis=0)
             if dynamics.diffusion is None:
                 noise = dynamics.noise(a, b)[0]
-                steep = sum((noise[d, e] * slope[d] * slope[e] for d, e in np.argwhere(noise)), np.zeros(len(log)))
+                pairs = [(d, e) for d in range(n) for e in range(n) if noise[d, e] != 0.0]
+                steep = sum((noise[d, e] * slope[d] * slope[e] for d, e in pairs), np.zeros(len(log)))
             else:
                 steep = np.einsum("jde,dj,ej->j", dynamics.diffusion(grid.points, 0.5 * (a + b)), slope, slope)
             return Factor(log.reshape(grid.sizes), ((a - b) / 144 * steep).reshape(grid.sizes))

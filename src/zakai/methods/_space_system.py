@@ -136,7 +136,14 @@ def grid_of(state: State, periodic: tuple[bool, ...]) -> Grid:
     """Return the grid of a state."""
     sizes = state.values.shape
     closed = tuple(angle and abs(state.basis[d, d] * sizes[d] - 2 * np.pi) < 1e-9 for d, angle in enumerate(periodic))
-    return Grid(state.centre, state.basis, sizes, closed)
+    return _shared(np.asarray(state.centre, float).tobytes(), np.asarray(state.basis, float).tobytes(), sizes, closed)
+
+
+@lru_cache(maxsize=4)
+def _shared(centre: bytes, basis: bytes, sizes: tuple[int, ...], closed: tuple[bool, ...]) -> Grid:
+    """Return one grid for all states on it, with what was computed for it."""
+    n = len(sizes)
+    return Grid(np.frombuffer(centre).copy(), np.frombuffer(basis).reshape(n, n).copy(), sizes, closed)
 
 
 def prior_on_grid(model: Model, prior: Any, theta: Array, tolerance: float, periodic: tuple[bool, ...]) -> PriorGrid:
