@@ -114,3 +114,8 @@ def test_latex_has_the_certificate_in_words_that_latex_takes_for_words():
     assert r"\mathop{\gamma'}{\left(x_{1} + x_{2} + x_{3} \right)}" in zakai.analyze(zakai.load_model("gallery:wong")).to_latex()
     model = zakai.Model(state=["x1", "x2"], drift=["0", "g(x1, x2)"], observation=["x1"], functions=["g"])
     assert r"\mathop{\partial_{1} g}" in zakai.analyze(model).to_latex()
+
+
+def test_an_analysis_shows_what_auto_takes_and_which_methods_hold():
+    text = repr(zakai.analyze(zakai.load_model("gallery:benes")))
+    assert text.startswith("Analysis('Benes', state x: auto takes benes; conditions hold for benes, hu-yau, ")

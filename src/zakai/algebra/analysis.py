@@ -87,7 +87,8 @@ class Analysis:
 
     def __repr__(self) -> str:
         holding = [name for name, conditions in self.methods.items() if all_hold(conditions) is True]
-        said = f"recommended {self.recommended}, {', '.join(holding) or 'no method'} holding"
+        best = "no method that auto tries holds" if self.recommended is None else f"auto takes {self.recommended}"
+        said = f"{best}; conditions hold for {', '.join(holding) or 'no method'}"
         return f"Analysis({self.model.name!r}, state {_display.short_names(self.model.state)}: {said})"
 
     def __str__(self) -> str:
