@@ -78,3 +78,14 @@ def test_angles_in_degrees_warn(zakai, tmp_path):
     assert "radians" in zakai("filter", "model.toml", "record.csv", "-o", "result.nc").err
     (tmp_path / "record.csv").write_text("time,y\n0.1,3.1\n0.2,-3.1\n")
     assert "radians" not in zakai("filter", "model.toml", "record.csv", "-o", "result.nc").err
+
+
+@pytest.mark.parametrize("command", ["filter model.toml record.csv", "simulate model.toml --until 2 --step 0.5"])
+def test_inputs_that_end_early_are_named_by_their_file(zakai, tmp_path, command):
+    keys = MODEL.replace('drift = ["-a*x"]', 'drift = ["u - a*x"]\ninputs = ["u"]\ninput_hold = "linear"')
+    (tmp_path / "model.toml").write_text(keys)
+    (tmp_path / "record.csv").write_text("time,y\n1,0.2\n2,0.1\n")
+    (tmp_path / "wind.csv").write_text("time,u\n0,1\n1,2\n")
+    answer = zakai(*command.split(), "--inputs", "wind.csv", "-o", "out.csv")
+    assert answer.code == 2
+    assert answer.err.startswith("error: wind.csv: the last time 1 is before 2; ")

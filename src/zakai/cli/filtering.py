@@ -15,6 +15,7 @@ from zakai.cli._progress import progress
 from zakai.errors import InputError
 from zakai.models.files import load_model
 from zakai.records import Record, Truth, read_inputs, read_record, read_truth
+from zakai.records.writing import shown
 
 if TYPE_CHECKING:
     from zakai.engine.results import FilterResult
@@ -149,7 +150,9 @@ def record_with_inputs(
         return record
     if record.inputs is not None:
         raise InputError(f"--inputs {inputs_path}: {path} has columns for the inputs too; give them once")
-    return replace(record, inputs=read_inputs(inputs_path, model, record.clock))
+    inputs = read_inputs(inputs_path, model, record.clock)
+    inputs.check(model, float(record.times[-1]), name=shown(inputs_path))
+    return replace(record, inputs=inputs)
 
 
 def _warn(warnings: Iterable[str]) -> None:

@@ -24,11 +24,15 @@ def simulate(
     from zakai.models.files import load_model
     from zakai.models.simulate import simulate
     from zakai.records import read_inputs, write_record, write_truth
+    from zakai.records.writing import shown
 
     check_outputs([output, truth_path], [source, inputs_path])
     model = load_model(source)
-    inputs = None if inputs_path is None else read_inputs(inputs_path, model)
     times = clock(model.start, until, step)
+    inputs = None
+    if inputs_path is not None:
+        inputs = read_inputs(inputs_path, model)
+        inputs.check(model, float(times[-1]), name=shown(inputs_path))
     start = _numbers(initial, model.state) if initial else None
     truth, record = simulate(model, times, seed=seed, initial=start, inputs=inputs)
     if truth_path is not None:

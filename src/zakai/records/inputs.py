@@ -122,21 +122,24 @@ class Inputs:
         kept = self.times < later.times[0]
         return Inputs(np.concatenate([self.times[kept], later.times]), np.concatenate([self.values[kept], later.values]))
 
-    def check(self, model: Model, last: float, start: float | None = None) -> None:
-        """Raise InputError unless the inputs are those of the model from `start`, by default its own, to the time `last`."""
+    def check(self, model: Model, last: float, start: float | None = None, name: str = "inputs") -> None:
+        """Raise InputError unless the inputs are those of the model from `start`, by default its own, to the time `last`.
+
+        `name` is what the message calls the inputs: their file, where they have one.
+        """
         start = model.start if start is None else start
         if self.values.shape[1] != len(model.inputs):
             names = ", ".join(model.inputs) or "none"
-            raise InputError(f"inputs: {self.values.shape[1]} columns; {model.source} has {len(model.inputs)}: {names}")
+            raise InputError(f"{name}: {self.values.shape[1]} columns; {model.source} has {len(model.inputs)}: {names}")
         first = float(self.times[0])
         if first > start:
             raise InputError(
-                f"inputs: the first time {first:g} is after the start {start:g} of {model.source}; "
+                f"{name}: the first time {first:g} is after the start {start:g} of {model.source}; "
                 f"give {', '.join(model.inputs)} from the start on"
             )
         if model.input_hold == "linear" and self.times[-1] < last:
             raise InputError(
-                f'inputs: the last time {float(self.times[-1]):g} is before {last:g}; with input_hold = "linear" give '
+                f'{name}: the last time {float(self.times[-1]):g} is before {last:g}; with input_hold = "linear" give '
                 f"{', '.join(model.inputs)} up to {last:g}"
             )
 
