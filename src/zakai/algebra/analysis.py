@@ -86,9 +86,9 @@ class Analysis:
         return explosion(self.model)
 
     def __repr__(self) -> str:
-        holding = [name for name, conditions in self.methods.items() if all_hold(conditions) is True]
+        holding = sum(all_hold(conditions) is True for conditions in self.methods.values())
         best = "no method that auto tries holds" if self.recommended is None else f"auto takes {self.recommended}"
-        said = f"{best}; conditions hold for {', '.join(holding) or 'no method'}"
+        said = f"{best}; the conditions hold for {holding} of {len(self.methods)} methods"
         return f"Analysis({self.model.name!r}, state {_display.short_names(self.model.state)}: {said})"
 
     def __str__(self) -> str:
