@@ -42,6 +42,9 @@ WORDS = {
     r"`(?:missed|surprise|exponent|resolution|negative|lost)`": "the present names of the health figures",
 }
 _PATTERNS = {word: re.compile(rf"(?<![\w`]){word}(?!\w)" if word[0] != "`" else word, re.IGNORECASE) for word in WORDS}
+# One pass over a file finds whether any word of it matters.
+_PLAIN = "|".join(word for word in WORDS if word[0] != "`")
+_ANY = re.compile("|".join([rf"(?<![\w`])(?:{_PLAIN})(?!\w)", *(word for word in WORDS if word[0] == "`")]), re.IGNORECASE)
 _KINDS = {".py", ".md", ".toml", ".css", ".js", ""}
 FOLDERS = ("README.md", "CONTRIBUTING.md", "docs", "src", "tests", "benchmarks", "examples", "fuzz")
 _NOT_TEXT = ("katex", "corpus", "_build", "_generated", "generated", "__pycache__")
@@ -65,10 +68,12 @@ def hits(path: Path) -> Iterator[tuple[str, int, str, str]]:
     for file in files(path):
         if file.resolve() in (Path(__file__).resolve(), Path(__file__).resolve().parent / "test_documents.py"):
             continue
-        for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-            for word, pattern in _PATTERNS.items():
-                for match in pattern.finditer(line):
-                    yield str(file), number, match.group(), WORDS[word]
+        text = file.read_text(encoding="utf-8", errors="replace")
+        if _ANY.search(text):
+            for number, line in enumerate(text.splitlines(), 1):
+                for word, pattern in _PATTERNS.items():
+                    for match in pattern.finditer(line):
+                        yield str(file), number, match.group(), WORDS[word]
 
 
 def main(arguments: list[str]) -> None:
