@@ -117,6 +117,8 @@ class Prepared:
                 (predicted, report, after), found, quick = quick[:3], quick[3] if factor is None else None, None
             else:
                 predicted, report, after = self.predicted(begin, parts, inside, rates, control, allowed, bounds)
+            if potential is None:  # what is not observed has no evidence
+                predicted = predicted._replace(log_scale=-np.log(predicted.values.sum() * predicted.grid.cell))
             update = Update(predicted, report.edges, report.tails, 0.0, False)
             if factor is not None:
                 update = updated(predicted, factor, bounds, report.tails)
