@@ -78,3 +78,18 @@ def test_a_fill_value_beyond_the_reach_of_a_grid_of_one_state_leaves_the_predict
     filled, missing = zakai.filter(model, records, "yau-yau")
     assert filled.mean == pytest.approx(missing.mean, abs=1e-6)
     assert any("cannot be explained" in warning for warning in filled.warnings)
+
+
+# The first three have no finite mass over z; the last two have, one with the tails of Cauchy's law and one with a support.
+@pytest.mark.parametrize("law", ["z*x", "z + x**4", "-log(1 + abs(z - x))/2", "-log(1 + (z - x)**2) - log(pi)",
+                                 "log(heaviside(1 - z**2)) - log(2)"])  # fmt: skip
+def test_a_log_density_without_finite_mass_over_the_observation_is_named(law):
+    model = zakai.Model(
+        state=["x"], drift=["-x/2"], observation_log_density=law, observed=["z"], observation_kind="samples", prior=PRIOR
+    )
+    result = zakai.filter(model, zakai.Record([0.5, 1.0], [[0.3], [0.4]], "samples"))
+    infinite = "log(1 + (z" not in law and "heaviside" not in law
+    assert any("no finite mass over 'z'" in warning for warning in result.warnings) == infinite
+    assert not any("cannot be explained" in warning for warning in result.warnings)
+    online = zakai.online(model)
+    assert any("no finite mass over 'z'" in warning for warning in online.update(0.5, [0.3]).warnings) == infinite

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities import Density
-from zakai.engine.lengths import distances, note_on_lengths
-from zakai.engine.misfit import misfits, note_on_misfits
+from zakai.engine.lengths import notes_on_lengths
+from zakai.engine.misfit import notes_on_law
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
 from zakai.methods._protocol import Info, stacked
@@ -107,8 +107,8 @@ class Feed:
         (values, seen, elapsed), stop = moment.observed, np.array([moment.time])
         schedule = Schedule(stop - moment.length, stop, np.array([seen]), np.array([elapsed]), moment.inputs)
         model, theta, infos = self.setting.model, self.setting.theta.real, stacked([moment.info])
-        apart, short = distances(model, theta, schedule, infos), misfits(model, theta, schedule, np.array([values]), infos)
-        return (*moment.notes, *note_on_lengths(apart, stop), *note_on_misfits(short, stop))
+        lengths = notes_on_lengths(model, theta, schedule, infos)
+        return (*moment.notes, *lengths, *notes_on_law(model, theta, schedule, np.array([values]), infos))
 
     def density(self, moment: Moment) -> Density:
         """Return the density at a moment."""

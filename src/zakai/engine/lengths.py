@@ -24,14 +24,35 @@ Array = NDArray[np.float64]
 DIFFERS = 0.05  # standard deviations that a result reports
 
 
-def distances(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> Array:
+def notes_on_lengths(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> list[str]:
+    """Return a sentence on the intervals for which the formula above exceeds 0.05, if there are any.
+
+    Args:
+        model: The model.
+        theta: The parameters (p,).
+        schedule: The K intervals.
+        infos: What the filter reports at their ends.
+    """
+    apart = _distances(model, theta, schedule, infos)
+    over = apart > DIFFERS
+    if not over.any():
+        return []
+    where = f"within {int(over.sum())} of {len(apart)} intervals (first at t = {schedule.stops[np.argmax(over)]:g})"
+    size = f"{apart.max():.1g}" if apart.max() < 1 else "1 or more"
+    return [
+        f"y is taken as linear between observations, but the state moves {where} so much that the exact law of the increments "
+        f"differs: means are off by up to about {size} standard deviations; give shorter intervals"
+    ]
+
+
+def _distances(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> Array:
     """Return that formula (K,) for every interval, with the slopes of h over a standard deviation about the filtered mean."""
     n, m = model.n, model.m
     if model.observation_kind == "samples" or not len(schedule):
         return np.zeros(len(schedule))
     h, G, S = kept(
         model,
-        distances,
+        _distances,
         lambda: (
             numpy_function(model.observation, model),
             numpy_function(model.covariance, model, (n, n)),
@@ -51,15 +72,3 @@ def distances(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> A
             found = found + np.einsum("kia,kab,kjb,kij->k", slopes, spread, slopes, precision) / 24.0
         return np.where(np.isfinite(found), found, 0.0)
 
-
-def note_on_lengths(apart: Array, times: Array) -> list[str]:
-    """Return a sentence on the intervals that end at these times (K,) and have such a distance, if any do."""
-    over = apart > DIFFERS
-    if not over.any():
-        return []
-    where = f"within {int(over.sum())} of {len(apart)} intervals (first at t = {times[np.argmax(over)]:g})"
-    size = f"{apart.max():.1g}" if apart.max() < 1 else "1 or more"
-    return [
-        f"y is taken as linear between observations, but the state moves {where} so much that the exact law of the increments "
-        f"differs: means are off by up to about {size} standard deviations; give shorter intervals"
-    ]

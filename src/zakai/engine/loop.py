@@ -10,8 +10,8 @@ import numpy as np
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.health_warnings import warnings_of_run
-from zakai.engine.lengths import distances, note_on_lengths
-from zakai.engine.misfit import misfits, note_on_misfits
+from zakai.engine.lengths import notes_on_lengths
+from zakai.engine.misfit import notes_on_law
 from zakai.engine.notes import notes_on_angles, notes_on_formulas, notes_on_tables, why_not_finite
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import KEPT, Setting
@@ -201,8 +201,8 @@ class Run:
         )
         theta = self.setting.theta.real
         undefined = notes_on_formulas(model, theta, self.record, result.mean, result.variance)
-        lengths = note_on_lengths(distances(model, theta, self.schedule, infos), self.schedule.stops)
-        misfit = note_on_misfits(misfits(model, theta, self.schedule, self.values, infos), self.schedule.stops)
+        lengths = notes_on_lengths(model, theta, self.schedule, infos)
+        misfit = notes_on_law(model, theta, self.schedule, self.values, infos)
         result.warnings.extend([*undefined, *self.notes, *lengths, *misfit, *warnings_of_run(result)])
         return result
 

@@ -24,6 +24,7 @@ LARGEST = 200.0  # nats of a coordinate: 20 standard deviations
 AT_ONCE = 32  # rows in which the mode of a log density is searched together
 ROUNDS, CLOSE = 60, 0.5  # of that search: the most rounds, and the gain in nats that ends it
 STEPS = np.concatenate([[0.0], *(sign * 2.0 ** np.arange(-40, 41) for sign in (-1.0, 1.0))])
+FAR = 2.0 ** np.arange(20, 41, 10)  # distances from an observation at which a density must decay
 
 
 def misfits(model: Model, theta: Array, schedule: Schedule, values: Array, infos: Infos) -> Array:
@@ -53,7 +54,39 @@ def misfits(model: Model, theta: Array, schedule: Schedule, values: Array, infos
         return np.where(np.isfinite(short) & (short > LARGEST * np.maximum(seen.sum(axis=1), 1)), short, 0.0)
 
 
-def note_on_misfits(short: Array, times: Array) -> list[str]:
+def notes_on_law(model: Model, theta: Array, schedule: Schedule, values: Array, infos: Infos) -> list[str]:
+    """Return sentences on a log density without finite mass over what is observed, else on the observations that fall short."""
+    infinite = _infinite_mass(model, theta, schedule, values, infos)
+    if infinite:
+        return [
+            f"observation_log_density has no finite mass over {infinite!r}: it is no density of {infinite!r}, and the "
+            f"log-likelihood has no meaning; subtract the logarithm of its integral over {infinite!r}"
+        ]
+    return _note_on_misfits(misfits(model, theta, schedule, values, infos), schedule.stops)
+
+
+def _infinite_mass(model: Model, theta: Array, schedule: Schedule, values: Array, infos: Infos) -> str:
+    """Return the name of an observation in which the log density decays more slowly than 1 / |z|, "" where there is none.
+
+    One row is checked, at the filtered mean.
+    """
+    rows = np.flatnonzero(schedule.seen.any(axis=1) & np.isfinite(infos.mean).all(axis=1))[:1]
+    if model.log_density is None or not len(rows):
+        return ""
+    times = schedule.stops[rows]
+    u = None if schedule.inputs is None else schedule.inputs.at(times, model.input_hold)
+    for j, name in enumerate(model.observed):
+        for sign in (-1.0, 1.0):
+            z = np.repeat(values[rows], len(FAR), axis=0)
+            z[:, j] += sign * FAR
+            with np.errstate(all="ignore"):
+                logs = model.observation_law.log_density(z, infos.mean[rows], times, theta, u)
+                if (np.diff(logs) >= -np.diff(np.log(FAR))).all() or (logs == np.inf).any():
+                    return name
+    return ""
+
+
+def _note_on_misfits(short: Array, times: Array) -> list[str]:
     """Return a sentence on the observations at these times (K,) that fall short, if any do."""
     if not short.any():
         return []
