@@ -138,6 +138,48 @@ def test_a_smoothed_density_agrees_with_sums_over_a_fine_grid(case, kind):
     np.testing.assert_allclose(result.mean[-1], result.filtered.mean[-1], atol=1e-9)
 
 
+@pytest.mark.parametrize("kind", ["samples", "increments"])
+def test_a_drift_in_time_on_the_circle_agrees_with_sums_over_a_fine_grid(kind):
+    x, times, values, noise = CIRCLE[::2], np.array([0.3, 0.9, 1.1]), np.array([0.5, -0.4, 0.3]), 0.1
+    first, second = derivatives(x, True)
+    lengths = np.diff(np.append(0.0, times))
+
+    def advanced(state, k, backward):  # classical Runge-Kutta steps of the equation, or of its adjoint
+        start, tau, h = times[k] - lengths[k], lengths[k], np.cos(x)
+        inside = (h * values[k] / tau - 0.5 * h**2) / noise if kind == "increments" else np.zeros_like(x)
+        count = 600
+
+        def slope(s, u):
+            drift = 0.8 * np.sin(x) + np.cos(3 * (start + (tau - s if backward else s)))
+            moved = drift * (first @ u) if backward else -first @ (drift * u)
+            return moved + 0.2 * (second @ u) + inside * u
+
+        for s in tau / count * np.arange(count):
+            step = tau / count
+            a = slope(s, state)
+            b = slope(s + step / 2, state + step / 2 * a)
+            c = slope(s + step / 2, state + step / 2 * b)
+            state = state + step / 6 * (a + 2 * b + 2 * c + slope(s + step, state + step * c))
+        return state
+
+    factors = [np.exp(-0.5 * (z - np.cos(x)) ** 2 / noise) if kind == "samples" else np.ones_like(x) for z in values]
+    states, message = [np.exp(-((x - 0.4) ** 2) / 0.08)], np.ones_like(x)
+    for k, factor in enumerate(factors):
+        states.append(factor * advanced(states[-1], k, False))
+    model = zakai.Model(
+        state=["x"], drift=["0.8*sin(x) + cos(3*t)"], observation=["cos(x)"], observation_kind=kind, periodic=["x"],
+        observation_noise=[[noise]], process_noise=[[0.4]], prior={"kind": "gaussian", "mean": [0.4], "cov": [[0.04]]},
+    )  # fmt: skip
+    result = zakai.smooth(model, zakai.Record(times, values[:, None], kind), "yau-yau")
+    for k in (3, 2, 1, 0):
+        expected = states[k] * message / np.sum(states[k] * message) / (x[1] - x[0])
+        with np.errstate(divide="ignore"):
+            own = np.exp(result.density(k).log_density(x[:, None]))
+        np.testing.assert_allclose(own, expected, atol=1e-6 * expected.max())
+        message = advanced(factors[k - 1] * message, k - 1, True) if k else message
+    assert result.warnings == []
+
+
 def test_a_drift_in_time_is_smoothed_as_by_the_gaussian_smoother():
     model = zakai.Model(
         state=["x"], drift=["-x + cos(t)*x/2 + sin(t)"], observation=["x"], observation_kind="samples",

@@ -41,17 +41,22 @@ def attempted(
     last: float,
     inside: np.ndarray,
     rates: np.ndarray,
+    adjoint: bool = False,
 ) -> Attempt:
-    """Return the density after the part from start + first to start + last of an interval."""
+    """Return the density after the part from start + first to start + last of an interval.
+
+    The `adjoint` of the transition takes a message from the end of that part to its start.
+    """
     system, length = prepared.system, last - first
     if not system.varying:
         known = tables(prepared, window)
         if not inside.any():
-            modes = by_modes(prepared, values, window, length)
+            modes = None if adjoint else by_modes(prepared, values, window, length)
             if modes is not None:
                 return Attempt(modes[0], 0.0, modes[1], False, True)
-            key = ("exponential", window, length)
-            transition = prepared.once(key, lambda: Exponential(length * window.generator(known.covariance, known.drift)))
+            key = ("exponential", window, length, adjoint)
+            generator = length * window.generator(known.covariance, known.drift)
+            transition = prepared.once(key, lambda: Exponential(generator.T if adjoint else generator))
             found, error = transition(values)
             return Attempt(found, 0.0, error, False)
         potential, constant = potential_of(known.observation, precision_of(prepared, start, inside), rates, values)
@@ -60,9 +65,16 @@ def attempted(
         if split:
             return Attempt(values, 0.0, 0.0, True)
         matrix = window.generator(length * known.covariance, length * known.drift, potential - offset)
-        found, error = exponential_action(matrix, values)
+        found, error = exponential_action(matrix.T if adjoint else matrix, values)
         return Attempt(found, offset + constant, error, False)
-    return _magnus(prepared, values, window, start, first, last, inside, rates)
+    return _magnus(prepared, values, window, start, first, last, inside, rates, adjoint)
+
+
+def parts_of_split(prepared: Prepared, first: float, last: float, error: float) -> list[tuple[float, float]]:
+    """Return the parts of a substep whose error by Magnus' series, which falls as the fifth power of the length, is too large."""
+    count = int(np.clip(np.ceil(1.1 * (error / (MAGNUS * prepared.tolerance)) ** 0.2), 2, 16))
+    cuts = first + (last - first) * np.arange(1, count) / count
+    return list(zip([first, *cuts], [*cuts, last], strict=True))
 
 
 def _magnus(
@@ -74,6 +86,7 @@ def _magnus(
     last: float,
     inside: np.ndarray,
     rates: np.ndarray,
+    adjoint: bool,
 ) -> Attempt:
     """Advance a substep by two exponentials: the commutator-free Magnus integrator of order four.
 
@@ -89,12 +102,14 @@ def _magnus(
         return Attempt(values, 0.0, 0.0, True)
     if prepared.system.steady:
         matrix = window.generator(zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset)
-        found, error = exponential_action(matrix, values)
+        found, error = exponential_action(matrix.T if adjoint else matrix, values)
         return Attempt(found, offset + zeroth @ constant, error, False)
     shift = np.full(window.size, offset / 2)
     first_half, second_half = (
         window.generator(w @ covariance, w @ drift, w @ potential - shift) for w in (early, late)
     )
+    if adjoint:
+        first_half, second_half = second_half.T, first_half.T
     total, difference = (first_half + second_half).real, (second_half - first_half).real
     now = values.real
     # The part of third order that two exponentials contain; what they omit is of fifth order, with a factor that was measured.

@@ -20,11 +20,11 @@ from zakai.methods._line_adjoint import back
 from zakai.methods._line_figures import state_moments
 from zakai.methods._line_loop import joined
 from zakai.methods._line_message import Message, points_of, reliable, support
-from zakai.methods._line_parts import cut, parts_of_step
+from zakai.methods._line_parts import cut
 from zakai.methods._line_paths import draw
 from zakai.methods._line_system import Parts, Prepared, State
 from zakai.methods._line_update import exponential_factor, factor_at_end
-from zakai.methods._line_way import Way, negligible, smoothing_tolerance
+from zakai.methods._line_way import negligible, pulled, smoothing_tolerance
 from zakai.methods._protocol import Backward, Info, Infos
 from zakai.methods._states import Joined
 from zakai.numerics import line_window as lw
@@ -142,9 +142,6 @@ def _smoothed(prepared: Prepared, state: State, later: Message, found: _Product)
 @np.errstate(all="ignore")
 def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state: State) -> Message:
     """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
-    parts = parts_of_step(prepared, k, np.asarray(state.values), state.window)
-    if parts is not None:
-        return _of_parts(parts, slice(0, 1), state, later, observed[None])[0]
     length = float(prepared.lengths[k])
     finer = KINKED if prepared.weak and prepared.schedule.seen[k].any() else 1.0
     later = later.on(points_of(later.window, *later.ends, later.needed / finer))
@@ -161,10 +158,9 @@ def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state
         return later
     between = later.variance
     rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
-    way = Way(prepared, k, inside, rates, state)
-    later = way.back(later)
+    later, made = pulled(prepared, k, inside, rates, state, later)
     kept = float(np.clip(between / np.sqrt(max(before * later.variance, 1e-300)), 0.3, 1.0))
-    return later._replace(error=way.error + kept * later.error)
+    return later._replace(error=made + kept * later.error)
 
 
 @np.errstate(all="ignore")

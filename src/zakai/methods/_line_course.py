@@ -56,7 +56,7 @@ class Course(NamedTuple):
 
 def course_of(
     prepared: Prepared, values: Array, window: lw.Window, ends: Array, start: float, length: float, inside: np.ndarray,
-    sharpest: float = np.inf,
+    aim: tuple[float, float] = (0.0, np.inf),
 ) -> Course | None:  # fmt: skip
     """Return the course of a density between two offsets, None where the drift leads beyond all numbers.
 
@@ -66,13 +66,13 @@ def course_of(
         ends: its ends as offsets from the origin.
         start, length: the interval.
         inside: which increments act within it.
-        sharpest: the standard deviation of a function of the state at the end that is taken back to the start.
+        aim: the mean and the standard deviation of a function of the state at the end that is taken back to the start.
     """
     width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(drift_along(prepared, window, ends, start))))
     fastest = FASTEST * width / (length * prepared.tolerance)
     points = window.origin + np.linspace(ends[0], ends[1], 5)
     noise = float(np.max(covariance_at(prepared.system, points, start, prepared.theta.real)))
-    diffused, last = DIFFUSED * np.array([width / (2.0 * REACH), sharpest]) ** 2 / max(noise, 1e-300)
+    diffused, last = DIFFUSED * np.array([width / (2.0 * REACH), aim[1]]) ** 2 / max(noise, 1e-300)
     quick = min(FIRST * width / max(min(speed, fastest), 1e-300), FIRST * length, float(diffused))
     parts = Panels([(0.0, length)], 0.0)
     if prepared.system.varying:
@@ -85,6 +85,8 @@ def course_of(
         return None
     centre, scale, walls = 0.5 * (way.low + way.high), 0.5 * (way.high - way.low), walls_of(prepared, window.origin)
     low, high = np.clip([min(ends[0], centre - scale), max(ends[1], centre + scale)], *walls)
+    if REACH * aim[1] < scale:
+        centre, scale = aim[0], REACH * aim[1]
     cells = volumes(window.origin, centre, scale, float(low), float(high), LEVELS[0][0])
     finest = (cells.last - cells.first) / LEVELS[-1][0] * np.hypot(scale, max(abs(ends[0] - centre), abs(ends[1] - centre)))
     cells = cells._replace(cuts=_cuts(prepared, cells, start))

@@ -16,7 +16,7 @@ from zakai.methods._line_message import FALL, HALF, PAD
 from zakai.methods._line_system import Prepared
 from zakai.methods._line_tables import covariance_at, covariance_between, drift_at, finite
 from zakai.numerics import line_window as lw
-from zakai.numerics.line_operator import Spectral, derivatives, symmetric
+from zakai.numerics.line_operator import Spectral, symmetric
 from zakai.numerics.line_panels import GAUSS_NODES, GAUSS_WEIGHTS
 
 Array = Any
@@ -89,26 +89,3 @@ def derivative(values: Array, spacing: float, closed: bool) -> Array:
     found = np.gradient(values, spacing, edge_order=2)
     inner = sum(c * (np.roll(values, -j) - np.roll(values, j)) for j, c in ((1, 0.75), (2, -0.15), (3, 1 / 60))) / spacing
     return inner if closed else np.concatenate([found[:3], inner[3:-3], found[-3:]])
-
-
-def generator(window: lw.Window, gauge: Gauge, drift: Array, covariance: Array, weights: Array) -> Array:
-    """Return the operator of psi, integrated over time with weights (T,).
-
-        G psi'' / 2 + (mu - G s') psi' + (G (s'^2 - s'') / 2 - mu s') psi
-
-    Args:
-        window: the grid.
-        gauge: s.
-        drift: f (T, N).
-        covariance: G (T,) or (T, N).
-        weights: those of the times.
-    """
-    if gauge.modes is not None:
-        return -weights[0] * (gauge.modes.modes * gauge.modes.rates) @ gauge.modes.modes.T
-    first, second = derivatives(window.size, window.closed)
-    scale = 1.0 if window.closed else window.spacing
-    _, slope, _ = fall(window.size, window.closed)
-    spread = covariance if np.ndim(covariance) == np.ndim(drift) else np.asarray(covariance)[..., None]
-    G, m = weights @ (spread * np.ones(window.size)), weights @ (drift + spread * slope / window.spacing)
-    found = (0.5 * G / scale**2)[:, None] * second + ((m - G * gauge.slope) / scale)[:, None] * first
-    return found + np.diag(0.5 * G * (gauge.slope**2 - gauge.curvature) - m * gauge.slope)

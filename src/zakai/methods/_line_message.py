@@ -37,6 +37,12 @@ class Message(NamedTuple):
     needed: float
     error: float
 
+    @classmethod
+    def of(cls, logs: Array, window: lw.Window, needed: float, error: float) -> Message:
+        """Return the message with logarithms at the points of a grid."""
+        origin, centre, spacing, _, closed, unit = window
+        return cls(logs, origin, centre, spacing, unit, closed, needed, error)
+
     @property
     def window(self) -> lw.Window:
         """The grid."""
@@ -52,6 +58,12 @@ class Message(NamedTuple):
         """Return log b at offsets from the origin (J,)."""
         return local_polynomial(self.logs, self.window, offsets)
 
+    def falling(self, offsets: Array) -> Array:
+        """Return log b at offsets from the origin (J,), beyond the grid with the slope at its ends where b falls outward."""
+        found = self.at(offsets)
+        (low, high), (left, right) = self.ends, np.maximum(self.logs[[3, -4]] - self.logs[[0, -1]], 0.0) / (3.0 * self.spacing)
+        return found - left * np.maximum(low - offsets, 0.0) - right * np.maximum(offsets - high, 0.0)
+
     def between(self, low: float, high: float) -> Message:
         """Return the message on its points between two offsets, and on those that hold them."""
         if self.closed:
@@ -63,14 +75,19 @@ class Message(NamedTuple):
 
     def on(self, window: lw.Window) -> Message:
         """Return the message on another grid."""
-        origin, centre, spacing, _, closed, unit = window
-        return Message(self.at(window.offsets), origin, centre, spacing, unit, closed, self.needed, self.error)
+        return Message.of(self.at(window.offsets), window, self.needed, self.error)
+
+    @property
+    def moments(self) -> tuple[float, float]:
+        """The mean of b as a density, relative to the origin, and its variance."""
+        values = np.exp(self.logs - np.max(self.logs))
+        mean, variance = lw.moments(values / np.sum(values), self.window)
+        return float(mean), float(variance)
 
     @property
     def variance(self) -> float:
         """The variance of b as a density."""
-        values = np.exp(self.logs - np.max(self.logs))
-        return float(lw.moments(values / np.sum(values), self.window)[1])
+        return self.moments[1]
 
 
 def taper(offsets: Array, ends: tuple[float, float], spacing: float) -> Array:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods._line_attempt import MAGNUS, attempted, by_modes
+from zakai.methods._line_attempt import attempted, by_modes, parts_of_split
 from zakai.methods._line_coarse import EDGE, coarsened
 from zakai.methods._line_coefficients import resolved_parts
 from zakai.methods._line_figures import refitted
@@ -175,10 +175,8 @@ def by_substeps(
             split = split and substeps + len(stack) < MOST_SUBSTEPS
             break
         if split:
-            if attempt.split and attempt.error > 0:  # the error of Magnus' series falls as the fifth power of the length
-                count = int(np.clip(np.ceil(1.1 * (attempt.error / (MAGNUS * prepared.tolerance)) ** 0.2), 2, 16))
-                cuts = first + (last - first) * np.arange(1, count) / count
-                stack += list(zip([first, *cuts], [*cuts, last], strict=True))[::-1]
+            if attempt.split and attempt.error > 0:
+                stack += parts_of_split(prepared, first, last, attempt.error)[::-1]
             else:
                 middle = first + (last - first) * (0.25 if last - first > 1e-3 * length else 0.0625)
                 stack += [(middle, last), (first, middle)]

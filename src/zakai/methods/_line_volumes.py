@@ -125,7 +125,7 @@ def advanced_by(
     def summed(masses: Array) -> Array:
         return masses.reshape(-1, 2).sum(axis=1)
 
-    return _settled(allowed, course, at_level, summed)
+    return _settled(allowed, course, at_level, summed, lambda cells: np.ones(cells.size))
 
 
 class Worth(NamedTuple):
@@ -176,7 +176,7 @@ def pulled_back(
         padded = np.concatenate([found[:1], found, found[-1:]])
         return (9.0 * (found[::2] + found[1::2]) - padded[:-2:2] - padded[3::2]) / 16.0
 
-    found = _settled(SMOOTH, course, at_level, between)
+    found = _settled(SMOOTH, course, at_level, between, lambda cells: density(cells.offsets) * cells.widths)
     return None if found is None else Worth(found.cells, found.values, float(found.log_scale), found.error)
 
 
@@ -185,6 +185,7 @@ def _settled(
     course: Course,
     at_level: Callable[[Volumes, Array], tuple[Array, Any]],
     paired: Callable[[Array], Array],
+    weights: Callable[[Volumes], Array],
 ) -> Settled | None:
     """Return the values of cells, with more cells until they settle.
 
@@ -192,6 +193,7 @@ def _settled(
         allowed: the error at which more cells are not taken.
         at_level: values of the sum one on cells and the logarithm of their scale, for the ends of steps.
         paired: values on half as many cells.
+        weights: those of the errors of cells.
     """
     before = best = None
     error = np.inf
@@ -206,9 +208,8 @@ def _settled(
             finer, scale = finer / total, gained + np.log(total)
             if best is not None:
                 # The rest falls by more than a factor of four from one level to the next.
-                half = paired(finer)
-                change = half * np.exp(scale - best[1]) - best[0]
-                error = 0.25 * float(np.sum(np.abs(change.real)))
+                change, weight = paired(finer) * np.exp(scale - best[1]) - best[0], weights(best[2])
+                error = 0.25 * float(weight @ np.abs(change.real) / (weight @ best[0].real))
             best = finer, scale, cells._replace(size=len(finer))
             if error < allowed:
                 break

@@ -177,9 +177,10 @@ def _by_volumes(
 ) -> Message:
     """Return the message at the start of an interval by finite volumes."""
     element, values = state.element, np.asarray(state.values).real
-    ends, sharpest = np.array([0.0, element.upper - element.lower]), float(np.sqrt(later.variance))
-    course = course_of(prepared, values, element, ends, start, length, inside, sharpest)  # type: ignore[arg-type]  # by its points
+    ends, (mean, variance) = np.array([0.0, element.upper - element.lower]), later.moments
     shift = element.lower - later.origin
+    aim = mean - shift, variance**0.5
+    course = course_of(prepared, values, element, ends, start, length, inside, aim)  # type: ignore[arg-type]  # by its points
     found = pulled_back(
         prepared, lambda x: later.at(x + shift), lambda x: element.at(values, element.lower + x), course, start, inside, rates
     )
