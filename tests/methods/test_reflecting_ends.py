@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from scipy.stats import norm
+from scipy.stats import ncx2, norm
 
 import zakai
 from methods.test_line_features import error, normal, samples
@@ -291,3 +291,50 @@ def test_an_exponential_prior_at_an_end_that_it_has_flux_through_is_the_folded_p
     found = np.column_stack([result.mean[1:, 0], result.log_likelihood_increments[1:]])
     assert found == pytest.approx(np.array(expected), abs=1e-6)
     assert not result.warnings
+
+
+@pytest.mark.parametrize(("level", "bound"), [("0.5", 1e-6), ("0.4", 1e-3)])  # 2 a b / sigma^2 is 1 and 0.8
+def test_a_square_root_process_that_reaches_zero_has_chi_square_transitions(level, bound):
+    times, values, noise = np.array([0.3, 0.8, 1.0, 2.0]), [0.9, 0.3, 0.1, 0.4], 0.04
+    model = model_of(f"{level} - x", diffusion=[["sqrt(x)"]], observation_noise=[[str(noise)]],
+                     prior={"kind": "density", "log_density": "3*log(x) - 4*x"})  # fmt: skip
+    result = zakai.filter(model, samples(times, values), "yau-yau")
+    nodes, weights = np.polynomial.legendre.leggauss(800)
+    root, weights = 1.75 * (nodes + 1), 1.75 * weights  # the density of the root has no pole
+    x, weights = root**2, 2 * root * weights
+
+    def transition(k, p):
+        c = 2 / (1 - np.exp(-lengths(times)[k]))
+        decayed = 2 * c * x * np.exp(-lengths(times)[k])
+        return 2 * c * ncx2.pdf(2 * c * x[:, None], 4 * float(level), decayed) @ (weights * p)
+
+    p = x**3 * np.exp(-4 * x) / (weights @ (x**3 * np.exp(-4 * x)))
+    expected = bayes(p, x, weights, transition, [lambda x, z=z: normal(z, noise)(x) for z in values])
+    assert error(result, expected) < bound
+    assert bool(result.warnings) == (level == "0.4")
+
+
+@pytest.mark.parametrize(
+    ("drift", "diffusion", "boundary", "words"),
+    [
+        ("0.4 - x", "sqrt(x)", "natural", "reaches the end 0 of 'x'; give boundary"),
+        ("0.1/x - x", "1", "natural", "reaches the end 0 of 'x'; give boundary"),
+        ("0.4 - x", "x**0.25", "natural", "reaches the end 0 of 'x'; give boundary"),
+        ("-x", "sqrt(x)", "reflecting", "is absorbed there"),
+        ("-1", "x", "natural", "is absorbed there"),
+        ("0.5 - x", "sqrt(x)", "natural", ""),
+        ("0.6/x - x", "1", "natural", ""),
+        ("-x", "x", "natural", ""),
+        ("1 - x", "x**0.75", "natural", ""),
+        ("-x", "x**0.25", "reflecting", ""),
+    ],
+)
+def test_an_end_that_the_process_reaches_is_named(drift, diffusion, boundary, words):
+    keys = {"diffusion": [[diffusion]], "domain": {"x": {"lower": 0.0, "boundary": boundary}},
+            "prior": {"kind": "density", "log_density": "9*log(x) - 9*x"}}  # fmt: skip
+    try:
+        zakai.filter(model_of(drift, **keys), samples([1e-3], [1.0]), "yau-yau")
+    except zakai.InputError as raised:
+        assert words and words in str(raised)
+    else:
+        assert not words

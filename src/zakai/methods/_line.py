@@ -22,6 +22,7 @@ from zakai.errors import InputError
 from zakai.methods import _line_loop as loop
 from zakai.methods._line_cross import OMITTED
 from zakai.methods._line_domain import on_the_line, variable_of
+from zakai.methods._line_ends import check_ends
 from zakai.methods._line_figures import (
     edge_of_moments,
     figures,
@@ -67,6 +68,7 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
     """
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 1e-12 <= tolerance <= 0.1:
         raise InputError(f"option tolerance: {tolerance!r} must be a number from 1e-12 to 0.1")
+    check_ends(model, theta, None if schedule.inputs is None else schedule.inputs.values)
     system = system_of(on_the_line(model)).given(schedule.inputs)
     # A sample may lead deep into the tails, where a small error counts; increments do not.
     negligible = 1e-13 if system.samples else float(np.clip(1e-6 * tolerance, 1e-13, 1e-10))

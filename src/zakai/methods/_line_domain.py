@@ -13,10 +13,8 @@ from typing import Any
 
 import numpy as np
 import sympy as sp
-from sympy.core.function import AppliedUndef
 
 from zakai.densities.mapped import IntervalMap
-from zakai.errors import InputError
 from zakai.models.model import Model
 
 Array = Any
@@ -45,19 +43,6 @@ def variable_of(model: Model) -> Variable | None:
     return Variable(interval.lower, interval.upper)
 
 
-def _check_ends(model: Model, variable: Variable) -> None:
-    """Raise InputError at an end with a finite drift and a noise that does not vanish, which the process reaches."""
-    for end in filter(np.isfinite, variable):
-        place = {model.x[0]: sp.nsimplify(end, rational=True)}
-        drift, noise = (formula.subs(place) for formula in (model.drift[0], model.covariance[0, 0]))
-        unknown = any(value.has(sp.zoo, sp.oo, -sp.oo, sp.nan) for value in (drift, noise)) or noise.atoms(AppliedUndef)
-        if not unknown and sp.simplify(noise) != 0:
-            raise InputError(
-                f"{model.source}: domain: the process reaches the end {end:g} of {model.state[0]!r}, where its noise does not "
-                'vanish; give boundary = "reflecting", or a diffusion that is 0 there'
-            )
-
-
 @lru_cache(maxsize=32)
 def on_the_line(model: Model) -> Model:
     """Return the model for w, whose state has the same symbol; a model without a domain is returned as it is."""
@@ -65,7 +50,6 @@ def on_the_line(model: Model) -> Model:
     if variable is None:
         return model
     w = model.x[0]
-    _check_ends(model, variable)
     x = variable.formula(w)
     first, second = sp.diff(x, w), sp.diff(x, w, 2)
 
