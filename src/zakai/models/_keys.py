@@ -142,7 +142,7 @@ def read_formulas(model: Model, keys: Mapping[str, Any]) -> None:
             }
             vars(model)[key] = _matrix(len(canonical[key]), len(canonical[key][0]), entries)
             if key != "diffusion" and not (key == "observation_noise" and model.observation_kind == "samples"):
-                checks.check_independent_of_state(vars(model)[key], model)
+                checks.check_independent_of_state(key, model)
     read_law(model, keys, read)
 
 

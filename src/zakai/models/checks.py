@@ -181,12 +181,17 @@ def _instead(model: Model, place: str, expr: sympy.Expr, angle: str) -> str:
     return f"write it in cos({angle}) and sin({angle}), or leave {angle} out of periodic"
 
 
-def check_independent_of_state(matrix: sympy.MatrixBase, model: Model) -> None:
-    """Raise InputError at the first entry that depends on the state or on an input."""
-    others = {*model.x, *model.u}
+def check_independent_of_state(key: str, model: Model) -> None:
+    """Raise InputError at the first entry of a matrix that depends on the state or on an input, with what to write instead."""
+    matrix, others = getattr(model, key), {*model.x, *model.u}
     for (row, column), expr in sorted(matrix.todok().items()):
         found = expr.free_symbols & others
         if found:
             name = min(str(symbol) for symbol in found)
             what = "state" if name in model.state else "input"
-            raise InputError(f"[{row}][{column}]: depends on the {what} {name!r}; it may depend on t and on parameters only")
+            may = "it may depend on t and on parameters only"
+            if key == "process_noise":
+                may += "; multiply the column of diffusion by the square root of the variance, there it may"
+            elif what == "input":
+                may += "; give the known signal as a table of t"
+            raise InputError(f"[{row}][{column}]: depends on the {what} {name!r}; {may}")
