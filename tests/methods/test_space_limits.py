@@ -131,3 +131,14 @@ def test_a_distant_mode_with_a_small_weight_keeps_it_over_an_interval():
     error = max(abs(result.mean[1, 0] - mean) / deviation, abs(np.sqrt(result.variance[1, 0]) / deviation - 1))
     assert error < 10 * result.health["error_estimate"][1]
     assert error < 3e-4
+
+
+@pytest.mark.parametrize("kind", ["samples", "increments"])
+def test_what_is_not_observed_has_no_evidence(kind):
+    keys = {**CUBIC, "drift": ["y", "-x - y*(x**2 - 1)"], "observation_kind": kind}
+    values = np.full((8, 2), np.nan)
+    values[4] = [0.3, 0.2]
+    result = zakai.filter(zakai.Model(**keys), zakai.Record(0.2 * np.arange(1, 9), values, kind), "yau-yau")
+    unobserved = np.delete(result.log_likelihood_increments, 5)
+    assert np.abs(unobserved).max() < 1e-13
+    assert result.log_likelihood_increments[5] != 0
