@@ -139,4 +139,4 @@ def test_what_is_no_polynomial_or_depends_on_time_is_refused(changed, said):
 def test_a_kink_of_h_is_refused_whose_sums_over_the_grid_have_no_error_figure():
     model = zakai.Model(state=["x"], drift=["-sin(x)"], observation=["abs(x)"], observation_kind="samples")
     failed = [condition.statement for condition in conditions_of("kolmogorov-series", model) if condition.holds is False]
-    assert failed == ["f and h are smooth"]
+    assert failed == ["f and the law of observations are smooth"]

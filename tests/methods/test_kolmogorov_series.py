@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.stats import norm, poisson
 
 import zakai
 
@@ -246,3 +247,49 @@ def test_an_interval_does_not_depend_on_its_neighbours_and_lengths_may_be_prepar
     for k, (time, value) in enumerate(zip(observed.times, observed.values, strict=True), 1):
         estimate = online.update(time, value)
         assert np.array_equal(estimate.mean, whole.mean[k]) and np.array_equal(estimate.cov, whole.cov[k])
+
+
+def dense(z, h, log_likelihood):
+    """The posterior mean, deviation and evidence of a double well by finite volumes and a matrix exponential."""
+    edges = np.linspace(-3.5, 3.5, 801)
+    x, spacing = 0.5 * (edges[1:] + edges[:-1]), edges[1] - edges[0]
+    peclet = 2 * spacing * (edges[1:-1] - edges[1:-1] ** 3)
+    peclet = np.where(np.abs(peclet) < 1e-8, 1e-8, peclet)
+    right, left = peclet / -np.expm1(-peclet) / (2 * spacing**2), peclet / np.expm1(peclet) / (2 * spacing**2)
+    generator = np.diag(right, -1) + np.diag(left, 1)
+    generator -= np.diag(generator.sum(axis=0))
+    p = expm(0.4 * generator) @ (np.exp(-((x - 0.2) ** 2)) / np.exp(-((x - 0.2) ** 2)).sum()) * np.exp(log_likelihood(z, h(x)))
+    mean = x @ p / p.sum()
+    return mean, np.sqrt((x - mean) ** 2 @ p / p.sum()), np.log(p.sum())
+
+
+@pytest.mark.parametrize(
+    ("keys", "z", "h", "log_likelihood"),
+    [
+        ({"observation": ["3*exp(x)"], "observation_family": "poisson"}, 4.0, lambda x: 3 * np.exp(x), poisson.logpmf),
+        ({"observation": ["0"], "observation_noise": [["exp(x)"]]}, 1.5, lambda x: np.exp(x / 2),
+         lambda z, s: norm.logpdf(z, 0, s)),
+        ({"observation": ["x + u"], "observation_noise": [["0.1"]], "inputs": ["u"]}, 0.9, lambda x: x + 0.7,
+         lambda z, m: norm.logpdf(z, m, np.sqrt(0.1))),
+        ({"observation_log_density": "-log(cosh(z - x)) - log(pi)", "observed": ["z"]}, 0.9, lambda x: x,
+         lambda z, m: -np.log(np.cosh(z - m)) - np.log(np.pi)),
+    ],
+)  # fmt: skip
+def test_samples_of_any_law_multiply_the_density(keys, z, h, log_likelihood):
+    model = zakai.Model(state=["x"], drift=["x - x**3"], observation_kind="samples",
+                        prior={"kind": "gaussian", "mean": [0.2], "cov": [[0.5]]}, **keys)  # fmt: skip
+    inputs = zakai.Inputs([0.0], [[0.7]]) if "inputs" in keys else None
+    result = zakai.filter(model, zakai.Record([0.4], [z], "samples", inputs=inputs), "kolmogorov-series", substeps=32)
+    found = result.mean[1, 0], np.sqrt(result.variance[1, 0]), result.log_likelihood
+    assert found == pytest.approx(dense(z, h, log_likelihood), abs=1e-4)
+
+
+def test_a_law_with_a_kink_and_a_driven_state_are_refused():
+    kinked = {"observation_log_density": "-abs(z - x)/0.2 - log(0.4)", "observed": ["z"]}
+    model = zakai.Model(state=["x"], drift=["x - x**3"], observation_kind="samples", prior=GAUSSIAN, **kinked)
+    with pytest.raises(zakai.ConditionError, match="smooth"):
+        zakai.filter(model, zakai.Record([0.1], [[0.0]], "samples"), "kolmogorov-series")
+    driven = zakai.Model(state=["x"], drift=["u - x**3"], observation=["x"], inputs=["u"], observation_kind="samples",
+                         prior=GAUSSIAN)  # fmt: skip
+    with pytest.raises(zakai.ConditionError, match="formulas of the class"):
+        zakai.filter(driven, zakai.Record([0.1], [[0.0]], "samples", inputs=zakai.Inputs([0.0], [[1.0]])), "kolmogorov-series")

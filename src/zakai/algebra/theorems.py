@@ -173,11 +173,11 @@ def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
     The paper asks for constant h, which its robust equation needs and the transition between observations does not.
     """
     source = "Yau 1993, Theorems 10 to 12"
-    conditions = [determined(model)]
-    if conditions[0].holds is not True:
+    conditions = [determined(model), *features_of_samples(model)]
+    if any(condition.holds is not True for condition in conditions):
         return tuple(conditions)
     varying = [part for part in (*model.drift, *model.covariance) if model.t in part.free_symbols]
-    kinked = [part for part in (*model.drift, *model.observation) if part.has(sp.Abs, sp.sign)]
+    kinked = [part for part in features.formulas_of(model) if part.has(sp.Abs, sp.sign)]
     return (
         *conditions,
         Condition(
@@ -187,7 +187,12 @@ def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
             source,
         ),
         definite_covariance(model),
-        Condition("f and h are smooth", not kinked, short(str(kinked[0])) if kinked else "no absolute value", source),
+        Condition(
+            "f and the law of observations are smooth",
+            not kinked,
+            short(str(kinked[0])) if kinked else "no absolute value",
+            source,
+        ),
         Condition("there is one state", model.n == 1, f"n = {model.n}", "the grid of this method"),
         Condition("the state is no angle", not model.periodic, f"periodic: {list(model.periodic)}", "the grid of this method"),
     )

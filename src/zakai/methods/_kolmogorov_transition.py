@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -10,7 +11,9 @@ import numpy as np
 
 from zakai.errors import InputError
 from zakai.methods._heat_series import heat_series
+from zakai.methods._observation import log_likelihood
 from zakai.methods._residuals import Factor, Sensors
+from zakai.models import features
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.composed_kernels import SHORTEST, Kernels
@@ -54,18 +57,51 @@ class Prepared:
     notes: tuple[str, ...] = ()
 
 
-def times_factor(system: System, field: Field, factor: Factor | None) -> Field:
+class Law(NamedTuple):
+    """The likelihood of a sample with a law of its own: `log_density` (N,) at points (N, 1), NaN where it has no value."""
+
+    log_density: Callable[[Array], Array]
+    constant: float = 0.0
+
+
+def factor_at_end(prepared: Prepared, k: int, values: Array) -> Factor | Law:
+    """Return the likelihood of what is observed at the stop of interval k."""
+    system, schedule = prepared.system, prepared.schedule
+    model, seen, stop = system.model, schedule.seen[k], float(schedule.stops[k])
+    u = None if schedule.inputs is None else schedule.inputs.at(stop, model.input_hold)
+    if (features.OF_OBSERVATION | {features.INPUTS}) & model.features.keys():
+        return Law(lambda points: log_likelihood(model, values, seen, points, stop, system.theta, u))
+    return system.sensors.at_end(schedule, k, values, system.theta, seen, u)
+
+
+def without_law(field: Field, law: Law) -> float:
+    """Return the share of the mass of a density where a law has no value."""
+    weights = np.exp((field.logs - np.max(field.logs.real)).real)
+    lawless = np.isnan(law.log_density(field.grid.points[:, None]).real)
+    return float(weights[lawless].sum() / weights.sum())
+
+
+def _logs_of(system: System, factor: Factor | Law, points: Array) -> tuple[Array, Array]:
+    """Return the logarithm of a factor at points (N,), and upper bounds of it (N - 1,) between them."""
+    if isinstance(factor, Law):
+        logs = factor.log_density(points[:, None])
+        logs = np.where(np.isnan(logs), -np.inf, logs)
+        return logs, np.maximum(logs.real[1:], logs.real[:-1])
+    residuals = factor.residuals(system.sensors.observed, points[:, None], system.theta)
+    e = residuals.real
+    # A residual that changes its sign is zero between the points.
+    least = np.where(e[:, 1:] * e[:, :-1] <= 0, 0.0, np.minimum(np.abs(e[:, 1:]), np.abs(e[:, :-1])))
+    return -0.5 * np.sum(residuals * residuals, axis=0), -0.5 * np.sum(least * least, axis=0)
+
+
+def times_factor(system: System, field: Field, factor: Factor | Law | None) -> Field:
     """Multiply by a factor, on a finer grid where the product needs it."""
     source = field  # interpolate the whole field only: a part of it ends abruptly
-    while factor is not None and factor.roots.size:
-        grid = field.grid
-        residuals = factor.residuals(system.sensors.observed, grid.points[:, None], system.theta)
-        product = Field(grid, field.logs - 0.5 * np.sum(residuals * residuals, axis=0))
-        e = residuals.real
-        # Upper bound of the factor between two points: a residual that changes its sign is zero there.
-        least = np.where(e[:, 1:] * e[:, :-1] <= 0, 0.0, np.minimum(np.abs(e[:, 1:]), np.abs(e[:, :-1])))
-        logs = field.logs.real
-        upper = np.maximum(logs[1:], logs[:-1]) - 0.5 * np.sum(least * least, axis=0)
+    while factor is not None and (isinstance(factor, Law) or factor.roots.size):
+        grid, logs = field.grid, field.logs.real
+        own, bounds = _logs_of(system, factor, grid.points)
+        product = Field(grid, field.logs + own)
+        upper = np.maximum(logs[1:], logs[:-1]) + bounds
         place = int(np.argmax(product.logs.real))
         top = product.logs.real[place]
         if not 2 <= place < grid.size - 2 or not np.isfinite(product.logs[place - 2 : place + 3]).all():

@@ -21,6 +21,7 @@ import numpy as np
 from zakai.algebra.theorems import kolmogorov_series as theorem
 from zakai.densities import GridDensity
 from zakai.errors import InputError
+from zakai.methods import yau_yau
 from zakai.methods._borrowed_backward import OF_MESSAGE, borrowed
 from zakai.methods._heat_series import FORMS
 from zakai.methods._kolmogorov_transition import (
@@ -28,17 +29,21 @@ from zakai.methods._kolmogorov_transition import (
     MOST_POINTS,
     MOST_REFINED,
     Attempt,
+    Law,
     Prediction,
     Prepared,
     System,
+    factor_at_end,
     grid_for,
     times_factor,
     transition,
+    without_law,
 )
 from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info, Method
 from zakai.methods._residuals import Factor
 from zakai.methods._space_system import prior_on_grid
+from zakai.models import features
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.numerics.dyadic_grid import Field, Grid, edge_masses, quadrature_error
@@ -115,6 +120,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     """Advance one interval: the factor at its start, the transition, the factor at its end; repeat it on better grids."""
     system, schedule, length = prepared.system, prepared.schedule, float(prepared.lengths[k])
     before: Factor | None = None
+    after: Any
     start, in_time = Field(state.grid, state.logs), 0.0
     seen, inside = schedule.seen[k], schedule.inside[k]
     within = bool(seen.any()) and np.array_equal(seen, inside)
@@ -126,7 +132,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
             times, roots = np.concatenate([before.times, after.times]), np.concatenate([before.roots, after.roots])
             before, after = None, after._replace(times=times, roots=roots)
     else:
-        after = system.sensors.at_end(schedule, k, values, system.theta, seen)
+        after = factor_at_end(prepared, k, values)
     start = times_factor(system, start, before)
     attempt, predictions = Attempt((1.0, 1.0), state.fineness), []
     for trial in range(ATTEMPTS):
@@ -139,7 +145,11 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
             break
         attempt = better
     split = _splitting_error(prepared, state, before, after, length, final) if within and predictions else 0.0
-    return _reported(prepared, attempt, start, predictions, final, after.constant, in_time, split)
+    new, info = _reported(prepared, attempt, start, predictions, final, after.constant, in_time, split)
+    if isinstance(after, Law):
+        lawless = without_law(predictions[-1].field if predictions else start, after)
+        info = info._replace(health={**info.health, "without_law": lawless})
+    return new, info
 
 
 def _better(prepared: Prepared, attempt: Attempt, predictions: list[Prediction], final: Field) -> Attempt | None:
@@ -173,7 +183,7 @@ def _weighted(prediction: Prediction, final: Field) -> float:
 
 
 def _splitting_error(
-    prepared: Prepared, state: State, before: Factor | None, after: Factor, length: float, final: Field
+    prepared: Prepared, state: State, before: Factor | None, after: Any, length: float, final: Field
 ) -> float:
     """Return the error of the splitting, in deviations of the mean or nats, by comparison with the interval divided in two."""
     system, start = prepared.system, Field(state.grid, state.logs)
@@ -257,6 +267,7 @@ BOUNDS = {
     "truncation": (1e-4, "the estimated error of the composed series over one interval; set substeps to more, or to None"),
     "negative_mass": (1e-12, 'share of the density that became negative and was cut; set form to "log"'),
     "tail_depth": (18.0, "nats below its maximum at which the density lies after an observation: the series is cut there"),
+    "without_law": yau_yau.BOUNDS["without_law"],
     "time_quadrature_error": (1e-5, "nats: coefficients vary too fast within an interval to be integrated"),
     "splitting_error": (0.02, "deviations of the mean, or nats, by which the splitting is off; give shorter intervals"),
 }
@@ -283,5 +294,6 @@ METHOD = Method(
     bounds={**BOUNDS, **OF_MESSAGE},
     shorter="set order to 3 or give shorter records",
     valid=valid,
+    handles=features.OF_OBSERVATION | {features.INPUTS, features.SINC},
     backward=borrowed(density, accuracy),
 )
