@@ -25,12 +25,12 @@ def derivatives(x, closed):
     return first / spacing, second / spacing**2
 
 
-def forward_backward(x, drift, covariance, h, noise, prior, kind, closed):
+def forward_backward(x, drift, covariance, h, noise, prior, kind, closed, times=TIMES, values=VALUES):
     """The smoothed densities at the start and at each time, by sums over a fine grid."""
     first, second = derivatives(x, closed)
     operator, spacing = 0.5 * covariance * second - first * drift, x[1] - x[0]
     states, matrices = [prior / prior.sum() / spacing], []
-    for length, value in zip(np.diff(np.concatenate([[0.0], TIMES])), VALUES, strict=True):
+    for length, value in zip(np.diff(np.concatenate([[0.0], times])), values, strict=True):
         inside, factor = np.zeros_like(x), np.ones_like(x)
         if not np.isnan(value) and kind == "samples":
             factor = np.exp(-0.5 * (value - h) ** 2 / noise)
@@ -58,6 +58,24 @@ def test_sharp_samples_hold_the_paths_between_them():
     )  # fmt: skip
     result = zakai.smooth(model, zakai.Record(TIMES, VALUES[:, None], "samples"), "yau-yau")
     expected = forward_backward(x, np.sin(x), 0.4, x, noise, np.exp(-((x - 0.4) ** 2) / 0.08), "samples", False)
+    for k, density in enumerate(expected):
+        with np.errstate(divide="ignore"):
+            own = np.exp(result.density(k).log_density(x[:, None]))
+        np.testing.assert_allclose(own, density, atol=1e-6 * density.max())
+    assert result.warnings == []
+
+
+def test_increments_that_are_sharper_than_the_noise_of_their_intervals():
+    # The observation holds the state within a third of the noise of an interval.
+    x, noise, times = np.linspace(-0.7, 1.1, 301), 1e-4, np.array([0.1, 0.16, 0.22])
+    values = np.array([0.2, 0.3, 0.15]) * np.diff(np.append(0.0, times))
+    model = zakai.Model(
+        state=["x"], drift=["x - x**3"], observation=["x"], observation_kind="increments", observation_noise=[[noise]],
+        process_noise=[[0.4]], prior={"kind": "gaussian", "mean": [0.2], "cov": [[0.02]]},
+    )  # fmt: skip
+    result = zakai.smooth(model, zakai.Record(times, values[:, None], "increments"), "yau-yau")
+    prior = np.exp(-((x - 0.2) ** 2) / 0.04)
+    expected = forward_backward(x, x - x**3, 0.4, x, noise, prior, "increments", False, times, values)
     for k, density in enumerate(expected):
         with np.errstate(divide="ignore"):
             own = np.exp(result.density(k).log_density(x[:, None]))

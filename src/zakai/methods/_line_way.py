@@ -1,8 +1,9 @@
 """A message of one state over one interval, backward in time, where the compiled loop does not take it.
 
-On a circle the transposed exponentials of the filter act.  On the line a Gaussian kernel is a sum over a grid.
-Where no coefficient depends on t, a grid covers the support of the message at the end of the interval, that of the density at its
-start, and the paths between them; psi is moved by its decomposition.  All else is for finite volumes (`_line_volumes.py`).
+On the circle, and where increments act within, the transposed exponentials of the filter act (`_line_transposed.py`).  Else a
+Gaussian kernel is a sum over a grid.  Where no coefficient depends on t, a grid covers the support of the message at the end of
+the interval, that of the density at its start, and the paths between them; psi is moved by its decomposition.  All else is for
+finite volumes (`_line_volumes.py`).
 """
 
 from __future__ import annotations
@@ -12,14 +13,13 @@ from typing import Any
 import numpy as np
 
 from zakai.methods import _line
-from zakai.methods._line_attempt import attempted, parts_of_split
-from zakai.methods._line_coefficients import resolved_parts
 from zakai.methods._line_course import course_of, ends_of
 from zakai.methods._line_gauge import Gauge, gauge_of
 from zakai.methods._line_message import FEWEST, Message, covering, points_of, reliable, support, taper
-from zakai.methods._line_moves import MOST_SUBSTEPS, Report
+from zakai.methods._line_moves import Report
 from zakai.methods._line_system import Prepared, State
 from zakai.methods._line_tables import covariance_at
+from zakai.methods._line_transposed import by_exponentials
 from zakai.methods._line_volumes import pulled_back
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_adjoint import EXCURSION
@@ -31,7 +31,7 @@ ROUNDING = 1e-15  # of the maximum: smaller values of psi are not kept
 RESOLVED = 0.25  # spacing in standard deviations of the noise
 WIDTH = 0.8  # spacing in standard deviations of a Gaussian kernel at which sums are integrals
 MOST_POINTS = 4000  # of such sums
-MOST_GRIDS = 7  # of finer and finer spacing
+MOST_GRIDS = 7  # of finer and finer spacing, for a decomposition
 SHARE = 1e-2  # of the tolerance that rounding in psi may leave
 
 
@@ -57,46 +57,14 @@ def pulled(
         state: the filter's state at its start.
         later: the message at its end.
     """
-    if later.closed:
-        return _around(prepared, k, inside, rates, state, later)
+    found = by_exponentials(prepared, k, inside, rates, state, later, negligible(prepared))
+    if found is not None:
+        return found
     own = state.window
     first, last = support(np.asarray(state.values).real, 1e-13)
     ends = float(own.offsets[first]), float(own.offsets[last])
     found = _by_kernel(prepared, k, rates, ends, later) or _by_modes(prepared, k, inside, state, ends, later)
     return found or _by_volumes(prepared, k, inside, rates, state, ends, later)
-
-
-def _around(
-    prepared: Prepared, k: int, inside: np.ndarray, rates: np.ndarray, state: State, later: Message
-) -> tuple[Message, float]:
-    """Return the same on the circle, by transposed exponentials on a grid that resolves the message."""
-    start, length, spacing = float(prepared.schedule.starts[k]), float(prepared.lengths[k]), min(later.needed, state.spacing)
-    for _ in range(MOST_GRIDS):
-        window = covering(later.window, 0.0, 0.0, spacing)
-        logs = later.at(window.offsets)
-        top = float(np.max(logs) + np.log(np.sum(np.exp(logs - np.max(logs)))))
-        values, error, stack, count = np.exp(logs - top), 0.0, [(0.0, length)], 0
-        if prepared.system.varying:
-            stack, error = resolved_parts(prepared, values, window, start, length, inside)
-        while stack:
-            first, last = stack.pop()
-            attempt = attempted(prepared, values, window, start, first, last, inside, rates, adjoint=True)
-            count += 1
-            if attempt.split and count + len(stack) < MOST_SUBSTEPS:
-                stack += parts_of_split(prepared, first, last, attempt.error)
-                continue
-            error = np.inf if attempt.split else error
-            total = float(np.sum(attempt.values))
-            values, top, error = attempt.values / total, top + attempt.offset + float(np.log(total)), error + attempt.error
-        look = lw.figures(values, True, negligible(prepared))
-        if look.aliasing <= negligible(prepared) or window.size >= lw.LARGEST:
-            break
-        spacing = window.spacing / 1.5
-    density = reliable(state, window)
-    least = ROUNDING * float(np.max(values))
-    error += 2.0 * look.aliasing + least * float(np.sum(density) / (density @ values))
-    needed = window.spacing * float(np.clip(look.resolving, 1.0, 2.0))
-    return Message.of(np.log(np.maximum(values, least)) + top, window, needed, later.error), error
 
 
 def _by_kernel(
