@@ -6,7 +6,6 @@ import numpy as np
 
 from zakai.methods._line_steps import parts_needed, probed
 from zakai.methods._line_system import Prepared
-from zakai.methods._line_tables import profile_of, spectral
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_panels import GAUSS_NODES
 from zakai.numerics.line_segment import MARGIN, Grid
@@ -16,15 +15,11 @@ from zakai.numerics.line_weak import at_nodes, nodes
 BLOCK = 2048  # points by which the tables of a spacing are apart; a table has twice as many
 SHARED = 128  # points of the largest grid on which many steps share a decomposition
 LOBATTO = np.array([0.0, 0.5 - 0.5 / np.sqrt(5.0), 0.5 + 0.5 / np.sqrt(5.0)])  # nodes within a spacing
-_NONE, _NOWHERE = np.zeros(0), np.zeros((3, 1))
-
+_NONE = np.zeros(0)
 
 
 def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
-    """Return what the loop knows of a grid, None where the operator has no decomposition or a formula no value."""
-    if not prepared.gaussian:
-        found: tuple[Grid | None] = prepared.once(("grid", window), lambda: (_decomposed_grid(prepared, window),))
-        return found[0]
+    """Return what the loop knows of a grid, None where a formula has no value."""
     index, size = round(window.centre / window.spacing), window.size
     if window.closed:
         begin, length = 0, size
@@ -40,28 +35,12 @@ def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
         table = _mixed(prepared, window, x, rows) if prepared.mixed else _separated(prepared, window, x)
         offset, fine = window.origin - prepared.origin + float(offsets[0]), _fine(prepared, window, x)
         missing = ~np.isfinite(table[:, :, OBSERVED:]).all(axis=(0, 1, 2))
-        grid = Grid(_NONE[None], _NONE, table, _NOWHERE, 0, offset, window.spacing, window.unit, fine)
+        grid = Grid(table, 0, offset, window.spacing, fine)
         return grid, np.append(0, np.cumsum(missing))
 
     key = ("table", window.origin, window.spacing, begin, length)
     grid, missing = make() if prepared.mixed else prepared.once(key, make)
     return None if missing[start + size] > missing[start] else grid._replace(start=start)
-
-
-def _decomposed_grid(prepared: Prepared, window: lw.Window) -> Grid | None:
-    # The decomposition of a large grid takes longer than steps on a coarser one.
-    if window.size > SHARED and not window.closed and not prepared.kinked:
-        return None
-    decomposed = spectral(prepared, window)
-    if decomposed is None or not (decomposed.scale > 0).all():
-        return None
-    table = _separated(prepared, window, window.points)
-    table[0, 0, PHI] = np.log(decomposed.scale)
-    if not np.isfinite(table[0, 0, [PHI, *range(OBSERVED, table.shape[2])]]).all():
-        return None
-    modes, profile = np.ascontiguousarray(decomposed.modes.T), profile_of(prepared, window)
-    fine = _fine(prepared, window, window.points)
-    return Grid(modes, decomposed.rates, table, profile, 0, window.centre, window.spacing, window.unit, fine)
 
 
 def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods import _line_sharp as sharp
+from zakai.methods import _line_modal as modal
 from zakai.methods._line_figures import edge_of_moments, figures, outside_tables, resampled, state_moments
 from zakai.methods._line_grids import grid_of
 from zakai.methods._line_system import FINEST, Prepared, State
@@ -20,6 +20,7 @@ from zakai.methods._states import Joined, StackedStates
 from zakai.numerics import line_window as lw
 from zakai.numerics.line_filters import BAND
 from zakai.numerics.line_loop import advance
+from zakai.numerics.line_modal import BROAD, NARROW, OWN, PLACE, STAY
 from zakai.numerics.line_segment import AFTER, COLUMNS, FAILED, OK, RANGE, UNRESOLVED, Segment
 
 Array = Any
@@ -41,7 +42,7 @@ class Piece(NamedTuple):
     """Steps that begin with interval `first`, from the state `before` on.
 
     The densities (K, N) have grids with these centres and spacings (K,); `last` is the state after them, on the grid of the next
-    step.  Where every step has placed a grid of its own, `coarse` are the grids of the transitions (`_line_sharp`).
+    step.  Where every step has placed a grid of its own, `coarse` are the grids of the transitions (`_line_modal`).
     """
 
     first: int
@@ -94,31 +95,16 @@ def one(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple
 def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> list[Piece]:
     """Return the first steps of `rows`, as many as the loop takes."""
     pieces: list[Piece] = []
-    attempts, first, own, observed = 0, rows.start, False, np.ascontiguousarray(observed, float)
-    general = prepared.system.general and not prepared.gaussian
+    attempts, first, way, observed = 0, rows.start, STAY, np.ascontiguousarray(observed, float)
     while first < rows.stop and attempts < ATTEMPTS:
-        attempts, why, answer, piece = attempts + 1, OK, np.zeros(3), None
-        is_sharp = sharp.is_sharp(prepared, first, state)
-        own = own or (not is_sharp and general and bool(prepared.schedule.seen[first].any()))
-        if own or is_sharp:
-            if prepared.kinked or prepared.gaussian or state.closed:
-                break
-            found = sharp.advanced(prepared, first, rows.stop, state, observed[first - rows.start :], own)
-            piece = None if found is None else Piece.of(first, state, *found[:-1])._replace(coarse=found.coarse)
+        attempts += 1
+        now = observed[first - rows.start :]
+        if prepared.gaussian:
+            piece, why, answer = _on_one_table(prepared, slice(first, rows.stop), state, now)
         else:
-            together = 1 if general or prepared.cut_up else TOGETHER if prepared.mixed else len(observed)
-            here = slice(first, min(rows.stop, first + together))
-            grid = grid_of(prepared, state.window, here)
-            if grid is None:
-                break
-            segment = advance(
-                prepared.mechanisms, np.ascontiguousarray(state.values), grid, prepared.steps, first,
-                observed[first - rows.start : here.stop - rows.start], float(state.error), float(state.log_floor),
-                prepared.limits,
-            )  # fmt: skip
-            why, answer = segment.why, segment.answer
-            if len(segment.reports):
-                piece = _piece(first, state, grid.start, segment)
+            found = modal.advanced(prepared, first, rows.stop, state, now, way)
+            why, answer = found.why, found.answer
+            piece = Piece.of(first, state, *found[:4])._replace(coarse=found.coarse) if len(found.reports) else None
         if piece is not None:
             last = regridded(prepared, piece.last) if why == AFTER or prepared.cut_up else piece.last
             pieces.append(piece._replace(last=last))
@@ -130,8 +116,27 @@ def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -
             if larger is None:
                 break
             state = larger
-        own = why == UNRESOLVED
+        if way == STAY and why in (NARROW, UNRESOLVED):
+            if prepared.kinked:
+                break
+            way = PLACE if why == NARROW else OWN
+        elif why == BROAD or way == OWN:
+            way = STAY
     return pieces
+
+
+def _on_one_table(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Piece | None, int, Array]:
+    """Return the first steps of `rows` by kernels or splitting, why they end, and the grid that is needed."""
+    together = 1 if prepared.cut_up else TOGETHER if prepared.mixed else len(observed)
+    here = slice(rows.start, min(rows.stop, rows.start + together))
+    grid = grid_of(prepared, state.window, here)
+    if grid is None:
+        return None, FAILED, np.zeros(3)
+    segment = advance(
+        prepared.mechanisms, np.ascontiguousarray(state.values), grid, prepared.steps, rows.start, observed[:together],
+        float(state.error), float(state.log_floor), prepared.limits,
+    )  # fmt: skip
+    return (_piece(rows.start, state, grid.start, segment) if len(segment.reports) else None), segment.why, segment.answer
 
 
 def _piece(first: int, before: State, start: int, segment: Segment) -> Piece:

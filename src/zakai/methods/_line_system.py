@@ -212,11 +212,9 @@ class Prepared:
     def mechanisms(self) -> Mechanisms:
         """What the compiled loop needs for this model."""
         system, yau, closed = self.system, self.yau, bool(self.model.periodic)
-        if not self.gaussian:
-            return Mechanisms(True, False, False, True, self.weak, closed)
         whole = yau is not None and yau.unobserved and yau.steady_gauge and self.kernels is not None
         always = whole and yau is not None and (not system.moving if system.samples else yau.affine)
-        return Mechanisms(False, whole, self.divides and not always, system.samples, self.weak, closed)
+        return Mechanisms(whole, self.divides and not always, system.samples, self.weak, closed)
 
     @cached_property
     def fast(self) -> list[bool]:

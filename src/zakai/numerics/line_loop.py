@@ -21,8 +21,6 @@ from zakai.numerics.compiled import kernel
 from zakai.numerics.line_averages import AVERAGES
 from zakai.numerics.line_density import circular_moments, highest_of, moments, separated, spectrum, support, waves
 from zakai.numerics.line_filters import BAND, convolved, kernel_of
-from zakai.numerics.line_modes import LOG_NOISE, decayed, decomposed
-from zakai.numerics.line_outlook import is_sharp
 from zakai.numerics.line_segment import (
     AFTER,
     COLUMNS,
@@ -42,7 +40,7 @@ from zakai.numerics.line_segment import (
 )  # fmt: skip
 from zakai.numerics.line_splitting import divided
 from zakai.numerics.line_step import checked, copied, extent, likelihood, product
-from zakai.numerics.line_terms import PHI, Transition, failed, observation_of
+from zakai.numerics.line_terms import PHI, failed, observation_of
 from zakai.numerics.line_weak import WEAK_SHARE, weak_error, weaken
 from zakai.numerics.line_window import ALIGNMENT, CUT
 
@@ -53,28 +51,26 @@ _V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :
 
 
 @cache
-def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) -> Any:
+def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) -> Any:
     """Return the loop with the code of these mechanisms only."""
-    filters = not modal
-
     @kernel(
         types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]
-            _V, int64, _Q, _M, _V, _V, _T, _M, _M, float64, float64, float64, int64, _M, int64[::1], _V, _V, _Q, _V, _M, _T,
-            _T, _M, float64, float64, _V, _M, _M, _M
+            _V, int64, _Q, _T, _M, _M, float64, float64, int64, _M, int64[::1], _V, _V, _Q, _V, _M, _T, _T, _M, float64, float64,
+            _V, _M, _M, _M
         )
     )  # fmt: skip
     def advance(
-        values: Array, start: int, table: Array, profile: Array, modes: Array, rates: Array, averages: Array, cosines: Array,
-        sines: Array, offset: float, spacing: float, unit: float, begin: int, observed: Array, kinds: Array, lengths: Array,
-        shares: Array, precisions: Array, constants: Array, kernel_parameters: Array, drifts: Array, outputs: Array,
-        covariances: Array, error: float, log_floor: float, limits: Array, densities: Array, out: Array, fine: Array,
+        values: Array, start: int, table: Array, averages: Array, cosines: Array, sines: Array, offset: float, spacing: float,
+        begin: int, observed: Array, kinds: Array, lengths: Array, shares: Array, precisions: Array, constants: Array,
+        kernel_parameters: Array, drifts: Array, outputs: Array, covariances: Array, error: float, log_floor: float,
+        limits: Array, densities: Array, out: Array, fine: Array,
     ) -> tuple[int, int]:  # fmt: skip
         """Return the number of steps, and why the loop ended; the last row of `out` receives the answer."""
         negligible, most, generous, size, length = limits[0], limits[1], limits[4], values.size, table.shape[3]
-        half, timed, movable, near = size // 2, table.shape[0] > 1, filters and not closed, length == size + 2 * MARGIN
+        half, timed, movable, near = size // 2, table.shape[0] > 1, not closed, length == size + 2 * MARGIN
         now, local = values.copy(), np.empty((table.shape[1], table.shape[2], size))
-        b, change, channel, decay, answer = np.empty(size), np.empty(size), np.full(6, np.nan), rates, out[-1]
-        home, place, status, done, last_tau = start, -1, OK, 0, np.nan
+        b, change, channel, answer = np.empty(size), np.empty(size), np.full(6, np.nan), out[-1]
+        home, place, status, done = start, -1, OK, 0
         for i in range(observed.shape[0]):
             k = begin + i
             own, row, tau, kind = i if timed else 0, out[i], lengths[k], kinds[k]
@@ -82,9 +78,6 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
             if samples:
                 for j in range(observed.shape[1]):
                     seen |= precisions[k, 0, j, j] != 0.0
-            if modal and not closed and i > 0 and is_sharp(now, offset, spacing, unit, tau, profile):
-                status = TABLE  # the steps of `line_sharp` may take this one
-                break
             cut = max(limits[3], min(30.0 * np.exp(log_floor), CUT))
             low, high = support(now, cut)
             if place != start or timed:
@@ -121,12 +114,7 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
             at, before = highest_of(now), moments(now)[2]
             depth, finest = 8.0 - np.log(cut), (high - low) * 1.2 * spacing / (limits[5] - 2 * ALIGNMENT)
             move = failed(0.0, 0.0)
-            if modal:
-                if tau != last_tau:
-                    decay, last_tau = decayed(rates, tau), tau
-                rounding = decomposed(now, local[0, PHI], modes, decay, 0.1 * most, closed)
-                move = Transition(0.0, rounding, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
-            elif kernels and not np.isnan(channel[0]):
+            if kernels and not np.isnan(channel[0]):
                 middle = offset + spacing * (start + half)
                 move = convolved(now, local[0, PHI], channel, middle, spacing, finest, depth, closed)
             elif splits:
@@ -138,21 +126,17 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
                 answer[0], answer[1], answer[2] = float(low), float(high), move.needed
                 status = RANGE if move.needed > 0.0 and not (move.error < np.inf) else FAILED
                 break
-            positive = filters and move.needed == 0.0
+            positive = move.needed == 0.0
             status, mass, aliasing, edge, negative, highest = checked(
-                now, low, high, filters, weak, positive, closed, weak or not seen, cut, negligible, spacing, cosines, sines,
+                now, low, high, weak, positive, closed, weak or not seen, cut, negligible, spacing, cosines, sines,
                 answer,
             )  # fmt: skip
             if status != OK:
                 break
             predicted, gained = moments(now)[2], np.log(mass) + constants[k] + move.log_factor
-            if filters:
-                log_floor *= min(max(predicted / max(move.contraction**2 * before, 1e-300), 1.0), 20.0)
-                log_floor = max(log_floor, np.log(max(cut, move.clipped)))
-                floor = np.exp(log_floor) + edge + (0.0 if positive else aliasing)
-            else:
-                log_floor = LOG_NOISE
-                floor = np.exp(log_floor) + aliasing + edge + move.rounding
+            log_floor *= min(max(predicted / max(move.contraction**2 * before, 1e-300), 1.0), 20.0)
+            log_floor = max(log_floor, np.log(max(cut, move.clipped)))
+            floor = np.exp(log_floor) + edge + (0.0 if positive else aliasing)
             # The sample, on a finer grid where the product is not resolved.
             worst, growth, below = aliasing, 0.0, 0.0
             if seen:
@@ -171,8 +155,8 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
                     highest = top
                 if not (aliasing <= limit):
                     answer[0], answer[1], answer[2] = float(low), float(high), 0.6 * spacing
-                    status = FAILED if weak or not (positive or modal) or not (aliasing < np.inf) else RANGE
-                    if not closed and status == RANGE and (modal or aliasing > COARSE):
+                    status = FAILED if weak or not positive or not (aliasing < np.inf) else RANGE
+                    if not closed and status == RANGE and aliasing > COARSE:
                         status = UNRESOLVED
                     break
                 if np.isnan(added) or not (closed or max(left, right) < 1e-10):
@@ -206,17 +190,12 @@ def _loop(modal: bool, kernels: bool, splits: bool, samples: bool, weak: bool, c
             home, done = start, i + 1
             # Whether the same grid serves for the next step: as in `line_window.fitted`.
             low, high = int(answer[0]), int(answer[1])
-            if filters or weak:
-                low, high = support(now, cut)
-            resolving = (BAND if filters else 0.92) * (size // 2) / (max(highest, 0.0) + 1.0)
-            least, points = max(3, size // 16), high - low + 1.0
+            low, high = support(now, cut)
+            resolving = BAND * (size // 2) / (max(highest, 0.0) + 1.0)
             if resolving < 0.97 or (not near and abs(home + half - length // 2) > length // 4):
                 status = AFTER
             elif closed:
                 status = AFTER if size > generous and size > 2.2 * size / resolving else OK
-            elif modal:
-                fewer = size > generous and size > 1.6 * (1.2 * points * min(1.0, 1.0 / resolving) + 16.0)
-                status = AFTER if fewer or low < least or high >= size - least else OK
             elif near and abs(start - MARGIN) > MARGIN // 3:
                 status = TABLE
             if status != OK:
@@ -252,7 +231,7 @@ def advance(
     densities, out = np.empty((count, size)), np.empty((count + 1, len(COLUMNS)))
     averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
     done, why = _loop(*mechanisms)(
-        values, grid.start, grid.table, grid.profile, grid.modes.ravel(), grid.rates, averages, *waves(size), grid.offset,
-        grid.spacing, grid.unit, first, observed, *steps, error, log_floor, limits, densities, out, grid.fine,
+        values, grid.start, grid.table, averages, *waves(size), grid.offset, grid.spacing, first, observed, *steps, error,
+        log_floor, limits, densities, out, grid.fine,
     )  # fmt: skip
     return Segment(densities[:done], out[:done], why, out[-1, :3])

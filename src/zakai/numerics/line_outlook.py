@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import boolean, float64
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import helper, kernel
-from zakai.numerics.line_density import support
+from zakai.numerics.compiled import helper
 from zakai.numerics.line_place import PER
-from zakai.numerics.line_window import CUT, SIZES
+from zakai.numerics.line_window import SIZES
 
 Array = NDArray[Any]
 
@@ -22,7 +20,6 @@ _MARGIN = 7.2  # of them beyond the support: the waves that R' leaves everywhere
 _NARROW = 7.0  # support of a density in standard deviations of the noise
 _APART = 32  # the centres of coarse grids are multiples of so many spacings
 _SIZES = np.array(SIZES)
-_V, _M = float64[::1], float64[:, ::1]
 
 
 class Outlook(NamedTuple):
@@ -42,8 +39,11 @@ def outlook(low: float, high: float, tau: float, unit: float, profile: Array) ->
         low, high: the ends of the support.
         tau: the length of the interval.
         unit: the scale of spacings.
-        profile: f, f' and G (3, L) at offsets that are unit / PER apart.
+        profile: f, f' and G (3, L) at offsets that are unit / PER apart, or of one point, of which only G is read: then the
+            spacing is infinite where the interval makes the support far wider, else zero.
     """
+    if profile.shape[1] == 1:
+        return Outlook(np.inf if high - low < _NARROW * np.sqrt(profile[2, 0] * tau) else 0.0, low, high, 0.0)
     middle, per, last = profile.shape[1] // 2, PER / unit, profile.shape[1] - 1.0
     first, stop = int(min(max(np.floor(low * per) + middle, 0.0), last)), int(min(max(np.ceil(high * per) + middle, 0.0), last))
     least, most = profile[2, first], profile[2, first]
@@ -65,21 +65,6 @@ def outlook(low: float, high: float, tau: float, unit: float, profile: Array) ->
 def relative(x: float) -> float:
     """Return (1 - exp(-x)) / x."""
     return (1.0 - np.exp(-max(x, -5.0))) / max(x, -5.0) if abs(x) > 1e-8 else 1.0
-
-
-@kernel(boolean(_V, float64, float64, float64, float64, _M))
-def is_sharp(values: Array, centre: float, spacing: float, unit: float, tau: float, profile: Array) -> bool:
-    """Return whether an interval allows a grid that is not finer than that of a density.
-
-    With a `profile` of one point, of which only G is read, whether it makes the support of the density far wider.
-    """
-    low, high = support(values, CUT)
-    half = values.size // 2
-    if profile.shape[1] == 1:
-        return bool((high - low) * spacing < _NARROW * np.sqrt(profile[2, 0] * tau))
-    found = outlook(centre + spacing * (low - half), centre + spacing * (high - half), tau, unit, profile)
-    sharp: bool = found.spacing >= 1.41 * spacing
-    return sharp
 
 
 @helper

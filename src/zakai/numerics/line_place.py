@@ -9,15 +9,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import boolean, float64, int64, types, void
 from numpy.typing import NDArray
 
-from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.compiled import helper
 from zakai.numerics.line_density import highest_of
 from zakai.numerics.line_window import ALIGNMENT
 
 Array = NDArray[Any]
-_F, _V, _M = float64, float64[::1], float64[:, ::1]
 
 PER = 8  # points of rows in a spacing of the grid
 _STENCIL = 8
@@ -30,7 +28,7 @@ _LEVELS = 80
 _MOST_CELLS = 4096
 
 
-@kernel(int64(_F, int64, int64, _V))
+@helper
 def weigh(at: float, size: int, stride: int, weights: Array) -> int:
     """Write the weights of the polynomial through eight points of a row, `stride` apart, at an index; return the first point."""
     first = min(max(int(np.floor(at / stride)) - 3, 0), (size - 1) // stride - _STENCIL + 1)
@@ -89,7 +87,7 @@ def _surveyed(
     return highest, top, bottom
 
 
-@kernel(types.UniTuple(_F, 3)(_V, int64, int64, _M, boolean, _M, _V))
+@helper
 def placed(
     logs: Array, first: int, last: int, rows: Array, general: bool, precision: Array, observed: Array
 ) -> tuple[float, float, float]:  # fmt: skip
@@ -141,7 +139,7 @@ def placed(
     return low, high, finest
 
 
-@kernel(void(_V, _F, _V, _V, _V))
+@helper
 def interpolated(values: Array, top: float, at: Array, found: Array, weights: Array) -> None:
     """Write the interpolant of a positive density at indices of its grid; small values by their logarithms."""
     signed = np.empty(values.size)
@@ -180,11 +178,7 @@ def differences(h: Array, centre: Array, general: bool, precision: Array, observ
     return total
 
 
-@kernel(
-    types.Tuple((_F, _F, _F, _F, boolean))(  # type: ignore[no-untyped-call]
-        _V, int64, int64, _M, boolean, _M, _V, _F, _F, _F, _V, _V
-    )
-)
+@helper
 def sampled(
     q: Array, first: int, last: int, rows: Array, general: bool, precision: Array, observed: Array, grid_first: float,
     grid_spacing: float, unit: float, now: Array, b: Array,

@@ -14,7 +14,7 @@ COLUMNS = (
 )  # fmt: skip
 # The transition: whole with a sample after it, split with increments inside, whole with increments inside, split with a sample.
 FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = 0, 1, 2, 3
-OK, FAILED, RANGE, AFTER, TABLE, UNRESOLVED = range(6)  # why the loop ends; the last where a product needs a finer grid
+OK, FAILED, RANGE, AFTER, TABLE, UNRESOLVED = range(6)  # why a loop ends; the last where a product needs a finer grid
 RELIABLE = 1e-3  # of the promised error: smaller estimates are not reported
 MARGIN = 96  # points of a table of coefficients in time beyond the grid, of which a third may be used before it is made again
 
@@ -22,11 +22,10 @@ MARGIN = 96  # points of a table of coefficients in time beyond the grid, of whi
 class Mechanisms(NamedTuple):
     """What the steps of a record may need; only that is compiled.
 
-    `modes`: transitions by modes, else `kernels` or `splits` or both; `samples`: samples after the transition; `weak`: their
-    likelihoods have kinks and act in the weak sense; `closed`: grids around the circle.
+    `kernels` or `splits` or both; `samples`: samples after the transition; `weak`: their likelihoods have kinks and act in the
+    weak sense; `closed`: grids around the circle.
     """
 
-    modes: bool
     kernels: bool
     splits: bool
     samples: bool
@@ -35,22 +34,16 @@ class Mechanisms(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """The data of a grid: the rows of `modes` (N, N), `rates` (N,), and terms `table` (K, R, 4 + m, T) as in `line_terms`.
+    """The data of a grid: terms `table` (K, R, 4 + m, T) as in `line_terms`, K = 1 where they do not depend on the interval.
 
-    K = 1 where the terms do not depend on the interval.  With modes the table is that of the grid, of which `offset` is the
-    centre, and `profile` is that of `line_outlook.outlook`.  Else it is longer than the grid, which begins at `start`; the first
-    point of the table is `offset` away from the origin of the kernels.  `unit` is the scale of spacings.  `fine` (m, F) are the
-    values of an h with kinks at the nodes of `line_weak`, else empty.
+    The table is longer than the grid, which begins at `start`; its first point is `offset` away from the origin of the kernels.
+    `fine` (m, F) are the values of an h with kinks at the nodes of `line_weak`, else empty.
     """
 
-    modes: Array
-    rates: Array
     table: Array
-    profile: Array
     start: int
     offset: float
     spacing: float
-    unit: float
     fine: Array
 
 

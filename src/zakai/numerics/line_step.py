@@ -47,7 +47,7 @@ def extent(
 
 @helper
 def checked(
-    now: Array, low: int, high: int, filters: bool, weak: bool, positive: bool, closed: bool, search: bool, cut: float,
+    now: Array, low: int, high: int, weak: bool, positive: bool, closed: bool, search: bool, cut: float,
     negligible: float, spacing: float, cosines: Array, sines: Array, answer: Array,
 ) -> tuple[int, float, float, float, float, float]:  # fmt: skip
     """Normalise a prediction that is accurate; return OK, its mass, aliasing, mass at the ends, negative mass, highest frequency.
@@ -59,12 +59,12 @@ def checked(
     left, right, first, last, negative, aliasing, middle, highest, _ = spectrum(now, cut, negligible, cosines, sines, search)
     bound = max(100.0 * cut, 0.0 if positive else 4.0 * aliasing)
     edge = 0.0 if closed else max(left, right)
-    if filters and not positive:  # what is outside of the band is filtered too
+    if not positive:  # what is outside of the band is filtered too
         aliasing = max(aliasing, middle)
     answer[0], answer[1], answer[2] = float(low), float(high), 0.7 * spacing
     status, mass = OK, 0.0
     if not (aliasing <= 30.0 * negligible):
-        status = RANGE if filters and not weak and aliasing < np.inf else FAILED
+        status = RANGE if not weak and aliasing < np.inf else FAILED
     elif not (edge <= bound):
         status = RANGE if edge < np.inf else FAILED
         answer[0] = min(low, (0 if left > bound else low) - size // 3 * (left > bound))
