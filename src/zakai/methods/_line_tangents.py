@@ -17,7 +17,6 @@ from sympy import sympify
 
 from zakai.methods import _line
 from zakai.methods._line_adjoint import log_likelihoods
-from zakai.methods._line_coarse import coarsened
 from zakai.methods._line_grids import grid_of
 from zakai.methods._line_loop import DIVIDED, START, Piece, infos_of
 from zakai.methods._line_parts import segment_of_parts
@@ -184,12 +183,8 @@ class _Walk:
                 if not error < INACCURATE:
                     self.tangents = tangents
                     return False
-            elif of_modes == window:
-                self.tangents = self._varied(prepared, window).through(start, self.tangents, length)
             else:
-                pairs = zip(self.shifted, start + 1j * STEP * self.tangents, strict=True)
-                carried = [coarsened(one, given, window, length) for one, given in pairs]
-                self.tangents = np.array([one[0].imag for one in carried if one is not None]) / STEP
+                self.tangents = self._varied(prepared, of_modes).through(start, self.tangents, length, window, of_modes)
             self.tangents, gained = self.tangents / np.exp(log_mass), gained + log_mass
         self._regrid(own, step.window)
         at_end = prepared.schedule.seen[k] & ~prepared.inside[k]
