@@ -112,15 +112,17 @@ def adjusted(grid: Grid, below: Array, above: Array, finer: Array, bounds: Bound
 
 def padded_sizes(values: Array, grid: Grid, noise: Array, bounds: Bounds) -> tuple[int, ...]:
     """Return the sizes that a density needs to be spread by N(0, noise) without running over the ends of its grid."""
-    halves, variances, sizes = _spread_halves(grid, noise, bounds), _variances(grid, noise), list(grid.sizes)
-    least = bounds.edge * values.real.max()
-    for d, size in enumerate(sizes):
+    variances, sizes = _variances(grid, noise), list(grid.sizes)
+    halves = _spread_halves(grid, variances, bounds)
+    for d, size in enumerate(grid.sizes):
         if grid.closed[d] or not variances[d] > 0:
             continue
         # A second mode at an end is spread farther than the end of a Gaussian that fills the grid.
-        highest = np.maximum(np.moveaxis(values.real, d, 0).reshape(size, -1).max(axis=1), least)
-        ends = np.abs(np.arange(size) - size // 2) + np.sqrt(2 * np.log(highest / least) * variances[d])
-        half = max(halves[d], float(np.max(ends, where=highest > least, initial=0.0)))
+        highest = values.real.max(axis=tuple(e for e in range(grid.n) if e != d))
+        least = bounds.edge * highest.max()
+        used = np.flatnonzero(highest > least)
+        ends = np.abs(used - size // 2) + np.sqrt(2 * np.log(highest[used] / least) * variances[d])
+        half = max(halves[d], float(ends.max(initial=0.0)))
         if half >= 0.5 * size + 1:
             sizes[d] = max(rounded_size(2 * half, LEAST[grid.n], 4 * bounds.most), size)
     return tuple(sizes)
@@ -133,15 +135,14 @@ def _variances(grid: Grid, noise: Array) -> list[float]:
     return variances
 
 
-def _spread_halves(grid: Grid, noise: Array, bounds: Bounds) -> list[float]:
-    """Return half of the widths in spacings that a density that fills its grid needs after spreading by N(0, noise)."""
-    pairs = zip(grid.sizes, _variances(grid, noise), strict=True)
-    return [math.sqrt(0.25 * size**2 + bounds.reach**2 * variance) for size, variance in pairs]
+def _spread_halves(grid: Grid, variances: list[float], bounds: Bounds) -> list[float]:
+    """Return half of the widths that a density that fills its grid needs after spreading by `variances`, in spacings."""
+    return [math.sqrt(0.25 * size**2 + bounds.reach**2 * v) for size, v in zip(grid.sizes, variances, strict=True)]
 
 
 def enlargement(grid: Grid, noise: Array, bounds: Bounds) -> float:
     """Return the ratio of the volume that a density needs to be spread by N(0, noise) to that of its grid."""
-    halves = _spread_halves(grid, noise, bounds)
+    halves = _spread_halves(grid, _variances(grid, noise), bounds)
     return math.prod(1.0 if grid.closed[d] else halves[d] / (0.5 * size) for d, size in enumerate(grid.sizes))
 
 
