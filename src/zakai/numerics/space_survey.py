@@ -48,14 +48,18 @@ def _survey(u: Any, sizes: Any, closed: Any, basis: Any, edge: float, mean: Any,
     """Write the mean and covariance; of each axis the edge, tail, first and last index and deviation; and the totals."""
     n, count = sizes.size, u.size
     last = sizes[n - 1]
-    marginals, spectra = np.zeros((n, sizes.max())), np.zeros((n, 2))
-    cosines, sines = np.empty((n, 2, sizes.max())), np.empty((n, 2, sizes.max()))
+    most = last
+    for d in range(n - 1):
+        most = max(most, sizes[d])
+    marginals, spectra, cosines, sines = np.zeros((n, most)), np.zeros((n, 2)), np.empty((n, 2, most)), np.empty((n, 2, most))
     for d in range(n):
         for k in range(2):
             for i in range(sizes[d]):
                 angle = 2.0 * math.pi * (((sizes[d] // 2 - k) * i) % sizes[d]) / sizes[d]
                 cosines[d, k, i], sines[d, k, i] = math.cos(angle), math.sin(angle)
-    index, z = np.zeros(n), np.arange(last) - float(last // 2)
+    index, z = np.zeros(n), np.empty(last)
+    for i in range(last):
+        z[i] = i - last // 2
     marginal, negative = marginals[n - 1], 0.0
     for line in range(count // last):
         rest = line
@@ -105,8 +109,9 @@ def _survey(u: Any, sizes: Any, closed: Any, basis: Any, edge: float, mean: Any,
         for e in range(d + 1):
             cov[d, e] = cov[e, d] = cov[d, e] / total - mean[d] * mean[e]
     for d in range(n):
-        size, marginal = sizes[d], marginals[d, : sizes[d]]
-        top = marginal.max()
+        size, marginal, top = sizes[d], marginals[d], -np.inf
+        for i in range(size):
+            top = max(top, marginal[i])
         if not closed[d]:
             lower, upper = max(abs(marginal[0]), abs(marginal[1])), max(abs(marginal[size - 2]), abs(marginal[size - 1]))
             if edge > ROUNDING:
