@@ -43,3 +43,13 @@ def test_points_of_a_fixed_grid_move_as_the_flow_does(share):
     exact = grid.points @ (expm(-0.5 * share * matrix) - np.eye(2)).T
     np.testing.assert_allclose(grid.basis @ found[:2], exact.T, atol=2e-6)
     np.testing.assert_allclose(found[2], -0.5 * share * np.trace(matrix), rtol=1e-12)
+
+
+def test_a_density_that_is_fitted_keeps_its_mass():
+    bounds = Bounds(edge=1e-6, tail=1e-6, most=512, periodic=(False, False))
+    grid = Grid(np.array([0.3, -1.0]), np.array([[0.5, 0.2], [0.0, 1.0]]), (40, 40), (False, False))
+    apart = np.moveaxis(np.indices(grid.sizes), 0, -1) - np.array([20.4, 19.7])
+    field = Field(3.0 * np.exp(-0.5 * (apart**2).sum(axis=-1) / 2.4**2), grid, 0.0)
+    found = refitted(field, bounds)
+    assert found.grid.sizes != grid.sizes
+    np.testing.assert_allclose(found.values.sum() * found.grid.cell, field.values.sum() * grid.cell, rtol=1e-12)
