@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import zakai
+from references.convention import within_convention
 from references.kalman_bucy import assert_agrees, kalman_bucy
 from zakai.methods.kalman_bucy import METHOD
 from zakai.records.schedule import schedule_of
@@ -43,7 +44,7 @@ def test_it_agrees_with_the_equations_of_kalman_and_bucy(n):
     dy = 0.3 * rng.standard_normal((8, 2))
     dy[2, 0] = dy[4] = np.nan
     result = zakai.filter(parts[0], zakai.Record(times, dy, "increments"))
-    assert result.method == "kalman-bucy" and not result.warnings
+    assert result.method == "kalman-bucy" and not within_convention(result.warnings)
     assert_agrees(result, kalman_bucy(times, dy, mean, cov, *parts[1:]), 1e-10)
 
 

@@ -21,11 +21,11 @@ from zakai.models.numeric import numpy_function
 from zakai.records.schedule import Schedule
 
 Array = NDArray[np.float64]
-DIFFERS = 0.05  # standard deviations that a result reports
+DIFFERS = 0.2  # standard deviations that a result reports
 
 
 def notes_on_lengths(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> list[str]:
-    """Return a sentence on the intervals for which the formula above exceeds 0.05, if there are any.
+    """Return a sentence on the intervals for which the formula above exceeds 0.2, if there are any.
 
     Args:
         model: The model.
