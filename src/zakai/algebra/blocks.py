@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import sympy as sp
@@ -20,6 +19,7 @@ from zakai.models.features import (
     STATE_DEPENDENT_OBSERVATION_NOISE,
     TABLES,
 )
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 
 # The features with which a model is divided.
@@ -37,7 +37,7 @@ class Block:
     model: Model
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def blocks(model: Model) -> tuple[Block, ...]:
     """The connected parts of (f, G, h, S): without common noise, and none in the formulas of another.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import sympy as sp
 
@@ -25,6 +25,7 @@ from zakai.algebra.operators import JetTowerEnds
 from zakai.algebra.ratios import TooLarge
 from zakai.algebra.systems import affine_observation
 from zakai.algebra.wei_norman import NoFactorisation, WeiNorman, wei_norman
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 
 MOST_SYMBOLS = 6  # parameters that stay symbols; more are tried at random rationals
@@ -107,7 +108,7 @@ class _Exploration:
         return self.verdict, self.dimension
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def estimation_algebra(model: Model) -> EstimationAlgebra:
     """Explore the estimation algebra of a model; nothing is raised, what cannot be decided is said to be so.
 

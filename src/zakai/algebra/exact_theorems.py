@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import lru_cache
 
 import sympy as sp
 
@@ -12,6 +11,7 @@ from zakai.algebra.conditions import Condition
 from zakai.algebra.gauges import affine_system, gauge
 from zakai.algebra.systems import affine_observation, affine_parts, cached_yau_form, definite_covariance, determined
 from zakai.algebra.yau import NoYauForm, form_text
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
 
@@ -21,7 +21,7 @@ _HU_YAU = "Hu and Yau 2002"
 _MOST_STATES = 3
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def kalman_bucy(model: Model) -> tuple[Condition, ...]:
     """Affine f and h, with coefficients that may depend on time; G may be singular (Kalman and Bucy 1961)."""
     conditions = [determined(model)]
@@ -35,7 +35,7 @@ def kalman_bucy(model: Model) -> tuple[Condition, ...]:
     )
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def benes(model: Model) -> tuple[Condition, ...]:
     """f = L x + l + G grad log cosh(q.x + delta) with a quadratic q, and affine h (Benes 1981, in any dimension)."""
     conditions = _yau_conditions(model, _BENES, "G")
@@ -51,7 +51,7 @@ def benes(model: Model) -> tuple[Condition, ...]:
     )
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def hu_yau(model: Model) -> tuple[Condition, ...]:
     """f = G grad F + l with affine l, a quadratic eta and affine h (Hu and Yau 2002, Theorems 3 to 6).
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from zakai.algebra.systems import affine_parts
 from zakai.errors import InputError
 from zakai.models.features import STATE_DEPENDENT_DIFFUSION, of_dynamics
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import NumericFunction, numpy_function
 
@@ -37,7 +37,7 @@ class Explosion:
         )
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def explosion(model: Model) -> Explosion | None:
     """A start from which the drift at the model's first time explodes; None where none was found, which proves nothing.
 

@@ -10,7 +10,6 @@ a shift and a multiplier (Yau 1993, Theorem 6; Dong, Chen and Yau 2021, Theorem 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import sympy as sp
 
@@ -20,6 +19,7 @@ from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algeb
 from zakai.algebra.normal_form import operator_symbols
 from zakai.algebra.systems import determined
 from zakai.algebra.yau import inverse
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 
 _SOURCE = "Wei and Norman 1964"
@@ -58,7 +58,7 @@ def exponentials(model: Model, algebra: EstimationAlgebra) -> tuple[Exponential,
     return tuple(found)
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def wei_norman_filter(model: Model) -> tuple[Condition, ...]:
     """A finite estimation algebra whose exponentials are shifts and multipliers, in few enough states for a grid."""
     grid = "the grid of exp(t L_0)"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import sympy as sp
@@ -14,6 +13,7 @@ from zakai.algebra.identities import is_zero
 from zakai.algebra.quadratics import Quadratic, as_quadratic
 from zakai.algebra.systems import affine_parts, cached_yau_form
 from zakai.algebra.yau import YauForm, q_without_observation
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 
@@ -38,7 +38,7 @@ class Gauge:
         return self.slopes is not None and self.slopes.rows == 2
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def affine_system(model: Model) -> tuple[YauForm, Quadratic | None, bool | None, str] | None:
     """The Yau form with -q/2 without the observation's energy, whether that q is quadratic, and why; None without a Yau form."""
     form: object
@@ -54,7 +54,7 @@ def affine_system(model: Model) -> tuple[YauForm, Quadratic | None, bool | None,
     return form, *as_quadratic(q_without_observation(model, form), model.x)
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def gauge(model: Model) -> Gauge | None:
     """The gauge of a model with a Yau form, or None where phi depends on more than two directions."""
     system = affine_system(model)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
 from zakai.algebra.blocks import Groups, connected, part_of
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior, GaussianPrior, MixturePrior
 
@@ -33,7 +33,7 @@ class IndependentBlock:
     prior: Any
 
 
-@lru_cache(maxsize=8)
+@once_for_a_model
 def independent_blocks(model: Model, prior: Any, by_value: bool = True) -> tuple[IndependentBlock, ...]:
     """Return the connected parts of (f, G, h, S) and of a prior (or None): p(x, t | y) is the product of their densities.
 

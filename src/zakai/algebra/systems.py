@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import sympy as sp
@@ -13,6 +12,7 @@ from zakai.algebra.conditions import Condition
 from zakai.algebra.identities import all_zero, is_in_one_piece, is_zero
 from zakai.algebra.quadratics import Quadratic, as_quadratic
 from zakai.algebra.yau import NoYauForm, YauForm, observation_energy, q_without_observation, yau_form
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 
@@ -34,13 +34,13 @@ class YauSystem:
     intercept: sp.ImmutableMatrix | None
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def cached_yau_form(model: Model) -> YauForm | NoYauForm:
     """`yau_form`, computed once for each model."""
     return yau_form(model)
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def q_parts(model: Model):
     """(-q/2 as a quadratic, whether q is one, why) without and with the observation's energy."""
     form = cached_yau_form(model)
@@ -50,7 +50,7 @@ def q_parts(model: Model):
     return first, as_quadratic(unobserved + observation_energy(model), model.x)
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def affine_observation(model: Model) -> tuple[sp.ImmutableMatrix, sp.ImmutableMatrix] | None:
     """C and c if h = C x + c, else None."""
     return affine_parts(model.observation, model.x)

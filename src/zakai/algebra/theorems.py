@@ -6,7 +6,6 @@ Each function takes a Model and gives a tuple of `Condition`.  A theorem says wh
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import lru_cache
 
 import sympy as sp
 
@@ -28,12 +27,13 @@ from zakai.algebra.systems import CLY, affine_observation, cached_yau_form, defi
 from zakai.algebra.yau import YauForm, form_text
 from zakai.models import features
 from zakai.models.features import ASSUMPTIONS
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 
 _SURVEY = "Chen and Dong, survey of direct methods"
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def limited_direct(model: Model) -> tuple[Condition, ...]:
     """The assumptions under which the Kolmogorov equation of a time-varying Yau system has an explicit kernel.
 
@@ -105,7 +105,7 @@ def _angle_conditions(model: Model, form: YauForm) -> Iterator[Condition]:
         )
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def general_direct(model: Model) -> tuple[Condition, ...]:
     """The assumptions under which a Gaussian stays one, in gauge, between the observations of a time-varying Yau system.
 
@@ -120,7 +120,7 @@ def general_direct(model: Model) -> tuple[Condition, ...]:
     return (*conditions, *own, *_yau_conditions(model, source, lambda form: _few_directions(model, form)))
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def gaussian_sum(model: Model) -> tuple[Condition, ...]:
     """The survey's Theorems 2 and 3: the same for a system that does not depend on time."""
     conditions = general_direct(model)
@@ -148,13 +148,13 @@ def _few_directions(model: Model, form: YauForm) -> Condition:
     )
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def smooth_system(model: Model) -> tuple[Condition, ...]:
     """Any smooth system: what a method that only linearises asks for."""
     return (determined(model),)
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def any_smooth_system(model: Model) -> tuple[Condition, ...]:
     """Any smooth system whose density fits on a grid."""
     return (
@@ -166,7 +166,7 @@ def any_smooth_system(model: Model) -> tuple[Condition, ...]:
     )
 
 
-@lru_cache(maxsize=64)
+@once_for_a_model
 def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
     """A smooth drift without time and a constant, definite G: its kernel has the series of Yau 1993, Theorems 10 and 11.
 

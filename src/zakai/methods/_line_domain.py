@@ -8,18 +8,18 @@ density of w is negligible far out.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
 from zakai.densities.mapped import IntervalMap
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 
 Array = Any
 # attributes that a model computes from its formulas
-_DERIVED = ("text", "observation_law", "covariance", "features", "depends_on_time")
+_DERIVED = ("text", "observation_law", "covariance", "features", "depends_on_time", "_kept")
 
 
 class Variable(IntervalMap):
@@ -43,7 +43,7 @@ def variable_of(model: Model) -> Variable | None:
     return Variable(interval.lower, interval.upper)
 
 
-@lru_cache(maxsize=32)
+@once_for_a_model
 def on_the_line(model: Model) -> Model:
     """Return the model for w, whose state has the same symbol; a model without a domain is returned as it is."""
     variable = variable_of(model)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ import sympy as sp
 from zakai.methods._outside_tables import OutsideTables
 from zakai.models.features import CROSS_NOISE, OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
 from zakai.models.functions import Floor, Maximum, Minimum, TableFunction
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.records.inputs import Inputs
@@ -44,7 +44,7 @@ class Formulas(NamedTuple):
     kinks: Function | None
 
 
-@lru_cache(maxsize=32)
+@once_for_a_model
 def _formulas(model: Model) -> Formulas:
     """Return the functions of a model, made once."""
     x, m = model.x[0], model.m
@@ -140,7 +140,7 @@ def _rough(formula: sp.Expr, x: sp.Symbol) -> bool:
     return linear or any(part.has(x) for part in formula.atoms(*_KINKS))
 
 
-@lru_cache(maxsize=32)
+@once_for_a_model
 def in_pieces(model: Model) -> bool:
     """Return whether densities of a state are polynomials between ends and kinks.
 
@@ -231,7 +231,7 @@ class System:
         return self._outside(points[:, None], t, theta)
 
 
-@lru_cache(maxsize=32)
+@once_for_a_model
 def system_of(model: Model) -> System:
     """Return the formulas of a model, made once."""
     return System(model)

@@ -8,7 +8,6 @@ In the gauge u = e^phi v the equation of an interval is linear-quadratic, so tha
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ import sympy as sp
 
 from zakai.algebra.systems import yau_system
 from zakai.methods._series_kernel import PowerSeries
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics import line_window as lw
@@ -175,13 +175,13 @@ def _unexpanded(model: Model, yau: Any) -> list[sp.Expr] | None:
     return entries
 
 
-@lru_cache(maxsize=32)
+@once_for_a_model
 def yau_line_of(model: Model) -> YauLine:
     """Return the equation of a model, made once."""
     return YauLine(model)
 
 
-@lru_cache(maxsize=32)
+@once_for_a_model
 def power_series_of(model: Model, order: int | None) -> PowerSeries:
     """Return the equation of a model as Taylor series in time, made once."""
     return PowerSeries(model, yau_line_of(model).blocks, order)

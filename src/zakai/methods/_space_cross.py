@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ import sympy
 from zakai.methods._space_functions import PointFunction
 from zakai.methods._space_observed import Observations
 from zakai.methods._space_system import System, without_jumps
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.space_average import panel_rule
@@ -63,7 +63,7 @@ class CrossFormulas:
         self.potential_varies = noise or bool(potential.free_symbols & given)
 
 
-@lru_cache(maxsize=32)
+@once_for_a_model
 def cross_formulas(model: Model) -> CrossFormulas:
     """Return the coefficients of a model, made once."""
     return CrossFormulas(model)

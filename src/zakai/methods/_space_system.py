@@ -14,6 +14,7 @@ from zakai.methods._space import State
 from zakai.methods._space_functions import PointFunction
 from zakai.models.features import OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
 from zakai.models.functions import TableFunction
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior
@@ -126,7 +127,7 @@ def _table_calls(model: Model) -> list[Any]:
     return sorted({call for part in parts for call in part.atoms(TableFunction) if call.has(*model.x)}, key=str)
 
 
-@lru_cache(maxsize=32)
+@once_for_a_model
 def system_of(model: Model) -> System:
     """Return the functions of a model, made once."""
     return System(model)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import sympy as sp
 from zakai.algebra.systems import yau_system
 from zakai.methods._affine_system import Matrices, precision_of
 from zakai.methods._series_kernel import PowerSeries
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.flow import Coefficients
@@ -70,13 +70,13 @@ class YauSystem:
         return bool(self.matrices.varying or (self.affine and inside.any() and self._noise.varying))
 
 
-@lru_cache(maxsize=32)
+@once_for_a_model
 def yau_of(model: Model) -> YauSystem:
     """Return the equation of a model, made once."""
     return YauSystem(model)
 
 
-@lru_cache(maxsize=32)
+@once_for_a_model
 def power_series_of(model: Model, order: int | None) -> PowerSeries:
     """Return the equation of a model as Taylor series in time, made once."""
     return PowerSeries(model, yau_of(model).blocks, order)

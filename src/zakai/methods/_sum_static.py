@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 import sympy as sp
@@ -11,6 +11,7 @@ import sympy as sp
 from zakai.errors import InputError
 from zakai.methods._sum_gauge import SumGauge, directions_of, span
 from zakai.methods._sum_system import System, system_of
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 
 # Components by the number of directions in which they must be narrow.
@@ -68,7 +69,7 @@ class Sum:
         return used, round(_COMPANION * used) if used >= 6 else used + 4
 
 
-@lru_cache(maxsize=32)
+@once_for_a_model
 def sum_of(model: Model, splitting: str, components: int | None, reduction: str, tolerance: float, alpha: float) -> Sum:
     """Return what does not depend on data or parameters, made once."""
     return Sum(model, splitting, components, reduction, tolerance, alpha)

@@ -12,7 +12,6 @@ exp(int h'S^-1 dt dy/length) is divided between both ends so that its first mome
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +24,7 @@ from zakai.methods._outside_tables import OutsideTables
 from zakai.methods._residuals import Factor as Residuals
 from zakai.methods._residuals import Sensors
 from zakai.methods._sum_law import SampleLaw, has_own_law
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
 from zakai.numerics.complex_step import cholesky
@@ -252,7 +252,7 @@ def _centre(model: Model) -> tuple[Array, Array]:
     return np.where(turning, 0.0, np.asarray(prior.mean, float)), np.sqrt(np.diag(prior.cov))
 
 
-@lru_cache(maxsize=32)
+@once_for_a_model
 def system_of(model: Model, splitting: str) -> System:
     """Return the system of a model."""
     return System(model, splitting)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
+from functools import wraps
 from threading import Lock
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 if TYPE_CHECKING:
     from zakai.models.model import Model
 
 Value = TypeVar("Value")
+Rest = ParamSpec("Rest")
 _LOCK = Lock()
 
 
@@ -35,3 +37,18 @@ def kept(model: Model, purpose: Any, make: Callable[[], Value], key: Hashable = 
         while len(values) > most:
             values.popitem(last=False)
     return value
+
+
+def once_for_a_model(function: Callable[Concatenate[Model, Rest], Value]) -> Callable[Concatenate[Model, Rest], Value]:
+    """Return a function of a model, and of other hashable arguments, that stores its last eight values in the model."""
+
+    @wraps(function)
+    def found(model: Model, *others: Rest.args, **names: Rest.kwargs) -> Value:
+        key = (*others, *sorted(names.items()))
+        try:
+            value: Value = vars(model)["_kept"][function][key]
+        except KeyError:
+            return kept(model, function, lambda: function(model, *others, **names), key, most=8)
+        return value
+
+    return found

@@ -167,6 +167,9 @@ class Model:
 
     __delattr__ = __setattr__  # type: ignore[assignment]
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in vars(self).items() if key not in _OWN}
+
     def __repr__(self) -> str:
         observed = _display.counted(self.m, "observation")
         return f"Model({self.name!r}: state {_display.short_names(self.state)}, {observed} as {self.observation_kind})"
