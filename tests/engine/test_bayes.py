@@ -1,11 +1,20 @@
 """Posteriors of parameters by the no-U-turn sampler."""
 
+import io
+import sys
+
 import numpy as np
 import pytest
 from scipy import stats
 
 import zakai
+from zakai._progress import bar
 from zakai.engine.priors import Prior
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
 
 
 def _model():
@@ -45,9 +54,14 @@ def test_wrong_priors_are_refused(priors, message):
 
 
 @pytest.mark.filterwarnings("ignore:sample. R-hat")
-def test_the_posterior_is_that_of_a_quadrature():
+def test_the_posterior_is_that_of_a_quadrature_and_its_draws_have_a_bar(monkeypatch):
     pytest.importorskip("blackjax")
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setattr(bar.__wrapped__, "__defaults__", (0.0,))
     found = zakai.sample(_model(), RECORD, {"a": "lognormal(0, 0.5)"}, draws=100, warmup=50)
+    assert "sampling parameters" in terminal.getvalue()
     grid = np.linspace(0.02, 6, 60)
     likelihood = zakai.log_likelihood(_model(), RECORD)
     logs = np.array([likelihood([a]) for a in grid]) + stats.lognorm(0.5).logpdf(grid)

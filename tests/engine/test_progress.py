@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import sys
-import warnings
 
 import numpy as np
 import pytest
@@ -61,18 +60,6 @@ def test_a_fit_counts_its_evaluations_and_its_filters_have_no_bar(monkeypatch):
     zakai.fit(model, zakai.simulate(model, 0.1 * np.arange(1, 21), seed=0)[1], ["a"])
     fitting, filtering = terminal.getvalue().find("fitting"), terminal.getvalue().find("filtering")
     assert 0 <= fitting and (filtering < 0 or fitting < filtering)
-
-
-def test_draws_of_parameters_have_the_same_bar_and_none_in_a_pipe(monkeypatch):
-    pytest.importorskip("blackjax")
-    model = zakai.load_model("gallery:kalman-bucy-1d")
-    record = zakai.simulate(model, 0.1 * np.arange(1, 11), seed=0)[1]
-    for terminal in (on_a_terminal(monkeypatch), io.StringIO()):
-        monkeypatch.setattr(sys, "stderr", terminal)
-        monkeypatch.setattr(bar.__wrapped__, "__defaults__", (0.0,))
-        with warnings.catch_warnings(action="ignore"):
-            zakai.sample(model, record, {"a": "lognormal(0, 1)"}, draws=4, chains=1, warmup=20)
-        assert ("sampling parameters" in terminal.getvalue()) == terminal.isatty()
 
 
 def test_a_caller_who_asks_for_the_progress_gets_it_and_no_bar(monkeypatch):
