@@ -26,7 +26,7 @@ LAZILY = {
 FILES = sorted(path.relative_to(SOURCE).as_posix() for path in SOURCE.rglob("*.py") if path.parent != SOURCE)
 JAX = {"jax", "jaxlib", "cuthbert", "cuthbertlib", "dynamax", "tensorflow_probability"}
 # Inside functions, for what a caller who uses JAX passes: a key, or the parameters under `jax.grad`.
-WHERE_JAX_IS_LOADED = {"densities/_density.py", "engine/likelihood.py", "engine/bayes.py"}
+WHERE_JAX_IS_LOADED = {"densities/_density.py", "engine/likelihood.py", "engine/likelihood_in_jax.py", "engine/bayes.py"}
 KNOWS_NO_MODEL = {"models", "algebra", "densities", "records", "methods", "engine"}  # what numerics/ may not import
 
 

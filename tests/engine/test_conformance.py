@@ -146,6 +146,7 @@ def test_one_prior_said_in_two_ways_gives_one_posterior(method, name, prior):
     same(other, expected, NEAR.get(method, 1e-7))
 
 
+@pytest.mark.filterwarnings("ignore:log_likelihood")  # methods that approximate are differentiated too
 @on_every_system
 @pytest.mark.parametrize("kind", ["increments", "samples"])
 def test_the_gradient_is_that_of_differences(method, name, kind):

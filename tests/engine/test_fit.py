@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -183,6 +185,7 @@ def test_the_likelihood_of_a_double_well_and_its_gradient_are_right():
     assert fitted.converged and reference(fitted.estimates["k"]) >= value - 1e-6
 
 
+@pytest.mark.filterwarnings("ignore:log_likelihood")  # one jump of the drift is not resolved
 @pytest.mark.parametrize("jump", ["sign(x - b)", "heaviside(x - b)", "floor(x - b)"])
 def test_the_place_of_a_jump_has_no_gradient(jump):
     model = zakai.Model(
@@ -195,3 +198,17 @@ def test_the_place_of_a_jump_has_no_gradient(jump):
             refused()
     assert np.isfinite(zakai.log_likelihood(model, record)([1.0, 0.1]))
     assert np.isfinite(zakai.log_likelihood(model, record, parameters=["k"]).value_and_gradient([1.0])[1]).all()
+
+
+@pytest.mark.parametrize(("last", "said"), [(0.9, False), (40.0, True)])
+def test_a_log_likelihood_beyond_the_bounds_of_its_health_figures_warns(last, said):
+    model = zakai.Model(
+        state=["x"], drift=["a*x - x**3"], diffusion=[["1/2"]], observation=["x**3"], observation_kind="samples",
+        observation_noise=[["1/10"]], prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]}, parameters={"a": 1.0},
+    )  # fmt: skip
+    likelihood = zakai.log_likelihood(model, zakai.Record([0.3, 0.7, 1.0], [[0.2], [0.5], [last]], "samples"))
+    for call in (likelihood, likelihood.value_and_gradient):
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            call([1.0])
+        assert [("tail_depth" in str(warning.message), warning.filename) for warning in found] == [(True, __file__)] * said

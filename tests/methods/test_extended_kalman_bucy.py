@@ -262,6 +262,7 @@ def test_an_oscillating_noise_is_integrated_over_every_part_of_an_interval():
     assert misses[-1] < 1e-5 and misses[0] / misses[-1] > 12
 
 
+@pytest.mark.filterwarnings("ignore:log_likelihood")  # the system is curved
 @pytest.mark.parametrize("kind", ["increments", "samples"])
 @pytest.mark.parametrize("options", [{"substeps": 3}, {"riccati": "euler", "substeps": 30}])
 def test_the_log_likelihood_has_the_gradient_of_differences(kind, options):

@@ -137,7 +137,7 @@ def fit(
         def counted(theta: np.ndarray) -> tuple[float, np.ndarray]:
             if advance is not None:
                 advance(next(evaluations), None)
-            return function.value_and_gradient(theta)
+            return function.unwarned(theta)
 
         found = maximum(counted, values, box, names, model)
     values = found.values

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
@@ -17,6 +18,7 @@ from zakai.engine.driver import check_noise, check_records, planned
 from zakai.engine.loop import CHUNK, Run, segments
 from zakai.engine.setting import Setting
 from zakai.errors import ConditionError, InputError
+from zakai.methods._protocol import Infos
 from zakai.models._entries import formula
 from zakai.models._errors import did_you_mean, listing
 from zakai.models.checks import COEFFICIENTS, depends_on_state, noise_check
@@ -30,7 +32,6 @@ from zakai.records.schedule import Schedule
 
 SHORT = 0.02  # seconds of one evaluation below which threads do not pay
 JUMPS = sp.sign, Floor
-DIFFERENCE = 1e-5  # relative step of the differences of gradients that give second derivatives
 
 
 def log_likelihood(
@@ -43,7 +44,7 @@ def log_likelihood(
     The function takes the values (p,) of the parameters and returns l, which `filter` gives as `log_likelihood` at these values;
     `value_and_gradient` returns l and its gradient (p,).  With JAX installed it may be used under `jax.grad`,
     `jax.value_and_grad`, `jax.hessian`, `jax.vmap` and `jax.jit` (set `jax_enable_x64` for double precision).  Where a noise is
-    not a covariance, the value is NaN.
+    not a covariance, the value is NaN.  Where a health figure exceeds its bound, a Python warning names it.
 
     Args:
         model: the system, with a prior and parameters.
@@ -127,7 +128,9 @@ class LogLikelihood:
         """Return l at the values (p,)."""
         if "jax" in sys.modules and isinstance(values, sys.modules["jax"].core.Tracer):
             return self._in_jax(values)
-        return self._evaluated(values, False)[0]
+        value, _, exceeded = self._evaluated(values, False)
+        _warn(exceeded)
+        return value
 
     def value_and_gradient(self, values: Any) -> tuple[float, np.ndarray]:
         """Return l and its gradient (p,) at the values (p,).
@@ -135,14 +138,22 @@ class LogLikelihood:
         Raises:
             InputError: sign, heaviside or floor of an expression with one of the parameters.
         """
-        return self._evaluated(values, True)
+        value, gradient, exceeded = self._evaluated(values, True)
+        _warn(exceeded)
+        return value, gradient
+
+    def unwarned(self, values: Any) -> tuple[float, np.ndarray]:
+        """Return what `value_and_gradient` returns, for searches that report the health of their end alone."""
+        return self._evaluated(values, True)[:2]
 
     def consistent_pair(self, values: Any) -> tuple[float, np.ndarray]:
         """Return l and its gradient (p,), both by complex steps, which takes less time; on a grid l differs by its accuracy."""
-        return self._evaluated(values, True, own=False)
+        return self._evaluated(values, True, own=False)[:2]
 
-    def _evaluated(self, values: Any, derivatives: bool, own: bool = True) -> tuple[float, np.ndarray]:
-        """Return l and its gradient, zero unless `derivatives` are wanted; NaN where l does not exist.
+    def _evaluated(self, values: Any, derivatives: bool, own: bool = True) -> tuple[float, np.ndarray, set[str]]:
+        """Return l, its gradient, zero unless `derivatives` are wanted, and the health figures beyond their bounds.
+
+        Where l does not exist it is NaN.
 
         With derivatives a density may have another grid; `own`: l is the filter's.
         """
@@ -153,7 +164,7 @@ class LogLikelihood:
             raise InputError(self._jump)
         theta = self.model.theta()
         theta[self._where] = given
-        missing = np.nan, np.full(len(given), np.nan)
+        missing: tuple[float, np.ndarray, set[str]] = np.nan, np.full(len(given), np.nan), set()
         with np.errstate(all="ignore"):
             if not np.isfinite(given).all() or any(check(self._times, theta) for check in self._checks):
                 return missing
@@ -163,20 +174,23 @@ class LogLikelihood:
             found[self._where[direction]] += 1j * STEP
             return found
 
-        value, gradient = 0.0, np.zeros(len(given))
+        value, gradient, exceeded = 0.0, np.zeros(len(given)), set()
         try:
             for part in self._parts:
                 directions = [i for i, name in enumerate(self.names) if derivatives and name in part.depends]
-                gained, slopes = part.derivatives(theta, [shifted(i) for i in directions], own)
+                gained, slopes, over = part.derivatives(theta, [shifted(i) for i in directions], own)
                 value, gradient[directions] = value + gained, gradient[directions] + slopes
+                exceeded |= over
         except InputError:
             return missing
-        return value, gradient
+        return value, gradient, exceeded
 
     @cached_property
     def _in_jax(self) -> Callable[[Any], Any]:
         """The function for values that JAX traces."""
-        return _traced(self)
+        from zakai.engine.likelihood_in_jax import traced
+
+        return traced(self)
 
 
 class _Part(NamedTuple):
@@ -191,26 +205,36 @@ class _Part(NamedTuple):
     def of(cls, run: Run) -> _Part:
         return cls(run.setting, run.schedule, run.values, _parameters_of(run.setting))
 
-    def evidence(self, theta: np.ndarray) -> Any:
-        """Return the log-likelihood at the parameters, complex where they are."""
-        found = segments(self.setting._replace(theta=theta), self.schedule, None, self.values)
-        return _total([segment.infos.log_likelihood_increment for segment in found])
+    def evidence(self, theta: np.ndarray) -> tuple[Any, set[str]]:
+        """Return the log-likelihood at the parameters, complex where they are, and the figures beyond their bounds."""
+        infos = [one.infos for one in segments(self.setting._replace(theta=theta), self.schedule, None, self.values)]
+        return _total([part.log_likelihood_increment for part in infos]), self._exceeded(infos)
 
-    def derivatives(self, theta: np.ndarray, shifted: Sequence[np.ndarray], own: bool) -> tuple[float, np.ndarray]:
-        """Return the log-likelihood and its derivatives (p,) in complex directions; `own`: it is the filter's."""
+    def _exceeded(self, infos: Sequence[Infos]) -> set[str]:
+        """Return the names of the health figures that exceed their bounds."""
+        bounds = self.setting.method.bounds
+        figures = [(name, part.health[name]) for part in infos for name in bounds if name in part.health]
+        return {name for name, values in figures if (np.real(values) > bounds[name][0]).any()}
+
+    def derivatives(self, theta: np.ndarray, shifted: Sequence[np.ndarray], own: bool) -> tuple[float, np.ndarray, set[str]]:
+        """Return the log-likelihood, its derivatives (p,) in complex directions, and the figures beyond their bounds.
+
+        `own`: the log-likelihood is the filter's.
+        """
         carried = self._carried(theta, shifted) if shifted else None
         if carried is not None:
             return carried
         found = _each(self.evidence, [theta, *shifted] if own or not shifted else shifted)
-        return float(found[0].real), np.array([total.imag / STEP for total in found[len(found) - len(shifted) :]])
+        totals, exceeded = [total for total, _ in found], set().union(*(over for _, over in found))
+        return float(totals[0].real), np.array([total.imag / STEP for total in totals[len(totals) - len(shifted) :]]), exceeded
 
-    def _carried(self, theta: np.ndarray, shifted: Sequence[np.ndarray]) -> tuple[float, np.ndarray] | None:
+    def _carried(self, theta: np.ndarray, shifted: Sequence[np.ndarray]) -> tuple[float, np.ndarray, set[str]] | None:
         """Return the same where the method carries all derivatives in one pass, else None."""
         method, prior = self.setting.method, self.setting.prior
         if method.tangents is None:
             return None
         states: list[Any] = []
-        increments, slopes = [], np.zeros(len(shifted))
+        parts, slopes = [], np.zeros(len(shifted))
         for start in range(0, len(self.schedule), CHUNK):
             rows = slice(start, min(start + CHUNK, len(self.schedule)))
             chunk = self.schedule.part(rows)
@@ -222,9 +246,19 @@ class _Part(NamedTuple):
                 )
             if found is None:
                 return None
-            increments.append(found.infos.log_likelihood_increment)
+            parts.append(found.infos)
             slopes, states = slopes + found.slopes, [found.states[-1], *found.shifted]
-        return float(_total(increments)), slopes
+        return float(_total([part.log_likelihood_increment for part in parts])), slopes, self._exceeded(parts)
+
+
+def _warn(exceeded: set[str]) -> None:
+    """Warn, three calls up, where figures exceed their bounds."""
+    if exceeded:
+        warnings.warn(
+            f"log_likelihood: health figures exceed their bounds at these values ({', '.join(sorted(exceeded))}), so that the "
+            "value and its gradient may be wrong; zakai.filter at these values says where, and what to change",
+            stacklevel=3,
+        )
 
 
 def _total(increments: list[np.ndarray]) -> Any:
@@ -251,50 +285,3 @@ def _parameters_of(setting: Setting) -> set[str]:
     if isinstance(prior, DensityPrior):
         symbols |= prior.log_density.free_symbols
     return {symbol.name for symbol in symbols}
-
-
-def _traced(function: LogLikelihood) -> Callable[[Any], Any]:
-    """Return a function with derivatives for JAX: the second ones are central differences of the gradient."""
-    import jax
-    import jax.numpy as jnp
-
-    p = len(function.names)
-
-    def called(host: Callable[..., Any], shape: tuple[int, ...], values: Any, *rest: Any) -> Any:
-        # Single precision, unless jax_enable_x64 is set.
-        result = jax.ShapeDtypeStruct(shape, values.dtype)  # type: ignore[no-untyped-call]
-        return jax.pure_callback(lambda *v: np.asarray(host(*v), values.dtype), result, values, *rest, vmap_method="sequential")
-
-    @jax.custom_jvp
-    def gradient(values: Any) -> Any:
-        return called(lambda v: function.value_and_gradient(v)[1], (p,), values)
-
-    def difference(values: Any, direction: Any) -> Any:
-        values, direction = np.asarray(values), np.asarray(direction)
-        size = np.max(np.abs(direction))
-        if size == 0:
-            return np.zeros(p)
-        step = DIFFERENCE * max(np.max(np.abs(values)), 1e-3) / size
-        above = function.value_and_gradient(values + step * direction)[1]
-        return (above - function.value_and_gradient(values - step * direction)[1]) / (2 * step)
-
-    @gradient.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        # The Hessian is symmetric; what JAX asks for is linear in the tangent.
-        (values,), (tangent,) = primals, tangents
-        columns = jnp.stack([called(difference, (p,), values, direction) for direction in jnp.eye(p)])
-        return gradient(values), tangent @ columns
-
-    @jax.custom_jvp
-    def value(values: Any) -> Any:
-        return called(lambda v: function(np.asarray(v)), (), values)
-
-    @value.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        (values,), (tangent,) = primals, tangents
-        return value(values), gradient(values) @ tangent
-
-    def traced(values: Any) -> Any:
-        return value(jnp.asarray(values, dtype=float))
-
-    return traced
