@@ -86,8 +86,8 @@ CALLED = {
         "zakai.engine.stored",
     },
     # The parts of one method.
-    "methods/_space.py": {"zakai.methods._space_direct", "zakai.methods._space_kolmogorov"},
-    "methods/_line_system.py": {"zakai.methods._line_parts", "zakai.methods._line_steps"},
+    "methods/space/filter.py": {"zakai.methods.space.direct", "zakai.methods.space.kolmogorov"},
+    "methods/line/system.py": {"zakai.methods.line.parts", "zakai.methods.line.steps"},
 }
 
 

@@ -12,7 +12,7 @@ import sympy
 from sympy import Function, Matrix, Symbol, symbols
 
 import zakai
-from zakai.methods import _one_shot
+from zakai.methods.gaussian import one_shot
 
 t = Symbol("t", real=True)
 X = Matrix(symbols("x1 x2", real=True))
@@ -129,7 +129,7 @@ def test_the_running_code_has_the_wrong_evidence_with_14_as_printed(monkeypatch)
         inner, matrix = k.inverse @ b_rate, k.hamiltonian[: len(b), : len(b)]
         return -0.5 * b_rate @ inner + a @ b_rate - (matrix.T @ inner).sum() + 0.5 * b @ k.N @ b + 0.5 * k.e @ b
 
-    monkeypatch.setattr(_one_shot, "c_rate", printed_rate)
+    monkeypatch.setattr(one_shot, "c_rate", printed_rate)
     wrong = zakai.filter(model, record, "hu-yau", form="one-shot")
     assert np.abs(wrong.mean - exact.mean).max() <= 1e-12
     assert abs(wrong.log_likelihood - exact.log_likelihood) >= 1e-3

@@ -7,8 +7,8 @@ import pytest
 from scipy.special import erf
 
 import zakai
-from zakai.methods._family_prior import prior_families
-from zakai.methods._gauge import Gauge
+from zakai.methods.gaussian.family_prior import prior_families
+from zakai.methods.gaussian.gauge import Gauge
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.families import log_terms
 

@@ -11,7 +11,9 @@ import zakai
 from references.kolmogorov import Box, filter_system, propagate
 from references.systems import planar
 from zakai.errors import InputError
-from zakai.methods import _space, _space_direct, _space_kolmogorov
+from zakai.methods.space import direct as space_direct
+from zakai.methods.space import filter as space_filter
+from zakai.methods.space import kolmogorov as space_kolmogorov
 from zakai.numerics.prior_grid import mixture_grid, prior_grid
 from zakai.records.schedule import schedule_of
 
@@ -21,11 +23,11 @@ L, H = np.array([[-0.3, 1.0], [-1.0, -0.2]]), np.array([[1.0, 0.0]])
 def steps(model, record, theta=None, method="yau-yau", **options):
     """The reports and states of all steps."""
     schedule, values = schedule_of(model, record)
-    prepare = _space_direct.prepare if method == "limited-direct" else _space_kolmogorov.prepare
+    prepare = space_direct.prepare if method == "limited-direct" else space_kolmogorov.prepare
     prepared = prepare(model, schedule, model.theta() if theta is None else theta, **options)
-    state, infos, states = _space.init(prepared, model.prior), [], []
+    state, infos, states = space_filter.init(prepared, model.prior), [], []
     for k in range(len(schedule)):
-        state, info = _space.step(prepared, k, state, values[k])
+        state, info = space_filter.step(prepared, k, state, values[k])
         infos.append(info)
         states.append(state)
     return prepared, states, infos
@@ -98,7 +100,7 @@ def test_limited_direct_agrees_with_the_kolmogorov_equation():
     prepared, states, _ = steps(model, record, method="limited-direct", splitting="lie")
     for state, (_, expected) in zip(states, reference, strict=True):
         expected = expected / (expected.sum() * box.cell)
-        computed = np.exp(_space.density(prepared, state).log_density(box.x))
+        computed = np.exp(space_filter.density(prepared, state).log_density(box.x))
         assert np.abs(computed - expected).max() <= 1e-9 * expected.max()
 
 
@@ -213,12 +215,12 @@ def test_units_and_offsets_change_nothing_but_rounding():
 def test_an_interval_depends_on_itself_alone():
     model = linear([["1", "0"], ["0", "1"]])
     schedule, values = schedule_of(model, IRREGULAR)
-    whole = _space_kolmogorov.prepare(model, schedule, model.theta())
-    one = other = _space.init(whole, model.prior)
+    whole = space_kolmogorov.prepare(model, schedule, model.theta())
+    one = other = space_filter.init(whole, model.prior)
     for k in range(len(schedule)):
-        single = _space_kolmogorov.prepare(model, schedule.part(slice(k, k + 1)), model.theta())
-        one, first = _space.step(whole, k, one, values[k])
-        other, second = _space.step(single, 0, other, values[k])
+        single = space_kolmogorov.prepare(model, schedule.part(slice(k, k + 1)), model.theta())
+        one, first = space_filter.step(whole, k, one, values[k])
+        other, second = space_filter.step(single, 0, other, values[k])
         assert first.log_likelihood_increment == second.log_likelihood_increment
         assert np.array_equal(one.values, other.values) and np.array_equal(first.mean, second.mean)
 
@@ -305,7 +307,7 @@ def test_a_free_angle_with_a_rate_that_is_not_observed_has_its_wrapped_gaussian(
         law = multivariate_normal(exact.mean[k], exact.cov[k])
         points = np.stack([np.full(40, exact.mean[k, 0] + 0.3), angles], axis=1)
         expected = sum(law.pdf(points + [0.0, 2 * np.pi * turn]) for turn in range(-30, 31))
-        got = np.exp(_space.density(prepared, state).log_density(points))
+        got = np.exp(space_filter.density(prepared, state).log_density(points))
         assert np.abs(got - expected).max() < 1e-8 * expected.max()
         assert abs(info.mean[0] - exact.mean[k, 0]) < 1e-9 and abs(info.cov[0, 0] / exact.cov[k, 0, 0] - 1) < 1e-9
         resultant = np.exp(1j * exact.mean[k, 1])

@@ -3,7 +3,7 @@
 import numpy as np
 import sympy
 
-from zakai.methods._space_functions import PointFunction
+from zakai.methods.space.functions import PointFunction
 from zakai.models import Model
 
 FORMULAS = [

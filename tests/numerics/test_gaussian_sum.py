@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from zakai.numerics.gaussian_sum import components, moments, shares
-from zakai.numerics.sum_quadrature import refit, refit_affine
-from zakai.numerics.sum_reduction import FIVE, THREE, exchange, gathered, groups, split
+from zakai.numerics.sums.mixture import components, moments, shares
+from zakai.numerics.sums.quadrature import refit, refit_affine
+from zakai.numerics.sums.reduction import FIVE, THREE, exchange, gathered, groups, split
 
 LINE = np.linspace(-12, 12, 6001)
 SPACE = LINE[1] - LINE[0]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from zakai.numerics.space_diffusion import diffused
-from zakai.numerics.space_grid import Grid
+from zakai.numerics.space.diffusion import diffused
+from zakai.numerics.space.grid import Grid
 
 
 def test_noise_of_correlated_states_spreads_a_gaussian():

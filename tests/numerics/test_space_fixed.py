@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from zakai.numerics.space_field import Field
-from zakai.numerics.space_fixed import motion, refitted
-from zakai.numerics.space_grid import Grid
-from zakai.numerics.space_transport import Dynamics
-from zakai.numerics.space_window import Bounds
+from zakai.numerics.space.field import Field
+from zakai.numerics.space.fixed import motion, refitted
+from zakai.numerics.space.grid import Grid
+from zakai.numerics.space.transport import Dynamics
+from zakai.numerics.space.window import Bounds
 
 
 def two_peaks(points):

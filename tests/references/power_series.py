@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import sympy
 
-from zakai.methods._jets import Expansion
-from zakai.methods._power_series import power_series, schroedinger, taylor_data
-from zakai.methods._series_kernel import transition_of
+from zakai.methods.series.jets import Expansion
+from zakai.methods.series.kernel import transition_of
+from zakai.methods.series.power import power_series, schroedinger, taylor_data
 
 KEYS = ("G", "L", "l", "Q", "p", "r")
 

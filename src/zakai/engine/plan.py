@@ -22,7 +22,7 @@ from zakai.methods._moments import prior_moments
 from zakai.methods._protocol import Method
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior, GaussianPrior
-from zakai.numerics.gaussian_sum import wrapped
+from zakai.numerics.sums.mixture import wrapped
 from zakai.records import Record
 
 

@@ -12,11 +12,11 @@ from typing import Any
 
 from zakai.densities import GridDensity
 from zakai.methods import yau_yau
-from zakai.methods._line_system import State as LineState
 from zakai.methods._protocol import Backward, through
-from zakai.numerics import line_window as lw
-from zakai.numerics.space_field import Field
-from zakai.numerics.space_grid import Grid
+from zakai.methods.line.system import State as LineState
+from zakai.numerics.line import window as lw
+from zakai.numerics.space.field import Field
+from zakai.numerics.space.grid import Grid
 
 FIGURES = ("error_estimate", "tolerance_ratio")
 OF_MESSAGE = {"tolerance_ratio": yau_yau.BOUNDS["tolerance_ratio"]}

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from zakai.algebra.theorems import smooth_system as theorem
-from zakai.methods._extended_backward import density as smoothed_density
-from zakai.methods._extended_backward import message, smoothed
-from zakai.methods._extended_backward import step as step_back
-from zakai.methods._extended_filter import Prepared, State, density, init, prepare, step, valid
 from zakai.methods._protocol import Backward, Method
+from zakai.methods.extended.backward import density as smoothed_density
+from zakai.methods.extended.backward import message, smoothed
+from zakai.methods.extended.backward import step as step_back
+from zakai.methods.extended.filter import Prepared, State, density, init, prepare, step, valid
 from zakai.models.features import CROSS_NOISE, INPUTS, KINKS, SINC, STATE_DEPENDENT_DIFFUSION, TABLES
 
 METHOD: Method[Prepared, State] = Method(

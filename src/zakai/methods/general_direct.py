@@ -16,16 +16,16 @@ import numpy as np
 from zakai.algebra.theorems import general_direct as theorem
 from zakai.densities import GaussianMixture
 from zakai.errors import InputError
-from zakai.methods import _sum_start as start
 from zakai.methods._options import one_of, real_number, whole_number
 from zakai.methods._protocol import Info, Method
-from zakai.methods._sum_backward import BACKWARD
-from zakai.methods._sum_intervals import Prepared, advance, prepared_of
-from zakai.methods._sum_static import Sum, sum_of
-from zakai.methods._sum_update import SPLIT_FACTOR
+from zakai.methods.sums import start
+from zakai.methods.sums.backward import BACKWARD
+from zakai.methods.sums.intervals import Prepared, advance, prepared_of
+from zakai.methods.sums.static import Sum, sum_of
+from zakai.methods.sums.update import SPLIT_FACTOR
 from zakai.models import features
 from zakai.models.model import Model
-from zakai.numerics.gaussian_sum import Array, Components, selected, shares, wrapped
+from zakai.numerics.sums.mixture import Array, Components, selected, shares, wrapped
 from zakai.records.schedule import Schedule
 
 TOLERANCE = 1e-3

@@ -7,7 +7,7 @@ With S, H and P as in Theorems 4 to 6, u~ = e^{S - F} sigma, taken along (b, a, 
 
 and the survey of Chen and Dong, Theorem 1, is Theorem 5 with G = I.  `form="stepwise"` starts again at every observation and is
 stable over any time; Theorems 4 and 5 then are one method, for e^F cancels.  `form="one-shot"` is the papers' own: see
-`_one_shot`.
+`gaussian/one_shot.py`.
 """
 
 from __future__ import annotations
@@ -23,17 +23,16 @@ from zakai.algebra.exact_theorems import hu_yau as condition
 from zakai.algebra.gauges import affine_system
 from zakai.algebra.identities import all_zero
 from zakai.errors import InputError
-from zakai.methods import _gaussian_families as families
-from zakai.methods import _one_shot as one_shot
-from zakai.methods._affine_system import AffineSystem
-from zakai.methods._gaussian_backward import BACKWARD
 from zakai.methods._options import one_of, real_number
 from zakai.methods._protocol import Info, Method, through
+from zakai.methods.gaussian import families, one_shot
+from zakai.methods.gaussian.affine_system import AffineSystem
+from zakai.methods.gaussian.backward import BACKWARD
 from zakai.models.features import INPUTS
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.flow import Coefficients
-from zakai.numerics.gaussian_exponents import Exponents
+from zakai.numerics.gaussian.exponents import Exponents
 from zakai.numerics.transition import Array, symmetric, transposed
 from zakai.records.schedule import Schedule
 

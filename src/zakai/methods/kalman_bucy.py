@@ -12,9 +12,9 @@ one, and a density becomes a family of them (Makowski 1986).
 from __future__ import annotations
 
 from zakai.algebra.exact_theorems import kalman_bucy as theorem
-from zakai.methods import _gaussian_families as families
-from zakai.methods._gaussian_backward import BACKWARD
 from zakai.methods._protocol import Method
+from zakai.methods.gaussian import families
+from zakai.methods.gaussian.backward import BACKWARD
 from zakai.models.features import CROSS_NOISE, INPUTS, JUMPS, KINKS, SINC
 
 METHOD: Method[families.Prepared, families.State] = Method(

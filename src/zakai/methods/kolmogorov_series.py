@@ -2,7 +2,7 @@
 
     p_t = G p'' / 2 - (f p)',        p(t + d) = K(r) K(c)^m p(t),      d = r + m c
 
-with K the logarithmic form of the series up to t^N (`zakai.methods._heat_series`), positive everywhere, on a uniform grid.  The
+with K the logarithmic form of the series up to t^N (`zakai.methods.series.heat`), positive everywhere, on a uniform grid.  The
 powers K(c)^(2^i) are made once for a grid, so that every interval costs the remainder and a few products, whatever its length.
 An observation multiplies the density by its likelihood, a part before the transition and a part after, in the logarithm.
 
@@ -23,8 +23,11 @@ from zakai.densities import GridDensity
 from zakai.errors import InputError
 from zakai.methods import yau_yau
 from zakai.methods._borrowed_backward import OF_MESSAGE, borrowed
-from zakai.methods._heat_series import FORMS
-from zakai.methods._kolmogorov_transition import (
+from zakai.methods._options import one_of, whole_number
+from zakai.methods._protocol import Info, Method
+from zakai.methods._residuals import Factor
+from zakai.methods.series.heat import FORMS
+from zakai.methods.series.transition import (
     FEW,
     MOST_POINTS,
     MOST_REFINED,
@@ -39,10 +42,7 @@ from zakai.methods._kolmogorov_transition import (
     transition,
     without_law,
 )
-from zakai.methods._options import one_of, whole_number
-from zakai.methods._protocol import Info, Method
-from zakai.methods._residuals import Factor
-from zakai.methods._space_system import prior_on_grid
+from zakai.methods.space.system import prior_on_grid
 from zakai.models import features
 from zakai.models.kept import kept
 from zakai.models.model import Model

@@ -13,13 +13,14 @@ import numpy as np
 
 from zakai.algebra.theorems import limited_direct
 from zakai.errors import InputError
-from zakai.methods import _line, _line_tangents
-from zakai.methods._line_backward import BACKWARD as LINE
-from zakai.methods._line_model import in_pieces
-from zakai.methods._line_system import State
-from zakai.methods._line_yau import power_series_of, yau_line_of
 from zakai.methods._options import one_of
 from zakai.methods._protocol import Method
+from zakai.methods.line import filter as line_filter
+from zakai.methods.line import tangents as line_tangents
+from zakai.methods.line.backward import BACKWARD as LINE
+from zakai.methods.line.model import in_pieces
+from zakai.methods.line.system import State
+from zakai.methods.line.yau import power_series_of, yau_line_of
 from zakai.methods.yau_yau import BOUNDS, in_space, on_line
 from zakai.models import features
 from zakai.models.model import Model
@@ -64,11 +65,11 @@ def prepare(
     if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1 or not series):
         raise InputError(f'option order: {order!r} must be a whole number from 1, and needs kernel="power-series"')
     if model.n > 1:
-        from zakai.methods import _space_direct
+        from zakai.methods.space import direct as space_direct
 
         options: dict[str, Any] = {"splitting": splitting, "tolerance": tolerance, "kernel": kernel, "order": order}
-        return _space_direct.prepare(model, schedule, theta, **options)
-    prepared = _line.prepare(model, schedule, theta, 1e-9 if tolerance is None else tolerance, in_pieces(model))
+        return space_direct.prepare(model, schedule, theta, **options)
+    prepared = line_filter.prepare(model, schedule, theta, 1e-9 if tolerance is None else tolerance, in_pieces(model))
     prepared.promised = 1e-7 if tolerance is None else prepared.tolerance
     yau, lie = yau_line_of(model), splitting == "lie"
     prior = model.prior
@@ -94,16 +95,16 @@ METHOD: Method[Any, Any] = Method(
     theorem=limited_direct,
     options={"kernel": "flow", "splitting": "strang", "order": None, "tolerance": None},
     prepare=prepare,
-    init=_line.init,
-    step=_line.step,
-    density=_line.density,
+    init=line_filter.init,
+    step=line_filter.step,
+    density=line_filter.density,
     state=State,
     bounds=BOUNDS,
     shorter="raise the option tolerance (command: --option tolerance=...)",
     variant=variant,
-    valid=_line.valid,
+    valid=line_filter.valid,
     handles=features.OF_OBSERVATION | {features.INPUTS, features.JUMPS, features.KINKS, features.SINC, features.TABLES},
-    segment=_line.segment,
-    tangents=_line_tangents.tangents,
+    segment=line_filter.segment,
+    tangents=line_tangents.tangents,
     backward=LINE,
 )

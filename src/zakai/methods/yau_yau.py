@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 
 from zakai.algebra.theorems import any_smooth_system
-from zakai.methods import _line, _line_tangents, _reflecting
-from zakai.methods._line_backward import BACKWARD as LINE
-from zakai.methods._line_model import in_pieces
-from zakai.methods._line_system import Prepared, State
 from zakai.methods._protocol import Method
-from zakai.methods._reflecting_backward import BACKWARD as REFLECTING
+from zakai.methods.line import filter as line_filter
+from zakai.methods.line import tangents as line_tangents
+from zakai.methods.line.backward import BACKWARD as LINE
+from zakai.methods.line.model import in_pieces
+from zakai.methods.line.system import Prepared, State
+from zakai.methods.reflecting import filter as reflecting_filter
+from zakai.methods.reflecting.backward import BACKWARD as REFLECTING
 from zakai.models import features
 from zakai.models.model import Model
 from zakai.records.schedule import Schedule
@@ -57,16 +59,16 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: f
     Raises:
         InputError: the tolerance is out of range.
     """
-    return _line.prepare(model, schedule, theta, 1e-5 if tolerance is None else tolerance, in_pieces(model))
+    return line_filter.prepare(model, schedule, theta, 1e-5 if tolerance is None else tolerance, in_pieces(model))
 
 
 def variant(model: Model, options: Mapping[str, Any]) -> Method[Any, Any]:
     """Return the method for the model's number of states and its domain."""
     if model.n == 1:
         return on_line(METHOD, model)
-    from zakai.methods import _space_kolmogorov
+    from zakai.methods.space import kolmogorov as space_kolmogorov
 
-    return in_space(METHOD, _space_kolmogorov.prepare)
+    return in_space(METHOD, space_kolmogorov.prepare)
 
 
 def on_line(method: Method[Any, Any], model: Model) -> Method[Any, Any]:
@@ -74,19 +76,19 @@ def on_line(method: Method[Any, Any], model: Model) -> Method[Any, Any]:
     if not in_pieces(model):
         return method
     return replace(
-        method, init=_reflecting.init, step=_reflecting.step, density=_reflecting.density, state=_reflecting.State,
-        valid=_reflecting.valid, segment=None, tangents=None, backward=REFLECTING,
+        method, init=reflecting_filter.init, step=reflecting_filter.step, density=reflecting_filter.density,
+        state=reflecting_filter.State, valid=reflecting_filter.valid, segment=None, tangents=None, backward=REFLECTING,
     )  # fmt: skip
 
 
 def in_space(method: Method[Any, Any], prepare: Callable[..., Any]) -> Method[Any, Any]:
     """Return a method with the functions for several states."""
-    from zakai.methods import _space
-    from zakai.methods._space_backward import BACKWARD as SPACE
+    from zakai.methods.space import filter as space_filter
+    from zakai.methods.space.backward import BACKWARD as SPACE
 
     return replace(
-        method, prepare=prepare, init=_space.init, step=_space.step, density=_space.density, state=_space.State,
-        valid=_space.valid, segment=None, tangents=None, backward=SPACE,
+        method, prepare=prepare, init=space_filter.init, step=space_filter.step, density=space_filter.density,
+        state=space_filter.State, valid=space_filter.valid, segment=None, tangents=None, backward=SPACE,
     )  # fmt: skip
 
 
@@ -98,16 +100,16 @@ METHOD: Method[Any, Any] = Method(
     theorem=any_smooth_system,
     options={"tolerance": None},
     prepare=prepare,
-    init=_line.init,
-    step=_line.step,
-    density=_line.density,
+    init=line_filter.init,
+    step=line_filter.step,
+    density=line_filter.density,
     state=State,
     bounds=BOUNDS,
     shorter="raise the option tolerance (command: --option tolerance=...)",
     variant=variant,
-    valid=_line.valid,
+    valid=line_filter.valid,
     handles=HANDLES,
-    segment=_line.segment,
-    tangents=_line_tangents.tangents,
+    segment=line_filter.segment,
+    tangents=line_tangents.tangents,
     backward=LINE,
 )

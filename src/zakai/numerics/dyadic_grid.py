@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.numerics import line_window as lw
+from zakai.numerics.line import window as lw
 
 SUPPORT = 36.0  # nats below the maximum at which a density is negligible
 Array = NDArray[Any]

@@ -18,8 +18,8 @@ from scipy.integrate import solve_ivp
 
 from zakai.algebra.analysis import analyze
 from zakai.engine.driver import filter as filter_record
-from zakai.methods._heat_series import HeatSeries, heat_series
 from zakai.methods._options import whole_number
+from zakai.methods.series.heat import HeatSeries, heat_series
 from zakai.models.files import load_model
 from zakai.models.model import Model
 from zakai.models.simulate import simulate

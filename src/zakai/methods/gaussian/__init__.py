@@ -1,0 +1,1 @@
+"""Gaussians and families of them: what `kalman-bucy`, `benes`, `hu-yau` and `general-direct` share."""

@@ -1,0 +1,247 @@
+"""Many intervals backward in time in one compiled loop (`numerics/line/backward.py`), for `line/backward.py`.
+
+The message is moved on the grids of the filter.  An interval that the loop does not take is taken by `line/way.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.methods._protocol import Infos
+from zakai.methods.line.figures import state_moments
+from zakai.methods.line.gauge import Gauge, gauge_of
+from zakai.methods.line.grids import grid_of
+from zakai.methods.line.loop import TOGETHER
+from zakai.methods.line.message import LOWEST, PAD, SURE, Message, support, taper
+from zakai.methods.line.system import Prepared, State
+from zakai.methods.line.tables import covariance_at
+from zakai.methods.line.update import factor_at_end
+from zakai.methods.line.way import negligible, smoothing_tolerance
+from zakai.numerics.line import backward as lb
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.adjoint import EXCURSION, by_adjoints
+from zakai.numerics.line.segment import SPLIT, SPLIT_FACTOR
+
+Array = Any
+
+STRIDES = (1, 2, 4)  # points of psi in a spacing of the filter's grid
+MOST = 64  # intervals that are taken together
+APART = 32  # the ends of a grid for a decomposition are multiples of so many spacings
+SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
+
+
+class Taken(NamedTuple):
+    """The message before the last `number` intervals, and what is reported at the times between them."""
+
+    message: Message
+    number: int
+    infos: Infos
+
+
+def back(
+    prepared: Prepared, rows: slice, states: Sequence[State], later: Message, product: Array, grid: lw.Window, observed: Array
+) -> Taken | None:
+    """Take a message back over the last of some intervals, None where the loop takes none of them.
+
+    Args:
+        prepared: the system.
+        rows: the intervals.
+        states: those of the filter before and after them.
+        later: the message after the last interval.
+        product, grid: the smoothed density at the same time, and its grid.
+        observed: the observations (K, m).
+    """
+    k, first = rows.stop - 1, rows.start
+    split = prepared.gaussian
+    if prepared.kinked or not _served(prepared, k):
+        return None
+    shared = _shared(states[k - first], states[k - first + 1].window, later, product, grid)
+    if split and shared and not shared[-1].closed:
+        shared.append(lw.refined(shared[-1], 2.0))  # for a kernel that is narrow in spacings
+    for window in shared:
+        begin, most = k, TOGETHER if prepared.mixed else MOST
+        own = states[k - first].window
+        if not _holds(window, *own.offsets[[0, -1]]) or (split and window.spacing < own.spacing):
+            most = 1
+        while begin > first and k - begin < most - 1 and _served(prepared, begin - 1):
+            earlier = states[begin - 1 - first].window
+            shifted = split and own.spacing == window.spacing and own.origin == window.origin
+            if earlier != own and not (shifted and earlier.spacing == own.spacing and earlier.size == own.size == window.size):
+                break
+            begin -= 1
+        here = slice(begin, k + 1)
+        before = states[begin - first : k + 1 - first]
+        for stride in (0,) if split else STRIDES:
+            taken = _taken(prepared, here, before, later, product, grid, window, stride, observed[begin - first : k + 1 - first])
+            if taken is not None:
+                return taken
+    return None
+
+
+def _served(prepared: Prepared, k: int) -> bool:
+    """Return whether the loop may take an interval."""
+    if prepared.gaussian:
+        return bool(prepared.kinds[k] in (SPLIT, SPLIT_FACTOR))
+    return prepared.system.samples and not prepared.system.moving and bool(prepared.lengths[k] > 0)
+
+
+def _taken(
+    prepared: Prepared, here: slice, before: Sequence[State], later: Message, product: Array, grid: lw.Window, window: lw.Window,
+    stride: int, observed: Array,
+) -> Taken | None:  # fmt: skip
+    """Return the message before intervals, moved on one grid, None where none is taken."""
+    limits = lb.Limits(smoothing_tolerance(prepared), SHARE * prepared.tolerance, negligible(prepared), prepared.cut)
+    now, start, longer, gauge = lw.resampled(product, grid, window), 0, window, np.zeros(1)
+    filtered, centres = _before(before, window)
+    if not stride:
+        table = grid_of(prepared, window, here)
+        if table is None:
+            return None
+        start = table.start
+        filtered, ends = filtered._replace(starts=filtered.starts + start), np.append(centres[1:], window.centre)
+        logs = log_likelihoods(prepared, here, observed, window.origin + ends[:, None] + window.spacing * lw.index(window.size))
+        message, steps = _on(later, window, start, now), prepared.steps.part(here)
+        taken = by_adjoints(message, filtered, table, logs, steps, np.ascontiguousarray(observed, float), window.closed, limits)
+    else:
+        lengths = np.ascontiguousarray(prepared.lengths[here])
+        longer = _longer(prepared, window, stride, float(np.max(lengths)))
+        gauged = _gauged(prepared, window, stride, longer)
+        if gauged is None:
+            return None
+        logs, gauge = log_likelihoods(prepared, here, observed, longer.points[None]), gauged.gauge
+        taken = lb.by_modes(_psi(later, longer, gauge, now), filtered, gauged, logs, lengths, window.closed, limits)
+    if not taken.number:
+        return None
+    reports, found = taken.reports, taken.message
+    first, last = found.first, found.last
+    logs = (np.log(np.maximum(found.values, 1e-300)) - gauge)[first : last + 1] + found.scale + reports[0, lb.LOG_MASS]
+    middle = found.start - start + first + len(logs) // 2 - longer.size // 2
+    origin, centre, spacing, _, closed, unit = longer
+    kept = Message(logs, origin, centre + spacing * middle, spacing, unit, closed, spacing, found.error)
+    errors = np.array([float(state.error) for state in before[len(before) - taken.number + 1 :]])
+    centres = centres[len(centres) - taken.number + 1 :]
+    return Taken(kept, taken.number, _infos(prepared, window, centres, errors, taken.products[1:], reports[1:]))
+
+
+def _before(states: Sequence[State], window: lw.Window) -> tuple[lb.Filtered, Array]:
+    """Return the filter's densities on grids of one spacing and size, and the centres of these."""
+    own, values = states[0].window, np.array([state.values for state in states])
+    floors = SURE * np.exp(np.minimum([float(state.log_floor) for state in states], LOWEST))
+    centres = np.array([state.centre for state in states])
+    if (own.spacing, own.size) != (window.spacing, window.size) or (len(states) == 1 and own != window):
+        values, centres = np.array([lw.resampled(one, own, window) for one in values]), np.full(len(states), window.centre)
+    return lb.Filtered(values, np.round((centres - window.centre) / window.spacing).astype(int), floors), centres
+
+
+def log_likelihoods(prepared: Prepared, here: slice, observed: Array, points: Array) -> Array:
+    """Return the log-likelihoods of what is observed at the ends of intervals at points (K, N), or (1, N), zero for none."""
+    system, logs = prepared.system, np.zeros((len(observed), points.shape[1]), prepared.theta.dtype)
+    at_end = prepared.schedule.seen[here] & ~prepared.inside[here]
+    if system.general or (at_end.any() and system.separated is None):
+        for i in np.flatnonzero(at_end.any(axis=1)):
+            logs[i] = factor_at_end(prepared, here.start + i, at_end[i], observed[i], None).logs(points[i % len(points)])
+    elif at_end.any():
+        c, stops = prepared.coefficients, prepared.schedule.stops[here, None]
+        rest = observed[:, None] - system.observation(points[..., None], stops, prepared.theta)
+        rest = np.where(np.abs(rest) < 1e150, rest, 1e150)
+        logs = c.constants[here, None] - 0.5 * np.einsum("kni,kij,knj->kn", rest, c.precisions[here, 0], rest)
+    return np.where(logs.real > -1e8, logs, -1e8)
+
+
+def _shared(state: State, after: lw.Window, later: Message, product: Array, grid: lw.Window) -> list[lw.Window]:
+    """Return the grids that may serve for all of an interval: those before and after it, and finer ones."""
+    own = state.window
+    first, last = support(np.asarray(state.values).real, lb.SMALLEST)
+    low, high = min(own.offsets[first], later.ends[0]), max(own.offsets[last], later.ends[1])
+    found = []
+    for window in sorted({own, after}, key=lambda window: window.spacing, reverse=True):
+        if _holds(window, low, high):
+            on_it = lw.resampled(product, grid, window)
+            whole = abs(float(np.sum(on_it)) - 1.0) <= lb.UNRESOLVED  # or it stands between the points
+            found += [window] if whole and lw.figures(on_it, window.closed).aliasing <= lb.UNRESOLVED else []
+    return found
+
+
+def _holds(window: lw.Window, low: float, high: float) -> bool:
+    """Return whether a grid holds what is between two offsets."""
+    first, last = window.offsets[[0, -1]] + 0.01 * window.spacing * np.array([-1.0, 1.0])
+    return bool(window.closed or first <= low <= high <= last)
+
+
+def _on(later: Message, window: lw.Window, start: int, product: Array) -> lb.Message:
+    """Return a message on a grid."""
+    offsets, size = window.offsets, window.size
+    first, last = 0, size - 1
+    if not window.closed:
+        first = int(np.searchsorted(offsets, later.ends[0] - 1e-6 * window.spacing))
+        last = int(np.searchsorted(offsets, later.ends[1] + 1e-6 * window.spacing)) - 1
+    logs = np.full(size, -np.inf)
+    logs[first : last + 1] = later.at(offsets[first : last + 1])
+    scale = float(np.max(logs))
+    return lb.Message(np.exp(logs - scale), scale, first, last, start, later.error, product)
+
+
+def _psi(later: Message, window: lw.Window, gauge: Array, product: Array) -> lb.Message:
+    """Return psi = F e^s b of a message on a grid."""
+    logs = later.at(window.offsets) + gauge
+    scale = float(np.max(logs))
+    values = np.exp(logs - scale)
+    if not window.closed:
+        values = values * taper(window.offsets, later.ends, window.spacing)
+    return lb.Message(values, scale, 0, window.size - 1, 0, later.error, product)
+
+
+def _longer(prepared: Prepared, window: lw.Window, stride: int, length: float) -> lw.Window:
+    """Return the grid, with so many points in a spacing, that holds the paths around another one and the fall of F beyond."""
+    if window.closed:
+        return window._replace(size=window.size * stride, spacing=window.spacing / stride)
+    spacing = window.spacing / stride
+    covariance = covariance_at(prepared.system, window.points, prepared.model.start, prepared.theta.real)
+    reach = EXCURSION * float(np.sqrt(np.max(covariance) * length)) / spacing
+    reach = PAD + 2.0 ** (1.0 + 2.0 * np.ceil(0.5 * np.log2(np.clip(reach, 8.0, lw.SIZES[-1]) / 2.0)))
+    begin = stride * _first(window)
+    low = int(APART * np.floor((begin - reach) / APART))
+    size = int(APART * np.ceil((begin + stride * window.size + reach) / APART)) - low
+    return window._replace(centre=spacing * (low + size // 2), size=size, spacing=spacing)
+
+
+def _first(window: lw.Window) -> int:
+    """Return the number of the first point of a grid, which is zero at the origin."""
+    return round(window.centre / window.spacing) - window.size // 2
+
+
+def _gauged(prepared: Prepared, window: lw.Window, stride: int, longer: lw.Window) -> lb.Gauged | None:
+    """Return the decomposition for psi on the longer grid, None where there is none."""
+
+    def make() -> tuple[lb.Gauged | None]:
+        found: Gauge = gauge_of(prepared, longer, prepared.model.start)
+        if found.modes is None or not np.isfinite(found.values).all():
+            return (None,)
+        return (lb.Gauged(np.ascontiguousarray(found.modes.modes.T), found.modes.rates, found.values, 0, 1),)
+
+    found: tuple[lb.Gauged | None] = prepared.once(("gauged", longer), make)
+    place = 0 if window.closed else stride * _first(window) - _first(longer)
+    return None if found[0] is None else found[0]._replace(place=place, stride=stride)
+
+
+def _infos(prepared: Prepared, window: lw.Window, centres: Array, own: Array, products: Array, reports: Array) -> Infos:
+    """Return what is reported of smoothed densities, from the errors of the filter and those of the message."""
+    mean = window.origin + centres + window.spacing * reports[:, lb.MEAN_AT]
+    variance = window.spacing**2 * reports[:, lb.VARIANCE]
+    if prepared.model.domain:
+        grids = [window._replace(centre=centre) for centre in centres]
+        pairs = [state_moments(prepared, *pair, 0.0, 0.0) for pair in zip(products, grids, strict=True)]
+        mean, variance = (np.array([pair[i] for pair in pairs]) for i in range(2))
+    errors = reports[:, lb.ERROR]
+    health = {
+        "error_estimate": errors + own,
+        "tolerance_ratio": errors / smoothing_tolerance(prepared),
+        "edge_mass": reports[:, lb.EDGE],
+        "negative_mass": np.zeros(len(own)),
+        "aliasing": reports[:, lb.ALIASING],
+        "std_in_spacings": np.sqrt(reports[:, lb.VARIANCE]),
+    }
+    return Infos(reports[:, lb.LOG_MASS], mean[:, None], variance[:, None, None], health)

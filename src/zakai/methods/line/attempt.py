@@ -1,0 +1,137 @@
+"""One substep of the density of one state on one grid: by modes, by an exponential of the operator, or by Magnus' series."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.methods.line.coarse import EDGE
+from zakai.methods.line.coefficients import coefficients, offset_of, potential_of, precision_of
+from zakai.methods.line.system import Prepared
+from zakai.methods.line.tables import spectral, tables
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.operator import Exponential, exponential_action
+from zakai.numerics.line.panels import GAUSS_NODES, GAUSS_WEIGHTS
+
+Array = Any
+
+MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
+
+
+class Attempt(NamedTuple):
+    """The density after a substep, times exp(-offset); its error; whether a shorter substep is needed.
+
+    `decomposed` tells whether the decomposition of the operator gave it.
+    """
+
+    values: Array
+    offset: Any
+    error: float
+    split: bool
+    decomposed: bool = False
+
+
+def attempted(
+    prepared: Prepared,
+    values: Array,
+    window: lw.Window,
+    start: float,
+    first: float,
+    last: float,
+    inside: np.ndarray,
+    rates: np.ndarray,
+    adjoint: bool = False,
+) -> Attempt:
+    """Return the density after the part from start + first to start + last of an interval.
+
+    The `adjoint` of the transition takes a message from the end of that part to its start.
+    """
+    system, length = prepared.system, last - first
+    if not system.varying:
+        known = tables(prepared, window)
+        if not inside.any():
+            modes = None if adjoint else by_modes(prepared, values, window, length)
+            if modes is not None:
+                return Attempt(modes[0], 0.0, modes[1], False, True)
+            key = ("exponential", window, length, adjoint)
+            generator = length * window.generator(known.covariance, known.drift)
+            transition = prepared.once(key, lambda: Exponential(generator.T if adjoint else generator))
+            found, error = transition(values)
+            return Attempt(found, 0.0, error, False)
+        potential, constant = potential_of(known.observation, precision_of(prepared, start, inside), rates, values)
+        potential, constant = length * potential, length * constant
+        offset, split = offset_of(potential, values)
+        if split:
+            return Attempt(values, 0.0, 0.0, True)
+        matrix = window.generator(length * known.covariance, length * known.drift, potential - offset)
+        found, error = exponential_action(matrix.T if adjoint else matrix, values)
+        return Attempt(found, offset + constant, error, False)
+    return _magnus(prepared, values, window, start, first, last, inside, rates, adjoint)
+
+
+def parts_of_split(prepared: Prepared, first: float, last: float, error: float) -> list[tuple[float, float]]:
+    """Return the parts of a substep whose error by Magnus' series, which falls as the fifth power of the length, is too large."""
+    count = int(np.clip(np.ceil(1.1 * (error / (MAGNUS * prepared.tolerance)) ** 0.2), 2, 16))
+    cuts = first + (last - first) * np.arange(1, count) / count
+    return list(zip([first, *cuts], [*cuts, last], strict=True))
+
+
+def _magnus(
+    prepared: Prepared,
+    values: Array,
+    window: lw.Window,
+    start: float,
+    first: float,
+    last: float,
+    inside: np.ndarray,
+    rates: np.ndarray,
+    adjoint: bool,
+) -> Attempt:
+    """Advance a substep by two exponentials: the commutator-free Magnus integrator of order four.
+
+        exp(B0 / 2 + 2 B1 / tau) exp(B0 / 2 - 2 B1 / tau),   B0 = int L dt,   B1 = int (t - middle) L dt.
+    """
+    length = last - first
+    times = start + first + length * GAUSS_NODES
+    drift, covariance, potential, constant = coefficients(prepared, window, times, inside, rates, values)
+    zeroth, moment = length * GAUSS_WEIGHTS, 2.0 * length * GAUSS_WEIGHTS * (GAUSS_NODES - 0.5)
+    early, late = 0.5 * zeroth - moment, 0.5 * zeroth + moment
+    offset, split = offset_of(zeroth @ potential, values)
+    if split or np.any((early @ covariance).real < 0) or np.any((late @ covariance).real < 0):
+        return Attempt(values, 0.0, 0.0, True)
+    if prepared.system.steady:
+        matrix = window.generator(zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset)
+        found, error = exponential_action(matrix.T if adjoint else matrix, values)
+        return Attempt(found, offset + zeroth @ constant, error, False)
+    shift = np.full(window.size, offset / 2)
+    first_half, second_half = (
+        window.generator(w @ covariance, w @ drift, w @ potential - shift) for w in (early, late)
+    )
+    if adjoint:
+        first_half, second_half = second_half.T, first_half.T
+    total, difference = (first_half + second_half).real, (second_half - first_half).real
+    now = values.real
+    # The part of third order that two exponentials contain; what they omit is of fifth order, with a factor that was measured.
+    commutator = 0.25 * (total @ (difference @ now) - difference @ (total @ now))
+    error = 5.0 * float(np.sum(np.abs(commutator))) ** (5.0 / 3.0)
+    if error > MAGNUS * prepared.tolerance:
+        return Attempt(values, 0.0, error, True)
+    middle, one = exponential_action(first_half, values)
+    found, two = exponential_action(second_half, middle)
+    return Attempt(found, offset + zeroth @ constant, error + one + two, False)
+
+
+def by_modes(prepared: Prepared, values: Array, window: lw.Window, length: float) -> tuple[Array, float] | None:
+    """Return the density after a time and its error by the decomposition on a grid, None where it does not serve."""
+    decomposed = spectral(prepared, window)
+    if decomposed is None:
+        return None
+    found, error = decomposed(values, length)
+    # Tails that were cut off are jumps in the gauge of the decomposition, which show at the highest frequencies, as does a
+    # density that reaches the ends of the grid: that one needs another grid, not another transition.
+    allowed = 1e-5 * prepared.tolerance
+    look = lw.figures(found, window.closed, prepared.negligible)
+    aliased = look.aliasing > max(allowed, 30.0 * prepared.negligible)
+    ended = max(look.left, look.right) > max(EDGE, 4.0 * look.aliasing)
+    return (found, error) if error < max(1e-11, allowed) and (ended or not aliased) else None

@@ -1,0 +1,179 @@
+"""The backward pass for one state: what the observations after t say of the state at t, as a function on a grid.
+
+Backward in time a message b obeys the adjoint of the filter's equation,
+
+    -b_t = G b'' / 2 + f b' + V b.
+
+Only the product of b with the filter's density matters: a message is kept where this product is not negligible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.densities import Density
+from zakai.methods._protocol import Backward, Info, Infos
+from zakai.methods._states import Joined
+from zakai.methods.line import filter as line_filter
+from zakai.methods.line.adjoint import back
+from zakai.methods.line.figures import state_moments
+from zakai.methods.line.loop import joined
+from zakai.methods.line.message import Message, points_of, reliable, support
+from zakai.methods.line.parts import cut
+from zakai.methods.line.paths import draw
+from zakai.methods.line.system import Parts, Prepared, State
+from zakai.methods.line.update import exponential_factor, factor_at_end
+from zakai.methods.line.way import negligible, pulled, smoothing_tolerance
+from zakai.numerics.line import window as lw
+
+Array = Any
+
+KINKED = 16.0  # points of a likelihood with kinks in the spacing that a message needs
+SMALLEST = 1e-13  # value of a smoothed density relative to its maximum that is not rounding
+
+
+def message(prepared: Prepared, state: State) -> Message:
+    """Return the message one at the last time."""
+    origin, centre, spacing, size, closed, unit = state.window
+    return Message(np.zeros(size), origin, centre, spacing, unit, closed, spacing, 0.0)
+
+
+class _Product(NamedTuple):
+    """The product of a state and a message on the finer of their grids, of sum one, and the logarithm of the sum before."""
+
+    values: Array
+    window: lw.Window
+    log_mass: float
+
+
+def _product(state: State, later: Message) -> _Product:
+    finer = state.window
+    if later.spacing < 0.9999 * finer.spacing:
+        low, high = float(finer.offsets[0]), float(finer.offsets[-1])
+        if not finer.closed and later.spacing < 0.25 * finer.spacing:  # a message that is far narrower than the density
+            low, high = max(low, later.ends[0]), min(high, later.ends[1])
+        finer = points_of(finer, low, high, later.spacing)
+    density = reliable(state, finer)
+    logs = np.where(density > 0, np.log(density) + later.at(finer.offsets), -np.inf)
+    top = float(np.max(logs))
+    values = np.exp(logs - top)
+    first, last = support(values, SMALLEST)
+    values[:first], values[last + 1 :] = 0.0, 0.0
+    total = float(np.sum(values))
+    return _Product(values / total, finer, float(np.log(total)) + top)
+
+
+@np.errstate(all="ignore")
+def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message, Info]:
+    """Return the message, normalised and without what is negligible in its product with the state, and the product's report."""
+    return _smoothed(prepared, state, later, _product(state, later))
+
+
+def segment(
+    prepared: Prepared, rows: slice, states: Sequence[State], later: Message, observed: np.ndarray
+) -> tuple[Message, Infos]:
+    """Return the message at the start of the intervals of a slice, and the reports after each."""
+    if prepared.parts is None:
+        return _of_whole(prepared, rows, states, later, observed)
+    return _of_parts(prepared.parts, rows, states[0], later, observed)
+
+
+def _of_parts(parts: Parts, rows: slice, state: State, later: Message, observed: np.ndarray) -> tuple[Message, Infos]:
+    # What a report says of the step after it belongs to that interval's gain.
+    inner, values, last = cut(parts, rows, observed)
+    between, _ = line_filter.segment_of_whole(parts.prepared, inner, state, values)
+    found, infos = _of_whole(parts.prepared, inner, Joined([[state], between]), later, values)
+    gained = infos.log_likelihood_increment
+    health = {name: np.fmax.reduceat(figures, last) for name, figures in infos.health.items()}
+    reports = Infos(np.add.reduceat(gained, last), infos.mean[last], infos.cov[last], health)
+    return found._replace(logs=found.logs + np.sum(gained[: last[0]])), reports
+
+
+@np.errstate(all="ignore")
+def _of_whole(
+    prepared: Prepared, rows: slice, states: Sequence[State], later: Message, observed: np.ndarray
+) -> tuple[Message, Infos]:
+    """Return the same of intervals that are not cut into parts."""
+    parts: list[Infos] = []
+    stop = rows.stop
+    while stop > rows.start:
+        place = stop - rows.start
+        found = _product(states[place], later)
+        later, info = _smoothed(prepared, states[place], later, found)
+        parts.append(line_filter.alone(info))
+        taken = back(prepared, slice(rows.start, stop), states, later, found.values, found.window, observed)
+        if taken is None:
+            stop -= 1
+            later = step(prepared, stop, later, observed[place - 1], states[place - 1])
+        else:
+            later, stop = taken.message, stop - taken.number
+            parts.append(taken.infos)
+    return later, joined(parts[::-1])
+
+
+def _smoothed(prepared: Prepared, state: State, later: Message, found: _Product) -> tuple[Message, Info]:
+    window = found.window
+    look = lw.figures(found.values, window.closed, prepared.negligible)
+    mean, variance = lw.moments(found.values, window)
+    spacings = float(np.sqrt(max(variance, 0.0))) / window.spacing
+    mean, variance = state_moments(prepared, found.values, window, mean, variance)
+    if window.closed:
+        mean = mean - 2 * np.pi * np.ceil((mean - np.pi) / (2 * np.pi))
+    health = {
+        "error_estimate": float(state.error) + later.error,
+        "tolerance_ratio": later.error / smoothing_tolerance(prepared),
+        "edge_mass": max(look.left, look.right),
+        "negative_mass": look.negative,
+        "aliasing": look.aliasing,
+        "std_in_spacings": spacings,
+    }
+    first, last = support(found.values, negligible(prepared))
+    needed = min(later.needed, window.spacing * max(look.resolving, 1.0), float(state.spacing))
+    low, high = float(window.offsets[first]), float(window.offsets[last])
+    finer = later.spacing > 2.0 * needed  # few points hold more than the product
+    kept = later.on(points_of(later.window, low, high, needed)) if finer else later.between(low, high)
+    kept = kept._replace(logs=kept.logs - found.log_mass, needed=needed)
+    return kept, Info(found.log_mass, np.array([mean]), np.array([[variance]]), health)
+
+
+@np.errstate(all="ignore")
+def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state: State) -> Message:
+    """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
+    length = float(prepared.lengths[k])
+    finer = KINKED if prepared.weak and prepared.schedule.seen[k].any() else 1.0
+    later = later.on(points_of(later.window, *later.ends, later.needed / finer))
+    before = later.variance
+    inside = prepared.inside[k]
+    if prepared.lie and not inside.all():
+        inside = np.zeros_like(inside)
+    at_end = prepared.schedule.seen[k] & ~inside
+    if at_end.any() or (prepared.lie and inside.any()):
+        exact, window = bool(at_end.any()), later.window
+        likelihood = factor_at_end(prepared, k, at_end, observed, window) if exact else exponential_factor(prepared, k, observed)
+        later = later._replace(logs=later.logs + likelihood.logs(window.points).real)
+    if length == 0:
+        return later
+    between = later.variance
+    rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
+    later, made = pulled(prepared, k, inside, rates, state, later)
+    kept = float(np.clip(between / np.sqrt(max(before * later.variance, 1e-300)), 0.3, 1.0))
+    return later._replace(error=made + kept * later.error)
+
+
+@np.errstate(all="ignore")
+def density(prepared: Prepared, state: State, later: Message) -> Density:
+    """Return the smoothed density."""
+    found = _product(state, later)
+    origin, centre, spacing, _, closed, unit = found.window
+    return line_filter.density(prepared, State(found.values, origin, centre, spacing, unit, closed, state.error, state.log_floor))
+
+
+def accuracy(prepared: Prepared) -> float:
+    """Return the error of the evidence that a step of the filter may leave."""
+    return max(1e-6, prepared.promised)
+
+
+BACKWARD: Backward[Prepared, State, Message] = Backward(message, step, smoothed, density, segment, draw, accuracy)

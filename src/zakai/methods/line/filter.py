@@ -1,0 +1,296 @@
+"""One state on a grid: what `yau-yau` and `limited-direct` share.
+
+Inside an interval the density obeys the DMZ equation with y linear between observations,
+
+    u_t = G u'' / 2 - (f u)' + (h'S^-1 dy/dt - h'S^-1 h / 2) u,
+
+for the coordinates whose increment belongs to just this interval; samples, and increments gathered over more than the interval,
+are factors at its end.  The equation is solved on a grid that follows the density (`numerics/line/window.py`): spectrally
+accurate in x, and in time by the exponential of the operator, which is exact where no coefficient depends on t, and by
+Magnus' series of fourth order in adaptive substeps elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.densities import Density, GridDensity, MappedDensity
+from zakai.errors import InputError
+from zakai.methods._protocol import Info, Infos
+from zakai.methods._states import Joined
+from zakai.methods.line import loop
+from zakai.methods.line.cross import OMITTED
+from zakai.methods.line.domain import on_the_line, variable_of
+from zakai.methods.line.ends import check_ends
+from zakai.methods.line.figures import (
+    edge_of_moments,
+    figures,
+    forgetting,
+    outside_tables,
+    refitted,
+    resampled,
+    spread,
+    state_moments,
+)
+from zakai.methods.line.grids import SHARED
+from zakai.methods.line.model import system_of
+from zakai.methods.line.moves import Passage, Report, by_decomposition, by_kernel, by_substeps
+from zakai.methods.line.parts import parts_of_step, segment_of_parts
+from zakai.methods.line.prior import init as init
+from zakai.methods.line.prior import state_of
+from zakai.methods.line.system import NOISE, Parts, Prepared, State
+from zakai.methods.line.update import exponential_factor, factor_at_end, sampled_weakly
+from zakai.methods.line.volumes import contracted
+from zakai.models.model import Model
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.channel import Channel, around, chosen
+from zakai.numerics.line.density import separated
+from zakai.numerics.line.posterior import General, Likelihood, multiplied
+from zakai.numerics.line.segment import RELIABLE
+from zakai.records.schedule import Schedule
+
+Array = Any
+
+SLOW = 1e-2  # of the tolerance: the spectrum that need not be resolved where f has kinks
+SLOW_GENEROUS = 256  # points of a grid that is kept though fewer would do
+GENEROUS = 96  # points of a grid that is kept though fewer would do
+PILED = 0.5  # density at an end of the grid, relative to the maximum, of a product that is cut off there
+
+
+def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: float, pieces: bool = False) -> Prepared:
+    """Return what `step` needs for the intervals of a schedule; `pieces` is whether that is the one of `reflecting/filter.py`.
+
+    Raises:
+        InputError: the tolerance is not a number from 1e-12 to .1.
+    """
+    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 1e-12 <= tolerance <= 0.1:
+        raise InputError(f"option tolerance: {tolerance!r} must be a number from 1e-12 to 0.1")
+    check_ends(model, theta, None if schedule.inputs is None else schedule.inputs.values)
+    system = system_of(on_the_line(model)).given(schedule.inputs)
+    # A sample may lead deep into the tails, where a small error counts; increments do not.
+    negligible = 1e-13 if system.samples else float(np.clip(1e-6 * tolerance, 1e-13, 1e-10))
+    if system.kinked_drift and not pieces:  # the spectrum of a density falls slowly
+        negligible = max(negligible, SLOW * float(tolerance))
+    generous = SHARED if system.samples and not system.moving else GENEROUS
+    lengths, inside = schedule.lengths, schedule.inside
+    found = Prepared(model, schedule, theta, system, float(tolerance), lengths, inside, negligible, generous, float(tolerance))
+    found.pieces = pieces
+    if found.kinked:  # a grid is finer, and another one takes long to prepare
+        found.generous = SLOW_GENEROUS
+    found.notes = (OMITTED,) if system.cross is not None and (schedule.seen & ~inside).any() else ()
+    return found
+
+
+def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
+    """Return the state after interval k and the observation at its stop, and the report."""
+    if prepared.parts is not None:
+        return _of_parts(prepared.parts, k, state, observed)
+    if prepared.fast[k]:
+        found = loop.one(prepared, k, state, observed)
+        if found is not None:
+            return found
+    # Attempts that overflow are taken again in shorter substeps.
+    with np.errstate(all="ignore"):
+        stepped = single(prepared, k, state, observed)
+    return stepped.state, stepped.info
+
+
+def _of_parts(parts: Parts, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
+    states, infos = segment_of_parts(parts, slice(k, k + 1), state, observed[None], segment_of_whole)
+    health = {name: float(values[0]) for name, values in infos.health.items()}
+    return states[0], Info(infos.log_likelihood_increment[0], infos.mean[0], infos.cov[0], health)
+
+
+def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos]:
+    """Return the states after the intervals of a slice, and their reports."""
+    if prepared.parts is not None:
+        return segment_of_parts(prepared.parts, rows, state, observed, segment_of_whole)
+    return segment_of_whole(prepared, rows, state, observed)
+
+
+class Stepped(NamedTuple):
+    """The state after an interval that the compiled loop does not take, its report, and how the density came about.
+
+    That is how its transition moved it, where that is known, and the density after the observation on its own grid.
+    """
+
+    state: State
+    info: Info
+    passages: tuple[Passage, ...]
+    values: Array
+    window: lw.Window
+
+
+Taken = list[loop.Piece] | Stepped
+
+
+def segment_of_whole(
+    prepared: Prepared,
+    rows: slice,
+    state: State,
+    observed: np.ndarray,
+    noted: Callable[[int, State, Taken], None] | None = None,
+) -> tuple[Sequence[State], Infos]:
+    """Return the same of intervals that are not cut into parts.
+
+    `noted` receives the steps as they are taken: the first interval, the state before it, and the pieces of the compiled loop or
+    the single step.
+    """
+    states: Joined[State] = Joined()
+    parts: list[Infos] = []
+    k = rows.start
+    while k < rows.stop:
+        last, before = k, state
+        while last < rows.stop and prepared.fast[last]:
+            last += 1
+        pieces = loop.taken(prepared, slice(k, last), state, observed[k - rows.start : last - rows.start]) if last > k else []
+        if pieces:
+            found: Taken = pieces
+            states.append(Joined([piece.states for piece in pieces]))
+            parts.append(loop.infos_of(prepared, pieces))
+        else:
+            with np.errstate(all="ignore"):
+                found = single(prepared, k, state, observed[k - rows.start])
+            states.append([found.state])
+            parts.append(alone(found.info))
+        if noted is not None:
+            noted(k, before, found)
+        k, state = rows.start + len(states), states[-1]
+    return states, loop.joined(parts)
+
+
+def alone(info: Info) -> Infos:
+    health = {name: np.array([value]) for name, value in info.health.items()}
+    return Infos(np.array([info.log_likelihood_increment]), info.mean[None], info.cov[None], health)
+
+
+def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Stepped:
+    schedule, length = prepared.schedule, float(prepared.lengths[k])
+    values, window, report, look = np.asarray(state.values), state.window, Report(), None
+    inside = prepared.inside[k]
+    if prepared.lie and not inside.all():
+        inside = np.zeros_like(inside)
+    parts = parts_of_step(prepared, k, values, window)
+    if parts is not None:
+        state, info = _of_parts(parts, 0, state, observed)
+        return Stepped(state, info, (), np.asarray(state.values), state.window)
+    passages: tuple[Passage, ...] = ()
+    before, gained, contraction = lw.moments(values, window), 0.0, 1.0
+    if length > 0:
+        rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
+        start = float(schedule.starts[k])
+        kernel = kernel_of(prepared, k, window, rates, report)
+        contraction = 1.0 if kernel is None else float(kernel.scale.real)
+        found = None if kernel is None else by_kernel(prepared, values, window, start, length, kernel, report)
+        if found is None:
+            if prepared.gaussian:  # the grids of kernels are finer
+                look = lw.figures(values, window.closed, prepared.negligible)
+                values, window = refitted(prepared, values, window, look, prepared.generous)
+            report.positive = False
+            interval = start, length, inside, rates, report
+            if not prepared.system.varying and not inside.any():
+                found = by_decomposition(prepared, values, window, length, report)
+            if found is None:
+                found = contracted(prepared, values, window, *interval) or by_substeps(prepared, values, window, *interval)
+        values, window, gained, look, passages = found
+    predicted, log_floor = lw.moments(values, window), float(state.log_floor)
+    if report.positive:
+        # A positive kernel fills the tails again.
+        wider = predicted[1].real / max(contraction**2 * before[1].real, 1e-300)
+        log_floor = max(log_floor * float(np.clip(wider, 1.0, 20.0)), float(np.log(prepared.cut)))
+        floor = float(np.exp(log_floor)) + report.edge
+    else:
+        log_floor = float(np.log(NOISE))
+        floor = NOISE + report.aliasing + report.edge + report.noise
+    at_end = schedule.seen[k] & ~inside
+    if at_end.any() or (prepared.lie and inside.any()):
+        if at_end.any():
+            likelihood: Likelihood = factor_at_end(prepared, k, at_end, observed, window)
+        else:
+            likelihood = exponential_factor(prepared, k, observed)
+        if isinstance(likelihood, General):
+            report.lawless = float(np.sum(values.real[np.isnan(likelihood.log_density(window.points).real)]))
+        if prepared.weak and not np.iscomplexobj(values):
+            result, look = sampled_weakly(prepared, k, values, window, observed)
+        else:
+            result = multiplied(values, window, likelihood, max(1e-10, 1e-3 * prepared.tolerance))
+            ends = lw.figures(result.values, result.window.closed)
+            if max(ends.left, ends.right) > PILED and result.depth > prepared.deepest(floor):
+                # No state within reach explains the observation: it counts in the evidence alone.
+                result = result._replace(values=values, window=window, depth=np.inf)
+            look = figures(prepared, result.values, result.window)
+        values, window, gained = result.values, result.window, gained + result.log_mass
+        report.depth, report.growth = result.depth, result.growth
+        report.density(look)
+    elif look is None or prepared.kinked:
+        look = figures(prepared, values, window)
+    # A large grid is kept only where its decomposition serves the next intervals too.
+    generous = prepared.generous if report.decomposed else min(prepared.generous, GENEROUS)
+    new = lw.fitted(look, window, prepared.largest, generous)
+    moved = resampled(prepared, values, window, new)
+    if new != window and not prepared.weak:  # the largest grid may be too coarse for all that the density has
+        moved = moved / np.sum(moved)
+        coarse = lw.figures(moved, new.closed, prepared.negligible, prepared.cut).aliasing
+        report.aliasing = max(report.aliasing, coarse)
+    mean, variance = lw.moments(values, window)
+    report.edge = max(report.edge, edge_of_moments(prepared, values, window))
+    made = 2.0 * report.aliasing + 10.0 * report.edge + report.time + 10.0 * report.negative
+    made += min(floor * report.growth, 1.0)
+    kept = forgetting(before[1], predicted[1], variance, spread(prepared, k, length, window.origin + mean.real))
+    error = made + state.error * (1.0 if separated(np.ascontiguousarray(values.real)) else kept)
+    error = max(error, RELIABLE * prepared.promised)
+    spacings = float(np.sqrt(max(variance.real, 0.0))) / window.spacing
+    health = {
+        "error_estimate": error,
+        "tolerance_ratio": made / prepared.promised,
+        "edge_mass": report.edge,
+        "negative_mass": report.negative,
+        "aliasing": report.aliasing,
+        "time_error": report.time,
+        "tail_depth": report.depth / prepared.deepest(floor),
+        "std_in_spacings": spacings,
+    }
+    if prepared.system.general:
+        health["without_law"] = report.lawless
+    if prepared.system.tabulated:
+        health["outside_tables"] = outside_tables(prepared, values, window, float(schedule.stops[k]))
+    mean, variance = state_moments(prepared, values, window, mean, variance)
+    if window.closed:
+        mean = mean - 2 * np.pi * np.ceil((mean.real - np.pi) / (2 * np.pi))
+    log_floor = min(log_floor + max(report.depth - 1.0, 0.0), 0.0)
+    info = Info(gained, np.array([mean]), np.array([[variance]]), health)
+    return Stepped(state_of(moved, new, float(error), log_floor), info, passages, values, window)
+
+
+def kernel_of(prepared: Prepared, k: int, window: lw.Window, rates: np.ndarray, report: Report) -> Channel | None:
+    """Return the Gaussian kernel of interval k, for x relative to the origin of the window, if there is one."""
+    kernels = prepared.kernels
+    if kernels is None or kernels.place[k] < 0:
+        return None
+    place = int(kernels.place[k])
+    report.time += float(kernels.errors[place])
+    return around(chosen(kernels.channels, place, np.concatenate([np.ones(1), rates])), window.origin - kernels.origin)
+
+
+def valid(prepared: Prepared, state: State) -> bool:
+    """Return whether the parts of a state fit together."""
+    values = np.asarray(state.values)
+    numbers = np.array([state.origin, state.centre, state.spacing, state.unit, state.error, state.log_floor], float)
+    if values.ndim != 1 or not 8 <= len(values) <= lw.SIZES[-1] or not np.isfinite(numbers).all():
+        return False
+    if bool(state.closed) != bool(prepared.model.periodic) or not (state.spacing > 0 and state.unit > 0):
+        return False
+    return bool(np.isfinite(values).all() and values.real.sum() > 0)
+
+
+def density(prepared: Prepared, state: State) -> Density:
+    """Return the density of a state."""
+    with np.errstate(divide="ignore"):
+        logs = np.log(np.maximum(np.asarray(state.values).real, 0.0))
+    window = state.window
+    names, variable = prepared.model.state, variable_of(prepared.model)
+    found = GridDensity(logs, np.array([window.origin + window.centre]), np.array([[window.spacing]]), names, (window.closed,))
+    return found if variable is None else MappedDensity(found, variable)

@@ -1,0 +1,239 @@
+"""Many steps in one compiled loop (`numerics/line/loop.py`), for `line/filter.py`.
+
+A step that the loop does not take (an error above the tolerance, a gap in a path) is taken by `_line.step`, which asks this loop
+for its one interval first: whether steps are taken one by one or together makes no difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.methods._protocol import Info, Infos
+from zakai.methods._states import Joined, StackedStates
+from zakai.methods.line import modal
+from zakai.methods.line.figures import edge_of_moments, figures, outside_tables, resampled, state_moments
+from zakai.methods.line.grids import grid_of
+from zakai.methods.line.system import FINEST, Prepared, State
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.filters import BAND
+from zakai.numerics.line.loop import advance
+from zakai.numerics.line.modal import BROAD, NARROW, OWN, PLACE, STAY
+from zakai.numerics.line.segment import AFTER, COLUMNS, FAILED, OK, RANGE, UNRESOLVED, Segment
+
+Array = Any
+
+LARGER = 0.2  # margin of a new grid, relative to the range of the density
+TOGETHER = 32  # intervals whose tables of coefficients in time are computed together
+ATTEMPTS = 8  # grids on which a step is tried
+HEALTH = {
+    "edge_mass": "edge",
+    "negative_mass": "negative",
+    "aliasing": "aliasing",
+    "time_error": "time",
+    "tail_depth": "depth",
+    "error_estimate": "error",
+}
+
+
+class Piece(NamedTuple):
+    """Steps that begin with interval `first`, from the state `before` on.
+
+    The densities (K, N) have grids with these centres and spacings (K,); `last` is the state after them, on the grid of the next
+    step.  Where every step has placed a grid of its own, `coarse` are the grids of the transitions (`line/modal.py`).
+    """
+
+    first: int
+    before: State
+    densities: Array
+    centres: Array
+    spacings: Array
+    reports: Array
+    last: State
+    coarse: Array | None = None
+
+    @property
+    def number(self) -> int:
+        """The number of steps."""
+        return len(self.reports)
+
+    @property
+    def states(self) -> Sequence[State]:
+        """The states after the steps."""
+        errors, floors = self.reports[:, ERROR], self.reports[:, FLOOR]
+        fields = {
+            "values": self.densities, "centre": self.centres, "spacing": self.spacings, "error": errors, "log_floor": floors
+        }  # fmt: skip
+        return Joined([StackedStates[State](self.before, fields)[:-1], [self.last]])
+
+    @classmethod
+    def of(cls, first: int, before: State, densities: Array, centres: Array, spacings: Array, reports: Array) -> Piece:
+        """Return steps after which the grid stays."""
+        error, log_floor = reports[-1, [ERROR, FLOOR]].tolist()
+        centre, spacing = float(centres[-1]), float(spacings[-1])
+        last = before._replace(values=densities[-1], centre=centre, spacing=spacing, error=error, log_floor=log_floor)
+        return cls(first, before, densities, centres, spacings, reports, last)
+
+
+START, ERROR, FLOOR = (COLUMNS.index(name) for name in ("start", "error", "log_floor"))
+DIVIDED = [COLUMNS.index(name) for name in ("pairs", "substeps", "needed")]  # what a splitting was
+
+
+def infos_of(prepared: Prepared, pieces: Sequence[Piece]) -> Infos:
+    """Return the reports of the steps of pieces."""
+    return joined([_infos(prepared, piece) for piece in pieces])
+
+
+def one(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info] | None:
+    """Return the state after interval k, and its report; None where the loop does not take it."""
+    pieces = taken(prepared, slice(k, k + 1), state, observed[None])
+    return (pieces[0].last, _info(prepared, pieces[0])) if pieces else None
+
+
+def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> list[Piece]:
+    """Return the first steps of `rows`, as many as the loop takes."""
+    pieces: list[Piece] = []
+    attempts, first, way, observed = 0, rows.start, STAY, np.ascontiguousarray(observed, float)
+    while first < rows.stop and attempts < ATTEMPTS:
+        attempts += 1
+        now = observed[first - rows.start :]
+        if prepared.gaussian:
+            piece, why, answer = _on_one_table(prepared, slice(first, rows.stop), state, now)
+        else:
+            found = modal.advanced(prepared, first, rows.stop, state, now, way)
+            why, answer = found.why, found.answer
+            piece = Piece.of(first, state, *found[:4])._replace(coarse=found.coarse) if len(found.reports) else None
+        if piece is not None:
+            last = regridded(prepared, piece.last) if why == AFTER or prepared.cut_up else piece.last
+            pieces.append(piece._replace(last=last))
+            attempts, state, first = 1, last, first + len(piece.reports)
+        if why == FAILED or (why == OK and piece is None):
+            break
+        if why == RANGE:
+            larger = _covering(prepared, state, *answer.tolist())
+            if larger is None:
+                break
+            state = larger
+        if way == STAY and why in (NARROW, UNRESOLVED):
+            if prepared.kinked:
+                break
+            way = PLACE if why == NARROW else OWN
+        elif why == BROAD or way == OWN:
+            way = STAY
+    return pieces
+
+
+def _on_one_table(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Piece | None, int, Array]:
+    """Return the first steps of `rows` by kernels or splitting, why they end, and the grid that is needed."""
+    together = 1 if prepared.cut_up else TOGETHER if prepared.mixed else len(observed)
+    here = slice(rows.start, min(rows.stop, rows.start + together))
+    grid = grid_of(prepared, state.window, here)
+    if grid is None:
+        return None, FAILED, np.zeros(3)
+    segment = advance(
+        prepared.mechanisms, np.ascontiguousarray(state.values), grid, prepared.steps, rows.start, observed[:together],
+        float(state.error), float(state.log_floor), prepared.limits,
+    )  # fmt: skip
+    return (_piece(rows.start, state, grid.start, segment) if len(segment.reports) else None), segment.why, segment.answer
+
+
+def _piece(first: int, before: State, start: int, segment: Segment) -> Piece:
+    """Return the steps of a grid that begins at a point of its table: centres are multiples of the spacing."""
+    spacing = before.spacing
+    centres = spacing * (round(before.centre / spacing) + (segment.reports[:, START] - start))
+    return Piece.of(first, before, segment.densities, centres, np.full(len(centres), spacing), segment.reports)
+
+
+def joined(parts: list[Infos]) -> Infos:
+    """Return the reports of consecutive steps as one."""
+    health = {name: np.concatenate([part.health[name] for part in parts]) for name in parts[0].health}
+    increments, means, covs = (np.concatenate([part[i] for part in parts]) for i in range(3))
+    return Infos(increments, means, covs, health)
+
+
+def _covering(prepared: Prepared, state: State, low: float, high: float, spacing: float) -> State | None:
+    """Return a state on a grid for a range relative to the centre of its grid, None if that needs too many points."""
+    window = state.window
+    if window.closed:
+        size = lw.size_for(2 * np.pi / spacing)
+        new = window._replace(size=size, spacing=2 * np.pi / size)
+    else:
+        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, LARGER, _most(prepared))
+        if new.spacing * new.size < high - low:
+            return None
+    return None if new == window else moved_to(prepared, state, new)
+
+
+def _most(prepared: Prepared) -> int:
+    """Return the points of the largest grid of the loop."""
+    return FINEST if prepared.gaussian else lw.LARGEST
+
+
+def moved_to(prepared: Prepared, state: State, new: lw.Window) -> State:
+    """Return a state on another grid."""
+    window = state.window
+    moved, floor = resampled(prepared, np.asarray(state.values), window, new), float(state.log_floor)
+    return state._replace(values=moved / np.sum(moved), centre=new.centre, spacing=new.spacing, log_floor=floor)
+
+
+def regridded(prepared: Prepared, state: State) -> State:
+    """Return a state on a grid that fits it, with a margin for the next steps."""
+    window, values = state.window, state.values
+    look = figures(prepared, values, window)
+    if prepared.gaussian:
+        look = look._replace(resolving=look.resolving * BAND / 0.92)
+    new = lw.fitted(look, window, _most(prepared), prepared.generous, LARGER)
+    return state if new == window else moved_to(prepared, state, new)
+
+
+def _infos(prepared: Prepared, piece: Piece) -> Infos:
+    """Return the reports of some steps."""
+    states, stops = piece.states, prepared.schedule.stops[piece.first :].tolist()
+
+    def each(function: Callable[[State, float], Any]) -> np.ndarray:
+        return np.array([function(*pair) for pair in zip(states, stops)])
+
+    columns = dict(zip(COLUMNS, piece.reports.T)) | {"centre": piece.centres, "spacing": piece.spacings}
+    mean, variance, health = _report(prepared, piece, columns, each)
+    return Infos(columns["gained"], mean[:, None], variance[:, None, None], health)
+
+
+def _info(prepared: Prepared, piece: Piece) -> Info:
+    """Return the report of a single step."""
+
+    def each(function: Callable[[State, float], Any]) -> np.ndarray:
+        return np.asarray(function(piece.states[0], float(prepared.schedule.stops[piece.first])))
+
+    columns = dict(zip(COLUMNS, piece.reports[0].tolist()))
+    columns |= {"centre": float(piece.centres[0]), "spacing": float(piece.spacings[0])}
+    mean, variance, health = _report(prepared, piece, columns, each)
+    return Info(columns["gained"], np.array([mean]), np.array([[variance]]), health)
+
+
+def _report(
+    prepared: Prepared, piece: Piece, columns: Mapping[str, Any], each: Callable[[Callable[[State, float], Any]], np.ndarray]
+) -> tuple[Any, Any, dict[str, Any]]:
+    """Return the mean, the variance and the health figures of steps, as arrays (K,), or as the numbers of a single one.
+
+    `each` applies a function to the state after every step and the time.
+    """
+    spacing = columns["spacing"]
+    mean = piece.before.origin + (columns["centre"] + spacing * columns["mean"])
+    variance = spacing**2 * columns["variance"]
+    health = {name: columns[source] for name, source in HEALTH.items()}
+    health["tolerance_ratio"] = columns["made"] / prepared.promised
+    health["std_in_spacings"] = np.sqrt(columns["variance"])
+    if prepared.model.domain:
+        mean, variance = each(lambda one, t: state_moments(prepared, one.values, one.window, 0.0, 0.0)).T
+        edges = each(lambda one, t: edge_of_moments(prepared, one.values, one.window))
+        for name, edge in (
+            ("edge_mass", edges), ("tolerance_ratio", 10.0 * edges / prepared.promised), ("error_estimate", 10.0 * edges)
+        ):  # fmt: skip
+            health[name] = np.maximum(health[name], edge)
+    if prepared.system.general:
+        health["without_law"] = 0.0 * columns["made"]
+    if prepared.system.tabulated:
+        health["outside_tables"] = each(lambda one, t: outside_tables(prepared, one.values, one.window, t))
+    return mean, variance, health

@@ -1,0 +1,134 @@
+"""What the observations after t say of the state at t, for one state: the logarithm of a function on a grid."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.methods.line.system import State
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.polynomial import local_polynomial
+
+Array = Any
+
+FALL = 3.3  # spacings over which F falls
+HALF = 14.0  # spacings from where F is one to where it is one half
+PAD = 28  # spacings over which F falls to zero
+FEWEST = 12  # points of a message
+FEW = 16  # larger grids have a multiple of so many points: few different sizes
+SURE = 10.0  # errors of a density from which its small values count
+LOWEST = -30.0  # logarithm of the largest error of small values, relative to the largest value
+
+
+class Message(NamedTuple):
+    """The logarithm of the function b at the points of a grid (N,), constant beyond them.
+
+    The grid covers where b matters.  `needed` is the spacing that its product with the density needs; `error` is the estimate of
+    its relative error.
+    """
+
+    logs: np.ndarray
+    origin: float
+    centre: float
+    spacing: float
+    unit: float
+    closed: bool
+    needed: float
+    error: float
+
+    @classmethod
+    def of(cls, logs: Array, window: lw.Window, needed: float, error: float) -> Message:
+        """Return the message with logarithms at the points of a grid."""
+        origin, centre, spacing, _, closed, unit = window
+        return cls(logs, origin, centre, spacing, unit, closed, needed, error)
+
+    @property
+    def window(self) -> lw.Window:
+        """The grid."""
+        return lw.Window(self.origin, self.centre, self.spacing, len(self.logs), self.closed, self.unit)
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The first and the last point, as offsets from the origin."""
+        half = len(self.logs) // 2
+        return self.centre - half * self.spacing, self.centre + (len(self.logs) - 1 - half) * self.spacing
+
+    def at(self, offsets: Array) -> Array:
+        """Return log b at offsets from the origin (J,)."""
+        return local_polynomial(self.logs, self.window, offsets)
+
+    def falling(self, offsets: Array) -> Array:
+        """Return log b at offsets from the origin (J,), beyond the grid with the slope at its ends where b falls outward."""
+        found = self.at(offsets)
+        (low, high), (left, right) = self.ends, np.maximum(self.logs[[3, -4]] - self.logs[[0, -1]], 0.0) / (3.0 * self.spacing)
+        return found - left * np.maximum(low - offsets, 0.0) - right * np.maximum(offsets - high, 0.0)
+
+    def between(self, low: float, high: float) -> Message:
+        """Return the message on its points between two offsets, and on those that hold them."""
+        if self.closed:
+            return self
+        size, first = len(self.logs), self.ends[0]
+        i = int(np.clip(np.floor((low - first) / self.spacing + 1e-9), 0, size - FEWEST))
+        j = int(np.clip(np.ceil((high - first) / self.spacing - 1e-9), i + FEWEST - 1, size - 1))
+        return self._replace(logs=self.logs[i : j + 1], centre=first + self.spacing * (i + (j - i + 1) // 2))
+
+    def on(self, window: lw.Window) -> Message:
+        """Return the message on another grid."""
+        return Message.of(self.at(window.offsets), window, self.needed, self.error)
+
+    @property
+    def moments(self) -> tuple[float, float]:
+        """The mean of b as a density, relative to the origin, and its variance."""
+        values = np.exp(self.logs - np.max(self.logs))
+        mean, variance = lw.moments(values / np.sum(values), self.window)
+        return float(mean), float(variance)
+
+    @property
+    def variance(self) -> float:
+        """The variance of b as a density."""
+        return self.moments[1]
+
+
+def taper(offsets: Array, ends: tuple[float, float], spacing: float) -> Array:
+    """Return F of a grid that ends `PAD` spacings beyond two offsets."""
+    from scipy.special import erfc
+
+    beyond = np.maximum(ends[0] - offsets, offsets - ends[1]) / spacing
+    return 0.5 * erfc((beyond - HALF) / FALL)
+
+
+def covering(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:
+    """Return the grid of at most this spacing for offsets from `low` to `high` and the fall of F beyond, of any size."""
+    if window.closed:
+        size = lw.size_for(2 * np.pi / spacing * 0.999)
+        return window._replace(size=size, spacing=2 * np.pi / size)
+    spacing = lw.quantized(window, low, high, spacing).spacing
+    # Few different grids: their ends are multiples of an eighth of their size, and decompositions serve many times.
+    apart = spacing * 2.0 ** np.floor(np.log2(max((high - low) / spacing + 2 * PAD, 32.0) / 8.0))
+    first, last = apart * np.floor(low / apart), apart * np.ceil(high / apart)
+    size = int(round((last - first) / spacing)) + 2 * PAD
+    return window._replace(centre=float(0.5 * (first + last)), spacing=spacing, size=size)
+
+
+def points_of(window: lw.Window, low: float, high: float, spacing: float) -> lw.Window:
+    """Return the grid of at most this spacing between two offsets, without the fall of F."""
+    if window.closed:
+        return covering(window, low, high, spacing)
+    spacing = lw.quantized(window, low, high, spacing).spacing
+    first, last = np.floor(low / spacing + 1e-9), np.ceil(high / spacing - 1e-9)
+    size = max(int(last - first) + 1, FEWEST)
+    size = size if size < 4 * FEW else FEW * -(-size // FEW)
+    return window._replace(centre=float((first + size // 2) * spacing), spacing=spacing, size=size)
+
+
+def reliable(state: State, window: lw.Window) -> Array:
+    """Return the density on another grid, zero where its error is as large."""
+    values = np.asarray(state.values).real
+    floor = SURE * float(np.exp(min(state.log_floor, LOWEST))) * float(np.max(values))
+    return lw.resampled(np.where(values > floor, values, 0.0), state.window, window)
+
+
+def support(values: Array, cut: float) -> tuple[int, int]:
+    counts = np.flatnonzero(values > cut * np.max(values))
+    return (int(counts[0]), int(counts[-1])) if len(counts) else (0, len(values) - 1)

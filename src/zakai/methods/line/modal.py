@@ -1,0 +1,181 @@
+"""Steps by the modes of the operator (`numerics/line/modal.py`), for `line/loop.py`."""
+
+from __future__ import annotations
+
+from threading import Lock
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.methods.line.grids import SHARED
+from zakai.methods.line.system import Prepared, State
+from zakai.methods.line.tables import covariance_at, profile_of, spectral
+from zakai.methods.line.update import factor_at_end
+from zakai.numerics.line import modal as lm
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.density import waves
+from zakai.numerics.line.panels import GAUSS_NODES, GAUSS_WEIGHTS
+from zakai.numerics.line.place import PER
+from zakai.numerics.line.posterior import General
+from zakai.numerics.line.segment import COLUMNS, FAILED
+from zakai.numerics.line.weak import at_nodes, nodes, weaken
+
+Array = Any
+
+TOGETHER = 8  # intervals whose likelihoods are computed together
+NEW = 12  # coarse grids and rows that are made for one step
+SIZES = (80, 160, 384, 1024)  # points of fine grids
+NUMBERS = 2**21  # of the grids that are known together
+
+
+class Advanced(NamedTuple):
+    """Steps on grids of their own: densities (K, n), centres and spacings (K,), and reports (K, .).
+
+    The transitions were those of `coarse` grids, with centres, spacings and sizes (K, 3), or of the grid on which all steps have
+    stayed.  `why` is why the loop ended, and `answer` the range of the grid that it needs and its spacing.
+    """
+
+    densities: Array
+    centres: Array
+    spacings: Array
+    reports: Array
+    coarse: Array | None
+    why: int
+    answer: Array
+
+
+class Coarse:
+    """Grids and their modes as the loop reads them.
+
+    Grids are only added, so that other threads may read those that are there.
+    """
+
+    def __init__(self) -> None:
+        """Begin without grids."""
+        self.numbers, self.used, self.index, self.lock = np.empty(NUMBERS), 0, np.empty((0, 4)), Lock()
+
+    def add(self, grid: lw.Window, parts: list[Array]) -> bool:
+        """Add a grid, and return whether it fits beside the others."""
+        with self.lock:
+            stop = self.used + sum(part.size for part in parts)
+            if stop <= len(self.numbers):
+                self.numbers[self.used : stop] = np.concatenate([part.reshape(-1) for part in parts])
+                self.index = np.concatenate([self.index, [[grid.centre, grid.spacing, grid.size, self.used]]])
+                self.used = stop
+            return bool(stop <= len(self.numbers))
+
+
+def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.ndarray, way: int) -> Advanced:
+    """Return the first steps of some intervals.
+
+    Args:
+        prepared: a system with samples whose operator has a decomposition.
+        k, stop: the intervals.
+        state: the state before them.
+        observed: what is observed (K, m).
+        way: whether the steps stay on the grid of the state, see `numerics/line/modal.py`.
+    """
+    system, window, steps, stays = prepared.system, state.window, prepared.steps, way == lm.STAY
+    general, special = system.general or prepared.weak, system.general or not system.steady_observation or prepared.weak
+    key, profile = ("coarse grids", window.origin, window.unit, window.closed), profile_of(prepared, window)
+    coarse, rows, at = prepared.once(key, Coarse), np.empty((0, 0, 0)), 0
+    owner, count = (-2, stop - k) if not special else (-1, min(TOGETHER, stop - k) if stays else 1)
+    for _ in range(NEW):
+        n = window.size if stays else SIZES[at]
+        densities, places, out = np.empty((count, n)), np.empty((count + 1, 3)), np.zeros((count, len(COLUMNS)))
+        done, why = lm.advance(
+            np.ascontiguousarray(state.values), float(state.centre), float(state.spacing), window.unit, window.closed, profile,
+            coarse.numbers, coarse.index, rows, owner, general, way, k, observed[:count], steps.lengths, steps.precisions[:, 0],
+            steps.constants, float(state.error), prepared.limits, *waves(n), densities, places, out,
+        )  # fmt: skip
+        taken = None if stays else coarse.index[places[:done, 2].astype(int), :3]
+        found = Advanced(densities[:done], places[:done, 0], places[:done, 1], out[:done], taken, why, places[-1])
+        if done or why not in (lm.SIZE, lm.GRID):
+            return found
+        if why == lm.SIZE:
+            at, count = at + 1, 1
+            if at < len(SIZES):
+                continue
+        else:
+            centre, spacing, size = places[-1].tolist()
+            grid = window._replace(centre=centre, spacing=spacing, size=int(size))
+            places_of = np.flatnonzero((coarse.index[:, :3] == places[-1]).all(axis=1))
+            if len(places_of):  # what is missing is what is observed
+                here = range(k, k + count)
+                owner, rows = int(places_of[0]), np.stack([_rows(prepared, i, grid, observed[i - k], stays) for i in here])
+                count = int(np.argmax(np.append(np.isnan(rows).any(axis=(1, 2)), True)))
+                if count:
+                    continue
+            # The decomposition of a large grid takes longer than steps on a coarser one.
+            elif not stays or grid.size <= SHARED or grid.closed or prepared.kinked:
+                parts = _parts(prepared, grid)
+                if parts is not None and not coarse.add(grid, parts):  # the others are left to threads that read them
+                    prepared.kept.pop(key, None)
+                    coarse = prepared.once(key, Coarse)
+                    coarse.add(grid, parts)
+                if parts is not None:
+                    continue
+        break
+    return found._replace(why=FAILED)
+
+
+def _parts(prepared: Prepared, grid: lw.Window) -> list[Array] | None:
+    """Return what is known of a coarse grid, None where its operator has no decomposition or a formula no value."""
+    decomposed = spectral(prepared, grid)
+    if decomposed is None:
+        return None
+    system, start, theta, x = prepared.system, prepared.model.start, prepared.theta, _points(grid)
+    parts = 4 if system.rough else 1
+    within = np.linspace(0.0, 1.0, parts, endpoint=False)[:, None] + GAUSS_NODES / parts
+    within = (x[:-1, None] + grid.spacing / PER * within.reshape(-1)).reshape(-1)
+    slopes = system.drift(within[:, None], start, theta)[:, 0] / covariance_at(system, within, start, theta)
+    means = (slopes.reshape(len(x) - 1, parts, -1) @ GAUSS_WEIGHTS).mean(axis=1)
+    scale = np.append(0.0, np.cumsum(grid.spacing / PER * means))
+    if system.state_dependent:
+        scale = scale - 0.5 * np.log(covariance_at(system, x, start, theta))
+    rows = np.zeros((system.m, len(x)))
+    if not system.general and system.steady_observation:
+        rows = system.observation(x[:, None], start, theta).T
+    angle = 2.0 * np.pi / grid.size * np.arange(grid.size)
+    found = [decomposed.rates, np.ascontiguousarray(decomposed.modes.T), np.cos(angle), np.sin(angle), scale, rows]
+    return found if all(np.isfinite(part).all() for part in found) else None
+
+
+def _rows(prepared: Prepared, k: int, grid: lw.Window, observed: np.ndarray, stays: bool) -> Array:
+    """Return h, or the log-likelihood of what is observed, at PER points in a spacing of a grid, for interval k; NaN for none.
+
+    For steps that stay on the grid they are at its points only; of an h with kinks in the weak sense, with their change.
+    """
+    seen, x = prepared.schedule.seen[k], grid.points if stays else _points(grid)
+    if prepared.weak:
+        return _weak_rows(prepared, k, grid, observed)
+    if not prepared.system.general:
+        found = prepared.system.observation(x[:, None], float(prepared.schedule.stops[k]), prepared.theta).T
+    elif seen.any():
+        likelihood = factor_at_end(prepared, k, seen, observed, None)
+        assert isinstance(likelihood, General)
+        found = likelihood.log_density(x)[None]
+    else:
+        found = np.zeros((1, len(x)))
+    return np.array(found, float, order="C")
+
+
+def _weak_rows(prepared: Prepared, k: int, grid: lw.Window, observed: np.ndarray) -> Array:
+    system, start, theta = prepared.system, prepared.model.start, prepared.theta
+
+    def make() -> tuple[Array, Array]:
+        points = nodes(grid.points, grid.spacing)[:, None]
+        fine = at_nodes(system.observation(points, start, theta).T)
+        return fine, np.ascontiguousarray(system.observation(grid.points[grid.size // 2, None][None], start, theta)[0])
+
+    fine, centre = prepared.once(("fine", grid), make)
+    found, precision = np.full((2, grid.size), [[-1e150], [1.0]]), np.ascontiguousarray(prepared.steps.precisions[k, 0])
+    weaken(fine, 0, precision, observed, centre, found[0], found[1])
+    found[0] -= 0.5 * (observed - centre) @ precision @ (observed - centre)
+    return found if prepared.schedule.seen[k].any() else np.zeros_like(found)
+
+
+def _points(grid: lw.Window) -> Array:
+    """Return the points at which rows are known."""
+    first = grid.origin + grid.centre - grid.spacing * (grid.size // 2)
+    return first + grid.spacing / PER * np.arange(PER * (grid.size - 1) + 1.0)

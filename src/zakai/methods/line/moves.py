@@ -1,0 +1,234 @@
+"""The density of one state after an interval: attempts on a grid, in substeps, until one is accurate.
+
+    u_t = (G u)'' / 2 - (f u)' + (h'S^-1 dy/dt - h'S^-1 h / 2) u
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.methods.line.attempt import attempted, by_modes, parts_of_split
+from zakai.methods.line.coarse import EDGE, coarsened
+from zakai.methods.line.coefficients import resolved_parts
+from zakai.methods.line.figures import refitted
+from zakai.methods.line.system import Prepared
+from zakai.methods.line.yau import moved
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.channel import Channel
+from zakai.numerics.line.density import support
+from zakai.numerics.line.filters import WIDE, wrapped
+
+Array = Any
+
+GROSS = 1e-4  # spectrum at the highest frequencies from which a shorter substep is taken at once
+MOST_SUBSTEPS = 4000
+
+
+class Report:
+    """The worst health figures within one step."""
+
+    def __init__(self) -> None:
+        self.aliasing = self.edge = self.time = self.noise = self.depth = self.growth = self.negative = self.lawless = 0.0
+        self.positive = True  # small values are accurate
+        self.decomposed = True  # the operator has a decomposition on the grid that serves every interval
+
+    def density(self, look: lw.Figures) -> None:
+        """Note the figures of a density."""
+        self.aliasing = max(self.aliasing, look.aliasing)
+        self.negative = max(self.negative, look.negative)
+        self.edge = max(self.edge, look.left, look.right)
+
+
+class Passage(NamedTuple):
+    """A transition without coefficients in time: the density and the grid before it, its length and the logarithm of its mass.
+
+    `of_modes` is the grid whose modes were taken, None for the exponential of the operator on the grid.
+    """
+
+    values: Array
+    window: lw.Window
+    length: float
+    log_mass: Any
+    of_modes: lw.Window | None
+
+
+class Moved(NamedTuple):
+    """The density after an interval, its grid, the logarithm of its mass, its figures, and how it was moved, where known."""
+
+    values: Array
+    window: lw.Window
+    gained: Any
+    look: lw.Figures | None
+    passages: tuple[Passage, ...] = ()
+
+
+def by_kernel(
+    prepared: Prepared, values: Array, window: lw.Window, start: float, length: float, kernel: Channel, report: Report
+) -> Moved | None:
+    """Return the density after an interval with a Gaussian kernel; None where it is too narrow for the grid."""
+    negligible, rough = prepared.negligible, max(1e-10, 1e-3 * prepared.tolerance)
+    if window.closed:
+        around = _around(prepared, values, window, kernel)
+        if around is None:
+            return None
+        look, mass = lw.figures(around, True, negligible), np.sum(around)
+        report.density(look)
+        return Moved(around / mass, window, np.log(mass) + kernel.constant, look)
+    if prepared.yau is None:
+        return None
+    ends = start, start + length
+    direct = moved(prepared.yau, kernel, values, window, *ends, prepared.theta, negligible, rough, prepared.cut)
+    if direct is None:
+        return None
+    report.density(direct.look)
+    mass = np.sum(direct.values)
+    return Moved(direct.values / mass, direct.window, np.log(mass) + direct.offset, direct.look)
+
+
+def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, length: float, report: Report) -> Moved | None:
+    """Return the density after an interval without observations inside by modes of its operator, None where they do not serve."""
+    negligible, rough = prepared.negligible, max(1e-10, 1e-3 * prepared.tolerance)
+    carried = coarsened(prepared, values, window, length)
+    if carried is not None:
+        return _normalised(*carried, report, negligible, Passage(values, window, length, 0.0, carried[1]))
+    known, begin = lw.figures(values, window.closed, negligible).aliasing, window
+    while window.size <= lw.LARGEST:
+        found = by_modes(prepared, values, window, length)
+        if found is None or not abs(float(np.sum(found[0].real)) - 1.0) < 1e-3:
+            return None
+        look = lw.figures(found[0], window.closed, negligible)
+        if look.aliasing > 30.0 * negligible and (look.aliasing > rough or not look.rough):
+            return None
+        bound = max(EDGE, 4.0 * look.aliasing)
+        left, right = look.left > bound, look.right > bound
+        if not (left or right):
+            if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
+                report.aliasing = max(report.aliasing, lw.figures(values, window.closed, negligible).aliasing - known)
+            return _normalised(found[0], window, found[1], report, negligible, Passage(values, window, length, 0.0, window))
+        new = lw.enlarged(window, left, right)
+        if new == window:
+            return None
+        values, window = lw.resampled(values, window, new), new
+    return None
+
+
+def by_substeps(
+    prepared: Prepared,
+    values: Array,
+    window: lw.Window,
+    start: float,
+    length: float,
+    inside: np.ndarray,
+    rates: np.ndarray,
+    report: Report,
+) -> Moved:
+    """Return the density after an interval, by exponentials of its operator."""
+    system, negligible, look = prepared.system, prepared.negligible, None
+    gained: Any = 0.0
+    rough, resolved = max(1e-10, 1e-3 * prepared.tolerance), 30.0 * negligible
+    report.positive = False
+    bounds = [(0.0, length)]
+    if system.varying:
+        parts = resolved_parts(prepared, values, window, start, length, inside)
+        bounds, report.time = parts.bounds, report.time + parts.error
+    stack = bounds[::-1]
+    substeps, passages = 0, []
+    while stack:
+        first, last = stack.pop()
+        substeps += 1
+        if not np.isfinite(values.real).all():
+            return Moved(values, window, np.float64(np.nan), look)
+        begin, grown = window, False
+        known = lw.figures(values, window.closed, negligible).aliasing
+        while True:
+            attempt = attempted(prepared, values, window, start, first, last, inside, rates)
+            report.decomposed = attempt.decomposed
+            total = float(np.sum(attempt.values.real))
+            lost = not 1e-100 < total < 1e6 or (not inside.any() and abs(total - 1.0) > 1e-3)
+            split = (attempt.split or lost) and last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
+            if split:
+                break
+            look = lw.figures(attempt.values, window.closed, negligible)
+            coarse = look.aliasing > resolved and (look.aliasing > rough or not look.rough)
+            coarse = coarse and (not prepared.weak or known <= resolved)  # a finer grid has no more of the spectrum of a kink
+            bound = max(EDGE, 4.0 * look.aliasing)
+            left, right = look.left > bound, look.right > bound
+            if not (left or right or coarse):
+                break
+            new = window
+            smooth = lw.figures(values, window.closed, negligible).aliasing < 0.1 * rough
+            if look.aliasing > GROSS and smooth:
+                new = window  # what such an attempt shows of the edges is not the density
+            elif left or right:
+                new, grown = lw.enlarged(new, left, right), True
+            if coarse and window.size < lw.LARGEST and not (look.aliasing > GROSS and smooth):
+                new = lw.refined(new) if grown else _finer(values, window, look)
+            if new.size <= lw.LARGEST and new != window:
+                values = lw.resampled(values, window, new)
+                window = new
+                continue
+            # The grid is as large as it may be: take a shorter substep, unless that does not help.
+            helps = smooth and look.aliasing > rough and (not look.rough or look.aliasing > GROSS)
+            split = (left or right or helps) and last - first > 1e-12 * length
+            split = split and substeps + len(stack) < MOST_SUBSTEPS
+            break
+        if split:
+            if attempt.split and attempt.error > 0:
+                stack += parts_of_split(prepared, first, last, attempt.error)[::-1]
+            else:
+                middle = first + (last - first) * (0.25 if last - first > 1e-3 * length else 0.0625)
+                stack += [(middle, last), (first, middle)]
+            values, window = refitted(prepared, values, window, lw.figures(values, window.closed, negligible))
+            continue
+        assert look is not None
+        if prepared.smoothing and stack:  # what a kink leaves everywhere
+            look = look._replace(aliasing=0.0, left=0.0, right=0.0)
+        report.density(look)
+        if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
+            brought = lw.figures(values, window.closed, negligible).aliasing
+            report.aliasing = max(report.aliasing, brought - known)
+        report.time += attempt.error
+        before, values = values, np.where(attempt.values.real > 0, attempt.values, 0.0)
+        mass = np.sum(values)
+        passages.append(Passage(before, window, last - first, np.log(mass), window if attempt.decomposed else None))
+        values = values / mass
+        gained = gained + np.log(mass) + attempt.offset
+        if stack:
+            values, window = refitted(prepared, values, window, look)
+    if substeps >= MOST_SUBSTEPS:
+        report.time = np.inf
+    return Moved(values, window, gained, look, () if system.varying or inside.any() else tuple(passages))
+
+
+def _finer(values: Array, window: lw.Window, look: lw.Figures) -> lw.Window:
+    """Return a finer grid around a density, of which what is seen after a substep has the figures `look`."""
+    factor = float(np.clip(1.0 / look.resolving, 2**0.5, 4.0))
+    if window.closed:
+        return lw.refined(window, factor)
+    low, high = window.offsets[list(support(np.ascontiguousarray(values.real), lw.CUT))]
+    return lw.quantized(window, low, high, 1.001 * window.spacing / factor, most=lw.SIZES[-1])
+
+
+def _normalised(
+    found: Array, window: lw.Window, error: float, report: Report, negligible: float, passage: Passage
+) -> Moved:
+    look = lw.figures(found, window.closed, negligible)
+    report.density(look)
+    report.time, report.decomposed = report.time + error, True
+    found = np.where(found.real > 0, found, 0.0)
+    mass = np.sum(found)
+    return Moved(found / mass, window, np.log(mass), look, (passage._replace(log_mass=np.log(mass)),))
+
+
+def _around(prepared: Prepared, values: Array, window: lw.Window, kernel: Channel) -> Array | None:
+    """Return a density on the circle convolved with a wrapped Gaussian, None where the kernel is none or too narrow."""
+    if np.iscomplexobj(values) or np.iscomplexobj(kernel.variance) or np.iscomplexobj(kernel.shift):
+        return None
+    variance = kernel.variance / window.spacing**2
+    if kernel.scale != 1.0 or kernel.slope != 0.0 or kernel.curvature != 0.0 or not variance >= WIDE:
+        return None
+    moved = np.array(values, float)
+    wrapped(moved, np.empty_like(moved), kernel.shift / window.spacing, variance, 8.0 - np.log(prepared.cut))
+    return moved

@@ -1,0 +1,248 @@
+"""The derivatives of densities of one state with respect to parameters, for the gradient of the log-likelihood.
+
+The filter's own steps are taken, to the bit.  With each the derivatives of the density are carried for all parameters at once,
+where the transition is by the modes of the operator; elsewhere by the step at parameters with infinitesimal imaginary parts, for
+one parameter after the other (`numerics/complex_step.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from sympy import sympify
+
+from zakai.methods._protocol import Infos, Tangents
+from zakai.methods.line import filter as line_filter
+from zakai.methods.line.adjoint import log_likelihoods
+from zakai.methods.line.grids import grid_of
+from zakai.methods.line.loop import DIVIDED, START, Piece, infos_of
+from zakai.methods.line.parts import segment_of_parts
+from zakai.methods.line.system import Prepared, State
+from zakai.methods.line.tables import spectral, tables
+from zakai.methods.line.update import factor_at_end
+from zakai.numerics.complex_step import STEP
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.segment import SPLIT
+from zakai.numerics.line.split_tangents import Coefficients, Interval, shifted_by, through
+from zakai.numerics.line.tangents import Varied, exponential_derivatives
+
+Array = Any
+
+IN_TIME = "drifts", "outputs", "covariances", "precisions"
+INACCURATE = 1e-4  # difference of quadratures of orders ten and six from which they do not serve
+
+
+def tangents(
+    prepared: Prepared, shifted: Sequence[Prepared], rows: slice, state: State, shifted_states: Sequence[State], observed: Array
+) -> Tangents[State] | None:
+    """Return what `line_filter.segment` returns, with derivatives; None where likelihoods act in the weak sense.
+
+    Args:
+        prepared: what is known without data.
+        shifted: the same at parameters of which the i-th has an infinitesimal imaginary part, for i < p.
+        rows: the intervals.
+        state: the state before them.
+        shifted_states: the same at the p parameters.
+        observed: what is observed (K, m).
+    """
+    if prepared.weak:
+        return None
+    walk = _Walk(shifted, np.array([_on(state.window, one.values.imag / STEP, one.window) for one in shifted_states]))
+    if prepared.parts is None:
+        states, infos = walk.over(prepared, rows, state, observed)
+    else:
+        inner = prepared.parts.prepared
+        walk.shifted = [replace(inner, theta=one.theta) for one in shifted]
+        states, infos = segment_of_parts(prepared.parts, rows, state, observed, walk.over)
+    last = states[-1]
+    return Tangents(states, infos, walk.slopes, [last._replace(values=last.values + 1j * STEP * one) for one in walk.tangents])
+
+
+class _Walk:
+    """The derivatives (p, N) of a density on their way through the intervals, and those (p,) of what was gained."""
+
+    def __init__(self, shifted: Sequence[Prepared], tangents: Array):
+        self.shifted, self.tangents, self.slopes = shifted, tangents, np.zeros(len(shifted))
+        self.known: dict[lw.Window, Varied] = {}
+        model = shifted[0].model
+        own = [list(model.parameters)[int(np.argmax(one.theta.imag))] for one in shifted]
+        parts = [*model.observation, *model.observation_noise, *model.family_parameters.values(), model.log_density or 0]
+        symbols = {symbol.name for part in parts for symbol in sympify(part, strict=True).free_symbols}
+        self.observing = [i for i, name in enumerate(own) if name in symbols]  # parameters of likelihoods
+
+    def over(self, prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos]:
+        """Take the intervals of a slice; return the states and the reports."""
+
+        def noted(k: int, before: State, found: line_filter.Taken) -> None:
+            values = observed[k - rows.start :]
+            if isinstance(found, line_filter.Stepped):
+                if not (found.passages and self._passed(prepared, k, before, found, values[0])):
+                    self._singly(k, before, found.state, values[0])
+                return
+            for piece in found:
+                place = piece.first - k
+                self._regrid(before.window, piece.before.window)
+                own = values[place : place + piece.number]
+                if piece.coarse is not None:
+                    window = self._placed(prepared, piece, piece.coarse, own)
+                else:
+                    window = (self._by_splitting if prepared.gaussian else self._by_modes)(prepared, piece, own)
+                self._regrid(window, piece.last.window)
+                before = piece.last
+
+        return line_filter.segment_of_whole(prepared, rows, state, observed, noted)
+
+    def _singly(self, k: int, before: State, after: State, observed: np.ndarray) -> None:
+        """Take one interval, for one parameter after the other."""
+        found = []
+        # Beyond that, ratios of rounding errors would spread with interpolated logarithms.
+        known = np.where(before.values > lw.CUT * np.max(before.values), self.tangents, 0.0)
+        for i, prepared in enumerate(self.shifted):
+            state = before._replace(values=before.values + 1j * STEP * known[i])
+            state, info = line_filter.step(prepared, k, state, observed)
+            found.append(_on(after.window, state.values.imag / STEP, state.window))
+            self.slopes[i] += info.log_likelihood_increment.imag / STEP
+        self.tangents = np.array(found)
+
+    def _placed(self, prepared: Prepared, piece: Piece, coarse: Array, observed: np.ndarray) -> lw.Window:
+        """Take the steps of a piece by the modes of coarse grids (K, 3), to grids of their own; return the last one."""
+        states = [piece.before, *piece.states]
+        for i, gained in enumerate(infos_of(prepared, [piece]).log_likelihood_increment):
+            k, window, after = piece.first + i, states[i].window, piece.densities[i]
+            centre, spacing, size = coarse[i].tolist()
+            wide = window._replace(centre=centre, spacing=spacing, size=int(size))
+            varied = self._varied(prepared, wide)
+            self.tangents = varied.through(states[i].values, self.tangents, prepared.lengths[k], window, wide)
+            new = window._replace(centre=float(piece.centres[i]), spacing=float(piece.spacings[i]), size=len(after))
+            self._regrid(wide, new)
+            seen, logs = prepared.schedule.seen[k], np.zeros((len(self.shifted), len(after)), complex)
+            if seen.any():
+                logs = self._logs(partial(_logs_of, k=k, observed=observed[i], points=new.points), prepared)
+            self._multiply(after, logs, gained)
+        return states[-1].window
+
+    def _by_modes(self, prepared: Prepared, piece: Piece, observed: np.ndarray) -> lw.Window:
+        """Take the steps of a piece by the modes of its grid; return the grid."""
+        window, own, density = piece.before.window, slice(piece.first, piece.first + piece.number), piece.before.values
+        varied = self._varied(prepared, window)
+        logs = self._logs(lambda one: log_likelihoods(one, own, observed, window.points[None]), prepared)
+        for i, gained in enumerate(infos_of(prepared, [piece]).log_likelihood_increment):
+            after = piece.densities[i]
+            self.tangents = varied.through(density, self.tangents, prepared.lengths[piece.first + i])
+            self._multiply(after, logs[:, i], gained)
+            density = after
+        return window
+
+    def _by_splitting(self, prepared: Prepared, piece: Piece, observed: np.ndarray) -> lw.Window:
+        """Take the steps of a piece by splittings, or singly; return the last grid."""
+        window, own, states = piece.before.window, slice(piece.first, piece.first + piece.number), [piece.before, *piece.states]
+        grids = [grid_of(one, window, own) for one in self.shifted]
+        table = np.array([grid.table for grid in grids if grid is not None])
+        cells = np.rint(np.append(window.centre, piece.centres) / window.spacing).astype(int)
+        starts = cells + int(piece.reports[0, START]) - cells[1]  # in the table
+        centres, gains = piece.centres, infos_of(prepared, [piece]).log_likelihood_increment
+        points = window.origin + centres[:, None] + window.spacing * lw.index(window.size)
+        logs = self._logs(lambda one: log_likelihoods(one, own, observed, points), prepared)
+        for i in range(piece.number):
+            shift = int(starts[i + 1] - starts[i])
+            interval, coefficients = self._divided(prepared, piece, i, observed[i]), None
+            if interval is not None and len(table) == len(self.shifted):
+                own_table = table[:, i if table.shape[1] > 1 else 0, :, :, starts[i + 1] : starts[i + 1] + window.size]
+                time = [np.array([getattr(one.coefficients, name)[piece.first + i] for one in self.shifted]) for name in IN_TIME]
+                coefficients = Coefficients(own_table, *time)
+            if interval is None or coefficients is None:
+                self._singly(piece.first + i, states[i], states[i + 1], observed[i])
+                window = states[i + 1].window
+            else:
+                before, tangents = shifted_by(states[i].values, shift), shifted_by(self.tangents, shift)
+                _, self.tangents, log_factor = through(interval, coefficients, before, tangents)
+                self._multiply(piece.densities[i], logs[:, i] + log_factor[:, None], gains[i])
+                window = window._replace(centre=float(centres[i]))
+        return window
+
+    def _divided(self, prepared: Prepared, piece: Piece, i: int, observed: Array) -> Interval | None:
+        """Return what the filter did in a step that was split, None for another one."""
+        k, (pairs, substeps, needed) = piece.first + i, piece.reports[i, DIVIDED]
+        if substeps == 0.0:
+            return None
+        length, inside, closed = float(prepared.lengths[k]), bool(prepared.kinds[k] == SPLIT), piece.before.closed
+        return Interval(length, piece.before.spacing, closed, observed, inside, int(pairs), int(substeps), bool(needed > 0.0))
+
+    def _passed(self, prepared: Prepared, k: int, before: State, step: line_filter.Stepped, observed: np.ndarray) -> bool:
+        """Take a single step whose transition is known; return whether the derivatives are accurate."""
+        own, tangents, gained = before.window, self.tangents, 0.0
+        for start, window, length, log_mass, of_modes in step.passages:
+            self._regrid(own, window)
+            own = of_modes or window
+            if of_modes is None:
+                self.tangents, error = self._exponential(prepared, window, length, start)
+                if not error < INACCURATE:
+                    self.tangents = tangents
+                    return False
+            else:
+                self.tangents = self._varied(prepared, of_modes).through(start, self.tangents, length, window, of_modes)
+            self.tangents, gained = self.tangents / np.exp(log_mass), gained + log_mass
+        self._regrid(own, step.window)
+        at_end = prepared.schedule.seen[k] & ~prepared.inside[k]
+        logs = np.zeros((len(self.shifted), step.window.size), complex)
+        if at_end.any():
+            logs = self._logs(partial(_logs_of, k=k, observed=observed, points=step.window.points), prepared)
+        self._multiply(step.values, logs, step.info.log_likelihood_increment - gained)
+        self._regrid(step.window, step.state.window)
+        return True
+
+    def _exponential(self, prepared: Prepared, window: lw.Window, length: float, values: Array) -> tuple[Array, float]:
+        """Return the derivatives of a density after a time by the exponential of the operator, and their relative error."""
+        known = [tables(one, window) for one in (prepared, *self.shifted)]
+        operator, *shifted = (length * window.generator(one.covariance, one.drift) for one in known)
+        return exponential_derivatives(operator, np.array([one.imag for one in shifted]) / STEP, values, self.tangents)
+
+    def _logs(self, function: Callable[[Prepared], Array], prepared: Prepared) -> Array:
+        """Return the logarithms (p, ...) of likelihoods, with imaginary parts where a likelihood depends on the parameter."""
+        found = {i: function(self.shifted[i]) for i in self.observing}
+        real = next(iter(found.values())).real if found else function(prepared)
+        return np.array([found.get(i, real) for i in range(len(self.shifted))], complex)
+
+    def _varied(self, prepared: Prepared, window: lw.Window) -> Varied:
+        """Return the decomposition on a grid with its derivatives."""
+        if window not in self.known:
+            modes, shifted = spectral(prepared, window), [spectral(one, window) for one in self.shifted]
+            assert modes is not None
+            self.known[window] = Varied.of(modes, [one for one in shifted if one is not None])
+        return self.known[window]
+
+    def _multiply(self, after: Array, logs: Array, gained: float) -> None:
+        """Multiply the derivatives of a prediction by a likelihood.
+
+        Args:
+            after: the density after that (N,).
+            logs: the logarithms (p, N) of the likelihood, with imaginary parts.
+            gained: the log-likelihood of what was observed.
+        """
+        factor = np.where(after > 0, np.exp(np.where(after > 0, logs[0].real - gained, 0.0)), 0.0)
+        product = self.tangents * factor + np.where(after > 0, after * logs.imag, 0.0) / STEP
+        slopes = np.sum(product, axis=1)
+        self.slopes += slopes
+        self.tangents = product - after * slopes[:, None]
+
+    def _regrid(self, window: lw.Window, new: lw.Window) -> None:
+        """Take the derivatives to another grid."""
+        if new != window:
+            self.tangents = np.array([_on(new, tangent, window) for tangent in self.tangents])
+
+
+def _logs_of(prepared: Prepared, k: int, observed: Array, points: Array) -> Array:
+    """Return the log-likelihood of an observation at points (N,)."""
+    likelihood = factor_at_end(prepared, k, prepared.schedule.seen[k], observed, None)
+    assert likelihood is not None
+    found: Array = likelihood.logs(points)
+    return found
+
+
+def _on(new: lw.Window, tangent: Array, window: lw.Window) -> Array:
+    """Return the derivative of a density on another grid: linear in it, so that the rounding of small values does not spread."""
+    return lw.interpolated(tangent, window, new.offsets) * (new.spacing / window.spacing) if new != window else tangent

@@ -1,0 +1,278 @@
+"""One interval of one state on finite volumes (`numerics/line/volumes.py`), where a uniform grid does not serve.
+
+That is where the density contracts so much that no uniform grid holds it, as by -x^3 from a broad prior, and where coefficients
+have kinks or jumps.  The cells are small where the drift leads and grow with the distance; kinks and jumps are faces.  There are
+more and more cells and steps until the result settles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from zakai.methods.line.coefficients import coefficients
+from zakai.methods.line.course import FAST, LEVELS, Course, course_of, drift_along, ends_of
+from zakai.methods.line.model import within
+from zakai.methods.line.moves import Moved, Report
+from zakai.methods.line.system import Prepared
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.panels import GAUSS_NODES, interpolation
+from zakai.numerics.line.polynomial import local_polynomial
+from zakai.numerics.line.volumes import Bands, Volumes, advanced
+
+Array = Any
+
+STIFF = 100.0  # the same, above which no uniform grid is tried
+MOST_TRAVEL = 20.0  # ranges of a density, as it is at the time, that it moves on uniform grids
+MOST_DEVIATIONS = 100.0  # range of a density on a uniform grid, in the smallest deviations of its parts
+EDGE = 1e-9  # density in the outermost cells, relative to the maximum, beyond which they are too few
+SETTLED = 1e-2  # error above which volumes do not serve
+NARROWEST = 40.0  # range of a density in cells
+SHARE = 0.1  # of the tolerance that volumes may leave
+SMOOTH = 1e-7  # error of a backward interval at which more cells are not taken
+
+
+def rough(prepared: Prepared, inside: np.ndarray) -> bool:
+    """Return whether coefficients have kinks or jumps with which a uniform grid has no decomposition of the operator."""
+    system = prepared.system
+    needed = system.varying or bool(inside.any()) or system.slope is None or system.spread is None
+    return needed and system.kinks is not None
+
+
+def contracted(
+    prepared: Prepared,
+    values: Array,
+    window: lw.Window,
+    start: float,
+    length: float,
+    inside: np.ndarray,
+    rates: np.ndarray,
+    report: Report,
+) -> Moved | None:
+    """Return the density after an interval, None where a uniform grid is better or volumes do not serve."""
+    if window.closed:
+        return None
+    ends = ends_of(values, window)
+    width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(drift_along(prepared, window, ends, start))))
+    general = rough(prepared, inside)
+    if not (general or speed * length > FAST * width):
+        return None
+    course = course_of(prepared, values, window, ends, start, length, inside)
+    if course is None:
+        return None
+    stiff = speed * length > STIFF * width
+    if not (general or stiff or course.way.travel > MOST_TRAVEL or course.way.deviations > MOST_DEVIATIONS):
+        return None
+    if width < NARROWEST * course.finest:  # sharper than the cells where it begins
+        return None
+
+    # Cells do not bring back what the grid does not resolve.
+    allowed = max(SHARE * prepared.tolerance, SHARE * lw.figures(values, False, prepared.negligible).aliasing)
+
+    def density(offsets: Array) -> Array:
+        return lw.density_at(values, window, offsets)
+
+    found = advanced_by(prepared, density, course, start, inside, rates, allowed)
+    if found is None:
+        return None
+    masses, cells, gained, error = found
+    after = np.abs((masses / cells.widths).real)
+    if max(after[0], after[-1]) > EDGE * np.max(after):  # the cells do not hold it
+        return None
+    report.time, report.noise = report.time + error + course.unresolved, max(report.noise, min(error, 1.0))
+    resampled = _resampled(prepared, cells, masses, window, error)
+    assert resampled.look is not None
+    report.density(resampled.look)
+    return resampled._replace(gained=gained)
+
+
+class Settled(NamedTuple):
+    """Values of cells (N,) of sum one, the cells, the logarithm of the scale, and the error."""
+
+    values: Array
+    cells: Volumes
+    log_scale: Any
+    error: float
+
+
+def advanced_by(
+    prepared: Prepared,
+    density: Callable[[Array], Array],
+    course: Course,
+    start: float,
+    inside: np.ndarray,
+    rates: np.ndarray,
+    allowed: float,
+) -> Settled | None:
+    """Return the masses of cells after an interval, None where they do not settle.
+
+    Args:
+        prepared: the system.
+        density: the density before, as a function of offsets (J,).
+        course: the course of the density.
+        start: the time before.
+        inside, rates: which increments act within the interval, and their rates.
+        allowed: the error at which more cells are not taken.
+    """
+
+    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
+        before = density(cells.offsets)
+        masses = before * cells.widths
+        return _advanced(masses / np.sum(masses), prepared, before, cells, start, inside, rates, steps, course)
+
+    def summed(masses: Array) -> Array:
+        return masses.reshape(-1, 2).sum(axis=1)
+
+    return _settled(allowed, course, at_level, summed, lambda cells: np.ones(cells.size))
+
+
+class Worth(NamedTuple):
+    """A function of the state at the start of an interval: values (N,) at the middles of cells, the logarithm of their scale."""
+
+    cells: Volumes
+    values: Array
+    log_scale: float
+    error: float
+
+    def at(self, offsets: Array) -> Array:
+        """Return the values at offsets from the origin (J,)."""
+        size = self.cells.size
+        index = self.cells.place(np.clip(offsets, *self.cells.faces[[0, -1]]))
+        return local_polynomial(self.values, lw.Window(0.0, size // 2 + 0.5, 1.0, size, False, 1.0), index)
+
+
+def pulled_back(
+    prepared: Prepared,
+    log_worth: Callable[[Array], Array],
+    density: Callable[[Array], Array],
+    course: Course | None,
+    start: float,
+    inside: np.ndarray,
+    rates: np.ndarray,
+) -> Worth | None:
+    """Return the expectation of a function of the state after an interval, given the state before; None where it does not settle.
+
+    Args:
+        prepared: the system.
+        log_worth: the logarithm of the function at offsets (J,).
+        density: the density before the interval, as a function of offsets (J,).
+        course: the course of the density, None where there is none.
+        start: the time before.
+        inside, rates: which increments act within the interval, and their rates.
+    """
+    if course is None:
+        return None
+
+    def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
+        logs = log_worth(cells.offsets)
+        top = float(np.max(logs))
+        interval = prepared, density(cells.offsets), cells, start, inside, rates, steps, course
+        found, gained = _advanced(np.exp(logs - top), *interval, backward=True)
+        return found, gained + top
+
+    def between(found: Array) -> Array:
+        padded = np.concatenate([found[:1], found, found[-1:]])
+        return (9.0 * (found[::2] + found[1::2]) - padded[:-2:2] - padded[3::2]) / 16.0
+
+    found = _settled(SMOOTH, course, at_level, between, lambda cells: density(cells.offsets) * cells.widths)
+    return None if found is None else Worth(found.cells, found.values, float(found.log_scale), found.error)
+
+
+def _settled(
+    allowed: float,
+    course: Course,
+    at_level: Callable[[Volumes, Array], tuple[Array, Any]],
+    paired: Callable[[Array], Array],
+    weights: Callable[[Volumes], Array],
+) -> Settled | None:
+    """Return the values of cells, with more cells until they settle.
+
+    Args:
+        allowed: the error at which more cells are not taken.
+        at_level: values of the sum one on cells and the logarithm of their scale, for the ends of steps.
+        paired: values on half as many cells.
+        weights: those of the errors of cells.
+    """
+    before = best = None
+    error = np.inf
+    for size, count in LEVELS:
+        cells = course.cells._replace(size=size)
+        values, gained = at_level(cells, course.steps(count))
+        if before is not None:
+            coarse = paired(values)
+            # The error of second order falls to a quarter where the size of the cells is halved.
+            finer = coarse + (coarse - before[0] * np.exp(before[1] - gained)) / 3.0
+            total = np.sum(finer)
+            finer, scale = finer / total, gained + np.log(total)
+            if best is not None:
+                # The rest falls by more than a factor of four from one level to the next.
+                change, weight = paired(finer) * np.exp(scale - best[1]) - best[0], weights(best[2])
+                error = 0.25 * float(weight @ np.abs(change.real) / (weight @ best[0].real))
+            best = finer, scale, cells._replace(size=len(finer))
+            if error < allowed:
+                break
+        before = values, gained
+    if best is None or not error < SETTLED:
+        return None
+    return Settled(best[0], best[2], best[1], error)
+
+
+def _advanced(
+    masses: Array,
+    prepared: Prepared,
+    density: Array,
+    cells: Volumes,
+    start: float,
+    inside: np.ndarray,
+    rates: np.ndarray,
+    ends: Array,
+    course: Course,
+    backward: bool = False,
+) -> tuple[Array, Any]:
+    """Return the masses of cells after steps, and the logarithm of their sum; `density` is the one before the interval."""
+    at, bounds = cast(lw.Window, cells), course.bounds  # by its points
+    known: dict[int, Bands] = {}
+
+    def operators(times: Array) -> Bands:
+        drift, covariance, potential, constant = coefficients(prepared, at, times, inside, rates, density)
+        drift = np.where(np.abs(drift) < course.fastest, drift, course.fastest * np.sign(drift.real))
+        covariance = covariance if covariance.ndim == 2 else covariance[:, None]
+        return cells.bands(covariance, drift, potential + constant[:, None] - offset)
+
+    def bands(times: Array) -> Bands:
+        part = int(np.searchsorted(bounds, 0.5 * (times[0] + times[-1]))) - 1 if prepared.system.varying else 0
+        first, last = bounds[part : part + 2]
+        if part not in known:
+            nodes = first + (last - first) * GAUSS_NODES if prepared.system.varying else np.zeros(1)
+            known[part] = operators(within(start + nodes, start + first, start + last))
+        if not prepared.system.varying:
+            return known[part]
+        matrix = interpolation((times - first) / (last - first))
+        below, diagonal, above = (matrix @ one for one in known[part])
+        return below, diagonal, above
+
+    offset = 0.0
+    if inside.any():
+        *_, potential, constant = coefficients(prepared, at, np.array([start]), inside, rates, density)
+        counts = density.real > 1e-6 * density.real.max()
+        offset = float(np.max(potential[0, : cells.size][counts].real) + constant[0].real)
+    masses, gained = advanced(bands, masses, ends, backward)
+    return masses, gained + offset * ends[-1]
+
+
+def _resampled(prepared: Prepared, cells: Volumes, masses: Array, window: lw.Window, error: float) -> Moved:
+    """Return the masses of cells as a density on a uniform grid."""
+    density, real = cells.density(masses), (masses / cells.widths).real
+    used = cells.offsets[np.flatnonzero(real > lw.CUT * real.max())]
+    spacing = (used[-1] - used[0]) / 64.0
+    for _ in range(9):
+        new = lw.quantized(window, used[0], used[-1], spacing, most=lw.LARGEST_POSTERIOR)
+        values = density(new.offsets)
+        values = values / np.sum(values)
+        look = lw.figures(values, False, prepared.negligible)
+        if look.aliasing <= max(1e-11, 1e-2 * error) or new.size >= lw.LARGEST_POSTERIOR:
+            break
+        spacing = 1.001 * new.spacing / 2**0.5
+    return Moved(values, new, 0.0, look)

@@ -1,0 +1,204 @@
+"""A message of one state over one interval, backward in time, where the compiled loop does not take it.
+
+On the circle, and where increments act within, the transposed exponentials of the filter act (`line/transposed.py`).  Else a
+Gaussian kernel is a sum over a grid.  Where no coefficient depends on t, a grid covers the support of the message at the end of
+the interval, that of the density at its start, and the paths between them; psi is moved by its decomposition.  All else is for
+finite volumes (`line/volumes.py`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from zakai.methods.line import filter as line_filter
+from zakai.methods.line.course import course_of, ends_of
+from zakai.methods.line.gauge import Gauge, gauge_of
+from zakai.methods.line.message import FEWEST, Message, covering, points_of, reliable, support, taper
+from zakai.methods.line.moves import Report
+from zakai.methods.line.system import Prepared, State
+from zakai.methods.line.tables import covariance_at
+from zakai.methods.line.transposed import by_exponentials
+from zakai.methods.line.volumes import pulled_back
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.adjoint import EXCURSION
+from zakai.numerics.line.polynomial import local_polynomial
+
+Array = Any
+
+ROUNDING = 1e-15  # of the maximum: smaller values of psi are not kept
+RESOLVED = 0.25  # spacing in standard deviations of the noise
+WIDTH = 0.8  # spacing in standard deviations of a Gaussian kernel at which sums are integrals
+MOST_POINTS = 4000  # of such sums
+MOST_GRIDS = 7  # of finer and finer spacing, for a decomposition
+SHARE = 1e-2  # of the tolerance that rounding in psi may leave
+
+
+def negligible(prepared: Prepared) -> float:
+    """Return the values relative to the maximum that do not count."""
+    return float(np.clip(1e-5 * prepared.tolerance, 1e-13, 1e-10))
+
+
+def smoothing_tolerance(prepared: Prepared) -> float:
+    """Return the error of an interval above which a smoother warns."""
+    return max(prepared.tolerance, 1e-6)
+
+
+def pulled(
+    prepared: Prepared, k: int, inside: np.ndarray, rates: np.ndarray, state: State, later: Message
+) -> tuple[Message, float]:
+    """Return the message at the start of interval k, and the error that the interval adds.
+
+    Args:
+        prepared: the system.
+        k: the interval.
+        inside, rates: which increments act within it, and their rates.
+        state: the filter's state at its start.
+        later: the message at its end.
+    """
+    found = by_exponentials(prepared, k, inside, rates, state, later, negligible(prepared))
+    if found is not None:
+        return found
+    own = state.window
+    first, last = support(np.asarray(state.values).real, 1e-13)
+    ends = float(own.offsets[first]), float(own.offsets[last])
+    found = _by_kernel(prepared, k, rates, ends, later) or _by_modes(prepared, k, inside, state, ends, later)
+    return found or _by_volumes(prepared, k, inside, rates, state, ends, later)
+
+
+def _by_kernel(
+    prepared: Prepared, k: int, rates: np.ndarray, ends: tuple[float, float], later: Message
+) -> tuple[Message, float] | None:
+    """Return the same of an interval whose kernel is Gaussian, None where it is not or needs many points."""
+    if prepared.yau is None:
+        return None
+    report = Report()
+    kernel = line_filter.kernel_of(prepared, k, later.window, rates, report)
+    if kernel is None or not kernel.variance > 0:
+        return None
+    deviation, (low, high) = float(np.sqrt(kernel.variance)), later.ends
+    if (high - low) > MOST_POINTS * WIDTH * deviation:
+        return None
+    spacing = min(max(later.needed, RESOLVED * deviation) / max(abs(kernel.scale), 1e-3), (ends[1] - ends[0]) / FEWEST)
+    fine = points_of(later.window, low, high, min(later.spacing, WIDTH * deviation))
+    new = points_of(later.window, *ends, spacing)
+    x, y, theta = fine.offsets, new.offsets, prepared.theta.real
+    after = later.at(x) + prepared.yau.potential(fine.points, float(prepared.schedule.stops[k]), theta)
+    logs = after - 0.5 * ((x - kernel.scale * y[:, None] - kernel.shift) / deviation) ** 2
+    top = np.max(logs, axis=1)
+    found = np.log(np.sum(np.exp(logs - top[:, None]), axis=1) * fine.spacing / (deviation * np.sqrt(2 * np.pi))) + top
+    found += kernel.constant + y * (kernel.slope + kernel.curvature * y)
+    found -= prepared.yau.potential(new.points, float(prepared.schedule.starts[k]), theta)
+    return Message.of(found, new, new.spacing, later.error), report.time
+
+
+def _by_modes(
+    prepared: Prepared, k: int, inside: np.ndarray, state: State, ends: tuple[float, float], later: Message
+) -> tuple[Message, float] | None:
+    """Return the same by a decomposition, None where there is none or rounding in psi counts."""
+    if prepared.system.varying or prepared.system.rough or inside.any():
+        return None
+    length, accepted = float(prepared.lengths[k]), max(negligible(prepared), 30.0 * prepared.negligible)
+    low, high = min(later.ends[0], ends[0]), max(later.ends[1], ends[1])
+    least, most = _noise(prepared, k, state.origin + low, state.origin + high)
+    low, high = low - EXCURSION * most, high + EXCURSION * most  # paths from one support to the other leave both
+    spacing = max(later.needed, RESOLVED * least)
+    for attempt in range(MOST_GRIDS):
+        window = covering(later.window, low, high, spacing)
+        if window.size > lw.SIZES[-1]:
+            return None
+        gauge = _gauge(prepared, window)
+        if gauge.modes is None:
+            return None
+        psi, top = _psi(later, window, gauge.values)
+        decay = np.exp(-length * gauge.modes.rates)
+        moved = gauge.modes.modes @ (decay * (gauge.modes.modes.T @ psi))
+        highest = float(np.max(moved))
+        if not 0.0 < highest < np.inf:
+            return None
+        error = 4e-16 * float(np.sqrt(np.sum(psi * psi))) * max(1.0, float(decay.max())) / highest
+        if not _exact(prepared, state, moved, gauge, window, error):
+            return None
+        look = lw.figures(moved, False, accepted)
+        coarse = look.aliasing > accepted and not (look.rough and look.aliasing < 1e-3 * prepared.tolerance)
+        if not coarse or window.size >= lw.LARGEST or (look.rough and attempt > 1):
+            break
+        spacing = window.spacing / 1.5
+    made = error + 2.0 * look.aliasing + 10.0 * max(look.left, look.right)
+    if made > smoothing_tolerance(prepared):
+        return None
+    logs = np.log(np.maximum(moved, ROUNDING * highest) / window.spacing) - gauge.values + top
+    needed = window.spacing * float(np.clip(look.resolving, 1.0, 2.0))
+    return Message.of(logs, window, needed, later.error).between(*ends), made
+
+
+def _psi(later: Message, window: lw.Window, gauge: Array) -> tuple[Array, float]:
+    """Return the values of psi on a grid times its spacing, divided by the exponential of the second number."""
+    finer = window.spacing > 1.01 * later.spacing
+    fine = covering(later.window, *later.ends, later.spacing) if finer else window
+    logs = later.at(fine.offsets) + (local_polynomial(gauge, window, fine.offsets) if finer else gauge)
+    top = float(np.max(logs))
+    values = fine.spacing * np.exp(logs - top) * taper(fine.offsets, later.ends, fine.spacing)
+    # Integrals of psi with what the coarse grid resolves.
+    return lw.gathered(values, fine.offsets, window) if finer else values, top
+
+
+def _exact(prepared: Prepared, state: State, psi: Array, gauge: Gauge, window: lw.Window, error: float) -> bool:
+    """Return whether the error of psi, relative to its maximum, is small in the product with the density at the start."""
+    own, top = state.window, float(np.max(psi))
+    if own.spacing < window.spacing:  # of which the grid may have no point
+        density = reliable(state, own)
+        density, offsets = density[density > 0.0], own.offsets[density > 0.0]
+        log_gauge = local_polynomial(gauge.values, window, offsets)
+        log_psi = local_polynomial(np.log(np.maximum(psi, ROUNDING * top) / top), window, offsets)
+    else:
+        density = reliable(state, window)
+        inside = density > 0.0
+        density, log_gauge, log_psi = density[inside], gauge.values[inside], np.log(np.maximum(psi[inside], 0.0) / top)
+    logs, product = np.log(density) - log_gauge, np.log(density) - log_gauge + log_psi
+    shift = np.max(product)
+    allowed = SHARE * smoothing_tolerance(prepared)
+    return bool(max(error, ROUNDING) * np.sum(np.exp(logs - shift)) < allowed * np.sum(np.exp(product - shift)))
+
+
+def _gauge(prepared: Prepared, window: lw.Window) -> Gauge:
+    """Return the gauge of a system without time on a grid."""
+    found: Gauge = prepared.once(("gauge", window), lambda: gauge_of(prepared, window, prepared.model.start))
+    return found
+
+
+def _by_volumes(
+    prepared: Prepared,
+    k: int,
+    inside: np.ndarray,
+    rates: np.ndarray,
+    state: State,
+    ends: tuple[float, float],
+    later: Message,
+) -> tuple[Message, float]:
+    """Return the same by finite volumes, of infinite error where they do not serve."""
+    values, window, start = np.asarray(state.values).real, state.window, float(prepared.schedule.starts[k])
+    mean, variance = later.moments
+    interval = start, float(prepared.lengths[k]), inside, (mean, variance**0.5)
+    course = course_of(prepared, values, window, ends_of(values, window), *interval)
+
+    def density(offsets: Array) -> Array:
+        return lw.density_at(values, window, offsets)
+
+    found = pulled_back(prepared, later.falling, density, course, start, inside, rates)
+    if found is None:
+        return later._replace(logs=np.full(len(later.logs), np.nan)), np.inf
+    least, _ = _noise(prepared, k, *(state.origin + np.array(later.ends)))
+    needed = min(max(later.needed, 0.5 * RESOLVED * least), window.spacing)
+    new = points_of(window, *ends, needed)
+    values = found.at(new.offsets)
+    logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + found.log_scale
+    return Message.of(logs, new, needed, later.error), found.error
+
+
+def _noise(prepared: Prepared, k: int, low: float, high: float) -> tuple[float, float]:
+    """Return the smallest and the largest standard deviation of the noise of an interval between two states."""
+    middle, length = 0.5 * (prepared.schedule.starts[k] + prepared.schedule.stops[k]), float(prepared.lengths[k])
+    covariance = covariance_at(prepared.system, np.linspace(low, high, 9), middle, prepared.theta.real) * np.ones(9)
+    return float(np.sqrt(max(np.min(covariance), 0.0) * length)), float(np.sqrt(np.max(covariance) * length))

@@ -1,0 +1,219 @@
+"""One state with reflecting ends, kinks or jumps: the equation of `line/filter.py` on Gauss-Lobatto points between these.
+
+    u_t = G u'' / 2 - (f u)' + (h'S^-1 dy/dt - h'S^-1 h / 2) u,      (G u)' / 2 - f u = 0 where the state is reflected
+
+The points cover the part of the domain in which the density is; at an end that is not one of the domain nothing is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.densities import IntervalDensity
+from zakai.errors import InputError
+from zakai.methods._protocol import Info
+from zakai.methods.line.figures import forgetting, outside_tables, spread
+from zakai.methods.line.moves import Report
+from zakai.methods.line.system import NOISE, Prepared
+from zakai.methods.line.update import factor_at_end
+from zakai.methods.reflecting.elements import (
+    CUT,
+    SAMPLES,
+    SIZES,
+    SIZES_OF_PRIORS,
+    domain_of,
+    element_of,
+    logarithm,
+    moments,
+    negligible_of,
+    placed,
+    sampled,
+    support,
+    with_margin,
+    without_nan,
+)
+from zakai.methods.reflecting.moves import propagated
+from zakai.models.numeric import numpy_function
+from zakai.models.prior import DensityPrior
+from zakai.numerics.line.posterior import General, Likelihood, place
+from zakai.numerics.line.segment import RELIABLE
+from zakai.numerics.lobatto import Element
+from zakai.numerics.prior_grid import mixture_log_density, prior_grid
+
+Array = Any
+
+
+class State(NamedTuple):
+    """The probabilities (N,) of the Gauss-Lobatto points between `lower`, `cuts` (C,) and `upper`; an estimate of their error."""
+
+    values: np.ndarray
+    lower: float
+    upper: float
+    error: float
+    cuts: np.ndarray
+
+    @classmethod
+    def of(cls, values: Array, element: Element, error: float) -> State:
+        """Return the state with probabilities at the points of an element."""
+        return cls(values, element.lower, element.upper, error, np.array(element.cuts, float))
+
+    @property
+    def element(self) -> Element:
+        """The points."""
+        size = len(self.values) // (len(self.cuts) + 1)
+        return Element(float(self.lower), float(self.upper), size, tuple(np.asarray(self.cuts).tolist()))
+
+
+def init(prepared: Prepared, prior: Any) -> State:
+    """Return the prior, which counts inside of the domain."""
+    model, domain = prepared.model, domain_of(prepared)
+    if isinstance(prior, DensityPrior):
+        function = numpy_function([prior.log_density], model, ())
+
+        def logs(x: Array) -> Array:
+            return function(x[:, None], model.start, prepared.theta)
+
+        lower, upper = _ends_of(prepared, lambda x: logs(x).real)
+    else:
+        weights, means, covs = prior.components
+        if np.any(covs[:, 0, 0] <= 1e-28 * means[:, 0] ** 2):
+            raise InputError("prior: a variance is zero; a grid needs a density, so give it a small variance")
+        mixture = mixture_log_density(weights, means, covs, [False])
+        reach = np.sqrt(2.0 * CUT * covs[:, 0, 0])
+        lower, upper = np.clip([np.min(means[:, 0] - reach), np.max(means[:, 0] + reach)], domain.lower, domain.upper).tolist()
+
+        def logs(x: Array) -> Array:
+            return mixture(np.zeros(1), x[:, None])
+
+    lower, upper = placed(lambda x: logs(x).real, lower, upper, domain)
+    top, negligible = _top(logs, lower, upper), negligible_of(prepared)
+    element, values = sampled(prepared, lambda x: np.exp(without_nan(logs(x)) - top), lower, upper, negligible, SIZES_OF_PRIORS)
+    return State.of(values / np.sum(values), element, max(element.unresolved(values) - negligible, 0.0))
+
+
+def _ends_of(prepared: Prepared, logs: Callable[[Array], Array]) -> tuple[float, float]:
+    """Return ends between which a density of unknown scale lies, from its logarithm."""
+    domain = domain_of(prepared)
+    lower, upper = domain.lower, domain.upper
+    if np.isfinite(upper - lower):
+        return lower, upper
+    if np.isinf(lower) and np.isinf(upper):
+        grid = prior_grid(lambda points: logs(points[:, 0]), 1, [False])
+        return float(grid.points[0, 0]), float(grid.points[-1, 0])
+    end = lower if np.isfinite(lower) else upper  # powers of two
+    points = np.unique(end + np.concatenate([[0.0], 2.0 ** np.arange(-60.0, 61.0, 0.5)]) * (1.0 if end == lower else -1.0))
+    return support(points, logs(points))
+
+
+def _top(logs: Callable[[Array], Array], lower: float, upper: float) -> float:
+    return float(np.max(without_nan(logs(np.linspace(lower, upper, SAMPLES))).real))
+
+
+def _multiplied(
+    prepared: Prepared, values: Array, element: Element, likelihood: Likelihood, report: Report, negligible: float
+) -> tuple[Any, ...]:
+    """Return the product with a likelihood, its points, and the logarithm of its mass."""
+    domain = domain_of(prepared)
+    peak = logarithm(np.max((values / element.weights).real))
+
+    def product(x: Array, density: Array) -> tuple[Array, Array]:
+        # Relative to the largest product: neither factor needs to be a number there.
+        logs = without_nan(likelihood.logs(x))
+        own = np.where(density.real > 0, logarithm(density.real), -np.inf)
+        top = np.max(own + logs.real)
+        relative = density / np.where(density.real > 0, density.real, 1.0)
+        return np.where(density.real > 0, relative * np.exp(own + logs - top), 0.0), top
+
+    new, density = element, values / element.weights
+    found, top = product(new.points, density)
+    if not new.unresolved(found * new.weights) < negligible or _narrow(found * new.weights, new):
+        ends = place(element.offsets, np.maximum(logarithm(density.real), peak - 70.0), likelihood, element.lower)
+        if ends is not None:
+            low, high = with_margin(element.lower + ends[0], element.lower + ends[1], domain)
+            low, high = max(low, element.lower), min(high, element.upper)
+            for size in SIZES:
+                new = element_of(prepared, low, high, size)
+                density = element.at(values, new.points)
+                found, top = product(new.points, density)
+                if new.unresolved(found * new.weights) < negligible:
+                    break
+    found = found * new.weights
+    report.aliasing = max(report.aliasing, new.unresolved(found))
+    mass = np.sum(found)
+    found = found / mass
+    report.depth = float(found.real @ (peak - logarithm(density.real)))
+    growth = np.exp(np.minimum(without_nan(likelihood.logs(new.points)).real + peak - top - np.log(mass.real), 80.0))
+    report.growth = max(report.growth, 1.0) * float(np.sum(new.weights * growth))
+    return found, new, np.log(mass) + top
+
+
+def _narrow(values: Array, element: Element) -> bool:
+    """Return whether a density fills less than a quarter of an element."""
+    density = logarithm((values / element.weights).real)
+    here = element.points[density > np.max(density) - CUT]
+    return bool(here[-1] - here[0] < 0.25 * (element.upper - element.lower))
+
+
+def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
+    """Return the state after interval k and the observation at its stop, and the report."""
+    with np.errstate(all="ignore"):
+        return _step(prepared, k, state, observed)
+
+
+def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
+    schedule, length, inside = prepared.schedule, float(prepared.lengths[k]), prepared.inside[k]
+    values, report, gained = np.asarray(state.values), Report(), 0.0
+    element: Any = state.element  # in the place of a grid
+    before, negligible = moments(values, element), negligible_of(prepared, float(state.error))
+    if length > 0:
+        rates = np.where(inside, observed, 0.0) / length
+        values, element, gained = propagated(prepared, values, element, k, inside, rates, report, negligible)
+    predicted, floor = moments(values, element), NOISE + report.aliasing + report.edge
+    at_end = schedule.seen[k] & ~inside
+    if at_end.any():
+        likelihood = factor_at_end(prepared, k, at_end, observed, element)
+        if isinstance(likelihood, General):
+            report.lawless = float(np.sum(values.real[np.isnan(likelihood.log_density(element.points).real)]))
+        values, element, more = _multiplied(prepared, values, element, likelihood, report, negligible)
+        gained = gained + more
+    mean, variance = moments(values, element)
+    made = 2.0 * report.aliasing + 10.0 * report.edge + report.time + 10.0 * report.negative + min(floor * report.growth, 1.0)
+    kept = forgetting(before[1], predicted[1], variance, spread(prepared, k, length, float(mean.real)))
+    error = max(made + state.error * kept, RELIABLE * prepared.promised)
+    health = {
+        "error_estimate": error,
+        "tolerance_ratio": made / prepared.promised,
+        "edge_mass": report.edge,
+        "negative_mass": report.negative,
+        "aliasing": report.aliasing,
+        "time_error": report.time,
+        "tail_depth": report.depth / prepared.deepest(floor),
+        "std_in_spacings": float(np.sqrt(max(variance.real, 0.0))) / element.spacing,
+    }
+    if prepared.system.general:
+        health["without_law"] = report.lawless
+    if prepared.system.tabulated:
+        health["outside_tables"] = outside_tables(prepared, values, element, float(schedule.stops[k]))
+    state = State.of(values, element, float(error))
+    return state, Info(gained, np.array([mean]), np.array([[variance]]), health)
+
+
+def valid(prepared: Prepared, state: State) -> bool:
+    """Return whether the parts of a state fit together."""
+    values, cuts, domain = np.asarray(state.values), np.asarray(state.cuts), domain_of(prepared)
+    if values.ndim != 1 or cuts.ndim != 1 or len(values) not in [size * (len(cuts) + 1) for size in SIZES_OF_PRIORS]:
+        return False
+    ends = np.array([state.lower, *cuts, state.upper], float)
+    if not (np.isfinite(values).all() and np.isfinite(ends).all() and np.isfinite(state.error) and (np.diff(ends) > 0).all()):
+        return False
+    return bool(domain.lower <= state.lower and state.upper <= domain.upper and values.real.sum() > 0)
+
+
+def density(prepared: Prepared, state: State) -> IntervalDensity:
+    """Return the density of a state."""
+    element = state.element
+    values = np.asarray(state.values).real / element.weights
+    return IntervalDensity(values, element.points, element.weights, prepared.model.state)

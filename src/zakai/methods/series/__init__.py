@@ -1,0 +1,1 @@
+"""The power series of the Kolmogorov equation, for `kolmogorov-series`."""

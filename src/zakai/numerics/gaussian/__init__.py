@@ -1,0 +1,1 @@
+"""Steps of Gaussians, forward and backward."""

@@ -1,0 +1,171 @@
+"""Averages over an interval of coefficients that vary in time: Magnus' integrator of fourth order without commutators.
+
+The mean takes the place of the coefficients where that is accurate, else two averages with weights, one after the other.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import helper
+from zakai.numerics.line.density import highest_of
+from zakai.numerics.line.panels import GAUSS_NODES, GAUSS_WEIGHTS, NODES
+from zakai.numerics.line.terms import CELL, DRIFT, SLOPE, add, exponent_added, observation_of
+
+Array = NDArray[Any]
+
+MOST_MAGNUS = 32  # equal parts of an interval with two averages each
+MEAN, EARLY, LATE, DIFFERENCE, SECOND = 0, 1, 2, 3, 4  # weights of a part
+IMPOSSIBLE = -1e8  # exponent where a formula has no value
+
+
+def _averages() -> Array:
+    """Return the weights (P, 5, 6) of the six Gauss nodes in each of n equal parts of an interval, n = 1 .. MOST_MAGNUS.
+
+    They give the integral over the part, the two averages of the integrator, their difference, and the second Legendre
+    coefficient.
+    """
+    y = 2.0 * GAUSS_NODES - 1.0
+    own = GAUSS_WEIGHTS * np.array([np.ones(NODES), 0.5 - y, 0.5 + y, 2.0 * y, 2.5 * (3.0 * y**2 - 1.0)])
+    inverse = np.linalg.inv(np.polynomial.legendre.legvander(y, NODES - 1))
+    parts = [(n, part) for n in range(1, MOST_MAGNUS + 1) for part in range(n)]
+    nodes = [2.0 * (part + GAUSS_NODES) / n - 1.0 for n, part in parts]
+    between = [np.polynomial.legendre.legvander(at, NODES - 1) @ inverse / n for at, (n, _) in zip(nodes, parts, strict=True)]
+    return np.array([own @ matrix for matrix in between])
+
+
+AVERAGES = _averages()  # those of n parts begin at n (n - 1) / 2
+
+
+@helper
+def averaged(
+    table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, weights: Array, tau: float,
+    observed: Array, inside: bool, at: int, spacing: float, closed: bool, phi: Array, drift: Array, b: Array,
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """Write phi, f and b of an average; return length, int G dt, shift and the constant of b."""
+    size, fraction, spread, mean, constant = b.size, 0.0, 0.0, 0.0, 0.0
+    for j in range(size):
+        phi[j], drift[j], b[j] = 0.0, 0.0, 0.0
+    for q in range(weights.size):
+        fraction += weights[q]
+        spread += weights[q] * covariances[q] * tau
+    for r in range(table.shape[0]):
+        weight = 0.0
+        for q in range(weights.size):
+            weight += weights[q] * drifts[q, r]
+        if weight != 0.0:
+            for j in range(size):
+                phi[j] += weight * table[r, CELL, j]
+                drift[j] += weight * table[r, DRIFT, j]
+                b[j] += weight * table[r, SLOPE, j]
+    length = fraction * tau
+    G = spread / length
+    if closed:
+        for j in range(size):
+            mean += phi[j] / (2.0 * np.pi * fraction)
+    constant -= 0.5 * length * ((drift[at] / fraction - mean) * (drift[at] / fraction + mean) / G + b[at] / fraction)
+    own = constant
+    for j in range(size):
+        drift[j] /= fraction
+        phi[j] = (phi[j] / fraction - mean * spacing) / G
+        b[j] = -0.5 * length * ((drift[j] - mean) * (drift[j] + mean) / G + b[j] / fraction) - own
+    if inside:
+        for q in range(outputs.shape[0]):
+            w = fraction if outputs.shape[0] == 1 else weights[q]
+            h, centre = observation_of(table, outputs[q], at)
+            constant += exponent_added(h, centre, precisions[q], observed, w, w * tau, b)
+    for j in range(size):
+        if not (b[j] > IMPOSSIBLE):
+            b[j] = IMPOSSIBLE
+    # phi, from its derivative, relative to the point `at`.
+    total, step = 0.0, phi[at]
+    phi[at] = 0.0
+    for j in range(at + 1, size):
+        total += step
+        step = phi[j]
+        phi[j] = total
+    total = 0.0
+    for j in range(at - 1, -1, -1):
+        total -= phi[j]
+        phi[j] = total
+    return length, spread, mean * length, constant
+
+
+@helper
+def _generated(u: Array, parts: Array, spread: float, spacing: float, weight: float, closed: bool, to: Array) -> None:
+    """Add the integral of the equation's right-hand side with a weight, by differences of fourth order."""
+    size, around, flow = u.size, np.zeros(u.size + 4), np.zeros(u.size + 4)
+    for j in range(size):
+        around[j + 2], flow[j + 2] = u[j], parts[0, j] * u[j]
+    skipped = 0 if closed else 2  # points at the ends of a line
+    if closed:
+        for j in range(2):
+            around[j], flow[j] = around[size + j], flow[size + j]
+            around[size + 2 + j], flow[size + 2 + j] = around[2 + j], flow[2 + j]
+    one, two = weight / (12.0 * spacing), 0.5 * weight * spread / (12.0 * spacing * spacing)
+    a, b, c, d, e = around[:size], around[1 : size + 1], around[2 : size + 2], around[3 : size + 3], around[4:]
+    first, second, fourth, fifth = flow[:size], flow[1 : size + 1], flow[3 : size + 3], flow[4:]
+    for j in range(skipped, size - skipped):
+        curved = 16.0 * (b[j] + d[j]) - a[j] - e[j] - 30.0 * c[j]
+        to[j] += two * curved - one * (8.0 * (fourth[j] - second[j]) - fifth[j] + first[j]) + weight * parts[1, j] * c[j]
+
+
+# Which operator (B, D, E) acts on which density, with which weight, and to which density it is added.  From the density 0 they
+# make 4 = [B, D] and 5 = [B, [B, E]] = B (B E - 2 E B) + E B B.
+_PRODUCTS = np.array(
+    [
+        (0, 0, 1, 1), (1, 0, 1, 2), (0, 2, 1, 4), (1, 1, -1, 4), (2, 0, 1, 3), (0, 3, 1, 6), (2, 1, -2, 6), (0, 6, 1, 5),
+        (0, 1, 1, 7), (2, 7, 1, 5),
+    ]
+)  # fmt: skip
+
+
+@helper
+def operators(
+    table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, averages: Array, tau: float,
+    observed: Array, inside: bool, at: int, to: Array, spreads: Array,
+) -> None:  # fmt: skip
+    """Write f and the potential (3, 2, N), and int G dt (3,), of B, D and E in a part of an interval, see `averaging`."""
+    to[:] = 0.0
+    for i in range(3):
+        weights, whole = averages[MEAN if i == 0 else (DIFFERENCE if i == 1 else SECOND)], 0.0
+        spreads[i] = 0.0
+        for q in range(weights.size):
+            spreads[i] += tau * weights[q] * covariances[q]
+            whole += weights[q]
+        for r in range(table.shape[0]):
+            weight = 0.0
+            for q in range(weights.size):
+                weight += tau * weights[q] * drifts[q, r]
+            if weight != 0.0:
+                add(to[i, 0], weight, table[r, DRIFT])
+        if inside and (i == 0 or outputs.shape[0] > 1):
+            for q in range(outputs.shape[0]):
+                w = whole if outputs.shape[0] == 1 else weights[q]
+                h, centre = observation_of(table, outputs[q], at)
+                exponent_added(h, centre, precisions[q], observed, w, w * tau, to[i, 1])
+
+
+@helper
+def averaging(values: Array, parts: Array, spreads: Array, spacing: float, closed: bool) -> tuple[float, float]:
+    """Return estimates of the errors of the mean and of two averages in a part of an interval.
+
+    With the integral B of the operator, D the difference of the averages and E the second Legendre coefficient they are
+    [B, D] / 4 + [B, [B, E]] / 10, and of fifth order 5 |[B, D] / 4|^(5/3) + [B, [B, E]] / 10.
+    """
+    size = values.size
+    found = np.zeros((8, size))
+    add(found[0], 1.0, values)
+    for operator, of, weight, to in _PRODUCTS:
+        _generated(found[of], parts[operator], spreads[operator], spacing, float(weight), closed, found[to])
+    one, two, mass, limit = 0.0, 0.0, 0.0, 1e-12 * values[highest_of(values)]
+    for j in range(size):
+        mass += values[j]
+        if values[j] > limit:
+            one += abs(found[4, j])
+            two += abs(found[5, j])
+    one, two = 0.25 * one / mass, 0.1 * two / mass
+    return one + two, 5.0 * one ** (5.0 / 3.0) + two

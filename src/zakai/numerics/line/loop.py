@@ -1,0 +1,237 @@
+"""Steps on one grid in one compiled loop.
+
+The transition of an interval is by the modes of the operator (`line/modes.py`), a Gaussian kernel (`line/filters.py`) or a
+splitting into diffusion and a potential (`line/splitting.py`).  A sample multiplies the density after the transition
+(`line/step.py`); an increment is a part of the potential, or of the kernel.
+
+With kernels or potentials the grid is a window of a longer table, and the loop moves it by whole spacings.  It stops before the
+first step that is not accurate enough, or needs another grid or table, and returns why.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numba import float64, int64, types
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import kernel
+from zakai.numerics.line.averages import AVERAGES
+from zakai.numerics.line.density import circular_moments, highest_of, moments, separated, spectrum, support, waves
+from zakai.numerics.line.filters import BAND, convolved, kernel_of
+from zakai.numerics.line.segment import (
+    AFTER,
+    COLUMNS,
+    FAILED,
+    KERNEL,
+    MARGIN,
+    OK,
+    RANGE,
+    RELIABLE,
+    SPLIT,
+    TABLE,
+    UNRESOLVED,
+    Grid,
+    Mechanisms,
+    Segment,
+    Steps,
+)  # fmt: skip
+from zakai.numerics.line.splitting import divided
+from zakai.numerics.line.step import checked, copied, extent, likelihood, product
+from zakai.numerics.line.terms import PHI, failed, observation_of
+from zakai.numerics.line.weak import WEAK_SHARE, weak_error, weaken
+from zakai.numerics.line.window import ALIGNMENT, CUT
+
+Array = NDArray[Any]
+
+COARSE = 1e-5  # spectrum of a product at the highest frequencies from which a somewhat finer grid does not serve
+_V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1]
+
+
+@cache
+def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) -> Any:
+    """Return the loop with the code of these mechanisms only."""
+    @kernel(
+        types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]
+            _V, int64, _Q, _T, _M, _M, float64, float64, int64, _M, int64[::1], _V, _V, _Q, _V, _M, _T, _T, _M, float64, float64,
+            _V, _M, _M, _M
+        )
+    )  # fmt: skip
+    def advance(
+        values: Array, start: int, table: Array, averages: Array, cosines: Array, sines: Array, offset: float, spacing: float,
+        begin: int, observed: Array, kinds: Array, lengths: Array, shares: Array, precisions: Array, constants: Array,
+        kernel_parameters: Array, drifts: Array, outputs: Array, covariances: Array, error: float, log_floor: float,
+        limits: Array, densities: Array, out: Array, fine: Array,
+    ) -> tuple[int, int]:  # fmt: skip
+        """Return the number of steps, and why the loop ended; the last row of `out` receives the answer."""
+        negligible, most, generous, size, length = limits[0], limits[1], limits[4], values.size, table.shape[3]
+        half, timed, movable, near = size // 2, table.shape[0] > 1, not closed, length == size + 2 * MARGIN
+        now, local = values.copy(), np.empty((table.shape[1], table.shape[2], size))
+        b, change, channel, answer = np.empty(size), np.empty(size), np.full(6, np.nan), out[-1]
+        home, place, status, done = start, -1, OK, 0
+        for i in range(observed.shape[0]):
+            k = begin + i
+            own, row, tau, kind = i if timed else 0, out[i], lengths[k], kinds[k]
+            inside, seen = kind == SPLIT or kind == KERNEL, False
+            if samples:
+                for j in range(observed.shape[1]):
+                    seen |= precisions[k, 0, j, j] != 0.0
+            cut = max(limits[3], min(30.0 * np.exp(log_floor), CUT))
+            low, high = support(now, cut)
+            if place != start or timed:
+                copied(table[own], start, local)
+                place = start
+            if kernels:
+                kernel_of(kernel_parameters[k], observed[i], tau if kind == KERNEL else np.inf, channel)
+            if movable:
+                first, last = extent(
+                    now, low, high, channel, drifts[k, 0], local, covariances[k, 0] * tau, tau,
+                    offset + spacing * (start + half), spacing, cut,
+                )  # fmt: skip
+                answer[0], answer[1], answer[2], status = first, last, spacing, OK
+                if not (last - first < 1e9):
+                    status = FAILED
+                    break
+                fewer = 1.7 * (1.2 * (last - first) + 2 * ALIGNMENT) < size
+                if last - first > size or (size > generous and fewer):
+                    status = RANGE
+                    break
+                if first < 0 or last > size - 1:
+                    by = ALIGNMENT * int(np.floor((0.5 * (first + last) - half) / ALIGNMENT + 0.5))
+                    if abs(by) > length or start + by < 0 or start + by + size > length or (near and abs(by) > MARGIN // 2):
+                        status = RANGE
+                        break
+                    for j in range(size):
+                        b[j] = now[j]
+                    for j in range(size):
+                        now[j] = b[j + by] if 0 <= j + by < size else 0.0
+                    start, place = start + by, start + by
+                    copied(table[own], start, local)
+                    low, high = support(now, cut)
+            # The transition.
+            at, before = highest_of(now), moments(now)[2]
+            depth, finest = 8.0 - np.log(cut), (high - low) * 1.2 * spacing / (limits[5] - 2 * ALIGNMENT)
+            move = failed(0.0, 0.0)
+            if kernels and not np.isnan(channel[0]):
+                middle = offset + spacing * (start + half)
+                move = convolved(now, local[0, PHI], channel, middle, spacing, finest, depth, closed)
+            elif splits:
+                move = divided(
+                    now, local, drifts[k], outputs[k], precisions[k], covariances[k], averages, observed[i], inside, tau, spacing,
+                    closed, depth, limits[2] * shares[k], finest,
+                )  # fmt: skip
+            if not (move.error < np.inf and move.rounding < max(1e-11, 1e-3 * most)):
+                answer[0], answer[1], answer[2] = float(low), float(high), move.needed
+                status = RANGE if move.needed > 0.0 and not (move.error < np.inf) else FAILED
+                break
+            positive = move.needed == 0.0
+            status, mass, aliasing, edge, negative, highest = checked(
+                now, low, high, weak, positive, closed, weak or not seen, cut, negligible, spacing, cosines, sines,
+                answer,
+            )  # fmt: skip
+            if status != OK:
+                break
+            predicted, gained = moments(now)[2], np.log(mass) + constants[k] + move.log_factor
+            log_floor *= min(max(predicted / max(move.contraction**2 * before, 1e-300), 1.0), 20.0)
+            log_floor = max(log_floor, np.log(max(cut, move.clipped)))
+            floor = np.exp(log_floor) + edge + (0.0 if positive else aliasing)
+            # The sample, on a finer grid where the product is not resolved.
+            worst, growth, below = aliasing, 0.0, 0.0
+            if seen:
+                h, centre = observation_of(local, outputs[k, 0], at)
+                gained += likelihood(h, centre, precisions[k, 0], observed[i], b)
+                if weak:
+                    weaken(fine, start, precisions[k, 0], observed[i], centre, b, change)
+                added, growth, below = product(now, b)
+                left, right, answer[0], answer[1], _, aliasing, _, top, _ = spectrum(
+                    now, cut, negligible, cosines, sines, not weak
+                )
+                limit = 30.0 * negligible
+                if weak:  # of a kink the spectrum falls slowly
+                    aliasing, limit = 0.5 * weak_error(now, change), WEAK_SHARE * most
+                else:
+                    highest = top
+                if not (aliasing <= limit):
+                    answer[0], answer[1], answer[2] = float(low), float(high), 0.6 * spacing
+                    status = FAILED if weak or not positive or not (aliasing < np.inf) else RANGE
+                    if not closed and status == RANGE and aliasing > COARSE:
+                        status = UNRESOLVED
+                    break
+                if np.isnan(added) or not (closed or max(left, right) < 1e-10):
+                    status = FAILED
+                    break
+                if not closed:
+                    edge = max(edge, min(left, right) if positive else max(left, right))
+                worst, gained = max(worst, aliasing), gained + added
+            # The report.
+            row[1], row[2] = moments(now)[1:]
+            width = row[2]
+            if closed:
+                row[1], row[2] = circular_moments(now, cosines, sines)
+            made = 2.0 * worst + 10.0 * edge + move.rounding + move.error + 10.0 * negative + min(floor * growth, 1.0)
+            if not (made <= most):
+                status = FAILED
+                break
+            ratio = np.sqrt(max(before * width, 0.0)) / max(predicted, 1e-300)
+            if inside:
+                ratio *= np.exp(-min(0.5 * move.spread / max(before * spacing * spacing, 1e-300), 5.0))
+            ratio = 1.0 if separated(now) else min(max(ratio, 0.3), 1.0)
+            # No estimate is reliable far below the tolerance.
+            error = max(made + error * ratio, RELIABLE * most)
+            row[0], row[3], row[4], row[5], row[6] = gained, worst, edge, negative, move.rounding + move.error
+            row[7] = below / max(np.log(most) - np.log(floor), 2.3) if floor > 0.0 else 0.0
+            log_floor = min(log_floor + max(below - 1.0, 0.0), 0.0)
+            row[8], row[9], row[10], row[11] = growth, made, error, log_floor
+            for j in range(size):
+                densities[i, j] = now[j]
+            row[12], row[13], row[14], row[15] = start, move.pairs, move.substeps, move.needed
+            home, done = start, i + 1
+            # Whether the same grid serves for the next step: as in `line_window.fitted`.
+            low, high = int(answer[0]), int(answer[1])
+            low, high = support(now, cut)
+            resolving = BAND * (size // 2) / (max(highest, 0.0) + 1.0)
+            if resolving < 0.97 or (not near and abs(home + half - length // 2) > length // 4):
+                status = AFTER
+            elif closed:
+                status = AFTER if size > generous and size > 2.2 * size / resolving else OK
+            elif near and abs(start - MARGIN) > MARGIN // 3:
+                status = TABLE
+            if status != OK:
+                break
+        if status == RANGE or status == UNRESOLVED:  # the step is tried again on another grid, from that of the last state
+            for j in range(2):
+                answer[j] = spacing * (answer[j] + start - home - half)
+        return done, status
+
+    return advance
+
+
+_WHOLE = np.ones((1, 5, 1))
+
+
+def advance(
+    mechanisms: Mechanisms, values: Array, grid: Grid, steps: Steps, first: int, observed: Array, error: float, log_floor: float,
+    limits: Array,
+) -> Segment:  # fmt: skip
+    """Return steps, as many as are accurate on one grid.
+
+    Args:
+        mechanisms: what the steps may need.
+        values: probabilities (N,).
+        grid: the grid.
+        steps: the intervals, of which `first` is the first that is taken.
+        observed: what is observed in the intervals from there on (K, m), zero where nothing is.
+        error: the estimate of the relative error of `values`.
+        log_floor: the logarithm of the error of small values, relative to the largest.
+        limits: what a step must keep, as the fields of `Limits`.
+    """
+    count, size = len(observed), len(values)
+    densities, out = np.empty((count, size)), np.empty((count + 1, len(COLUMNS)))
+    averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
+    done, why = _loop(*mechanisms)(
+        values, grid.start, grid.table, averages, *waves(size), grid.offset, grid.spacing, first, observed, *steps, error,
+        log_floor, limits, densities, out, grid.fine,
+    )  # fmt: skip
+    return Segment(densities[:done], out[:done], why, out[-1, :3])

@@ -1,0 +1,260 @@
+"""The product of a density on a grid with a likelihood that may be much narrower, or stand far in its tails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import kernel
+from zakai.numerics.line import window as lw
+
+Array = NDArray[Any]
+
+_DEPTH = 36.0  # logarithm below the best bound from which parts of the line are left out
+_LEVELS = 80
+_MOST_CELLS = 4096
+_NOTHING = 1e-290
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """log l(x) = constant - (value - h(x))'(precision)(value - h(x)) / 2; `observation` maps points (J,) to h (m, J).
+
+    With `linear`, log l(x) = constant + h(x)'(precision) value.
+    """
+
+    observation: Callable[[Array], Array]
+    value: Array
+    precision: Array
+    constant: Any
+    linear: bool = False
+    known: tuple[lw.Window, Array] | None = None  # h at the points of a grid
+
+    def logs(self, points: Array) -> Array:
+        """Return log l (J,), minus infinity where h has no value."""
+        return self.of(self.observation(points))
+
+    def of(self, h: Array) -> Array:
+        """Return log l (J,) for values of h (m, J)."""
+        if self.linear:
+            logs = self.constant + np.sum(h * (self.precision @ self.value)[:, None], axis=0)
+            return np.where(np.isnan(logs.real), -np.inf, logs)
+        rest = self.value[:, None] - h
+        with np.errstate(all="ignore"):
+            logs = self.constant - 0.5 * np.sum(rest * (self.precision @ rest), axis=0)
+        return np.where(np.isnan(logs.real), -np.inf, logs)
+
+    def cells(self, ends: Array, prior: Callable[[Array], Array], origin: float) -> tuple[Array, Array, Array]:
+        """Return for cells between offsets `ends` (J, 2) from the origin what the placing of a grid needs.
+
+        The likelihood of a cell is bounded by the range of h over its ends, widened by half of it.
+
+        Args:
+            ends: (J, 2).
+            prior: logarithm of the density at offsets.
+            origin: the point from which offsets count.
+
+        Returns:
+            The logarithm of the product at the ends (J, 2), a bound of it (J,) and by how much it changes, in deviations (J,).
+        """
+        factor = np.linalg.cholesky(self.precision.real).T
+        target = factor @ self.value.real
+        h = self.observation(origin + ends.reshape(-1)).real
+        own = prior(ends)
+        scaled = (factor @ np.where(np.isfinite(h), h, np.inf)).reshape(len(target), -1, 2)
+        with np.errstate(all="ignore"):
+            rest = target[:, None, None] - scaled
+            product = own - 0.5 * np.sum(np.where(np.isfinite(rest), rest, 1e150) ** 2, axis=0)
+            low, high = scaled.min(axis=2), scaled.max(axis=2)
+            more = 0.5 * (high - low)
+            apart = np.maximum(np.maximum(low - more - target[:, None], target[:, None] - high - more), 0.0)
+            bound = own.max(axis=1) + 1.0 - 0.5 * np.sum(np.where(np.isfinite(apart), apart, 0.0) ** 2, axis=0)
+            change = np.max(np.where(np.isfinite(high - low), high - low, np.inf), axis=0)
+        return product, bound, change
+
+
+@dataclass(frozen=True)
+class General:
+    """Any likelihood, by its values: `log_density` maps points (J,) to log l (J,), NaN where there is none."""
+
+    log_density: Callable[[Array], Array]
+    linear = False
+
+    def logs(self, points: Array) -> Array:
+        """Return log l (J,), minus infinity where it has no value."""
+        found = self.log_density(points)
+        return np.where(np.isnan(found.real), -np.inf, found)
+
+    def cells(self, ends: Array, prior: Callable[[Array], Array], origin: float) -> tuple[Array, Array, Array]:
+        """Return what `Gaussian.cells` returns, from values at five points of each cell.
+
+        A change d of the logarithm counts as the distance from the maximum of a Gaussian between depths D and D + d.
+        """
+        points = ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * np.linspace(0.0, 1.0, 5)
+        logs = np.maximum(self.logs(origin + points.reshape(-1)).real.reshape(points.shape), -1e150)
+        product = prior(points) + logs
+        highest, range_ = product.max(axis=1), logs.max(axis=1) - logs.min(axis=1)
+        depth = np.maximum(product.max() - highest, 0.0)
+        change = np.sqrt(2.0 * (depth + range_)) - np.sqrt(2.0 * depth)
+        return product[:, [0, -1]], highest + 0.5 * range_ + 1.0, change
+
+
+Likelihood = Gaussian | General
+
+
+class Product(NamedTuple):
+    """The normalised product on its grid, the logarithm of its mass, and how deep in the tails of the density it stands.
+
+    `growth` is the factor by which an error that is uniform, relative to the maximum of the density, is relative to the product.
+    """
+
+    values: Array
+    log_mass: Any
+    depth: float
+    growth: float
+    window: lw.Window
+
+
+def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: float) -> Product:
+    """Return the product of probabilities and a likelihood, on a grid that resolves it.
+
+    Args:
+        values: (N,) probabilities of the points of `window`.
+        window: the grid.
+        likelihood: the likelihood.
+        rough: the largest spectrum at the highest frequencies, relative to the mass, with which the grid is kept.
+    """
+    product = _product(values, window, values, window, likelihood)
+    look = lw.figures(product.values, window.closed)
+    resolved = look.aliasing <= 1e-11 or (look.aliasing <= rough and look.rough)
+    if resolved and max(look.left, look.right) < 1e-10:
+        return product
+    new = lw.fitted(look, window) if likelihood.linear else _placed(values, window, likelihood)
+    for _ in range(12):
+        moved = lw.resampled(values, window, new)
+        if not moved.any():  # the observation contradicts all that is known, which the depth reports
+            moved = np.full_like(moved, _NOTHING)
+        product = _product(values, window, moved, new, likelihood)
+        if not np.isfinite(product.log_mass.real):
+            return product
+        look = lw.figures(product.values, new.closed)
+        if look.aliasing <= 1e-11 or new.size >= lw.LARGEST_POSTERIOR:
+            break
+        finer = _finer(product.values, look, new)
+        if finer == new:
+            break
+        new = finer
+    return product
+
+
+def _finer(values: Array, look: lw.Figures, window: lw.Window) -> lw.Window:
+    """Return a finer grid that holds all of a density, of which modes may be far apart; the same grid where there is none."""
+    used = window.offsets[np.flatnonzero(values.real > lw.CUT * values.real.max())]
+    factor = float(np.clip(1.0 / look.resolving, 2**0.5, 8.0))
+    while factor > 1.1:
+        if window.closed:
+            finer = lw.refined(window, factor)
+        else:
+            finer = lw.quantized(window, used[0], used[-1], 1.001 * window.spacing / factor, most=lw.LARGEST_POSTERIOR)
+        if finer.spacing < 0.95 * window.spacing and finer.size * finer.spacing > 1.04 * (used[-1] - used[0]):
+            return finer
+        factor /= 2**0.25
+    return window
+
+
+def _product(values: Array, window: lw.Window, moved: Array, new: lw.Window, likelihood: Likelihood) -> Product:
+    if isinstance(likelihood, Gaussian) and likelihood.known is not None and likelihood.known[0] == new:
+        logs = likelihood.of(likelihood.known[1])
+    else:
+        logs = likelihood.logs(new.points)
+    if np.iscomplexobj(logs) or np.iscomplexobj(moved):
+        logs, moved = logs.astype(complex), moved.astype(complex)
+    top_of_density = float(values.real.max()) * new.spacing / window.spacing
+    return Product(*_normalized(np.ascontiguousarray(moved), np.ascontiguousarray(logs), top_of_density), new)
+
+
+_R, _C = types.float64, types.complex128
+
+
+@kernel(
+    types.Tuple((_R[::1], _R, _R, _R))(_R[::1], _R[::1], _R),  # type: ignore[no-untyped-call]
+    types.Tuple((_C[::1], _C, _R, _R))(_C[::1], _C[::1], _R),  # type: ignore[no-untyped-call]
+)
+def _normalized(values: Array, logs: Array, largest: float) -> tuple[Array, Any, float, float]:
+    """values exp(logs) normalised, the logarithm of its sum, how deep below `largest` its mass is, and the growth of errors."""
+    size = values.size
+    found = np.zeros(size, values.dtype)
+    own = np.empty(size)
+    top = -np.inf
+    for i in range(size):
+        own[i] = np.log(values[i].real) if values[i].real > 0 else -np.inf
+        top = max(top, own[i] + logs[i].real)
+    mass = 0.0 * values[0]
+    if not (-np.inf < top < np.inf):
+        return values, mass - np.inf, np.inf, np.inf
+    for i in range(size):
+        if own[i] > -np.inf and logs[i].real > -np.inf:
+            # Relative to the largest product: neither factor needs to be a number there.
+            found[i] = values[i] / np.exp(own[i]) * np.exp(own[i] + logs[i] - top)
+            mass += found[i]
+    depth, growth, reference = 0.0, 0.0, np.log(largest)
+    for i in range(size):
+        found[i] /= mass
+        growth += np.exp(min(logs[i].real + reference - top - np.log(mass.real), 80.0))
+        if found[i].real > 0:
+            depth += found[i].real * (reference - own[i])
+    return found, np.log(mass) + top, depth, growth
+
+
+def _placed(values: Array, window: lw.Window, likelihood: Likelihood) -> lw.Window:
+    """Return a grid for the product; the same where no number compares parts of it, which the depth reports."""
+    top = values.real.max()
+    found = place(window.offsets, np.log(np.maximum(values.real, 1e-30 * top)), likelihood, window.origin)
+    if found is None:
+        return window
+    low, high, finest = found
+    spacing = min(window.spacing, max(finest, (high - low) / 370.0))
+    if window.closed:
+        size = lw.size_for(min(2 * np.pi / spacing, lw.LARGEST_POSTERIOR))
+        return window._replace(size=size, spacing=2 * np.pi / size)
+    return lw.quantized(window, low, high, spacing, margin=0.3, most=lw.LARGEST_POSTERIOR)
+
+
+def place(offsets: Array, logs: Array, likelihood: Likelihood, origin: float) -> tuple[float, float, float] | None:
+    """Return the ends of the product of a density and a likelihood, and the smallest cell that resolves it.
+
+    Cells whose bound is far below the best value are left out, and the others divided until the likelihood hardly changes in any.
+
+    Args:
+        offsets: points (N,) relative to the origin.
+        logs: the logarithm of the density at these (N,).
+        likelihood: the likelihood.
+        origin: the point from which offsets count.
+    """
+
+    def prior(points: Array) -> Array:
+        return np.asarray(np.interp(points.reshape(-1), offsets, logs, left=-200.0, right=-200.0)).reshape(points.shape)
+
+    cells = np.stack([offsets[:-1], offsets[1:]], axis=1)
+    for _ in range(_LEVELS):
+        product, bound, change = likelihood.cells(cells, prior, origin)
+        best = float(product.max())
+        if not np.isfinite(best):
+            return None
+        keep = bound >= best - _DEPTH  # equal, where the logarithms are so large that nothing can be subtracted
+        cells, change, product = cells[keep], change[keep], product[keep]
+        widths = cells[:, 1] - cells[:, 0]
+        divide = (change > 0.7) & (widths > 1e-14 * np.max(np.abs(offsets)) + 1e-300)
+        if not divide.any() or len(cells) > _MOST_CELLS:
+            break
+        quarters = cells[divide, :1] + widths[divide, None] * np.linspace(0.0, 1.0, 5)
+        parts = np.stack([quarters[:, :-1], quarters[:, 1:]], axis=2).reshape(-1, 2)
+        cells = np.concatenate([cells[~divide], parts])
+    product, _, _ = likelihood.cells(cells, prior, origin)
+    good = (product >= product.max() - 32.0).any(axis=1)
+    return float(cells[good, 0].min()), float(cells[good, 1].max()), float((cells[good, 1] - cells[good, 0]).min())

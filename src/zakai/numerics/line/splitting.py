@@ -1,0 +1,243 @@
+"""The transition of an interval by splitting, with increments that act inside: diffusion, and a potential for all the rest.
+
+    u_t = G u'' / 2 - (f u)' + (h'S^-1 dy/dt - h'S^-1 h / 2) u
+
+With constant coefficients and phi' = f / G the gauge v = e^-phi u leaves v_t = G v'' / 2 + (b / tau) v,
+
+    b = h'S^-1 dy - tau h'S^-1 h / 2 - tau (f^2 / G + f') / 2,
+    exp(b / 6) K exp(2 b / 3 - tau G b'^2 / 72) K exp(b / 6),     K the convolution with N(0, tau G / 2),
+
+which is of fourth order in tau (Chin 1997, scheme A).  On the circle the mean of f becomes a shift of K.  The residual is, with
+the third and fifth commutators for a Gaussian density of the variance P,
+
+    tau^2 std(G^2 b'^2 b'') / 2160 + 7 tau^3 sqrt(8) (G / P) rms(G^2 b''^2) / 8640
+    + tau^4 max(rate^2 rms([A, [b, A]]), std(L^4 b)) / 2880,
+
+L the backward operator.  With s substeps of an interval, s^-4 of that.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import helper
+from zakai.numerics.exponentials import exponentiate
+from zakai.numerics.line.averages import EARLY, IMPOSSIBLE, LATE, MEAN, MOST_MAGNUS, averaged, averaging, operators
+from zakai.numerics.line.density import highest_of, moments
+from zakai.numerics.line.filters import filtered, taps_of, wrapped
+from zakai.numerics.line.terms import Transition, failed
+
+Array = NDArray[Any]
+
+MOST_SUBSTEPS = 64
+OVERFLOW = 690.0
+STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
+
+
+@helper
+def divided(
+    now: Array, table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, averages: Array,
+    observed: Array, inside: bool, tau: float, spacing: float, closed: bool, depth: float, most: float, finest: float,
+) -> Transition:  # fmt: skip
+    """Replace a density by that after a split interval, in as many averages and substeps as its error asks for.
+
+    The samples of a Gaussian of the variance V, in squares of the spacing, are a filter of positive numbers with the relative
+    error 2 exp(-2 pi^2 V).  Narrower kernels are used where these would need a spacing below `finest`.
+
+    Args:
+        now: the density (N,).
+        table, drifts, outputs, precisions, covariances, observed: see `line_segment.Grid` and `line_segment.Steps`.
+        averages: the weights of `line/averages.py`.
+        inside: whether the observation acts inside the interval.
+        tau: the length of the interval.
+        spacing: the spacing of the grid.
+        closed: whether it goes around the circle.
+        depth: the depth of the tails, as a logarithm below the maximum, to which filters are accurate.
+        most: the largest error.
+        finest: the smallest spacing that may be asked for.
+    """
+    size, at, varying = now.size, highest_of(now), averages.shape[0] > 1
+    begin, phi, drift = now.copy(), np.empty(size), np.empty(size)
+    b, first, second = np.empty(size), np.empty(size), np.empty(size)
+    magnus, substeps = 0.0, 1.0  # pairs of averages, one after the other, or the mean
+    both, spreads = np.empty((3, 2, size if varying else 1)), np.empty(3)
+    if varying:
+        operators(table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, both, spreads)
+        mean_error, pair_error = averaging(now, both, spreads, spacing, closed)
+        if mean_error > most:
+            magnus = max(np.ceil(1.1 * (pair_error / most) ** 0.25), 1.0)
+    for _ in range(8):
+        if not (magnus <= MOST_MAGNUS and max(magnus, 1.0) * substeps <= MOST_SUBSTEPS):
+            break
+        parts = int(max(magnus, 1.0))
+        splitting, time, pairs, rounding, clipped, spread, constant, needed = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        wide = np.log(1e4 * parts * substeps / most) / (2.0 * np.pi**2)
+        for j in range(size):
+            now[j] = begin[j]
+        for i in range(2 * parts if magnus > 0.0 else 1):
+            weights = averages[parts * (parts - 1) // 2 + i // 2]
+            which = MEAN if magnus == 0.0 else (EARLY if i % 2 == 0 else LATE)
+            length, own_spread, shift, added = averaged(
+                table, drifts, outputs, precisions, covariances, weights[which], tau, observed, inside, at, spacing, closed, phi,
+                drift, b,
+            )  # fmt: skip
+            if not (own_spread > 0.0):
+                return failed(spread, 0.0)
+            variance = 0.5 * own_spread / substeps
+            if variance < wide * spacing * spacing:
+                needed = np.sqrt(variance / (1.05 * wide))
+                if closed or needed > finest:
+                    return failed(spread, needed)
+            differences(b, spacing, closed, first, second)
+            noise, end = split(now, phi, b, first, own_spread, shift, substeps, spacing, depth, closed, needed > 0.0)
+            if needed > 0.0 and not (noise < 1e-2 * most):  # perhaps the exponents vary too much between points
+                return failed(spread, max(needed, 0.6 * spacing))
+            splitting += residual(now, b, first, second, drift, own_spread, spacing, length) / substeps**4
+            rounding, clipped, spread, constant = rounding + noise, max(clipped, end), spread + own_spread, constant + added
+            if varying and (magnus == 0.0 or i % 2 == 1):
+                if parts > 1:
+                    operators(table, drifts, outputs, precisions, covariances, weights, tau, observed, inside, at, both, spreads)
+                mean_error, pair_error = averaging(now, both, spreads, spacing, closed)
+                time, pairs = time + (pair_error if magnus > 0.0 else mean_error), pairs + pair_error
+            total = moments(now)[0]
+            if not (1e-200 < total < 1e200):
+                splitting = np.inf
+            if not (splitting < np.inf):
+                break
+        if splitting <= most and time <= most:
+            return Transition(splitting + time, rounding, clipped, spread, 1.0, needed, constant, magnus, substeps)
+        if not (splitting + time < np.inf):
+            substeps *= 4.0
+        else:
+            if time > most:
+                magnus = max(np.ceil(1.1 * parts * (pairs / most) ** 0.25), 1.0)
+            rest = splitting * (parts / max(magnus, 1.0)) ** 4
+            substeps = np.ceil(substeps * max(1.02 * (rest / most) ** 0.25, 1.0 / substeps))
+    return failed(0.0, 0.0)
+
+
+@helper
+def differences(b: Array, spacing: float, closed: bool, first: Array, second: Array) -> None:
+    """Write b' and b'' by differences of sixth order, at the ends of the line of second order."""
+    size, inner = b.size, b.size - 6
+    one, two = 1.0 / spacing, 1.0 / (spacing * spacing)
+    left, middle, right = b[:inner], b[3 : inner + 3], b[6:]
+    left_two, left_one, right_one, right_two = b[1 : inner + 1], b[2 : inner + 2], b[4 : inner + 4], b[5 : inner + 5]
+    to_first, to_second = first[3 : inner + 3], second[3 : inner + 3]
+    for j in range(inner):
+        far, near = right_two[j] - left_two[j], right_one[j] - left_one[j]
+        to_first[j] = one * (0.75 * near - 0.15 * far + (right[j] - left[j]) / 60.0)
+        far, near = right_two[j] + left_two[j], right_one[j] + left_one[j]
+        to_second[j] = two * (1.5 * near - 0.15 * far + (right[j] + left[j]) / 90.0 - 49.0 / 18.0 * middle[j])
+    for end in range(3):
+        for j in (end, size - 1 - end):
+            below, above = (j - 1) % size, (j + 1) % size
+            if not closed:
+                below, above = max(j - 1, 0), min(j + 1, size - 1)
+            first[j] = one * (b[above] - b[below]) / (2.0 if closed or above - below == 2 else 1.0)
+            second[j] = two * (b[above] - 2.0 * b[j] + b[below])
+
+
+@helper
+def residual(
+    values: Array, b: Array, first: Array, second: Array, drift: Array, spread: float, spacing: float, tau: float
+) -> float:
+    """Return the residual of the splitting, relative to the density."""
+    size, G = values.size, spread / tau
+    mass, mean, variance = moments(values)
+    mean, variance = mean + size // 2, variance * spacing * spacing
+    third = third_square = fourth_power = upward = flow = seen = 0.0
+    twice_mean = twice_square = four_mean = four_square = 0.0
+    one, two = 0.5 / spacing, 0.5 * G / (spacing * spacing)
+    # L b, ..., L^4 b, L the backward operator by differences.
+    powers = np.zeros((5, size))
+    for j in range(1, size - 1):
+        powers[1, j] = drift[j] * first[j] + 0.5 * G * second[j]
+    for i in range(1, 4):
+        for j in range(i + 1, size - i - 1):
+            rise = (powers[i, j + 1] - powers[i, j - 1]) * one
+            powers[i + 1, j] = drift[j] * rise + two * (powers[i, j + 1] - 2.0 * powers[i, j] + powers[i, j - 1])
+    scale = 1.0 / mass
+    for j in range(4, size - 4):
+        p = values[j] * scale
+        if p < 1e-12:
+            continue
+        seen += p
+        part = G * G * first[j] * first[j] * second[j]
+        third += p * part
+        third_square += p * part * part
+        fourth_power += p * (G * second[j]) ** 4
+        upward += p * G * ((powers[1, j + 1] - powers[1, j - 1]) * one) ** 2
+        twice_mean += p * powers[2, j]
+        twice_square += p * powers[2, j] ** 2
+        four_mean += p * powers[4, j]
+        four_square += p * powers[4, j] ** 2
+        flow += p * drift[j] * (j - mean) * spacing
+    if not (seen > 0.5 and variance > 0):
+        return np.inf
+    growth, turning = G / variance, abs(flow) / variance
+    deviation = np.sqrt(max(third_square - third * third, 0.0))
+    curved = np.sqrt(fourth_power)
+    twice = np.sqrt(max(twice_square - twice_mean * twice_mean, 0.0))
+    four = np.sqrt(max(four_square - four_mean * four_mean, 0.0))
+    commutator = twice + 2.0 * np.sqrt(upward * growth) + growth * np.sqrt(2.0 * curved)
+    total: float = tau**2 / 2160.0 * deviation + 7.0 / 8640.0 * tau**3 * np.sqrt(8.0) * growth * curved
+    return total + tau**4 / 2880.0 * max((growth + turning) ** 2 * commutator, four)
+
+
+@helper
+def split(
+    now: Array, phi: Array, b: Array, first: Array, spread: float, shift: float, substeps: float, spacing: float, depth: float,
+    closed: bool, narrow: bool,
+) -> tuple[float, float]:  # fmt: skip
+    """Replace a density by that after an average, in substeps; return the rounding error and what may have become zero.
+
+    The filter of a narrow kernel is accurate where v is band-limited, that is where the exponents change little between points.
+    """
+    size, count, weight, part = now.size, 2 * int(substeps), 1.0 / (6.0 * substeps), spread / (2.0 * substeps)
+    correction, negligible, clipped = spread / (72.0 * substeps**3), 1e-13 * now[highest_of(now)], 0.0
+    early, middle, joint, late, work = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    for j in range(1, size):
+        if narrow and not (abs(phi[j] - phi[j - 1]) + 5.0 * weight * abs(b[j] - b[j - 1]) < STEEPEST):
+            for i in (j - 1, j):
+                if now[i] > negligible:
+                    return np.inf, 1.0
+                clipped, now[i] = max(clipped, now[i]), 0.0
+    for j in range(size):
+        outer, gauge = weight * b[j], phi[j]
+        if not (abs(gauge) < OVERFLOW and outer - gauge < OVERFLOW):
+            if now[j] > negligible or not (gauge < 0.0 or b[j] == IMPOSSIBLE):
+                return np.inf, 1.0
+            clipped = max(clipped, now[j])
+            now[j], outer, gauge = 0.0, -OVERFLOW, 0.0
+        early[j], late[j], joint[j], work[j] = outer - gauge, outer + gauge, 2.0 * outer, gauge
+        middle[j] = 4.0 * outer - correction * first[j] * first[j]
+    for exponents in (early, middle, late):
+        exponentiate(exponents)
+    if narrow:
+        exponentiate(work)
+    else:
+        work[:] = 1.0
+    if substeps > 1.0:
+        exponentiate(joint)
+    for j in range(size):
+        now[j] *= early[j]
+    variance = part / (spacing * spacing)
+    taps = taps_of(variance, depth, size, narrow)
+    rounding, clipped = 0.0, clipped * 1e-13 / negligible
+    for i in range(count):
+        after = middle if i % 2 == 0 else (joint if i < count - 1 else late)
+        if closed:
+            rounding += wrapped(now, work, shift / (count * spacing), variance, depth)
+            for j in range(size):
+                now[j] *= after[j]
+        else:
+            if i == count - 1:
+                for j in range(size):
+                    work[j] = 1.0
+            noise, end = filtered(now, taps, after, work, narrow)
+            rounding, clipped = rounding + noise, max(clipped, end)
+    return rounding, clipped

@@ -1,0 +1,274 @@
+"""Uniform grids on the line and the circle that follow a density: choice of the grid, resampling, moments.
+
+A density is a vector of probabilities of the grid points.  A smooth density that the grid resolves is band-limited, so that its
+sums are integrals and its values between the points are those of the sinc (line) or trigonometric (circle) interpolant, both to
+rounding.  Grids are taken out of few (spacings a factor of 2^(1/4) apart, centres at multiples of 8 spacings), so that what
+was computed for a grid is found again.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai.numerics.complex_step import angle
+from zakai.numerics.line.density import spectrum, waves
+from zakai.numerics.line.operator import generator
+from zakai.numerics.line.polynomial import interpolated_logs
+
+Array = NDArray[Any]
+
+SIZES = (32, 48, 64, 80, 96, 112, 128, 160, 192, 256, 384, 512, 768, 1024)
+LARGEST = 384  # points of a grid on which densities are moved
+LARGEST_POSTERIOR = 1024  # points of a grid for the product with a likelihood
+CUT = 1e-13  # density relative to its maximum that a new grid must hold
+DEEP = 1e-20  # the same of densities whose small values are accurate
+NEGLIGIBLE = 1e-13  # spectrum relative to the mass that need not be resolved
+ALIGNMENT = 8  # centres stand at multiples of so many spacings
+
+
+class Window(NamedTuple):
+    """The grid x_i = origin + centre + spacing (i - size // 2), i = 0 .. size - 1; `closed` if it goes once around the circle.
+
+    `unit` is the scale of the spacings, which are unit 2^(j/4).
+    """
+
+    origin: float
+    centre: float
+    spacing: float
+    size: int
+    closed: bool
+    unit: float
+
+    @property
+    def offsets(self) -> Array:
+        """The points (size,) relative to the origin."""
+        return self.centre + self.spacing * index(self.size)
+
+    @property
+    def points(self) -> Array:
+        """The points (size,)."""
+        return self.origin + self.offsets
+
+    def generator(self, covariance: Any, drift: Array, potential: Array | None = None) -> Array:
+        """Return the Kolmogorov operator L (size, size) for G, f and V at the points, or integrals over time of these."""
+        return generator(self.closed, self.spacing, covariance, drift, potential)
+
+
+@lru_cache(maxsize=64)
+def index(size: int) -> Array:
+    """Return i - size // 2 (size,)."""
+    found = np.arange(size) - size // 2.0
+    found.setflags(write=False)
+    return found
+
+
+def size_for(count: float) -> int:
+    """Return the smallest size of at least `count` points, or the largest of all."""
+    for size in SIZES:
+        if size >= count:
+            return size
+    return SIZES[-1]
+
+
+def quantized(window: Window, low: float, high: float, spacing: float, margin: float = 0.12, most: int = LARGEST) -> Window:
+    """Return the grid for offsets from `low` to `high` with at most this spacing, and a margin on both sides."""
+    power = np.floor(4.0 * np.log2(spacing / window.unit) + 1e-6)
+    spacing = float(window.unit * 2.0 ** (power / 4.0))
+    needed = (high - low) / spacing * (1.0 + margin)
+    size = min(size_for(needed + ALIGNMENT), most)
+    apart = spacing * ALIGNMENT
+    if size > 96 and needed + 2 * ALIGNMENT <= most:  # few large grids, which take long to prepare
+        size, apart = min(size_for(needed + 2 * ALIGNMENT), most), 2 * apart
+    centre = apart * np.round(0.5 * (low + high) / apart)
+    return window._replace(centre=float(centre), spacing=spacing, size=size)
+
+
+class Figures(NamedTuple):
+    """What decisions about a density are made of.
+
+    `left` and `right` are the largest moduli of the two outermost points on each side, relative to the maximum; `first` and
+    `last` the support; the negative share of the mass; `aliasing` the largest spectrum in the highest eighth of the
+    frequencies, relative to the mass; `rough` tells that the spectrum falls like a power of the frequency, as that of kinks does,
+    or not at all, as that of noise; `resolving` is the spacing that is needed, in spacings.
+    """
+
+    left: float
+    right: float
+    first: int
+    last: int
+    negative: float
+    aliasing: float
+    rough: bool
+    resolving: float
+
+
+def figures(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: float = CUT) -> Figures:
+    """Return the figures of a density.
+
+    Args:
+        values: probabilities (N,).
+        closed: whether the grid goes around the circle.
+        negligible: the spectrum that need not be resolved.
+        cut: the smallest value that counts, relative to the largest.
+    """
+    real = np.ascontiguousarray(values.real)
+    found = spectrum(real, cut, negligible, *waves(len(real)), True)
+    left, right, first, last, negative, aliasing, middle, highest, nyquist = found
+    rough = middle < 6.0 * aliasing
+    if aliasing <= negligible or (rough and aliasing < 1e-9):
+        resolving = 0.92 * nyquist / (max(highest, 0.0) + 1.0)
+    else:  # the spectrum of a Gaussian falls as exp(-c k^2)
+        share = min(max(aliasing, 1e-15), 0.3)
+        resolving = 1.0 / min(max((np.log(negligible) / np.log(share)) ** 0.5, 1.05), 4.0)
+    if closed:
+        left = right = 0.0
+    return Figures(left, right, int(first), int(last), negative, aliasing, rough, float(resolving))
+
+
+def fitted(look: Figures, window: Window, most: int = LARGEST, generous: int = 64, margin: float = 0.12) -> Window:
+    """Return the grid to go on with: the same where it serves, else one that fits the density.
+
+    Args:
+        look: the figures of the density.
+        window: its grid.
+        most: the largest size.
+        generous: a grid of up to so many points is kept though fewer would do.
+        margin: range of a new grid beyond that of the density, relative to it.
+    """
+    needed = look.resolving * window.spacing
+    if not 0.0 < needed < np.inf:  # the values are not finite
+        return window
+    if window.closed:
+        size = min(size_for(2 * np.pi / needed), most)
+        if window.size >= size and (window.size <= 2 * size or window.size <= generous):
+            return window
+        return window._replace(size=size, spacing=2 * np.pi / size)
+    first, last = look.first, look.last
+    width = last - first + 1
+    least = max(3, window.size // 16)
+    inside = first >= least and last < window.size - least
+    resolved = look.resolving >= 0.97
+    enough = width * min(1.0, 1.0 / look.resolving) * 1.12 + ALIGNMENT
+    thrifty = window.size <= max(generous, 1.6 * size_for(enough))
+    if inside and resolved and thrifty and window.size <= most:
+        return window
+    # Rather too coarse than without a part of the mass.
+    needed = max(needed, window.spacing * width / (most - 12) * 1.12 * 2**0.25)
+    low = window.centre + window.spacing * (first - window.size // 2)
+    high = window.centre + window.spacing * (last - window.size // 2)
+    if margin * (high - low) / needed > 0.5 * (most - (high - low) / needed):
+        margin = 0.12
+    return quantized(window, low, high, needed, margin, most)
+
+
+def enlarged(window: Window, left: bool, right: bool) -> Window:
+    """Return the grid with the same spacing and a third as many points more on each side that asks for them."""
+    more = window.size // 3
+    low = window.centre - window.spacing * (window.size // 2 + more * left)
+    high = window.centre + window.spacing * (window.size - 1 - window.size // 2 + more * right)
+    return quantized(window, low, high, window.spacing, margin=0.0, most=SIZES[-1])
+
+
+def refined(window: Window, factor: float = 2**0.5) -> Window:
+    """Return the grid over the same range with a spacing smaller by a factor."""
+    if window.closed:
+        size = size_for(window.size * factor * 0.999)
+        return window._replace(size=size, spacing=2 * np.pi / size)
+    low = window.centre - window.spacing * (window.size // 2)
+    high = window.centre + window.spacing * (window.size - 1 - window.size // 2)
+    return quantized(window, low, high, window.spacing / factor * 1.001, margin=0.0, most=SIZES[-1])
+
+
+def interpolated(values: Array, window: Window, offsets: Array) -> Array:
+    """Return the interpolant of the values at offsets (J,) from the origin."""
+    at = (offsets - window.centre) / window.spacing + window.size // 2
+    nearest = np.round(at)
+    # sin(pi (at - j)) = (-1)^(nearest - j) sin(pi (at - nearest)).
+    distance = at[:, None] - np.arange(window.size)
+    sine = np.sin(np.pi * (at - nearest)) * np.where(nearest % 2 == 0, 1.0, -1.0)
+    signed = values * np.where(np.arange(window.size) % 2 == 0, 1.0, -1.0)
+    exact = np.abs(at - nearest) < 1e-12
+    with np.errstate(all="ignore"):
+        if window.closed:
+            found = (1.0 / np.tan(np.pi / window.size * distance)) @ signed * (sine / window.size)
+        else:
+            found = (1.0 / distance) @ signed * (sine / np.pi)
+    if window.closed:
+        return np.asarray(np.where(exact, values[nearest.astype(int) % window.size], found))
+    inside = (at > -0.5) & (at < window.size - 0.5)
+    own = values[np.where(inside, nearest, 0.0).astype(int)]
+    return np.asarray(np.where(inside, np.where(exact, own, found), 0.0))
+
+
+def gathered(values: Array, offsets: Array, window: Window) -> Array:
+    """Return the values (J,) at offsets, times the matrix of interpolation from a grid on the line to them: (N,)."""
+    at = (offsets - window.centre) / window.spacing + window.size // 2
+    nearest = np.round(at)
+    distance = at[:, None] - np.arange(window.size)
+    exact = np.abs(at - nearest) < 1e-12
+    sine = np.where(exact, 0.0, np.sin(np.pi * (at - nearest)) * np.where(nearest % 2 == 0, 1.0, -1.0))
+    signs = np.where(np.arange(window.size) % 2 == 0, 1.0, -1.0)
+    with np.errstate(divide="ignore"):
+        inverse = np.where(exact[:, None], 0.0, 1.0 / distance)
+    found = (values * sine / np.pi) @ inverse * signs
+    np.add.at(found, nearest[exact].astype(int), values[exact])
+    return np.asarray(found)
+
+
+def resampled(values: Array, window: Window, new: Window) -> Array:
+    """Return the probabilities of the points of another grid."""
+    if new == window:
+        return values
+    if not window.closed and new.spacing == window.spacing:
+        shift = (new.centre - window.centre) / window.spacing + window.size // 2 - new.size // 2
+        if abs(shift - round(shift)) < 1e-6:
+            return _shifted(values, round(shift), new.size)
+    return density_at(values, window, new.offsets) * (new.spacing / window.spacing)
+
+
+def density_at(values: Array, window: Window, offsets: Array) -> Array:
+    """Return the density at offsets (J,) from the origin, times the spacing of the grid."""
+    found = interpolated(values, window, offsets)
+    found = np.where(found.real > 0, found, 0.0)
+    bound = _SMALL * values.real.max()
+    small = np.flatnonzero(found.real < bound)
+    if len(small):
+        # There the interpolant is the rounding of large values; small values are interpolated by their logarithms.
+        logs = interpolated_logs(values, window, offsets[small])
+        found[small] = np.where(logs.real < 2.0 * bound, logs, 0.0)
+    return found
+
+
+_SMALL = 1e-8
+
+
+def _shifted(values: Array, shift: int, size: int) -> Array:
+    found = np.zeros(size, values.dtype)
+    first, last = max(shift, 0), min(shift + size, len(values))
+    if last > first:
+        found[first - shift : last - shift] = values[first:last]
+    return found
+
+
+def moments(values: Array, window: Window) -> tuple[Any, Any]:
+    """Return the mean, relative to the origin, and the variance of probabilities with the sum one.
+
+    On the circle the mean is the argument of E exp(i x) and deviations are wrapped.
+    """
+    if not window.closed:
+        i = index(window.size)
+        first = i @ values
+        apart = i - first
+        return window.centre + window.spacing * first, (window.spacing * window.spacing) * ((apart * apart) @ values)
+    x = window.points
+    cosine, sine = np.cos(x) @ values, np.sin(x) @ values
+    length = np.sqrt(cosine**2 + sine**2)
+    mean: Any = 0.0 * cosine if length.real < 1e-9 else angle(sine, cosine)
+    # The square of a wrapped deviation d is pi^2 / 3 + 4 sum (-1)^k cos(k d) / k^2.
+    k = np.arange(1, window.size // 2)
+    waves = np.cos(k[:, None] * (x - mean)) @ values
+    return mean - window.origin, np.pi**2 / 3 + 4.0 * np.sum(np.where(k % 2 == 0, 1.0, -1.0) / k**2 * waves)

@@ -1,0 +1,1 @@
+"""Densities of two to four states on a grid that moves with them."""

@@ -1,0 +1,185 @@
+"""The grid that covers and resolves weighted points, in one kernel."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.small_matrices import congruence, solve
+from zakai.numerics.space.grid import SIZES
+
+_CORRELATED = 0.6  # correlation above which the axes follow the covariance
+_OPEN, _CLOSED = 0.6, 0.85  # shares of a circle below which an axis is cut open, and above which it is closed
+
+
+@helper
+def invert(out: Any, matrix: Any) -> None:
+    """Set `out` (n, n) to the inverse of a matrix."""
+    n = len(matrix)
+    work = np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
+            work[i, j], out[i, j] = matrix[i, j], (1.0 if i == j else 0.0)
+    solve(work, out)
+
+
+@helper
+def rounded(points: float, least: int, most: int) -> int:
+    """Return the smallest size, fast for the Fourier transform, of at least so many points, between two bounds."""
+    wanted = min(points, float(most)) if points > least else float(least)
+    for size in SIZES:
+        if size >= wanted - 1e-9:
+            return int(size)
+    return int(SIZES[-1])
+
+
+@helper
+def conditional_deviations(out: Any, cov: Any, ridge: float) -> None:
+    """Set `out` (n,) to the standard deviations of a Gaussian along the axes, all other coordinates given."""
+    n = len(cov)
+    scaled, inverse = np.empty((n, n)), np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
+            scaled[i, j] = cov[i, j] / math.sqrt(cov[i, i] * cov[j, j])
+        scaled[i, i] += ridge
+    invert(inverse, scaled)
+    for i in range(n):
+        out[i] = math.sqrt(cov[i, i] / inverse[i, i])
+
+
+@helper
+def _axes(shape: Any, cov: Any, previous: Any, aligned: bool) -> None:
+    """Set `shape` to axes (columns) of unit size in their own coordinate: those of the states, previous ones, or Cholesky's."""
+    n = len(cov)
+    inverse, product, spread = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    for attempt in range(2):
+        for i in range(n):
+            for j in range(n):
+                shape[i, j] = previous[i, j] / previous[j, j] if attempt == 0 else (1.0 if i == j else 0.0)
+        if aligned or n == 1:
+            continue
+        invert(inverse, shape)
+        congruence(spread, inverse, cov, product)
+        worst = 0.0
+        for i in range(n):
+            for j in range(i):
+                worst = max(worst, abs(spread[i, j]) / math.sqrt(spread[i, i] * spread[j, j]))
+        if worst < _CORRELATED:
+            return
+    if aligned or n == 1:
+        return
+    factor = np.zeros((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            total = cov[i, j] / math.sqrt(cov[i, i] * cov[j, j]) + (1e-8 if i == j else 0.0)
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            factor[i, j] = math.sqrt(max(total, 1e-16)) if i == j else total / factor[j, j]
+    for i in range(n):
+        for j in range(n):
+            shape[i, j] = math.sqrt(cov[i, i] / cov[j, j]) * factor[i, j] / factor[j, j]
+
+
+@helper
+def _moments(x: Any, logs: Any, least: float, closed: Any, mean: Any, cov: Any) -> None:
+    """Write the mean (n,) of points with logarithms of at least `least`, add their covariance, and move angles near the mean."""
+    n, count = x.shape
+    total = 0.0
+    for j in range(count):
+        total += math.exp(logs[j]) if logs[j] >= least else 0.0
+    for d in range(n):
+        if closed[d]:
+            sine, cosine = 0.0, 0.0
+            for j in range(count):
+                if logs[j] >= least:
+                    sine += math.exp(logs[j]) * math.sin(x[d, j])
+                    cosine += math.exp(logs[j]) * math.cos(x[d, j])
+            middle = math.atan2(sine, cosine)
+            for j in range(count):
+                x[d, j] -= 2 * math.pi * math.floor((x[d, j] - middle) / (2 * math.pi) + 0.5)
+    for j in range(count):
+        if logs[j] >= least:
+            weight = math.exp(logs[j]) / total
+            for d in range(n):
+                mean[d] += weight * x[d, j]
+    for j in range(count):
+        if logs[j] >= least:
+            weight = math.exp(logs[j]) / total
+            for d in range(n):
+                for e in range(d + 1):
+                    cov[d, e] += weight * (x[d, j] - mean[d]) * (x[e, j] - mean[e])
+    for d in range(n):
+        for e in range(d):
+            cov[e, d] = cov[d, e]
+
+
+@kernel(
+    "void(float64[:, ::1], float64[::1], float64, float64[::1], float64[:, ::1], float64[::1], float64[:, ::1], boolean[::1],"
+    " boolean[::1], float64, float64, float64, int64, int64, float64, float64[::1], float64[:, ::1], int64[::1], boolean[::1])"
+)
+def fit(
+    x: Any, logs: Any, least: float, start: Any, noise: Any, narrowness: Any, previous: Any, was_closed: Any,
+    periodic: Any, reach: float, spacings: float, extra: float, smallest: int, most: int, points: float, centre: Any, basis: Any,
+    sizes: Any, closed: Any,
+) -> None:  # fmt: skip
+    """Write the centre, basis, sizes and closed axes of a grid for weighted points with a Gaussian N(0, noise) added.
+
+    The arguments are those of `space_window.fitted_grid`; the points x (n, J) are overwritten, and those with logarithms below
+    `least` do not count.
+    """
+    n, count = x.shape
+    mean, cov = np.zeros(n), np.empty((n, n))
+    for d in range(n):
+        for e in range(n):
+            cov[d, e] = noise[d, e]
+    _moments(x, logs, least, was_closed, mean, cov)
+    shape, inverse, product = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    aligned = False
+    for d in range(n):
+        aligned = aligned or periodic[d]
+    _axes(shape, cov, previous, aligned)
+    invert(inverse, shape)
+    spread, added = np.empty((n, n)), np.empty((n, n))
+    congruence(spread, inverse, cov, product)
+    congruence(added, inverse, noise, product)
+    low, high = np.empty(n), np.empty(n)
+    for d in range(n):
+        low[d], high[d] = np.inf, -np.inf
+    for j in range(count):
+        if logs[j] >= least:
+            beyond = math.sqrt(max(reach**2 + 2 * min(logs[j], 0.0), 0.0))
+            for d in range(n):
+                z = 0.0
+                for e in range(n):
+                    z += inverse[d, e] * (x[e, j] - mean[e])
+                width = beyond * math.sqrt(added[d, d])
+                low[d], high[d] = min(low[d], z - width), max(high[d], z + width)
+    spacing = np.empty(n)
+    conditional_deviations(spacing, spread, 1e-10)
+    total = 1.0
+    for d in range(n):
+        wider = extra * (high[d] - low[d])
+        low[d], high[d] = low[d] - wider, high[d] + wider
+        spacing[d] *= min(max(narrowness[d], 1e-3), 1.0) / spacings
+        total *= min((high[d] - low[d]) / spacing[d] + 4, most)
+    coarser = max(total / points, 1.0) ** (1 / n)
+    for d in range(n):
+        spacing[d] *= coarser
+        width = high[d] - low[d] + 4 * spacing[d]
+        middle = 0.5 * (low[d] + high[d])
+        closed[d] = periodic[d] and width > 2 * math.pi * (_OPEN if was_closed[d] else _CLOSED)
+        if closed[d]:
+            width, middle = 2 * math.pi, 0.0
+        sizes[d] = rounded(width / spacing[d], smallest, most)
+        # Points to spare go to the width and to the spacing alike.
+        step = width / sizes[d]
+        if not closed[d]:
+            step = max(step, math.sqrt(step * min(spacing[d], 1.3 * step)))
+        for e in range(n):
+            centre[e] += shape[e, d] * middle
+            basis[e, d] = shape[e, d] * step
+    for d in range(n):
+        centre[d] += mean[d] + start[d]
