@@ -16,6 +16,7 @@ from zakai.numerics.line.panels import GAUSS_NODES, GAUSS_WEIGHTS
 
 Array = Any
 
+PARTS = (1, 4, 16)  # of a substep with six nodes each, where the grid moves
 MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
 
 
@@ -42,13 +43,14 @@ def attempted(
     inside: np.ndarray,
     rates: np.ndarray,
     adjoint: bool = False,
+    speed: float = 0.0,
 ) -> Attempt:
-    """Return the density after the part from start + first to start + last of an interval.
+    """Return the density after the part from start + first to start + last of an interval, on a grid that moves with a speed.
 
     The `adjoint` of the transition takes a message from the end of that part to its start.
     """
     system, length = prepared.system, last - first
-    if not system.varying:
+    if not (system.varying or speed):
         known = tables(prepared, window)
         if not inside.any():
             modes = None if adjoint else by_modes(prepared, values, window, length)
@@ -67,7 +69,7 @@ def attempted(
         matrix = window.generator(length * known.covariance, length * known.drift, potential - offset)
         found, error = exponential_action(matrix.T if adjoint else matrix, values)
         return Attempt(found, offset + constant, error, False)
-    return _magnus(prepared, values, window, start, first, last, inside, rates, adjoint)
+    return _magnus(prepared, values, window, start, first, last, inside, rates, adjoint, speed)
 
 
 def parts_of_split(prepared: Prepared, first: float, last: float, error: float) -> list[tuple[float, float]]:
@@ -87,20 +89,30 @@ def _magnus(
     inside: np.ndarray,
     rates: np.ndarray,
     adjoint: bool,
+    speed: float,
 ) -> Attempt:
     """Advance a substep by two exponentials: the commutator-free Magnus integrator of order four.
 
         exp(B0 / 2 + 2 B1 / tau) exp(B0 / 2 - 2 B1 / tau),   B0 = int L dt,   B1 = int (t - middle) L dt.
     """
     length = last - first
-    times = start + first + length * GAUSS_NODES
-    drift, covariance, potential, constant = coefficients(prepared, window, times, inside, rates, values)
-    zeroth, moment = length * GAUSS_WEIGHTS, 2.0 * length * GAUSS_WEIGHTS * (GAUSS_NODES - 0.5)
+    for parts in PARTS if speed else PARTS[:1]:
+        nodes = ((np.arange(parts)[:, None] + GAUSS_NODES) / parts).reshape(-1)
+        times, shifts = start + first + length * nodes, speed * length * nodes if speed else None
+        drift, covariance, potential, constant = coefficients(prepared, window, times, inside, rates, values, shifts)
+        drift = drift - speed
+        error = _unresolved(window, values, length * drift, length * potential) if speed else 0.0
+        if error <= MAGNUS * prepared.tolerance:
+            break
+    else:
+        return Attempt(values, 0.0, error, True)
+    zeroth = length / parts * np.tile(GAUSS_WEIGHTS, parts)
+    moment = 2.0 * zeroth * (nodes - 0.5)
     early, late = 0.5 * zeroth - moment, 0.5 * zeroth + moment
     offset, split = offset_of(zeroth @ potential, values)
     if split or np.any((early @ covariance).real < 0) or np.any((late @ covariance).real < 0):
         return Attempt(values, 0.0, 0.0, True)
-    if prepared.system.steady:
+    if prepared.system.steady and not speed:
         matrix = window.generator(zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset)
         found, error = exponential_action(matrix.T if adjoint else matrix, values)
         return Attempt(found, offset + zeroth @ constant, error, False)
@@ -120,6 +132,20 @@ def _magnus(
     middle, one = exponential_action(first_half, values)
     found, two = exponential_action(second_half, middle)
     return Attempt(found, offset + zeroth @ constant, error + one + two, False)
+
+
+def _unresolved(window: lw.Window, values: Array, drift: Array, potential: Array) -> float:
+    """Return the error of a density, in its deviations, by integrals over time of coefficients whose nodes do not resolve them.
+
+    It is that of the last two terms of the polynomials of time through each six of the nodes (T, N).
+    """
+    mass = values.real > 1e-6 * np.max(values.real)
+    deviation, parts = float(np.sqrt(lw.moments(values, window)[1].real)), len(drift) // len(GAUSS_NODES)
+    drift, potential = (part.real[:, mass].reshape(parts, len(GAUSS_NODES), -1) for part in (drift, potential))
+    return float(np.abs(_LAST @ drift).max() / deviation + np.abs(_LAST @ potential).max()) / parts
+
+
+_LAST = np.linalg.inv(np.polynomial.legendre.legvander(2.0 * GAUSS_NODES - 1.0, len(GAUSS_NODES) - 1))[-2:]
 
 
 def by_modes(prepared: Prepared, values: Array, window: lw.Window, length: float) -> tuple[Array, float] | None:

@@ -19,12 +19,22 @@ GROWTH = 12.0  # largest growth by the potential in one substep where there is n
 
 
 def coefficients(
-    prepared: Prepared, window: lw.Window, times: np.ndarray, inside: np.ndarray, rates: np.ndarray, values: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return f (T, N), G (T,) or (T, N), V less a constant (T, N) and the constant (T,)."""
+    prepared: Prepared, window: lw.Window, times: np.ndarray, inside: np.ndarray, rates: np.ndarray, values: Array,
+    shifts: Array | None = None,
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    """Return f (T, N), G (T,) or (T, N), V less a constant (T, N) and the constant (T,).
+
+    At the times the points of the grid are displaced by `shifts` (T,).
+    """
     system, theta = prepared.system, prepared.theta
-    points = window.points[:, None]
-    if system.moving:
+    points = window.points[:, None] if shifts is None else (window.points + shifts[:, None])[..., None]
+    if shifts is not None:
+        drift = finite(system.drift(points, times[:, None], theta)[..., 0])
+        if system.state_dependent:
+            covariance = finite(system.covariance(points, times[:, None], theta)[..., 0, 0])
+        else:
+            covariance = covariance_at(system, window.points, times, theta)
+    elif system.moving:
         drift = drift_at(system, window, times, theta)
         covariance = covariance_at(system, window.points, times, theta)
     else:
@@ -33,11 +43,11 @@ def coefficients(
         covariance = np.broadcast_to(known.covariance, (len(times), *np.shape(known.covariance)))
     if not inside.any():
         return drift, covariance, np.zeros(drift.shape), np.zeros(len(times))
-    if system.steady_observation and system.steady_noise and system.cross is None:
+    if system.steady_observation and system.steady_noise and system.cross is None and shifts is None:
         h = tables(prepared, window).observation
         value, constant = potential_of(h, precision_of(prepared, times, inside), rates, values)
         return drift, covariance, np.broadcast_to(value, (len(times), len(value))), np.full(len(times), constant)
-    if system.steady_observation:
+    if system.steady_observation and shifts is None:
         h = np.broadcast_to(tables(prepared, window).observation, (len(times), system.m, drift.shape[1]))
     else:
         h = np.moveaxis(system.observation(points, times[:, None], theta), -1, 1)

@@ -38,6 +38,7 @@ from zakai.methods.line.figures import (
 from zakai.methods.line.grids import SHARED
 from zakai.methods.line.model import system_of
 from zakai.methods.line.moves import Passage, Report, by_decomposition, by_kernel, by_substeps
+from zakai.methods.line.moving import SOME, travel
 from zakai.methods.line.parts import parts_of_step, segment_of_parts
 from zakai.methods.line.prior import init as init
 from zakai.methods.line.prior import state_of
@@ -48,6 +49,7 @@ from zakai.models.model import Model
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.channel import Channel, around, chosen
 from zakai.numerics.line.density import separated
+from zakai.numerics.line.outlook import FAR
 from zakai.numerics.line.posterior import General, Likelihood, multiplied
 from zakai.numerics.line.segment import RELIABLE
 from zakai.records.schedule import Schedule
@@ -191,10 +193,12 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> St
                 values, window = refitted(prepared, values, window, look, prepared.generous)
             report.positive = False
             interval = start, length, inside, rates, report
-            if not prepared.system.varying and not inside.any():
+            ranges = travel(prepared, values, window, start, length)
+            if not (ranges > FAR or prepared.system.varying or inside.any()):
                 found = by_decomposition(prepared, values, window, length, report)
             if found is None:
-                found = contracted(prepared, values, window, *interval) or by_substeps(prepared, values, window, *interval)
+                whole = prepared, values, window, *interval, ranges > SOME
+                found = contracted(*whole) or by_substeps(*whole)
         values, window, gained, look, passages = found
     predicted, log_floor = lw.moments(values, window), float(state.log_floor)
     if report.positive:

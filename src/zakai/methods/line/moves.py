@@ -13,6 +13,7 @@ from zakai.methods.line.attempt import attempted, by_modes, parts_of_split
 from zakai.methods.line.coarse import EDGE, coarsened
 from zakai.methods.line.coefficients import resolved_parts
 from zakai.methods.line.figures import refitted
+from zakai.methods.line.moving import speed_of
 from zakai.methods.line.system import Prepared
 from zakai.methods.line.yau import moved
 from zakai.numerics.line import window as lw
@@ -123,8 +124,9 @@ def by_substeps(
     inside: np.ndarray,
     rates: np.ndarray,
     report: Report,
+    moving: bool = False,
 ) -> Moved:
-    """Return the density after an interval, by exponentials of its operator."""
+    """Return the density after an interval, by exponentials of its operator, on grids that move with it or stand."""
     system, negligible, look = prepared.system, prepared.negligible, None
     gained: Any = 0.0
     rough, resolved = max(1e-10, 1e-3 * prepared.tolerance), 30.0 * negligible
@@ -134,7 +136,7 @@ def by_substeps(
         parts = resolved_parts(prepared, values, window, start, length, inside)
         bounds, report.time = parts.bounds, report.time + parts.error
     stack = bounds[::-1]
-    substeps, passages = 0, []
+    substeps, passages, speed = 0, [], 0.0
     while stack:
         first, last = stack.pop()
         substeps += 1
@@ -143,7 +145,9 @@ def by_substeps(
         begin, grown = window, False
         known = lw.figures(values, window.closed, negligible).aliasing
         while True:
-            attempt = attempted(prepared, values, window, start, first, last, inside, rates)
+            if moving:
+                speed = speed_of(prepared, values, window, start + first, last - first)
+            attempt = attempted(prepared, values, window, start, first, last, inside, rates, speed=speed)
             report.decomposed = attempt.decomposed
             total = float(np.sum(attempt.values.real))
             lost = not 1e-100 < total < 1e6 or (not inside.any() and abs(total - 1.0) > 1e-3)
@@ -194,12 +198,13 @@ def by_substeps(
         mass = np.sum(values)
         passages.append(Passage(before, window, last - first, np.log(mass), window if attempt.decomposed else None))
         values = values / mass
+        window = window._replace(centre=window.spacing * round((window.centre + speed * (last - first)) / window.spacing))
         gained = gained + np.log(mass) + attempt.offset
         if stack:
             values, window = refitted(prepared, values, window, look)
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
-    return Moved(values, window, gained, look, () if system.varying or inside.any() else tuple(passages))
+    return Moved(values, window, gained, look, () if moving or system.varying or inside.any() else tuple(passages))
 
 
 def _finer(values: Array, window: lw.Window, look: lw.Figures) -> lw.Window:

@@ -50,12 +50,14 @@ def contracted(
     inside: np.ndarray,
     rates: np.ndarray,
     report: Report,
+    moving: bool,
 ) -> Moved | None:
-    """Return the density after an interval, None where a uniform grid is better or volumes do not serve."""
+    """Return the density after an interval, None where a uniform grid, which may move with it, is better or volumes do not serve."""
     if window.closed:
         return None
     ends = ends_of(values, window)
-    width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(drift_along(prepared, window, ends, start))))
+    drift = drift_along(prepared, window, ends, start)
+    width, speed = float(ends[1] - ends[0]), 0.5 * float(np.ptp(drift)) if moving else float(np.max(np.abs(drift)))
     general = rough(prepared, inside)
     if not (general or speed * length > FAST * width):
         return None
@@ -63,7 +65,7 @@ def contracted(
     if course is None:
         return None
     stiff = speed * length > STIFF * width
-    if not (general or stiff or course.way.travel > MOST_TRAVEL or course.way.deviations > MOST_DEVIATIONS):
+    if not (general or stiff or (course.way.travel > MOST_TRAVEL and not moving) or course.way.deviations > MOST_DEVIATIONS):
         return None
     if width < NARROWEST * course.finest:  # sharper than the cells where it begins
         return None

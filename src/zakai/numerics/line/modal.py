@@ -88,6 +88,8 @@ def advance(
         if not closed:
             needed = outlook(centre + spacing * (begins - half), centre + spacing * (ends - half), tau, unit, profile)
         coarse, left, right, beyond = needed
+        if np.isnan(coarse):
+            return i, FAILED
         if stays and coarse >= 1.41 * spacing:
             return i, NARROW
         if not alone and not coarse >= 1.41 * spacing:

@@ -15,6 +15,7 @@ Array = NDArray[Any]
 
 PROFILE = 4096  # offsets at which f and G are known without a grid
 REACH = 7.6  # standard deviations of the noise by which the support grows
+FAR = 3.0  # ranges of a density that it moves in an interval, above which grids move with it
 _SPACING = 0.34  # spacing in standard deviations of the noise, at most: the shortest wave decays by exp(-42)
 _MARGIN = 7.2  # of them beyond the support: the waves that R' leaves everywhere end there, and spread from the ends
 _NARROW = 7.0  # support of a density in standard deviations of the noise
@@ -23,7 +24,10 @@ _SIZES = np.array(SIZES)
 
 
 class Outlook(NamedTuple):
-    """The spacing and the ends of a grid for the density after an interval, and the margin beyond these."""
+    """The spacing and the ends of a grid for the density after an interval, and the margin beyond these.
+
+    The spacing is NaN where the density moves so far that the grid should move with it.
+    """
 
     spacing: float
     left: float
@@ -58,6 +62,7 @@ def outlook(low: float, high: float, tau: float, unit: float, profile: Array) ->
     spacing = _SPACING * np.sqrt(least * tau * relative(2.0 * fast))
     spacing = unit * 2.0 ** (0.5 * np.floor(2.0 * np.log2(spacing / unit) + 1e-9))
     half, centre = 0.5 * (high - low) * np.exp(-slow) + REACH * wide * np.sqrt(relative(2.0 * slow)), 0.5 * (low + high)
+    spacing = np.nan if abs(shift) > 2.0 * FAR * half else spacing
     return Outlook(spacing, centre - half + min(shift, 0.0), centre + half + max(shift, 0.0), _MARGIN * wide)
 
 

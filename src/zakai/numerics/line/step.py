@@ -14,6 +14,7 @@ from zakai.numerics.compiled import helper
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.averages import IMPOSSIBLE
 from zakai.numerics.line.density import spectrum
+from zakai.numerics.line.outlook import FAR
 from zakai.numerics.line.segment import FAILED, OK, RANGE
 from zakai.numerics.line.terms import DRIFT, exponent_added
 
@@ -29,19 +30,25 @@ def extent(
     now: Array, low: int, high: int, channel: Array, drifts: Array, table: Array, spread: float, tau: float, middle: float,
     spacing: float, cut: float,
 ) -> tuple[float, float]:  # fmt: skip
-    """Return the range of points that a density occupies after the transition, as if it were Gaussian."""
-    half = now.size // 2
+    """Return the range of points that a density occupies until it is after the transition, as if it were Gaussian.
+
+    It is NaN where the density moves so far that the grid should move with it.
+    """
+    half, by = now.size // 2, 0.0
     left, right = float(low - half), float(high - half)
     if np.isnan(channel[0]):
         down, up = 0.0, 0.0
         for r in range(drifts.size):
             down, up = down + drifts[r] * table[r, DRIFT, low], up + drifts[r] * table[r, DRIFT, high]
+        by = min(abs(down), abs(up)) * tau / spacing if down * up > 0.0 else 0.0
         left, right = left + min(down * tau / spacing, 0.0), right + max(up * tau / spacing, 0.0)
     else:
         shift, spread = (channel[1] + (channel[0] - 1.0) * middle) / spacing, channel[2]
         left, right = channel[0] * left + shift, channel[0] * right + shift
     centre, width = 0.5 * (left + right), 0.5 * abs(right - left)
     width = np.sqrt(width * width - 2.0 * np.log(cut) * spread / spacing**2) + 2.0
+    if by > FAR * (high - low + 2.0 * (width - 0.5 * (right - left))):
+        return np.nan, np.nan
     return min(centre - width + half, float(low)), max(centre + width + half, float(high))
 
 

@@ -1,0 +1,69 @@
+"""One state that the drift carries far between observations, against Fourier collocation on a box that stands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import zakai
+from references.kolmogorov import Box, propagate
+
+SYSTEMS = {
+    # f and f' for NumPy; noise, mean and variance of the prior, times, half width and centre of the box, its points
+    "1 + 0.5*sin(x)": (
+        lambda x: 1.0 + 0.5 * np.sin(x), lambda x: 0.5 * np.cos(x), 0.02, 0.5, 1e-3, [0.7, 1.0, 2.1], 2.5, 2.2, 640,
+    ),
+    "0.5*x + sin(x)": (
+        lambda x: 0.5 * x + np.sin(x), lambda x: 0.5 + np.cos(x), 0.7, 300.0, 0.05, [0.1, 0.13, 0.2], 21.0, 316.0, 1000,
+    ),
+}  # fmt: skip
+
+
+def reference(formula, kind, values, S):
+    """Means, deviations and the evidence; that of increments is the integral of the likelihood relative to no signal."""
+    drift, slope, noise, mean, variance, times, half, centre, points = SYSTEMS[formula]
+    box, start, rows, total = Box(half, points, [centre]), 0.0, [], 0.0
+    x = box.x[:, 0]
+    u = np.exp(-0.5 * (x - mean) ** 2 / variance)
+    u /= u.sum()
+    for stop, y in zip(times, values, strict=True):
+        rate = y / (stop - start)
+
+        def potential(x, t, rate=rate):
+            return (x[..., 0] - rate) ** 2 / S if kind == "increments" else 0.0 * x[..., 0]
+
+        u = propagate(
+            box, u, start, stop, lambda x, t: drift(x), lambda x, t: slope(x[..., 0]), lambda t: np.array([[noise**2]]), potential,
+            1e-11,
+        )  # fmt: skip
+        if kind == "samples":
+            u = u * np.exp(-0.5 * (y - x) ** 2 / S) / np.sqrt(2.0 * np.pi * S)
+        else:
+            total += 0.5 * (stop - start) * rate**2 / S
+        total, u, start = total + np.log(u.sum()), u / u.sum(), stop
+        rows.append([u @ x, np.sqrt(u @ (x - u @ x) ** 2)])
+    return *np.array(rows).T, total
+
+
+@pytest.mark.parametrize("kind", ["samples", "increments"])
+@pytest.mark.parametrize("formula", SYSTEMS)
+def test_a_density_that_moves_far_is_the_right_one(formula, kind):
+    drift, _, noise, mean, variance, times, *_ = SYSTEMS[formula]
+    lengths, S = np.diff([0.0, *times]), 2.0 * variance
+    path = solve_ivp(lambda t, x: drift(x), (0.0, times[-1]), [mean], rtol=1e-9, dense_output=True).sol
+    values = path(np.array(times))[0]
+    if kind == "increments":
+        S = 20.0 * variance
+        values = np.array([path(np.linspace(t - tau, t, 101))[0].mean() for t, tau in zip(times, lengths, strict=True)])
+    values = (values + np.array([0.8, -0.5, 0.3]) * variance**0.5) * (lengths if kind == "increments" else 1.0)
+    model = zakai.Model(
+        state=["x"], drift=[formula], diffusion=[[noise]], observation=["x"], observation_noise=[[S]], observation_kind=kind,
+        prior={"kind": "gaussian", "mean": [mean], "cov": [[variance]]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record(np.array(times), values[:, None], kind), "yau-yau")
+    means, deviations, total = reference(formula, kind, values, S)
+    assert not result.warnings
+    assert np.abs(result.mean[1:, 0] - means).max() < 1e-5 * deviations.min()
+    assert np.abs(result.variance[1:, 0] ** 0.5 / deviations - 1.0).max() < 1e-5
+    assert abs(result.log_likelihood - total) < 1e-5 * max(1.0, abs(total))
