@@ -20,12 +20,12 @@ SYSTEMS = {
 }  # fmt: skip
 
 
-def reference(formula, kind, values, S):
-    """Means, deviations and the evidence; that of increments is the integral of the likelihood relative to no signal."""
+def reference(formula, kind, values, S, shift=0.0):
+    """Means, deviations and the evidence, with the mean of the prior displaced."""
     drift, slope, noise, mean, variance, times, half, centre, points = SYSTEMS[formula]
     box, start, rows, total = Box(half, points, [centre]), 0.0, [], 0.0
     x = box.x[:, 0]
-    u = np.exp(-0.5 * (x - mean) ** 2 / variance)
+    u = np.exp(-0.5 * (x - mean - shift) ** 2 / variance)
     u /= u.sum()
     for stop, y in zip(times, values, strict=True):
         rate = y / (stop - start)
@@ -34,8 +34,8 @@ def reference(formula, kind, values, S):
             return (x[..., 0] - rate) ** 2 / S if kind == "increments" else 0.0 * x[..., 0]
 
         u = propagate(
-            box, u, start, stop, lambda x, t: drift(x), lambda x, t: slope(x[..., 0]), lambda t: np.array([[noise**2]]), potential,
-            1e-11,
+            box, u, start, stop, lambda x, t: drift(x), lambda x, t: slope(x[..., 0]), lambda t: np.array([[noise**2]]),
+            potential, 1e-11,
         )  # fmt: skip
         if kind == "samples":
             u = u * np.exp(-0.5 * (y - x) ** 2 / S) / np.sqrt(2.0 * np.pi * S)
@@ -67,3 +67,9 @@ def test_a_density_that_moves_far_is_the_right_one(formula, kind):
     assert np.abs(result.mean[1:, 0] - means).max() < 1e-5 * deviations.min()
     assert np.abs(result.variance[1:, 0] ** 0.5 / deviations - 1.0).max() < 1e-5
     assert abs(result.log_likelihood - total) < 1e-5 * max(1.0, abs(total))
+    if kind == "samples":  # d log Z / d mean = (E (x_0 | all) - mean) / variance
+        step = 1e-2 * variance**0.5
+        one, other = (reference(formula, kind, values, S, shift)[2] for shift in (step, -step))
+        smoothed = zakai.smooth(model, zakai.Record(np.array(times), values[:, None], kind), "yau-yau")
+        assert not smoothed.warnings
+        assert abs(smoothed.mean[0, 0] - mean - variance * (one - other) / (2.0 * step)) < 1e-4 * variance**0.5

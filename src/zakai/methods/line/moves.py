@@ -198,7 +198,7 @@ def by_substeps(
         mass = np.sum(values)
         passages.append(Passage(before, window, last - first, np.log(mass), window if attempt.decomposed else None))
         values = values / mass
-        window = window._replace(centre=window.spacing * round((window.centre + speed * (last - first)) / window.spacing))
+        window = lw.moved(window, speed * (last - first))
         gained = gained + np.log(mass) + attempt.offset
         if stack:
             values, window = refitted(prepared, values, window, look)

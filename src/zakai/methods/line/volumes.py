@@ -52,7 +52,7 @@ def contracted(
     report: Report,
     moving: bool,
 ) -> Moved | None:
-    """Return the density after an interval, None where a uniform grid, which may move with it, is better or volumes do not serve."""
+    """Return the density after an interval, None where volumes do not serve or a uniform grid, which may move, is better."""
     if window.closed:
         return None
     ends = ends_of(values, window)

@@ -1,9 +1,9 @@
 """A message of one state over one interval, backward in time, where the compiled loop does not take it.
 
-On the circle, and where increments act within, the transposed exponentials of the filter act (`line/transposed.py`).  Else a
-Gaussian kernel is a sum over a grid.  Where no coefficient depends on t, a grid covers the support of the message at the end of
-the interval, that of the density at its start, and the paths between them; psi is moved by its decomposition.  All else is for
-finite volumes (`line/volumes.py`).
+On the circle, where increments act within, and where the drift carries the density far, the transposed exponentials of the filter
+act (`line/transposed.py`).  Else a Gaussian kernel is a sum over a grid.  Where no coefficient depends on t, a grid covers the
+support of the message at the end of the interval, that of the density at its start, and the paths between them; psi is moved by
+its decomposition.  All else is for finite volumes (`line/volumes.py`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from zakai.methods.line.course import course_of, ends_of
 from zakai.methods.line.gauge import Gauge, gauge_of
 from zakai.methods.line.message import FEWEST, Message, covering, points_of, reliable, support, taper
 from zakai.methods.line.moves import Report
+from zakai.methods.line.moving import SOME, travel
 from zakai.methods.line.system import Prepared, State
 from zakai.methods.line.tables import covariance_at
 from zakai.methods.line.transposed import by_exponentials
@@ -57,14 +58,20 @@ def pulled(
         state: the filter's state at its start.
         later: the message at its end.
     """
-    found = by_exponentials(prepared, k, inside, rates, state, later, negligible(prepared))
-    if found is not None:
-        return found
-    own = state.window
-    first, last = support(np.asarray(state.values).real, 1e-13)
-    ends = float(own.offsets[first]), float(own.offsets[last])
+    own, accepted = state.window, negligible(prepared)
+    ranges = travel(prepared, np.asarray(state.values), own, float(prepared.schedule.starts[k]), float(prepared.lengths[k]))
+    first = later.closed or bool(inside.any()) or ranges > SOME
+    dense = by_exponentials(prepared, k, inside, rates, state, later, accepted, ranges > SOME) if first else None
+    if dense is not None and (later.closed or dense[1] <= smoothing_tolerance(prepared)):
+        return dense
+    low, high = support(np.asarray(state.values).real, 1e-13)
+    ends = float(own.offsets[low]), float(own.offsets[high])
     found = _by_kernel(prepared, k, rates, ends, later) or _by_modes(prepared, k, inside, state, ends, later)
-    return found or _by_volumes(prepared, k, inside, rates, state, ends, later)
+    if found is None and ranges > 0.0 and not first:
+        dense = by_exponentials(prepared, k, inside, rates, state, later, accepted, True)
+        found = dense if dense is not None and dense[1] <= smoothing_tolerance(prepared) else None
+    found = found or _by_volumes(prepared, k, inside, rates, state, ends, later)
+    return dense if dense is not None and dense[1] < found[1] else found
 
 
 def _by_kernel(

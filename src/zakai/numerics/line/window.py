@@ -173,6 +173,11 @@ def enlarged(window: Window, left: bool, right: bool) -> Window:
     return quantized(window, low, high, window.spacing, margin=0.0, most=SIZES[-1])
 
 
+def moved(window: Window, by: float) -> Window:
+    """Return a grid that is displaced by about a number of its spacings."""
+    return window._replace(centre=window.spacing * round((window.centre + by) / window.spacing)) if by else window
+
+
 def refined(window: Window, factor: float = 2**0.5) -> Window:
     """Return the grid over the same range with a spacing smaller by a factor."""
     if window.closed:
