@@ -27,8 +27,26 @@ KEPT_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are kept
 
 
 @lru_cache(maxsize=8)
-def _kept(model: Model, theta: bytes, kind: str, setting: Any) -> dict[Any, Any]:
-    return {}
+def _kept(model: Model, theta: bytes, kind: str, setting: Any) -> Kept:
+    return Kept()
+
+
+class Kept(dict[Any, tuple[Any, int]]):
+    """Values and their bytes, in the order of their last use; `bytes` is about their sum, which threads may miscount."""
+
+    bytes = 0
+
+    def insert(self, key: Any, value: Any) -> None:
+        """Store a value, and drop those that were used long ago where all are large."""
+        self[key] = value, (size := _bytes_of(value))
+        self.bytes += size
+        if self.bytes > KEPT_BYTES:
+            self.bytes = sum(size for _, size in list(self.values()))
+            while self.bytes > 0.75 * KEPT_BYTES and len(self) > 1:
+                try:
+                    self.bytes -= self.pop(next(iter(self)), (None, 0))[1]
+                except (StopIteration, RuntimeError):  # another thread was faster
+                    break
 
 
 class State(NamedTuple):
@@ -99,7 +117,7 @@ class Prepared:
     cut_up: bool = False
 
     @cached_property
-    def kept(self) -> dict[Any, Any]:
+    def kept(self) -> Kept:
         """What was computed for single grids, shared by all schedules of a model with these parameters and this method."""
         setting = self.pieces, self.tolerance, self.yau is None, self.kernels is None, self.series is None, self.lie, self.origin
         return _kept(self.model, self.theta.tobytes(), self.theta.dtype.str, setting)
@@ -231,13 +249,8 @@ class Prepared:
         found = self.kept.pop(key, None)
         if found is None:
             value = make()
-            found = value, _bytes_of(value)
-            excess = found[1] - KEPT_BYTES + sum(size for _, size in list(self.kept.values()))
-            while excess > 0 and self.kept:
-                try:
-                    excess -= self.kept.pop(next(iter(self.kept)), (None, 0))[1]
-                except (StopIteration, RuntimeError):  # another thread was faster
-                    break
+            self.kept.insert(key, value)
+            return value
         self.kept[key] = found  # the last one that was used is the last one to go
         return found[0]
 
