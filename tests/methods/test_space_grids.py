@@ -82,3 +82,21 @@ def test_an_epidemic_near_extinction_agrees_with_particles():
         deviations = np.sqrt(result.variance[k + 1])
         assert np.abs((np.array([s.mean(), i.mean()]) - result.mean[k + 1]) / deviations).max() < 0.03
         assert np.abs(np.array([s.std(), i.std()]) / deviations - 1).max() < 0.015
+
+
+def test_the_moments_are_those_of_the_density_at_a_small_tolerance():
+    model = zakai.Model(
+        state=["x", "y"], drift=["cos(x) + sin(y)/2", "cos(y)"], observation=["x**3", "y**3"], observation_kind="increments",
+        observation_noise=[[1, 0], [0, 1]], prior={"kind": "gaussian", "mean": [0, 0], "cov": [0.05, 0.05]},
+    )  # fmt: skip
+    _, record = zakai.simulate(model, 0.01 * np.arange(1, 26), seed=2)
+    result = zakai.filter(model, record, "yau-yau", tolerance=1e-5)
+    for k in range(1, 26):
+        density = result.density(k)
+        weights = np.exp(density.log_values - density.log_values.max())
+        index = np.stack(np.meshgrid(*(np.arange(size) - size // 2 for size in weights.shape), indexing="ij"), axis=-1)
+        x = density.centre + index @ density.basis.T
+        mean = np.tensordot(weights, x, axes=2) / weights.sum()
+        variance = np.tensordot(weights, (x - mean) ** 2, axes=2) / weights.sum()
+        assert np.abs((result.mean[k] - mean) / np.sqrt(variance)).max() < 1e-6
+        assert np.abs(result.variance[k] / variance - 1).max() < 1e-6

@@ -107,12 +107,13 @@ class Prepared:
         last = observations.over(*parts[-1])
         potential = last.potential(inside, values, *parts[-1]) if inside.any() and length > 0 else None
         factor, constant = last.factor(k, inside, values)
-        quick, found = None, None
+        quick = None
         if not (self.correlated and inside.any()):
             quick = predicted_on(self, begin, control, allowed, length, potential)
         bounds, rates = self.bounds, values / max(length, 1e-300)
         before: tuple[Field, Report, Control, Update] | None = None
         for _ in range(4):
+            found: Survey | None = None  # of this prediction: a repetition is on another grid
             if quick is not None:
                 (predicted, report, after), found, quick = quick[:3], quick[3] if factor is None else None, None
             else:
@@ -123,7 +124,7 @@ class Prepared:
             if factor is not None:
                 update = updated(predicted, factor, bounds, report.tails)
             if before is not None and not report.splitting + report.of_grid(bounds.reach) < LOST:
-                predicted, report, after, update = before
+                (predicted, report, after, update), found = before, None
                 break
             before = predicted, report, after, update
             of_splines = report.interpolation * update.growth
