@@ -133,6 +133,31 @@ def test_a_distant_mode_with_a_small_weight_keeps_it_over_an_interval():
     assert error < 3e-4
 
 
+@pytest.mark.parametrize("noise", [0.002, 0.01])
+def test_a_sample_that_lifts_a_mode_from_the_end_of_the_tails_is_warned_of(noise):
+    # Two independent linear states; the sample makes a mode count that is 13 nats below the other one.
+    weights, means = np.array([1 - 1.5e-6, 1.5e-6]), np.array([0.4, 1.9])
+    model = zakai.Model(
+        state=["x", "y"], drift=["-x", "-y"], process_noise=[[noise, 0], [0, noise]], observation=["x"],
+        observation_kind="samples", observation_noise=[["0.05"]],
+        prior={
+            "kind": "mixture", "weights": weights.tolist(), "means": [[m, 0] for m in means],
+            "covs": [[[0.004, 0], [0, 0.05]]] * 2,
+        },
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record([0.1], [[1.43]], "samples"), "yau-yau")
+    kept = np.exp(-0.1)
+    x = np.linspace(-1, 4, 20001)
+    density = (norm.pdf(x[:, None], kept * means, np.sqrt(0.004 * kept**2 + noise * (1 - kept**2) / 2)) @ weights) * norm.pdf(
+        x, 1.43, np.sqrt(0.05)
+    )
+    mean = density @ x / density.sum()
+    deviation = np.sqrt(density @ (x - mean) ** 2 / density.sum())
+    error = max(abs(result.mean[1, 0] - mean) / deviation, abs(np.sqrt(result.variance[1, 0]) / deviation - 1))
+    assert error < 10 * result.health["error_estimate"][1]
+    assert result.warnings
+
+
 @pytest.mark.parametrize("kind", ["samples", "increments"])
 def test_what_is_not_observed_has_no_evidence(kind):
     keys = {**CUBIC, "drift": ["y", "-x - y*(x**2 - 1)"], "observation_kind": kind}

@@ -26,10 +26,10 @@ from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.prior_grid import mixture_grid
 from zakai.numerics.space.advance import CHECKED, Control, advance
-from zakai.numerics.space.field import NOTHING, Field, Report, positive
+from zakai.numerics.space.field import NOTHING, Field, Report, positive, spline_error
 from zakai.numerics.space.grid import Grid
 from zakai.numerics.space.step import Stepper
-from zakai.numerics.space.survey import Survey
+from zakai.numerics.space.survey import Survey, deviations_in_spacings
 from zakai.numerics.space.update import Update, updated
 from zakai.numerics.space.window import MOST, Bounds
 from zakai.records.schedule import Schedule
@@ -39,8 +39,9 @@ DEFAULT_TOLERANCE = 1e-3
 OUTLIER_EDGE = 1e-15
 ACCURATE_DEPTH = 27.0  # nats below the maximum that rounding leaves accurate
 ALIKE = 0.5  # how much the errors of different intervals have in common
-FINER = 2.0  # ratio of the spacings of a grid to those of its splines, where these make more than a share of the tolerance
-COARSE = 0.1
+OF_SPLINES = 0.01  # of the tolerance, for the interpolation along one axis in a substep
+POINTWISE = 5.0  # times the error of splines in the moments of a density, for that in the moments of its product
+FINER = 2.0  # ratio of the spacings of a grid to those of its splines, where the product reaches the end of the prediction
 SHARE = 0.2  # of the tolerance, for the error in time of one interval
 LOST = 0.5  # error of a density relative to itself
 KEPT = 0.98  # largest share of an error that an interval is taken to leave
@@ -107,10 +108,10 @@ class Prepared:
         last = observations.over(*parts[-1])
         potential = last.potential(inside, values, *parts[-1]) if inside.any() and length > 0 else None
         factor, constant = last.factor(k, inside, values)
-        quick = None
-        if not (self.correlated and inside.any()):
+        quick, bounds = None, self.bounds
+        if not (self.correlated and inside.any()) and bounds.finer == 1.0:
             quick = predicted_on(self, begin, control, allowed, length, potential)
-        bounds, rates = self.bounds, values / max(length, 1e-300)
+        rates = values / max(length, 1e-300)
         before: tuple[Field, Report, Control, Update] | None = None
         for _ in range(4):
             found: Survey | None = None  # of this prediction: a repetition is on another grid
@@ -122,16 +123,18 @@ class Prepared:
                 predicted = predicted._replace(log_scale=-np.log(predicted.values.sum() * predicted.grid.cell))
             update = Update(predicted, report.edges, report.tails, 0.0, False)
             if factor is not None:
-                update = updated(predicted, factor, bounds, report.tails)
+                wider = self._wider(begin, predicted, parts)
+                update = updated(predicted, factor, bounds, report.tails, wider=wider)
+                report = report._replace(interpolation=POINTWISE * report.interpolation)
             if before is not None and not report.splitting + report.of_grid(bounds.reach) < LOST:
                 (predicted, report, after, update), found = before, None
                 break
             before = predicted, report, after, update
-            of_splines = report.interpolation * update.growth
-            if length > 0 and bounds.finer == 1.0 and (update.truncated or of_splines > COARSE * self.tolerance):
+            if update.truncated and length > 0 and bounds.finer == self.bounds.finer:
                 # The error of waves is as large in the tails as elsewhere.
-                if float(begin.survey(bounds).tails.max()) * np.exp(min(update.depth, 40.0)) < of_splines:
-                    bounds = bounds._replace(finer=FINER)
+                noise = float(begin.survey(bounds).tails.max()) * np.exp(min(update.depth, 40.0))
+                if noise < report.interpolation * update.growth:
+                    bounds = bounds._replace(finer=FINER * bounds.finer)
                     continue
             if not update.truncated or length == 0 or bounds.edge <= OUTLIER_EDGE:
                 break
@@ -216,7 +219,7 @@ class Prepared:
         if not report.splitting + report.of_grid(self.bounds.reach) < LOST and np.isfinite(update.depth):
             result, mass = self._gaussian(result, mean, cov), 1.0
         edge, tails = max(report.edges, update.edges), max(report.tails, update.tails)
-        made = (report.splitting + report.interpolation) * update.growth + update.interpolation
+        made = (report.splitting + report.interpolation) * update.growth + update.interpolation + min(update.cut, 1.0)
         made = made + 1e-15 * np.exp(min(update.depth, 40.0)) + self.bounds.reach**2 * edge * 0.1 + tails
         left = kept * state.error
         error = float(np.sqrt(left**2 + 2 * ALIKE * left * made + made**2))
@@ -259,6 +262,18 @@ class Prepared:
             int(control.age), control.fixed, deviations, float(error), float(kept),
         )  # fmt: skip
 
+    def _wider(self, begin: Field, predicted: Field, parts: list[tuple[float, float]]) -> float:
+        """Return by how much noise has made the variances of a density larger than the drift alone would have."""
+        first, last = begin.survey(self.bounds), predicted.survey(self.bounds)
+        mean, volume, n = (begin.grid.centre + first.mean)[None], 0.0, self.model.n
+        with np.errstate(all="ignore"):
+            for start, length in parts:
+                divergence = self.observations.over(start, length).dynamics.drift(mean, start)[0, n].real
+                volume += length * float(np.nan_to_num(divergence))
+            ratio = np.linalg.det(last.cov) / max(float(np.linalg.det(first.cov)), 1e-300)
+            wider = np.exp(-2 * volume / n) * max(ratio, 0.0) ** (1 / n)
+        return float(np.clip(np.nan_to_num(wider), 1.0, 20.0))
+
     def _kept(self, begin: Field, predicted: Field, result: Field) -> float:
         """Return the share of an error of the mean, in deviations, that an interval leaves."""
         volumes = np.linalg.det(np.stack([f.survey(self.bounds).cov for f in (begin, predicted, result)]))
@@ -282,7 +297,9 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: f
         raise InputError(f"{model.source}: a density grid is for at most four states, and there are {n}")
     periodic = tuple(name in model.periodic for name in model.state)
     tail = min(tolerance**2, 1e-3 * tolerance)
-    bounds = Bounds(1e-3 * tolerance, tail, MOST[n], periodic)
+    spline = float(spline_error(deviations_in_spacings(np.array(tail))))
+    finer = max(spline / (OF_SPLINES * tolerance), 1.0) ** (1 / 6)
+    bounds = Bounds(1e-3 * tolerance, tail, MOST[n], periodic, finer=finer)
     system, theta = system_of(model), np.asarray(theta)
     tables, motions = ({}, {}) if is_complex(theta) else system.caches(theta)
     observations = Observations(model, schedule, system, theta, tables)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from zakai.numerics.compiled import kernel
 from zakai.numerics.space.grid import Grid, rounded_size
 from zakai.numerics.space.resample import refined
-from zakai.numerics.space.survey import Survey, survey
+from zakai.numerics.space.survey import Survey, deviations_in_spacings, survey
 from zakai.numerics.space.window import Bounds
 
 Array = NDArray[Any]
@@ -71,12 +70,15 @@ class Report(NamedTuple):
         )
 
 
+def spline_error(deviations: Array) -> Array:
+    """Return the error of the moments of a Gaussian that splines make for some deviations in spacings."""
+    return np.asarray(1e-4 / deviations**6)
+
+
 def grid_report(found: Survey, finer: float = 1.0) -> Report:
     """Return the errors that a grid shows, whose densities were interpolated on a `finer` one."""
-    edges, tails = found.edges.tolist(), found.tails.tolist()
-    # 1e-4 / s^6 for a standard deviation of s spacings that has such tails
-    interpolation = sum(1e-4 / (-2 * finer**2 * math.log(min(max(tail, 1e-15), 0.9)) / math.pi**2) ** 3 for tail in tails)
-    return Report(0.0, interpolation, max(edges), max(tails), found.negative)
+    interpolation = float(spline_error(finer * deviations_in_spacings(found.tails)).sum())
+    return Report(0.0, interpolation, float(found.edges.max()), float(found.tails.max()), found.negative)
 
 
 def finer_field(field: Field, finer: Array, bounds: Bounds) -> Field:

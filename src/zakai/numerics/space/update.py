@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erfc
 
 from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import is_complex
@@ -35,7 +36,7 @@ class Update(NamedTuple):
 
     The edges and tails of its grid, how many nats below its maximum the prediction is where the product is largest, whether the
     product reaches the end of the predicted window, by how much an error of the prediction may be larger in the moments of the
-    product, and the error of these by the interpolation between the grids.
+    product, and the errors of these by the interpolation between the grids and by the cut of the density before the interval.
     """
 
     field: Field
@@ -45,6 +46,7 @@ class Update(NamedTuple):
     truncated: bool
     growth: float = 1.0
     interpolation: float = 0.0
+    cut: float = 0.0
 
 
 class _Product(NamedTuple):
@@ -102,13 +104,14 @@ def _multiplied(values: Array, grid: Grid, log_factor: Callable[[Grid], Array]) 
 
 
 def updated(
-    field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, tails: float, start: Grid | None = None
+    field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, tails: float, start: Grid | None = None, wider: float = 1.0
 ) -> Update:
     """Return the product of a density and a factor that is given by its logarithm at the points of a grid (J,).
 
     A factor that is narrower than the grid's spacing is found on a sequence of finer grids, with a power of it below one as long
     as neighbours differ by many nats.  `tails` are those of the spectrum of the density.  `start` is the first grid, which the
-    product may fill as it will; without it that is the grid of the density.  A product that is zero, or one point, leaves the
+    product may fill as it will; without it that is the grid of the density.  `wider` is the ratio of the variances of the density
+    to those that it has without the noise of the interval before.  A product that is zero, or one point, leaves the
     density as it is; its mass on the grid of the density is that of the result.
     """
     grid, values = field.grid, field.values
@@ -170,7 +173,7 @@ def updated(
     new_field = product.field._replace(log_scale=field.log_scale + product.top)
     if result is not product.field.values:
         new_field = new_field._replace(values=result)
-    depth, growth, of_spline = _growths(field, product)
+    depth, growth, of_spline, cut = _growths(field, product, bounds, wider)
     between = grid if grid.refines(field.grid) else between
     return Update(
         positive(new_field, bounds),
@@ -180,24 +183,29 @@ def updated(
         _at_end(product.field, field.grid, bounds),
         growth,
         0.0 if between is grid or bounds.band_limited else min(float(_of_spline(field, between, bounds).sum()) * of_spline, 1.0),
+        cut,
     )
 
 
-def _growths(field: Field, product: _Product) -> tuple[float, float, float]:
-    """Return the depth of a product, and by how much errors of the density and of its spline are larger in its moments.
+def _growths(field: Field, product: _Product, bounds: Bounds, wider: float = 1.0) -> tuple[float, float, float, float]:
+    """Return the depth of a product, by how much errors of the density are larger in its moments, and the error of the cut.
 
     At x deviations a Gaussian is d = x^2 / 2 nats below its maximum, in the mean n / 2, and the error of its spline, relative to
     itself, is as the sixth derivative He_6(x), where other errors grow as d.  Mass far from the mean counts by its distance.
+    What is d nats below the maximum of a Gaussian that noise has made `wider` was about d / wider below it before; the cut is the
+    share that comes from below the bound on edges, where the density was zero.
     """
     values, result, grid = product.values.real.reshape(-1), product.field.values.reshape(-1), product.field.grid
     highest = max(field.values.real.max(), values.max())
     peak = max(-math.log(max(float(values[product.peak] / highest), 1e-300)), 0.0)
     used = np.flatnonzero((result > 1e-9) & (values > 0.0))
-    depths, weights = np.maximum(np.log(highest / values[used]) - 0.5 * grid.n, 0.0), result[used] / result[used].sum()
+    below, weights = np.log(highest / values[used]), result[used] / result[used].sum()
+    depths, inside = np.maximum(below - 0.5 * grid.n, 0.0), np.sqrt(bounds.reach**2 / 2 * wider) - np.sqrt(below)
     z = grid.offsets[used] - weights @ grid.offsets[used]
     z = np.abs(z) / np.sqrt(np.maximum(weights @ z**2, 1e-300))
     weights = weights * np.maximum(z.max(axis=1) / FAR, 1.0)
-    return peak, float(weights @ (1.0 + depths)), float(weights @ (1.0 + (2.0 * depths) ** 3 / 15.0))
+    cut = float(weights @ erfc(inside / np.sqrt(max(wider - 1.0, 1e-3))))
+    return peak, float(weights @ (1.0 + depths)), float(weights @ (1.0 + (2.0 * depths) ** 3 / 15.0)), cut
 
 
 def _of_spline(field: Field, grid: Grid, bounds: Bounds) -> Array:
@@ -209,7 +217,7 @@ def _of_spline(field: Field, grid: Grid, bounds: Bounds) -> Array:
 def _interpolable(field: Field, product: _Product, bounds: Bounds) -> Field:
     """Return a density on a grid on which its spline is accurate where its product is."""
     grid, tails = field.grid, field.survey(bounds).tails
-    finer = _of_spline(field, grid, bounds) * _growths(field, product)[2] / (ACCURATE * bounds.edge)
+    finer = _of_spline(field, grid, bounds) * _growths(field, product, bounds)[2] / (ACCURATE * bounds.edge)
     finer = np.clip(finer ** (1 / 6), 1.0, MOST_REFINED)
     # The waves of a grid that does not resolve a density are less accurate than splines.
     finer = np.where(tails > ACCEPTED * bounds.tail, 1.0, finer)
