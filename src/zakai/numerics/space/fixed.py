@@ -65,11 +65,13 @@ def motion(dynamics: Dynamics, grid: Grid, tau: float) -> Motion:
     n, inverse = grid.n, grid.inverse
     away = STEEP_AT * grid.basis * grid.shape
     inside = grid.centre + np.concatenate([np.zeros((1, n)), away.T, -away.T])
-    with np.errstate(all="ignore"):
-        matrices = inverse @ dynamics.jacobian(inside, 0.0).real @ grid.basis
-        rate = float(np.abs(matrices).sum(axis=2).max())
     variances = inverse @ dynamics.noise(0.0, 1.0)[0] @ inverse.T
     noise = float((np.diagonal(variances).real / (grid.shape / 11.0) ** 2).max())
+    rate = np.inf
+    if noise * tau <= LARGEST_NOISE:
+        with np.errstate(all="ignore"):
+            matrices = inverse @ dynamics.jacobian(inside, 0.0).real @ grid.basis
+            rate = float(np.abs(matrices).sum(axis=2).max())
     longest = 1.0 / max(rate / STEEPEST, noise / LARGEST_NOISE, 1e-300)
     if not np.isfinite(rate) or longest < tau:
         return Motion(np.zeros((5, 0)), unit, np.zeros((n, 0)), variances, 0.0, {})
