@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from zakai.numerics.space.advance import CHECKED, Control, advance
 from zakai.numerics.space.field import NOTHING, Field, Report, positive, spline_error
 from zakai.numerics.space.grid import Grid
 from zakai.numerics.space.step import Stepper
-from zakai.numerics.space.survey import Survey, deviations_in_spacings
+from zakai.numerics.space.survey import Survey
 from zakai.numerics.space.update import Update, updated
 from zakai.numerics.space.window import MOST, Bounds
 from zakai.records.schedule import Schedule
@@ -123,7 +124,7 @@ class Prepared:
                 predicted = predicted._replace(log_scale=-np.log(predicted.values.sum() * predicted.grid.cell))
             update = Update(predicted, report.edges, report.tails, 0.0, False)
             if factor is not None:
-                wider = self._wider(begin, predicted, parts)
+                wider = partial(observations.wider, begin, predicted, parts, self.bounds)
                 update = updated(predicted, factor, bounds, report.tails, wider=wider)
                 report = report._replace(interpolation=POINTWISE * report.interpolation)
             if before is not None and not report.splitting + report.of_grid(bounds.reach) < LOST:
@@ -262,18 +263,6 @@ class Prepared:
             int(control.age), control.fixed, deviations, float(error), float(kept),
         )  # fmt: skip
 
-    def _wider(self, begin: Field, predicted: Field, parts: list[tuple[float, float]]) -> float:
-        """Return by how much noise has made the variances of a density larger than the drift alone would have."""
-        first, last = begin.survey(self.bounds), predicted.survey(self.bounds)
-        mean, volume, n = (begin.grid.centre + first.mean)[None], 0.0, self.model.n
-        with np.errstate(all="ignore"):
-            for start, length in parts:
-                divergence = self.observations.over(start, length).dynamics.drift(mean, start)[0, n].real
-                volume += length * float(np.nan_to_num(divergence))
-            ratio = np.linalg.det(last.cov) / max(float(np.linalg.det(first.cov)), 1e-300)
-            wider = np.exp(-2 * volume / n) * max(ratio, 0.0) ** (1 / n)
-        return float(np.clip(np.nan_to_num(wider), 1.0, 20.0))
-
     def _kept(self, begin: Field, predicted: Field, result: Field) -> float:
         """Return the share of an error of the mean, in deviations, that an interval leaves."""
         volumes = np.linalg.det(np.stack([f.survey(self.bounds).cov for f in (begin, predicted, result)]))
@@ -297,8 +286,7 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: f
         raise InputError(f"{model.source}: a density grid is for at most four states, and there are {n}")
     periodic = tuple(name in model.periodic for name in model.state)
     tail = min(tolerance**2, 1e-3 * tolerance)
-    spline = float(spline_error(deviations_in_spacings(np.array(tail))))
-    finer = max(spline / (OF_SPLINES * tolerance), 1.0) ** (1 / 6)
+    finer = max(spline_error(tail) / (OF_SPLINES * tolerance), 1.0) ** (1 / 6)
     bounds = Bounds(1e-3 * tolerance, tail, MOST[n], periodic, finer=finer)
     system, theta = system_of(model), np.asarray(theta)
     tables, motions = ({}, {}) if is_complex(theta) else system.caches(theta)

@@ -187,6 +187,17 @@ class Observations:
         before, after = (cut_off(begin.values, u, grid.closed) for u in (begin.values, weighed(begin.values.real, logs)[0]))
         return max(min(after, 1.0) - before, 0.0)  # what was cut off before was counted then
 
+    def wider(self, begin: Field, predicted: Field, parts: list[tuple[float, float]], bounds: Bounds) -> float:
+        """Return by how much noise has made the variances of a density larger than the drift alone would have, at most 20."""
+        first, last, n = begin.survey(bounds), predicted.survey(bounds), self.model.n
+        mean, volume = (begin.grid.centre + first.mean)[None], 0.0
+        with np.errstate(all="ignore"):
+            for start, length in parts:
+                volume += length * float(np.nan_to_num(self.over(start, length).dynamics.drift(mean, start)[0, n].real))
+            ratio = np.linalg.det(last.cov) / max(float(np.linalg.det(first.cov)), 1e-300)
+            found = np.exp(-2 * volume / n) * max(ratio, 0.0) ** (1 / n)
+        return float(np.clip(np.nan_to_num(found), 1.0, 20.0))
+
     def _panels(self, grid: Grid, a: float, b: float, precision: Any) -> int:
         """Return the panels that resolve S^-1 and h at some points of the grid over an interval."""
         x = grid.points[:: max(1, len(grid.points) // 16)]

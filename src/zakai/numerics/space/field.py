@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from zakai.numerics.compiled import kernel
 from zakai.numerics.space.grid import Grid, rounded_size
 from zakai.numerics.space.resample import refined
-from zakai.numerics.space.survey import Survey, deviations_in_spacings, survey
+from zakai.numerics.space.survey import Survey, survey
 from zakai.numerics.space.window import Bounds
 
 Array = NDArray[Any]
@@ -70,15 +71,18 @@ class Report(NamedTuple):
         )
 
 
-def spline_error(deviations: Array) -> Array:
-    """Return the error of the moments of a Gaussian that splines make for some deviations in spacings."""
-    return np.asarray(1e-4 / deviations**6)
+def spline_error(tail: float, finer: float = 1.0) -> float:
+    """Return the error of splines in the moments of a Gaussian whose spectrum has a tail, on a `finer` grid: 1e-4 / s^6.
+
+    s is the standard deviation in spacings of the finer grid.
+    """
+    return 1e-4 / (-2 * finer**2 * math.log(min(max(tail, 1e-15), 0.9)) / math.pi**2) ** 3
 
 
 def grid_report(found: Survey, finer: float = 1.0) -> Report:
     """Return the errors that a grid shows, whose densities were interpolated on a `finer` one."""
-    interpolation = float(spline_error(finer * deviations_in_spacings(found.tails)).sum())
-    return Report(0.0, interpolation, float(found.edges.max()), float(found.tails.max()), found.negative)
+    edges, tails = found.edges.tolist(), found.tails.tolist()
+    return Report(0.0, sum(spline_error(tail, finer) for tail in tails), max(edges), max(tails), found.negative)
 
 
 def finer_field(field: Field, finer: Array, bounds: Bounds) -> Field:

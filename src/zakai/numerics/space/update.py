@@ -26,7 +26,7 @@ _RESOLVED = 3  # grids on which neighbours differ by few nats that are tried fro
 LOWEST = -100.0  # logarithm of a product, relative to its largest, below which it is zero
 MOST_REFINED = 2.0  # ratio of spacings by which a grid is refined at once
 SPLINE = 5e-4  # error of the spline of a Gaussian, times the sixth power of its standard deviation in spacings
-ACCURATE = 10.0  # times the bound on edges, for the error of the spline
+ACCURATE = 10.0  # times the bound on edges, for the error of the spline, and of the cut, that is small
 FAR = 3.0  # deviations from the mean beyond which mass counts by its distance
 POINT = 0.1  # deviations in spacings of a product that is one point: rounding of the likelihood
 
@@ -104,14 +104,19 @@ def _multiplied(values: Array, grid: Grid, log_factor: Callable[[Grid], Array]) 
 
 
 def updated(
-    field: Field, log_factor: Callable[[Grid], Array], bounds: Bounds, tails: float, start: Grid | None = None, wider: float = 1.0
+    field: Field,
+    log_factor: Callable[[Grid], Array],
+    bounds: Bounds,
+    tails: float,
+    start: Grid | None = None,
+    wider: Callable[[], float] | None = None,
 ) -> Update:
     """Return the product of a density and a factor that is given by its logarithm at the points of a grid (J,).
 
     A factor that is narrower than the grid's spacing is found on a sequence of finer grids, with a power of it below one as long
     as neighbours differ by many nats.  `tails` are those of the spectrum of the density.  `start` is the first grid, which the
-    product may fill as it will; without it that is the grid of the density.  `wider` is the ratio of the variances of the density
-    to those that it has without the noise of the interval before.  A product that is zero, or one point, leaves the
+    product may fill as it will; without it that is the grid of the density.  `wider` returns the ratio of the variances of the
+    density to those that it has without the noise of the interval before.  A product that is zero, or one point, leaves the
     density as it is; its mass on the grid of the density is that of the result.
     """
     grid, values = field.grid, field.values
@@ -187,7 +192,9 @@ def updated(
     )
 
 
-def _growths(field: Field, product: _Product, bounds: Bounds, wider: float = 1.0) -> tuple[float, float, float, float]:
+def _growths(
+    field: Field, product: _Product, bounds: Bounds, wider: Callable[[], float] | None = None
+) -> tuple[float, float, float, float]:
     """Return the depth of a product, by how much errors of the density are larger in its moments, and the error of the cut.
 
     At x deviations a Gaussian is d = x^2 / 2 nats below its maximum, in the mean n / 2, and the error of its spline, relative to
@@ -200,11 +207,15 @@ def _growths(field: Field, product: _Product, bounds: Bounds, wider: float = 1.0
     peak = max(-math.log(max(float(values[product.peak] / highest), 1e-300)), 0.0)
     used = np.flatnonzero((result > 1e-9) & (values > 0.0))
     below, weights = np.log(highest / values[used]), result[used] / result[used].sum()
-    depths, inside = np.maximum(below - 0.5 * grid.n, 0.0), np.sqrt(bounds.reach**2 / 2 * wider) - np.sqrt(below)
+    depths, deepest, cut = np.maximum(below - 0.5 * grid.n, 0.0), 0.5 * bounds.reach**2, 0.0
     z = grid.offsets[used] - weights @ grid.offsets[used]
     z = np.abs(z) / np.sqrt(np.maximum(weights @ z**2, 1e-300))
     weights = weights * np.maximum(z.max(axis=1) / FAR, 1.0)
-    cut = float(weights @ erfc(inside / np.sqrt(max(wider - 1.0, 1e-3))))
+    if wider is not None:
+        cut = float(weights @ erfc(np.sqrt(np.maximum(deepest - below, 0.0))))  # the largest, for any noise
+        if cut > ACCURATE * bounds.edge:
+            ratio = wider()
+            cut = float(weights @ erfc((np.sqrt(deepest * ratio) - np.sqrt(below)) / np.sqrt(max(ratio - 1.0, 1e-3))))
     return peak, float(weights @ (1.0 + depths)), float(weights @ (1.0 + (2.0 * depths) ** 3 / 15.0)), cut
 
 
