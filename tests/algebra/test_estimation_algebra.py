@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import random
-import subprocess
-import sys
 import time
 
 import pytest
@@ -289,11 +287,6 @@ def test_the_analysis_explores_the_algebra_only_when_it_is_asked_for(monkeypatch
     analysis = zakai.analyze(FINITE["Benes"][0])
     assert asked == []
     assert analysis.algebra is None and asked == [analysis.model]
-
-
-def test_the_analysis_of_an_algebra_does_not_load_jax():
-    code = "import sys, zakai; print(zakai.analyze(zakai.load_model('gallery:wong')).algebra.dimension, 'jax' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "4 False\n"
 
 
 def test_derivatives_of_undetermined_functions_are_written_with_primes_and_numbers():

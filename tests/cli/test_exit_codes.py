@@ -180,12 +180,10 @@ def test_a_full_disk_behind_stdout_is_code_2():
     assert running.returncode == 2 and error.count(b"\n") == 1
 
 
-@pytest.mark.parametrize(
-    "arguments", [["--version"], ["--help"], ["gallery"], ["methods"], ["methods", "gallery:benes"], ["analyze", "gallery:benes"]]
-)
-def test_what_does_not_filter_loads_no_compiler(arguments):
+def test_what_does_not_filter_loads_no_compiler():
     code = (
-        f"import sys; from zakai.cli import main; assert main({arguments!r}) == 0; "
-        "assert not {'jax', 'numba'} & set(sys.modules)"
+        "import sys; from zakai.cli import main\n"
+        "for line in ('--version', '--help', 'gallery', 'methods', 'methods gallery:benes', 'analyze gallery:benes'):\n"
+        "    assert main(line.split()) == 0 and not {'jax', 'numba'} & set(sys.modules), line"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL, timeout=60)

@@ -62,10 +62,14 @@ def test_a_kernel_is_compiled_for_the_declared_types_when_it_first_receives_them
     assert answered(started(folder, f"import numpy, one; x = numpy.arange(4.0); {code}")) == ("0 1 2 2 1.5\n", "")
 
 
-@pytest.mark.parametrize("values", ["numpy.arange(4)", "numpy.arange(8.0)[::2]", "numpy.eye(2)"])
-def test_a_kernel_refuses_arrays_of_other_types(folder, values):
-    code = f"import numpy, one\ntry: print(one.total({values}))\nexcept TypeError: print('refused')"
-    assert answered(started(folder, code)) == ("refused\n", "")
+def test_a_kernel_refuses_arrays_of_other_types(folder):
+    code = (
+        "import numpy, one\n"
+        "for values in (numpy.arange(4), numpy.arange(8.0)[::2], numpy.eye(2)):\n"
+        "    try: print(one.total(values))\n"
+        "    except TypeError: print('refused')"
+    )
+    assert answered(started(folder, code)) == (3 * "refused\n", "")
 
 
 def test_two_processes_that_compile_at_once_leave_a_whole_cache(folder):
