@@ -222,8 +222,8 @@ def test_a_grid_and_a_gaussian_smoother_agree():
     np.testing.assert_allclose(grid.variance, exact.variance, atol=1e-6)
 
 
-@pytest.mark.parametrize("count", [10, 11])
-def test_a_message_that_is_lost_is_said_and_stops_nothing(count):
+@pytest.fixture(scope="module")
+def ignited():
     # A reactor that ignites: the drift grows from .1 to 100 within a few observations.
     model = zakai.Model(
         state=["T"], drift=["2*exp(5 - 15/(T + 2)) - 1.5*(T - 1)"], observation=["T"], observation_kind="samples",
@@ -233,6 +233,12 @@ def test_a_message_that_is_lost_is_said_and_stops_nothing(count):
     times = np.cumsum(rng.exponential(0.1, 120) + 0.005)
     _, record = zakai.simulate(model, times, seed=5)
     values = np.where(rng.random((120, 1)) < 0.15, np.nan, record.values)
+    return model, times, values
+
+
+@pytest.mark.parametrize("count", [10, 11])
+def test_a_message_that_is_lost_is_said_and_stops_nothing(ignited, count):
+    model, times, values = ignited
     result = zakai.smooth(model, zakai.Record(times[:count], values[:count], "samples"))
     assert np.isfinite(result.mean).all() or any("no moments were found" in line for line in result.warnings)
 

@@ -29,7 +29,7 @@ def one_state():
 @pytest.mark.parametrize("kernel", ["flow", "power-series"])
 def test_the_density_of_one_state_agrees_with_the_kolmogorov_equation(one_state, kernel):
     system, box, reference = one_state
-    model = zakai.Model(**system.keys())
+    model = system.model("increments")
     record = zakai.Record(system.times, system.increments, "increments")
     result = zakai.filter(model, record, splitting="lie", kernel=kernel)
     assert result.method == "limited-direct" and not result.warnings
@@ -47,7 +47,7 @@ def two_states():
 @pytest.mark.parametrize("kernel", ["flow", "power-series"])
 def test_the_density_of_two_states_agrees_with_the_kolmogorov_equation(two_states, kernel):
     system, box, reference = two_states
-    model = zakai.Model(**system.keys())
+    model = system.model("increments")
     record = zakai.Record(system.times, system.increments, "increments")
     result = zakai.filter(model, record, splitting="lie", kernel=kernel)
     assert not result.warnings
@@ -63,7 +63,7 @@ def test_the_density_of_two_states_agrees_with_the_kolmogorov_equation(two_state
     ],
 )  # fmt: skip
 def test_both_kernels_give_one_result_over_irregular_times_and_gaps(system, kind, splitting):
-    model = zakai.Model(**system.keys() | {"observation_kind": kind})
+    model = system.model(kind)
     times = np.array([0.0003, 0.1, 0.2, 0.9, 1.0]) if splitting == "lie" or kind == "samples" else np.array([0.003, 0.1, 0.15])
     values = 0.3 * np.random.default_rng(0).normal(size=(len(times), len(system.observation)))
     values[2] = np.nan

@@ -95,7 +95,7 @@ def test_limited_direct_is_exact_for_irregular_samples():
 def test_limited_direct_agrees_with_the_kolmogorov_equation():
     system, box = planar(), Box(7.0, 96, (0.0, 0.0))
     reference = filter_system(box, system)
-    model = zakai.Model(**system.keys())
+    model = system.model("increments")
     record = zakai.Record(system.times, system.increments, "increments")
     prepared, states, _ = steps(model, record, method="limited-direct", splitting="lie")
     for state, (_, expected) in zip(states, reference, strict=True):

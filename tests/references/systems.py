@@ -14,11 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 
+import zakai
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class System:
     """A filtering problem: texts for a model, numpy functions of x (..., n) and t for a reference."""
 
@@ -47,6 +50,11 @@ class System:
     @property
     def n(self) -> int:
         return len(self.state)
+
+    @cache  # noqa: B019 - systems are few
+    def model(self, kind: str) -> zakai.Model:
+        """One model for all tests: its analysis takes seconds and is kept in it."""
+        return zakai.Model(**self.keys() | {"observation_kind": kind})
 
     def keys(self) -> dict:
         """The keys of a model file, prior included; the record's values are increments."""
@@ -89,6 +97,7 @@ class System:
         return total
 
 
+@cache
 def scalar() -> System:
     """One state, two sensors with correlated noise, everything varies in time.
 
@@ -150,6 +159,7 @@ def scalar() -> System:
     )
 
 
+@cache
 def planar() -> System:
     """Two states, three correlated sensors, non-diagonal G(t), L that no Cholesky factor makes symmetric.
 
