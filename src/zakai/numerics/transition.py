@@ -29,7 +29,7 @@ Array = NDArray[Any]
 
 
 class Coefficients(NamedTuple):
-    """The coefficients of equation (1) at J times, for n states and k inputs; of one state without the axes of states.
+    """The coefficients of equation (1) at J times, for n states and k inputs.
 
     `matrix` L (J, n, n), `offset` l (J, n, k), `covariance` G (J, n, n), `quadratic` Q (J, n, n), `linear` p (J, n, k),
     `constant` r (J, k).

@@ -276,7 +276,7 @@ def kernel_of(prepared: Prepared, k: int, window: lw.Window, rates: np.ndarray, 
         return None
     place = int(kernels.place[k])
     report.time += float(kernels.errors[place])
-    return around(chosen(kernels.channels, place, np.concatenate([np.ones(1), rates])), window.origin - kernels.origin)
+    return around(chosen(kernels.transitions, place, np.concatenate([np.ones(1), rates])), window.origin - kernels.origin)
 
 
 def valid(prepared: Prepared, state: State) -> bool:

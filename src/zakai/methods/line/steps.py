@@ -10,6 +10,7 @@ from zakai.methods.line.system import Coefficients, Prepared
 from zakai.methods.line.tables import finite
 from zakai.models.prior import GaussianPrior
 from zakai.numerics.complex_step import log_determinant
+from zakai.numerics.line.channel import packed
 from zakai.numerics.line.filters import kernel_size
 from zakai.numerics.line.panels import GAUSS_NODES, interpolation
 from zakai.numerics.line.segment import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Steps
@@ -132,12 +133,11 @@ def steps_of(prepared: Prepared) -> Steps:
     """Return what the compiled loop reads of all intervals."""
     kinds, kernels, c = prepared.kinds, prepared.kernels, prepared.coefficients
     inputs = 1 + prepared.system.m
-    packed = np.full((len(kinds), kernel_size(inputs)), np.nan)
+    parameters = np.full((len(kinds), kernel_size(inputs)), np.nan)
     here = np.flatnonzero((kinds == KERNEL) | (kinds == FACTOR))
     if prepared.gaussian and kernels is not None and len(here):
-        found = [part[kernels.place[here]].reshape(len(here), -1) for part in kernels.channels]
-        packed[here] = np.concatenate(found, axis=1)
+        parameters[here] = packed(kernels.transitions, kernels.place[here])
     precisions = np.where((kinds == KERNEL)[:, None, None, None], 0.0, c.precisions)
     lengths = np.ascontiguousarray(prepared.lengths)
     shares = np.ones(len(kinds)) if prepared.shares is None else prepared.shares
-    return Steps(kinds, lengths, shares, precisions, c.constants, packed, c.drifts, c.outputs, c.covariances)
+    return Steps(kinds, lengths, shares, precisions, c.constants, parameters, c.drifts, c.outputs, c.covariances)

@@ -18,16 +18,16 @@ from zakai.methods.series.kernel import PowerSeries
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
+from zakai.numerics.flow import Coefficients, Transition, integrate
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.channel import Channel, Nodes, nodes_of, parts
-from zakai.numerics.line.collocation import Channels
+from zakai.numerics.line.channel import Channel
 from zakai.numerics.line.filters import applied
-from zakai.numerics.transition import Coefficients
 
 Array = Any
 
 KEPT_SPACING = 160  # points up to which the spacing of a grid is kept where it is enlarged
 NARROWEST = 1.4  # spacings that the standard deviation of a kernel must have
+UNRESOLVED = 1e-10  # relative error of a transition from which the coefficients in time are not resolved
 
 
 class YauLine:
@@ -57,6 +57,7 @@ class YauLine:
         entries = [*own, *numbers(yau.full), *slope, *intercept, *noise]
         self.m, self.blocks = m, entries[:9]
         self._numbers = numpy_function(entries, model)
+        self.steady = not any(sp.sympify(entry, strict=True).has(model.t) for entry in entries)
         # Whether the kernel of an interval depends on x - y alone.
         self.flat = self.unobserved and all(entry == 0 for entry in (own[0], own[3], own[4], yau.form.potential))
         self.gauged = yau.form.potential != 0
@@ -79,33 +80,34 @@ class YauLine:
         return self.affine and self.unobserved
 
     def coefficients(self, t: Array, theta: Array, inside: np.ndarray, lie: bool, origin: float) -> Coefficients:
-        """Return the coefficients at times (K, T) for x relative to `origin`; the inputs are 1 and the rates of the coordinates.
+        """Return the coefficients at times (J,) for x relative to `origin`; the inputs are 1 and the rates of the coordinates.
 
-        `inside` (K, m) marks the coordinates that act inside of each interval.
+        `inside` (J, m) marks the coordinates that act inside of the interval of each time.
         """
-        numbers = np.moveaxis(self._numbers(np.zeros((*t.shape, 1)), t, theta), -1, 0)
-        m, whole = self.m, np.asarray(inside.all(axis=1) & lie)[:, None]
+        numbers = np.moveaxis(self._numbers(np.zeros((len(t), 1)), t, theta), -1, 0)
+        m, whole = self.m, np.asarray(inside.all(axis=1) & lie)
         L, l, G = numbers[:3]
         Q, p, r = (np.where(whole, full, unobserved) for unobserved, full in zip(numbers[3:6], numbers[6:9], strict=True))
         l, p, r = l + L * origin, p + 2.0 * Q * origin, r + (p + Q * origin) * origin
-        inputs = np.zeros((3, *t.shape, 1 + m), numbers.dtype)
-        inputs[:, ..., 0] = l, p, r
+        inputs = np.zeros((3, len(t), 1 + m), numbers.dtype)
+        inputs[..., 0] = l, p, r
         if not lie and inside.any():
             C = np.moveaxis(numbers[9 : 9 + m], 0, -1)
             c = np.moveaxis(numbers[9 + m : 9 + 2 * m], 0, -1) + C * origin
-            S = np.moveaxis(numbers[9 + 2 * m :], 0, -1).reshape(*t.shape, m, m)
-            both = (inside[:, :, None] & inside[:, None])[:, None]
-            alone = np.eye(m) * ~inside[:, None, None, :]
+            S = np.moveaxis(numbers[9 + 2 * m :], 0, -1).reshape(len(t), m, m)
+            both = inside[:, :, None] & inside[:, None]
+            alone = np.eye(m) * ~inside[:, None]
             precision = np.where(both, np.linalg.inv(np.where(both, S, 0.0) + alone), 0.0)
             gain, weighted = np.zeros_like(C), np.zeros_like(c)
             for i in range(m):
-                gain, weighted = gain + precision[..., i] * C[..., i, None], weighted + precision[..., i] * c[..., i, None]
+                gain, weighted = gain + precision[..., i] * C[:, i, None], weighted + precision[..., i] * c[:, i, None]
             for i in range(m):
-                Q = Q - 0.5 * gain[..., i] * C[..., i]
-                inputs[1, ..., 0] -= gain[..., i] * c[..., i]
-                inputs[2, ..., 0] -= 0.5 * weighted[..., i] * c[..., i]
-            inputs[1, ..., 1:], inputs[2, ..., 1:] = gain, weighted
-        return Coefficients(L, inputs[0], G, Q, inputs[1], inputs[2])
+                Q = Q - 0.5 * gain[:, i] * C[:, i]
+                inputs[1, :, 0] -= gain[:, i] * c[:, i]
+                inputs[2, :, 0] -= 0.5 * weighted[:, i] * c[:, i]
+            inputs[1, :, 1:], inputs[2, :, 1:] = gain, weighted
+        L, G, Q = (part[:, None, None] for part in (L, G, Q))
+        return Coefficients(L, inputs[0, :, None], G, Q, inputs[1, :, None], inputs[2])
 
     def kernels(
         self,
@@ -116,10 +118,8 @@ class YauLine:
         lie: bool,
         origin: float,
         series: PowerSeries | None = None,
-        count: int = 1,
-        nodes: Nodes | None = None,
     ) -> Kernels | None:
-        """Return the kernels of `count` equal parts of intervals whose equation is linear-quadratic, None if there are none.
+        """Return the kernels of intervals whose equation is linear-quadratic, None if there are none.
 
         With `series` they are computed by power series, which have no inputs: rates of observation do not act inside.
         """
@@ -129,33 +129,27 @@ class YauLine:
             return None
 
         def at(times: Array, which: Array) -> Coefficients:
-            return self.coefficients(times, theta, inside[rows[which[:, 0]]], lie, origin)
+            return self.coefficients(times, theta, inside[rows[which]], lie, origin)
 
         if series is None:
-            nodes = nodes_of(at, starts[rows], lengths[rows]) if nodes is None else nodes
-            found, errors = parts(at, starts[rows], lengths[rows], count, nodes)
+            begins = np.zeros(len(rows)) if self.steady else starts[rows]
+            found, errors = integrate(at, begins, begins + lengths[rows], self.steady)
+            errors = np.where(errors > UNRESOLVED, errors, 0.0)
         else:
-            full = np.repeat(inside[rows].all(axis=1) & lie, count)
-            length = lengths[rows] / count
-            begins = starts[rows, None] + length[:, None] * np.arange(count)
-            found, errors = series.channels(begins.reshape(-1), np.repeat(length, count), theta, origin, full, 1 + self.m)
-            errors = errors.reshape(-1, count).sum(axis=1)
+            full = np.asarray(inside[rows].all(axis=1) & lie)
+            found, errors = series.channels(starts[rows], lengths[rows], theta, origin, full, 1 + self.m)
         place = np.full(len(starts), -1)
         place[rows] = np.arange(len(rows))
-        return Kernels(found, errors, place, origin, nodes)
+        return Kernels(found, errors, place, origin)
 
 
 class Kernels(NamedTuple):
-    """The kernels for x relative to `origin`, the errors of their coefficients, and where that of an interval is, or -1.
+    """The kernels for x relative to `origin`, the errors of their coefficients, and where that of an interval is, or -1."""
 
-    `nodes` are the coefficients that they were computed from, None for a series.
-    """
-
-    channels: Channels
+    transitions: Transition
     errors: Array
     place: Array
     origin: float
-    nodes: Nodes | None
 
 
 def _unexpanded(model: Model, yau: Any) -> list[sp.Expr] | None:

@@ -21,7 +21,6 @@ from zakai.methods.series.power import Schroedinger, Series, power_series, schro
 from zakai.models.model import Model
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.flow import FlowResult
-from zakai.numerics.line.collocation import Channels
 from zakai.numerics.series import apply, dot, value
 from zakai.numerics.transition import Array, Transition, at, compose, identity, symmetric, transposed
 
@@ -95,21 +94,19 @@ class PowerSeries:
 
     def channels(
         self, starts: Array, lengths: Array, theta: Array, origin: float, full: Array, inputs: int
-    ) -> tuple[Channels, Array]:
-        """Return the kernels of one state for `inputs`, which have no effect, and their errors; `full` is (K,)."""
+    ) -> tuple[Transition, Array]:
+        """Return the transitions of one state for `inputs`, which have no effect, and their errors; `full` is (K,)."""
         groups = [(which, np.flatnonzero(full == which)) for which in (False, True)]
         both = [self.integrate(starts[rows], lengths[rows], theta, np.array([origin]), which) for which, rows in groups]
         back = np.argsort(np.concatenate([rows for _, rows in groups]))
         found = Transition(*(np.concatenate(fields)[back] for fields in zip(*(one.transition for one in both), strict=True)))
         wider = ((0, 0), (0, inputs - 1))
-        return Channels(
-            found.map[:, 0, 0],
-            np.pad(found.offset[:, 0], wider),
-            found.noise[:, 0, 0],
-            np.pad(found.constant, (*wider, wider[1])),
-            np.pad(found.vector[:, 0], wider),
-            -0.5 * found.information[:, 0, 0],
-        ), np.concatenate([one.error for one in both])[back]
+        found = found._replace(
+            offset=np.pad(found.offset, (*wider[:1], *wider)),
+            vector=np.pad(found.vector, (*wider[:1], *wider)),
+            constant=np.pad(found.constant, (*wider, wider[1])),
+        )
+        return found, np.concatenate([one.error for one in both])[back]
 
     def _divided(
         self, starts: Array, lengths: Array, theta: Array, origin: Array, full: bool, parts: int

@@ -156,7 +156,7 @@ def kernel_size(inputs: int) -> int:
 def kernel_of(parameters: Array, observed: Array, length: float, to: Array) -> None:
     """Write a, b, V, k0, k1, k2 of a kernel for increments (m,) over an interval of a length, infinite where none acts inside.
 
-    With the inputs e = (1, increments / length) the parameters are those of `line_collocation.Channels`, one after the other.
+    With the inputs e = (1, increments / length) the parameters are those of `line/channel.packed`.
     """
     count = 1 + observed.size
     shift, variance, constant = parameters[1 : 1 + count], parameters[1 + count], parameters[2 + count : -1 - count]
