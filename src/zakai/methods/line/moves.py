@@ -43,16 +43,13 @@ class Report:
 
 
 class Passage(NamedTuple):
-    """A transition without coefficients in time: the density and the grid before it, its length and the logarithm of its mass.
-
-    `of_modes` is the grid whose modes were taken, None for the exponential of the operator on the grid.
-    """
+    """A transition by modes: the density and the grid before it, its length, the log of its mass, and the grid of the modes."""
 
     values: Array
     window: lw.Window
     length: float
     log_mass: Any
-    of_modes: lw.Window | None
+    of_modes: lw.Window
 
 
 class Moved(NamedTuple):
@@ -136,7 +133,7 @@ def by_substeps(
         parts = resolved_parts(prepared, values, window, start, length, inside)
         bounds, report.time = parts.bounds, report.time + parts.error
     stack = bounds[::-1]
-    substeps, passages, speed = 0, [], 0.0
+    substeps, passages, decomposed, speed = 0, [], True, 0.0
     while stack:
         first, last = stack.pop()
         substeps += 1
@@ -196,7 +193,8 @@ def by_substeps(
         report.time += attempt.error
         before, values = values, np.where(attempt.values.real > 0, attempt.values, 0.0)
         mass = np.sum(values)
-        passages.append(Passage(before, window, last - first, np.log(mass), window if attempt.decomposed else None))
+        passages.append(Passage(before, window, last - first, np.log(mass), window))
+        decomposed = decomposed and attempt.decomposed
         values = values / mass
         window = lw.moved(window, speed * (last - first))
         gained = gained + np.log(mass) + attempt.offset
@@ -204,7 +202,7 @@ def by_substeps(
             values, window = refitted(prepared, values, window, look)
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
-    return Moved(values, window, gained, look, () if moving or system.varying or inside.any() else tuple(passages))
+    return Moved(values, window, gained, look, tuple(passages) if decomposed else ())
 
 
 def _finer(values: Array, window: lw.Window, look: lw.Figures) -> lw.Window:

@@ -22,18 +22,17 @@ from zakai.methods.line.grids import grid_of
 from zakai.methods.line.loop import DIVIDED, START, Piece, infos_of
 from zakai.methods.line.parts import segment_of_parts
 from zakai.methods.line.system import Prepared, State
-from zakai.methods.line.tables import spectral, tables
+from zakai.methods.line.tables import spectral
 from zakai.methods.line.update import factor_at_end
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.segment import SPLIT
 from zakai.numerics.line.split_tangents import Coefficients, Interval, shifted_by, through
-from zakai.numerics.line.tangents import Varied, exponential_derivatives
+from zakai.numerics.line.tangents import Varied
 
 Array = Any
 
 IN_TIME = "drifts", "outputs", "covariances", "precisions"
-INACCURATE = 1e-4  # difference of quadratures of orders ten and six from which they do not serve
 
 
 def tangents(
@@ -80,7 +79,9 @@ class _Walk:
         def noted(k: int, before: State, found: line_filter.Taken) -> None:
             values = observed[k - rows.start :]
             if isinstance(found, line_filter.Stepped):
-                if not (found.passages and self._passed(prepared, k, before, found, values[0])):
+                if found.passages:
+                    self._passed(prepared, k, before, found, values[0])
+                else:
                     self._singly(k, before, found.state, values[0])
                 return
             for piece in found:
@@ -172,20 +173,14 @@ class _Walk:
         length, inside, closed = float(prepared.lengths[k]), bool(prepared.kinds[k] == SPLIT), piece.before.closed
         return Interval(length, piece.before.spacing, closed, observed, inside, int(pairs), int(substeps), bool(needed > 0.0))
 
-    def _passed(self, prepared: Prepared, k: int, before: State, step: line_filter.Stepped, observed: np.ndarray) -> bool:
-        """Take a single step whose transition is known; return whether the derivatives are accurate."""
-        own, tangents, gained = before.window, self.tangents, 0.0
+    def _passed(self, prepared: Prepared, k: int, before: State, step: line_filter.Stepped, observed: np.ndarray) -> None:
+        """Take a single step whose transition was by modes."""
+        own, gained = before.window, 0.0
         for start, window, length, log_mass, of_modes in step.passages:
             self._regrid(own, window)
-            own = of_modes or window
-            if of_modes is None:
-                self.tangents, error = self._exponential(prepared, window, length, start)
-                if not error < INACCURATE:
-                    self.tangents = tangents
-                    return False
-            else:
-                self.tangents = self._varied(prepared, of_modes).through(start, self.tangents, length, window, of_modes)
-            self.tangents, gained = self.tangents / np.exp(log_mass), gained + log_mass
+            own = of_modes
+            moved = self._varied(prepared, own).through(start, self.tangents, length, window, own)
+            self.tangents, gained = moved / np.exp(log_mass), gained + log_mass
         self._regrid(own, step.window)
         at_end = prepared.schedule.seen[k] & ~prepared.inside[k]
         logs = np.zeros((len(self.shifted), step.window.size), complex)
@@ -193,13 +188,6 @@ class _Walk:
             logs = self._logs(partial(_logs_of, k=k, observed=observed, points=step.window.points), prepared)
         self._multiply(step.values, logs, step.info.log_likelihood_increment - gained)
         self._regrid(step.window, step.state.window)
-        return True
-
-    def _exponential(self, prepared: Prepared, window: lw.Window, length: float, values: Array) -> tuple[Array, float]:
-        """Return the derivatives of a density after a time by the exponential of the operator, and their relative error."""
-        known = [tables(one, window) for one in (prepared, *self.shifted)]
-        operator, *shifted = (length * window.generator(one.covariance, one.drift) for one in known)
-        return exponential_derivatives(operator, np.array([one.imag for one in shifted]) / STEP, values, self.tangents)
 
     def _logs(self, function: Callable[[Prepared], Array], prepared: Prepared) -> Array:
         """Return the logarithms (p, ...) of likelihoods, with imaginary parts where a likelihood depends on the parameter."""

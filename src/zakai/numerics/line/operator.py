@@ -93,11 +93,6 @@ def _taylor(matrix: Array, vector: Array, shift: float, norm: float) -> Array:
     return total
 
 
-def norm_of(matrix: Array) -> float:
-    """Return the norm of the real part as an operator on probabilities: the largest sum of moduli of a column."""
-    return float(np.abs(matrix.real).sum(axis=0).max())
-
-
 def exponential_action(matrix: Array, vector: Array) -> tuple[Array, float]:
     """Return exp(matrix) vector, and an estimate of its relative rounding error.
 
@@ -119,7 +114,7 @@ class Exponential:
         size = len(matrix)
         self.shift = float(np.trace(matrix.real)) / size
         self.matrix = np.ascontiguousarray(matrix - self.shift * np.eye(size))
-        self.norm = norm_of(self.matrix)
+        self.norm = float(np.abs(self.matrix.real).sum(axis=0).max())  # as an operator on probabilities
         self.dense = np.isfinite(self.norm) and self.norm * _DENSE > size**2
         if self.dense:
             squarings = int(np.ceil(np.log2(self.norm))) + 1

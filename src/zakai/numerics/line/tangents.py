@@ -4,11 +4,7 @@ With u = s v, v_t = -H v and the decomposition H = U diag(lambda) U', the deriva
 
     U (Q o (U' dH U)) U',   Q_ij = (exp(-tau lambda_i) - exp(-tau lambda_j)) / (lambda_i - lambda_j),
 
-exact for every tau (Daleckii and Krein 1965).  Where the operator A has no accurate decomposition, it is
-
-    int_0^1 exp((1 - s) A) dA exp(s A) ds,
-
-by quadrature on panels whose lengths fall to zero towards s = 0, where the density changes fast.
+exact for every tau (Daleckii and Krein 1965).
 """
 
 from __future__ import annotations
@@ -20,17 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.complex_step import STEP
-from zakai.numerics.line.operator import Spectral, exponential, norm_of, quotients
+from zakai.numerics.line.operator import Spectral, quotients
 from zakai.numerics.line.polynomial import local_polynomial
 from zakai.numerics.line.window import CUT, Window, gathered
 
 Array = NDArray[Any]
-
-
-PANELS = 7  # the last one is a half of the interval, each before it a half of the next, and the first as long as the second
-_STEPS = 8  # of a panel
-_TENTH = np.array([989.0, 5888.0, -928.0, 10496.0, -4540.0, 10496.0, -928.0, 5888.0, 989.0]) / 28350.0
-_SIXTH = np.array([7.0, 0.0, 32.0, 0.0, 12.0, 0.0, 32.0, 0.0, 7.0]) / 90.0
 
 
 class Varied(NamedTuple):
@@ -75,38 +65,3 @@ class Varied(NamedTuple):
         turned = (self.operators * quotients(self.modes.rates, decay, length)) @ coefficients
         after = scale * (U @ (decay * coefficients))
         return scale * (((changes @ U) * decay + turned) @ U.T) + after * self.scales
-
-
-def exponential_derivatives(matrix: Array, changes: Array, vector: Array, tangents: Array) -> tuple[Array, float]:
-    """Return the derivatives (p, N) of exp(A) u, and the relative difference of quadratures of orders ten and six.
-
-    Args:
-        matrix: A (N, N).
-        changes: the derivatives of A (p, N, N).
-        vector: u (N,).
-        tangents: the derivatives of u (p, N).
-    """
-    size, shift = len(vector), float(np.trace(matrix)) / len(vector)
-    matrix = matrix - shift * np.eye(size)
-    # exp(A / 2^k) for k from `deepest` to that of the steps of the last panel.
-    deepest = max(PANELS + 2, int(np.ceil(np.log2(max(norm_of(matrix), 1.0)))) + 1)
-    power = exponential(matrix * 0.5**deepest) * np.exp(shift * 0.5**deepest)
-    powers = {}
-    for k in range(deepest, 3, -1):
-        powers[k] = power
-        power = power @ power
-    found = np.concatenate([vector[None], tangents, np.zeros_like(tangents)])
-    count = len(tangents)
-    for panel in range(PANELS):
-        halvings = min(PANELS - panel, PANELS - 1)  # of the interval
-        step = np.ascontiguousarray(powers[halvings + 3].T)
-        for i in range(_STEPS + 1):
-            if i:
-                found = found @ step
-            source = 0.5**halvings * (changes @ found[0])
-            found[1 : count + 1] += _TENTH[i] * source
-            found[count + 1 :] += (_TENTH[i] - _SIXTH[i]) * source
-    derivatives, rest = found[1 : count + 1], found[count + 1 :]
-    scale = np.sum(np.abs(derivatives), axis=1)
-    error = np.max(np.sum(np.abs(rest), axis=1) / np.where(scale > 0, scale, 1.0), initial=0.0)
-    return derivatives, float(error)
