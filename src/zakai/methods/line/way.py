@@ -1,9 +1,9 @@
 """A message of one state over one interval, backward in time, where the compiled loop does not take it.
 
-On the circle, where increments act within, and where the drift carries the density far, the transposed exponentials of the filter
-act (`line/transposed.py`).  Else a Gaussian kernel is a sum over a grid.  Where no coefficient depends on t, a grid covers the
-support of the message at the end of the interval, that of the density at its start, and the paths between them; psi is moved by
-its decomposition.  All else is for finite volumes (`line/volumes.py`).
+A Gaussian kernel is a sum over a grid.  On the circle, where other increments act within, and where the drift carries the density
+far, the transposed exponentials of the filter act (`line/transposed.py`).  Else, where no coefficient depends on t, a grid covers
+the support of the message at the end of the interval, that of the density at its start, and the paths between them; psi is moved
+by its decomposition.  All else is for finite volumes (`line/volumes.py`).
 """
 
 from __future__ import annotations
@@ -59,14 +59,17 @@ def pulled(
         later: the message at its end.
     """
     own, accepted = state.window, negligible(prepared)
+    low, high = support(np.asarray(state.values).real, 1e-13)
+    ends = float(own.offsets[low]), float(own.offsets[high])
+    found = _by_kernel(prepared, k, rates, ends, later)
+    if found is not None:
+        return found
     ranges = travel(prepared, np.asarray(state.values), own, float(prepared.schedule.starts[k]), float(prepared.lengths[k]))
     first = later.closed or bool(inside.any()) or ranges > SOME
     dense = by_exponentials(prepared, k, inside, rates, state, later, accepted, ranges > SOME) if first else None
     if dense is not None and (later.closed or dense[1] <= smoothing_tolerance(prepared)):
         return dense
-    low, high = support(np.asarray(state.values).real, 1e-13)
-    ends = float(own.offsets[low]), float(own.offsets[high])
-    found = _by_kernel(prepared, k, rates, ends, later) or _by_modes(prepared, k, inside, state, ends, later)
+    found = _by_modes(prepared, k, inside, state, ends, later)
     if found is None and ranges > 0.0 and not first:
         dense = by_exponentials(prepared, k, inside, rates, state, later, accepted, True)
         found = dense if dense is not None and dense[1] <= smoothing_tolerance(prepared) else None
@@ -78,7 +81,7 @@ def _by_kernel(
     prepared: Prepared, k: int, rates: np.ndarray, ends: tuple[float, float], later: Message
 ) -> tuple[Message, float] | None:
     """Return the same of an interval whose kernel is Gaussian, None where it is not or needs many points."""
-    if prepared.yau is None:
+    if prepared.yau is None or later.closed:
         return None
     report = Report()
     kernel = line_filter.kernel_of(prepared, k, later.window, rates, report)
