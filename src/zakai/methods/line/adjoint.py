@@ -12,7 +12,7 @@ import numpy as np
 
 from zakai.methods._protocol import Infos
 from zakai.methods.line.figures import state_moments
-from zakai.methods.line.gauge import Gauge, gauge_of
+from zakai.methods.line.gauge import gauged
 from zakai.methods.line.grids import grid_of
 from zakai.methods.line.loop import TOGETHER
 from zakai.methods.line.message import LOWEST, PAD, SURE, Message, support, taper
@@ -108,11 +108,12 @@ def _taken(
     else:
         lengths = np.ascontiguousarray(prepared.lengths[here])
         longer = _longer(prepared, window, stride, float(np.max(lengths)))
-        gauged = _gauged(prepared, window, stride, longer)
-        if gauged is None:
+        operator = gauged(prepared, longer)
+        if operator is None:
             return None
-        logs, gauge = log_likelihoods(prepared, here, observed, longer.points[None]), gauged.gauge
-        taken = lb.by_modes(_psi(later, longer, gauge, now), filtered, gauged, logs, lengths, window.closed, limits)
+        logs, gauge = log_likelihoods(prepared, here, observed, longer.points[None]), operator.logs
+        known = lb.Gauged(np.ascontiguousarray(operator.modes.T), operator.rates, gauge, _place(window, longer, stride), stride)
+        taken = lb.by_modes(_psi(later, longer, gauge, now), filtered, known, logs, lengths, window.closed, limits)
     if not taken.number:
         return None
     reports, found = taken.reports, taken.message
@@ -213,18 +214,9 @@ def _first(window: lw.Window) -> int:
     return round(window.centre / window.spacing) - window.size // 2
 
 
-def _gauged(prepared: Prepared, window: lw.Window, stride: int, longer: lw.Window) -> lb.Gauged | None:
-    """Return the decomposition for psi on the longer grid, None where there is none."""
-
-    def make() -> tuple[lb.Gauged | None]:
-        found: Gauge = gauge_of(prepared, longer, prepared.model.start)
-        if found.modes is None or not np.isfinite(found.values).all():
-            return (None,)
-        return (lb.Gauged(np.ascontiguousarray(found.modes.modes.T), found.modes.rates, found.values, 0, 1),)
-
-    found: tuple[lb.Gauged | None] = prepared.once(("gauged", longer), make)
-    place = 0 if window.closed else stride * _first(window) - _first(longer)
-    return None if found[0] is None else found[0]._replace(place=place, stride=stride)
+def _place(window: lw.Window, longer: lw.Window, stride: int) -> int:
+    """Return which point of the longer grid is the first of the other one."""
+    return 0 if window.closed else stride * _first(window) - _first(longer)
 
 
 def _infos(prepared: Prepared, window: lw.Window, centres: Array, own: Array, products: Array, reports: Array) -> Infos:

@@ -49,7 +49,7 @@ def tables(prepared: Prepared, window: lw.Window) -> Tables:
 
 def spectral(prepared: Prepared, window: lw.Window) -> Spectral | None:
     """Return the decomposition of the operator on a grid, if it has one."""
-    found: tuple[Spectral | None] = prepared.once(("spectral", window), lambda: (_decomposed(prepared, window),))
+    found: tuple[Spectral | None] = prepared.once(("spectral", window), lambda: (decomposed(prepared, window, lw.LARGEST),))
     return found[0]
 
 
@@ -95,11 +95,17 @@ def covariance_between(system: System, window: lw.Window, t: Array, theta: Array
     return covariance_at(system, ends[:-1] if window.closed else ends, t, theta)
 
 
-def _decomposed(prepared: Prepared, window: lw.Window) -> Spectral | None:
+def decomposed(
+    prepared: Prepared, window: lw.Window, largest: int, ends: tuple[Array, Array] | None = None
+) -> Spectral | None:
+    """Return the decomposition of the operator on a grid of at most so many points, None where there is none.
+
+    With `ends`, F'/F and its derivative (N,) of a function F, the drift in the symmetric operator is f + G F'/F.
+    """
     known = tables(prepared, window)
     drift, covariance = known.drift, known.covariance
     system, theta, start = prepared.system, prepared.theta, prepared.model.start
-    if system.moving or system.slope is None or system.spread is None or window.size > lw.LARGEST:
+    if system.moving or system.slope is None or system.spread is None or window.size > largest:
         return None
     if not (covariance.real > 0).all():
         return None
@@ -117,6 +123,8 @@ def _decomposed(prepared: Prepared, window: lw.Window) -> Spectral | None:
         slope = system.slope(points, start, theta)[:, 0]
         if system.state_dependent:
             spread, curvature = np.moveaxis(system.spread(points, start, theta), -1, 0)
+        if ends is not None:
+            drift, slope = drift + covariance * ends[0], slope + spread * ends[0] + covariance * ends[1]
         potential = 0.5 * ((drift - 0.5 * spread) ** 2 / covariance + slope - 0.5 * curvature)
     covariance = known.covariance
     if system.state_dependent:

@@ -14,7 +14,7 @@ import numpy as np
 
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line.course import course_of, ends_of
-from zakai.methods.line.gauge import Gauge, gauge_of
+from zakai.methods.line.gauge import gauged
 from zakai.methods.line.message import FEWEST, Message, covering, points_of, reliable, support, taper
 from zakai.methods.line.moves import Report
 from zakai.methods.line.moving import SOME, travel
@@ -118,17 +118,16 @@ def _by_modes(
         window = covering(later.window, low, high, spacing)
         if window.size > lw.SIZES[-1]:
             return None
-        gauge = _gauge(prepared, window)
-        if gauge.modes is None:
+        operator = gauged(prepared, window)
+        if operator is None:
             return None
-        psi, top = _psi(later, window, gauge.values)
-        decay = np.exp(-length * gauge.modes.rates)
-        moved = gauge.modes.modes @ (decay * (gauge.modes.modes.T @ psi))
+        psi, top = _psi(later, window, operator.logs)
+        moved, growth = operator.decayed(psi, length), max(1.0, float(np.exp(-length * operator.rates[0])))
         highest = float(np.max(moved))
         if not 0.0 < highest < np.inf:
             return None
-        error = 4e-16 * float(np.sqrt(np.sum(psi * psi))) * max(1.0, float(decay.max())) / highest
-        if not _exact(prepared, state, moved, gauge, window, error):
+        error = 4e-16 * float(np.sqrt(np.sum(psi * psi))) * growth / highest
+        if not _exact(prepared, state, moved, operator.logs, window, error):
             return None
         look = lw.figures(moved, False, accepted)
         coarse = look.aliasing > accepted and not (look.rough and look.aliasing < 1e-3 * prepared.tolerance)
@@ -138,7 +137,8 @@ def _by_modes(
     made = error + 2.0 * look.aliasing + 10.0 * max(look.left, look.right)
     if made > smoothing_tolerance(prepared):
         return None
-    logs = np.log(np.maximum(moved, ROUNDING * highest) / window.spacing) - gauge.values + top
+    assert operator is not None
+    logs = np.log(np.maximum(moved, ROUNDING * highest) / window.spacing) - operator.logs + top
     needed = window.spacing * float(np.clip(look.resolving, 1.0, 2.0))
     return Message.of(logs, window, needed, later.error).between(*ends), made
 
@@ -154,28 +154,22 @@ def _psi(later: Message, window: lw.Window, gauge: Array) -> tuple[Array, float]
     return lw.gathered(values, fine.offsets, window) if finer else values, top
 
 
-def _exact(prepared: Prepared, state: State, psi: Array, gauge: Gauge, window: lw.Window, error: float) -> bool:
+def _exact(prepared: Prepared, state: State, psi: Array, gauge: Array, window: lw.Window, error: float) -> bool:
     """Return whether the error of psi, relative to its maximum, is small in the product with the density at the start."""
     own, top = state.window, float(np.max(psi))
     if own.spacing < window.spacing:  # of which the grid may have no point
         density = reliable(state, own)
         density, offsets = density[density > 0.0], own.offsets[density > 0.0]
-        log_gauge = local_polynomial(gauge.values, window, offsets)
+        log_gauge = local_polynomial(gauge, window, offsets)
         log_psi = local_polynomial(np.log(np.maximum(psi, ROUNDING * top) / top), window, offsets)
     else:
         density = reliable(state, window)
         inside = density > 0.0
-        density, log_gauge, log_psi = density[inside], gauge.values[inside], np.log(np.maximum(psi[inside], 0.0) / top)
+        density, log_gauge, log_psi = density[inside], gauge[inside], np.log(np.maximum(psi[inside], 0.0) / top)
     logs, product = np.log(density) - log_gauge, np.log(density) - log_gauge + log_psi
     shift = np.max(product)
     allowed = SHARE * smoothing_tolerance(prepared)
     return bool(max(error, ROUNDING) * np.sum(np.exp(logs - shift)) < allowed * np.sum(np.exp(product - shift)))
-
-
-def _gauge(prepared: Prepared, window: lw.Window) -> Gauge:
-    """Return the gauge of a system without time on a grid."""
-    found: Gauge = prepared.once(("gauge", window), lambda: gauge_of(prepared, window, prepared.model.start))
-    return found
 
 
 def _by_volumes(

@@ -63,7 +63,6 @@ class YauLine:
         self.gauged = yau.form.potential != 0
         self.steady_gauge = not sp.sympify(yau.form.potential, strict=True).has(model.t)
         self._potential = numpy_function([yau.form.potential], model, (1,))
-        self.gauge_slope = numpy_function([yau.form.gradient[0]], model, (1,))
 
     def potential(self, points: Array, t: float, theta: Array) -> Array:
         """Return phi (N,)."""

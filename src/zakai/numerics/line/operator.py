@@ -190,6 +190,8 @@ class Spectral:
     With u = s v and s'/s = (f - G'/2) / G,
 
         v_t = (G v')' / 2 - ((f - G'/2)^2 / G + f' - G''/2) / 2 v = -H v,      exp(tau L) = s U exp(-tau lambda) U' / s.
+
+    `rates` are lambda, `modes` U, `scale` s over the exponential of `top`, and `logs` its logarithms.
     """
 
     def __init__(self, operator: Array, gauge: Array, scale: Any = 1.0, known: Spectral | None = None):
@@ -206,6 +208,7 @@ class Spectral:
         self.rates, self.modes = np.linalg.eigh(operator.real) if known is None else (known.rates, known.modes)
         self.change = self.modes.T @ operator.imag @ self.modes if np.iscomplexobj(operator) else None
         self.top = float(gauge.real.max())
+        self.logs = gauge - self.top + np.log(scale)
         self.scale = np.exp(gauge - self.top) * scale
 
     def __call__(self, values: Array, length: float) -> tuple[Array, float]:
