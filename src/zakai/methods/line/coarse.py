@@ -17,9 +17,8 @@ import numpy as np
 
 from zakai.methods.line.figures import figures
 from zakai.methods.line.system import Prepared
-from zakai.methods.line.tables import covariance_at, spectral
+from zakai.methods.line.tables import covariance_at, gauge_at, spectral
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.panels import GAUSS_NODES, GAUSS_WEIGHTS
 
 Array = Any
 
@@ -97,12 +96,7 @@ def _grid(window: lw.Window, low: float, high: float, spacing: float) -> lw.Wind
 
 
 def _gauge(prepared: Prepared, coarse: lw.Window, points: Array) -> Array:
-    """Return int f / G from the first point of the coarse grid to points in it (J,), in steps between neighbours."""
+    """Return int f / G from the first point of the coarse grid to points in it (J,)."""
     ends = np.sort(np.concatenate([coarse.points, points]))
-    start, theta = prepared.model.start, prepared.theta
-    steps = np.diff(ends)
-    nodes = (ends[:-1, None] + steps[:, None] * GAUSS_NODES).reshape(-1)
-    slopes = prepared.system.drift(nodes[:, None], start, theta)[:, 0] / covariance_at(prepared.system, nodes, start, theta)
-    total = np.concatenate([np.zeros(1), np.cumsum(steps * (slopes.reshape(len(steps), -1) @ GAUSS_WEIGHTS))])
-    total = total - total[np.searchsorted(ends, coarse.points[0])]
-    return total[np.searchsorted(ends, points)]
+    total = gauge_at(prepared, ends)
+    return np.asarray(total[np.searchsorted(ends, points)] - total[np.searchsorted(ends, coarse.points[0])])

@@ -9,12 +9,11 @@ import numpy as np
 
 from zakai.methods.line.grids import SHARED
 from zakai.methods.line.system import Prepared, State
-from zakai.methods.line.tables import covariance_at, profile_of, spectral
+from zakai.methods.line.tables import covariance_at, gauge_at, profile_of, spectral
 from zakai.methods.line.update import factor_at_end
 from zakai.numerics.line import modal as lm
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import waves
-from zakai.numerics.line.panels import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line.place import PER
 from zakai.numerics.line.posterior import General
 from zakai.numerics.line.segment import COLUMNS, FAILED
@@ -125,12 +124,7 @@ def _parts(prepared: Prepared, grid: lw.Window) -> list[Array] | None:
     if decomposed is None:
         return None
     system, start, theta, x = prepared.system, prepared.model.start, prepared.theta, _points(grid)
-    parts = 4 if system.rough else 1
-    within = np.linspace(0.0, 1.0, parts, endpoint=False)[:, None] + GAUSS_NODES / parts
-    within = (x[:-1, None] + grid.spacing / PER * within.reshape(-1)).reshape(-1)
-    slopes = system.drift(within[:, None], start, theta)[:, 0] / covariance_at(system, within, start, theta)
-    means = (slopes.reshape(len(x) - 1, parts, -1) @ GAUSS_WEIGHTS).mean(axis=1)
-    scale = np.append(0.0, np.cumsum(grid.spacing / PER * means))
+    scale = gauge_at(prepared, x, 4 if system.rough else 1)
     if system.state_dependent:
         scale = scale - 0.5 * np.log(covariance_at(system, x, start, theta))
     rows = np.zeros((system.m, len(x)))

@@ -95,6 +95,14 @@ def covariance_between(system: System, window: lw.Window, t: Array, theta: Array
     return covariance_at(system, ends[:-1] if window.closed else ends, t, theta)
 
 
+def gauge_at(prepared: Prepared, points: Array, parts: int = 1) -> Array:
+    """Return int f / G from the first of increasing points (J,) to each, by Gauss' rule in equal parts of the steps between."""
+    start, theta, steps = prepared.model.start, prepared.theta, np.diff(points) / parts
+    nodes = (points[:-1, None] + steps[:, None] * (np.arange(parts)[:, None] + GAUSS_NODES).reshape(-1)).reshape(-1)
+    slopes = prepared.system.drift(nodes[:, None], start, theta)[:, 0] / covariance_at(prepared.system, nodes, start, theta)
+    return np.append(0.0, np.cumsum(steps * (slopes.reshape(len(steps), parts, -1) @ GAUSS_WEIGHTS).sum(axis=1)))
+
+
 def decomposed(
     prepared: Prepared, window: lw.Window, largest: int, ends: tuple[Array, Array] | None = None
 ) -> Spectral | None:
@@ -110,9 +118,7 @@ def decomposed(
     if not (covariance.real > 0).all():
         return None
     points, parts, spread, curvature, scale = window.points[:, None], PARTS if system.rough else 1, 0.0, 0.0, 1.0
-    within = (points + window.spacing / parts * (np.arange(parts)[:, None] + GAUSS_NODES).reshape(-1)).reshape(-1, 1)
-    inner = system.drift(within, start, theta)[:, 0] / covariance_at(system, within[:, 0], start, theta)
-    steps = window.spacing / parts * (inner.reshape(window.size, parts, -1) @ GAUSS_WEIGHTS).sum(axis=1)
+    gauge = gauge_at(prepared, np.append(window.points, window.points[-1] + window.spacing), parts)
     if system.rough and not window.closed:
         x = nodes(window.points, window.spacing)
         drift, covariance = system.drift(x[:, None], start, theta)[:, 0], covariance_at(system, x, start, theta)
@@ -130,10 +136,9 @@ def decomposed(
     if system.state_dependent:
         scale = 1.0 / np.sqrt(covariance)
         covariance = covariance_between(system, window, start, theta)
-    if not np.isfinite(potential.real).all() or not np.isfinite(steps.real).all():
+    if not np.isfinite(potential.real).all() or not np.isfinite(gauge.real).all():
         return None
-    if window.closed and abs(np.sum(steps).real) > 1e-12 * max(1.0, float(np.sum(np.abs(steps.real)))):
+    if window.closed and abs(gauge[-1].real) > 1e-12 * max(1.0, float(np.sum(np.abs(np.diff(gauge.real))))):
         return None
-    gauge = np.concatenate([np.zeros(1), np.cumsum(steps[:-1])])
     modes = spectral(prepared.real, window) if np.iscomplexobj(theta) else None
-    return Spectral(symmetric(window.closed, window.spacing, covariance, potential), gauge, scale, modes)
+    return Spectral(symmetric(window.closed, window.spacing, covariance, potential), gauge[:-1], scale, modes)
