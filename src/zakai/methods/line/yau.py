@@ -11,14 +11,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import sympy as sp
 
-from zakai.algebra.systems import yau_system
+from zakai.methods._yau_system import YauSystem
 from zakai.methods.series.kernel import PowerSeries
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
-from zakai.models.numeric import numpy_function
-from zakai.numerics.flow import Coefficients, Transition, integrate
+from zakai.numerics.flow import FlowResult, Transition, integrate
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.channel import Channel
 from zakai.numerics.line.filters import applied
@@ -30,45 +28,19 @@ NARROWEST = 1.4  # spacings that the standard deviation of a kernel must have
 UNRESOLVED = 1e-10  # relative error of a transition from which the coefficients in time are not resolved
 
 
-class YauLine:
-    """The coefficients of the equation of v as functions of time."""
+class YauLine(YauSystem):
+    """The equation of v of one state, and its kernels."""
 
     def __init__(self, model: Model):
-        yau = yau_system(model)
-        assert yau is not None
-        zero = sp.Integer(0)
-        self.affine = yau.slope is not None and model.observation_kind != "samples"
-        self.unobserved, self.full = yau.unobserved is not None, yau.full is not None
-        m = model.m
-        slope = yau.slope if self.affine and yau.slope is not None else sp.zeros(m, 1)
-        intercept = yau.intercept if self.affine and yau.intercept is not None else sp.zeros(m, 1)
-
-        def numbers(quadratic: Any) -> list[Any]:
-            if quadratic is None:
-                return [zero, zero, zero]
-            return [quadratic.matrix[0, 0], quadratic.linear[0], quadratic.constant]
-
-        own = [yau.form.matrix[0, 0], yau.form.offset[0], model.covariance[0, 0], *numbers(yau.unobserved)]
-        if model.drift.has(model.t) or model.covariance.has(model.t):
-            found = _unexpanded(model, yau)
-            self.unobserved = self.unobserved and found is not None
-            own = own if found is None else found
-        noise = sp.eye(m) if model.observation_kind == "samples" else model.observation_noise
-        entries = [*own, *numbers(yau.full), *slope, *intercept, *noise]
-        self.m, self.blocks = m, entries[:9]
-        self._numbers = numpy_function(entries, model)
-        self.steady = not any(sp.sympify(entry, strict=True).has(model.t) for entry in entries)
+        super().__init__(model)
+        matrix, _, _, quadratic, linear, *_ = self.blocks
         # Whether the kernel of an interval depends on x - y alone.
-        self.flat = self.unobserved and all(entry == 0 for entry in (own[0], own[3], own[4], yau.form.potential))
-        self.gauged = yau.form.potential != 0
-        self.steady_gauge = not sp.sympify(yau.form.potential, strict=True).has(model.t)
-        self._potential = numpy_function([yau.form.potential], model, (1,))
+        self.flat = self.unobserved and matrix == quadratic == linear == 0 and not self.gauged
+        self.m, self.steady_gauge = model.m, not self.gauge_varies
 
     def potential(self, points: Array, t: float, theta: Array) -> Array:
         """Return phi (N,)."""
-        if not self.gauged:
-            return np.zeros(len(points))
-        return self._potential(points[:, None], t, theta)[:, 0]
+        return super().potential(points[:, None], t, theta) if self.gauged else np.zeros(len(points))
 
     def serves(self, inside: np.ndarray, lie: bool) -> bool:
         """Return whether the equation of an interval is linear-quadratic with these coordinates acting inside."""
@@ -77,36 +49,6 @@ class YauLine:
         if lie:
             return self.full and bool(inside.all())
         return self.affine and self.unobserved
-
-    def coefficients(self, t: Array, theta: Array, inside: np.ndarray, lie: bool, origin: float) -> Coefficients:
-        """Return the coefficients at times (J,) for x relative to `origin`; the inputs are 1 and the rates of the coordinates.
-
-        `inside` (J, m) marks the coordinates that act inside of the interval of each time.
-        """
-        numbers = np.moveaxis(self._numbers(np.zeros((len(t), 1)), t, theta), -1, 0)
-        m, whole = self.m, np.asarray(inside.all(axis=1) & lie)
-        L, l, G = numbers[:3]
-        Q, p, r = (np.where(whole, full, unobserved) for unobserved, full in zip(numbers[3:6], numbers[6:9], strict=True))
-        l, p, r = l + L * origin, p + 2.0 * Q * origin, r + (p + Q * origin) * origin
-        inputs = np.zeros((3, len(t), 1 + m), numbers.dtype)
-        inputs[..., 0] = l, p, r
-        if not lie and inside.any():
-            C = np.moveaxis(numbers[9 : 9 + m], 0, -1)
-            c = np.moveaxis(numbers[9 + m : 9 + 2 * m], 0, -1) + C * origin
-            S = np.moveaxis(numbers[9 + 2 * m :], 0, -1).reshape(len(t), m, m)
-            both = inside[:, :, None] & inside[:, None]
-            alone = np.eye(m) * ~inside[:, None]
-            precision = np.where(both, np.linalg.inv(np.where(both, S, 0.0) + alone), 0.0)
-            gain, weighted = np.zeros_like(C), np.zeros_like(c)
-            for i in range(m):
-                gain, weighted = gain + precision[..., i] * C[:, i, None], weighted + precision[..., i] * c[:, i, None]
-            for i in range(m):
-                Q = Q - 0.5 * gain[:, i] * C[:, i]
-                inputs[1, :, 0] -= gain[:, i] * c[:, i]
-                inputs[2, :, 0] -= 0.5 * weighted[:, i] * c[:, i]
-            inputs[1, :, 1:], inputs[2, :, 1:] = gain, weighted
-        L, G, Q = (part[:, None, None] for part in (L, G, Q))
-        return Coefficients(L, inputs[0, :, None], G, Q, inputs[1, :, None], inputs[2])
 
     def kernels(
         self,
@@ -123,23 +65,30 @@ class YauLine:
         With `series` they are computed by power series, which have no inputs: rates of observation do not act inside.
         """
         served = np.array([self.serves(row, lie) and (series is None or lie or not row.any()) for row in inside], bool)
-        rows = np.flatnonzero(served & (lengths > 0))
+        rows, at, none = np.flatnonzero(served & (lengths > 0)), np.array([origin]), np.zeros(self.m, bool)
         if not len(rows):
             return None
 
-        def at(times: Array, which: Array) -> Coefficients:
-            return self.coefficients(times, theta, inside[rows[which]], lie, origin)
+        def integrated(own: Array) -> FlowResult:
+            """Return the transitions of intervals in which the same coordinates act."""
+            begins, times, acting = starts[own], lengths[own], inside[own[0]]
+            full = bool(lie and acting.all())
+            if series is not None:
+                return series.integrate(begins, times, theta, at, full)
+            acting = none if lie else acting
+            begins = begins if self.varies(acting) else np.zeros(len(own))
+            found = integrate(
+                lambda t, _: self.coefficients(t, theta, at, acting, full), begins, begins + times, not self.varies(acting)
+            )
+            return found._replace(error=np.where(found.error > UNRESOLVED, found.error, 0.0))
 
-        if series is None:
-            begins = np.zeros(len(rows)) if self.steady else starts[rows]
-            found, errors = integrate(at, begins, begins + lengths[rows], self.steady)
-            errors = np.where(errors > UNRESOLVED, errors, 0.0)
-        else:
-            full = np.asarray(inside[rows].all(axis=1) & lie)
-            found, errors = series.channels(starts[rows], lengths[rows], theta, origin, full, 1 + self.m)
+        which = np.unique(inside[rows], axis=0, return_inverse=True)[1].reshape(-1)
+        groups = [rows[which == i] for i in range(which.max() + 1)]
+        found = [integrated(own) for own in groups]
         place = np.full(len(starts), -1)
-        place[rows] = np.arange(len(rows))
-        return Kernels(found, errors, place, origin)
+        place[np.concatenate(groups)] = np.arange(len(rows))
+        fields = zip(*(_padded(one.transition, 1 + self.m) for one in found), strict=True)
+        return Kernels(Transition(*map(np.concatenate, fields)), np.concatenate([one.error for one in found]), place, origin)
 
 
 class Kernels(NamedTuple):
@@ -151,33 +100,17 @@ class Kernels(NamedTuple):
     origin: float
 
 
-def _unexpanded(model: Model, yau: Any) -> list[sp.Expr] | None:
-    """L, l, G, Q, p, r from the formulas as they were written, or None where these do not show that they are all there is.
-
-    An expanded pulse such as exp(-(t - 1/3)^2 / w^2) overflows, and its parts may be taken for zero.
-    """
-    x, t, G = model.x[0], model.t, model.covariance[0, 0]
-    phi, slope = yau.form.potential, yau.form.gradient[0]
-    rest = model.drift[0] - G * slope
-    matrix = sp.diff(rest, x).subs(x, 0)
-    offset = rest.subs(x, 0)
-    q = -(sp.diff(phi, t) + G * (sp.diff(slope, x) + slope**2) / 2 + (matrix * x + offset) * slope + matrix)
-    entries = [matrix, offset, G, sp.diff(q, x, 2).subs(x, 0) / 2, sp.diff(q, x).subs(x, 0), q.subs(x, 0)]
-    if any(entry.has(sp.zoo, sp.nan, sp.oo) for entry in entries) or sp.expand(rest - matrix * x - offset) != 0:
-        return None
-    return entries
+def _padded(found: Transition, inputs: int) -> Transition:
+    """Return transitions for more inputs, which have no effect."""
+    more = (0, 0), (0, 0), (0, inputs - found.offset.shape[2])
+    offset, vector = np.pad(found.offset, more), np.pad(found.vector, more)
+    return found._replace(offset=offset, vector=vector, constant=np.pad(found.constant, (more[0], more[2], more[2])))
 
 
 @once_for_a_model
 def yau_line_of(model: Model) -> YauLine:
     """Return the equation of a model, made once."""
     return YauLine(model)
-
-
-@once_for_a_model
-def power_series_of(model: Model, order: int | None) -> PowerSeries:
-    """Return the equation of a model as Taylor series in time, made once."""
-    return PowerSeries(model, yau_line_of(model).blocks, order)
 
 
 class Moved(NamedTuple):

@@ -92,22 +92,6 @@ class PowerSeries:
             pending, parts = np.concatenate(again), 2 * parts
         return FlowResult(at(whole, inverse), error[inverse])
 
-    def channels(
-        self, starts: Array, lengths: Array, theta: Array, origin: float, full: Array, inputs: int
-    ) -> tuple[Transition, Array]:
-        """Return the transitions of one state for `inputs`, which have no effect, and their errors; `full` is (K,)."""
-        groups = [(which, np.flatnonzero(full == which)) for which in (False, True)]
-        both = [self.integrate(starts[rows], lengths[rows], theta, np.array([origin]), which) for which, rows in groups]
-        back = np.argsort(np.concatenate([rows for _, rows in groups]))
-        found = Transition(*(np.concatenate(fields)[back] for fields in zip(*(one.transition for one in both), strict=True)))
-        wider = ((0, 0), (0, inputs - 1))
-        found = found._replace(
-            offset=np.pad(found.offset, (*wider[:1], *wider)),
-            vector=np.pad(found.vector, (*wider[:1], *wider)),
-            constant=np.pad(found.constant, (*wider, wider[1])),
-        )
-        return found, np.concatenate([one.error for one in both])[back]
-
     def _divided(
         self, starts: Array, lengths: Array, theta: Array, origin: Array, full: bool, parts: int
     ) -> tuple[Transition, Array]:

@@ -33,6 +33,10 @@ class YauSystem:
         for quadratic in (yau.unobserved or yau.full, yau.full or yau.unobserved):
             assert quadratic is not None
             blocks += [quadratic.matrix, quadratic.linear, sp.Matrix([quadratic.constant])]
+        if n == 1 and (model.drift.has(model.t) or model.covariance.has(model.t)):
+            found = _unexpanded(model, yau)
+            self.unobserved = self.unobserved and found is not None
+            blocks[:6] = blocks[:6] if found is None else [sp.Matrix([entry]) for entry in found]
         self.blocks = [entry for block in blocks for entry in block.flat()]
         self.matrices = Matrices([*blocks, slope, intercept], model)
         self._noise = Matrices([model.observation_noise], model)
@@ -68,6 +72,23 @@ class YauSystem:
     def varies(self, inside: Array) -> bool:
         """Return whether the coefficients depend on time."""
         return bool(self.matrices.varying or (self.affine and inside.any() and self._noise.varying))
+
+
+def _unexpanded(model: Model, yau: Any) -> list[sp.Expr] | None:
+    """L, l, G, Q, p, r from the formulas as they were written, or None where these do not show that they are all there is.
+
+    An expanded pulse such as exp(-(t - 1/3)^2 / w^2) overflows, and its parts may be taken for zero.
+    """
+    x, t, G = model.x[0], model.t, model.covariance[0, 0]
+    phi, slope = yau.form.potential, yau.form.gradient[0]
+    rest = model.drift[0] - G * slope
+    matrix = sp.diff(rest, x).subs(x, 0)
+    offset = rest.subs(x, 0)
+    q = -(sp.diff(phi, t) + G * (sp.diff(slope, x) + slope**2) / 2 + (matrix * x + offset) * slope + matrix)
+    entries = [matrix, offset, G, sp.diff(q, x, 2).subs(x, 0) / 2, sp.diff(q, x).subs(x, 0), q.subs(x, 0)]
+    if any(entry.has(sp.zoo, sp.nan, sp.oo) for entry in entries) or sp.expand(rest - matrix * x - offset) != 0:
+        return None
+    return entries
 
 
 @once_for_a_model
