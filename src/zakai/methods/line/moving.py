@@ -23,16 +23,19 @@ SOME = 0.3  # ranges of a density that it moves in an interval without modes, ab
 
 
 def travel(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
-    """Return by how many of its ranges the drift moves a density in an interval, zero where grids do not move with it."""
+    """Return by how many of its ranges the drift moves a density in an interval, zero where grids do not move with it.
+
+    They do not where noise moves the state as far, or the density becomes much sharper.
+    """
     system = prepared.system
     if window.closed or prepared.kinked or system.kinks is not None or system.cross is not None or system.reflecting:
         return 0.0
     look, (carried, growth) = lw.figures(values, False), _carried(prepared, values, window, start, length)
-    if growth < CONTRACTED:
-        return 0.0
     G = covariance_at(system, window.points[[look.first, look.last]], start, prepared.theta.real)
-    width = window.spacing * (look.last - look.first + 1) + 2.0 * REACH * float(np.sqrt(np.max(G.real) * length))
-    return abs(carried) / width
+    noise = float(np.sqrt(np.max(G.real) * length))
+    if growth < CONTRACTED or abs(carried) < noise:
+        return 0.0
+    return abs(carried) / (window.spacing * (look.last - look.first + 1) + 2.0 * REACH * noise)
 
 
 def speed_of(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
