@@ -49,6 +49,7 @@ def processor() -> str:
 Call = Callable[..., zakai.FilterResult]
 TIDE, SATURATING = "tide: linear, with coefficients in time", "saturating sensor"
 WELL = "double well, irregular samples with gaps"
+MOTION = {"drift": ["1 + 0.5*sin(x)"], "diffusion": [["0.03"]]}
 # What is measured, of which system, the call, and the keys of the model that differ.
 VARIANTS: tuple[tuple[str, str, Call, dict[str, Any]], ...] = (
     ("smoothing", TIDE, zakai.smooth, {}),
@@ -59,6 +60,8 @@ VARIANTS: tuple[tuple[str, str, Call, dict[str, Any]], ...] = (
     ("increments", SATURATING, zakai.filter, {"observation_kind": "increments"}),
     ("a kink in h, abs(x)", WELL, zakai.filter, {"observation": ["abs(x)"]}),
     ("a kink in f, 2*x - 2*x*abs(x)", WELL, zakai.filter, {"drift": ["2*x - 2*x*abs(x)"]}),
+    ("motion with little noise, 1 + sin(x)/2", WELL, zakai.filter, MOTION),
+    ("the same, smoothing", WELL, zakai.smooth, MOTION),
 )
 
 
