@@ -36,7 +36,6 @@ Array = NDArray[Any]
 STAY, OWN, PLACE = range(3)  # steps on the grid of the density; on its own grid the first transition, or none
 NARROW, BROAD, GRID, SIZE = range(10, 14)  # why the loop ends, beside those of `line/segment.py`
 _EDGE = 1e-11  # density at the outermost points, relative to the maximum
-SMOOTH = 1e-10  # spectrum that need not be resolved, of densities without kinks
 _ATTEMPTS = 6  # coarse grids on which a step is tried
 _V, _M, _T = float64[::1], float64[:, ::1], float64[:, :, ::1]
 
@@ -117,10 +116,7 @@ def advance(
             for j in range(now.size):
                 at[j] = (centre + spacing * (j - half) - begin_at) / coarse
             first, last = inset, size - 1 - inset
-            rounding, unsure = carried(
-                now, at, alone, closed, negligible <= SMOOTH and not weak, scale, modes, rates, tau, first, last, 0.1 * allowed,
-                moved,
-            )  # fmt: skip
+            rounding, unsure = carried(now, at, alone, closed, scale, modes, rates, tau, first, last, 0.1 * allowed, moved)
             aliasing, top = unresolved(moved, cosine, sine), moved[highest_of(moved)]
             on_left, on_right = max(abs(moved[first]), abs(moved[first + 1])), max(abs(moved[last]), abs(moved[last - 1]))
             edge, bound = 0.0 if closed else max(on_left, on_right) / top, max(_EDGE, 4.0 * aliasing)

@@ -102,8 +102,8 @@ def falling(values: Array, inner: Array) -> tuple[int, int]:
 
 @helper
 def carried(
-    now: Array, at: Array, same: bool, closed: bool, smooth: bool, scale: Array, modes: Array, rates: Array, tau: float,
-    first: int, last: int, most: float, moved: Array,
+    now: Array, at: Array, same: bool, closed: bool, scale: Array, modes: Array, rates: Array, tau: float, first: int, last: int,
+    most: float, moved: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """Write the density (N,) of the grid of the modes after an interval; return its rounding error and that of the scale.
 
@@ -114,7 +114,6 @@ def carried(
         at: its points as indices of the grid of the modes.
         same: whether these are the points of the grid of the modes.
         closed: whether the grid goes around the circle.
-        smooth: whether the spectrum of the density falls to rounding.
         scale: log s (T,) at the points of rows.
         modes, rates: the rows of U' and lambda.
         tau: the length of the interval.
@@ -124,7 +123,7 @@ def carried(
     """
     size, top, weights = moved.size, highest_of(now), np.empty(8)
     inner, logs, after, unsure, total, end = np.zeros(now.size), np.zeros(now.size), np.empty(size), 0.0, 0.0, 0.0
-    lost, limit, reference = 0.0, CUT * now[top], scale[PER * top] if same else 0.0
+    limit, reference = CUT * now[top], scale[PER * top] if same else 0.0
     if not same:
         reference = weighed(scale, weigh(at[top] * PER, scale.size, 1, weights), 1, weights)
     for j in range(size):
@@ -134,14 +133,11 @@ def carried(
         coefficients = inner
         for j in range(size):
             inner[j] = now[j] / after[j]
-            if not (closed or smooth) and (now[j] <= limit or j < 2 or j >= size - 2):  # a kink hides where a density ends
-                end = max(end, inner[j])
-        if smooth and not closed:  # abrupt ends, which the interpolant spreads
+        if not closed:  # abrupt ends, which the interpolant spreads
             left, right = falling(now, inner)
             end = max(max(inner[left], inner[left + 1]), max(inner[right], inner[right - 1]))
             for j in range(size):
-                if not left <= j <= right:
-                    lost, inner[j] = lost + now[j], 0.0
+                inner[j] = inner[j] if left <= j <= right else 0.0
     else:
         coefficients = np.empty(size)
         for i in range(now.size):
@@ -173,4 +169,4 @@ def carried(
             highest, largest = max(highest, after[j]), max(largest, moved[j])
     if not (largest > 0.0 and noise * outside < most * largest):
         return np.inf, unsure
-    return ((noise + _SPREAD * end) * highest + lost) / largest, unsure
+    return (noise + _SPREAD * end) * highest / largest, unsure
