@@ -72,17 +72,3 @@ def test_several_samples_that_barely_overlap_keep_the_gradient():
         step = 1e-3 * at * np.eye(3)[i]
         wide, narrow = ((likelihood(model.theta() + h * step) - likelihood(model.theta() - h * step)) / (2 * h) for h in (2, 1))
         assert gradient[i] * step[i] == pytest.approx((4 * narrow - wide) / 3, abs=1e-7, rel=1e-5)
-
-
-@pytest.mark.parametrize("seed", [2, 3])
-def test_rounding_beyond_a_density_from_a_broad_prior_does_not_reach_the_gradient(seed):
-    """On the grid of the contracted prior the scale of the modes falls below 1e-40, where the density is rounding."""
-    keys = {**WELL, "observation_kind": "samples", "prior": WIDE}
-    model = zakai.Model(state=["x"], **keys, parameters={"k": 1.0, "g": 1.0, "s": 1.0})
-    _, record = zakai.simulate(model, 0.1 * np.arange(1, 13), seed=seed)
-    _, gradient = zakai.log_likelihood(model, record, "yau-yau").value_and_gradient(model.theta())
-
-    def at(k):
-        return zakai.filter(model.with_parameters(k=k), record, "yau-yau", keep="moments").log_likelihood
-
-    assert gradient[0] == pytest.approx((at(1.001) - at(0.999)) / 0.002, abs=1e-6)

@@ -133,7 +133,7 @@ class _Walk:
         logs = self._logs(lambda one: log_likelihoods(one, own, observed, window.points[None]), prepared)
         for i, gained in enumerate(infos_of(prepared, [piece]).log_likelihood_increment):
             after = piece.densities[i]
-            self.tangents = varied.through(density, self.tangents, prepared.lengths[piece.first + i], window, window)
+            self.tangents = varied.through(density, self.tangents, prepared.lengths[piece.first + i])
             self._multiply(after, logs[:, i], gained)
             density = after
         return window

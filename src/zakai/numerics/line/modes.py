@@ -6,12 +6,12 @@ from math import erfc
 from typing import Any
 
 import numpy as np
-from numba import float64, int64, types, void
+from numba import float64, void
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.exponentials import exponentiate
-from zakai.numerics.line.density import highest_of, support
+from zakai.numerics.line.density import highest_of
 from zakai.numerics.line.place import PER, weigh, weighed
 from zakai.numerics.line.window import CUT
 
@@ -86,20 +86,6 @@ def gathered(values: Array, at: Array, found: Array) -> None:
         found[j] = -found[j]
 
 
-@kernel(types.UniTuple(int64, 2)(_V, _V))  # type: ignore[no-untyped-call]
-def falling(values: Array, inner: Array) -> tuple[int, int]:
-    """Return the points between which a density may be divided by s: its support, and beyond it where the quotient falls.
-
-    Farther out the density is rounding, which a small s would amplify.
-    """
-    first, last = support(values, CUT)
-    while first > 0 and inner[first - 1] < inner[first]:
-        first -= 1
-    while last < values.size - 1 and inner[last + 1] < inner[last]:
-        last += 1
-    return first, last
-
-
 @helper
 def carried(
     now: Array, at: Array, same: bool, closed: bool, scale: Array, modes: Array, rates: Array, tau: float, first: int, last: int,
@@ -133,11 +119,8 @@ def carried(
         coefficients = inner
         for j in range(size):
             inner[j] = now[j] / after[j]
-        if not closed:  # abrupt ends, which the interpolant spreads
-            left, right = falling(now, inner)
-            end = max(max(inner[left], inner[left + 1]), max(inner[right], inner[right - 1]))
-            for j in range(size):
-                inner[j] = inner[j] if left <= j <= right else 0.0
+            if not closed and (now[j] <= limit or j < 2 or j >= size - 2):  # abrupt ends, which the interpolant spreads
+                end = max(end, inner[j])
     else:
         coefficients = np.empty(size)
         for i in range(now.size):

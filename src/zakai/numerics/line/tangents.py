@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.complex_step import STEP
-from zakai.numerics.line.modes import falling
 from zakai.numerics.line.operator import Spectral, quotients
 from zakai.numerics.line.polynomial import local_polynomial
 from zakai.numerics.line.window import CUT, Window, gathered
@@ -38,29 +37,28 @@ class Varied(NamedTuple):
         still = np.zeros((len(modes.rates), len(modes.rates)))
         return cls(modes, scales, np.array([still if one.change is None else one.change / STEP for one in shifted]))
 
-    def through(self, values: Array, tangents: Array, length: float, window: Window, own: Window) -> Array:
+    def through(
+        self, values: Array, tangents: Array, length: float, window: Window | None = None, own: Window | None = None
+    ) -> Array:
         """Return the derivatives (p, N) of a density after a time.
 
         Args:
             values: the density (J,); its derivatives count where it is positive.
             tangents: its derivatives (p, J).
             length: the time.
-            window, own: the grid of the density and that of the decomposition.
+            window, own: the grid of the density and that of the decomposition, where they differ.
         """
         U, used, scale, scales = self.modes.modes, values > 0, self.modes.scale, self.scales
-        if window != own:
+        if window is not None and own is not None and window != own:
             logs, points, used = np.log(np.maximum(scale, 1e-300)), window.offsets, values > CUT * np.max(values)
             top = float(local_polynomial(logs, own, points[[int(np.argmax(values))]])[0])
             scale, at = np.exp(logs - top), np.exp(local_polynomial(logs, own, points) - top)
             scales = np.array([local_polynomial(one, own, points) for one in scales])
         else:
             at = scale = scale / scale[int(np.argmax(values))]
-            if not own.closed:
-                first, last = falling(values, np.where(used, values / at, 0.0))
-                used[:first] = used[last + 1 :] = False
         inner = np.where(used, values / at, 0.0)
         changes = np.where(used, (tangents - values * scales) / at, 0.0)
-        if window != own:
+        if at is not scale and window is not None and own is not None:
             inner = gathered(inner, window.offsets, own)
             changes = np.array([gathered(one, window.offsets, own) for one in changes])
         decay, coefficients = np.exp(-length * self.modes.rates), inner @ U
