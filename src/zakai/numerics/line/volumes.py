@@ -19,7 +19,8 @@ from numba import complex128, float64, int64
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
-from zakai.numerics.line.interpolation import of_logs
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.polynomial import interpolated_logs
 
 Array = NDArray[Any]
 Bands = tuple[Array, Array, Array]
@@ -115,16 +116,16 @@ class Volumes(NamedTuple):
             own, size = masses[first:last], last - first
             curvature = np.diff(own, 2)[np.clip(np.arange(size) - 1, 0, size - 3)]
             smooth = own - curvature / 24.0  # from the mean over a cell to the value in its middle
-            parts.append(np.where(smooth.real > 0, smooth, 0.0))
+            parts.append((np.where(smooth.real > 0, smooth, 0.0), lw.Window(0.0, first + size // 2 + 0.5, 1.0, size, False, 1.0)))
         steps = np.diff(s) / np.diff(before)
 
         def at(offsets: Array) -> Array:
             index, found = self.place(offsets), np.zeros(offsets.shape, masses.dtype)
             part = np.searchsorted(before[1:-1], index, side="right")
-            for j, smooth in enumerate(parts):
+            for j, (smooth, window) in enumerate(parts):
                 here = (part == j) & np.isfinite(index)
                 inner = np.clip(index[here], before[j] + 1e-6, before[j + 1] - 1e-6)  # a face itself lies beyond a window
-                found[here] = of_logs(smooth, inner - before[j] - 0.5, False)
+                found[here] = interpolated_logs(smooth, window, inner)
             return found / (steps[part] * np.sqrt(self.scale**2 + (offsets - self.centre) ** 2))
 
         return at

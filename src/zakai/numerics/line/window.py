@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from zakai.numerics.complex_step import angle
 from zakai.numerics.line.density import spectrum, waves
-from zakai.numerics.line.interpolation import band_limited, density_between
 from zakai.numerics.line.operator import generator
+from zakai.numerics.line.polynomial import interpolated_logs
 
 Array = NDArray[Any]
 
@@ -190,17 +190,28 @@ def refined(window: Window, factor: float = 2**0.5) -> Window:
 
 def interpolated(values: Array, window: Window, offsets: Array) -> Array:
     """Return the interpolant of the values at offsets (J,) from the origin."""
-    return band_limited(np.ascontiguousarray(values), _indices(window, offsets), window.closed)
-
-
-def _indices(window: Window, offsets: Array) -> Array:
-    """Return the indices (J,) of offsets from the origin."""
-    return np.asarray((offsets - window.centre) / window.spacing + window.size // 2)
+    at = (offsets - window.centre) / window.spacing + window.size // 2
+    nearest = np.round(at)
+    # sin(pi (at - j)) = (-1)^(nearest - j) sin(pi (at - nearest)).
+    distance = at[:, None] - np.arange(window.size)
+    sine = np.sin(np.pi * (at - nearest)) * np.where(nearest % 2 == 0, 1.0, -1.0)
+    signed = values * np.where(np.arange(window.size) % 2 == 0, 1.0, -1.0)
+    exact = np.abs(at - nearest) < 1e-12
+    with np.errstate(all="ignore"):
+        if window.closed:
+            found = (1.0 / np.tan(np.pi / window.size * distance)) @ signed * (sine / window.size)
+        else:
+            found = (1.0 / distance) @ signed * (sine / np.pi)
+    if window.closed:
+        return np.asarray(np.where(exact, values[nearest.astype(int) % window.size], found))
+    inside = (at > -0.5) & (at < window.size - 0.5)
+    own = values[np.where(inside, nearest, 0.0).astype(int)]
+    return np.asarray(np.where(inside, np.where(exact, own, found), 0.0))
 
 
 def gathered(values: Array, offsets: Array, window: Window) -> Array:
     """Return the values (J,) at offsets, times the matrix of interpolation from a grid on the line to them: (N,)."""
-    at = _indices(window, offsets)
+    at = (offsets - window.centre) / window.spacing + window.size // 2
     nearest = np.round(at)
     distance = at[:, None] - np.arange(window.size)
     exact = np.abs(at - nearest) < 1e-12
@@ -226,7 +237,18 @@ def resampled(values: Array, window: Window, new: Window) -> Array:
 
 def density_at(values: Array, window: Window, offsets: Array) -> Array:
     """Return the density at offsets (J,) from the origin, times the spacing of the grid."""
-    return density_between(np.ascontiguousarray(values), _indices(window, offsets), window.closed)
+    found = interpolated(values, window, offsets)
+    found = np.where(found.real > 0, found, 0.0)
+    bound = _SMALL * values.real.max()
+    small = np.flatnonzero(found.real < bound)
+    if len(small):
+        # There the interpolant is the rounding of large values; small values are interpolated by their logarithms.
+        logs = interpolated_logs(values, window, offsets[small])
+        found[small] = np.where(logs.real < 2.0 * bound, logs, 0.0)
+    return found
+
+
+_SMALL = 1e-8
 
 
 def _shifted(values: Array, shift: int, size: int) -> Array:
