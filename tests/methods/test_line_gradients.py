@@ -72,3 +72,19 @@ def test_several_samples_that_barely_overlap_keep_the_gradient():
         step = 1e-3 * at * np.eye(3)[i]
         wide, narrow = ((likelihood(model.theta() + h * step) - likelihood(model.theta() - h * step)) / (2 * h) for h in (2, 1))
         assert gradient[i] * step[i] == pytest.approx((4 * narrow - wide) / 3, abs=1e-7, rel=1e-5)
+
+
+def test_the_gradient_of_an_accurate_sensor_with_gaps_is_that_of_differences():
+    model = zakai.Model(
+        state=["x"], drift=["b*(x - x**3)"], diffusion=[["s"]], observation=["x"], observation_kind="samples",
+        observation_noise=[[0.0004]], parameters={"b": 2.0, "s": 0.7}, prior={"kind": "gaussian", "mean": [1.0], "cov": [[0.1]]},
+    )  # fmt: skip
+    times = np.unique(np.round(np.sort(np.random.default_rng(7).uniform(0, 40, 120)), 4))
+    _, record = zakai.simulate(model, times, seed=8)
+    values = record.values.copy()
+    values[50:70], values[90:92] = np.nan, np.nan
+    value = zakai.log_likelihood(model, zakai.Record(times[:90], values[:90], "samples"))
+    theta = np.array([3.4311860446525273, 0.9])
+    _, gradient = value.value_and_gradient(theta)
+    for i, step in enumerate(1e-4 * np.eye(2)):
+        assert gradient[i] == pytest.approx((value(theta + step) - value(theta - step)) / 2e-4, rel=1e-4)
