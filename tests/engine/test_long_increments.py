@@ -59,3 +59,41 @@ def test_the_distance_from_the_exact_law_of_increments_is_said(method, slope, no
     assert bool(online.update(times[0], values[:1]).warnings) == warns
     if warns:
         assert 0.25 * said[0] < apart.max() < 1.1 * said[0]
+
+
+def moved(speed, growth, length, count, diffusion=0.02, noise=1e-3):
+    """Increments (count,) of dx = (speed + growth x) dt + .02 dv, dy = x dt + dw, x = 0 at the start, and their exact law."""
+    drift, spread = np.array([[growth, 0.0, speed], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.diag([diffusion**2, noise, 0.0])
+    both = expm(length * np.block([[-drift, spread], [np.zeros((3, 3)), drift.T]]))  # Van Loan
+    move = both[3:, 3:].T
+    added = move @ both[:3, 3:]
+    rng, x, mean, cov, nats, values, found = np.random.default_rng(7), 0.0, 0.0, 0.01, 0.0, [], []
+    for _ in range(count):
+        x, z = (move @ [x, 0.0, 1.0] + np.linalg.cholesky(added + 1e-18 * np.eye(3)) @ rng.normal(size=3))[:2]
+        law, joint = move @ [mean, 0.0, 1.0], move @ np.diag([cov, 0.0, 0.0]) @ move.T + added
+        white, gain = noise * length, joint[0, 1] / joint[1, 1]
+        nats += (z**2 / white + np.log(white) - (z - law[1]) ** 2 / joint[1, 1] - np.log(joint[1, 1])) / 2.0
+        mean, cov = law[0] + gain * (z - law[1]), joint[0, 0] - gain * joint[0, 1]
+        values.append(z)
+        found.append((mean, np.sqrt(cov)))
+    return np.array(values), np.array(found).T, nats
+
+
+@pytest.mark.parametrize(
+    ("speed", "growth", "length", "warns"),
+    [(1.0, 0.0, 0.2, True), (0.5, 0.5, 0.3, True), (1.0, 0.0, 0.05, False), (-4.0, 0.0, 0.1, True)],
+)
+def test_motion_within_an_interval_of_increments_is_said(speed, growth, length, warns):
+    values, (mean, deviation), nats = moved(speed, growth, length, 12)
+    model = zakai.Model(
+        state=["x"], drift=[f"{speed} + {growth}*x"], diffusion=[["0.02"]], observation=["x"], observation_noise=[["1e-3"]],
+        prior={"kind": "gaussian", "mean": [0.0], "cov": [[0.01]]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record(length * np.arange(1, 13), values[:, None]), "kalman-bucy")
+    lost, apart = (nats - result.log_likelihood) / 12, np.max(np.abs(result.mean[1:, 0] - mean) / deviation)
+    said = [re.search(r"up to about (\S+) .* interval by about (\d[\d.]*)", warning) for warning in result.warnings]
+    assert bool(said) == warns
+    assert warns or max(lost, apart) < 0.1
+    if warns:
+        assert apart < 1.1 * float(said[0][1]) or said[0][1] == "1"
+        assert 0.1 < lost < 1.3 * float(said[0][2]) or said[0][2] == "1"

@@ -1,4 +1,4 @@
-"""Intervals in which the state moves so much that increments have another law than y linear between observations.
+"""Intervals in which h changes so much that increments have another law than y linear between observations.
 
 With y linear, a path over an interval of length d is weighted by exp(-1/2 int |h - dy/d|^2 / S dt), where the increment, the
 integral of h and of noise, says nothing of how h changes within the interval.  With H = dh/dx, the change of the state, whose
@@ -6,7 +6,12 @@ covariance is d G, receives the precision d H'S^-1 H / 12.  The mean is off by u
 
     d^2 tr(H G H' S^-1) / 12
 
-standard deviations of the state.
+standard deviations of the state, and the log-likelihood by as much.  Motion that the drift or t brings adds to that: where they
+change h by D within an interval, the log-likelihood is too small by d D'S^-1 D / 24, and the mean is off by up to about
+
+    d |P^1/2 H'S^-1 D| / 12
+
+standard deviations, where P is the covariance of the filter, and by the change of that loss over a standard deviation.
 """
 
 from __future__ import annotations
@@ -21,11 +26,11 @@ from zakai.models.numeric import numpy_function
 from zakai.records.schedule import Schedule
 
 Array = NDArray[np.float64]
-DIFFERS = 0.2  # standard deviations that a result reports
+DIFFERS = 0.2  # standard deviations, or nats of an interval, that a result reports
 
 
 def notes_on_lengths(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> list[str]:
-    """Return a sentence on the intervals for which the formula above exceeds 0.2, if there are any.
+    """Return a sentence on the intervals for which one of the formulas above exceeds 0.2, if there are any.
 
     Args:
         model: The model.
@@ -33,27 +38,32 @@ def notes_on_lengths(model: Model, theta: Array, schedule: Schedule, infos: Info
         schedule: The K intervals.
         infos: What the filter reports at their ends.
     """
-    apart = _distances(model, theta, schedule, infos)
-    over = apart > DIFFERS
+    if model.observation_kind == "samples" or not len(schedule):
+        return []
+    means, nats = _distances(model, theta, schedule, infos)
+    over = np.maximum(means, nats) > DIFFERS
     if not over.any():
         return []
-    where = f"within {int(over.sum())} of {len(apart)} intervals (first at t = {schedule.stops[np.argmax(over)]:g})"
-    size = f"{apart.max():.1g}" if apart.max() < 1 else "1 or more"
+    where = f"within {int(over.sum())} of {len(over)} intervals (first at t = {schedule.stops[np.argmax(over)]:g})"
     return [
-        f"y is taken as linear between observations, but the state moves {where} so much that the exact law of the increments "
-        f"differs: means are off by up to about {size} standard deviations; give shorter intervals"
+        f"y is taken as linear between observations, but h changes {where} so much that the exact law of the increments differs, "
+        f"means by up to about {_size(means)} standard deviations, the log-likelihood of an interval by about {_size(nats)}: "
+        f"give shorter intervals"
     ]
 
 
-def _distances(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> Array:
-    """Return that formula (K,) for every interval, with the slopes of h over a standard deviation about the filtered mean."""
+def _size(distances: Array) -> str:
+    return f"{distances.max():.1g}" if distances.max() < 1 else "1 or more"
+
+
+def _distances(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> tuple[Array, Array]:
+    """Return by how much means (K,), in standard deviations, and log-likelihoods (K,) of the intervals differ."""
     n, m = model.n, model.m
-    if model.observation_kind == "samples" or not len(schedule):
-        return np.zeros(len(schedule))
-    h, G, S = kept(
+    f, h, G, S = kept(
         model,
         _distances,
         lambda: (
+            numpy_function(model.drift, model),
             numpy_function(model.observation, model),
             numpy_function(model.covariance, model, (n, n)),
             numpy_function(model.observation_noise, model, (m, m)),
@@ -62,13 +72,21 @@ def _distances(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> 
     times, mean = schedule.stops, np.real(infos.mean)
     u = None if schedule.inputs is None else schedule.inputs.at(times, model.input_hold)
     inside = np.where(schedule.inside, schedule.elapsed, 0.0)
+    length = np.max(inside, axis=1)
     with np.errstate(all="ignore"):
         reach = np.sqrt(np.diagonal(np.real(infos.cov), axis1=1, axis2=2))
-        spread, middle, found = G(mean, times, theta, u), h(mean, times, theta, u), 0.0
         precision = np.linalg.inv(np.broadcast_to(S(np.zeros(n), times, theta), (len(times), m, m)))
-        for side in (reach, -reach):
-            ends = [h(mean + side * axis, times, theta, u) for axis in np.eye(n)]
-            slopes = inside[:, :, None] * np.stack([(end - middle) / side[:, j, None] for j, end in enumerate(ends)], axis=2)
-            found = found + np.einsum("kia,kab,kjb,kij->k", slopes, spread, slopes, precision) / 24.0
-        return np.where(np.isfinite(found), found, 0.0)
-
+        sides = [mean, *(mean + side * axis for side in (reach, -reach) for axis in np.eye(n))]
+        seen, drift = np.stack([h(x, times, theta, u) for x in sides]), np.stack([f(x, times, theta, u) for x in sides])
+        rate = np.nanmax(np.abs(drift[1:] - drift[0]) / reach, axis=(0, 2))  # fast changes of the drift end within an interval
+        back = drift * (length / (1.0 + rate * length))[:, None]
+        before = np.stack([h(x - moved, times - length, theta, u) for x, moved in zip(sides, back, strict=True)])
+        change = np.where(inside > 0.0, seen - before, 0.0)
+        motion = length / 24.0 * np.einsum("ika,kab,ikb->ik", change, precision, change)
+        slopes = inside * (seen[1:] - seen[0]) / np.concatenate([reach, -reach], axis=1).T[:, :, None]
+        slopes = slopes.reshape(2, n, len(times), m)
+        noise = np.einsum("sika,kij,kab,sjkb->k", slopes, G(mean, times, theta, u), precision, slopes) / 24.0
+        noise /= 1.0 + rate * length / 3.0
+        pull = length * np.einsum("ka,kab,ikb->ik", change[0], precision, seen[1 : n + 1] - seen[n + 1 :]) / 24.0
+        means = noise + np.linalg.norm(np.abs(pull) + np.abs(motion[1 : n + 1] - motion[n + 1 :]) / 2.0, axis=0)
+        return np.nan_to_num(means, posinf=0.0), np.nan_to_num(noise + motion[0], posinf=0.0)
