@@ -1,9 +1,10 @@
-"""How many points the grids of two states have where a density has a kink or is stretched, against particles."""
+"""Grids of two states where a density has a kink, is stretched or falls into narrow peaks, against particles and quadrature."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import zakai
 
@@ -100,3 +101,28 @@ def test_the_moments_are_those_of_the_density_at_a_small_tolerance():
         variance = np.tensordot(weights, (x - mean) ** 2, axes=2) / weights.sum()
         assert np.abs((result.mean[k] - mean) / np.sqrt(variance)).max() < 1e-6
         assert np.abs(result.variance[k] / variance - 1).max() < 1e-6
+
+
+@pytest.mark.parametrize(("wave", "noise"), [(2.0, 0.02), (2.0, 0.002), (3.0, 0.01)])
+def test_a_sample_that_leaves_several_narrow_peaks(wave, noise):
+    model = zakai.Model(
+        state=["x", "v"], drift=["v", "-x - 0.3*v"], diffusion=[["0"], ["0.5"]], observation=[f"sin({wave}*x)"],
+        observation_kind="samples", observation_noise=[[str(noise)]],
+        prior={"kind": "gaussian", "mean": [1.0, 0.0], "cov": [[0.2, 0.0], [0.0, 0.1]]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record([0.4], [[0.3]], kind="samples"), "yau-yau")
+    A, prior = np.array([[0.0, 1.0], [-1.0, -0.3]]), np.diag([0.2, 0.1])
+    both = expm(0.4 * np.block([[-A, np.diag([0.0, 0.25])], [np.zeros((2, 2)), A.T]]))  # Van Loan
+    move = both[2:, 2:].T
+    mean, cov = move @ [1.0, 0.0], move @ prior @ move.T + move @ both[:2, 2:]
+    x = mean[0] + np.sqrt(cov[0, 0]) * np.linspace(-8.0, 8.0, 40_001)
+    logs = -((x - mean[0]) ** 2) / (2 * cov[0, 0]) - (0.3 - np.sin(wave * x)) ** 2 / (2 * noise)
+    weights = np.exp(logs) / np.exp(logs).sum()
+    slope = cov[1, 0] / cov[0, 0]
+    found = weights @ x, mean[1] + slope * (weights @ x - mean[0])
+    spread = weights @ (x - found[0]) ** 2, cov[1, 1] - slope * cov[0, 1] + slope**2 * (weights @ (x - found[0]) ** 2)
+    evidence = np.log(np.exp(logs).sum() * (x[1] - x[0])) - 0.5 * np.log(2 * np.pi * cov[0, 0]) - 0.5 * np.log(2 * np.pi * noise)
+    assert not result.warnings
+    assert np.allclose(result.mean[1], found, atol=1e-3 * np.sqrt(spread[0]))
+    assert np.allclose(result.variance[1], spread, rtol=2e-3)
+    assert abs(result.log_likelihood - evidence) < 1e-3

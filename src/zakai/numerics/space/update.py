@@ -24,6 +24,7 @@ _STEEP = 4.0  # change of the log-likelihood between neighbours that a grid may 
 _TRIES = 16
 _RESOLVED = 3  # grids on which neighbours differ by few nats that are tried from a grid that was chosen for the product
 LOWEST = -100.0  # logarithm of a product, relative to its largest, below which it is zero
+SMALLER = 0.8  # ratio of cells, above which a grid around a power of a factor is refined instead
 MOST_REFINED = 2.0  # ratio of spacings by which a grid is refined at once
 SPLINE = 5e-4  # error of the spline of a Gaussian, times the sixth power of its standard deviation in spacings
 ACCURATE = 10.0  # times the bound on edges, for the error of the spline, and of the cut, that is small
@@ -53,7 +54,7 @@ class _Product(NamedTuple):
     """The product of a density `values` and a factor on a grid, with the logarithm of the factor (*sizes).
 
     `levels` are the logarithms of the product, but for its largest, `top`, which is at the index `peak`; `field` is the product
-    but for exp(top); between `peak` and its neighbours the log of the factor changes by at most `steepest`.
+    but for exp(top); between `peak` and its neighbours along each axis the log of the factor changes by at most `steep` (n,).
     """
 
     values: Array
@@ -62,12 +63,12 @@ class _Product(NamedTuple):
     field: Field
     top: float
     peak: int
-    steepest: float
+    steep: Array
 
 
-@kernel("Tuple((float64, int64, float64))(float64[::1], float64[::1], int64[::1], boolean[::1], float64[::1], float64[::1])")
-def _multiply(values: Any, logs: Any, sizes: Any, closed: Any, levels: Any, product: Any) -> tuple[float, int, float]:
-    """Write the logarithms of a product, but for the largest, and the product; return the largest, its place, and the change.
+@kernel("Tuple((float64, int64))(float64[::1], float64[::1], int64[::1], boolean[::1], float64[::1], float64[::1], float64[::1])")
+def _multiply(values: Any, logs: Any, sizes: Any, closed: Any, levels: Any, product: Any, steep: Any) -> tuple[float, int]:
+    """Write the logarithms of a product, but for the largest, the product and the changes; return the largest and its place.
 
     Where the product is so small that arithmetic with it is slow it is zero.
     """
@@ -79,7 +80,7 @@ def _multiply(values: Any, logs: Any, sizes: Any, closed: Any, levels: Any, prod
     for j in range(values.size):
         levels[j] -= top
         product[j] = math.exp(levels[j]) if levels[j] > LOWEST else 0.0
-    steepest, stride = 0.0, 1
+    stride = 1
     for d in range(sizes.size - 1, -1, -1):
         index = peak // stride % sizes[d]
         for step in (-1, 1):
@@ -89,18 +90,18 @@ def _multiply(values: Any, logs: Any, sizes: Any, closed: Any, levels: Any, prod
             if 0 <= beside < sizes[d]:
                 change = abs(logs[peak + (beside - index) * stride] - logs[peak])
                 if math.isfinite(change):
-                    steepest = max(steepest, change)
+                    steep[d] = max(steep[d], change)
         stride *= sizes[d]
-    return top, peak, steepest
+    return top, peak
 
 
 def _multiplied(values: Array, grid: Grid, log_factor: Callable[[Grid], Array]) -> _Product:
     """Return the product of a density and a factor on a grid."""
     logs = log_factor(grid).reshape(grid.sizes)
-    levels, product = np.empty(grid.sizes), np.empty(grid.sizes)
+    levels, product, steep = np.empty(grid.sizes), np.empty(grid.sizes), np.zeros(grid.n)
     flat = [np.array(a.real, order="C").reshape(-1) for a in (values, logs)]
-    found = _multiply(*flat, grid.shape, grid.circles, levels.reshape(-1), product.reshape(-1))
-    return _Product(values, logs, levels, Field(product, grid, 0.0), *found)
+    found = _multiply(*flat, grid.shape, grid.circles, levels.reshape(-1), product.reshape(-1), steep)
+    return _Product(values, logs, levels, Field(product, grid, 0.0), *found, steep)
 
 
 def updated(
@@ -129,7 +130,7 @@ def updated(
         product = _multiplied(values, grid, log_factor)
         if not np.isfinite(product.top):
             return _unchanged(field, log_factor)
-        if product.steepest <= _STEEP:
+        if product.steep.max() <= _STEEP:
             found = product.field.survey(bounds)
             worst = float(max(found.tails.max(), found.edges.max()))
             wide = found.edges > 3 * bounds.edge
@@ -248,10 +249,10 @@ def _next(product: _Product, bounds: Bounds, sparse: bool, late: bool) -> Grid |
     grid, levels = product.field.grid, product.levels.reshape(-1)
     noise, narrow = np.zeros((grid.n, grid.n)), np.ones(grid.n)
     least = math.log(bounds.edge)
-    if product.steepest > _STEEP:
+    if product.steep.max() > _STEEP:
         logs = product.logs.real.reshape(-1)
         with np.errstate(invalid="ignore"):
-            levels = levels - (1 - _STEEP / product.steepest) * np.where(np.isfinite(logs), logs, 0.0)
+            levels = levels - (1 - _STEEP / product.steep.max()) * np.where(np.isfinite(logs), logs, 0.0)
         levels = np.where(np.isnan(levels), -np.inf, levels)
         levels = levels - levels.max()
         noise = 0.25 * grid.basis @ grid.basis.T
@@ -271,7 +272,10 @@ def _next(product: _Product, bounds: Bounds, sparse: bool, late: bool) -> Grid |
     if bounds.band_limited:
         used = np.flatnonzero(levels >= least)
         return whitened_grid(grid.offsets[used], levels[used], noise, narrow, bounds, grid)
-    return fitted_grid(grid.offsets, levels, grid.centre, noise, narrow, bounds, grid, least=least)
+    new = fitted_grid(grid.offsets, levels, grid.centre, noise, narrow, bounds, grid, least=least)
+    if product.steep.max() > _STEEP and new.cell > SMALLER * grid.cell:  # of several peaks
+        return adjusted(grid, np.zeros(grid.n), np.zeros(grid.n), np.where(product.steep > _STEEP, MOST_REFINED, 1.0), bounds)
+    return new
 
 
 def _beside(used: Array) -> Array:
