@@ -208,6 +208,32 @@ def test_cox_ingersoll_ross_against_its_exact_transition():
     assert density.mean()[0] == pytest.approx(result.mean[3, 0], abs=1e-9)
 
 
+def test_a_square_root_without_a_domain_is_filtered_and_smoothed():
+    a, b, s, lengths = 1.0, 1.0, 0.3, np.array([0.3, 0.1, 0.9, 0.3])
+    keys = {"diffusion": [[f"{s}*sqrt(x)"]], "observation_noise": [["0.1"]]}
+    model = model_of(f"{a}*({b} - x)", "x", prior={"kind": "gaussian", "mean": [1.0], "cov": [[0.01]]}, **keys)
+    record, law = samples(np.cumsum(lengths), [0.9, 1.3, 0.5, 0.8]), lambda z: normal(z, 0.1)
+    x = np.linspace(0.05, 4.0, 1500)
+    kernels = []
+    for length in lengths:
+        c = 2 * a / (s**2 * (1 - np.exp(-a * length)))
+        kernels.append(2 * c * ncx2.pdf(2 * c * x[:, None], 4 * a * b / s**2, 2 * c * x * np.exp(-a * length)))
+    densities, message = [normal(1.0, 0.01)(x)], np.ones(len(x))
+    for kernel, z in zip(kernels, record.values[:, 0], strict=True):
+        densities.append(kernel @ densities[-1] * law(z)(x) / np.sum(kernel @ densities[-1] * law(z)(x)))
+    products = [densities[-1]]
+    for kernel, density, z in zip(kernels[::-1], densities[-2::-1], record.values[::-1, 0], strict=True):
+        message = kernel.T @ (message * law(z)(x))
+        products.append(density * message)
+    for result, found in ((zakai.filter(model, record), densities), (zakai.smooth(model, record), products[::-1])):
+        means = [x @ p / p.sum() for p in found]
+        assert not result.warnings
+        assert np.allclose(result.mean[:, 0], means, atol=1e-5)
+        assert np.allclose(
+            result.variance[:, 0], [x**2 @ p / p.sum() - m**2 for p, m in zip(found, means, strict=True)], rtol=1e-4
+        )
+
+
 @pytest.mark.parametrize("lower", [0.0, -1e6])
 def test_geometric_brownian_motion_is_lognormal(lower):
     shifted = "x" if lower == 0 else f"(x + {-lower})"

@@ -30,10 +30,7 @@ def coefficients(
     points = window.points[:, None] if shifts is None else (window.points + shifts[:, None])[..., None]
     if shifts is not None:
         drift = finite(system.drift(points, times[:, None], theta)[..., 0])
-        if system.state_dependent:
-            covariance = finite(system.covariance(points, times[:, None], theta)[..., 0, 0])
-        else:
-            covariance = covariance_at(system, window.points, times, theta)
+        covariance = covariance_at(system, points[..., 0], times, theta)
     elif system.moving:
         drift = drift_at(system, window, times, theta)
         covariance = covariance_at(system, window.points, times, theta)

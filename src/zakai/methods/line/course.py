@@ -22,6 +22,7 @@ FASTEST = 100.0  # ranges of the density in the interval, divided by the toleran
 REACH = 8.0  # standard deviations to the end of a density
 KINK_PROBES = 1025  # points between which kinks are sought
 MOST_KINKS = 16
+PROBES = 65  # points between which a formula ceases to have values
 DIFFUSED = 0.5  # of the time in which noise would double the variance: the first step
 GENTLE = 0.25  # of the steps where the density does not contract much
 _FLOW_POINTS = 17
@@ -85,12 +86,31 @@ def course_of(
         return None
     centre, scale, walls = 0.5 * (way.low + way.high), 0.5 * (way.high - way.low), walls_of(prepared, window.origin)
     low, high = np.clip([min(ends[0], centre - scale), max(ends[1], centre + scale)], *walls)
+    low, high = (_defined(prepared, window.origin, centre, float(end), start) for end in (low, high))
     if REACH * aim[1] < scale:
         centre, scale = aim[0], REACH * aim[1]
     cells = volumes(window.origin, centre, scale, float(low), float(high), LEVELS[0][0])
     finest = (cells.last - cells.first) / LEVELS[-1][0] * np.hypot(scale, max(abs(ends[0] - centre), abs(ends[1] - centre)))
     cells = cells._replace(cuts=_cuts(prepared, cells, start))
     return Course(way, cells, float(finest), quick, fastest, bounds, parts.error, share, float(last))
+
+
+def _defined(prepared: Prepared, origin: float, inner: float, outer: float, t: float) -> float:
+    """Return how far between two offsets from the origin the drift and the noise have values."""
+    system, theta = prepared.system, prepared.theta.real
+
+    def has_values(offsets: Array) -> Array:
+        x = origin + offsets[:, None]
+        return np.isfinite(system.drift(x, t, theta)[:, 0]) & (system.covariance(x, t, theta)[:, 0, 0] >= 0.0)
+
+    for _ in range(4):
+        offsets = np.linspace(inner, outer, PROBES)
+        missing = ~has_values(offsets)
+        if not missing.any():
+            return outer
+        first = max(int(np.argmax(missing)), 1)
+        inner, outer = float(offsets[first - 1]), float(offsets[first])
+    return inner
 
 
 def walls_of(prepared: Prepared, origin: float) -> tuple[float, float]:

@@ -83,9 +83,10 @@ def drift_at(system: System, window: lw.Window, t: Array, theta: Array) -> Array
 
 
 def covariance_at(system: System, points: Array, t: Array, theta: Array) -> Array:
-    """Return G at points (N,) and times (...): (..., N) where it depends on the state, else (...)."""
+    """Return G at points (..., N) and times (...): (..., N), or (...) if it is constant; zero where g has no value."""
     if system.state_dependent:
-        return finite(system.covariance(points[:, None], np.asarray(t)[..., None], theta)[..., 0, 0])
+        found = finite(system.covariance(points[..., None], np.asarray(t)[..., None], theta)[..., 0, 0])
+        return np.where(found.real > 0.0, found, 0.0)
     return system.covariance(np.zeros((*np.shape(t), 1)), t, theta)[..., 0, 0]
 
 
