@@ -1,10 +1,11 @@
-"""The smoother of density grids in two states against dense forward-backward sums by differences of order eight."""
+"""The smoother of density grids in two states against dense forward-backward sums and quadrature."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from scipy.linalg import expm
 from scipy.sparse.linalg import expm_multiply
 
 import zakai
@@ -207,3 +208,50 @@ def test_correlated_noise_that_depends_on_the_state_is_smoothed_as_without_a_fol
     assert not result.warnings and result.health["evidence_error"].max() < 5e-4
     np.testing.assert_allclose(result.mean[:, 0], expected.mean[:, 0], atol=1e-3)
     np.testing.assert_allclose(result.variance[:, 0], expected.variance[:, 0], rtol=2e-3)
+
+
+def by_quadrature(mean, prior, noise, times, values, observe, variance):
+    """Smoothed means and variances (3, 2) of x' = v, v' = noise, for two samples of a function of x.
+
+    Given x at both times all states are jointly normal; what remains is a sum over x at both.
+    """
+    A, joint, cov = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array(mean), np.diag(prior)
+    for length in np.diff(times, prepend=0.0):
+        both = expm(length * np.block([[-A, np.diag([0.0, noise])], [np.zeros((2, 2)), A.T]]))  # Van Loan
+        move = both[2:, 2:].T
+        cross = cov[:, -2:] @ move.T
+        cov = np.block([[cov, cross], [cross.T, move @ cov[-2:, -2:] @ move.T + move @ both[:2, 2:]]])
+        joint = np.concatenate([joint, move @ joint[-2:]])
+    seen = [2, 4]
+    P, m = cov[np.ix_(seen, seen)], joint[seen]
+    axes = [m[k] + np.sqrt(P[k, k]) * np.linspace(-8.0, 8.0, 1201) for k in range(2)]
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2) - m
+    logs = -0.5 * np.einsum("ij,jk,ik->i", x, np.linalg.inv(P), x) - ((values - observe(x + m)) ** 2).sum(axis=1) / (2 * variance)
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    gain = cov[:, seen] @ np.linalg.inv(P)
+    states = joint + x @ gain.T
+    means = weights @ states
+    return means.reshape(3, 2), (np.diag(cov - gain @ cov[seen]) + weights @ (states - means) ** 2).reshape(3, 2)
+
+
+@pytest.mark.parametrize(
+    ("mean", "times", "values", "variance"),
+    [
+        ([1.6, -0.2], [0.3, 0.6], [1.8, 2.2], 0.01),
+        ([1.2, -0.5], [0.2, 0.5], [1.3, 1.15], 0.002),
+        ([0.1, 0.0], [0.5, 0.9], [1.5, 1.95], 0.02),
+    ],
+)
+def test_a_distance_that_two_places_explain_is_smoothed(mean, times, values, variance):
+    model = zakai.Model(
+        state=["x", "v"], drift=["v", "0"], diffusion=[["0"], ["0.3"]], observation=["sqrt(x**2 + 1)"],
+        observation_kind="samples", observation_noise=[[str(variance)]],
+        prior={"kind": "gaussian", "mean": mean, "cov": [0.2, 0.1]},
+    )  # fmt: skip
+    record = zakai.Record(times, np.array(values)[:, None], "samples")
+    result = zakai.smooth(model, record, "yau-yau")
+    expected = by_quadrature(mean, [0.2, 0.1], 0.09, times, values, lambda x: np.sqrt(x**2 + 1), variance)
+    assert not result.warnings
+    assert np.all(np.abs(result.mean - expected[0]) < 5e-3 * np.sqrt(expected[1]))
+    assert np.allclose(result.variance, expected[1], rtol=2e-2)

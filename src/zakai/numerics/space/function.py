@@ -20,6 +20,7 @@ Array = NDArray[Any]
 TINY = 1e-300
 LEAST = 1e-30  # of the maximum, below which values count as equal
 HIGHEST = 12.0  # nats by which a function may be above its value where it counts most
+COUNTS, TILTED = 1e-6, 8.0  # weights that count, of the largest, and nats by which a tilt may change between them
 REACH = 5.0  # deviations of the noise that a continued function covers at each end
 MARGIN = 8  # points of a continued function, without noise
 LARGEST, SPREAD_AT_ONCE = 2.0, 2**16  # ratio of its points along an axis to those of a function, and points for any ratio
@@ -49,7 +50,8 @@ class Function(NamedTuple):
 def function_of(logs: Array, grid: Grid, weights: Array, tilted: bool) -> Function:
     """Return the function with these logarithms (*sizes), with the tilt that fits them best under weights (*sizes).
 
-    The values are one where the weights are largest, and much larger nowhere.
+    The values are one where the weights are largest, and much larger nowhere, least of all where the weights are negligible:
+    waves of the interpolation there would be as large as the values that count.
     """
     logs, share = np.where(np.isnan(logs), -np.inf, logs), weights.reshape(-1) / weights.sum()
     middle, tilt, n = grid.centre + share @ grid.offsets, np.zeros(grid.n), ~grid.circles
@@ -58,11 +60,14 @@ def function_of(logs: Array, grid: Grid, weights: Array, tilted: bool) -> Functi
         used = (share > 0) & np.isfinite(flat)
         z, share, flat = (grid.points[used] - middle)[:, n], share[used], flat[used]
         tilt[n] = np.linalg.lstsq((z * share[:, None]).T @ z, share * (flat - share @ flat) @ z, rcond=1e-8)[0]
+        tilt /= max(float(np.ptp(z[share > COUNTS * share.max()] @ tilt[n])) / TILTED, 1.0)
     values = logs - ((grid.points - middle) @ tilt).reshape(grid.sizes)
     top = float(values.flat[np.argmax(weights)])
     if not np.isfinite(top):
         top = float(values.max()) if np.isfinite(values.max()) else 0.0
-    return Function(np.exp(np.minimum(values - top, HIGHEST)), grid, top, tilt, middle)
+    with np.errstate(divide="ignore"):
+        highest = HIGHEST + np.log(np.minimum(weights / (COUNTS * weights.max()), 1.0))
+    return Function(np.exp(np.minimum(values - top, highest)), grid, top, tilt, middle)
 
 
 def continued(values: Array, sizes: tuple[int, ...]) -> Array:
