@@ -239,7 +239,7 @@ def by_quadrature(mean, prior, noise, times, values, observe, variance):
     ("mean", "times", "values", "variance"),
     [
         ([1.6, -0.2], [0.3, 0.6], [1.8, 2.2], 0.01),
-        ([1.2, -0.5], [0.2, 0.5], [1.3, 1.15], 0.002),
+        ([1.2, -0.5], [0.2, 0.5], [1.3, 1.15], 0.005),
         ([0.1, 0.0], [0.5, 0.9], [1.5, 1.95], 0.02),
     ],
 )
@@ -255,3 +255,16 @@ def test_a_distance_that_two_places_explain_is_smoothed(mean, times, values, var
     assert not result.warnings
     assert np.all(np.abs(result.mean - expected[0]) < 5e-3 * np.sqrt(expected[1]))
     assert np.allclose(result.variance, expected[1], rtol=2e-2)
+
+
+def test_a_density_that_leaves_its_grid_within_an_interval_is_smoothed():
+    model = zakai.Model(
+        state=["v", "w"], drift=["v - v**3/3 - w + 0.5", "0.08*(v + 0.7 - 0.8*w)"], diffusion=[["0.1", "0"], ["0", "0.05"]],
+        observation=["v"], observation_kind="samples", observation_noise=[["0.04"]],
+        prior={"kind": "gaussian", "mean": [-1.0, 0.0], "cov": [0.3, 0.1]},
+    )  # fmt: skip
+    times = np.cumsum(0.05 + np.random.default_rng(5).exponential(0.5, 40))
+    _, record = zakai.simulate(model, times, seed=11)
+    result = zakai.smooth(model, record, "yau-yau")
+    assert not result.warnings
+    assert np.nanmax(result.health["evidence_error"]) < 1e-3

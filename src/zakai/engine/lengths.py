@@ -78,7 +78,7 @@ def _distances(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> 
         precision = np.linalg.inv(np.broadcast_to(S(np.zeros(n), times, theta), (len(times), m, m)))
         sides = [mean, *(mean + side * axis for side in (reach, -reach) for axis in np.eye(n))]
         seen, drift = np.stack([h(x, times, theta, u) for x in sides]), np.stack([f(x, times, theta, u) for x in sides])
-        rate = np.nanmax(np.abs(drift[1:] - drift[0]) / reach, axis=(0, 2))  # fast changes of the drift end within an interval
+        rate = np.nan_to_num(np.abs(drift[1:] - drift[0]) / reach).max(axis=(0, 2))  # fast changes of the drift end within it
         back = drift * (length / (1.0 + rate * length))[:, None]
         before = np.stack([h(x - moved, times - length, theta, u) for x, moved in zip(sides, back, strict=True)])
         change = np.where(inside > 0.0, seen - before, 0.0)

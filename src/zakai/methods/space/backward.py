@@ -165,11 +165,9 @@ def _substeps(
     if not (general.correlated and inside.any()):
         last = observations.over(*parts[-1])
         potential = last.potential(inside, values, *parts[-1]) if inside.any() else None
-        fixed = control
-        if not (control.fixed and control.known(length, allowed)):
-            quick = predicted_on(general, begin, control, allowed, length, potential)
-            fixed = Control(np.inf, 0.0, 0) if quick is None else quick[2]
-        if fixed.fixed:
+        quick = predicted_on(general, begin, control, allowed, length, potential)
+        if quick is not None:
+            fixed = quick[2]
             stepper = Stepper(observations.dynamics, general.bounds, general.tolerance)
             singles, pairs = fixed.parts(length, allowed)
             extrapolated, pairs = singles > 3 * pairs or fewest > 1, max(pairs, fewest)
