@@ -23,6 +23,8 @@ SPIRAL: dict[str, Any] = dict(
     observation_noise=[["1/2", "1/8"], ["1/8", "1/3"]],
     prior={"kind": "gaussian", "mean": [0.3], "cov": [[0.5]]},
 )
+# One number of particles and members, for which the loop of a system is compiled once.
+FEW: dict[str, dict[str, int]] = {"particle": {"particles": 100}, "enkf": {"members": 100}}
 
 
 def linear(kind: str) -> zakai.Model:

@@ -74,7 +74,7 @@ class System:
 
 @dataclass(frozen=True)
 class _Formulas:
-    """A model, equal to every other with the same formulas: what is compiled for one serves them all."""
+    """A model, equal to every other with the same compiled formulas: what is compiled for one serves them all."""
 
     key: Hashable
     model: Model = field(compare=False, repr=False)
@@ -92,8 +92,8 @@ def system_of(model: Model, scheme: str, substeps: int, rule: Any) -> System:
         InputError: an unknown scheme or number of substeps.
     """
     one_of("scheme", scheme, SCHEMES)
-    matrices = (model.drift, model.diffusion, model.process_noise, model.observation, model.observation_noise)
-    names = (model.state, model.parameter_symbols, model.periodic, model.functions, model.observation_kind)
+    matrices = (model.drift, model.covariance, model.observation)
+    names = (model.state, model.parameter_symbols, model.periodic, model.functions)
     return _system(_Formulas((names, matrices), model), scheme, whole_number("substeps", substeps, 1), rule)
 
 
