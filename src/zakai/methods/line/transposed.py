@@ -41,14 +41,15 @@ def by_exponentials(
         moving: whether the grid moves with the message.
     """
     start, length, spacing = float(prepared.schedule.starts[k]), float(prepared.lengths[k]), later.needed
-    margin = PAD * spacing
+    margin, tried = PAD * spacing, None
     for _ in range(MOST_GRIDS):
         if later.closed:
             window = covering(later.window, 0.0, 0.0, min(spacing, state.spacing))
         else:
             window = lw.quantized(later.window, later.ends[0] - margin, later.ends[1] + margin, spacing, margin=0.0)
-            if window.size > MOST_DENSE:
+            if window == tried or window.size > MOST_DENSE:
                 return None
+            tried = window
         values = np.exp(later.at(window.offsets) - np.max(later.logs))
         values = values if later.closed else values * taper(window.offsets, later.ends, window.spacing)
         found = _transposed(prepared, values, window, start, length, inside, rates, moving)
