@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.special import gammaln
 from scipy.stats import multivariate_normal, norm
 from scipy.stats import t as student
@@ -21,24 +23,31 @@ LINEAR = {
 TIMES = np.array([0.2, 0.9, 1.0, 1.6])
 
 
-def dense(values, log_density, size=61, reach=5.0, times=TIMES):
+def grid_of(size, reach=5.0):
+    """Return points (size^2, 2), none of them on an axis, and the area of each."""
+    deviation = np.sqrt(np.maximum(np.diagonal(COV), np.diagonal(solve_continuous_lyapunov(F, -G))))
+    axes = [np.linspace(-reach, reach, size) * d + 0.5 * reach * d / size for d in deviation]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2), np.prod([axis[1] - axis[0] for axis in axes])
+
+
+@lru_cache(maxsize=4)
+def transition(tau, size):
+    """Return the transition densities of the linear system between the points of a grid, times the area of a point."""
+    x, area = grid_of(size)
+    blocks = expm(np.block([[-F, G], [np.zeros((2, 2)), F.T]]) * tau)
+    A = blocks[2:, 2:].T
+    root = np.linalg.cholesky(A @ blocks[:2, 2:])
+    to, frm = np.linalg.solve(root, x.T), np.linalg.solve(root, A @ x.T)
+    apart = (to**2).sum(0)[:, None] + (frm**2).sum(0) - 2 * to.T @ frm
+    return np.exp(-0.5 * apart) * area / (2 * np.pi * np.linalg.det(root))
+
+
+def dense(values, log_density, size):
     """Bayes' rule on a fixed grid for the linear system: means, variances, and increments of the log-likelihood."""
-    stationary = sum(expm(F * s) @ G @ expm(F.T * s) for s in np.arange(0, 40, 0.01)) * 0.01
-    deviation = np.sqrt(np.maximum(np.diagonal(COV), np.diagonal(stationary)))
-    axes = [np.linspace(-reach, reach, size) * d + 0.5 * reach * d / size for d in deviation]  # no point on an axis
-    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    area = np.prod([axis[1] - axis[0] for axis in axes])
-    u, time, out, kernels = multivariate_normal(MEAN, COV).pdf(x) * area, 0.0, [], {}
-    for stop, z in zip(times, values, strict=True):
-        tau = round(stop - time, 9)
-        if tau not in kernels:
-            blocks = expm(np.block([[-F, G], [np.zeros((2, 2)), F.T]]) * tau)
-            A = blocks[2:, 2:].T
-            root = np.linalg.cholesky(A @ blocks[:2, 2:])
-            to, frm = np.linalg.solve(root, x.T), np.linalg.solve(root, A @ x.T)
-            apart = (to**2).sum(0)[:, None] + (frm**2).sum(0) - 2 * to.T @ frm
-            kernels = {tau: np.exp(-0.5 * apart) * area / (2 * np.pi * np.linalg.det(root))}
-        u, time = kernels[tau] @ u, stop
+    x, area = grid_of(size)
+    u, time, out = multivariate_normal(MEAN, COV).pdf(x) * area, 0.0, []
+    for stop, z in zip(TIMES, values, strict=True):
+        u, time = transition(round(stop - time, 9), size) @ u, stop
         u = u * np.exp(log_density(z, x))
         mass, u = u.sum(), u / u.sum()
         mean = u @ x
@@ -46,12 +55,12 @@ def dense(values, log_density, size=61, reach=5.0, times=TIMES):
     return out
 
 
-def check(keys, values, log_density, bound=1e-3, warns=False, compares=True):
+def check(keys, values, log_density, bound=1e-3, warns=False, compares=True, size=45):
     """Compare `yau-yau` with the dense grid, which is of order two where a factor has a kink; return its result."""
     record = zakai.Record(TIMES, np.asarray(values, float)[:, None], "samples")
     result = zakai.filter(zakai.Model(**{**LINEAR, **keys}), record, "yau-yau")
     assert bool(result.warnings) == warns
-    expected = dense(values, log_density)
+    expected = dense(values, log_density, size)
     error = max(
         max(
             np.abs((result.mean[k + 1] - mean) / np.sqrt(variance)).max(),
@@ -120,18 +129,19 @@ def test_every_law_of_an_observation_follows_bayes_rule(name):
 
 def test_a_kink_in_an_observation():
     keys = {"observation": ["max(x, y)"], "observation_noise": [["0.1"]]}
-    check(keys, [0.5, 0.4, 0.9, 0.2], lambda z, x: norm.logpdf(z, x.max(axis=1), np.sqrt(0.1)), 3e-3, compares=False)
+    check(keys, [0.5, 0.4, 0.9, 0.2], lambda z, x: norm.logpdf(z, x.max(axis=1), np.sqrt(0.1)), 3e-3, compares=False, size=61)
 
 
 def test_a_jump_in_an_observation_warns():
     keys = {"observation": ["heaviside(x)"], "observation_noise": [["0.1"]]}
-    check(keys, [0.5, 1.4, 0.9, 0.2], lambda z, x: norm.logpdf(z, x[:, 0] > 0, np.sqrt(0.1)), bound=0.05, warns=True)
+    check(keys, [0.5, 1.4, 0.9, 0.2], lambda z, x: norm.logpdf(z, x[:, 0] > 0, np.sqrt(0.1)), bound=0.05, warns=True, size=61)
 
 
 def test_mass_outside_of_a_table_and_mass_without_a_law_warn():
     narrow = {"depth": {"kind": "linear", "x": [-0.5, 0.5], "values": [-0.5, 0.5]}}
     keys = {"observation": ["depth(x)"], "observation_noise": [["0.1"]], "tables": narrow}
-    clipped = check(keys, [0.5, -0.4, 0.9, 0.2], lambda z, x: norm.logpdf(z, np.clip(x[:, 0], -0.5, 0.5), 0.1**0.5), 3e-3, True)
+    law = lambda z, x: norm.logpdf(z, np.clip(x[:, 0], -0.5, 0.5), 0.1**0.5)  # noqa: E731
+    clipped = check(keys, [0.5, -0.4, 0.9, 0.2], law, 3e-3, True, size=61)
     assert 0.05 < np.nanmax(clipped.health["outside_tables"]) < 1
     record = zakai.Record([0.2], [[1.0]], "samples")
     model = zakai.Model(**LINEAR, observation=["x + 2"], observation_family="poisson")
