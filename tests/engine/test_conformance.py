@@ -35,7 +35,7 @@ SYSTEMS = {
 NEAR = {"general-direct": 2e-2, "gaussian-sum": 5e-4}
 # A method with a tolerance is asked for more where rounding is compared.
 OPTIONS = {"yau-yau": {"tolerance": 1e-8}}
-TIMES = np.cumsum([0.1, 0.05, 0.2, 0.1, 0.1, 0.15, 0.05, 0.1, 0.3, 0.1])
+TIMES = np.cumsum([0.1, 0.05, 0.2, 0.1, 0.1, 0.05, 0.3])
 
 
 @cache

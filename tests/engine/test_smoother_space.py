@@ -70,7 +70,7 @@ SYSTEMS = {
     "cubic": (
         {"drift": ["-x + 0.5*y - x**3", "-0.5*x - y"], "observation": ["x", "y + 0.3*x**2"],
          "process_noise": [[0.5, 0.1], [0.1, 0.4]]},
-        (np.linspace(-2.6, 3.2, 84), np.linspace(-4.0, 3.4, 76)), (False, False),
+        (np.linspace(-2.6, 3.2, 75), np.linspace(-4.0, 3.4, 68)), (False, False),
         lambda x, y: (-x + 0.5 * y - x**3, -0.5 * x - y), lambda x, y: (0.5, 0.1, 0.4), lambda x, y: (x, y + 0.3 * x**2),
     ),
     "angle": (
@@ -82,7 +82,7 @@ SYSTEMS = {
     "state-dependent noise": (
         {"drift": ["-x", "x - y"], "observation": ["x", "y"], "process_noise": [[1, 0], [0, 1]],
          "diffusion": [["0.6 + 0.2*sin(y)", "0"], ["0.2*cos(x)", "0.6"]]},
-        (np.linspace(-3.3, 3.5, 80), np.linspace(-3.4, 3.2, 80)), (False, False),
+        (np.linspace(-3.3, 3.5, 62), np.linspace(-3.4, 3.2, 62)), (False, False),
         lambda x, y: (-x, x - y),
         lambda x, y: ((0.6 + 0.2 * np.sin(y)) ** 2, (0.6 + 0.2 * np.sin(y)) * 0.2 * np.cos(x), 0.36 + 0.04 * np.cos(x) ** 2),
         lambda x, y: (x, y),

@@ -329,7 +329,7 @@ def test_ten_thousand_steps_lose_nothing_against_a_reference_that_restarts():
     assert result.method == "benes" and not result.warnings
 
     # v0 = sigma0 / cosh on points; after one step each is a Gaussian (mean m_i, common variance P, log-weight w_i).
-    z = np.linspace(-7, 7, 4001)
+    z = np.linspace(-7, 7, 401)
     sigma = sum(0.5 * np.exp(-((z - m) ** 2) / (2 * c)) / np.sqrt(2 * np.pi * c) for m, c in ((-1, 0.16), (1.2, 0.25)))
     with np.errstate(divide="ignore"):
         w = np.log(sigma / np.cosh(z) * (z[1] - z[0]))

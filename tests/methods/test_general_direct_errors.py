@@ -44,7 +44,7 @@ def transition(step):
 
 @cache
 def record_of(name, seed):
-    return zakai.simulate(sensor(name), np.arange(1, 41) * 0.1, seed=seed)[1]
+    return zakai.simulate(sensor(name), np.arange(1, 21) * 0.1, seed=seed)[1]
 
 
 @cache
@@ -92,7 +92,7 @@ def test_a_sum_is_near_the_density_or_says_that_it_is_not(name, seed):
 
 
 @pytest.mark.parametrize("name", SENSORS)
-@pytest.mark.parametrize("components", [*(few for few in (2, 4, 6)), 10])
+@pytest.mark.parametrize("components", [2, 4, 10])
 def test_a_sum_of_too_few_components_says_so(name, components):
     model = sensor(name)
     result = zakai.filter(model, record_of(name, 3), "general-direct", components=components)
@@ -295,7 +295,7 @@ def test_four_states_with_a_nonlinear_observation_of_two_run_and_report_their_er
 
 def test_the_error_falls_with_the_number_of_slots():
     model = zakai.load_model("gallery:spiral-sensor")
-    records = [zakai.simulate(model, np.arange(1, 101) * 0.01, seed=seed)[1] for seed in range(1, 6)]
+    records = [zakai.simulate(model, np.arange(1, 61) * 0.01, seed=seed)[1] for seed in range(1, 6)]
     exact = zakai.filter(model, records, "limited-direct", keep="moments")
     errors = []
     for slots in (10, 20, 40):

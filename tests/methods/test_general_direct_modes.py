@@ -17,8 +17,8 @@ def spiral(variance, **changes):
 
 def test_paths_that_begin_anywhere_in_the_prior_keep_the_weights_of_their_modes():
     model = spiral(3.0)
-    # A whole path, and the beginnings of five.
-    steps = [1000] + [100] * 5
+    # A longer path, and the beginnings of five.
+    steps = [300] + [80] * 5
     truths, records = zip(*(zakai.simulate(model, np.arange(1, K + 1) * 0.01, seed=4000 + i) for i, K in enumerate(steps)))
     exact, filtered = (
         zakai.filter(model, list(records), method, keep="moments") for method in ("limited-direct", "general-direct")

@@ -38,7 +38,7 @@ def of_system(name):
     keys = {"state": ["x"], **SYSTEMS[name]}
     noise = keys.pop("noise", 0.2)
     model = zakai.Model(**keys, parameters={"k": 1.0, "g": 0.7, "s": noise})
-    times = np.cumsum([0.1, 0.02, 0.3, 0.05, 0.05, 0.6, 0.04, 0.1, 0.1, 0.02, 0.4, 0.1])
+    times = np.cumsum([0.1, 0.02, 0.3, 0.05, 0.05, 0.6, 0.04])
     _, record = zakai.simulate(model, times, seed=3)
     values = record.values.copy()
     values[4] = np.nan  # an interval without an observation
