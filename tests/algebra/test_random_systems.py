@@ -36,7 +36,7 @@ def agrees_in_other_coordinates(seed: int) -> bool:
 
 
 def test_random_systems_have_proofs_that_stand():
-    assert [seed for seed in range(200) if not has_a_proof_that_stands(seed)] == []
+    assert [seed for seed in range(100) if not has_a_proof_that_stands(seed)] == []
 
 
 @pytest.mark.parametrize("name", CONJUGATED)
@@ -46,4 +46,4 @@ def test_the_algebra_of_a_known_system_is_the_same_in_other_coordinates(name):
 
 
 def test_the_algebras_of_random_systems_are_the_same_in_other_coordinates():
-    assert [seed for seed in range(2000, 2050) if not agrees_in_other_coordinates(seed)] == []
+    assert [seed for seed in range(2000, 2030) if not agrees_in_other_coordinates(seed)] == []

@@ -51,7 +51,7 @@ class NodeGrid:
         array = np.reshape(values, self.sizes)
         for axis, size in enumerate(self.sizes):
             if size > 1:
-                array = np.moveaxis(np.tensordot(_inverse(size), array, (1, axis)), 0, axis)
+                array = _convolved(array, _inverse(size), axis)
         wide = self.basis[:, shape > 1]
         # The Gaussians have unit mass; the taps are those of grid spacings.
         return np.ravel(array) * np.sqrt(np.linalg.det(wide.T @ wide))
@@ -61,10 +61,14 @@ class NodeGrid:
         array = np.reshape(weights, self.sizes)
         for axis, size in enumerate(self.sizes):
             if size > 1:
-                away = np.arange(size)[:, None] + shift[axis] - np.arange(size)
-                array = np.moveaxis(np.tensordot(_taps(away), array, (1, axis)), 0, axis)
+                array = _convolved(array, _taps(np.arange(1 - size, size) + shift[axis]), axis)
         wide = self.basis[:, np.array(self.sizes) > 1]
         return np.asarray(np.ravel(array) / np.sqrt(np.linalg.det(wide.T @ wide)))
+
+
+def _convolved(array: Any, taps: np.ndarray, axis: int) -> Any:
+    """Return sum_j taps_(i - j) a_j at each of the points i of an axis, for taps from 1 - size to size - 1."""
+    return np.apply_along_axis(np.convolve, axis, array, taps, "valid")
 
 
 def _taps(away: np.ndarray) -> np.ndarray:
@@ -72,7 +76,7 @@ def _taps(away: np.ndarray) -> np.ndarray:
 
 
 def _inverse(size: int) -> np.ndarray:
-    """Return the inverse (size, size) of the convolution with a node, on an infinite grid.
+    """Return the taps from 1 - size to size - 1 of the inverse of the convolution with a node, on an infinite grid.
 
     The taps' Fourier series is a theta function of nome q; the coefficients of its reciprocal, each to full relative accuracy,
     are (-1)^k sum_m (-1)^m q^((m + 1/2)(m + 2|k| + 1/2)) but for a factor (Whittaker and Watson, chapter 21).
@@ -81,7 +85,7 @@ def _inverse(size: int) -> np.ndarray:
     k, m = np.arange(max(size, 64)), np.arange(24)[:, None]
     row = (-1.0) ** k * np.sum((-1.0) ** m * q ** ((m + 0.5) * (m + 2 * k + 0.5)), axis=0)
     row /= row[0] * _taps(np.array(0.0)) + 2 * row[1:] @ _taps(k[1:])
-    return np.asarray(row[np.abs(np.arange(size)[:, None] - np.arange(size))])
+    return np.asarray(row[np.abs(np.arange(1 - size, size))])
 
 
 def resolve(
