@@ -18,9 +18,9 @@ MOST_MAPS = 20_000  # Linux gives a process 65,530 of them, and a compiler that 
 MOST_BYTES = 5 * 2**30
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def _forget_what_is_compiled():
-    """A worker compiles thousands of functions in its life."""
+    """A worker compiles thousands of functions in its life; to count the maps takes milliseconds."""
     yield
     if "jax" in sys.modules and _crowded():
         sys.modules["jax"].clear_caches()
