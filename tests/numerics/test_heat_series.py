@@ -189,7 +189,7 @@ def test_each_term_of_the_convergent_series_brings_it_nearer_to_the_kernel(order
 
 def test_the_second_term_of_the_convergent_series_brings_it_nearer_still():
     for order, t, figure in ((0, 0.1, 4.8e-4), (1, 0.2, 3.8e-4), (1, 0.1, 5.4e-7), (1, 0.05, 1.2e-8)):
-        x, exact = spectral_kernel("x - x**3", t, 4.5, 361, gauged=True)
+        x, exact = spectral_kernel("x - x**3", t, 4.5, 361 if t < 0.1 else 241, gauged=True)
         inside = np.ix_(np.abs(x) < 1.5 + 1e-9, np.abs(x) < 1.5 + 1e-9)
         found = parametrix(system("x - x**3"), x, t, order, 2)[-1]
         assert np.max(np.abs(found - exact)[inside]) / np.max(exact[inside]) == pytest.approx(figure, rel=0.5)
