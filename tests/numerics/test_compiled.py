@@ -4,9 +4,10 @@ import gc
 import time
 
 import numpy as np
+import pytest
 from numba import float64
 
-from zakai.numerics.compiled import kernel, working_time
+from zakai.numerics.compiled import helper, kernel, working_time
 from zakai.numerics.exponentials import exponentiate
 
 
@@ -28,6 +29,32 @@ def test_exponentials_of_arrays_are_those_of_numpy():
     found = _exponentials(x)
     assert np.array_equal(found[-6:], [1.0, 0.0, 0.0, 0.0, np.inf, np.nan], equal_nan=True)
     assert np.allclose(found[:-6], np.exp(x[:-6]), rtol=4e-16, atol=0)
+
+
+def test_an_exception_in_a_helper_reaches_python():
+    assert _half(3.0) == 1.5
+    with pytest.raises(ValueError, match="negative"):
+        _half(-1.0)
+
+
+def test_a_helper_is_translated_with_the_kernel_that_calls_it():
+    names = {"kernel": kernel, "helper": helper, "float64": float64}
+    exec("@helper\ndef part(x):\n    return x + 1.0\n@kernel(float64(float64))\ndef whole(x):\n    return part(x)", names)
+    assert names["whole"](1.0) == 2.0
+    (compiled,) = names["part"].overloads.values()
+    assert compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name) == 0
+
+
+@helper
+def _halved(x):
+    if x < 0.0:
+        raise ValueError("negative")
+    return 0.5 * x
+
+
+@kernel(float64(float64))
+def _half(x):
+    return _halved(x)
 
 
 @kernel(float64[::1](float64[::1]))

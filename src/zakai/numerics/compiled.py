@@ -12,6 +12,8 @@ from numba import njit, types
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.sigutils import normalize_signature
 
+from zakai.numerics.inlined import InlinedCompiler
+
 F = TypeVar("F", bound=Callable[..., Any])
 R = TypeVar("R")
 
@@ -105,4 +107,4 @@ def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -
 
 def helper(function: F) -> F:
     """Compile a function that only kernels call, as a part of each of them; it has no entry for Python."""
-    return cast(F, _compiler(no_cpython_wrapper=True)(function))
+    return cast(F, _compiler(pipeline_class=InlinedCompiler)(function))
