@@ -106,5 +106,15 @@ def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -
 
 
 def helper(function: F) -> F:
-    """Compile a function that only kernels call, as a part of each of them; it has no entry for Python."""
-    return cast(F, _compiler(pipeline_class=InlinedCompiler)(function))
+    """Compile a function that only kernels call, as a part of each of them; it has no entry for Python.
+
+    It is compiled once for all literal integers, and once for each literal boolean, which selects code.
+    """
+    dispatcher = _compiler(pipeline_class=InlinedCompiler)(function)
+    compiled = dispatcher.compile
+
+    def compile_common(arguments: Any) -> Any:
+        return compiled(tuple(types.unliteral(t) if isinstance(t, types.IntegerLiteral) else t for t in arguments))
+
+    dispatcher.compile = compile_common
+    return cast(F, dispatcher)
