@@ -13,7 +13,7 @@ from zakai.methods.line.tables import covariance_at, gauge_at, profile_of, spect
 from zakai.methods.line.update import factor_at_end
 from zakai.numerics.line import modal as lm
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.density import waves
+from zakai.numerics.line.density import circular_rows, waves
 from zakai.numerics.line.place import PER
 from zakai.numerics.line.posterior import General
 from zakai.numerics.line.segment import COLUMNS, FAILED
@@ -81,12 +81,15 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
     owner, count = (-2, stop - k) if not special else (-1, min(TOGETHER, stop - k) if stays else 1)
     for _ in range(NEW):
         n = window.size if stays else SIZES[at]
+        cosines, sines = waves(n)
         densities, places, out = np.empty((count, n)), np.empty((count + 1, 3)), np.zeros((count, len(COLUMNS)))
         done, why = lm.advance(
             np.ascontiguousarray(state.values), float(state.centre), float(state.spacing), window.unit, window.closed, profile,
             coarse.numbers, coarse.index, rows, owner, general, way, k, observed[:count], steps.lengths, steps.precisions[:, 0],
-            steps.constants, float(state.error), prepared.limits, *waves(n), densities, places, out,
+            steps.constants, float(state.error), prepared.limits, cosines, sines, densities, places, out,
         )  # fmt: skip
+        if window.closed:
+            circular_rows(densities[:done], cosines, sines, out)
         taken = None if stays else coarse.index[places[:done, 2].astype(int), :3]
         found = Advanced(densities[:done], places[:done, 0], places[:done, 1], out[:done], taken, why, places[-1])
         if done or why not in (lm.SIZE, lm.GRID):

@@ -53,6 +53,12 @@ def circular_moments(values: Array, cosines: Array, sines: Array) -> tuple[float
     return mean / spacing, variance / spacing**2
 
 
+def circular_rows(densities: Array, cosines: Array, sines: Array, reports: Array) -> None:
+    """Write the `circular_moments` of densities (K, N) into the columns 1 and 2 of their reports."""
+    for density, row in zip(densities, reports, strict=False):
+        row[1], row[2] = circular_moments(density, cosines, sines)
+
+
 @helper
 def highest_of(values: Array) -> int:
     """Return the first index of the largest of values."""

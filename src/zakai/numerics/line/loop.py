@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
 from zakai.numerics.line.averages import AVERAGES
-from zakai.numerics.line.density import circular_moments, highest_of, moments, separated, spectrum, support, waves
+from zakai.numerics.line.density import circular_rows, highest_of, moments, separated, spectrum, support, waves
 from zakai.numerics.line.filters import BAND, convolved, kernel_of
 from zakai.numerics.line.segment import (
     AFTER,
@@ -167,14 +167,11 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
                 worst, gained = max(worst, aliasing), gained + added
             # The report.
             row[1], row[2] = moments(now)[1:]
-            width = row[2]
-            if closed:
-                row[1], row[2] = circular_moments(now, cosines, sines)
             made = 2.0 * worst + 10.0 * edge + move.rounding + move.error + 10.0 * negative + min(floor * growth, 1.0)
             if not (made <= most):
                 status = FAILED
                 break
-            ratio = np.sqrt(max(before * width, 0.0)) / max(predicted, 1e-300)
+            ratio = np.sqrt(max(before * row[2], 0.0)) / max(predicted, 1e-300)
             if inside:
                 ratio *= np.exp(-min(0.5 * move.spread / max(before * spacing * spacing, 1e-300), 5.0))
             ratio = 1.0 if separated(now) else min(max(ratio, 0.3), 1.0)
@@ -230,8 +227,11 @@ def advance(
     count, size = len(observed), len(values)
     densities, out = np.empty((count, size)), np.empty((count + 1, len(COLUMNS)))
     averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
+    cosines, sines = waves(size)
     done, why = _loop(*mechanisms)(
-        values, grid.start, grid.table, averages, *waves(size), grid.offset, grid.spacing, first, observed, *steps, error,
+        values, grid.start, grid.table, averages, cosines, sines, grid.offset, grid.spacing, first, observed, *steps, error,
         log_floor, limits, densities, out, grid.fine,
     )  # fmt: skip
+    if mechanisms.closed:
+        circular_rows(densities[:done], cosines, sines, out)
     return Segment(densities[:done], out[:done], why, out[-1, :3])

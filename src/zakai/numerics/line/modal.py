@@ -22,7 +22,7 @@ from numba import boolean, float64, int64, types
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
-from zakai.numerics.line.density import circular_moments, highest_of, moments, separated, spectrum, support
+from zakai.numerics.line.density import highest_of, moments, separated, spectrum, support
 from zakai.numerics.line.modes import LOG_NOISE, carried, unresolved
 from zakai.numerics.line.outlook import Outlook, outlook, place_of, wanted
 from zakai.numerics.line.place import PER, differences, log_likelihood, sampled
@@ -198,8 +198,6 @@ def advance(
         ratio = min(max(np.sqrt(before * row[2]) * spacing / predicted, 0.3), 1.0)
         # No estimate is reliable far below the tolerance.
         error = max(made + error * (1.0 if separated(now) else ratio), RELIABLE * allowed)
-        if closed:
-            row[1], row[2] = circular_moments(now, cosines, sines)
         row[0], row[3], row[4] = np.log(mass) + constants[k] + constant + added, aliasing, edge
         row[5], row[6], row[7] = negative, rounding + unsure, below / max(np.log(allowed) - np.log(floor), 2.3)
         row[8], row[9], row[10], row[11], row[12] = growth, made, error, min(LOG_NOISE + max(below - 1.0, 0.0), 0.0), 0.0
