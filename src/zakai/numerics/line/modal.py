@@ -216,12 +216,16 @@ def advance(
 @helper
 def on_grid(rows: Array, at: int, general: bool, precision: Array, observed: Array, b: Array) -> tuple[float, bool]:
     """Write the logarithm of a likelihood at the points of a grid relative to one of these; return it there, and if it varies."""
-    size, h, seen = b.size, rows[:, :: (rows.shape[1] - 1) // (b.size - 1)], False
-    centre = h[:, at].copy()
-    for j in range(size):
-        b[j] = differences(h[:, j], centre, general, precision, observed)
+    stride, seen = (rows.shape[1] - 1) // (b.size - 1), False
+    h, centre = np.empty(rows.shape[0]), np.empty(rows.shape[0])
+    for i in range(h.size):
+        centre[i] = rows[i, stride * at]
+    for j in range(b.size):
+        for i in range(h.size):
+            h[i] = rows[i, stride * j]
+        b[j] = differences(h, centre, general, precision, observed)
         seen |= b[j] != 0.0
-    return log_likelihood(h[:, at], general, precision, observed), seen
+    return log_likelihood(centre, general, precision, observed), seen
 
 
 @helper

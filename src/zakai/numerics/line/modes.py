@@ -56,7 +56,9 @@ def propagate(modes: Array, decay: Array, values: Array) -> None:
 @helper
 def unresolved(values: Array, cosines: Array, sines: Array) -> float:
     """Return the largest spectrum of values in the highest eighth of the frequencies, relative to the mass."""
-    size, mass, found = values.size, np.sum(values), 0.0
+    size, mass, found = values.size, 0.0, 0.0
+    for j in range(size):
+        mass += values[j]
     for k in range(size // 2, 7 * (size // 2) // 8 - 1, -max(1, size // 64)):
         real, imag, at = 0.0, 0.0, 0
         for j in range(size):
@@ -138,7 +140,10 @@ def carried(
             coefficients[j] *= fall
             coefficients[size - 1 - j] *= fall
     decay = decayed(rates, tau)
-    noise = 4e-16 * np.sqrt(np.sum(coefficients * coefficients)) * max(1.0, decay[0])
+    square = 0.0
+    for j in range(size):
+        square += coefficients[j] * coefficients[j]
+    noise = 4e-16 * np.sqrt(square) * max(1.0, decay[0])
     propagate(modes, decay, coefficients)
     # Beyond the support there is only rounding, which must not be amplified.
     outside, highest, largest = max(after[first], after[last]), 0.0, 0.0

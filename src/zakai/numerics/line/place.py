@@ -200,24 +200,24 @@ def sampled(
         return 0.0, np.nan, 0.0, np.inf, True
     apart = ALIGNMENT * spacing
     centre = apart * np.floor((grid_first + 0.5 * (low + high) * grid_spacing) / apart + 0.5)
-    at, h, middle, rough, unsure = np.empty(n), np.empty((m, n)), np.empty(m), np.empty(m), 0.0
+    at, h, middle, rough, unsure = np.empty(n), np.empty((n, m)), np.empty(m), np.empty(m), 0.0
     for i in range(n):
         at[i] = (centre + spacing * (i - n // 2) - grid_first) / grid_spacing
     interpolated(q, top, at, now, weights)
     for i in range(n):
         begin = weigh(at[i] * PER, rows.shape[1], 1, weights)
         for r in range(m):
-            h[r, i] = weighed(rows[r], begin, 1, weights)
+            h[i, r] = weighed(rows[r], begin, 1, weights)
     best, most = -np.inf, 0
     for i in range(n):
-        b[i] = log_likelihood(h[:, i], general, precision, observed)
+        b[i] = log_likelihood(h[i], general, precision, observed)
         if now[i] > 0.0 and np.log(now[i]) + b[i] > best:
             best, most = np.log(now[i]) + b[i], i
     for r in range(m):
-        middle[r] = h[r, most]
+        middle[r] = h[most, r]
     constant, total = b[most], 0.0
     for i in range(n):
-        b[i] = differences(h[:, i], middle, general, precision, observed)
+        b[i] = differences(h[i], middle, general, precision, observed)
         weight = np.exp(np.log(now[i]) + b[i] + constant - best) if now[i] > 0.0 else 0.0
         if weight > 1e-12:
             begin = weigh(at[i] * PER, rows.shape[1], 2, weights)
