@@ -59,7 +59,7 @@ def _axes(shape: Any, cov: Any, previous: Any, aligned: bool) -> None:
         for i in range(n):
             for j in range(n):
                 shape[i, j] = previous[i, j] / previous[j, j] if attempt == 0 else (1.0 if i == j else 0.0)
-        if aligned or n == 1:
+        if aligned:
             continue
         invert(inverse, shape)
         congruence(spread, inverse, cov, product)
@@ -69,7 +69,7 @@ def _axes(shape: Any, cov: Any, previous: Any, aligned: bool) -> None:
                 worst = max(worst, abs(spread[i, j]) / math.sqrt(spread[i, i] * spread[j, j]))
         if worst < _CORRELATED:
             return
-    if aligned or n == 1:
+    if aligned:
         return
     factor = np.zeros((n, n))
     for i in range(n):
@@ -137,7 +137,7 @@ def fit(
             cov[d, e] = noise[d, e]
     _moments(x, logs, least, was_closed, mean, cov)
     shape, inverse, product = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    aligned = False
+    aligned = n == 1
     for d in range(n):
         aligned = aligned or periodic[d]
     _axes(shape, cov, previous, aligned)
