@@ -69,7 +69,8 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
         negligible, most, generous, size, length = limits[0], limits[1], limits[4], values.size, table.shape[3]
         half, timed, movable, near = size // 2, table.shape[0] > 1, not closed, length == size + 2 * MARGIN
         now, local = values.copy(), np.empty((table.shape[1], table.shape[2], size))
-        b, change, channel, answer = np.empty(size), np.empty(size), np.full(6, np.nan), out[-1]
+        b, change, channel, answer = np.empty(size), np.empty(size), np.empty(6), out[-1]
+        channel[0] = np.nan
         home, place, status, done = start, -1, OK, 0
         for i in range(observed.shape[0]):
             k = begin + i
