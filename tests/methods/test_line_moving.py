@@ -20,9 +20,9 @@ SYSTEMS = {
 }  # fmt: skip
 
 
-def reference(formula, kind, values, S, shift=0.0):
+def reference(system, kind, values, S, shift=0.0):
     """Means, deviations and the evidence, with the mean of the prior displaced."""
-    drift, slope, noise, mean, variance, times, half, centre, points = SYSTEMS[formula]
+    drift, slope, noise, mean, variance, times, half, centre, points = system
     box, start, rows, total = Box(half, points, [centre]), 0.0, [], 0.0
     x = box.x[:, 0]
     u = np.exp(-0.5 * (x - mean - shift) ** 2 / variance)
@@ -62,14 +62,31 @@ def test_a_density_that_moves_far_is_the_right_one(formula, kind):
         prior={"kind": "gaussian", "mean": [mean], "cov": [[variance]]},
     )  # fmt: skip
     result = zakai.filter(model, zakai.Record(np.array(times), values[:, None], kind), "yau-yau")
-    means, deviations, total = reference(formula, kind, values, S)
+    means, deviations, total = reference(SYSTEMS[formula], kind, values, S)
     assert not result.warnings
     assert np.abs(result.mean[1:, 0] - means).max() < 1e-5 * deviations.min()
     assert np.abs(result.variance[1:, 0] ** 0.5 / deviations - 1.0).max() < 1e-5
     assert abs(result.log_likelihood - total) < 1e-5 * max(1.0, abs(total))
     if kind == "samples":  # d log Z / d mean = (E (x_0 | all) - mean) / variance
         step = 1e-2 * variance**0.5
-        one, other = (reference(formula, kind, values, S, shift)[2] for shift in (step, -step))
+        one, other = (reference(SYSTEMS[formula], kind, values, S, shift)[2] for shift in (step, -step))
         smoothed = zakai.smooth(model, zakai.Record(np.array(times), values[:, None], kind), "yau-yau")
         assert not smoothed.warnings
         assert abs(smoothed.mean[0, 0] - mean - variance * (one - other) / (2.0 * step)) < 1e-4 * variance**0.5
+
+
+def test_increments_over_short_intervals_of_motion_are_split_accurately():
+    """The drift carries the state by six deviations of the noise in an interval, so that a kernel ends far from its centre."""
+    drift, slope, noise, *_ = SYSTEMS["1 + 0.5*sin(x)"]
+    times, values, S = np.array([0.1, 0.2, 0.3]), 0.1 * np.array([6.04, 6.1, 6.17]), 0.0004
+    model = zakai.Model(
+        state=["x"], drift=["1 + 0.5*sin(x)"], diffusion=[[noise]], observation=["x"], observation_noise=[[S]],
+        observation_kind="increments", prior={"kind": "gaussian", "mean": [6.0], "cov": [[2.6e-4]]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record(times, values[:, None], "increments"), "yau-yau")
+    system = drift, slope, noise, 6.0, 2.6e-4, times, 0.4, 6.1, 256
+    means, deviations, total = reference(system, "increments", values, S)
+    assert not result.warnings
+    assert np.abs(result.mean[1:, 0] - means).max() < 1e-6 * deviations.min()
+    assert np.abs(result.variance[1:, 0] ** 0.5 / deviations - 1.0).max() < 1e-6
+    assert abs(result.log_likelihood - total) < 1e-5

@@ -131,7 +131,9 @@ def _split(interval: Interval, average: _Average, v: Array, dv: Array) -> tuple[
     if interval.closed:
         return _around(v, dv, factors, slopes, variances, shifts, order)
     variance, turned = float(variances[0].real), np.ascontiguousarray(variances.imag) / STEP
-    taps = narrow_taps(variance) if interval.narrow else _samples(variance, len(v))
+    change = np.abs(np.diff(phi[0].real)) + 5.0 * np.abs(np.diff(outer[0].real))
+    steepest = float(np.max(change[v[1:] > 1e-13 * np.max(v)], initial=0.0))
+    taps = narrow_taps(variance) if interval.narrow else _samples(variance, steepest, len(v))
     _along(v, dv, factors, slopes, *(np.ascontiguousarray(one[: len(v)]) for one in taps), turned, order)
     return v, dv
 
@@ -214,9 +216,9 @@ def _along(
             v[j] *= factors[which, j]
 
 
-def _samples(variance: float, most: int) -> tuple[Array, Array]:
-    """Return up to `most` samples of a Gaussian, as `line_filters.taps_of`, and their derivatives in the variance."""
-    squares = np.arange(min(np.ceil(np.sqrt(2.0 * _DEPTH * variance)) + 1.0, most)) ** 2
+def _samples(variance: float, steepest: float, most: int) -> tuple[Array, Array]:
+    """Return up to `most` samples of a Gaussian between exponentials of a slope, and their derivatives in the variance."""
+    squares = np.arange(min(np.ceil(np.sqrt(2.0 * _DEPTH * variance) + steepest * variance) + 1.0, most)) ** 2
     taps = np.exp(-0.5 * squares / variance) / np.sqrt(2.0 * np.pi * variance)
     return taps, taps * 0.5 * (squares / variance - 1.0) / variance
 

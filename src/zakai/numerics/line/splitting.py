@@ -198,10 +198,13 @@ def split(
     The filter of a narrow kernel is accurate where v is band-limited, that is where the exponents change little between points.
     """
     size, count, weight, part = now.size, 2 * int(substeps), 1.0 / (6.0 * substeps), spread / (2.0 * substeps)
-    correction, negligible, clipped = spread / (72.0 * substeps**3), 1e-13 * now[highest_of(now)], 0.0
+    correction, negligible, clipped, steepest = spread / (72.0 * substeps**3), 1e-13 * now[highest_of(now)], 0.0, 0.0
     early, middle, joint, late, work = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     for j in range(1, size):
-        if narrow and not (abs(phi[j] - phi[j - 1]) + 5.0 * weight * abs(b[j] - b[j - 1]) < STEEPEST):
+        change = abs(phi[j] - phi[j - 1]) + 5.0 * weight * abs(b[j] - b[j - 1])
+        if now[j] > negligible:
+            steepest = max(steepest, change)
+        if narrow and not (change < STEEPEST):
             for i in (j - 1, j):
                 if now[i] > negligible:
                     return np.inf, 1.0
@@ -226,7 +229,8 @@ def split(
     for j in range(size):
         now[j] *= early[j]
     variance = part / (spacing * spacing)
-    taps = taps_of(variance, depth, size, narrow)
+    # Between exponentials of such a slope the kernel is as wide, about a mean that the slope displaces.
+    taps = taps_of(variance, 0.5 * (np.sqrt(2.0 * depth) + steepest * np.sqrt(variance)) ** 2, size, narrow)
     rounding, clipped = 0.0, clipped * 1e-13 / negligible
     for i in range(count):
         after = middle if i % 2 == 0 else (joint if i < count - 1 else late)
