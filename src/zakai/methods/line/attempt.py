@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.methods.line.coarse import EDGE
-from zakai.methods.line.coefficients import coefficients, offset_of, potential_of, precision_of
+from zakai.methods.line.coefficients import GROWTH, coefficients, offset_of, potential_of, precision_of
 from zakai.methods.line.system import Prepared
 from zakai.methods.line.tables import spectral, tables
 from zakai.numerics.line import window as lw
@@ -23,7 +23,8 @@ MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
 class Attempt(NamedTuple):
     """The density after a substep, times exp(-offset); its error; whether a shorter substep is needed.
 
-    `decomposed` tells whether the decomposition of the operator gave it.
+    `decomposed` tells whether the decomposition of the operator gave it; the potential multiplies what is not density by up to
+    exp(lift).
     """
 
     values: Array
@@ -31,6 +32,7 @@ class Attempt(NamedTuple):
     error: float
     split: bool
     decomposed: bool = False
+    lift: float = 0.0
 
 
 def attempted(
@@ -63,12 +65,12 @@ def attempted(
             return Attempt(found, 0.0, error, False)
         potential, constant = potential_of(known.observation, precision_of(prepared, start, inside), rates, values)
         potential, constant = length * potential, length * constant
-        offset, split = offset_of(potential, values)
-        if split:
+        offset, lift = offset_of(potential, values)
+        if lift > GROWTH:
             return Attempt(values, 0.0, 0.0, True)
         matrix = window.generator(length * known.covariance, length * known.drift, potential - offset)
         found, error = exponential_action(matrix.T if adjoint else matrix, values)
-        return Attempt(found, offset + constant, error, False)
+        return Attempt(found, offset + constant, error, False, lift=lift)
     return _magnus(prepared, values, window, start, first, last, inside, rates, adjoint, speed)
 
 
@@ -109,13 +111,13 @@ def _magnus(
     zeroth = length / parts * np.tile(GAUSS_WEIGHTS, parts)
     moment = 2.0 * zeroth * (nodes - 0.5)
     early, late = 0.5 * zeroth - moment, 0.5 * zeroth + moment
-    offset, split = offset_of(zeroth @ potential, values)
-    if split or np.any((early @ covariance).real < 0) or np.any((late @ covariance).real < 0):
+    offset, lift = offset_of(zeroth @ potential, values)
+    if lift > GROWTH or np.any((early @ covariance).real < 0) or np.any((late @ covariance).real < 0):
         return Attempt(values, 0.0, 0.0, True)
     if prepared.system.steady and not speed:
         matrix = window.generator(zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset)
         found, error = exponential_action(matrix.T if adjoint else matrix, values)
-        return Attempt(found, offset + zeroth @ constant, error, False)
+        return Attempt(found, offset + zeroth @ constant, error, False, lift=lift)
     shift = np.full(window.size, offset / 2)
     first_half, second_half = (
         window.generator(w @ covariance, w @ drift, w @ potential - shift) for w in (early, late)
@@ -131,7 +133,7 @@ def _magnus(
         return Attempt(values, 0.0, error, True)
     middle, one = exponential_action(first_half, values)
     found, two = exponential_action(second_half, middle)
-    return Attempt(found, offset + zeroth @ constant, error + one + two, False)
+    return Attempt(found, offset + zeroth @ constant, error + one + two, False, lift=lift)
 
 
 def _unresolved(window: lw.Window, values: Array, drift: Array, potential: Array) -> float:

@@ -81,13 +81,13 @@ def potential_of(h: Array, precision: Array, rates: np.ndarray, values: Array) -
     return value, centre @ (precision @ (rates - 0.5 * centre))
 
 
-def offset_of(potential: Array, values: Array) -> tuple[float, bool]:
-    """Return the largest integral of V where there is mass, and whether it grows too much where there is none."""
+def offset_of(potential: Array, values: Array) -> tuple[float, float]:
+    """Return the largest integral of V where there is mass, and how much larger it is where there is none."""
     mass = values.real > 1e-6 * values.real.max()
     if not mass.any() or not np.isfinite(potential.real).all():
-        return 0.0, False
+        return 0.0, 0.0
     top = float(np.max(potential.real[mass]))
-    return top, bool(np.max(potential.real) > top + GROWTH)
+    return top, float(np.max(potential.real)) - top
 
 
 def resolved_parts(

@@ -14,7 +14,7 @@ from zakai.methods.line.coarse import EDGE, coarsened
 from zakai.methods.line.coefficients import resolved_parts
 from zakai.methods.line.figures import refitted
 from zakai.methods.line.moving import speed_of
-from zakai.methods.line.system import Prepared
+from zakai.methods.line.system import NOISE, Prepared
 from zakai.methods.line.yau import moved
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.channel import Channel
@@ -124,6 +124,28 @@ def by_substeps(
     moving: bool = False,
 ) -> Moved:
     """Return the density after an interval, by exponentials of its operator, on grids that move with it or stand."""
+    interval = start, length, inside, rates
+    found, tails = _by_substeps(prepared, values, window, *interval, report, moving)
+    if NOISE * np.exp(min(tails, 690.0)) > 0.1 * prepared.tolerance:
+        # Increments far from the density may multiply rounding errors in its tails: compare with a density that has more of them.
+        noisy, _ = _by_substeps(prepared, values + NOISE * np.max(values.real), window, *interval, Report(), moving)
+        (mean, variance), (other, another) = (lw.moments(one.values.real, one.window) for one in (found, noisy))
+        report.time += float(np.nan_to_num(abs(mean - other) / np.sqrt(variance) + abs(another / variance - 1.0), nan=1.0))
+    return found
+
+
+def _by_substeps(
+    prepared: Prepared,
+    values: Array,
+    window: lw.Window,
+    start: float,
+    length: float,
+    inside: np.ndarray,
+    rates: np.ndarray,
+    report: Report,
+    moving: bool,
+) -> tuple[Moved, float]:
+    """Return the same, and the logarithm of a bound on the growth of small values relative to the density."""
     system, negligible, look = prepared.system, prepared.negligible, None
     gained: Any = 0.0
     rough, resolved = max(1e-10, 1e-3 * prepared.tolerance), 30.0 * negligible
@@ -134,11 +156,12 @@ def by_substeps(
         bounds, report.time = parts.bounds, report.time + parts.error
     stack = bounds[::-1]
     substeps, passages, decomposed, speed = 0, [], True, 0.0
+    tails = 0.0
     while stack:
         first, last = stack.pop()
         substeps += 1
         if not np.isfinite(values.real).all():
-            return Moved(values, window, np.float64(np.nan), look)
+            return Moved(values, window, np.float64(np.nan), look), tails
         begin, grown = window, False
         known = lw.figures(values, window.closed, negligible).aliasing
         while True:
@@ -196,13 +219,14 @@ def by_substeps(
         passages.append(Passage(before, window, last - first, np.log(mass), window))
         decomposed = decomposed and attempt.decomposed
         values = values / mass
+        tails = max(tails + attempt.lift - float(np.log(mass.real)), 0.0)
         window = lw.moved(window, speed * (last - first))
         gained = gained + np.log(mass) + attempt.offset
         if stack:
             values, window = refitted(prepared, values, window, look)
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
-    return Moved(values, window, gained, look, tuple(passages) if decomposed else ())
+    return Moved(values, window, gained, look, tuple(passages) if decomposed else ()), tails
 
 
 def _finer(values: Array, window: lw.Window, look: lw.Figures) -> lw.Window:
