@@ -107,3 +107,42 @@ def test_an_increment_far_from_the_density_is_accurate_or_warned_of():
     )  # fmt: skip
     result = zakai.filter(model, zakai.Record(np.array([tau]), np.array([[rate * tau]]), "increments"), "yau-yau")
     assert abs(result.mean[1, 0] - mean) < 0.1 * variance**0.5 or any("tolerance" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize(
+    "drift, noise, kind, S, length, count",
+    [
+        ("1.5", 0.02, "samples", 0.04, 0.2, 30),
+        ("0.5*x", 0.3, "samples", 4.0, 0.5, 14),
+        ("0.5*x", 0.05, "increments", 0.02, 0.1, 20),
+    ],
+)
+def test_messages_of_motion_and_growth_agree_with_the_kalman_smoother(drift, noise, kind, S, length, count):
+    model = zakai.Model(
+        state=["x"], drift=[drift], diffusion=[[noise]], observation=["x"], observation_noise=[[S]], observation_kind=kind,
+        prior={"kind": "gaussian", "mean": [0.5], "cov": [[1.0]]},
+    )  # fmt: skip
+    times = np.cumsum(0.01 + np.random.default_rng(0).exponential(length, count))
+    _, record = zakai.simulate(model, times, seed=1)
+    exact, result = zakai.smooth(model, record, "kalman-bucy"), zakai.smooth(model, record, "yau-yau")
+    deviations = exact.variance[:, 0] ** 0.5
+    assert not result.warnings
+    assert (np.abs(result.mean[:, 0] - exact.mean[:, 0]) / deviations).max() < 1e-5
+    assert np.abs(result.variance[:, 0] ** 0.5 / deviations - 1.0).max() < 1e-5
+
+
+def test_a_message_that_is_much_narrower_than_the_prior_is_found_in_bent_motion():
+    """The score is E (x_0 | all) for a Gaussian prior of variance one: d log Z / d mean = (E (x_0 | all) - mean) / variance."""
+    times = np.cumsum(0.01 + np.random.default_rng(0).exponential(0.2, 40))
+
+    def model(mean):
+        return zakai.Model(
+            state=["x"], drift=["2 + sin(x)"], diffusion=[[0.01]], observation=["x"], observation_noise=[[0.04]],
+            observation_kind="samples", prior={"kind": "gaussian", "mean": [mean], "cov": [[1.0]]},
+        )  # fmt: skip
+
+    _, record = zakai.simulate(model(0.5), times, seed=1)
+    result = zakai.smooth(model(0.5), record, "yau-yau")
+    one, other = (zakai.filter(model(mean), record, "yau-yau").log_likelihood for mean in (0.51, 0.49))
+    assert not result.warnings
+    assert abs(result.mean[0, 0] - 0.5 - (one - other) / 0.02) < 1e-3

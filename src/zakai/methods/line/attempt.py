@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from zakai.numerics.line.operator import Exponential, exponential_action
 from zakai.numerics.line.panels import GAUSS_NODES, GAUSS_WEIGHTS
 
 Array = Any
+Coefficients = tuple[Array, Array, Array, Array]  # f (T, N), G (T,) or (T, N), V (T, N) and a constant (T,)
 
 PARTS = (1, 4, 16)  # of a substep with six nodes each, where the grid moves
 MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
@@ -71,7 +73,13 @@ def attempted(
         matrix = window.generator(length * known.covariance, length * known.drift, potential - offset)
         found, error = exponential_action(matrix.T if adjoint else matrix, values)
         return Attempt(found, offset + constant, error, False, lift=lift)
-    return _magnus(prepared, values, window, start, first, last, inside, rates, adjoint, speed)
+
+    def at(nodes: Array) -> Coefficients:
+        times, shifts = start + first + length * nodes, speed * length * nodes if speed else None
+        drift, *others = coefficients(prepared, window, times, inside, rates, values, shifts)
+        return drift - speed, *others
+
+    return magnus(prepared, values, window, length, at, adjoint, bool(speed))
 
 
 def parts_of_split(prepared: Prepared, first: float, last: float, error: float) -> list[tuple[float, float]]:
@@ -81,29 +89,26 @@ def parts_of_split(prepared: Prepared, first: float, last: float, error: float) 
     return list(zip([first, *cuts], [*cuts, last], strict=True))
 
 
-def _magnus(
-    prepared: Prepared,
-    values: Array,
-    window: lw.Window,
-    start: float,
-    first: float,
-    last: float,
-    inside: np.ndarray,
-    rates: np.ndarray,
-    adjoint: bool,
-    speed: float,
-) -> Attempt:
+def magnus(
+    prepared: Prepared, values: Array, window: lw.Window, length: float, at: Callable[[Array], Coefficients], adjoint: bool,
+    moving: bool,
+) -> Attempt:  # fmt: skip
     """Advance a substep by two exponentials: the commutator-free Magnus integrator of order four.
 
         exp(B0 / 2 + 2 B1 / tau) exp(B0 / 2 - 2 B1 / tau),   B0 = int L dt,   B1 = int (t - middle) L dt.
+
+    Args:
+        prepared: the system.
+        values, window: the density and its grid.
+        length: the length of the substep.
+        at: a function that returns f, G, V and a constant, as `coefficients`, at parts of the substep from zero to one.
+        adjoint: whether a message is taken from the end to the start.
+        moving: whether the grid moves.
     """
-    length = last - first
-    for parts in PARTS if speed else PARTS[:1]:
+    for parts in PARTS if moving else PARTS[:1]:
         nodes = ((np.arange(parts)[:, None] + GAUSS_NODES) / parts).reshape(-1)
-        times, shifts = start + first + length * nodes, speed * length * nodes if speed else None
-        drift, covariance, potential, constant = coefficients(prepared, window, times, inside, rates, values, shifts)
-        drift = drift - speed
-        error = _unresolved(window, values, length * drift, length * potential) if speed else 0.0
+        drift, covariance, potential, constant = at(nodes)
+        error = _unresolved(window, values, length * drift, length * potential) if moving else 0.0
         if error <= MAGNUS * prepared.tolerance:
             break
     else:
@@ -114,7 +119,7 @@ def _magnus(
     offset, lift = offset_of(zeroth @ potential, values)
     if lift > GROWTH or np.any((early @ covariance).real < 0) or np.any((late @ covariance).real < 0):
         return Attempt(values, 0.0, 0.0, True)
-    if prepared.system.steady and not speed:
+    if prepared.system.steady and not moving:
         matrix = window.generator(zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset)
         found, error = exponential_action(matrix.T if adjoint else matrix, values)
         return Attempt(found, offset + zeroth @ constant, error, False, lift=lift)

@@ -118,7 +118,8 @@ def _smoothed(prepared: Prepared, state: State, later: Message, found: _Product)
     window = found.window
     look = lw.figures(found.values, window.closed, prepared.negligible)
     mean, variance = lw.moments(found.values, window)
-    spacings = float(np.sqrt(max(variance, 0.0))) / window.spacing
+    centre, deviation = float(mean), float(np.sqrt(max(variance, 0.0)))
+    spacings = deviation / window.spacing
     mean, variance = state_moments(prepared, found.values, window, mean, variance)
     if window.closed:
         mean = mean - 2 * np.pi * np.ceil((mean - np.pi) / (2 * np.pi))
@@ -135,7 +136,7 @@ def _smoothed(prepared: Prepared, state: State, later: Message, found: _Product)
     low, high = float(window.offsets[first]), float(window.offsets[last])
     finer = later.spacing > 2.0 * needed  # few points hold more than the product
     kept = later.on(points_of(later.window, low, high, needed)) if finer else later.between(low, high)
-    kept = kept._replace(logs=kept.logs - found.log_mass, needed=needed)
+    kept = kept._replace(logs=kept.logs - found.log_mass, needed=needed, mean=centre, deviation=deviation)
     return kept, Info(found.log_mass, np.array([mean]), np.array([[variance]]), health)
 
 
@@ -144,7 +145,7 @@ def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state
     """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
     length = float(prepared.lengths[k])
     finer = KINKED if prepared.weak and prepared.schedule.seen[k].any() else 1.0
-    later = later.on(points_of(later.window, *later.ends, later.needed / finer))
+    later = later.on(points_of(later.window, *later.ends, later.needed / finer)).between(*later.ends)
     before = later.variance
     inside = prepared.inside[k]
     if prepared.lie and not inside.all():
@@ -159,8 +160,8 @@ def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state
     between = later.variance
     rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
     later, made = pulled(prepared, k, inside, rates, state, later)
-    kept = float(np.clip(between / np.sqrt(max(before * later.variance, 1e-300)), 0.3, 1.0))
-    return later._replace(error=made + kept * later.error)
+    kept = float(np.clip(later.scaled * between / np.sqrt(max(before * later.variance, 1e-300)), 0.3, 1.0))
+    return later._replace(error=made + kept * later.error, scaled=1.0)
 
 
 @np.errstate(all="ignore")

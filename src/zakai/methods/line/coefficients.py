@@ -24,10 +24,10 @@ def coefficients(
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Return f (T, N), G (T,) or (T, N), V less a constant (T, N) and the constant (T,).
 
-    At the times the points of the grid are displaced by `shifts` (T,).
+    At the times the points of the grid are displaced by `shifts` (T,) or (T, N).
     """
     system, theta = prepared.system, prepared.theta
-    points = window.points[:, None] if shifts is None else (window.points + shifts[:, None])[..., None]
+    points = window.points[:, None] if shifts is None else (window.points + shifts.reshape(len(times), -1))[..., None]
     if shifts is not None:
         drift = finite(system.drift(points, times[:, None], theta)[..., 0])
         covariance = covariance_at(system, points[..., 0], times, theta)
@@ -51,7 +51,7 @@ def coefficients(
     precision = np.broadcast_to(precision_of(prepared, times, inside), (len(times), system.m, system.m))
     potentials, constants = zip(*[potential_of(*pair, rates, values) for pair in zip(h, precision, strict=True)], strict=True)
     found = drift, covariance, np.stack(potentials), np.array(constants)
-    return found if system.cross is None else with_cross_noise(prepared, window, times, rates, h, precision, found)
+    return found if system.cross is None else with_cross_noise(prepared, points, times, rates, h, precision, found)
 
 
 def precision_of(prepared: Prepared, times: Any, inside: np.ndarray) -> Array:

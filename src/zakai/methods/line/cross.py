@@ -16,7 +16,6 @@ import numpy as np
 
 from zakai.methods.line.system import Prepared
 from zakai.methods.line.tables import finite
-from zakai.numerics.line import window as lw
 
 Array = Any
 
@@ -25,7 +24,7 @@ OMITTED = "an increment gathered over more than its interval counts as if dv and
 
 def with_cross_noise(
     prepared: Prepared,
-    window: lw.Window,
+    points: Array,
     times: Array,
     rates: Array,
     h: Array,
@@ -36,7 +35,7 @@ def with_cross_noise(
 
     Args:
         prepared: the system.
-        window: the grid of N points.
+        points: the points (N, 1) or (T, N, 1).
         times: (T,).
         rates: dy/dt (m,).
         h: (T, m, N).
@@ -44,7 +43,7 @@ def with_cross_noise(
         coefficients: f (T, N), G (T,) or (T, N), the potential (T, N) and its constant (T,).
     """
     drift, covariance, potential, constant = coefficients
-    parts = prepared.system.cross(window.points[:, None], times[:, None], prepared.theta)  # type: ignore[misc]
+    parts = prepared.system.cross(points, times[:, None], prepared.theta)  # type: ignore[misc]
     cross, slope, h_slope = np.moveaxis(finite(parts), (2, 3), (0, 2))
     gain = precision @ cross
     covariance = np.broadcast_to(covariance[..., None] if covariance.ndim == 1 else covariance, drift.shape)

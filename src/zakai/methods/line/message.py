@@ -25,7 +25,8 @@ class Message(NamedTuple):
     """The logarithm of the function b at the points of a grid (N,), constant beyond them.
 
     The grid covers where b matters.  `needed` is the spacing that its product with the density needs; `error` is the estimate of
-    its relative error.
+    its relative error.  `mean`, relative to the origin, and `deviation` are those of the product, where it is known; `scaled` is
+    the factor by which the drift has made the message wider in the last interval backward, where that is known.
     """
 
     logs: np.ndarray
@@ -36,6 +37,9 @@ class Message(NamedTuple):
     closed: bool
     needed: float
     error: float
+    mean: float = 0.0
+    deviation: float = 0.0
+    scaled: float = 1.0
 
     @classmethod
     def of(cls, logs: Array, window: lw.Window, needed: float, error: float) -> Message:
@@ -75,7 +79,8 @@ class Message(NamedTuple):
 
     def on(self, window: lw.Window) -> Message:
         """Return the message on another grid."""
-        return Message.of(self.at(window.offsets), window, self.needed, self.error)
+        found = Message.of(self.at(window.offsets), window, self.needed, self.error)
+        return found._replace(mean=self.mean, deviation=self.deviation)
 
     @property
     def moments(self) -> tuple[float, float]:

@@ -1,9 +1,9 @@
 """A message of one state over one interval, backward in time, where the compiled loop does not take it.
 
-A Gaussian kernel is a sum over a grid.  On the circle, where other increments act within, and where the drift carries the density
-far, the transposed exponentials of the filter act (`line/transposed.py`).  Else, where no coefficient depends on t, a grid covers
-the support of the message at the end of the interval, that of the density at its start, and the paths between them; psi is moved
-by its decomposition.  All else is for finite volumes (`line/volumes.py`).
+A Gaussian kernel is a sum over a grid.  On the circle the transposed exponentials of the filter act (`line/transposed.py`), on
+the line a grid that moves (`line/gauged.py`) where other increments act within or the drift carries the density.  Else, where no
+coefficient depends on t, a grid covers the support of the message at the end of the interval, that of the density at its start,
+and the paths between them; psi is moved by its decomposition.  All else is for finite volumes (`line/volumes.py`).
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import numpy as np
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line.course import course_of, ends_of
 from zakai.methods.line.gauge import gauged
+from zakai.methods.line.gauged import by_moving_grid
 from zakai.methods.line.message import FEWEST, Message, covering, points_of, reliable, support, taper
 from zakai.methods.line.moves import Report
-from zakai.methods.line.moving import SOME, travel
+from zakai.methods.line.moving import travel
 from zakai.methods.line.system import Prepared, State
 from zakai.methods.line.tables import covariance_at
 from zakai.methods.line.transposed import by_exponentials
@@ -64,15 +65,17 @@ def pulled(
     found = _by_kernel(prepared, k, rates, ends, later)
     if found is not None:
         return found
-    ranges = travel(prepared, np.asarray(state.values), own, float(prepared.schedule.starts[k]), float(prepared.lengths[k]))
-    first = later.closed or bool(inside.any()) or ranges > SOME
-    dense = by_exponentials(prepared, k, inside, rates, state, later, accepted, ranges > SOME) if first else None
-    if dense is not None and (later.closed or dense[1] <= smoothing_tolerance(prepared)):
-        return dense
+    if later.closed:
+        dense = by_exponentials(prepared, k, inside, rates, state, later, accepted)
+        if dense is not None:
+            return dense
+    interval = float(prepared.schedule.starts[k]), float(prepared.lengths[k])
+    dense = None
+    if not later.closed and (inside.any() or travel(prepared, np.asarray(state.values), own, *interval) > 0.0):
+        dense = by_moving_grid(prepared, k, inside, rates, state, later, accepted)
+        if dense is not None and dense[1] <= smoothing_tolerance(prepared):
+            return dense
     found = _by_modes(prepared, k, inside, state, ends, later)
-    if found is None and ranges > 0.0 and not first:
-        dense = by_exponentials(prepared, k, inside, rates, state, later, accepted, True)
-        found = dense if dense is not None and dense[1] <= smoothing_tolerance(prepared) else None
     found = found or _by_volumes(prepared, k, inside, rates, state, ends, later)
     return dense if dense is not None and dense[1] < found[1] else found
 
