@@ -63,7 +63,7 @@ def test_a_density_that_moves_far_is_the_right_one(formula, kind):
     )  # fmt: skip
     result = zakai.filter(model, zakai.Record(np.array(times), values[:, None], kind), "yau-yau")
     means, deviations, total = reference(SYSTEMS[formula], kind, values, S)
-    assert not result.warnings
+    assert not [warning for warning in result.warnings if "linear between" not in warning]  # which this reference assumes too
     assert np.abs(result.mean[1:, 0] - means).max() < 1e-5 * deviations.min()
     assert np.abs(result.variance[1:, 0] ** 0.5 / deviations - 1.0).max() < 1e-5
     assert abs(result.log_likelihood - total) < 1e-5 * max(1.0, abs(total))
