@@ -146,3 +146,33 @@ def test_a_message_that_is_much_narrower_than_the_prior_is_found_in_bent_motion(
     one, other = (zakai.filter(model(mean), record, "yau-yau").log_likelihood for mean in (0.51, 0.49))
     assert not result.warnings
     assert abs(result.mean[0, 0] - 0.5 - (one - other) / 0.02) < 1e-3
+
+
+def test_the_gradient_of_motion_is_that_of_the_kalman_filter():
+    times = np.cumsum([0.6, 1.0, 0.4, 0.9, 0.7, 0.8])
+    values = times + np.array([0.1, -0.2, 0.15, 0.0, -0.1, 0.2])
+    record = zakai.Record(times, values[:, None], "samples")
+    gradients = []
+    for drift, method in (("a - 0.1*x", "kalman-bucy"), ("a - 0.1*x + 1e-10*sin(x)", "yau-yau")):
+        model = zakai.Model(
+            state=["x"], drift=[drift], diffusion=[["c"]], observation=["x"], observation_noise=[["S"]],
+            observation_kind="samples", parameters={"a": 1.5, "c": 0.03, "S": 0.02},
+            prior={"kind": "gaussian", "mean": [0.0], "cov": [[0.04]]},
+        )  # fmt: skip
+        gradients.append(zakai.log_likelihood(model, record, method).value_and_gradient([1.4, 0.03, 0.02])[1])
+    assert np.abs(gradients[1] / gradients[0] - 1.0).max() < 1e-6
+
+
+def test_the_gradient_of_growth_is_that_of_differences():
+    times = np.array([0.1, 0.25, 0.5, 0.6])
+    record = zakai.Record(times, 3.0 * np.exp(0.5 * times)[:, None] + 0.2, "samples")
+    model = zakai.Model(
+        state=["x"], drift=["r*x + sin(x)"], diffusion=[["c"]], observation=["x"], observation_noise=[[0.05]],
+        observation_kind="samples", parameters={"r": 0.5, "c": 0.1},
+        prior={"kind": "gaussian", "mean": [3.0], "cov": [[0.04]]},
+    )  # fmt: skip
+    function, at = zakai.log_likelihood(model, record, "yau-yau"), np.array([0.5, 0.1])
+    _, gradient = function.value_and_gradient(at)
+    for i, step in enumerate(np.diag([1e-3, 1e-3])):
+        first, second = (function(at + n * step) - function(at - n * step) for n in (1, 2))
+        assert abs(gradient[i] - (8.0 * first - second) / (12.0 * step[i])) < 1e-6 * np.abs(gradient).max()

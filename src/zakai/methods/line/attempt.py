@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from zakai.methods.line.coefficients import GROWTH, coefficients, offset_of, pot
 from zakai.methods.line.system import Prepared
 from zakai.methods.line.tables import spectral, tables
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.operator import Exponential, exponential_action
+from zakai.numerics.line.operator import Exponential
 from zakai.numerics.line.panels import GAUSS_NODES, GAUSS_WEIGHTS
 
 Array = Any
@@ -22,19 +23,42 @@ PARTS = (1, 4, 16)  # of a substep with six nodes each, where the grid moves
 MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
 
 
+class Substep(NamedTuple):
+    """A part of an interval: when it begins, its length, and which increments act inside at which rates.
+
+    `speed` is that of the grid.  The coefficients in time have six nodes in each of so many `parts`.
+    """
+
+    start: float
+    length: float
+    inside: np.ndarray
+    rates: np.ndarray
+    speed: float = 0.0
+    parts: int = 1
+
+
 class Attempt(NamedTuple):
     """The density after a substep, times exp(-offset); its error; whether a shorter substep is needed.
 
-    `decomposed` tells whether the decomposition of the operator gave it; the potential multiplies what is not density by up to
-    exp(lift).
+    `substep` tells how exponentials of the operator gave it, None where its decomposition did; the potential multiplies what is
+    not density by up to exp(lift).
     """
 
     values: Array
     offset: Any
     error: float
     split: bool
-    decomposed: bool = False
+    substep: Substep | None = None
     lift: float = 0.0
+
+
+class Exponents(NamedTuple):
+    """The generators whose exponentials act in turn, each by its G, f and V, less an `offset` and a `constant` of V."""
+
+    generators: list[tuple[Any, Array, Array | None]]
+    offset: float
+    constant: Any
+    lift: float  # nats by which V is larger where there is no mass, infinite where G is negative
 
 
 def attempted(
@@ -53,33 +77,14 @@ def attempted(
 
     The `adjoint` of the transition takes a message from the end of that part to its start.
     """
-    system, length = prepared.system, last - first
-    if not (system.varying or speed):
-        known = tables(prepared, window)
-        if not inside.any():
-            modes = None if adjoint else by_modes(prepared, values, window, length)
-            if modes is not None:
-                return Attempt(modes[0], 0.0, modes[1], False, True)
-            key = ("exponential", window, length, adjoint)
-            generator = length * window.generator(known.covariance, known.drift)
-            transition = prepared.once(key, lambda: Exponential(generator.T if adjoint else generator))
-            found, error = transition(values)
-            return Attempt(found, 0.0, error, False)
-        potential, constant = potential_of(known.observation, precision_of(prepared, start, inside), rates, values)
-        potential, constant = length * potential, length * constant
-        offset, lift = offset_of(potential, values)
-        if lift > GROWTH:
-            return Attempt(values, 0.0, 0.0, True)
-        matrix = window.generator(length * known.covariance, length * known.drift, potential - offset)
-        found, error = exponential_action(matrix.T if adjoint else matrix, values)
-        return Attempt(found, offset + constant, error, False, lift=lift)
-
-    def at(nodes: Array) -> Coefficients:
-        times, shifts = start + first + length * nodes, speed * length * nodes if speed else None
-        drift, *others = coefficients(prepared, window, times, inside, rates, values, shifts)
-        return drift - speed, *others
-
-    return magnus(prepared, values, window, length, at, adjoint, bool(speed))
+    substep = Substep(start + first, last - first, inside, rates, speed)
+    if prepared.system.varying or speed:
+        return magnus(prepared, values, window, substep, _at_points(prepared, values, window, substep), adjoint, bool(speed))
+    modes = None if adjoint or inside.any() else by_modes(prepared, values, window, substep.length)
+    if modes is not None:
+        return Attempt(modes[0], 0.0, modes[1], False)
+    exponents = exponents_of(prepared, values, window, substep)
+    return _acted(prepared, values, window, substep, exponents, adjoint, not inside.any())
 
 
 def parts_of_split(prepared: Prepared, first: float, last: float, error: float) -> list[tuple[float, float]]:
@@ -89,56 +94,111 @@ def parts_of_split(prepared: Prepared, first: float, last: float, error: float) 
     return list(zip([first, *cuts], [*cuts, last], strict=True))
 
 
+def exponents_of(prepared: Prepared, values: Array, window: lw.Window, substep: Substep) -> Exponents:
+    """Return the generators of a substep: one where no coefficient depends on t, else those of Magnus' integrator."""
+    if prepared.system.varying or substep.speed:
+        averages = _averaged(substep, _at_points(prepared, values, window, substep))
+        return _of_magnus(prepared, values, averages, bool(substep.speed))
+    known, length = tables(prepared, window), substep.length
+    if not substep.inside.any():
+        return Exponents([(length * known.covariance, length * known.drift, None)], 0.0, 0.0, 0.0)
+    precision = precision_of(prepared, substep.start, substep.inside)
+    potential, constant = potential_of(known.observation, precision, substep.rates, values)
+    potential = length * potential
+    offset, lift = offset_of(potential, values)
+    generator = length * known.covariance, length * known.drift, potential - offset
+    return Exponents([generator], offset, length * constant, lift)
+
+
+def _acted(
+    prepared: Prepared, values: Array, window: lw.Window, substep: Substep, exponents: Exponents, adjoint: bool, keeps: bool
+) -> Attempt:
+    """Return a density after the exponentials, or a message after their transposes in reverse order; `keeps` the exponential."""
+    if exponents.lift > GROWTH:
+        return Attempt(values, 0.0, 0.0, True)
+    matrices, found, error = [window.generator(*one) for one in exponents.generators], values, 0.0
+    if len(matrices) == 2:
+        # The part of third order that two exponentials contain; they omit one of fifth order, with a factor that was measured.
+        total, difference, now = (matrices[0] + matrices[1]).real, (matrices[1] - matrices[0]).real, values.real
+        if adjoint:
+            total, difference = total.T, -difference.T
+        commutator = 0.25 * (total @ (difference @ now) - difference @ (total @ now))
+        error = 5.0 * float(np.sum(np.abs(commutator))) ** (5.0 / 3.0)
+        if error > MAGNUS * prepared.tolerance:
+            return Attempt(values, 0.0, error, True)
+    for matrix in [one.T for one in matrices[::-1]] if adjoint else matrices:
+        key = ("exponential", window, substep.length, adjoint)
+        transition: Exponential = prepared.once(key, partial(Exponential, matrix)) if keeps else Exponential(matrix)
+        found, rounding = transition(found)
+        error += rounding
+    return Attempt(found, exponents.offset + exponents.constant, error, False, substep, exponents.lift)
+
+
+class _Averages(NamedTuple):
+    """The nodes (T,) of a substep, their weights, and there f (T, N), G (T,) or (T, N), V (T, N) and the constant of V (T,)."""
+
+    nodes: Array
+    weights: Array
+    drift: Array
+    covariance: Array
+    potential: Array
+    constant: Array
+
+
+def _at_points(prepared: Prepared, values: Array, window: lw.Window, substep: Substep) -> Callable[[Array], Coefficients]:
+    """Return the function that gives the coefficients at parts of a substep, from zero to one, on a grid that moves with it."""
+
+    def at(nodes: Array) -> Coefficients:
+        times, shifts = substep.start + substep.length * nodes, substep.speed * substep.length * nodes if substep.speed else None
+        drift, *others = coefficients(prepared, window, times, substep.inside, substep.rates, values, shifts)
+        return drift - substep.speed, *others
+
+    return at
+
+
+def _averaged(substep: Substep, at: Callable[[Array], Coefficients]) -> _Averages:
+    nodes = ((np.arange(substep.parts)[:, None] + GAUSS_NODES) / substep.parts).reshape(-1)
+    return _Averages(nodes, substep.length / substep.parts * np.tile(GAUSS_WEIGHTS, substep.parts), *at(nodes))
+
+
+def _of_magnus(prepared: Prepared, values: Array, averages: _Averages, moving: bool) -> Exponents:
+    """Return the generators of the commutator-free Magnus integrator of order four.
+
+    exp(B0 / 2 + 2 B1 / tau) exp(B0 / 2 - 2 B1 / tau),   B0 = int L dt,   B1 = int (t - middle) L dt.
+    """
+    nodes, zeroth, drift, covariance, potential, constant = averages
+    offset, lift = offset_of(zeroth @ potential, values)
+    if prepared.system.steady and not moving:
+        generator = zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset
+        return Exponents([generator], offset, zeroth @ constant, lift)
+    moment = 2.0 * zeroth * (nodes - 0.5)
+    halves = [(w @ covariance, w @ drift, w @ potential - 0.5 * offset) for w in (0.5 * zeroth - moment, 0.5 * zeroth + moment)]
+    lift = np.inf if any(np.any(half[0].real < 0) for half in halves) else lift
+    return Exponents(halves, offset, zeroth @ constant, lift)
+
+
 def magnus(
-    prepared: Prepared, values: Array, window: lw.Window, length: float, at: Callable[[Array], Coefficients], adjoint: bool,
+    prepared: Prepared, values: Array, window: lw.Window, substep: Substep, at: Callable[[Array], Coefficients], adjoint: bool,
     moving: bool,
 ) -> Attempt:  # fmt: skip
-    """Advance a substep by two exponentials: the commutator-free Magnus integrator of order four.
-
-        exp(B0 / 2 + 2 B1 / tau) exp(B0 / 2 - 2 B1 / tau),   B0 = int L dt,   B1 = int (t - middle) L dt.
+    """Advance a substep by the exponentials of `_of_magnus`, with as many nodes as they need.
 
     Args:
         prepared: the system.
         values, window: the density and its grid.
-        length: the length of the substep.
+        substep: the substep.
         at: a function that returns f, G, V and a constant, as `coefficients`, at parts of the substep from zero to one.
         adjoint: whether a message is taken from the end to the start.
         moving: whether the grid moves.
     """
     for parts in PARTS if moving else PARTS[:1]:
-        nodes = ((np.arange(parts)[:, None] + GAUSS_NODES) / parts).reshape(-1)
-        drift, covariance, potential, constant = at(nodes)
-        error = _unresolved(window, values, length * drift, length * potential) if moving else 0.0
+        substep = substep._replace(parts=parts)
+        averages, error, length = _averaged(substep, at), 0.0, substep.length
+        if moving:
+            error = _unresolved(window, values, length * averages.drift, length * averages.potential)
         if error <= MAGNUS * prepared.tolerance:
-            break
-    else:
-        return Attempt(values, 0.0, error, True)
-    zeroth = length / parts * np.tile(GAUSS_WEIGHTS, parts)
-    moment = 2.0 * zeroth * (nodes - 0.5)
-    early, late = 0.5 * zeroth - moment, 0.5 * zeroth + moment
-    offset, lift = offset_of(zeroth @ potential, values)
-    if lift > GROWTH or np.any((early @ covariance).real < 0) or np.any((late @ covariance).real < 0):
-        return Attempt(values, 0.0, 0.0, True)
-    if prepared.system.steady and not moving:
-        matrix = window.generator(zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset)
-        found, error = exponential_action(matrix.T if adjoint else matrix, values)
-        return Attempt(found, offset + zeroth @ constant, error, False, lift=lift)
-    shift = np.full(window.size, offset / 2)
-    first_half, second_half = (
-        window.generator(w @ covariance, w @ drift, w @ potential - shift) for w in (early, late)
-    )
-    if adjoint:
-        first_half, second_half = second_half.T, first_half.T
-    total, difference = (first_half + second_half).real, (second_half - first_half).real
-    now = values.real
-    # The part of third order that two exponentials contain; what they omit is of fifth order, with a factor that was measured.
-    commutator = 0.25 * (total @ (difference @ now) - difference @ (total @ now))
-    error = 5.0 * float(np.sum(np.abs(commutator))) ** (5.0 / 3.0)
-    if error > MAGNUS * prepared.tolerance:
-        return Attempt(values, 0.0, error, True)
-    middle, one = exponential_action(first_half, values)
-    found, two = exponential_action(second_half, middle)
-    return Attempt(found, offset + zeroth @ constant, error + one + two, False, lift=lift)
+            return _acted(prepared, values, window, substep, _of_magnus(prepared, values, averages, moving), adjoint, False)
+    return Attempt(values, 0.0, error, True)
 
 
 def _unresolved(window: lw.Window, values: Array, drift: Array, potential: Array) -> float:

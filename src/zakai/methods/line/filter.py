@@ -43,14 +43,14 @@ from zakai.methods.line.parts import parts_of_step, segment_of_parts
 from zakai.methods.line.prior import init as init
 from zakai.methods.line.prior import state_of
 from zakai.methods.line.system import NOISE, Parts, Prepared, State
-from zakai.methods.line.update import exponential_factor, factor_at_end, sampled_weakly
+from zakai.methods.line.update import acting_inside, factor_of, sampled_weakly
 from zakai.methods.line.volumes import contracted
 from zakai.models.model import Model
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.channel import Channel, around, chosen
 from zakai.numerics.line.density import separated
 from zakai.numerics.line.outlook import FAR
-from zakai.numerics.line.posterior import General, Likelihood, multiplied
+from zakai.numerics.line.posterior import General, multiplied
 from zakai.numerics.line.segment import RELIABLE
 from zakai.records.schedule import Schedule
 
@@ -116,14 +116,16 @@ def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray)
 class Stepped(NamedTuple):
     """The state after an interval that the compiled loop does not take, its report, and how the density came about.
 
-    That is how its transition moved it, where that is known, and the density after the observation on its own grid.
+    That is how its transition moved it, where that is known; the density after the observation on its own grid; and the parts of
+    the interval, if it was cut.
     """
 
     state: State
     info: Info
     passages: tuple[Passage, ...]
-    values: Array
+    values: np.ndarray
     window: lw.Window
+    parts: Parts | None = None
 
 
 Taken = list[loop.Piece] | Stepped
@@ -172,13 +174,11 @@ def alone(info: Info) -> Infos:
 def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Stepped:
     schedule, length = prepared.schedule, float(prepared.lengths[k])
     values, window, report, look = np.asarray(state.values), state.window, Report(), None
-    inside = prepared.inside[k]
-    if prepared.lie and not inside.all():
-        inside = np.zeros_like(inside)
+    inside = acting_inside(prepared, k)
     parts = parts_of_step(prepared, k, values, window)
     if parts is not None:
         state, info = _of_parts(parts, 0, state, observed)
-        return Stepped(state, info, (), np.asarray(state.values), state.window)
+        return Stepped(state, info, (), np.asarray(state.values), state.window, parts)
     passages: tuple[Passage, ...] = ()
     before, gained, contraction = lw.moments(values, window), 0.0, 1.0
     if length > 0:
@@ -209,12 +209,8 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> St
     else:
         log_floor = float(np.log(NOISE))
         floor = NOISE + report.aliasing + report.edge + report.noise
-    at_end = schedule.seen[k] & ~inside
-    if at_end.any() or (prepared.lie and inside.any()):
-        if at_end.any():
-            likelihood: Likelihood = factor_at_end(prepared, k, at_end, observed, window)
-        else:
-            likelihood = exponential_factor(prepared, k, observed)
+    likelihood = factor_of(prepared, k, observed, window)
+    if likelihood is not None:
         if isinstance(likelihood, General):
             report.lawless = float(np.sum(values.real[np.isnan(likelihood.log_density(window.points).real)]))
         if prepared.weak and not np.iscomplexobj(values):

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.line.attempt import Attempt, Coefficients, magnus, parts_of_split
+from zakai.methods.line.attempt import Attempt, Coefficients, Substep, magnus, parts_of_split
 from zakai.methods.line.coefficients import coefficients, resolved_parts
 from zakai.methods.line.message import Message, reliable
 from zakai.methods.line.moves import MOST_SUBSTEPS
@@ -185,7 +185,7 @@ def _substep(
 
     by, _, s = place(np.array([-length]))
     unit = lw.Window(0.0, 0.0, 1.0, window.size, False, 1.0)
-    attempt = magnus(prepared, later.values, unit, length, at, True, True)
+    attempt = magnus(prepared, later.values, unit, Substep(start + first, length, inside, rates), at, True, True)
     total = float(np.sum(attempt.values))
     before = window._replace(centre=window.centre + float(by[0]), spacing=spacing * float(s[0]))
     scale = later.scale + float(attempt.offset) + float(np.log(total))

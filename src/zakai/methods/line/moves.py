@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.line.attempt import attempted, by_modes, parts_of_split
+from zakai.methods.line.attempt import Substep, attempted, by_modes, parts_of_split
 from zakai.methods.line.coarse import EDGE, coarsened
 from zakai.methods.line.coefficients import resolved_parts
 from zakai.methods.line.figures import refitted
@@ -43,13 +43,18 @@ class Report:
 
 
 class Passage(NamedTuple):
-    """A transition by modes: the density and the grid before it, its length, the log of its mass, and the grid of the modes."""
+    """A transition: the density and the grid before it, its length, the logarithm of its mass, and the grid after it.
+
+    It is by the modes of that grid, or by the exponentials of a `substep`, times exp(-offset).
+    """
 
     values: Array
     window: lw.Window
     length: float
     log_mass: Any
-    of_modes: lw.Window
+    after: lw.Window
+    substep: Substep | None = None
+    offset: Any = 0.0
 
 
 class Moved(NamedTuple):
@@ -155,8 +160,7 @@ def _by_substeps(
         parts = resolved_parts(prepared, values, window, start, length, inside)
         bounds, report.time = parts.bounds, report.time + parts.error
     stack = bounds[::-1]
-    substeps, passages, decomposed, speed = 0, [], True, 0.0
-    tails = 0.0
+    substeps, passages, speed, tails = 0, [], 0.0, 0.0
     while stack:
         first, last = stack.pop()
         substeps += 1
@@ -168,7 +172,7 @@ def _by_substeps(
             if moving:
                 speed = speed_of(prepared, values, window, start + first, last - first)
             attempt = attempted(prepared, values, window, start, first, last, inside, rates, speed=speed)
-            report.decomposed = attempt.decomposed
+            report.decomposed = attempt.substep is None
             total = float(np.sum(attempt.values.real))
             lost = not 1e-100 < total < 1e6 or (not inside.any() and abs(total - 1.0) > 1e-3)
             split = (attempt.split or lost) and last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
@@ -214,19 +218,18 @@ def _by_substeps(
             brought = lw.figures(values, window.closed, negligible).aliasing
             report.aliasing = max(report.aliasing, brought - known)
         report.time += attempt.error
+        begin, after = window, lw.moved(window, speed * (last - first))
         before, values = values, np.where(attempt.values.real > 0, attempt.values, 0.0)
         mass = np.sum(values)
-        passages.append(Passage(before, window, last - first, np.log(mass), window))
-        decomposed = decomposed and attempt.decomposed
-        values = values / mass
+        passages.append(Passage(before, begin, last - first, np.log(mass), after, attempt.substep, attempt.offset))
         tails = max(tails + attempt.lift - float(np.log(mass.real)), 0.0)
-        window = lw.moved(window, speed * (last - first))
+        values, window = values / mass, after
         gained = gained + np.log(mass) + attempt.offset
         if stack:
             values, window = refitted(prepared, values, window, look)
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
-    return Moved(values, window, gained, look, tuple(passages) if decomposed else ()), tails
+    return Moved(values, window, gained, look, tuple(passages)), tails
 
 
 def _finer(values: Array, window: lw.Window, look: lw.Figures) -> lw.Window:

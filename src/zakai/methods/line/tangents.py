@@ -18,14 +18,17 @@ from sympy import sympify
 from zakai.methods._protocol import Infos, Tangents
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line.adjoint import log_likelihoods
+from zakai.methods.line.attempt import Substep, exponents_of
 from zakai.methods.line.grids import grid_of
 from zakai.methods.line.loop import DIVIDED, START, Piece, infos_of
+from zakai.methods.line.moves import Passage
 from zakai.methods.line.parts import segment_of_parts
-from zakai.methods.line.system import Prepared, State
+from zakai.methods.line.system import Parts, Prepared, State
 from zakai.methods.line.tables import spectral
-from zakai.methods.line.update import factor_at_end
+from zakai.methods.line.update import factor_of
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.exponential_tangents import exponential_tangents
 from zakai.numerics.line.segment import SPLIT
 from zakai.numerics.line.split_tangents import Coefficients, Interval, shifted_by, through
 from zakai.numerics.line.tangents import Varied
@@ -54,9 +57,7 @@ def tangents(
     if prepared.parts is None:
         states, infos = walk.over(prepared, rows, state, observed)
     else:
-        inner = prepared.parts.prepared
-        walk.shifted = [replace(inner, theta=one.theta) for one in shifted]
-        states, infos = segment_of_parts(prepared.parts, rows, state, observed, walk.over)
+        states, infos = walk.in_parts(prepared.parts, rows, state, observed)
     last = states[-1]
     return Tangents(states, infos, walk.slopes, [last._replace(values=last.values + 1j * STEP * one) for one in walk.tangents])
 
@@ -79,7 +80,9 @@ class _Walk:
         def noted(k: int, before: State, found: line_filter.Taken) -> None:
             values = observed[k - rows.start :]
             if isinstance(found, line_filter.Stepped):
-                if found.passages:
+                if found.parts is not None:
+                    self.in_parts(found.parts, slice(0, 1), before, values[:1])
+                elif found.passages:
                     self._passed(prepared, k, before, found, values[0])
                 else:
                     self._singly(k, before, found.state, values[0])
@@ -96,6 +99,14 @@ class _Walk:
                 before = piece.last
 
         return line_filter.segment_of_whole(prepared, rows, state, observed, noted)
+
+    def in_parts(self, parts: Parts, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos]:
+        """Take the intervals of a slice that are cut into parts; return the states and the reports."""
+        whole = self.shifted
+        self.shifted = [replace(parts.prepared, theta=one.theta) for one in whole]
+        found = segment_of_parts(parts, rows, state, observed, self.over)
+        self.shifted = whole
+        return found
 
     def _singly(self, k: int, before: State, after: State, observed: np.ndarray) -> None:
         """Take one interval, for one parameter after the other."""
@@ -174,20 +185,33 @@ class _Walk:
         return Interval(length, piece.before.spacing, closed, observed, inside, int(pairs), int(substeps), bool(needed > 0.0))
 
     def _passed(self, prepared: Prepared, k: int, before: State, step: line_filter.Stepped, observed: np.ndarray) -> None:
-        """Take a single step whose transition was by modes."""
+        """Take a single step whose transitions are known."""
         own, gained = before.window, 0.0
-        for start, window, length, log_mass, of_modes in step.passages:
-            self._regrid(own, window)
-            own = of_modes
-            moved = self._varied(prepared, own).through(start, self.tangents, length, window, own)
-            self.tangents, gained = moved / np.exp(log_mass), gained + log_mass
+        for passage in step.passages:
+            self._regrid(own, passage.window)
+            own = passage.after
+            if passage.substep is None:
+                varied = self._varied(prepared, own)
+                moved = varied.through(passage.values, self.tangents, passage.length, passage.window, own)
+            else:
+                moved = self._by_exponentials(prepared, passage, passage.substep)
+            self.tangents, gained = moved / np.exp(passage.log_mass), gained + passage.log_mass + passage.offset
         self._regrid(own, step.window)
-        at_end = prepared.schedule.seen[k] & ~prepared.inside[k]
-        logs = np.zeros((len(self.shifted), step.window.size), complex)
-        if at_end.any():
-            logs = self._logs(partial(_logs_of, k=k, observed=observed, points=step.window.points), prepared)
+        logs = self._logs(partial(_logs_of, k=k, observed=observed, points=step.window.points), prepared)
         self._multiply(step.values, logs, step.info.log_likelihood_increment - gained)
         self._regrid(step.window, step.state.window)
+
+    def _by_exponentials(self, prepared: Prepared, passage: Passage, substep: Substep) -> Array:
+        """Return the derivatives of the density after a substep, which has been divided by its mass."""
+        values, window = passage.values, passage.window
+        exponents = exponents_of(prepared, values, window, substep)
+        shifted = [exponents_of(one, values, window, substep) for one in self.shifted]
+        tangents = np.where(values > 0, self.tangents, 0.0)
+        for i, generator in enumerate(exponents.generators):
+            changes = [one.generators[i] for one in shifted]
+            values, tangents = exponential_tangents(window.closed, window.spacing, generator, changes, values, tangents)
+        constants = np.array([np.imag(one.constant) for one in shifted]) / STEP
+        return tangents + values * constants[:, None]
 
     def _logs(self, function: Callable[[Prepared], Array], prepared: Prepared) -> Array:
         """Return the logarithms (p, ...) of likelihoods, with imaginary parts where a likelihood depends on the parameter."""
@@ -225,9 +249,8 @@ class _Walk:
 
 def _logs_of(prepared: Prepared, k: int, observed: Array, points: Array) -> Array:
     """Return the log-likelihood of an observation at points (N,)."""
-    likelihood = factor_at_end(prepared, k, prepared.schedule.seen[k], observed, None)
-    assert likelihood is not None
-    found: Array = likelihood.logs(points)
+    likelihood = factor_of(prepared, k, observed, None)
+    found: Array = np.zeros(len(points)) if likelihood is None else likelihood.logs(points)
     return found
 
 

@@ -20,6 +20,21 @@ from zakai.numerics.line.weak import WEAK_SHARE, at_nodes, nodes, weak_error, we
 Array = Any
 
 
+def acting_inside(prepared: Prepared, k: int) -> np.ndarray:
+    """Return which increments (m,) act within interval k."""
+    inside: np.ndarray = prepared.inside[k]
+    return np.zeros_like(inside) if prepared.lie and not inside.all() else inside
+
+
+def factor_of(prepared: Prepared, k: int, observed: np.ndarray, window: lw.Window | None) -> Likelihood | None:
+    """Return the likelihood of what acts at the end of interval k, None where nothing does; `window` as of `factor_at_end`."""
+    inside = acting_inside(prepared, k)
+    at_end = prepared.schedule.seen[k] & ~inside
+    if at_end.any():
+        return factor_at_end(prepared, k, at_end, observed, window)
+    return exponential_factor(prepared, k, observed) if prepared.lie and inside.any() else None
+
+
 def factor_at_end(prepared: Prepared, k: int, at_end: np.ndarray, observed: np.ndarray, window: lw.Window | None) -> Likelihood:
     """Return the likelihood of the samples, or of the increments that were gathered over more than the interval.
 

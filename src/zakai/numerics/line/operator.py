@@ -19,9 +19,9 @@ from zakai.numerics.compiled import kernel
 
 Array = NDArray[Any]
 
-_TERMS = 40
-_PART = 3.0  # norm up to which one Taylor series is summed
-_DENSE = 130.0  # norm times this, above size^2, from which the exponential is computed as a matrix
+TERMS = 40
+PART = 3.0  # norm up to which one Taylor series is summed
+DENSE = 130.0  # norm times this, above size^2, from which the exponential is computed as a matrix
 
 
 @lru_cache(maxsize=64)
@@ -69,7 +69,7 @@ def generator(closed: bool, spacing: float, covariance: Any, drift: Array, poten
 )
 def _taylor(matrix: Array, vector: Array, shift: float, norm: float) -> Array:
     """exp(matrix + shift) vector, by Taylor series in equal parts; `norm` bounds that of the matrix."""
-    parts = max(1, int(np.ceil(norm / _PART)))
+    parts = max(1, int(np.ceil(norm / PART)))
     total = vector.copy()
     size = total.shape[0]
     factor = np.exp(shift / parts)
@@ -78,7 +78,7 @@ def _taylor(matrix: Array, vector: Array, shift: float, norm: float) -> Array:
         largest = 0.0
         for i in range(size):
             largest = max(largest, abs(total[i].real))
-        for k in range(1, _TERMS):
+        for k in range(1, TERMS):
             term = np.dot(matrix, term)
             scale = 1.0 / (parts * k)
             change = 0.0
@@ -93,16 +93,6 @@ def _taylor(matrix: Array, vector: Array, shift: float, norm: float) -> Array:
     return total
 
 
-def exponential_action(matrix: Array, vector: Array) -> tuple[Array, float]:
-    """Return exp(matrix) vector, and an estimate of its relative rounding error.
-
-    Args:
-        matrix: (N, N), real, or complex with an infinitesimal imaginary part.
-        vector: (N,).
-    """
-    return Exponential(matrix)(vector)
-
-
 class Exponential:
     """exp(A) for A (N, N), real, or complex with an infinitesimal imaginary part: it multiplies any number of vectors.
 
@@ -115,7 +105,7 @@ class Exponential:
         self.shift = float(np.trace(matrix.real)) / size
         self.matrix = np.ascontiguousarray(matrix - self.shift * np.eye(size))
         self.norm = float(np.abs(self.matrix.real).sum(axis=0).max())  # as an operator on probabilities
-        self.dense = np.isfinite(self.norm) and self.norm * _DENSE > size**2
+        self.dense = np.isfinite(self.norm) and self.norm * DENSE > size**2
         if self.dense:
             squarings = int(np.ceil(np.log2(self.norm))) + 1
             self.powers = min(squarings, 4)
