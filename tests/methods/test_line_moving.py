@@ -148,6 +148,21 @@ def test_a_message_that_is_much_narrower_than_the_prior_is_found_in_bent_motion(
     assert abs(result.mean[0, 0] - 0.5 - (one - other) / 0.02) < 1e-3
 
 
+def test_linear_motion_on_the_grid_of_limited_direct_is_that_of_the_kalman_filter():
+    rng = np.random.default_rng(1)
+    times = np.cumsum(rng.uniform(0.2, 1.0, 30))
+    values = times + 0.14 * rng.standard_normal(30)
+    model = zakai.Model(
+        state=["x"], drift=["1"], diffusion=[[0.03]], observation=["x"], observation_noise=[[0.02]], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [0.0], "cov": [[0.04]]},
+    )  # fmt: skip
+    record = zakai.Record(times, values[:, None], "samples")
+    result, exact = (zakai.filter(model, record, method) for method in ("limited-direct", "kalman-bucy"))
+    assert not result.warnings
+    assert np.abs(result.mean - exact.mean).max() < 1e-8
+    assert abs(result.log_likelihood - exact.log_likelihood) < 1e-8
+
+
 def test_the_gradient_of_motion_is_that_of_the_kalman_filter():
     times = np.cumsum([0.6, 1.0, 0.4, 0.9, 0.7, 0.8])
     values = times + np.array([0.1, -0.2, 0.15, 0.0, -0.1, 0.2])

@@ -24,6 +24,7 @@ Array = NDArray[Any]
 
 WIDE = 1.96  # variance of a kernel, in squares of the spacing, from which its samples are a filter
 BAND = 0.625  # part of the frequencies of a grid for which the filters of narrow kernels are exact
+_LEAST = 1e-240  # factor of a density whose products with all values that count are normal numbers
 _NODES = 128  # of the periodic transfer function of a narrow kernel
 _TAPS = 50
 _FREQUENCIES = 2.0 * np.pi / _NODES * np.arange(_NODES // 2 + 1)
@@ -219,8 +220,12 @@ def convolved(
         _quadratic(early, pull * spacing, square * spacing**2)
         _quadratic(late, shift / variance * spacing, 0.5 * (a - 1.0) / variance * spacing**2)
         for j in range(size):
-            now[j] *= early[j] / gauge[j]
-            late[j], early[j] = late[j] * gauge[j], 1.0
+            early[j], late[j] = early[j] / gauge[j], late[j] * gauge[j]
+            if not (_LEAST < early[j] < 1.0 / _LEAST and _LEAST < late[j] < 1.0 / _LEAST):  # products may underflow
+                return failed(variance, 0.0)
+        for j in range(size):
+            now[j] *= early[j]
+            early[j] = 1.0
         rounding, clipped = filtered(now, taps_of(width, depth, size, narrow), late, early, narrow)
     return Transition(0.0, rounding, clipped, variance, a, needed, log_factor, 0.0, 0.0)
 
