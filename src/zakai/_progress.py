@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
-from threading import Lock
+from threading import Lock, Timer
 from typing import Any
 
 PATIENCE = 1.0  # seconds of work before a bar appears
@@ -27,8 +27,10 @@ def shown() -> bool:
 def bar(what: str, patience: float = PATIENCE) -> Iterator[Advance | None]:
     """Yield a function of (done, total) to call at every step, which draws a bar; None where nothing is drawn.
 
+    The bar appears in the middle of a long step, too.
+
     Args:
-        what: the word before the bar.
+        what: the words before the bar.
         patience: seconds of work before the bar appears; total is None where it is not known.
     """
     if not shown() or not _LOCK.acquire(blocking=False):
@@ -45,16 +47,28 @@ def bar(what: str, patience: float = PATIENCE) -> Iterator[Advance | None]:
 class _Bar:
     def __init__(self, what: str, patience: float):
         self.what, self.begins = what, time.monotonic() + patience
+        self.latest: tuple[int, int | None] | None = None
         self.display: Any = None
         self.task: Any = None
+        self.lock, self.timer = Lock(), Timer(patience, self._draw)
+        self.timer.daemon = True
+        self.timer.start()
 
     def advance(self, done: int, total: int | None) -> None:
         """Draw how much is done; nothing before its time, or if all is done by then."""
-        if self.display is None:
-            if time.monotonic() < self.begins or done == total:
+        self.latest = done, total
+        self._draw()
+
+    def _draw(self) -> None:
+        with self.lock:
+            if self.latest is None:
                 return
-            self._open(total)
-        self.display.update(self.task, completed=done, total=total)
+            done, total = self.latest
+            if self.display is None:
+                if time.monotonic() < self.begins or done == total:
+                    return
+                self._open(total)
+            self.display.update(self.task, completed=done, total=total)
 
     def _open(self, total: int | None) -> None:
         from rich.console import Console
@@ -68,5 +82,8 @@ class _Bar:
 
     def close(self) -> None:
         """Remove the bar."""
-        if self.display is not None:
-            self.display.stop()
+        self.timer.cancel()
+        with self.lock:
+            self.latest = None
+            if self.display is not None:
+                self.display.stop()

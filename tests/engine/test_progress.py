@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -60,6 +61,15 @@ def test_a_fit_counts_its_evaluations_and_its_filters_have_no_bar(monkeypatch):
     zakai.fit(model, zakai.simulate(model, 0.1 * np.arange(1, 21), seed=0)[1], ["a"])
     fitting, filtering = terminal.getvalue().find("fitting"), terminal.getvalue().find("filtering")
     assert 0 <= fitting and (filtering < 0 or fitting < filtering)
+
+
+def test_a_bar_appears_in_the_middle_of_a_long_step(monkeypatch):
+    terminal = on_a_terminal(monkeypatch)
+    with bar("work", 0.05) as advance:
+        advance(1, None)
+        assert terminal.getvalue() == ""
+        time.sleep(1.0)
+        assert "work" in terminal.getvalue() and "1/?" in terminal.getvalue()
 
 
 def test_a_caller_who_asks_for_the_progress_gets_it_and_no_bar(monkeypatch):

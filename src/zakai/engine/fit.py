@@ -132,7 +132,7 @@ def fit(
     box = _box(model, names, values, bounds)
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
     function, evaluations = LogLikelihood(now, record, method, names, options), count(1)
-    with bar("fitting") as advance:
+    with bar("fitting: log-likelihood and gradient") as advance:
 
         def counted(theta: np.ndarray) -> tuple[float, np.ndarray]:
             if advance is not None:
