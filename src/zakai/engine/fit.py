@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import count
 from typing import Any
 
 import numpy as np
@@ -131,13 +130,16 @@ def fit(
     values = _start(model, names, start)
     box = _box(model, names, values, bounds)
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
-    function, evaluations = LogLikelihood(now, record, method, names, options), count(1)
+    function, known = LogLikelihood(now, record, method, names, options), dict[bytes, tuple[float, np.ndarray]]()
     with bar("fitting: log-likelihood and gradient") as advance:
 
         def counted(theta: np.ndarray) -> tuple[float, np.ndarray]:
-            if advance is not None:
-                advance(next(evaluations), None)
-            return function.unwarned(theta)
+            key = theta.tobytes()
+            if key not in known:
+                if advance is not None:
+                    advance(len(known) + 1, None)
+                known[key] = function.unwarned(theta)
+            return known[key]
 
         found = maximum(counted, values, box, names, model)
     values = found.values

@@ -13,6 +13,7 @@ from zakai.models._errors import listing
 from zakai.models.model import Model
 
 ITERATIONS = 200
+FIRST = 0.1  # length of the first step of L-BFGS-B, relative to the parameters
 GAIN = 1e-6  # nats, by which an iteration of L-BFGS-B must raise the log-likelihood; Newton's steps do the rest
 NEAR = 1e-3  # the distance to the maximum, in standard errors, that counts as none
 SINGULAR = 1e-6  # the smallest eigenvalue of the information scaled to a unit diagonal; differences leave 1e-8
@@ -69,20 +70,20 @@ def hessian(gradient: Callable[[np.ndarray], np.ndarray], u: np.ndarray, steps: 
 
 def maximum(function: Function, values: np.ndarray, box: np.ndarray, names: tuple[str, ...], model: Model) -> Found:
     """Return the maximum of the likelihood from `values`: L-BFGS-B, and then Newton's steps in the free parameters."""
-    scale = np.where(values != 0, np.abs(values), 1.0)
+    scale = FIRST * np.where(values != 0, np.abs(values), 1.0)
     objective = _Objective(function, values, scale)
     value, gradient = objective.exact(np.zeros(len(values)))
     if not (np.isfinite(value) and np.isfinite(gradient).all()):
         at = ", ".join(f"{name} = {float(number):g}" for name, number in zip(names, values, strict=True))
         raise InputError(f"{model.source}: start: the log-likelihood does not exist at {at}; give another start")
     limits = (box - values[:, None]) / scale[:, None]
-    gtol = 1e-7 * max(1.0, np.abs(gradient).max() * 1e-3)
+    gtol = 1e-7 * max(FIRST, np.abs(gradient).max() * 1e-3)
     settings = {"maxiter": ITERATIONS, "ftol": GAIN / max(1.0, abs(value)), "gtol": gtol}
     search = minimize(objective, np.zeros(len(values)), jac=True, method="L-BFGS-B", bounds=limits, options=settings)
     assert objective.best is not None
     # The search may have moved far: the best point gives the new units.
     values, old = np.clip(values + scale * objective.best[1], box[:, 0], box[:, 1]), scale
-    scale = np.where(values != 0, np.abs(values), scale)
+    scale = np.where(values != 0, np.abs(values), scale / FIRST)
     limits = (box - values[:, None]) / scale[:, None]
     objective, u = _Objective(function, values, scale), np.zeros(len(values))
     value, gradient = objective.exact(u)
