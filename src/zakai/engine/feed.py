@@ -15,6 +15,7 @@ from zakai.engine.misfit import notes_on_law
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
 from zakai.methods._protocol import Info, stacked
+from zakai.numerics.one_thread import one_thread
 from zakai.records.inputs import Inputs
 from zakai.records.noise import noise_varies, notes_on_noise
 from zakai.records.schedule import ROUNDING, Schedule, length_of
@@ -60,6 +61,7 @@ class Feed:
         self.now = Moment(start, 0.0, state, None, (0.0,) * self.m, (start,) * self.m, self.empty.notes)
 
     @np.errstate(all="ignore")  # what is not finite is refused below
+    @one_thread
     def moved(self, time: float, values: list[float], inputs: Inputs | None = None) -> Moment:
         """Return the moment after an observation (m,), NaN where there is none; `now` stays as it is.
 

@@ -27,6 +27,7 @@ from zakai.models.functions import Floor
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
 from zakai.numerics.complex_step import STEP
+from zakai.numerics.one_thread import one_thread
 from zakai.records import Record
 from zakai.records.schedule import Schedule
 
@@ -216,6 +217,7 @@ class _Part(NamedTuple):
         figures = [(name, part.health[name]) for part in infos for name in bounds if name in part.health]
         return {name for name, values in figures if (np.real(values) > bounds[name][0]).any()}
 
+    @one_thread
     def derivatives(self, theta: np.ndarray, shifted: Sequence[np.ndarray], own: bool) -> tuple[float, np.ndarray, set[str]]:
         """Return the log-likelihood, its derivatives (p,) in complex directions, and the figures beyond their bounds.
 
@@ -241,9 +243,7 @@ class _Part(NamedTuple):
             prepared = [self.setting._replace(theta=one).prepared(chunk) for one in (theta, *shifted)]
             states = states or [method.init(one, prior) for one in prepared]
             with np.errstate(all="ignore"):
-                found = method.tangents(
-                    prepared[0], prepared[1:], slice(0, len(chunk)), states[0], states[1:], self.values[rows]
-                )
+                found = method.tangents(prepared[0], prepared[1:], slice(0, len(chunk)), states[0], states[1:], self.values[rows])
             if found is None:
                 return None
             parts.append(found.infos)

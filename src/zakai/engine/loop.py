@@ -19,6 +19,7 @@ from zakai.engine.versions import versions
 from zakai.errors import InputError
 from zakai.methods._protocol import Infos, stacked
 from zakai.methods._states import Joined
+from zakai.numerics.one_thread import one_thread
 from zakai.records import Record
 from zakai.records.noise import notes_on_noise
 from zakai.records.schedule import ROUNDING, Schedule, schedule_of
@@ -29,6 +30,7 @@ GROWTH = 8  # the first report comes after one interval
 KEPT_BYTES = 512 * 2**20  # of densities that are kept by default
 
 
+@one_thread
 def advance(setting: Setting, prepared: Any, rows: slice, state: Any, values: np.ndarray) -> tuple[Sequence[Any], Infos]:
     """Advance a state over the intervals `rows` of what is prepared; `values` (rows, m) are their observations.
 

@@ -14,6 +14,7 @@ from zakai.models.domain import NEGLIGIBLE
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
+from zakai.numerics.one_thread import one_thread
 from zakai.records.schedule import Schedule
 
 _ENDS = "in two or more states the density must vanish before the ends of the domain, and have a value beyond them"
@@ -39,6 +40,7 @@ class Setting(NamedTuple):
         method = method if method.variant is None else method.variant(model, options)
         return cls(model, prior, method, options, model.theta(), not (model.depends_on_time or method.absolute))
 
+    @one_thread
     def prepared(self, schedule: Schedule) -> Any:
         """Return what the method prepares for a schedule, kept for the last schedules of each model.
 
@@ -53,6 +55,7 @@ class Setting(NamedTuple):
             KEPT,
         )
 
+    @one_thread
     def begin(self) -> tuple[Any, Any]:
         """Return what is prepared for no interval, and the state at the model's start."""
         prepared = self.prepared(Schedule.empty(self.model.m))

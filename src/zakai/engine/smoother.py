@@ -27,6 +27,7 @@ from zakai.errors import InputError
 from zakai.methods._protocol import Info, Infos, stacked
 from zakai.methods._states import Joined
 from zakai.models.model import Model
+from zakai.numerics.one_thread import one_thread
 from zakai.records import Record
 
 _EVIDENCE = "the evidence of the backward pass differs from the filter's, in nats"
@@ -195,9 +196,8 @@ class SmoothingRun(Run):
         error = abs(float(info.log_likelihood_increment) - expected)
         self.start = info._replace(health={**info.health, "evidence_error": error})
 
-    def _backward(
-        self, prepared: Any, rows: slice, states: Sequence[Any], message: Any, observed: range
-    ) -> tuple[Any, Infos]:
+    @one_thread
+    def _backward(self, prepared: Any, rows: slice, states: Sequence[Any], message: Any, observed: range) -> tuple[Any, Infos]:
         """Return the message at the start of the intervals `rows` of what is prepared, and the smoothed moments after each."""
         values = self.values[observed.start : observed.stop]
         found = None
