@@ -8,17 +8,17 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar, cast
 
-from numba import njit, types
+from numba import njit, types, version_info
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.sigutils import normalize_signature
-
-from zakai.numerics.inlined import InlinedCompiler
 
 F = TypeVar("F", bound=Callable[..., Any])
 R = TypeVar("R")
 
 # Without Python's lock, with IEEE division, and without the entry for C, which nothing calls.
 _compiler: Any = partial(njit, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+
+_INLINED = (0, 68)  # the version of Numba, of which `numerics/inlined.py` replaces a part
 
 
 # Sums may be taken in any order, so that several terms are added at once.
@@ -108,9 +108,15 @@ def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -
 def helper(function: F) -> F:
     """Compile a function that only kernels call, as a part of each of them; it has no entry for Python.
 
-    It is compiled once for all literal integers, and once for each literal boolean, which selects code.
+    It is compiled once for all literal integers, and once for each literal boolean, which selects code.  With a version of Numba
+    that is not known it is compiled as any function, which takes longer.
     """
-    dispatcher = _compiler(pipeline_class=InlinedCompiler)(function)
+    keys = {}
+    if version_info.short == _INLINED:
+        from zakai.numerics.inlined import InlinedCompiler
+
+        keys["pipeline_class"] = InlinedCompiler
+    dispatcher = _compiler(**keys)(function)
     compiled = dispatcher.compile
 
     def compile_common(arguments: Any) -> Any:
