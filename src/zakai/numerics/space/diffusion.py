@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfftn, rfftn
 from scipy.special import ive
 
 from zakai.numerics.space.grid import Grid
@@ -64,15 +65,15 @@ def diffused(values: Array, grid: Grid, noise: Array, tau: float, adjoint: bool 
     radius = 0.5 * tau * np.pi**2 * min(largest, float(size.max()))
 
     def transformed(fields: list[Array]) -> Array:
-        spectrum = sum((np.fft.rfftn(field) * multiplier for field, (_, multiplier) in zip(fields, parts, strict=True)))
-        return np.asarray(np.fft.irfftn(spectrum, grid.sizes, axes))
+        spectrum = sum((rfftn(field) * multiplier for field, (_, multiplier) in zip(fields, parts, strict=True)))
+        return np.asarray(irfftn(spectrum, grid.sizes, axes=axes))
 
     def moved(u: Array) -> Array:
         """Return (1 + 2 L / radius) u."""
         if adjoint:
-            waves = np.fft.rfftn(u)
+            waves = rfftn(u)
             for entry, multiplier in parts:
-                u = u + (2.0 / radius) * entry * np.fft.irfftn(waves * multiplier, grid.sizes, axes)
+                u = u + (2.0 / radius) * entry * irfftn(waves * multiplier, grid.sizes, axes=axes)
             return u
         fields = [entry * u for entry, _ in parts]
         change = transformed([field.real for field in fields])
