@@ -1,7 +1,7 @@
 """Linear algebra on one thread while the package computes.
 
 The matrices of a filter are so small that threads of BLAS wait for each other more than they work, and the records of a batch
-have threads of their own.  The number of threads also decides the last bits of a product: a live filter has those of a record.
+have threads of their own.  The number of threads also decides the last bits of a product: an online filter has those of a record.
 """
 
 from __future__ import annotations
