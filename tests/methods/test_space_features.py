@@ -295,3 +295,18 @@ def test_a_fill_value_that_is_no_observation_warns():
     )  # fmt: skip
     record = zakai.Record([0.1, 0.2, 0.9], [[1.0], [1e20], [2.0]], "samples")
     assert any("tail_depth" in warning for warning in zakai.filter(model, record).warnings)
+
+
+def test_an_end_of_a_domain_that_two_states_cross_is_said():
+    keys = {
+        "state": ["c", "p"], "drift": ["-0.03", "-p"], "observation": ["c + p"], "observation_kind": "samples",
+        "observation_noise": [["0.01"]], "domain": {"c": {"lower": 0.0, "upper": 1.0}},
+        "prior": {"kind": "gaussian", "mean": [0.3, 0.0], "cov": [0.003, 0.01]},
+    }  # fmt: skip
+    record = zakai.Record(np.arange(1.0, 11.0), np.full((10, 1), 0.03), "samples")
+    crossing = zakai.filter(zakai.Model(**keys, diffusion=[["0.02", "0"], ["0", "0.1"]]), record)
+    assert any("cross the end 0 of 'c'" in warning for warning in crossing.warnings)
+    assert not any("end 1" in warning for warning in crossing.warnings)
+    keys["drift"] = ["c*(1 - c)", "-p"]
+    inside = zakai.filter(zakai.Model(**keys, diffusion=[["0.1*c*(1 - c)", "0"], ["0", "0.1"]]), record)
+    assert not any("cross" in warning for warning in inside.warnings)

@@ -12,7 +12,7 @@ from zakai.densities import Density
 from zakai.engine.health_warnings import warnings_of_run
 from zakai.engine.lengths import notes_on_lengths
 from zakai.engine.misfit import notes_on_law
-from zakai.engine.notes import notes_on_angles, notes_on_formulas, notes_on_tables, why_not_finite
+from zakai.engine.notes import notes_on_angles, notes_on_domain, notes_on_formulas, notes_on_tables, why_not_finite
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import KEPT, Setting
 from zakai.engine.versions import versions
@@ -203,6 +203,7 @@ class Run:
         )
         theta = self.setting.theta.real
         undefined = notes_on_formulas(model, theta, self.record, result.mean, result.variance)
+        undefined += notes_on_domain(model, theta, result.mean, result.variance)
         lengths = notes_on_lengths(model, theta, self.schedule, infos)
         misfit = notes_on_law(model, theta, self.schedule, self.values, infos)
         result.warnings.extend([*undefined, *self.notes, *lengths, *misfit, *warnings_of_run(result)])

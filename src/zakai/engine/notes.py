@@ -83,6 +83,34 @@ def notes_on_tables(model: Model, theta: np.ndarray, record: Record) -> list[str
     return notes
 
 
+def notes_on_domain(model: Model, theta: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> list[str]:
+    """Return a sentence for every end of a domain that several states may cross: only with one state an end is kept.
+
+    They cross an end near which there is mass where the noise of that coordinate does not vanish, or its drift leads outwards.
+    """
+    notes: list[str] = []
+    if model.n == 1 or not model.domain:
+        return notes
+    evaluate = kept(model, notes_on_domain, lambda: numpy_function([*model.drift, *model.covariance.diagonal()], model))
+    for name, interval in model.domain.items():
+        i = model.state.index(name)
+        for end, side in ((interval.lower, 1.0), (interval.upper, -1.0)):
+            if not np.isfinite(end) or model.inputs:
+                continue
+            distance = side * (mean[:, i] - end) / np.sqrt(np.maximum(variance[:, i], 1e-300))
+            k = int(np.nanargmin(distance))
+            point = mean[k].copy()
+            point[i] = end
+            with np.errstate(all="ignore"):
+                found = np.nan_to_num(evaluate(point[None], model.start, theta, None)[0])
+            if distance[k] < _REACH and (found[model.n + i] > 0 or side * found[i] < 0):
+                notes.append(
+                    f"domain: the process may cross the end {end:g} of {name!r}, which is not kept with several states: the density "
+                    f"counts what lies beyond it; let the noise of {name!r} vanish there, or take its logarithm as the state"
+                )
+    return notes
+
+
 def _is_partial(formulas: Any, model: Model) -> bool:
     """Return whether a formula has a part that may have no value at a real state."""
     state = set(model.x)
