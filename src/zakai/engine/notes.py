@@ -105,8 +105,9 @@ def notes_on_domain(model: Model, theta: np.ndarray, mean: np.ndarray, variance:
                 found = np.nan_to_num(evaluate(point[None], model.start, theta, None)[0])
             if distance[k] < _REACH and (found[model.n + i] > 0 or side * found[i] < 0):
                 notes.append(
-                    f"domain: the process may cross the end {end:g} of {name!r}, which is not kept with several states: the density "
-                    f"counts what lies beyond it; let the noise of {name!r} vanish there, or take its logarithm as the state"
+                    f"domain: the process may cross the end {end:g} of {name!r}, which is not kept with several states: "
+                    f"the density counts what lies beyond it; let the noise of {name!r} vanish there, or take its logarithm "
+                    f"as the state"
                 )
     return notes
 
