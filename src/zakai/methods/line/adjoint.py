@@ -16,6 +16,7 @@ from zakai.methods.line.gauge import gauged
 from zakai.methods.line.grids import grid_of
 from zakai.methods.line.loop import TOGETHER
 from zakai.methods.line.message import LOWEST, PAD, SURE, Message, support, taper
+from zakai.methods.line.moving import displaced
 from zakai.methods.line.system import Prepared, State
 from zakai.methods.line.tables import covariance_at
 from zakai.methods.line.update import factor_at_end
@@ -56,7 +57,7 @@ def back(
     """
     k, first = rows.stop - 1, rows.start
     split = prepared.gaussian
-    if prepared.kinked or not _served(prepared, k):
+    if prepared.kinked or not _served(prepared, k) or not (split or _exact(prepared, k, states[k - first])):
         return None
     shared = _shared(states[k - first], states[k - first + 1].window, later, product, grid)
     if split and shared and not shared[-1].closed:
@@ -86,6 +87,22 @@ def _served(prepared: Prepared, k: int) -> bool:
     if prepared.gaussian:
         return bool(prepared.kinds[k] in (SPLIT, SPLIT_FACTOR))
     return prepared.system.samples and not prepared.system.moving and bool(prepared.lengths[k] > 0)
+
+
+def _exact(prepared: Prepared, k: int, state: State) -> bool:
+    """Return whether rounding in psi may be negligible at the start of an interval, as a decomposition takes long.
+
+    With a gauge of the slope s' = f / G a drift that carries the state far loses digits: psi is smaller where the density is than
+    at its own maximum by about exp(-(s' P s' + f^2 tau / G)), with the variance P of the density.
+    """
+    if state.window.closed:
+        return True
+    values, length, start = np.asarray(state.values), float(prepared.lengths[k]), float(prepared.schedule.starts[k])
+    mean, variance = lw.moments(values, state.window)
+    displacement, _ = displaced(prepared, values, state.window, start, length)
+    noise = length * covariance_at(prepared.system, np.array([state.origin + mean]), start, prepared.theta.real)
+    lost = displacement**2 / noise * (1.0 + variance / noise)
+    return bool(np.all(lost < np.log(lb.ROUGH * smoothing_tolerance(prepared) / lb.NOISE)))
 
 
 def _taken(

@@ -30,7 +30,7 @@ def travel(prepared: Prepared, values: Array, window: lw.Window, start: float, l
     system = prepared.system
     if window.closed or prepared.kinked or system.kinks is not None or system.cross is not None or system.reflecting:
         return 0.0
-    look, (carried, growth) = lw.figures(values, False), _carried(prepared, values, window, start, length)
+    look, (carried, growth) = lw.figures(values, False), displaced(prepared, values, window, start, length)
     G = covariance_at(system, window.points[[look.first, look.last]], start, prepared.theta.real)
     noise = float(np.sqrt(np.max(G.real) * length))
     if growth < CONTRACTED or abs(carried) < noise:
@@ -40,11 +40,11 @@ def travel(prepared: Prepared, values: Array, window: lw.Window, start: float, l
 
 def speed_of(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
     """Return the speed with which a grid follows a density in a substep: a whole number of its spacings in that time."""
-    carried, _ = _carried(prepared, values, window, start, length)
+    carried, _ = displaced(prepared, values, window, start, length)
     return window.spacing * float(np.round(carried / window.spacing)) / length
 
 
-def _carried(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> tuple[float, float]:
+def displaced(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> tuple[float, float]:
     """Return about how far the drift carries the mean of a density, by its linearisation there, and f' times the length."""
     mean, variance = lw.moments(values, window)
     x = window.origin + float(mean.real) + float(np.sqrt(variance.real)) * np.array([0.0, -0.1, 0.1])
