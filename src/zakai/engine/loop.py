@@ -203,7 +203,7 @@ class Run:
         )
         theta = self.setting.theta.real
         undefined = notes_on_formulas(model, theta, self.record, result.mean, result.variance)
-        undefined += notes_on_domain(model, theta, result.mean, result.variance)
+        undefined += notes_on_domain(model, theta, self.record, result.mean, result.variance)
         lengths = notes_on_lengths(model, theta, self.schedule, infos)
         misfit = notes_on_law(model, theta, self.schedule, self.values, infos)
         result.warnings.extend([*undefined, *self.notes, *lengths, *misfit, *warnings_of_run(result)])

@@ -83,7 +83,7 @@ def notes_on_tables(model: Model, theta: np.ndarray, record: Record) -> list[str
     return notes
 
 
-def notes_on_domain(model: Model, theta: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> list[str]:
+def notes_on_domain(model: Model, theta: np.ndarray, record: Record, mean: np.ndarray, variance: np.ndarray) -> list[str]:
     """Return a sentence for every end of a domain that several states may cross: only with one state an end is kept.
 
     They cross an end near which there is mass where the noise of that coordinate does not vanish, or its drift leads outwards.
@@ -95,14 +95,15 @@ def notes_on_domain(model: Model, theta: np.ndarray, mean: np.ndarray, variance:
     for name, interval in model.domain.items():
         i = model.state.index(name)
         for end, side in ((interval.lower, 1.0), (interval.upper, -1.0)):
-            if not np.isfinite(end) or model.inputs:
+            if not np.isfinite(end):
                 continue
             distance = side * (mean[:, i] - end) / np.sqrt(np.maximum(variance[:, i], 1e-300))
-            k = int(np.nanargmin(distance))
-            point = mean[k].copy()
+            k = int(np.argmin(np.nan_to_num(distance, nan=np.inf)))
+            point, t = mean[k].copy(), float(record.times[k - 1]) if k else model.start
             point[i] = end
+            u = None if record.inputs is None else record.inputs.at(t, model.input_hold)
             with np.errstate(all="ignore"):
-                found = np.nan_to_num(evaluate(point[None], model.start, theta, None)[0])
+                found = np.nan_to_num(evaluate(point[None], t, theta, u)[0])
             if distance[k] < _REACH and (found[model.n + i] > 0 or side * found[i] < 0):
                 notes.append(
                     f"domain: the process may cross the end {end:g} of {name!r}, which is not kept with several states: "
