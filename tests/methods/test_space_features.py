@@ -308,5 +308,6 @@ def test_an_end_of_a_domain_that_two_states_cross_is_said():
     assert any("cross the end 0 of 'c'" in warning for warning in crossing.warnings)
     assert not any("end 1" in warning for warning in crossing.warnings)
     keys["drift"] = ["c*(1 - c)", "-p"]
-    inside = zakai.filter(zakai.Model(**keys, diffusion=[["0.1*c*(1 - c)", "0"], ["0", "0.1"]]), record)
+    short = zakai.Record([0.02, 0.04], [[0.3], [0.3]], "samples")
+    inside = zakai.filter(zakai.Model(**keys, diffusion=[["0.1*c*(1 - c)", "0"], ["0", "0.1"]]), short)
     assert not any("cross" in warning for warning in inside.warnings)
