@@ -56,7 +56,7 @@ class Table:
             ends = "periodic" if self.periodic and self.degree > 1 else None
             for place, axis in enumerate(self.axes):
                 spline = make_interp_spline(axis, coefficients, k=self.degree, axis=place, bc_type=ends)
-                coefficients = np.moveaxis(spline.c, 0, place) if spline.c.shape != coefficients.shape else spline.c
+                coefficients = np.moveaxis(spline.c, 0, place)
                 knots.append(spline.t)
             self._spline = NdBSpline(tuple(knots), np.ascontiguousarray(coefficients), self.degree)
         return self._spline
