@@ -211,3 +211,24 @@ def test_a_log_likelihood_beyond_the_bounds_of_its_health_figures_warns(last, sa
             warnings.simplefilter("always")
             call([1.0])
         assert [("tail_depth" in str(warning.message), warning.filename) for warning in found] == [(True, __file__)] * said
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        {"observation_family": "student-t", "degrees_of_freedom": "p", "observation_noise": [["0.1"]]},
+        {"observation_family": "von-mises", "concentration": "p"},
+        {"observation": None, "observed": ["z"], "observation_log_density": "-(z - x)**2*p/2 + log(p/6.283185307179586)/2"},
+    ],
+    ids=["degrees of freedom", "concentration", "log density"],
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_parameters_of_the_law_of_samples_have_gradients(law):
+    keys = {key: value for key, value in {**LINE, "observation_noise": None, "observation": ["x"], **law}.items() if value}
+    model = zakai.Model(**(keys | {"parameters": {"a": 0.5, "p": 4.0}, "drift": ["-a*x - x**3"]}))
+    record = zakai.Record([0.2, 0.5, 0.6, 1.1], [[0.5], [1.4], [-0.3], [0.2]], "samples")
+    likelihood, at = zakai.log_likelihood(model, record), np.array([0.5, 4.0])
+    steps = np.diag([1e-4, 1e-3])
+    expected = [(float(likelihood(at + h)) - float(likelihood(at - h))) / (2 * h.sum()) for h in steps]
+    assert min(np.abs(expected)) > 1e-3
+    np.testing.assert_allclose(likelihood.value_and_gradient(at)[1], expected, rtol=1e-4)

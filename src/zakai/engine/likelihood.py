@@ -280,7 +280,8 @@ def _parameters_of(setting: Setting) -> set[str]:
     """Return the names of the parameters on which a part of the likelihood depends."""
     model, prior = setting.model, setting.prior
     coefficients = [model.diffusion, model.process_noise, model.observation_noise, model.cross_noise]
-    parts = [model.drift, model.observation, *coefficients]
+    law = [*model.family_parameters.values(), *([] if model.log_density is None else [model.log_density])]
+    parts = [model.drift, model.observation, *coefficients, *law]
     symbols = set().union(*(part.free_symbols for part in parts))
     if isinstance(prior, DensityPrior):
         symbols |= prior.log_density.free_symbols
