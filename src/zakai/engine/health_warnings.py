@@ -58,7 +58,8 @@ def warnings_of_run(result: FilterResult) -> list[str]:
     if bad.any():
         time = result.times[np.argmax(bad)]
         said.append(
-            f"the density was lost at t = {time:g}: nothing after that time can be trusted; check that observation and its noise"
+            f"the density was lost at t = {time:g}: nothing after that time can be trusted; check that "
+            "observation and its noise, and whether the drift leads to infinity in a finite time"
         )
     else:
         lost = ~np.isfinite(result.mean).all(axis=1) | ~np.isfinite(result.cov).all(axis=(1, 2))
