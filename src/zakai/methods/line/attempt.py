@@ -13,13 +13,14 @@ from zakai.methods.line.coefficients import GROWTH, coefficients, offset_of, pot
 from zakai.methods.line.system import Prepared
 from zakai.methods.line.tables import spectral, tables
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.operator import Exponential
+from zakai.numerics.line.fourier import FourierOperator, exponential_of
 from zakai.numerics.line.panels import GAUSS_NODES, GAUSS_WEIGHTS
 
 Array = Any
 Coefficients = tuple[Array, Array, Array, Array]  # f (T, N), G (T,) or (T, N), V (T, N) and a constant (T,)
 
 PARTS = (1, 4, 16)  # of a substep with six nodes each, where the grid moves
+SMOOTHED = 100.0  # decay of the shortest wave of a large grid, as a logarithm, after which a coarser grid serves
 MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
 
 
@@ -117,18 +118,20 @@ def _acted(
     if exponents.lift > GROWTH:
         return Attempt(values, 0.0, 0.0, True)
     matrices, found, error = [window.generator(*one) for one in exponents.generators], values, 0.0
+    if any(isinstance(one, FourierOperator) and one.decay > SMOOTHED for one in matrices):
+        return Attempt(values, 0.0, 0.0, True)
     if len(matrices) == 2:
         # The part of third order that two exponentials contain; they omit one of fifth order, with a factor that was measured.
         total, difference, now = (matrices[0] + matrices[1]).real, (matrices[1] - matrices[0]).real, values.real
         if adjoint:
-            total, difference = total.T, -difference.T
+            total, difference = total.T, (matrices[0] - matrices[1]).real.T
         commutator = 0.25 * (total @ (difference @ now) - difference @ (total @ now))
         error = 5.0 * float(np.sum(np.abs(commutator))) ** (5.0 / 3.0)
         if error > MAGNUS * prepared.tolerance:
             return Attempt(values, 0.0, error, True)
     for matrix in [one.T for one in matrices[::-1]] if adjoint else matrices:
         key = ("exponential", window, substep.length, adjoint)
-        transition: Exponential = prepared.once(key, partial(Exponential, matrix)) if keeps else Exponential(matrix)
+        transition = prepared.once(key, partial(exponential_of, matrix)) if keeps else exponential_of(matrix)
         found, rounding = transition(found)
         error += rounding
     return Attempt(found, exponents.offset + exponents.constant, error, False, substep, exponents.lift)

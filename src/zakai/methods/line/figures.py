@@ -54,9 +54,9 @@ def refitted(
         generous: a grid of up to so many points is kept though fewer would do.
     """
     if not prepared.smoothing:
-        new = lw.fitted(look, window, lw.LARGEST, generous)
+        new = lw.fitted(look, window, prepared.largest_for(look), generous)
         return lw.resampled(values, window, new), new
-    new = lw.fitted(look._replace(resolving=1.0), window, lw.LARGEST, generous)
+    new = lw.fitted(look._replace(resolving=1.0), window, prepared.largest, generous)
     moved = resampled(prepared, values, window, new)
     return moved / np.sum(moved), new
 

@@ -16,7 +16,7 @@ from zakai.methods._states import Joined, StackedStates
 from zakai.methods.line import modal
 from zakai.methods.line.figures import edge_of_moments, figures, outside_tables, resampled, state_moments
 from zakai.methods.line.grids import grid_of
-from zakai.methods.line.system import FINEST, Prepared, State
+from zakai.methods.line.system import Prepared, State
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.filters import BAND
 from zakai.numerics.line.loop import advance
@@ -96,7 +96,8 @@ def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -
     """Return the first steps of `rows`, as many as the loop takes."""
     pieces: list[Piece] = []
     attempts, first, way, observed = 0, rows.start, STAY, np.ascontiguousarray(observed, float)
-    while first < rows.stop and attempts < ATTEMPTS:
+    most = prepared.largest
+    while first < rows.stop and attempts < ATTEMPTS and state.window.size <= most:
         attempts += 1
         now = observed[first - rows.start :]
         if prepared.gaussian:
@@ -160,15 +161,10 @@ def _covering(prepared: Prepared, state: State, low: float, high: float, spacing
         size = lw.size_for(2 * np.pi / spacing)
         new = window._replace(size=size, spacing=2 * np.pi / size)
     else:
-        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, LARGER, _most(prepared))
+        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, LARGER, prepared.largest_for(None))
         if new.spacing * new.size < high - low:
             return None
     return None if new == window else moved_to(prepared, state, new)
-
-
-def _most(prepared: Prepared) -> int:
-    """Return the points of the largest grid of the loop."""
-    return FINEST if prepared.gaussian else lw.LARGEST
 
 
 def moved_to(prepared: Prepared, state: State, new: lw.Window) -> State:
@@ -184,7 +180,7 @@ def regridded(prepared: Prepared, state: State) -> State:
     look = figures(prepared, values, window)
     if prepared.gaussian:
         look = look._replace(resolving=look.resolving * BAND / 0.92)
-    new = lw.fitted(look, window, _most(prepared), prepared.generous, LARGER)
+    new = lw.fitted(look, window, prepared.largest_for(look), prepared.generous, LARGER)
     return state if new == window else moved_to(prepared, state, new)
 
 

@@ -14,7 +14,7 @@ from zakai.methods.line.coarse import EDGE, coarsened
 from zakai.methods.line.coefficients import resolved_parts
 from zakai.methods.line.figures import refitted
 from zakai.methods.line.moving import speed_of
-from zakai.methods.line.system import NOISE, Prepared
+from zakai.methods.line.system import GROSS, NOISE, Prepared
 from zakai.methods.line.yau import moved
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.channel import Channel
@@ -23,7 +23,6 @@ from zakai.numerics.line.filters import WIDE, wrapped
 
 Array = Any
 
-GROSS = 1e-4  # spectrum at the highest frequencies from which a shorter substep is taken at once
 MOST_SUBSTEPS = 4000
 
 
@@ -155,6 +154,7 @@ def _by_substeps(
     gained: Any = 0.0
     rough, resolved = max(1e-10, 1e-3 * prepared.tolerance), 30.0 * negligible
     report.positive = False
+    most = lw.LARGEST if window.size <= lw.LARGEST else lw.SIZES[-1]
     bounds = [(0.0, length)]
     if system.varying:
         parts = resolved_parts(prepared, values, window, start, length, inside)
@@ -191,9 +191,9 @@ def _by_substeps(
                 new = window  # what such an attempt shows of the edges is not the density
             elif left or right:
                 new, grown = lw.enlarged(new, left, right), True
-            if coarse and window.size < lw.LARGEST and not (look.aliasing > GROSS and smooth):
+            if coarse and window.size < most and not (look.aliasing > GROSS and smooth):
                 new = lw.refined(new) if grown else _finer(values, window, look)
-            if new.size <= lw.LARGEST and new != window:
+            if new.size <= most and new != window and not window.size == new.size == lw.SIZES[-1]:
                 values = lw.resampled(values, window, new)
                 window = new
                 continue

@@ -22,6 +22,7 @@ Array = Any
 NOISE = 3e-15  # error of a density relative to its maximum, which matters in its tails
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
+GROSS = 1e-4  # spectrum at the highest frequencies from which it is that of what a grid does not resolve, not of noise
 FINEST = 1024  # points of the largest grid for Gaussian kernels and splitting
 KEPT_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are kept for a model
 
@@ -202,8 +203,17 @@ class Prepared:
 
     @property
     def largest(self) -> int:
-        """The largest size of a grid on which a step may begin that the compiled loop does not take."""
-        return FINEST if self.gaussian and self.yau is not None else lw.LARGEST
+        """The points of the largest grid of the compiled loop, and of any grid where a larger one does not help."""
+        return FINEST if self.gaussian else lw.LARGEST
+
+    def largest_for(self, look: lw.Figures | None) -> int:
+        """Return the points of the largest grid for a density with some figures.
+
+        The spectrum of kinks and that of noise fall slowly on every grid, and noise that grows with the state is too fast for a
+        large one.
+        """
+        noisy = look is not None and look.rough and self.negligible < look.aliasing < GROSS
+        return self.largest if noisy or self.kinked or self.system.state_dependent else lw.SIZES[-1]
 
     @cached_property
     def kinds(self) -> np.ndarray:

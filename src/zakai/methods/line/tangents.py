@@ -209,7 +209,7 @@ class _Walk:
         tangents = np.where(values > 0, self.tangents, 0.0)
         for i, generator in enumerate(exponents.generators):
             changes = [one.generators[i] for one in shifted]
-            values, tangents = exponential_tangents(window.closed, window.spacing, generator, changes, values, tangents)
+            values, tangents = exponential_tangents(window, generator, changes, values, tangents)
         constants = np.array([np.imag(one.constant) for one in shifted]) / STEP
         return tangents + values * constants[:, None]
 

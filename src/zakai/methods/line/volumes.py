@@ -24,6 +24,7 @@ from zakai.numerics.line.volumes import Bands, Volumes, advanced
 
 Array = Any
 
+FINE = 300.0  # phase by which the drift turns the shortest wave of a large grid, above which that is not tried
 STIFF = 100.0  # the same, above which no uniform grid is tried
 MOST_TRAVEL = 20.0  # ranges of a density, as it is at the time, that it moves on uniform grids
 MOST_DEVIATIONS = 100.0  # range of a density on a uniform grid, in the smallest deviations of its parts
@@ -58,7 +59,8 @@ def contracted(
     ends = ends_of(values, window)
     drift = drift_along(prepared, window, ends, start)
     width, speed = float(ends[1] - ends[0]), 0.5 * float(np.ptp(drift)) if moving else float(np.max(np.abs(drift)))
-    general = rough(prepared, inside)
+    fine = window.size > lw.LARGEST and np.pi * speed * length > FINE * window.spacing
+    general = rough(prepared, inside) or fine
     if not (general or speed * length > FAST * width):
         return None
     course = course_of(prepared, values, window, ends, start, length, inside)
@@ -270,11 +272,11 @@ def _resampled(prepared: Prepared, cells: Volumes, masses: Array, window: lw.Win
     used = cells.offsets[np.flatnonzero(real > lw.CUT * real.max())]
     spacing = (used[-1] - used[0]) / 64.0
     for _ in range(9):
-        new = lw.quantized(window, used[0], used[-1], spacing, most=lw.LARGEST_POSTERIOR)
+        new = lw.quantized(window, used[0], used[-1], spacing, most=lw.SIZES[-1])
         values = density(new.offsets)
         values = values / np.sum(values)
         look = lw.figures(values, False, prepared.negligible)
-        if look.aliasing <= max(1e-11, 1e-2 * error) or new.size >= lw.LARGEST_POSTERIOR:
+        if look.aliasing <= max(1e-11, 1e-2 * error) or new.size >= lw.SIZES[-1]:
             break
         spacing = 1.001 * new.spacing / 2**0.5
     return Moved(values, new, 0.0, look)

@@ -101,6 +101,22 @@ def waves(size: int) -> tuple[Array, Array]:
     return np.cos(angle)[turns], np.sin(angle)[turns]
 
 
+def spectrum_of_many(values: Array, cut: float, negligible: float) -> tuple[float, ...]:
+    """Return the figures of `spectrum` of a large grid, from all frequencies, by the fast Fourier transform."""
+    nyquist, top, total, mass = len(values) // 2, max(values.max(), 0.0), np.abs(values).sum(), values.sum()
+    found = np.abs(np.fft.rfft(values)) / (abs(mass) or np.inf)
+    aliasing, middle = found[nyquist * 7 // 8 :].max(), found[nyquist * 5 // 8 : nyquist * 3 // 4].max()
+    counting = np.flatnonzero(found[: nyquist * 7 // 8] > (negligible if aliasing <= negligible else 4.0 * aliasing))
+    used = np.flatnonzero(values > (max(cut, min(aliasing, 1e-4)) if cut >= 1e-14 else cut) * top)
+    first, last = used[[0, -1]] if len(used) else [len(values) - 1] * 2
+    left, right = (np.max(np.abs(ends)) / (top or np.inf) for ends in (values[:2], values[-2:]))
+    negative = 0.5 * (total - mass) / (total or np.inf)
+    if not total < np.inf:
+        aliasing = middle = np.inf
+    highest = counting[-1] if len(counting) else 0
+    return left, right, float(first), float(last), negative, aliasing, middle, float(highest), float(nyquist)
+
+
 @kernel(types.UniTuple(_F, 9)(_F[::1], _F, _F, _F[:, ::1], _F[:, ::1], boolean), reordered=True)  # type: ignore[no-untyped-call]
 def spectrum(
     values: Array, cut: float, negligible: float, cosines: Array, sines: Array, search: bool

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import STEP
-from zakai.numerics.line.operator import DENSE, PART, TERMS, Exponential, derivatives, generator
+from zakai.numerics.line.fourier import FourierOperator, exponential_of
+from zakai.numerics.line.operator import DENSE, PART, TERMS, derivatives
+from zakai.numerics.line.window import Window
 
 Array = NDArray[Any]
 Coefficients = tuple[Any, Array, Array | None]  # G, one number or (N,), f (N,) and V (N,), or integrals over time of these
@@ -27,43 +29,46 @@ _M = float64[:, ::1]
 
 
 def exponential_tangents(
-    closed: bool, spacing: float, coefficients: Coefficients, changed: Sequence[Coefficients], values: Array, tangents: Array
+    window: Window, coefficients: Coefficients, changed: Sequence[Coefficients], values: Array, tangents: Array
 ) -> tuple[Array, Array]:
     """Return exp(L) u and its derivatives (p, N).
 
     Args:
-        closed: whether the grid goes around the circle.
-        spacing: its spacing.
+        window: the grid.
         coefficients: those of L.
         changed: the same at p parameters with infinitesimal imaginary parts.
         values: u (N,).
         tangents: its derivatives (p, N).
     """
-    matrix = generator(closed, spacing, *coefficients)
-    size, unit = len(matrix), 1.0 if closed else spacing
+    matrix = window.generator(*coefficients)
+    if isinstance(matrix, FourierOperator):
+        return _by_complex_steps(window, changed, values, tangents)
+    size, unit = window.size, 1.0 if window.closed else window.spacing
     shift = float(np.trace(matrix)) / size
     norm = float(np.abs(matrix - shift * np.eye(size)).sum(axis=0).max())
     if not np.isfinite(norm):
         return np.full_like(values, np.nan), np.full_like(tangents, np.nan)
     scales = 0.5 / unit**2, 1.0 / unit, 1.0
     if norm * DENSE > LONG * size**2:
-        after = np.array([Exponential(generator(closed, spacing, *one))(values + 1j * STEP * tangent)[0]
-                          for one, tangent in zip(changed, tangents, strict=True)])  # fmt: skip
-        return after[0].real, after.imag / STEP
+        return _by_complex_steps(window, changed, values, tangents)
     rows = np.zeros((3, 1 + len(changed), size))  # of G, f and V: the values, and their derivatives
     for row, scale, *parts in zip(rows, scales, coefficients, *changed, strict=True):
         row[0] = 0.0 if parts[0] is None else scale * parts[0]
         row[1:] = [np.zeros(size) if one is None else scale * np.imag(one) / STEP * np.ones(size) for one in parts[1:]]
     rows[2, 0] -= shift
     found = np.concatenate([values[None], tangents])
-    _taylor(np.concatenate(derivatives(size, closed)), *rows, found, shift, norm)
+    _taylor(np.concatenate(derivatives(size, window.closed)), *rows, found, shift, norm)
     return found[0], found[1:]
 
 
+def _by_complex_steps(window: Window, changed: Sequence[Coefficients], values: Array, tangents: Array) -> tuple[Array, Array]:
+    pairs = zip(changed, tangents, strict=True)
+    after = np.array([exponential_of(window.generator(*one))(values + 1j * STEP * tangent)[0] for one, tangent in pairs])
+    return after[0].real, after.imag / STEP
+
+
 @kernel(void(_M, _M, _M, _M, _M, float64, float64))
-def _taylor(
-    matrices: Array, covariance: Array, drift: Array, potential: Array, rows: Array, shift: float, norm: float
-) -> None:
+def _taylor(matrices: Array, covariance: Array, drift: Array, potential: Array, rows: Array, shift: float, norm: float) -> None:
     """Replace a vector and its derivatives, the rows (1 + p, N), by those after the exponential.
 
     Args:

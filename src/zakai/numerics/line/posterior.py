@@ -143,7 +143,7 @@ def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: 
         if not np.isfinite(product.log_mass.real):
             return product
         look = lw.figures(product.values, new.closed)
-        if look.aliasing <= 1e-11 or new.size >= lw.LARGEST_POSTERIOR:
+        if look.aliasing <= 1e-11 or new.size >= (lw.LARGEST_OF_MESSAGES if look.rough else lw.SIZES[-1]):
             break
         finer = _finer(product.values, look, new)
         if finer == new:
@@ -160,7 +160,7 @@ def _finer(values: Array, look: lw.Figures, window: lw.Window) -> lw.Window:
         if window.closed:
             finer = lw.refined(window, factor)
         else:
-            finer = lw.quantized(window, used[0], used[-1], 1.001 * window.spacing / factor, most=lw.LARGEST_POSTERIOR)
+            finer = lw.quantized(window, used[0], used[-1], 1.001 * window.spacing / factor, most=lw.SIZES[-1])
         if finer.spacing < 0.95 * window.spacing and finer.size * finer.spacing > 1.04 * (used[-1] - used[0]):
             return finer
         factor /= 2**0.25
@@ -220,9 +220,9 @@ def _placed(values: Array, window: lw.Window, likelihood: Likelihood) -> lw.Wind
     low, high, finest = found
     spacing = min(window.spacing, max(finest, (high - low) / 370.0))
     if window.closed:
-        size = lw.size_for(min(2 * np.pi / spacing, lw.LARGEST_POSTERIOR))
+        size = lw.size_for(min(2 * np.pi / spacing, lw.SIZES[-1]))
         return window._replace(size=size, spacing=2 * np.pi / size)
-    return lw.quantized(window, low, high, spacing, margin=0.3, most=lw.LARGEST_POSTERIOR)
+    return lw.quantized(window, low, high, spacing, margin=0.3, most=lw.SIZES[-1])
 
 
 def place(offsets: Array, logs: Array, likelihood: Likelihood, origin: float) -> tuple[float, float, float] | None:

@@ -15,18 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.complex_step import angle
-from zakai.numerics.line.density import spectrum, waves
+from zakai.numerics.line.density import spectrum, spectrum_of_many, waves
+from zakai.numerics.line.fourier import FourierOperator
 from zakai.numerics.line.operator import generator
 from zakai.numerics.line.polynomial import interpolated_logs
 
 Array = NDArray[Any]
+Operator = Array | FourierOperator
 
-SIZES = (32, 48, 64, 80, 96, 112, 128, 160, 192, 256, 384, 512, 768, 1024)
-LARGEST = 384  # points of a grid on which densities are moved
-LARGEST_POSTERIOR = 1024  # points of a grid for the product with a likelihood
+SIZES = (32, 48, 64, 80, 96, 112, 128, 160, 192, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
+LARGEST = 384  # points of a grid on which densities are moved by matrices
+LARGEST_OF_MESSAGES = 1024  # points of a grid on which functions are moved by matrices
 CUT = 1e-13  # density relative to its maximum that a new grid must hold
 DEEP = 1e-20  # the same of densities whose small values are accurate
 NEGLIGIBLE = 1e-13  # spectrum relative to the mass that need not be resolved
+TOGETHER = 256  # points at which values of a large grid are interpolated together
 ALIGNMENT = 8  # centres stand at multiples of so many spacings
 
 
@@ -53,8 +56,10 @@ class Window(NamedTuple):
         """The points (size,)."""
         return self.origin + self.offsets
 
-    def generator(self, covariance: Any, drift: Array, potential: Array | None = None) -> Array:
-        """Return the Kolmogorov operator L (size, size) for G, f and V at the points, or integrals over time of these."""
+    def generator(self, covariance: Any, drift: Array, potential: Array | None = None) -> Operator:
+        """Return the Kolmogorov operator L for G, f and V at the points, or integrals over time of these."""
+        if self.size > LARGEST:
+            return FourierOperator(covariance, drift, 0.0 if potential is None else potential, self.spacing * self.size)
         return generator(self.closed, self.spacing, covariance, drift, potential)
 
 
@@ -116,7 +121,8 @@ def figures(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: fl
         cut: the smallest value that counts, relative to the largest.
     """
     real = np.ascontiguousarray(values.real)
-    found = spectrum(real, cut, negligible, *waves(len(real)), True)
+    large = len(real) > LARGEST_OF_MESSAGES
+    found = spectrum_of_many(real, cut, negligible) if large else spectrum(real, cut, negligible, *waves(len(real)), True)
     left, right, first, last, negative, aliasing, middle, highest, nyquist = found
     rough = middle < 6.0 * aliasing
     if aliasing <= negligible or (rough and aliasing < 1e-9):
@@ -190,6 +196,9 @@ def refined(window: Window, factor: float = 2**0.5) -> Window:
 
 def interpolated(values: Array, window: Window, offsets: Array) -> Array:
     """Return the interpolant of the values at offsets (J,) from the origin."""
+    if len(offsets) > TOGETHER and window.size > LARGEST_OF_MESSAGES:
+        parts = np.array_split(offsets, -(-len(offsets) // TOGETHER))
+        return np.concatenate([interpolated(values, window, part) for part in parts])
     at = (offsets - window.centre) / window.spacing + window.size // 2
     nearest = np.round(at)
     # sin(pi (at - j)) = (-1)^(nearest - j) sin(pi (at - nearest)).
