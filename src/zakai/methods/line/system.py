@@ -212,8 +212,9 @@ class Prepared:
         The spectrum of kinks and that of noise fall slowly on every grid, and noise that grows with the state is too fast for a
         large one.
         """
-        noisy = look is not None and look.rough and self.negligible < look.aliasing < GROSS
-        return self.largest if noisy or self.kinked or self.system.state_dependent else lw.SIZES[-1]
+        noisy, system = look is not None and look.rough and self.negligible < look.aliasing < GROSS, self.system
+        slow = noisy or system.kinked_drift or not system.smooth_observation or system.state_dependent
+        return self.largest if slow else lw.SIZES[-1]
 
     @cached_property
     def kinds(self) -> np.ndarray:
