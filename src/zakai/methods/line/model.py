@@ -168,8 +168,9 @@ class System:
         self.state_dependent = STATE_DEPENDENT_DIFFUSION in model.features
         self.reflecting = any(interval.reflecting for interval in model.domain.values())
         self.general = bool(OF_OBSERVATION & model.features.keys())
-        # Whether h has no jump and no kink.
-        self.smooth_observation = not any(not _continuous(part, x) or _rough(part, x) for part in model.observation)
+        # Whether h, or the law of what is observed, has no jump and no kink.
+        law = [*model.observation, *([] if model.log_density is None else [model.log_density])]
+        self.smooth_observation = not any(not _continuous(part, x) or _rough(part, x) for part in law)
         # Whether h has kinks, but no jump.
         self.kinked_observation = not self.smooth_observation and all(_continuous(part, x) for part in model.observation)
         self.kinked_drift = self.slope is not None and _rough(model.drift[0], x)
