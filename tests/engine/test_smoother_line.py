@@ -251,3 +251,38 @@ def test_a_sensor_with_a_kink_is_smoothed_by_both_methods():
     one, other = (zakai.smooth(model, record, method, tolerance=1e-5) for method in ("yau-yau", "limited-direct"))
     np.testing.assert_allclose(one.mean, other.mean, atol=1e-5)
     assert one.warnings == other.warnings == []
+
+
+def test_increments_under_noise_that_grows_with_the_state():
+    """The density is skew; the reference has the state v = log x, of constant noise."""
+    v, times = np.linspace(-1.3, 1.0, 400), 0.05 * np.arange(1.0, 21.0)
+    x, values = np.exp(v), 0.05 * (1.0 - 0.2 * times) + 0.02 * np.sin(9.0 * times)
+    model = zakai.Model(
+        state=["x"], drift=["0.5*x*(1 - x)"], diffusion=[["0.2*x"]], observation=["x"], observation_noise=[[0.01]],
+        observation_kind="increments", prior={"kind": "gaussian", "mean": [1.0], "cov": [[0.01]]},
+    )  # fmt: skip
+    smoothed = zakai.smooth(model, zakai.Record(times, values[:, None], "increments"))
+    prior = x * np.exp(-50.0 * (x - 1.0) ** 2)
+    densities = forward_backward(v, 0.5 * (1.0 - x) - 0.02, 0.04, x, 0.01, prior, "increments", False, times, values)
+    mean = np.array([np.sum(x * one) / np.sum(one) for one in densities])
+    variance = np.array([np.sum((x - m) ** 2 * one) / np.sum(one) for m, one in zip(mean, densities, strict=True)])
+    assert not smoothed.warnings
+    assert np.abs(smoothed.mean[:, 0] - mean).max() < 1e-5 * np.sqrt(variance.min())
+    assert np.abs(smoothed.variance[:, 0] / variance - 1.0).max() < 2e-5
+
+
+def test_increments_of_a_double_well_under_noise_that_depends_on_the_state():
+    """Intervals in which the density changes much, from a prior that covers both wells."""
+    x, times = np.linspace(-4.6, 4.6, 320), np.cumsum(np.tile([0.12, 0.4, 0.7], 4))
+    values = 0.4 * np.sin(0.9 * times) + 0.3 * np.sin(7.0 * times)
+    model = zakai.Model(
+        state=["x"], drift=["x - x**3"], diffusion=[["0.5 + 0.1*cos(x)"]], observation=["x"], observation_noise=[[0.3]],
+        observation_kind="increments", prior={"kind": "gaussian", "mean": [0.0], "cov": [[0.5]]},
+    )  # fmt: skip
+    smoothed = zakai.smooth(model, zakai.Record(times, values[:, None], "increments"), "yau-yau")
+    prior, covariance = np.exp(-(x**2)), (0.5 + 0.1 * np.cos(x)) ** 2
+    densities = forward_backward(x, x - x**3, covariance, x, 0.3, prior, "increments", False, times, values)
+    mean = np.array([np.sum(x * one) / np.sum(one) for one in densities])
+    variance = np.array([np.sum((x - m) ** 2 * one) / np.sum(one) for m, one in zip(mean, densities, strict=True)])
+    assert np.abs(smoothed.mean[:, 0] - mean).max() < 1e-6
+    assert np.abs(smoothed.variance[:, 0] / variance - 1.0).max() < 1e-5

@@ -159,7 +159,10 @@ def _at_points(prepared: Prepared, values: Array, window: lw.Window, substep: Su
     return at
 
 
-def _averaged(substep: Substep, at: Callable[[Array], Coefficients]) -> _Averages:
+def _averaged(substep: Substep, at: Callable[[Array], Coefficients], steady: bool = False) -> _Averages:
+    if steady:  # one node serves
+        middle = np.full(1, 0.5)
+        return _Averages(middle, np.full(1, substep.length), *at(middle))
     nodes = ((np.arange(substep.parts)[:, None] + GAUSS_NODES) / substep.parts).reshape(-1)
     return _Averages(nodes, substep.length / substep.parts * np.tile(GAUSS_WEIGHTS, substep.parts), *at(nodes))
 
@@ -196,7 +199,7 @@ def magnus(
     """
     for parts in PARTS if moving else PARTS[:1]:
         substep = substep._replace(parts=parts)
-        averages, error, length = _averaged(substep, at), 0.0, substep.length
+        averages, error, length = _averaged(substep, at, not prepared.system.varying and not moving), 0.0, substep.length
         if moving:
             error = _unresolved(window, values, length * averages.drift, length * averages.potential)
         if error <= MAGNUS * prepared.tolerance:

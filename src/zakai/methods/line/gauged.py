@@ -1,10 +1,14 @@
-"""A message of one state over one interval, backward in time, on a grid that moves and scales with it.
+"""A message of one state over one interval, backward in time, on grids that move and scale with it or stand.
 
-In x = m(t) + s(t) z, with m' = f(m) and an s that grows as the width of a message b, this one keeps its width.  What is moved is
-psi = e^l b with a quadratic polynomial l of z, so that psi at the end of the interval is about the smoothed density:
+What is moved is psi = e^l b.  On a grid that moves and scales with b, x = m(t) + s(t) z, with m' = f(m) and an s that grows as
+the width of b, l is a quadratic polynomial of z, so that psi at the end of the interval is about the smoothed density:
 
     -psi_t = (d - g l') psi_z + g psi_zz / 2 + (V - d l' + g (l'^2 - l'') / 2) psi,
     d = (f(x, t) - m' - (x - m) s' / s) / s,    g = G / s^2.
+
+On a grid that stands l follows the logarithm of the filter's density at the start, so that psi is the smoothed density there; an
+interval in which the density changes much has several parts.  The same operators take back an estimate of the error of psi, by
+rounding and by what is not known of b beyond its ends: where it is large b is not kept.
 """
 
 from __future__ import annotations
@@ -15,8 +19,9 @@ import numpy as np
 
 from zakai.methods.line.attempt import Attempt, Coefficients, Substep, magnus, parts_of_split
 from zakai.methods.line.coefficients import coefficients, resolved_parts
-from zakai.methods.line.message import Message, reliable
-from zakai.methods.line.moves import MOST_SUBSTEPS
+from zakai.methods.line.message import FEWEST, Message, reliable
+from zakai.methods.line.moves import MOST_SUBSTEPS, Report, by_substeps
+from zakai.methods.line.psi import RELAXED, Psi, part_of, placed
 from zakai.methods.line.system import Prepared, State
 from zakai.methods.line.tables import covariance_at, finite
 from zakai.numerics.line import window as lw
@@ -25,47 +30,20 @@ Array = Any
 
 WIDTH = 8.8  # standard deviations of psi from its mean to the ends of a grid
 MARGIN = 1.2  # of a wider grid
-ROUNDING = 1e-15  # of the maximum: smaller values are not kept
 ROUGH = 1e-3  # of the tolerance that noise of psi may leave
 MOST_GRIDS = 7  # that are finer or wider
-RELAXED = 4.0  # spacings that a message may need: its product with the density shows whether it does
+STANDS = 1.0  # deviations by which a message may move and change its width on a grid that stands
+BEYOND = 1.3  # length of such a grid, in ranges of the product
+MOST_PARTS = 48  # of an interval
+NOISE = -32.0  # logarithm of the error of small values of a density within an interval, relative to the largest
 
 
-class _Psi(NamedTuple):
-    """psi (N,) at the points of a grid, of sum one, with the logarithm of the sum before.
+class _Interval(NamedTuple):
+    """An interval: when it begins, and which increments act within it, at which rates."""
 
-    l is slope i + curvature i^2 / 2 at the points i of the grid, in its spacings; the drift has made psi wider by `scaled`.
-    """
-
-    values: Array
-    window: lw.Window
-    slope: float
-    curvature: float
-    scale: float
-    scaled: float = 1.0
-
-    @property
-    def gauge(self) -> Array:
-        """l (N,)."""
-        points = lw.index(self.window.size)
-        return points * (self.slope + 0.5 * self.curvature * points)
-
-    def kept(self, noise: float) -> tuple[int, int]:
-        """Return the first and the last point around the maximum with values above a noise relative to it."""
-        small, top = np.flatnonzero(self.values < 10.0 * noise * np.max(self.values)), int(np.argmax(self.values))
-        at = int(np.searchsorted(small, top))
-        first = int(small[at - 1]) + 1 if at > 0 else 0
-        last = int(small[at]) - 1 if at < len(small) else len(self.values) - 1
-        return first, last
-
-    def message(self, error: float, noise: float) -> Message:
-        """Return b, continued by its slopes where psi is noise."""
-        (first, last), points = self.kept(noise), lw.index(self.window.size)
-        logs = np.log(np.maximum(self.values, ROUNDING * np.max(self.values))) - self.gauge + self.scale
-        left, right = 0.5 * (logs[first + 2] - logs[first]), 0.5 * (logs[last] - logs[last - 2])
-        inner = logs[np.clip(np.arange(len(logs)), first, last)]
-        logs = inner + left * np.minimum(points - points[first], 0.0) + right * np.maximum(points - points[last], 0.0)
-        return Message.of(logs, self.window, RELAXED * self.window.spacing, error)
+    start: float
+    inside: np.ndarray
+    rates: np.ndarray
 
 
 def by_moving_grid(
@@ -81,28 +59,74 @@ def by_moving_grid(
         later: the message at its end.
         accepted: the values relative to the maximum that do not count.
     """
-    start, length = float(prepared.schedule.starts[k]), float(prepared.lengths[k])
-    spacing, error, noise, scaled = later.needed, 0.0, 1e-14, 1.0
-    now, begin, centre, deviation = None, later, later.mean, later.deviation
-    stack, count, tried = [(0.0, length)], 0, 0
+    interval = _Interval(float(prepared.schedule.starts[k]), inside, rates)
+    return _taken_back(prepared, interval, (0.0, float(prepared.lengths[k])), state, later, accepted, False)
+
+
+def by_standing_grids(
+    prepared: Prepared, k: int, inside: np.ndarray, rates: np.ndarray, state: State, later: Message, accepted: float
+) -> tuple[Message, float] | None:
+    """Return the same by grids that stand, each for a part of the interval in which the density changes by little."""
+    interval, length = _Interval(float(prepared.schedule.starts[k]), inside, rates), float(prepared.lengths[k])
+    count = _parts(prepared, later, interval.start + length, length)
+    while count <= MOST_PARTS:
+        cuts, found, error = np.linspace(0.0, length, count + 1).tolist(), later, 0.0
+        parts = list(zip(cuts[:-1], cuts[1:], _states(prepared, interval, cuts, state), strict=True))
+        for first, last, before in parts[::-1]:
+            back = _taken_back(prepared, interval, (first, last), before, found, accepted, True)
+            if back is None:
+                break
+            found, error = back[0]._replace(needed=back[0].spacing), error + back[1]
+        else:
+            if error <= prepared.tolerance:
+                return found._replace(needed=RELAXED * found.spacing), error
+        count *= 3
+    return None
+
+
+def _states(prepared: Prepared, interval: _Interval, cuts: list[float], state: State) -> list[State]:
+    """Return the filter's states at the cuts of an interval but the last."""
+    found, (start, inside, rates) = [state], interval
+    for first, last in zip(cuts[:-2], cuts[1:-1], strict=True):
+        moved = by_substeps(prepared, found[-1].values, found[-1].window, start + first, last - first, inside, rates, Report())
+        origin, centre, spacing, _, closed, unit = moved.window
+        floor = max(float(state.log_floor), NOISE)
+        found.append(State(moved.values, origin, centre, spacing, unit, closed, state.error, floor))
+    return found
+
+
+def _taken_back(
+    prepared: Prepared, interval: _Interval, part: tuple[float, float], state: State, later: Message, accepted: float,
+    stands: bool,
+) -> tuple[Message, float] | None:  # fmt: skip
+    """Return the message at the start of a part of an interval, and the error that it adds; None where this does not serve."""
+    start, inside, rates = interval
+    spacing, error, noise, scaled = later.needed, 0.0, 0.0, later.scaled
+    now, begin, centre, deviation, reach = None, later, later.mean, later.deviation, WIDTH * later.deviation
+    if stands:  # the ends of the product
+        centre, reach = 0.5 * (later.ends[0] + later.ends[1]), 0.5 * BEYOND * (later.ends[1] - later.ends[0])
+    stack, count, tried = [part], 0, 0
     while stack:
         first, last = stack.pop()
         if now is None:
-            now = _placed(begin, centre, deviation, spacing, MARGIN ** (tried // 2))
-            if now is None or tried > MOST_GRIDS or not np.isfinite(now.values).all():
+            if not stands:
+                reach = WIDTH * deviation
+            now = placed(begin, centre, deviation, spacing, reach * MARGIN ** (tried // 2), state if stands else None)
+            if now is None or tried > MOST_GRIDS:
                 return None
             now = now._replace(scaled=scaled)
-            if prepared.system.varying and last == length and not tried:
-                stack, error = resolved_parts(prepared, now.values, now.window, start, length, inside)
+            if prepared.system.varying and last == part[1] and not tried:
+                stack, error = resolved_parts(prepared, now.values, now.window, start + part[0], part[1] - part[0], inside)
+                stack = [(part[0] + low, part[0] + high) for low, high in stack]
                 first, last = stack.pop()
-        attempt, moved = _substep(prepared, now, start, first, last, inside, rates)
+        attempt, moved = _substep(prepared, now, start, first, last, inside, rates, stands)
         count += 1
         if attempt.split:
             if count + len(stack) >= MOST_SUBSTEPS or not np.isfinite(attempt.error):
                 return None
             stack += parts_of_split(prepared, first, last, attempt.error)
             continue
-        look = lw.figures(moved.values, False, accepted)
+        look = lw.figures(moved.values.real, False, accepted)
         made = max(look.aliasing, 0.1 * look.left, 0.1 * look.right)
         if made <= min(accepted * 10.0**tried if not look.rough else 1.0, ROUGH * prepared.tolerance):
             error, noise, now, tried = error + attempt.error, max(noise, made), moved, 0
@@ -110,62 +134,70 @@ def by_moving_grid(
         # Another grid about psi as it is, then wider and finer ones.
         stack.append((first, last))
         if tried == 0:
-            begin, spacing = now.message(later.error, noise), now.window.spacing
-            mean, variance = lw.moments(now.values, now.window)
-            centre, deviation = float(mean), float(np.sqrt(variance))
+            spacing = now.window.spacing
+            if last < part[1]:
+                begin, error = now.message(later.error, *now.reliable()), error + float(np.sum(np.abs(now.values.imag)))
+            mean, variance = lw.moments(now.values.real, now.window)
+            centre, deviation = centre if stands else float(mean), float(np.sqrt(variance))
         tried, scaled = tried + 1, now.scaled
         if tried % 2 and look.aliasing > accepted:
             spacing /= 1.4
         now = None
     assert now is not None
-    first_kept, last_kept = now.kept(noise)
-    here = slice(first_kept, last_kept + 1)
-    weights = reliable(state, now.window)[here] * np.exp(-now.gauge[here] - np.max(-now.gauge[here]))
-    product = weights * now.values[here]
-    error += 2.0 * float(max(product[[0, -1]]) / np.max(product))
-    error += 2.0 * noise * float(np.max(now.values) * np.sum(weights) / np.sum(product))
-    return (now.message(later.error, noise)._replace(scaled=now.scaled), error) if np.isfinite(error) else None
+    return _kept(now, state, later.error, noise, error)
 
 
-def _placed(later: Message, centre: float, deviation: float, spacing: float, wider: float) -> _Psi | None:
-    """Return psi of a message on a grid about a mean, None where that is too large.
-
-    Beyond the ends of the message psi differs from a Gaussian by a factor.
-    """
-    count = 2.0 * WIDTH * wider * deviation / spacing
-    if not count <= lw.LARGEST:
+def _kept(now: Psi, state: State, before: float, noise: float, error: float) -> tuple[Message, float] | None:
+    """Return the message where its product with the density is reliable, and the error with that of this product."""
+    density, highest = reliable(state, now.window), float(np.max(now.values.real))
+    logs = np.where(density > 0.0, np.log(density) - now.gauges[0], -np.inf)
+    shift = float(np.max(logs + np.log(np.maximum(now.values.real, 0.0))))
+    if not np.isfinite(shift):
         return None
-    window = later.window._replace(centre=centre, spacing=spacing, size=lw.size_for(count))
-    deviation /= spacing
-    ends = np.array(later.ends) + later.spacing * np.array([1.0, -1.0])  # the outermost values may be continued
-    z, inner = lw.index(window.size) / deviation, np.clip(window.offsets, *ends)
-    at, logs = (inner - centre) / (spacing * deviation), later.at(inner)
-    c2, c1, c0 = np.polyfit(at, logs, 2, w=np.exp(-0.25 * z * z))
-    curvature = min(-1.0 - 2.0 * c2, 0.0)
-    rest = logs - at * (c1 + at * c2)
-    slopes = (later.logs[[3, -2]] - later.logs[[1, -4]]) / (2.0 * later.spacing)
-    outer = (ends - centre) / (spacing * deviation)
-    slopes = slopes * spacing * deviation - c1 - 2.0 * c2 * outer
-    rest += slopes[0] * np.minimum(z - outer[0], 0.0) + slopes[1] * np.maximum(z - outer[1], 0.0)
-    exponents = rest + z * z * (c2 + 0.5 * curvature)
-    top = float(np.max(exponents))
-    values = np.exp(exponents - top)
-    total = float(np.sum(values))
-    return _Psi(values / total, window, -c1 / deviation, curvature / deviation**2, top + float(np.log(total)))
+    weights = np.exp(np.minimum(logs - shift, 600.0))
+    first, last = now.reliable(weights)
+    if last - first < FEWEST:
+        return None
+    here, window = slice(first, last + 1), part_of(now.window, first, last)
+    product, wrong = weights[here] * now.values.real[here], weights[here] * (np.abs(now.values.imag[here]) + noise * highest)
+    total = float(np.sum(product))
+    mean, variance = lw.moments(product / total, window)
+    moment = 1.0 + (window.offsets - mean) ** 2 / variance  # the error of the variance by that of a point
+    padded = np.concatenate([[0.0], density, [0.0]])
+    wrong[[0, -1]] += product[[0, -1]] * (padded[[first, last + 2]] > 0.0)  # beyond the ends
+    error += float(wrong @ moment) / total
+    found = now.message(before, first, last)._replace(scaled=now.scaled, mean=float(mean), deviation=float(np.sqrt(variance)))
+    return (found, error) if np.isfinite(error) else None
+
+
+def _parts(prepared: Prepared, later: Message, time: float, length: float) -> int:
+    """Return in how many parts grids stand while an interval that ends at a time is taken back."""
+    variance = later.deviation**2
+    speed, _, growth = _flow(prepared, later.origin + later.mean, 0.1 * later.deviation, variance, time, length)
+    return int(np.ceil(min(length * (abs(speed) / later.deviation + abs(growth)) / STANDS, MOST_PARTS + 1.0)))
+
+
+def _flow(prepared: Prepared, x: float, apart: float, variance: float, time: float, length: float) -> tuple[float, float, float]:
+    """Return f and f' at a state, by differences, and the rate at which a message of this variance becomes wider forward."""
+    theta, points = prepared.theta.real, x + apart * np.array([0.0, -1.0, 1.0])
+    speed, below, above = finite(prepared.system.drift(points[:, None], time, theta)[:, 0]).tolist()
+    slope = (above - below) / (2.0 * apart)
+    noise = covariance_at(prepared.system, points[:1], time, theta).reshape(-1)[0] * length
+    return speed, slope, slope - 0.5 * float(np.log1p(noise / variance)) / length
 
 
 def _substep(
-    prepared: Prepared, later: _Psi, start: float, first: float, last: float, inside: np.ndarray, rates: np.ndarray
-) -> tuple[Attempt, _Psi]:
+    prepared: Prepared, later: Psi, start: float, first: float, last: float, inside: np.ndarray, rates: np.ndarray,
+    stands: bool,
+) -> tuple[Attempt, Psi]:  # fmt: skip
     """Return psi before the part from start + first to start + last of an interval."""
     window, points = later.window, lw.index(later.window.size)
-    theta, length, spacing, derivative = prepared.theta.real, last - first, window.spacing, later.slope + later.curvature * points
-    x = window.origin + window.centre + spacing * np.array([0.0, -1.0, 1.0])
-    speed, below, above = finite(prepared.system.drift(x[:, None], start + last, theta)[:, 0]).tolist()
-    slope = (above - below) / (2.0 * spacing)
-    noise = covariance_at(prepared.system, x[:1], start + last, theta).reshape(-1)[0] * length
-    variance = lw.moments(later.values, window)[1]
-    growth = slope - 0.5 * float(np.log1p(noise / variance)) / length  # that of the width of psi
+    length, spacing, (_, derivative, curvature) = last - first, window.spacing, later.gauges
+    variance = float(lw.moments(later.values.real, window)[1])
+    speed, slope, growth = _flow(prepared, window.origin + window.centre, spacing, variance, start + last, length)
+    scaled = later.scaled * float(np.exp(-slope * length))
+    if stands:
+        speed, slope, growth = 0.0, 0.0, 0.0
 
     def place(times: Array) -> tuple[Array, Array, Array]:
         """Return m - m(t), m' and s at times after the end."""
@@ -180,14 +212,13 @@ def _substep(
         f, G, V, constant = coefficients(prepared, window, times, inside, rates, later.values, shifts)
         d = (f - velocity) / (s * spacing) - growth * points
         g = G.reshape(len(times), -1) / (s * spacing) ** 2
-        added = (0.5 * g * derivative - d) * derivative - 0.5 * g * later.curvature
+        added = (0.5 * g * derivative - d) * derivative - 0.5 * g * curvature
         return d - g * derivative, g if G.ndim > 1 else g[:, 0], V + added, constant
 
     by, _, s = place(np.array([-length]))
     unit = lw.Window(0.0, 0.0, 1.0, window.size, False, 1.0)
-    attempt = magnus(prepared, later.values, unit, Substep(start + first, length, inside, rates), at, True, True)
-    total = float(np.sum(attempt.values))
+    attempt = magnus(prepared, later.values, unit, Substep(start + first, length, inside, rates), at, True, not stands)
+    total = float(np.sum(attempt.values.real))
     before = window._replace(centre=window.centre + float(by[0]), spacing=spacing * float(s[0]))
     scale = later.scale + float(attempt.offset) + float(np.log(total))
-    scaled = later.scaled * float(np.exp(-slope * length))
     return attempt, later._replace(values=attempt.values / total, window=before, scale=scale, scaled=scaled)

@@ -1,9 +1,10 @@
 """A message of one state over one interval, backward in time, where the compiled loop does not take it.
 
 A Gaussian kernel is a sum over a grid.  On the circle the transposed exponentials of the filter act (`line/transposed.py`), on
-the line a grid that moves (`line/gauged.py`) where other increments act within or the drift carries the density.  Else, where no
-coefficient depends on t, a grid covers the support of the message at the end of the interval, that of the density at its start,
-and the paths between them; psi is moved by its decomposition.  All else is for finite volumes (`line/volumes.py`).
+the line a grid that moves (`line/gauged.py`) where the drift carries the density.  Else, where no coefficient depends on t and no
+increments act within, a grid covers the support of the message at the end of the interval, that of the density at its start, and
+the paths between them; psi is moved by its decomposition.  Else grids stand (`line/gauged.py`).  Other intervals are for finite
+volumes (`line/volumes.py`).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line.course import course_of, ends_of
 from zakai.methods.line.gauge import gauged
-from zakai.methods.line.gauged import by_moving_grid
+from zakai.methods.line.gauged import by_moving_grid, by_standing_grids
 from zakai.methods.line.message import FEWEST, Message, covering, points_of, reliable, support, taper
 from zakai.methods.line.moves import Report
 from zakai.methods.line.moving import travel
@@ -70,13 +71,15 @@ def pulled(
         if dense is not None:
             return dense
     interval = float(prepared.schedule.starts[k]), float(prepared.lengths[k])
-    dense = None
-    if not later.closed and (inside.any() or travel(prepared, np.asarray(state.values), own, *interval) > 0.0):
-        dense = by_moving_grid(prepared, k, inside, rates, state, later, accepted)
+    arguments, dense = (prepared, k, inside, rates, state, later, accepted), None
+    if travel(prepared, np.asarray(state.values), own, *interval) > 0.0:
+        dense = by_moving_grid(*arguments)
         if dense is not None and dense[1] <= smoothing_tolerance(prepared):
             return dense
-    found = _by_modes(prepared, k, inside, state, ends, later)
-    found = found or _by_volumes(prepared, k, inside, rates, state, ends, later)
+    found = _by_modes(prepared, k, inside, state, ends, later) or by_standing_grids(*arguments)
+    if found is not None:
+        return found
+    found = _by_volumes(prepared, k, inside, rates, state, ends, later)
     return dense if dense is not None and dense[1] < found[1] else found
 
 
@@ -150,7 +153,7 @@ def _psi(later: Message, window: lw.Window, gauge: Array) -> tuple[Array, float]
     """Return the values of psi on a grid times its spacing, divided by the exponential of the second number."""
     finer = window.spacing > 1.01 * later.spacing
     fine = covering(later.window, *later.ends, later.spacing) if finer else window
-    logs = later.at(fine.offsets) + (local_polynomial(gauge, window, fine.offsets) if finer else gauge)
+    logs = later.falling(fine.offsets) + (local_polynomial(gauge, window, fine.offsets) if finer else gauge)
     top = float(np.max(logs))
     values = fine.spacing * np.exp(logs - top) * taper(fine.offsets, later.ends, fine.spacing)
     # Integrals of psi with what the coarse grid resolves.
