@@ -34,7 +34,7 @@ ROUGH = 1e-3  # of the tolerance that noise of psi may leave
 MOST_GRIDS = 7  # that are finer or wider
 STANDS = 1.0  # deviations by which a message may move and change its width on a grid that stands
 BEYOND = 1.3  # length of such a grid, in ranges of the product
-MOST_PARTS = 48  # of an interval
+MOST_PARTS = 16  # of an interval
 NOISE = -32.0  # logarithm of the error of small values of a density within an interval, relative to the largest
 
 
@@ -174,7 +174,8 @@ def _parts(prepared: Prepared, later: Message, time: float, length: float) -> in
     """Return in how many parts grids stand while an interval that ends at a time is taken back."""
     variance = later.deviation**2
     speed, _, growth = _flow(prepared, later.origin + later.mean, 0.1 * later.deviation, variance, time, length)
-    return int(np.ceil(min(length * (abs(speed) / later.deviation + abs(growth)) / STANDS, MOST_PARTS + 1.0)))
+    count = length * (abs(speed) / later.deviation + abs(growth)) / STANDS
+    return max(int(np.ceil(count)), 1) if count <= MOST_PARTS else MOST_PARTS + 1  # NaN too
 
 
 def _flow(prepared: Prepared, x: float, apart: float, variance: float, time: float, length: float) -> tuple[float, float, float]:
