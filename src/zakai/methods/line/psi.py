@@ -75,8 +75,6 @@ def placed(later: Message, centre: float, deviation: float, spacing: float, reac
     at, logs = (inner - centre) / (spacing * deviation), later.at(inner)
     if not np.isfinite(logs).all():
         return None
-    if not np.isfinite(logs).all():
-        return None
     c2, c1, c0 = np.polyfit(at, logs, 2, w=np.exp(-0.25 * z * z))
     curvature = min(-1.0 - 2.0 * c2, 0.0)
     gauges = np.stack([z * (0.5 * curvature * z - c1), curvature * z - c1, np.full(len(z), curvature)])
