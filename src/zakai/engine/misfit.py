@@ -60,7 +60,8 @@ def notes_on_law(model: Model, theta: Array, schedule: Schedule, values: Array, 
     if infinite:
         return [
             f"observation_log_density has no finite mass over {infinite!r}: it is no density of {infinite!r}, and the "
-            f"log-likelihood has no meaning; subtract the logarithm of its integral over {infinite!r}"
+            f"log-likelihood has no meaning; subtract the logarithm of its integral over {infinite!r} (of a count: of its "
+            "sum over all counts; then this note does not apply)"
         ]
     return _note_on_misfits(misfits(model, theta, schedule, values, infos), schedule.stops)
 
