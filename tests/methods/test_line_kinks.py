@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 from tests.references.graded import posterior
 
 import zakai
@@ -162,3 +163,31 @@ def test_a_jump_of_a_likelihood_that_no_grid_resolves_does_not_widen_the_grid(me
         deviation = np.sqrt(p @ (x - p @ x) ** 2)
         assert abs(result.mean[k, 0] - p @ x) < 0.03 * deviation
         assert abs(np.sqrt(result.variance[k, 0]) / deviation - 1.0) < 0.03
+
+
+@pytest.mark.parametrize("drift", ["push(x)", "max(-x, -x/2 - 1/2)"])
+def test_a_drift_with_kinks_that_contracts_a_broad_prior(drift):
+    nodes, heights = np.linspace(-4.0, 4.0, 9), np.array([6.0, 3.0, -1.0, -1.0, 0.0, 1.0, 1.0, -3.0, -6.0])
+    lengths = [0.7, 0.1, 0.1, 0.3, 0.7, 0.1, 0.1, 0.3]
+    values = [1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]
+    model = zakai.Model(
+        state=["x"], drift=[drift], diffusion=[["3/5"]], observation=["1/(1 + exp(-x))"], observation_kind="samples",
+        observation_family="bernoulli", tables={"push": (nodes, heights)},
+        prior={"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record(np.cumsum(lengths), values, "samples"))
+    x, h, G = np.linspace(-6.5, 6.5, 651), 0.02, 0.36
+    between = 0.5 * (x[1:] + x[:-1])
+    f = np.interp(between, nodes, heights) if "push" in drift else np.maximum(-between, -between / 2 - 0.5)
+    # Scharfetter and Gummel's fluxes between cells, which are exact where f is constant.
+    to, back = (0.5 * G / h**2 * u / np.expm1(u) for u in (-2.0 * f * h / G - 1e-12, 2.0 * f * h / G + 1e-12))
+    rates = np.diag(to, -1) + np.diag(back, 1)
+    rates -= np.diag(rates.sum(axis=0))
+    known = {length: expm(length * rates) for length in set(lengths)}
+    p, chance = np.exp(-0.5 * x**2), 1.0 / (1.0 + np.exp(-x))
+    for k, (length, value) in enumerate(zip(lengths, values, strict=True), 1):
+        p = known[length] @ (p / p.sum()) * (chance if value else 1.0 - chance)
+        p = p / p.sum()
+        deviation = np.sqrt(p @ (x - p @ x) ** 2)
+        assert abs(result.mean[k, 0] - p @ x) < 2e-3 * deviation
+        assert abs(np.sqrt(result.variance[k, 0]) / deviation - 1.0) < 2e-3

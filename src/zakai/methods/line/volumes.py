@@ -36,10 +36,10 @@ SMOOTH = 1e-7  # error of a backward interval at which more cells are not taken
 
 
 def rough(prepared: Prepared, inside: np.ndarray) -> bool:
-    """Return whether coefficients have kinks or jumps with which a uniform grid has no decomposition of the operator."""
+    """Return whether coefficients have kinks or jumps, which without a decomposition leave waves on a uniform grid."""
     system = prepared.system
     needed = system.varying or bool(inside.any()) or system.slope is None or system.spread is None
-    return needed and system.kinks is not None
+    return (needed or (system.kinked_drift and not prepared.weak)) and system.kinks is not None
 
 
 def contracted(
@@ -73,7 +73,8 @@ def contracted(
         return None
 
     # Cells do not bring back what the grid does not resolve.
-    allowed = max(SHARE * prepared.tolerance, SHARE * lw.figures(values, False, prepared.negligible).aliasing)
+    unresolved = lw.figures(values, False, prepared.negligible).aliasing  # where the density is smaller, it may not end
+    allowed = SHARE * max(prepared.tolerance, unresolved)
 
     def density(offsets: Array) -> Array:
         return lw.density_at(values, window, offsets)
@@ -83,7 +84,7 @@ def contracted(
         return None
     masses, cells, gained, error = found
     after = np.abs((masses / cells.widths).real)
-    if max(after[0], after[-1]) > EDGE * np.max(after):  # the cells do not hold it
+    if max(after[0], after[-1]) > max(EDGE, unresolved) * np.max(after):  # the cells do not hold it
         return None
     report.time, report.noise = report.time + error + course.unresolved, max(report.noise, min(error, 1.0))
     resampled = _resampled(prepared, cells, masses, window, error)
