@@ -17,5 +17,5 @@ def test_noise_of_correlated_states_spreads_a_gaussian():
         inner = ((grid.points @ np.linalg.inv(cov)) * grid.points).sum(axis=1)
         return np.exp(-0.5 * inner).reshape(grid.sizes) / np.sqrt(np.linalg.det(cov))
 
-    result = diffused(gaussian(start), grid, np.broadcast_to(noise, (128 * 128, 2, 2)), 0.5)
+    result = diffused(gaussian(start), grid, np.broadcast_to(0.5 * noise, (128 * 128, 2, 2)))
     np.testing.assert_allclose(result, gaussian(start + 0.5 * noise), atol=1e-9)

@@ -26,7 +26,7 @@ from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.space.average import panel_rule
 from zakai.numerics.space.grid import Grid
-from zakai.numerics.space.transport import Factor
+from zakai.numerics.space.splitting import Factor
 
 Array = Any
 

@@ -17,7 +17,8 @@ from zakai.numerics.complex_step import is_complex, log_determinant
 from zakai.numerics.space.average import average, panel_rule
 from zakai.numerics.space.field import Field, cut_off
 from zakai.numerics.space.grid import Grid
-from zakai.numerics.space.transport import Dynamics, Factor, weighed
+from zakai.numerics.space.splitting import Factor, weighed
+from zakai.numerics.space.transport import Dynamics
 from zakai.numerics.space.window import Bounds
 from zakai.records.schedule import Schedule
 

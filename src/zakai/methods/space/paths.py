@@ -1,6 +1,6 @@
 """Draws of the state at the start of an interval given that at its end, for two to four states on a grid.
 
-They go back through the substeps of the filter (`numerics/space/transport.py`).  A characteristic leads back without noise.  Of
+They go back through the substeps of the filter (`numerics/space/splitting.py`).  A characteristic leads back without noise.  Of
 y in z = y + N(0, C), z with density w, the conditional mean and covariance are (Tweedie's formula)
 
     E[y | z] = z + C grad log w(z),      Cov[y | z] = C + C (Hess log w)(z) C,
@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from zakai.densities._density import wrap
-from zakai.numerics.space.diffusion import diffused
 from zakai.numerics.space.field import Field
-from zakai.numerics.space.grid import filtered, spread
+from zakai.numerics.space.grid import filtered
 from zakai.numerics.space.resample import padded
 from zakai.numerics.space.spline import gather
+from zakai.numerics.space.splitting import noise_of, spread_before, weighed
 from zakai.numerics.space.step import Stepper, Substep
-from zakai.numerics.space.transport import moved_points, weighed
+from zakai.numerics.space.transport import moved_points
 from zakai.numerics.space.window import Bounds, padded_sizes
 
 Array = Any
@@ -50,28 +50,26 @@ def _through(
 ) -> tuple[Array, float]:
     """Return draws at the start of a substep between two densities given those at its end."""
     dynamics, (t0, t1), bounds = stepper.dynamics, one.times, stepper.bounds
-    sizes = padded_sizes(begin.values, begin.grid, one.linear.before.real, bounds)
-    values, grid = padded(begin.values, begin.grid, sizes)
+    values, grid = begin.values, begin.grid
+    if dynamics.diffusion is None:
+        values, grid = padded(values, grid, padded_sizes(values, grid, one.linear.before.real, bounds))
     after = end.values
     if one.potential is not None:
         after, _ = weighed(after, -one.potential(end.grid, t0, t1, True).log / 6)
         values, _ = weighed(values, one.potential(grid, t0, t1, False).log / 6)
-    if dynamics.diffusion is None:
-        before = spread(values, grid, one.linear.before)
-    else:
-        before = diffused(values, grid, dynamics.diffusion(grid.points, 0.5 * (t0 + t1)), 0.5 * (t1 - t0))
+    before = Field(*spread_before(values, grid, dynamics, one.linear, one.times, bounds), 0.0)
     inside, moved = np.zeros(len(z), bool), np.zeros_like(z)
-    centre, root, last = _law(stepper, one, 0.5 * one.linear.noise, end._replace(values=after), z)
+    centre, root, last = _law(stepper, one, True, end._replace(values=after), z)
     for _ in range(TRIES):  # no characteristic leads from the grid to the others
         rest = np.flatnonzero(~inside)
         z[rest] = _drawn(centre[rest], root[rest], rng)
-        moved[rest] = z[rest] + moved_points(dynamics, z[rest], t1, t0, one.steps)[:, : grid.n]
-        index = wrapped(moved[rest] - grid.centre, bounds.periodic) @ grid.inverse.T
-        inside[rest] = ((np.abs(index) <= 0.5 * grid.shape) | grid.circles).all(axis=1)
+        moved[rest] = z[rest] + moved_points(dynamics, z[rest], t1, t0, one.steps)[:, : before.grid.n]
+        index = wrapped(moved[rest] - before.grid.centre, bounds.periodic) @ before.grid.inverse.T
+        inside[rest] = ((np.abs(index) <= 0.5 * before.grid.shape) | before.grid.circles).all(axis=1)
         if inside.all():
             break
-    moved[~inside] = grid.centre + begin.survey(bounds).mean
-    centre, root, first = _law(stepper, one, one.linear.before, Field(before, grid, 0.0), moved)
+    moved[~inside] = begin.grid.centre + begin.survey(bounds).mean
+    centre, root, first = _law(stepper, one, False, before, moved)
     departure = max(first, last) if np.mean(inside) > RELIABLE else np.inf
     return wrapped(_drawn(centre, root, rng), bounds.periodic), departure
 
@@ -80,23 +78,23 @@ def _drawn(centre: Array, root: Array, rng: np.random.Generator) -> Array:
     return centre + np.einsum("pij,pj->pi", root, rng.standard_normal(centre.shape))
 
 
-def _law(stepper: Stepper, one: Substep, cov: Array, w: Field, z: Array) -> tuple[Array, Array, float]:
+def _law(stepper: Stepper, one: Substep, last: bool, w: Field, z: Array) -> tuple[Array, Array, float]:
     """Return the means (P, n) and the roots of the covariances (P, n, n) of y given z = y + noise of density w.
 
     The third is the root mean square of the skewness.
     """
     bounds = stepper.bounds
     z, change, shift = wrapped(z, bounds.periodic), 0.0, np.zeros_like(z)
-    diffusion, (t0, t1) = stepper.dynamics.diffusion, one.times
-    if diffusion is None:
+    noise = noise_of(stepper.dynamics, one.linear, one.times, last)
+    if noise is None:
+        cov = 0.5 * one.linear.noise if last else one.linear.before
         root = np.broadcast_to(_root(cov), (len(z), *cov.shape))
     else:
-        middle, half = 0.5 * (t0 + t1), 0.5 * (t1 - t0)
-        root = _root(half * diffusion(z, middle).real)
+        root = _root(noise(z).real)
         steps = np.diag(NEAR * np.linalg.norm(w.grid.basis, axis=1))
-        slopes = np.stack([(diffusion(z + h, middle) - diffusion(z - h, middle)).real / (2 * h.sum()) for h in steps], axis=-1)
-        shift, inverse = half * np.einsum("pijj->pi", slopes), np.linalg.pinv(root, rcond=1e-6)
-        change = np.sum((half * np.einsum("pki,pijd,pdk,pkj->pk", inverse, slopes, root, inverse)) ** 2, axis=1)
+        slopes = np.stack([(noise(z + h) - noise(z - h)).real / (2 * h.sum()) for h in steps], axis=-1)
+        shift, inverse = np.einsum("pijj->pi", slopes), np.linalg.pinv(root, rcond=1e-6)
+        change = np.sum(np.einsum("pki,pijd,pdk,pkj->pk", inverse, slopes, root, inverse) ** 2, axis=1)
     slope, curvature, third = _derivatives(w, z, root, bounds)
     values, vectors = np.linalg.eigh(np.eye(z.shape[1]) + curvature)
     skewness = np.sum(np.minimum(third**2, 1.0), axis=1) + np.minimum(change, 1.0)

@@ -1,4 +1,4 @@
-"""One substep of the backward Kolmogorov equation on grids: the adjoint of the splitting of `space/transport.py`.
+"""One substep of the backward Kolmogorov equation on grids: the adjoint of the splitting of `space/splitting.py`.
 
     -b_t = f . grad b + G : Hess b / 2 + V b
 
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from zakai.numerics.space.function import MOST, REACH, Function, blurred, cropped, evaluated, weighed
 from zakai.numerics.space.grid import Grid, rounded_size
 from zakai.numerics.space.spline import gather, relative_index
-from zakai.numerics.space.step import Potential
-from zakai.numerics.space.transport import Dynamics, Factor, Linearisation, moved_points
+from zakai.numerics.space.splitting import Factor, Potential, noise_of
+from zakai.numerics.space.transport import Dynamics, Linearisation, moved_points
 
 Array = NDArray[Any]
 FARTHEST = 3.0  # deviations between neighbours up to which a grid resolves a function
@@ -84,7 +84,7 @@ class Adjoint:
         if after is not None:
             values, gained = weighed(values, after.log / 6)
             self.top += gained
-            values, grid = blurred(values, core, cov, tilt, False, self._noise(core))
+            values, grid = blurred(values, core, cov, tilt, False, self._noise(core, True))
             if np.array_equal(grid.basis, core.basis):
                 values = cropped(values, core.sizes)
             else:
@@ -94,15 +94,15 @@ class Adjoint:
             self.top += gained
             self.coefficients, self.grid = blurred(values, core, 0.0 * cov, tilt, True, None)
         else:
-            self.coefficients, self.grid = blurred(values, core, cov, tilt, True, self._noise(core))
+            self.coefficients, self.grid = blurred(values, core, cov, tilt, True, self._noise(core, True))
         self.core = core.sizes if np.array_equal(core.basis, self.grid.basis) else self.grid.sizes
 
     def _factor(self, grid: Grid, end: bool) -> Factor | None:
         return None if self.potential is None else self.potential(grid, *self.times, end)
 
-    def _noise(self, grid: Grid) -> tuple[Array, float] | None:
-        diffusion, (t0, t1) = self.dynamics.diffusion, self.times
-        return None if diffusion is None else (diffusion(grid.points, 0.5 * (t0 + t1)), 0.5 * (t1 - t0))
+    def _noise(self, grid: Grid, end: bool) -> Array | None:
+        noise = noise_of(self.dynamics, self.linear, self.times, end)
+        return None if noise is None else noise(grid.points)
 
     def rough(self, grid: Grid) -> Array:
         """Return the logarithms (*sizes) without the first half of the noise and of the potential."""
@@ -125,7 +125,7 @@ class Adjoint:
         if before is not None:
             logs = logs + before.log / 3 + before.correction
         values, top = weighed(np.ones(wide.sizes), logs - (wide.offsets @ tilt).reshape(wide.sizes))
-        values, wide = blurred(values, wide, cov, tilt, not same, self._noise(wide), whole=True)
+        values, wide = blurred(values, wide, cov, tilt, not same, self._noise(wide, False), whole=True)
         if same:
             values = cropped(values, target.sizes)
         else:

@@ -17,7 +17,8 @@ from zakai.numerics.space.field import (
     Report,
     positive,
 )
-from zakai.numerics.space.step import Potential, Stepper
+from zakai.numerics.space.splitting import Potential
+from zakai.numerics.space.step import Stepper
 
 Array = NDArray[Any]
 MOST_PARTS, MOST_WORK = 512, 2**22  # substeps of an interval, and substeps times points

@@ -1,4 +1,4 @@
-"""Short substeps on a grid that stays where it is: the splitting of `space/transport.py`, without its linearised noise.
+"""Short substeps on a grid that stays where it is: the splitting of `space/splitting.py`, without its linearised noise.
 
 What depends on the grid alone is prepared once, for intervals of any length: along the characteristics that end in a point the
 displacement and the change of volume are polynomials in the length, of degree five, that interpolate two Runge-Kutta steps.

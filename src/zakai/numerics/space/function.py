@@ -142,22 +142,21 @@ def _narrow_spread(values: Array, grid: Grid, cov: Array) -> tuple[Array, Grid, 
 
 
 def blurred(
-    values: Array, grid: Grid, cov: Array, tilt: Array, spline: bool, noise: tuple[Array, float] | None, whole: bool = False
+    values: Array, grid: Grid, cov: Array, tilt: Array, spline: bool, noise: Array | None, whole: bool = False
 ) -> tuple[Array, Grid]:
-    """Return c' spread by N(0, cov), or by noise at the points of its grid; with `spline`, its coefficients.
+    """Return c' spread by N(0, cov), or by noise (J, n, n) at the points of its grid; with `spline`, its coefficients.
 
     The result is on the grid, continued, or, unless it is wanted as a `whole`, on a coarser one where the noise is much wider.
     """
     inverse, values = grid.inverse, _least(values)
     if noise is not None:
-        at, time = noise
-        largest = at[np.argmax(np.trace(inverse @ at @ inverse.T, axis1=1, axis2=2))]
-        sizes = _margins(grid, (0.0 if whole and spline else time) * inverse @ largest @ inverse.T)
+        largest = noise[np.argmax(np.trace(inverse @ noise @ inverse.T, axis1=1, axis2=2))]
+        sizes = _margins(grid, (0.0 if whole and spline else 1.0) * inverse @ largest @ inverse.T)
         first = [new // 2 - old // 2 for old, new in zip(grid.sizes, sizes, strict=True)]
         ends = [(a, new - old - a) for a, old, new in zip(first, grid.sizes, sizes, strict=True)]
-        wide = np.pad(at.reshape(*grid.sizes, grid.n, grid.n), [*ends, (0, 0), (0, 0)], mode="edge")
+        wide = np.pad(noise.reshape(*grid.sizes, grid.n, grid.n), [*ends, (0, 0), (0, 0)], mode="edge")
         grid, cov = grid._replace(sizes=sizes), np.zeros_like(cov)
-        values = diffused(continued(values, sizes), grid, wide.reshape(-1, grid.n, grid.n), time, adjoint=True)
+        values = diffused(continued(values, sizes), grid, wide.reshape(-1, grid.n, grid.n), adjoint=True)
         return (filtered(values, cov, spline=True) if spline else values), grid
     shift, cov = cov @ tilt, inverse @ cov @ inverse.T
     if not spline and not np.any(cov):

@@ -1,12 +1,11 @@
 """Substeps of the Kolmogorov forward equation on grids that follow the mass, with an estimate of the error.
 
-A substep is the symmetric splitting of `space/transport.py`, of order two.  Taken once and in two halves it gives an estimate of
+A substep is the symmetric splitting of `space/splitting.py`, of order two.  Taken once and in two halves it gives an estimate of
 its error and, extrapolated in the logarithm, a result of order four.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -14,35 +13,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.space.field import (
-    ACCEPTED,
     Field,
     Report,
     better,
     extrapolated,
     finer_by,
-    finer_field,
     grid_report,
     moments_difference,
     positive,
     refinable,
 )
 from zakai.numerics.space.grid import Grid, filtered
-from zakai.numerics.space.resample import padded
+from zakai.numerics.space.splitting import Potential, Source, after_motion, before_motion
 from zakai.numerics.space.survey import deviations_in_spacings, narrowest, survey
 from zakai.numerics.space.transport import (
     Dynamics,
-    Factor,
     Linearisation,
-    characteristics,
     linearised,
     moved_points,
     steps_needed,
-    transported,
 )
-from zakai.numerics.space.window import LEAST, Bounds, adjusted, enlargement, fitted_grid, padded_sizes
+from zakai.numerics.space.window import LEAST, Bounds, adjusted, enlargement, fitted_grid
 
 Array = NDArray[Any]
-Potential = Callable[[Grid, float, float, bool], Factor]  # at the start (False) or the end (True) of a substep
 SUPPORT = 400  # points that are moved to see where a density goes
 FEW = 64  # points that show how many Runge-Kutta steps a short substep needs
 TRIES = 7
@@ -91,14 +84,16 @@ class Stepper:
             middle = mean + 0.5 * (t1 - t0) * drift(mean[None], t0)[0, :-1].real
             jacobian = self.dynamics.jacobian(middle[None], 0.5 * (t0 + t1))[0]
         jacobian = jacobian if np.all(np.isfinite(jacobian)) else np.zeros_like(jacobian)
-        noises = [self.dynamics.noise(a, b) for a, b in pairwise(times)]
-        if self.dynamics.diffusion is not None:
+        responds = self.dynamics.diffusion is not None
+        if responds:
             largest = self._largest_noise(mean, found.cov, 0.5 * (t0 + t1))
-            noises = [(largest, 0.5 * largest) for _ in noises]
+            noises = [(largest, 0.5 * largest) for _ in times[1:]]
+        else:
+            noises = [self.dynamics.noise(a, b) for a, b in pairwise(times)]
         linears: list[Linearisation] = []
         for i, ((a, b), noise) in enumerate(zip(pairwise(times), noises, strict=True)):
             same = i > 0 and b - a == times[i] - times[i - 1] and all(map(np.array_equal, noise, noises[i - 1]))
-            linears.append(linears[-1] if same else linearised(jacobian, *noise, b - a, t1 - t0, grid.basis))
+            linears.append(linears[-1] if same else linearised(jacobian, *noise, b - a, t1 - t0, grid.basis, responds))
         self._linearised = field.values, times, linears
         return linears
 
@@ -111,13 +106,6 @@ class Stepper:
         own = np.diagonal(noise[0])
         scale = np.sqrt(variances / np.where(own > 0, own, 1.0))
         return np.asarray(np.where(np.eye(len(mean)) > 0, variances, noise[0] * np.outer(scale, scale)))
-
-    def _noises(self, source: Grid, target: Grid, t0: float, t1: float) -> tuple[Array, Array, float] | None:
-        """Return G at the points of both grids and half of the substep, where the noise depends on the state."""
-        diffusion, t = self.dynamics.diffusion, 0.5 * (t0 + t1)
-        if diffusion is None:
-            return None
-        return diffusion(source.points, t), diffusion(target.points, t), 0.5 * (t1 - t0)
 
     def _moves(self, field: Field, times: tuple[float, ...]) -> list[_Move]:
         """Choose the target grids of substeps that follow each other by moving points of the density."""
@@ -167,9 +155,12 @@ class Stepper:
         needed = np.maximum((used[:, 1] - used[:, 0] + 4) * np.minimum(self.bounds.spacings / widths, 1.0), LEAST[grid.n])
         return bool(np.prod(np.minimum(needed / grid.shape, 1.0)) > 0.55)
 
-    def _apply(
+    def _before(self, field: Field, t0: float, t1: float, linear: Linearisation, potential: Potential | None) -> Source:
+        return before_motion(field, self.dynamics, linear, (t0, t1), potential, self.bounds)
+
+    def _after(
         self,
-        field: Field,
+        source: Source,
         t0: float,
         t1: float,
         move: _Move,
@@ -180,18 +171,8 @@ class Stepper:
 
         `begun` is their displacement from the end to a time in between.
         """
-        goal = move.target
-        sizes = padded_sizes(field.values, field.grid, move.linear.before.real, self.bounds)
-        tails = field.survey(self.bounds).tails
-        field = Field(*padded(field.values, field.grid, sizes), field.log_scale)
-        if self.bounds.finer > 1.0:
-            field = finer_field(field, np.where(tails > ACCEPTED * self.bounds.tail, 1.0, self.bounds.finer), self.bounds)
-        moved = characteristics(self.dynamics, field.grid, goal, t0, t1, move.steps, self.bounds.periodic, begun)
-        before = potential(field.grid, t0, t1, False) if potential else None
-        after = potential(goal, t0, t1, True) if potential else None
-        noises = self._noises(field.grid, goal, t0, t1)
-        values, top = transported(field.values, field.grid, goal, moved, move.linear, self.bounds.periodic, before, after, noises)
-        return Field(values, goal, field.log_scale + top), moved
+        dynamics, bounds = self.dynamics, self.bounds
+        return after_motion(source, move.target, dynamics, move.linear, move.steps, (t0, t1), potential, bounds, begun)
 
     def limit(self, field: Field, t0: float, t1: float) -> float:
         """Return the end, at most t1, of the longest substep by whose noise a density can be spread on a few times its grid."""
@@ -205,14 +186,14 @@ class Stepper:
     def _moved(
         self, field: Field, t0: float, t1: float, move: _Move, potential: Potential | None, tails: Array
     ) -> tuple[Field, Array, Report]:
-        """Return the density after one substep on a grid that fits it, as `_apply`, and the errors of the grid.
+        """Return the density after one substep on a grid that fits it, as `_after`, and the errors of the grid.
 
         `tails` (n,) are those of the density at the start of the interval, which no finer grid has made smaller.
         """
-        n, reach = field.grid.n, self.bounds.reach
+        n, reach, source = field.grid.n, self.bounds.reach, self._before(field, t0, t1, move.linear, potential)
         before, best, coarse, ratio, smallest = np.ones(n), None, np.zeros(n, bool), np.ones(n), np.inf
         for attempt in range(TRIES):
-            result, moved = self._apply(field, t0, t1, move, potential)
+            result, moved = self._after(source, t0, t1, move, potential)
             found = result.survey(self.bounds)
             report, wide = grid_report(found, self.bounds.finer), found.edges > 3 * self.bounds.edge
             # A finer grid may have the same tails, and a wider one that has no more points the noise of its spacings.
@@ -254,7 +235,8 @@ class Stepper:
 
     def replayed(self, field: Field, one: Substep) -> Field:
         """Return the density after a substep that was taken, from another one at its start."""
-        result, _ = self._apply(field, *one.times, _Move(one.linear, one.steps, one.end), one.potential)
+        source = self._before(field, *one.times, one.linear, one.potential)
+        result, _ = self._after(source, *one.times, _Move(one.linear, one.steps, one.end), one.potential)
         return positive(result, self.bounds)
 
     def single(self, field: Field, t0: float, t1: float, potential: Potential | None) -> tuple[Field, Report]:
@@ -290,7 +272,8 @@ class Stepper:
             Substep(half, (middle, t1), two.linear, two.steps, potential, fine.grid),
         )
         whole = _Move(one.linear.then(two.linear), one.steps, fine.grid)
-        coarse, _ = self._apply(field, t0, t1, whole, potential, (middle, moved))
+        source = self._before(field, t0, t1, whole.linear, potential)
+        coarse, _ = self._after(source, t0, t1, whole, potential, (middle, moved))
         fine = positive(fine, self.bounds)
         values, difference = extrapolated(fine.values, coarse.values, coarse.log_scale - fine.log_scale)
         # Moments differ by a few times as much as densities; by more only where rounding far away counts.

@@ -1,13 +1,4 @@
-"""One substep of the Kolmogorov forward equation on grids, with a potential: a symmetric splitting.
-
-    u_t = -div(f u) + G : Hess u / 2 + V u
-
-    exp(b/6) D' exp(b/3 - tau g/144) T exp(b/3 - tau g/144) D exp(b/6),     b = integral of V,  g = grad b . G grad b
-
-T moves along the characteristics of f, exactly but for the interpolation.  D' and D spread by the two halves of the noise of the
-system that is linearised at the mean, so that the splitting is exact for linear f and V = 0, singular G included; the factors
-are Chin's (1997), of fourth order where diffusion and V alone do not commute.  The splitting is symmetric, of order two.
-"""
+"""The motion of points along the characteristics of a drift, and the linearised system that goes with it."""
 
 from __future__ import annotations
 
@@ -20,16 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.formula_kernel import Formulas
-from zakai.numerics.space.diffusion import diffused
-from zakai.numerics.space.grid import Grid, filtered, inverted, spread, transformed
-from zakai.numerics.space.spline import gather, relative_index
+from zakai.numerics.space.grid import Grid, inverted, transformed
 
 Array = NDArray[Any]
 _TERMS = 18
 _LARGEST = 4.0  # of tau L
 _MOST_STEPS = 256
 _TOGETHER = 2**15  # points that are moved together: many more take memory, and time to fetch it
-_LARGEST_VOLUME = 300.0  # nats; points beyond come from outside of the grid
 
 
 class Dynamics(NamedTuple):
@@ -140,10 +128,14 @@ def _fastest(drift: Callable[[Array, Any], Array], x: Array, t0: float, t1: floa
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """Phi and the noise Q of a linear system over an interval."""
+    """Phi and the noise Q of a linear system over an interval.
+
+    Q is linear in G: `response` (n^2, n^2) has that of each element of G, where the noise depends on the state.
+    """
 
     map: Array
     noise: Array
+    response: Array | None = None
 
     @cached_property
     def before(self) -> Array:
@@ -151,15 +143,30 @@ class Linearisation:
         inverse = inverted(self.map)
         return np.asarray(0.5 * inverse @ self.noise @ inverse.T)
 
+    def halves(self, noise: Array, end: bool) -> Array:
+        """Return the half of Q for each of several G (J, n, n), before (False) or after (True) the motion."""
+        assert self.response is not None
+        half = 0.5 * self.response
+        if not end:
+            inverse = inverted(self.map)
+            half = np.kron(inverse, inverse) @ half
+        return np.asarray((noise.reshape(len(noise), -1) @ half.T).reshape(noise.shape))
+
     def then(self, other: Linearisation) -> Linearisation:
         """Return the linear system over both intervals."""
-        return Linearisation(other.map @ self.map, other.map @ self.noise @ other.map.T + other.noise)
+        response = None
+        if self.response is not None and other.response is not None:
+            response = np.kron(other.map, other.map) @ self.response + other.response
+        return Linearisation(other.map @ self.map, other.map @ self.noise @ other.map.T + other.noise, response)
 
 
-def linearised(matrix: Array, mean: Array, falling: Array, tau: float, span: float, basis: Array) -> Linearisation:
+def linearised(
+    matrix: Array, mean: Array, falling: Array, tau: float, span: float, basis: Array, responds: bool = False
+) -> Linearisation:
     """Return exp(tau L) and the integral of exp((tau - s) L) G exp((tau - s) L') for averages of G and of (1 - s) G.
 
-    Where the eigenvalues of L times the span are large L is reduced: it is a means to a smaller error of the splitting only.
+    With `responds` the result has the `response` to each element of G. Where the eigenvalues of L times the span are large L is
+    reduced: it is a means to a smaller error of the splitting only.
     """
     size = np.abs(inverted(basis) @ matrix.real @ basis).sum(axis=1).max()
     rate = span * np.abs(np.linalg.eigvals(matrix.real)).max() if span * size > _LARGEST else 0.0
@@ -179,10 +186,17 @@ def linearised(matrix: Array, mean: Array, falling: Array, tau: float, span: flo
     if doublings == 0:
         uneven = 2.0 * falling - mean
         noise = noise + 0.5 * tau**2 * (L @ uneven + uneven @ L.T)
+    response, rate = None, np.kron(step * L, one[:n, :n]) + np.kron(one[:n, :n], step * L)
+    if responds:
+        response = unit = np.eye(n * n)
+        for k in range(_TERMS, 1, -1):
+            response = unit + (rate / k) @ response
+        response = step * response
     for _ in range(doublings):
         noise = noise + transition @ noise @ transition.T
+        response = None if response is None else response + np.kron(transition, transition) @ response
         transition = transition @ transition
-    return Linearisation(transition, 0.5 * (noise + noise.T))
+    return Linearisation(transition, 0.5 * (noise + noise.T), response)
 
 
 def characteristics(
@@ -217,69 +231,3 @@ def characteristics(
     with np.errstate(all="ignore"):
         moved = np.concatenate([runge_kutta(dynamics.drift, part, t1, t0, steps, end) for part in parts])
     return moved if begun is None else begun[1] + moved
-
-
-class Factor(NamedTuple):
-    """The logarithms b and -tau g / 144 of a potential's factor at the points of a grid (*sizes)."""
-
-    log: Array
-    correction: Array
-
-
-def weighed(values: Array, logs: Array) -> tuple[Array, Any]:
-    """Return the values times exp(logs - top), and top, the largest logarithm where there is mass."""
-    real = values.real
-    top = float(np.max(logs.real, where=real > 1e-14 * real.max(), initial=-np.inf))
-    if not np.isfinite(top):
-        top = 0.0
-    shifted = logs - top
-    return values * np.exp(np.where(shifted.real > 30.0, 30.0, shifted)), top
-
-
-def faintest(values: Array) -> float:
-    """Return a value below the smallest of a density that is not zero: smaller ones are unknown."""
-    real = values.real
-    return 0.5 * float(np.min(real, where=real > 0, initial=np.inf))
-
-
-def transported(
-    values: Array,
-    source: Grid,
-    target: Grid,
-    moved: Array,
-    linear: Linearisation,
-    periodic: tuple[bool, ...],
-    before: Factor | None = None,
-    after: Factor | None = None,
-    noises: tuple[Array, Array, float] | None = None,
-) -> tuple[Array, Any]:
-    """Return the density after one substep on the target grid, and the logarithm of the factor that was taken out.
-
-    `noises` are G (J, n, n) at the points of both grids, and half of the substep, where the noise depends on the state.
-    """
-    top: Any = 0.0
-    inverse, least = source.inverse, faintest(values)
-    half = inverse @ linear.before @ inverse.T
-    if before is None and noises is None:
-        coefficients = filtered(values, half, spline=True)
-    elif before is None and noises is not None:
-        values = diffused(values, source, noises[0], noises[2])
-        coefficients = filtered(values, 0.0 * half, spline=True)
-    elif before is not None:
-        values, first = weighed(values, before.log / 6)
-        least = faintest(values)
-        values = spread(values, source, linear.before) if noises is None else diffused(values, source, noises[0], noises[2])
-        values, second = weighed(values, before.log / 3 + before.correction)
-        coefficients = filtered(values, 0.0 * half, spline=True)
-        top = first + second
-    at = relative_index(target, source, periodic, moved)
-    volume = np.exp(np.where(np.abs(moved[:, -1].real) < _LARGEST_VOLUME, moved[:, -1], 0.0))
-    result = (gather(coefficients, at, source, least) * volume).reshape(target.sizes)
-    if after is not None:
-        result, third = weighed(result, after.log / 3 + after.correction)
-        top = top + third
-    result = spread(result, target, 0.5 * linear.noise) if noises is None else diffused(result, target, noises[1], noises[2])
-    if after is not None:
-        result, fourth = weighed(result, after.log / 6)
-        top = top + fourth
-    return result, top
