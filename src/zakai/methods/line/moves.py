@@ -14,7 +14,7 @@ from zakai.methods.line.coarse import EDGE, coarsened
 from zakai.methods.line.coefficients import resolved_parts
 from zakai.methods.line.figures import refitted
 from zakai.methods.line.moving import speed_of
-from zakai.methods.line.system import GROSS, NOISE, Prepared
+from zakai.methods.line.system import NOISE, Prepared
 from zakai.methods.line.yau import moved
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.channel import Channel
@@ -187,18 +187,18 @@ def _by_substeps(
                 break
             new = window
             smooth = lw.figures(values, window.closed, negligible).aliasing < 0.1 * rough
-            if look.aliasing > GROSS and smooth:
+            if look.aliasing > lw.GROSS and smooth:
                 new = window  # what such an attempt shows of the edges is not the density
             elif left or right:
                 new, grown = lw.enlarged(new, left, right), True
-            if coarse and window.size < most and not (look.aliasing > GROSS and smooth):
+            if coarse and window.size < most and not (look.aliasing > lw.GROSS and smooth):
                 new = lw.refined(new) if grown else _finer(values, window, look)
             if new.size <= most and new != window and not window.size == new.size == lw.SIZES[-1]:
                 values = lw.resampled(values, window, new)
                 window = new
                 continue
             # The grid is as large as it may be: take a shorter substep, unless that does not help.
-            helps = smooth and look.aliasing > rough and (not look.rough or look.aliasing > GROSS)
+            helps = smooth and look.aliasing > rough and (not look.rough or look.aliasing > lw.GROSS)
             split = (left or right or helps) and last - first > 1e-12 * length
             split = split and substeps + len(stack) < MOST_SUBSTEPS
             break

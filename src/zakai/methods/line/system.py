@@ -22,7 +22,6 @@ Array = Any
 NOISE = 3e-15  # error of a density relative to its maximum, which matters in its tails
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
-GROSS = 1e-4  # spectrum at the highest frequencies from which it is that of what a grid does not resolve, not of noise
 FINEST = 1024  # points of the largest grid for Gaussian kernels and splitting
 KEPT_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are kept for a model
 
@@ -212,7 +211,7 @@ class Prepared:
         The spectrum of kinks and that of noise fall slowly on every grid, and noise that grows with the state is too fast for a
         large one.
         """
-        noisy, system = look is not None and look.rough and self.negligible < look.aliasing < GROSS, self.system
+        noisy, system = look is not None and look.rough and self.negligible < look.aliasing < lw.GROSS, self.system
         slow = noisy or system.kinked_drift or not system.smooth_observation or system.state_dependent
         return self.largest if slow else lw.SIZES[-1]
 

@@ -143,7 +143,8 @@ def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: 
         if not np.isfinite(product.log_mass.real):
             return product
         look = lw.figures(product.values, new.closed)
-        if look.aliasing <= 1e-11 or new.size >= (lw.LARGEST_OF_MESSAGES if look.rough else lw.SIZES[-1]):
+        noisy = look.rough and look.aliasing < lw.GROSS
+        if look.aliasing <= 1e-11 or new.size >= (lw.LARGEST_OF_MESSAGES if noisy else lw.SIZES[-1]):
             break
         finer = _finer(product.values, look, new)
         if finer == new:

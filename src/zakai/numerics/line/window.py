@@ -30,6 +30,7 @@ CUT = 1e-13  # density relative to its maximum that a new grid must hold
 DEEP = 1e-20  # the same of densities whose small values are accurate
 NEGLIGIBLE = 1e-13  # spectrum relative to the mass that need not be resolved
 TOGETHER = 256  # points at which values of a large grid are interpolated together
+GROSS = 1e-4  # spectrum at the highest frequencies from which it is that of what a grid does not resolve, not of noise
 ALIGNMENT = 8  # centres stand at multiples of so many spacings
 
 
