@@ -88,3 +88,30 @@ def test_the_gradient_of_an_accurate_sensor_with_gaps_is_that_of_differences():
     _, gradient = value.value_and_gradient(theta)
     for i, step in enumerate(1e-4 * np.eye(2)):
         assert gradient[i] == pytest.approx((value(theta + step) - value(theta - step)) / 2e-4, rel=1e-4)
+
+
+ROOT = dict(
+    state=["x"], domain={"x": {"lower": 0}}, observation=["x"], observation_kind="samples",
+    prior={"kind": "density", "log_density": "3*log(x) - 3*x"},
+)  # fmt: skip
+GENE = {"drift": ["a + b*x**3/(1 + x**3) - x"], "diffusion": [["s*sqrt(x)"]], "observation_noise": [[0.09]]}
+REVERTING = {"drift": ["a*(b - x)"], "diffusion": [["s*sqrt(x)"]], "observation_noise": [[1e-5]]}
+SMALL = {
+    "small values, after exponentials": (GENE, [0.3, 0.7, 1.1, 1.5], [1.9, 1.5, 1.2, 0.7], [0.079, 1.843, 0.189]),
+    "small values, that are interpolated": (GENE, [0.3, 0.7, 1.1, 1.5], [1.9, 1.5, 1.2, 0.7], [0.032, 2.547, 0.135]),
+    "ends of coarse grids": (REVERTING, [0.1, 0.2, 0.3, 0.35, 0.45], [0.9, 0.95, 1.1, 1.3, 1.35], [0.586, 0.503, 0.187]),
+}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_small_values_of_the_density_do_not_amplify_the_rounding_of_derivatives(name):
+    """The density falls by hundreds of nats within a grid on which its derivatives are known relative to their maximum."""
+    keys, times, values, theta = SMALL[name]
+    model, theta = zakai.Model(**ROOT, **keys, parameters=dict(zip("abs", theta, strict=True))), np.array(theta)
+    likelihood = zakai.log_likelihood(model, zakai.Record(times, np.array(values)[:, None], "samples"))
+    _, gradient = likelihood.value_and_gradient(theta)
+    scale = np.max(np.abs(gradient))
+    for size in (1e-3, 3e-4, 1e-4):
+        steps = size * np.diag(theta)
+        slopes = [(likelihood(theta + step) - likelihood(theta - step)) / (2.0 * np.sum(step)) for step in steps]
+        assert gradient == pytest.approx(slopes, abs=5e-5 * scale)

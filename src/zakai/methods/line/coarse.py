@@ -11,7 +11,7 @@ the integrals of modes times density).  The fine grid needs no decomposition, an
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,8 +30,17 @@ ATTEMPTS = 6
 EDGE = 1e-11  # density at the outermost points, relative to the maximum
 
 
-def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: float) -> tuple[Array, lw.Window, float] | None:
-    """Return the density after an interval without observations inside, its coarse grid, and its error; None where none serves.
+class Coarsened(NamedTuple):
+    """A density (N,) on a coarse grid, its error, and the numbers of points at the two ends at which there is no density."""
+
+    values: Array
+    window: lw.Window
+    error: float
+    margins: tuple[int, int]
+
+
+def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: float) -> Coarsened | None:
+    """Return the density after an interval without observations inside; None where no coarse grid serves.
 
     Args:
         prepared: a system without coefficients in time.
@@ -74,7 +83,7 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
         elif error > max(1e-11, allowed):
             return None
         else:
-            return found, coarse, error
+            return Coarsened(found, coarse, error, (int(ends[0]), coarse.size - 1 - int(ends[-1])))
     return None
 
 

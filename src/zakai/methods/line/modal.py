@@ -30,8 +30,9 @@ NUMBERS = 2**21  # of the grids that are known together
 class Advanced(NamedTuple):
     """Steps on grids of their own: densities (K, n), centres and spacings (K,), and reports (K, .).
 
-    The transitions were those of `coarse` grids, with centres, spacings and sizes (K, 3), or of the grid on which all steps have
-    stayed.  `why` is why the loop ended, and `answer` the range of the grid that it needs and its spacing.
+    The transitions were those of `coarse` grids, with centres, spacings, sizes and the numbers of points at either end at which
+    there is no density (K, 4), or of the grid on which all steps have stayed.  `why` is why the loop ended, and `answer` the
+    range of the grid that it needs and its spacing.
     """
 
     densities: Array
@@ -82,7 +83,7 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
     for _ in range(NEW):
         n = window.size if stays else SIZES[at]
         cosines, sines = waves(n)
-        densities, places, out = np.empty((count, n)), np.empty((count + 1, 3)), np.zeros((count, len(COLUMNS)))
+        densities, places, out = np.empty((count, n)), np.empty((count + 1, 4)), np.zeros((count, len(COLUMNS)))
         done, why = lm.advance(
             np.ascontiguousarray(state.values), float(state.centre), float(state.spacing), window.unit, window.closed, profile,
             coarse.numbers, coarse.index, rows, owner, general, way, k, observed[:count], steps.lengths, steps.precisions[:, 0],
@@ -90,8 +91,9 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
         )  # fmt: skip
         if window.closed:
             circular_rows(densities[:done], cosines, sines, out)
-        taken = None if stays else coarse.index[places[:done, 2].astype(int), :3]
-        found = Advanced(densities[:done], places[:done, 0], places[:done, 1], out[:done], taken, why, places[-1])
+        grids = coarse.index[places[:done, 2].astype(int), :3]
+        taken = None if stays else np.column_stack([grids, places[:done, 3]])
+        found = Advanced(densities[:done], places[:done, 0], places[:done, 1], out[:done], taken, why, places[-1, :3])
         if done or why not in (lm.SIZE, lm.GRID):
             return found
         if why == lm.SIZE:
@@ -99,9 +101,9 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
             if at < len(SIZES):
                 continue
         else:
-            centre, spacing, size = places[-1].tolist()
+            centre, spacing, size = found.answer.tolist()
             grid = window._replace(centre=centre, spacing=spacing, size=int(size))
-            places_of = np.flatnonzero((coarse.index[:, :3] == places[-1]).all(axis=1))
+            places_of = np.flatnonzero((coarse.index[:, :3] == found.answer).all(axis=1))
             if len(places_of):  # what is missing is what is observed
                 here = range(k, k + count)
                 owner, rows = int(places_of[0]), np.stack([_rows(prepared, i, grid, observed[i - k], stays) for i in here])

@@ -44,7 +44,8 @@ class Report:
 class Passage(NamedTuple):
     """A transition: the density and the grid before it, its length, the logarithm of its mass, and the grid after it.
 
-    It is by the modes of that grid, or by the exponentials of a `substep`, times exp(-offset).
+    It is by the modes of that grid, of which at the `margins`, in points, there is no density; or by the exponentials of a
+    `substep`, times exp(-offset).
     """
 
     values: Array
@@ -54,6 +55,7 @@ class Passage(NamedTuple):
     after: lw.Window
     substep: Substep | None = None
     offset: Any = 0.0
+    margins: tuple[int, int] = 0, 0
 
 
 class Moved(NamedTuple):
@@ -94,7 +96,8 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
     negligible, rough = prepared.negligible, max(1e-10, 1e-3 * prepared.tolerance)
     carried = coarsened(prepared, values, window, length)
     if carried is not None:
-        return _normalised(*carried, report, negligible, Passage(values, window, length, 0.0, carried[1]))
+        passage = Passage(values, window, length, 0.0, carried.window, margins=carried.margins)
+        return _normalised(carried.values, carried.window, carried.error, report, negligible, passage)
     known, begin = lw.figures(values, window.closed, negligible).aliasing, window
     while window.size <= lw.LARGEST:
         found = by_modes(prepared, values, window, length)

@@ -31,7 +31,7 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.exponential_tangents import exponential_tangents
 from zakai.numerics.line.segment import SPLIT
 from zakai.numerics.line.split_tangents import Coefficients, Interval, shifted_by, through
-from zakai.numerics.line.tangents import Varied
+from zakai.numerics.line.tangents import Varied, extended, resampled_tangents
 
 Array = Any
 
@@ -53,7 +53,7 @@ def tangents(
     """
     if prepared.weak:
         return None
-    walk = _Walk(shifted, np.array([_on(state.window, one.values.imag / STEP, one.window) for one in shifted_states]))
+    walk = _Walk(shifted, _derivatives(shifted_states, state.window))
     if prepared.parts is None:
         states, infos = walk.over(prepared, rows, state, observed)
     else:
@@ -89,13 +89,13 @@ class _Walk:
                 return
             for piece in found:
                 place = piece.first - k
-                self._regrid(before.window, piece.before.window)
+                self._regrid(before.values, before.window, piece.before.window)
                 own = values[place : place + piece.number]
                 if piece.coarse is not None:
                     window = self._placed(prepared, piece, piece.coarse, own)
                 else:
                     window = (self._by_splitting if prepared.gaussian else self._by_modes)(prepared, piece, own)
-                self._regrid(window, piece.last.window)
+                self._regrid(piece.densities[-1], window, piece.last.window)
                 before = piece.last
 
         return line_filter.segment_of_whole(prepared, rows, state, observed, noted)
@@ -110,27 +110,25 @@ class _Walk:
 
     def _singly(self, k: int, before: State, after: State, observed: np.ndarray) -> None:
         """Take one interval, for one parameter after the other."""
-        found = []
-        # Beyond that, ratios of rounding errors would spread with interpolated logarithms.
-        known = np.where(before.values > lw.CUT * np.max(before.values), self.tangents, 0.0)
+        states, known = [], extended(before.values, self.tangents)
         for i, prepared in enumerate(self.shifted):
             state = before._replace(values=before.values + 1j * STEP * known[i])
             state, info = line_filter.step(prepared, k, state, observed)
-            found.append(_on(after.window, state.values.imag / STEP, state.window))
+            states.append(state)
             self.slopes[i] += info.log_likelihood_increment.imag / STEP
-        self.tangents = np.array(found)
+        self.tangents = _derivatives(states, after.window)
 
     def _placed(self, prepared: Prepared, piece: Piece, coarse: Array, observed: np.ndarray) -> lw.Window:
-        """Take the steps of a piece by the modes of coarse grids (K, 3), to grids of their own; return the last one."""
+        """Take the steps of a piece by the modes of coarse grids (K, 4), to grids of their own; return the last one."""
         states = [piece.before, *piece.states]
         for i, gained in enumerate(infos_of(prepared, [piece]).log_likelihood_increment):
             k, window, after = piece.first + i, states[i].window, piece.densities[i]
-            centre, spacing, size = coarse[i].tolist()
+            centre, spacing, size, margin = coarse[i].tolist()
             wide = window._replace(centre=centre, spacing=spacing, size=int(size))
-            varied = self._varied(prepared, wide)
-            self.tangents = varied.through(states[i].values, self.tangents, prepared.lengths[k], window, wide)
+            varied, margins = self._varied(prepared, wide), (int(margin), int(margin))
+            predicted, self.tangents = varied.through(states[i].values, self.tangents, prepared.lengths[k], window, wide, margins)
             new = window._replace(centre=float(piece.centres[i]), spacing=float(piece.spacings[i]), size=len(after))
-            self._regrid(wide, new)
+            self._regrid(predicted, wide, new)
             seen, logs = prepared.schedule.seen[k], np.zeros((len(self.shifted), len(after)), complex)
             if seen.any():
                 logs = self._logs(partial(_logs_of, k=k, observed=observed[i], points=new.points), prepared)
@@ -144,7 +142,7 @@ class _Walk:
         logs = self._logs(lambda one: log_likelihoods(one, own, observed, window.points[None]), prepared)
         for i, gained in enumerate(infos_of(prepared, [piece]).log_likelihood_increment):
             after = piece.densities[i]
-            self.tangents = varied.through(density, self.tangents, prepared.lengths[piece.first + i])
+            _, self.tangents = varied.through(density, self.tangents, prepared.lengths[piece.first + i])
             self._multiply(after, logs[:, i], gained)
             density = after
         return window
@@ -186,32 +184,34 @@ class _Walk:
 
     def _passed(self, prepared: Prepared, k: int, before: State, step: line_filter.Stepped, observed: np.ndarray) -> None:
         """Take a single step whose transitions are known."""
-        own, gained = before.window, 0.0
+        density, own, gained = before.values, before.window, 0.0
         for passage in step.passages:
-            self._regrid(own, passage.window)
+            self._regrid(density, own, passage.window)
             own = passage.after
             if passage.substep is None:
                 varied = self._varied(prepared, own)
-                moved = varied.through(passage.values, self.tangents, passage.length, passage.window, own)
+                density, moved = varied.through(
+                    passage.values, self.tangents, passage.length, passage.window, own, passage.margins
+                )
             else:
-                moved = self._by_exponentials(prepared, passage, passage.substep)
+                density, moved = self._by_exponentials(prepared, passage, passage.substep)
             self.tangents, gained = moved / np.exp(passage.log_mass), gained + passage.log_mass + passage.offset
-        self._regrid(own, step.window)
+        self._regrid(density, own, step.window)
         logs = self._logs(partial(_logs_of, k=k, observed=observed, points=step.window.points), prepared)
         self._multiply(step.values, logs, step.info.log_likelihood_increment - gained)
-        self._regrid(step.window, step.state.window)
+        self._regrid(step.values, step.window, step.state.window)
 
-    def _by_exponentials(self, prepared: Prepared, passage: Passage, substep: Substep) -> Array:
-        """Return the derivatives of the density after a substep, which has been divided by its mass."""
+    def _by_exponentials(self, prepared: Prepared, passage: Passage, substep: Substep) -> tuple[Array, Array]:
+        """Return the density after a substep, but for its mass, and the derivatives, which are to be divided by its mass."""
         values, window = passage.values, passage.window
         exponents = exponents_of(prepared, values, window, substep)
         shifted = [exponents_of(one, values, window, substep) for one in self.shifted]
-        tangents = np.where(values > 0, self.tangents, 0.0)
+        tangents = extended(values, self.tangents)
         for i, generator in enumerate(exponents.generators):
             changes = [one.generators[i] for one in shifted]
             values, tangents = exponential_tangents(window, generator, changes, values, tangents)
         constants = np.array([np.imag(one.constant) for one in shifted]) / STEP
-        return tangents + values * constants[:, None]
+        return values, tangents + values * constants[:, None]
 
     def _logs(self, function: Callable[[Prepared], Array], prepared: Prepared) -> Array:
         """Return the logarithms (p, ...) of likelihoods, with imaginary parts where a likelihood depends on the parameter."""
@@ -241,10 +241,9 @@ class _Walk:
         self.slopes += slopes
         self.tangents = product - after * slopes[:, None]
 
-    def _regrid(self, window: lw.Window, new: lw.Window) -> None:
-        """Take the derivatives to another grid."""
-        if new != window:
-            self.tangents = np.array([_on(new, tangent, window) for tangent in self.tangents])
+    def _regrid(self, values: Array, window: lw.Window, new: lw.Window) -> None:
+        """Take the derivatives of a density to another grid."""
+        self.tangents = resampled_tangents(values, self.tangents, window, new)
 
 
 def _logs_of(prepared: Prepared, k: int, observed: Array, points: Array) -> Array:
@@ -254,6 +253,7 @@ def _logs_of(prepared: Prepared, k: int, observed: Array, points: Array) -> Arra
     return found
 
 
-def _on(new: lw.Window, tangent: Array, window: lw.Window) -> Array:
-    """Return the derivative of a density on another grid: linear in it, so that the rounding of small values does not spread."""
-    return lw.interpolated(tangent, window, new.offsets) * (new.spacing / window.spacing) if new != window else tangent
+def _derivatives(states: Sequence[State], new: lw.Window) -> Array:
+    """Return the derivatives (p, N) on a grid of states at parameters with infinitesimal imaginary parts."""
+    found = [resampled_tangents(one.values.real, one.values.imag[None] / STEP, one.window, new)[0] for one in states]
+    return np.array(found)

@@ -74,8 +74,8 @@ def advance(
         error: the estimate of the relative error of `values`.
         limits: as the fields of `line_segment.Limits`.
         cosines, sines: `waves` of the size of densities.
-        densities, places, out: receive the densities (K, n), the centres, the spacings and which grid of modes was taken
-            (K + 1, 3), and the reports.
+        densities, places, out: receive the densities (K, n); the centres, the spacings, which grid of modes was taken, and its
+            points at either end at which there is no density (K + 1, 4); and the reports.
     """
     negligible, allowed, generous = limits[0], limits[1], limits[4]
     now, n, answer, place, stays = values.copy(), densities.shape[1], places[-1], -1, way == STAY
@@ -201,7 +201,7 @@ def advance(
         row[0], row[3], row[4] = np.log(mass) + constants[k] + constant + added, aliasing, edge
         row[5], row[6], row[7] = negative, rounding + unsure, below / max(np.log(allowed) - np.log(floor), 2.3)
         row[8], row[9], row[10], row[11], row[12] = growth, made, error, min(LOG_NOISE + max(below - 1.0, 0.0), 0.0), 0.0
-        places[i, 0], places[i, 1], places[i, 2] = centre, spacing, place
+        places[i, 0], places[i, 1], places[i, 2], places[i, 3] = centre, spacing, place, inset
         for j in range(n):
             densities[i, j] = now[j]
         if stays:

@@ -17,10 +17,10 @@ _WEIGHTS = np.array([1.0 / np.prod([float(i - j) for j in _STENCIL if j != i]) f
 
 
 def local_polynomial(values: Array, window: Window, offsets: Array) -> Array:
-    """Return the polynomial through the nearest eight values of any function at offsets (J,), constant beyond the grid."""
+    """Return the polynomials through the nearest eight values of functions (..., N) at offsets (J,), constant beyond the grid."""
     at = (offsets - window.centre) / window.spacing + window.size // 2
     weights, own = _nearest(values, window, at if window.closed else np.clip(at, 0.0, window.size - 1.0))
-    return np.asarray(np.sum(weights * own, axis=1))
+    return np.asarray(np.sum(weights * own, axis=-1))
 
 
 def interpolated_logs(values: Array, window: Window, offsets: Array) -> Array:
@@ -36,12 +36,12 @@ def interpolated_logs(values: Array, window: Window, offsets: Array) -> Array:
 
 
 def _nearest(values: Array, window: Window, at: Array) -> tuple[Array, Array]:
-    """Return the weights and the values (J, 8) of the polynomials at indices of a grid (J,)."""
+    """Return the weights (J, 8) and the values (..., J, 8) of the polynomials at indices of a grid (J,)."""
     near = np.floor(at)
     if not window.closed:
         near = np.clip(near, -_STENCIL[0], window.size - 1 - _STENCIL[-1])
     distance = (at - near)[:, None] - _STENCIL
     exact = np.abs(distance) < 1e-12
     weights = np.where(exact.any(axis=1, keepdims=True), exact, _WEIGHTS / np.where(exact, 1.0, distance))
-    own = values[(near[:, None].astype(int) + _STENCIL) % window.size]
+    own = values[..., (near[:, None].astype(int) + _STENCIL) % window.size]
     return weights / np.sum(weights, axis=1, keepdims=True), own

@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line.operator import Spectral, quotients
 from zakai.numerics.line.polynomial import local_polynomial
-from zakai.numerics.line.window import CUT, Window, gathered
+from zakai.numerics.line.window import CUT, SMALL, Window, density_at, gathered, interpolated
 
 Array = NDArray[Any]
 
@@ -38,30 +39,82 @@ class Varied(NamedTuple):
         return cls(modes, scales, np.array([still if one.change is None else one.change / STEP for one in shifted]))
 
     def through(
-        self, values: Array, tangents: Array, length: float, window: Window | None = None, own: Window | None = None
-    ) -> Array:
-        """Return the derivatives (p, N) of a density after a time.
+        self,
+        values: Array,
+        tangents: Array,
+        length: float,
+        window: Window | None = None,
+        own: Window | None = None,
+        margins: tuple[int, int] = (0, 0),
+    ) -> tuple[Array, Array]:
+        """Return a density (N,) after a time, and its derivatives (p, N).
 
         Args:
-            values: the density (J,); its derivatives count where it is positive.
+            values: the density (J,).
             tangents: its derivatives (p, J).
             length: the time.
             window, own: the grid of the density and that of the decomposition, where they differ.
+            margins: the numbers of points at the two ends of the latter at which there is no density after the time.
         """
-        U, used, scale, scales = self.modes.modes, values > 0, self.modes.scale, self.scales
-        if window is not None and own is not None and window != own:
-            logs, points, used = np.log(np.maximum(scale, 1e-300)), window.offsets, values > CUT * np.max(values)
-            top = float(local_polynomial(logs, own, points[[int(np.argmax(values))]])[0])
-            scale, at = np.exp(logs - top), np.exp(local_polynomial(logs, own, points) - top)
-            scales = np.array([local_polynomial(one, own, points) for one in scales])
+        U, rates, top = self.modes.modes, self.modes.rates, int(np.argmax(values))
+        if window is None or own is None or window == own:
+            at = scale = self.modes.scale / self.modes.scale[top]
+            scales = self.scales - self.scales[:, top : top + 1]
+            inner = np.where(values > 0, values / at, 0.0)
+            changes = np.where(values > 0, (extended(values, tangents) - values * scales) / at, 0.0)
         else:
-            at = scale = scale / scale[int(np.argmax(values))]
-        inner = np.where(used, values / at, 0.0)
-        changes = np.where(used, (tangents - values * scales) / at, 0.0)
-        if at is not scale and window is not None and own is not None:
-            inner = gathered(inner, window.offsets, own)
-            changes = np.array([gathered(one, window.offsets, own) for one in changes])
-        decay, coefficients = np.exp(-length * self.modes.rates), inner @ U
-        turned = (self.operators * quotients(self.modes.rates, decay, length)) @ coefficients
-        after = scale * (U @ (decay * coefficients))
-        return scale * (((changes @ U) * decay + turned) @ U.T) + after * self.scales
+            logs, points, used = np.log(np.maximum(self.modes.scale, 1e-300)), window.offsets, values > CUT * values[top]
+            known, shifts = local_polynomial(logs, own, points), local_polynomial(self.scales, own, points)
+            scale, at = np.exp(logs - known[top]), np.exp(known - known[top])
+            scales, shifts = self.scales - shifts[:, top : top + 1], shifts - shifts[:, top : top + 1]
+            found = np.where(used, np.concatenate([values[None], tangents - values * shifts]) / at, 0.0)
+            # Interpolation leaves waves everywhere; where they end abruptly, the derivatives spread that.
+            inner, *rest = np.array([gathered(one, points, own) for one in found]) * _faded(own.size, margins)
+            changes = np.array(rest)
+        decay, coefficients = np.exp(-length * rates), inner @ U
+        turned = (self.operators * quotients(rates, decay, length)) @ coefficients
+        after = U @ (decay * coefficients)
+        # Beyond the support there is only rounding, which the scale must not amplify.
+        noise = 4e-16 * np.sqrt(np.sum(inner * inner)) * max(1.0, decay[0])
+        seen, place = np.flatnonzero(after[margins[0] : len(after) - margins[1]] > noise) + margins[0], np.arange(len(after))
+        first, last = seen[[0, -1]] if len(seen) else (np.nan, np.nan)
+        scale = np.where((place < first) | (place > last), 0.0, scale if len(seen) else np.nan)
+        return scale * after, scale * (((changes @ U) * decay + turned) @ U.T + after * scales)
+
+
+def extended(values: Array, tangents: Array) -> Array:
+    """Return the derivatives (p, N) of a density (N,), by those of its logarithm where its values are small.
+
+    Derivatives have rounding errors relative to their maximum, which transitions and likelihoods would amplify where the density
+    is far smaller.  There the derivative of the logarithm is that of the nearest points at which the density counts.
+    """
+    used = np.flatnonzero(values > CUT * np.max(values))
+    if len(used) in (0, len(values)):
+        return tangents
+    found, small = tangents.copy(), np.flatnonzero(~(values > CUT * np.max(values)))
+    for one in found:
+        one[small] = values[small] * np.interp(small, used, one[used] / values[used])
+    return found
+
+
+def resampled_tangents(values: Array, tangents: Array, window: Window, new: Window) -> Array:
+    """Return the derivatives (p, N) of a density (N,) on another grid, by those of its logarithm where it is small."""
+    if new == window:
+        return tangents
+    tangents = extended(values, tangents)
+    found, density = interpolated(tangents, window, new.offsets), density_at(values, window, new.offsets)
+    small = np.flatnonzero(density < SMALL * np.max(values))
+    scores = tangents / np.where(values > 0, values, np.inf)
+    found[:, small] = density[small] * local_polynomial(scores, window, new.offsets[small])
+    return np.ascontiguousarray(found * (new.spacing / window.spacing))
+
+
+def _faded(size: int, margins: tuple[int, int]) -> Array:
+    """Return factors (N,) that fall to zero at the two ends of a grid."""
+    found = np.ones(size)
+    for margin, end in zip(margins, (found, found[::-1]), strict=True):
+        end[:margin] = ndtr(_FALL * np.linspace(-1.0, 1.0, margin, endpoint=False))
+    return found
+
+
+_FALL = 6.0  # standard deviations from the middle to the ends of a factor that falls

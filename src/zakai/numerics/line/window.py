@@ -28,6 +28,7 @@ LARGEST = 384  # points of a grid on which densities are moved by matrices
 LARGEST_OF_MESSAGES = 1024  # points of a grid on which functions are moved by matrices
 CUT = 1e-13  # density relative to its maximum that a new grid must hold
 DEEP = 1e-20  # the same of densities whose small values are accurate
+SMALL = 1e-8  # density relative to its maximum below which its logarithm is interpolated
 NEGLIGIBLE = 1e-13  # spectrum relative to the mass that need not be resolved
 TOGETHER = 256  # points at which values of a large grid are interpolated together
 GROSS = 1e-4  # spectrum at the highest frequencies from which it is that of what a grid does not resolve, not of noise
@@ -196,10 +197,10 @@ def refined(window: Window, factor: float = 2**0.5) -> Window:
 
 
 def interpolated(values: Array, window: Window, offsets: Array) -> Array:
-    """Return the interpolant of the values at offsets (J,) from the origin."""
+    """Return the interpolants of values (..., N) at offsets (J,) from the origin."""
     if len(offsets) > TOGETHER and window.size > LARGEST_OF_MESSAGES:
         parts = np.array_split(offsets, -(-len(offsets) // TOGETHER))
-        return np.concatenate([interpolated(values, window, part) for part in parts])
+        return np.concatenate([interpolated(values, window, part) for part in parts], axis=-1)
     at = (offsets - window.centre) / window.spacing + window.size // 2
     nearest = np.round(at)
     # sin(pi (at - j)) = (-1)^(nearest - j) sin(pi (at - nearest)).
@@ -209,13 +210,13 @@ def interpolated(values: Array, window: Window, offsets: Array) -> Array:
     exact = np.abs(at - nearest) < 1e-12
     with np.errstate(all="ignore"):
         if window.closed:
-            found = (1.0 / np.tan(np.pi / window.size * distance)) @ signed * (sine / window.size)
+            found = ((1.0 / np.tan(np.pi / window.size * distance)) @ signed.T).T * (sine / window.size)
         else:
-            found = (1.0 / distance) @ signed * (sine / np.pi)
+            found = ((1.0 / distance) @ signed.T).T * (sine / np.pi)
     if window.closed:
-        return np.asarray(np.where(exact, values[nearest.astype(int) % window.size], found))
+        return np.asarray(np.where(exact, values[..., nearest.astype(int) % window.size], found))
     inside = (at > -0.5) & (at < window.size - 0.5)
-    own = values[np.where(inside, nearest, 0.0).astype(int)]
+    own = values[..., np.where(inside, nearest, 0.0).astype(int)]
     return np.asarray(np.where(inside, np.where(exact, own, found), 0.0))
 
 
@@ -249,7 +250,7 @@ def density_at(values: Array, window: Window, offsets: Array) -> Array:
     """Return the density at offsets (J,) from the origin, times the spacing of the grid."""
     found = interpolated(values, window, offsets)
     found = np.where(found.real > 0, found, 0.0)
-    bound = _SMALL * values.real.max()
+    bound = SMALL * values.real.max()
     small = np.flatnonzero(found.real < bound)
     if len(small):
         # There the interpolant is the rounding of large values; small values are interpolated by their logarithms.
@@ -257,8 +258,6 @@ def density_at(values: Array, window: Window, offsets: Array) -> Array:
         found[small] = np.where(logs.real < 2.0 * bound, logs, 0.0)
     return found
 
-
-_SMALL = 1e-8
 
 
 def _shifted(values: Array, shift: int, size: int) -> Array:
