@@ -42,7 +42,7 @@ def figures(prepared: Prepared, values: Array, window: lw.Window) -> lw.Figures:
 
 
 def refitted(
-    prepared: Prepared, values: Array, window: lw.Window, look: lw.Figures, generous: int = 64
+    prepared: Prepared, values: Array, window: lw.Window, look: lw.Figures, generous: int = 64, large: bool = True
 ) -> tuple[Array, lw.Window]:
     """Return a density on the grid for its next substep, and this grid.
 
@@ -52,11 +52,13 @@ def refitted(
         window: their grid.
         look: figures of the density by its spectrum.
         generous: a grid of up to so many points is kept though fewer would do.
+        large: whether it may have more points than a matrix of the operator.
     """
     if not prepared.smoothing:
-        new = lw.fitted(look, window, prepared.largest_for(look), generous)
+        large = large and prepared.largest_for(look, window.size) > prepared.largest
+        new = lw.fitted(look, window, lw.SIZES[-1] if large else lw.LARGEST, generous)
         return lw.resampled(values, window, new), new
-    new = lw.fitted(look._replace(resolving=1.0), window, prepared.largest, generous)
+    new = lw.fitted(look._replace(resolving=1.0), window, lw.LARGEST, generous)
     moved = resampled(prepared, values, window, new)
     return moved / np.sum(moved), new
 

@@ -229,7 +229,7 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> St
         look = figures(prepared, values, window)
     # A large grid is kept only where its decomposition serves the next intervals too.
     generous = prepared.generous if report.decomposed else min(prepared.generous, GENEROUS)
-    new = lw.fitted(look, window, prepared.largest_for(look), generous)
+    new = lw.fitted(look, window, prepared.largest_for(look, window.size), generous)
     moved = resampled(prepared, values, window, new)
     if new != window and not prepared.weak:  # the largest grid may be too coarse for all that the density has
         moved = moved / np.sum(moved)

@@ -161,7 +161,7 @@ def _covering(prepared: Prepared, state: State, low: float, high: float, spacing
         size = lw.size_for(2 * np.pi / spacing)
         new = window._replace(size=size, spacing=2 * np.pi / size)
     else:
-        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, LARGER, prepared.largest_for(None))
+        new = lw.quantized(window, low + window.centre, high + window.centre, spacing, LARGER, prepared.largest_for())
         if new.spacing * new.size < high - low:
             return None
     return None if new == window else moved_to(prepared, state, new)
@@ -180,7 +180,7 @@ def regridded(prepared: Prepared, state: State) -> State:
     look = figures(prepared, values, window)
     if prepared.gaussian:
         look = look._replace(resolving=look.resolving * BAND / 0.92)
-    new = lw.fitted(look, window, prepared.largest_for(look), prepared.generous, LARGER)
+    new = lw.fitted(look, window, prepared.largest_for(look, window.size), prepared.generous, LARGER)
     return state if new == window else moved_to(prepared, state, new)
 
 

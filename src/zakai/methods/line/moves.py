@@ -24,6 +24,7 @@ from zakai.numerics.line.filters import WIDE, wrapped
 Array = Any
 
 MOST_SUBSTEPS = 4000
+FEW = 24  # substeps of an interval, after which no large grid is taken
 
 
 class Report:
@@ -157,7 +158,6 @@ def _by_substeps(
     gained: Any = 0.0
     rough, resolved = max(1e-10, 1e-3 * prepared.tolerance), 30.0 * negligible
     report.positive = False
-    most = lw.LARGEST if window.size <= lw.LARGEST else lw.SIZES[-1]
     bounds = [(0.0, length)]
     if system.varying:
         parts = resolved_parts(prepared, values, window, start, length, inside)
@@ -167,6 +167,8 @@ def _by_substeps(
     while stack:
         first, last = stack.pop()
         substeps += 1
+        large = window.size > lw.LARGEST and substeps < FEW
+        most = lw.SIZES[-1] if large else lw.LARGEST
         if not np.isfinite(values.real).all():
             return Moved(values, window, np.float64(np.nan), look), tails
         begin, grown = window, False
@@ -211,7 +213,8 @@ def _by_substeps(
             else:
                 middle = first + (last - first) * (0.25 if last - first > 1e-3 * length else 0.0625)
                 stack += [(middle, last), (first, middle)]
-            values, window = refitted(prepared, values, window, lw.figures(values, window.closed, negligible))
+            look = lw.figures(values, window.closed, negligible)
+            values, window = refitted(prepared, values, window, look, large=substeps < FEW)
             continue
         assert look is not None
         if prepared.smoothing and stack:  # what a kink leaves everywhere
@@ -229,7 +232,7 @@ def _by_substeps(
         values, window = values / mass, after
         gained = gained + np.log(mass) + attempt.offset
         if stack:
-            values, window = refitted(prepared, values, window, look)
+            values, window = refitted(prepared, values, window, look, large=substeps < FEW)
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
     return Moved(values, window, gained, look, tuple(passages)), tails

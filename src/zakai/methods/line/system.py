@@ -205,14 +205,16 @@ class Prepared:
         """The points of the largest grid of the compiled loop, and of any grid where a larger one does not help."""
         return FINEST if self.gaussian else lw.LARGEST
 
-    def largest_for(self, look: lw.Figures | None) -> int:
-        """Return the points of the largest grid for a density with some figures.
+    def largest_for(self, look: lw.Figures | None = None, size: int = 0) -> int:
+        """Return the points of the largest grid for a density with some figures on a grid of some size.
 
-        The spectrum of kinks and that of noise fall slowly on every grid, and noise that grows with the state is too fast for a
-        large one.
+        The spectrum of kinks and that of noise fall slowly on every grid, what the largest grid of all does not resolve none
+        does, and noise that grows with the state, and potentials within intervals, are too fast for a large one.
         """
-        noisy, system = look is not None and look.rough and self.negligible < look.aliasing < lw.GROSS, self.system
-        slow = noisy or system.kinked_drift or not system.smooth_observation or system.state_dependent
+        noisy, system = False, self.system
+        if look is not None and look.aliasing > self.negligible:
+            noisy = look.rough if look.aliasing < lw.GROSS else size >= lw.SIZES[-1]
+        slow = noisy or system.kinked_drift or not system.smooth_observation or system.state_dependent or not system.samples
         return self.largest if slow else lw.SIZES[-1]
 
     @cached_property
