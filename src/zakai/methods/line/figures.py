@@ -15,6 +15,7 @@ from zakai.numerics.line.weak import at_nodes, nodes, weak
 
 Array = Any
 
+RESOLVED = 1e-11  # spectrum at the highest frequencies that does not ask for a large grid
 UNRESOLVED = 1e-6  # spectrum at the highest frequencies from which waves around a density hide where it ends
 
 
@@ -61,6 +62,27 @@ def refitted(
     new = lw.fitted(look._replace(resolving=1.0), window, lw.LARGEST, generous)
     moved = resampled(prepared, values, window, new)
     return moved / np.sum(moved), new
+
+
+def on_fitting_grid(
+    prepared: Prepared, values: Array, window: lw.Window, look: lw.Figures, generous: int, margin: float = 0.12
+) -> tuple[Array, lw.Window, float]:
+    """Return a density on the grid for the next interval, this grid, and the spectrum that it does not resolve.
+
+    The grid is large only where one on which matrices act does not resolve the density.  For the arguments see `fitted` of
+    `numerics/line/window.py`.
+    """
+    most, large = prepared.largest, prepared.largest_for(look, window.size)
+    while True:
+        new = lw.fitted(look, window, most, generous, margin)
+        if new == window:
+            return values, window, look.aliasing
+        moved = resampled(prepared, values, window, new)
+        moved = moved / np.sum(moved)
+        coarse = 0.0 if prepared.weak else lw.figures(moved, new.closed, prepared.negligible, prepared.cut).aliasing
+        if coarse <= RESOLVED or most >= large:
+            return moved, new, coarse
+        most = large
 
 
 def outside_tables(prepared: Prepared, values: Array, window: lw.Window, t: float) -> float:

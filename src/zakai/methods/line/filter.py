@@ -29,9 +29,9 @@ from zakai.methods.line.figures import (
     edge_of_moments,
     figures,
     forgetting,
+    on_fitting_grid,
     outside_tables,
     refitted,
-    resampled,
     spread,
     state_moments,
 )
@@ -229,11 +229,8 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> St
         look = figures(prepared, values, window)
     # A large grid is kept only where its decomposition serves the next intervals too.
     generous = prepared.generous if report.decomposed else min(prepared.generous, GENEROUS)
-    new = lw.fitted(look, window, prepared.largest_for(look, window.size), generous)
-    moved = resampled(prepared, values, window, new)
+    moved, new, coarse = on_fitting_grid(prepared, values, window, look, generous)
     if new != window and not prepared.weak:  # the largest grid may be too coarse for all that the density has
-        moved = moved / np.sum(moved)
-        coarse = lw.figures(moved, new.closed, prepared.negligible, prepared.cut).aliasing
         report.aliasing = max(report.aliasing, coarse)
     mean, variance = lw.moments(values, window)
     report.edge = max(report.edge, edge_of_moments(prepared, values, window))

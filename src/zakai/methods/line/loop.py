@@ -14,7 +14,7 @@ import numpy as np
 from zakai.methods._protocol import Info, Infos
 from zakai.methods._states import Joined, StackedStates
 from zakai.methods.line import modal
-from zakai.methods.line.figures import edge_of_moments, figures, outside_tables, resampled, state_moments
+from zakai.methods.line.figures import edge_of_moments, figures, on_fitting_grid, outside_tables, resampled, state_moments
 from zakai.methods.line.grids import grid_of
 from zakai.methods.line.system import Prepared, State
 from zakai.numerics.line import window as lw
@@ -180,8 +180,8 @@ def regridded(prepared: Prepared, state: State) -> State:
     look = figures(prepared, values, window)
     if prepared.gaussian:
         look = look._replace(resolving=look.resolving * BAND / 0.92)
-    new = lw.fitted(look, window, prepared.largest_for(look, window.size), prepared.generous, LARGER)
-    return state if new == window else moved_to(prepared, state, new)
+    moved, new, _ = on_fitting_grid(prepared, np.asarray(values), window, look, prepared.generous, LARGER)
+    return state if new == window else state._replace(values=moved, centre=new.centre, spacing=new.spacing)
 
 
 def _infos(prepared: Prepared, piece: Piece) -> Infos:
