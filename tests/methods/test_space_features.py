@@ -263,6 +263,22 @@ def test_noise_that_depends_on_the_state_has_the_exact_moments():
     assert not result.warnings
 
 
+def test_little_mass_where_noise_has_no_value_makes_a_small_error():
+    # d E x = -E x / 2 dt and d E x^2 = (-E x^2 + 0.09 E x) dt; P(x < 0) = 3e-6 at the start.
+    model = zakai.Model(
+        state=["x", "y"], drift=["-x/2", "x - y"], diffusion=[["0.3*sqrt(x)", "0"], ["0", "0.4"]], observation=["y"],
+        observation_kind="samples", prior={"kind": "gaussian", "mean": [0.9, 0.1], "cov": [0.04, 0.5]},
+    )  # fmt: skip
+    times = np.array([0.2, 0.5, 1.0])
+    result = zakai.filter(model, zakai.Record(times, np.full((3, 1), np.nan), "samples"), "yau-yau", tolerance=1e-4)
+    mean = 0.9 * np.exp(-times / 2)
+    square = (0.9**2 + 0.04) * np.exp(-times) + 0.09 * 0.9 * 2 * (np.exp(-times / 2) - np.exp(-times))
+    variance = square - mean**2
+    means, variances = (result.mean[1:, 0] - mean) / np.sqrt(variance), result.variance[1:, 0] / variance - 1
+    error, estimate = max(np.abs(means).max(), np.abs(variances).max()), np.nanmax(result.health["error_estimate"])
+    assert error < 3e-4 and error < 10 * estimate and estimate < 5e-3
+
+
 def test_noise_that_depends_on_another_coordinate_agrees_with_particles():
     model = zakai.Model(
         **{**LINEAR, "drift": ["-x + y", "-y"], "process_noise": [["1", "0"], ["0", "1"]]}, observation=["x"],

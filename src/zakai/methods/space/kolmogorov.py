@@ -200,13 +200,12 @@ class Prepared:
             if steppers is not None:
                 steppers.append(stepper)
             result, more, control = advance(stepper, result, start, length, potential, control, allowed / len(parts), least)
-            unresolved = least >= MOST_PANELS
-            if observations.system.state_dependent:
+            if least >= MOST_PANELS:
+                more = more._replace(splitting=max(more.splitting, 1.0))
+            if observations.system.state_dependent:  # mass where the noise has no value may be anywhere on the grid
                 valid = valid_noise(observations.system.covariance(result.grid.points, start + length, self.theta))
                 invalid = np.sum(result.values.real, where=~valid.reshape(result.grid.sizes)) / result.values.real.sum()
-                unresolved = unresolved or float(invalid) > 1e-2 * self.tolerance
-            if unresolved:
-                more = more._replace(splitting=max(more.splitting, 1.0))
+                more = more._replace(splitting=more.splitting + bounds.reach**2 * float(invalid))
             report = report.worst(more)
         return result, report, control
 
