@@ -25,25 +25,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parent))
 
 import numpy as np  # noqa: E402
-from first_answer import distance, particle_filter  # noqa: E402
+from first_answer import distance, particle_filter, processor, write_table  # noqa: E402
 from first_answer_systems import SYSTEMS, System  # noqa: E402
 
 import zakai  # noqa: E402
 
-PAGE = Path(__file__).parents[1] / "docs/reference/figures.md"
-BEGIN, END = "% begin of the measured table", "% end of the measured table"
 LONG = 10.0  # seconds of all calls after which none is repeated
 TITLES = ("system", "method", "states", "observations", "zakai, µs an observation", "particles, µs", "distance", "error")
 OTHER_TITLES = ("what", "system", "method", "zakai, µs an observation", "error")
-
-
-def processor() -> str:
-    """Return the name of the processor, or what Python knows of it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 Call = Callable[..., zakai.FilterResult]
@@ -65,19 +54,13 @@ VARIANTS: tuple[tuple[str, str, Call, dict[str, Any]], ...] = (
 )
 
 
-def record_of(model: zakai.Model, system: System, number: int) -> zakai.Record:
-    """Return a simulated record of a system, with missing values; each number has its own."""
-    _, record = zakai.simulate(model, system.times(1 + number), seed=2 + number)
-    missing = np.random.default_rng(2 + number).random(record.values.shape) < system.missing
-    return zakai.Record(record.times, np.where(missing, np.nan, record.values), record.kind)
-
-
 def measured(model: zakai.Model, system: System, call: Call, repeats: int) -> tuple[zakai.FilterResult, zakai.Record, float, str]:
     """Return the first result, its record, the microseconds an observation of later calls, and the error in words."""
-    record = record_of(model, system, 0)
+    record = system.record(model, system.times(1), 2)
     result, seconds = call(model, record), []
     while not seconds or (len(seconds) < repeats and sum(seconds) < LONG):
-        other = record_of(model, system, 1 + len(seconds))
+        number = 1 + len(seconds)
+        other = system.record(model, system.times(1 + number), 2 + number)
         begin = time.process_time()
         call(model, other)
         seconds.append(time.process_time() - begin)
@@ -87,7 +70,7 @@ def measured(model: zakai.Model, system: System, call: Call, repeats: int) -> tu
 
 def row_of(name: str, system: System, repeats: int) -> tuple[str, ...]:
     """Return the row of a system."""
-    model = zakai.load_model(f"gallery:{system.model}") if isinstance(system.model, str) else zakai.Model(**system.model)
+    model = system.loaded()
     result, record, ours, error = measured(model, system, zakai.filter, repeats)
     begin = time.process_time()
     mean = particle_filter(system, record.times, record.values, record.kind)
@@ -133,8 +116,7 @@ def main() -> None:
         print(line, flush=True)
         lines.append(line)
     if given.write:
-        before, _, rest = PAGE.read_text(encoding="utf-8").partition(f"{BEGIN}\n")
-        PAGE.write_text(f"{before}{BEGIN}\n\n" + "\n".join(lines) + f"\n\n{END}{rest.partition(END)[2]}", encoding="utf-8")
+        write_table(lines, "measured table")
 
 
 if __name__ == "__main__":

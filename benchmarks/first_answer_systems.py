@@ -1,8 +1,9 @@
-"""The systems of `first_answer.py`: the gallery and fifteen others, each as a model and, written again, as NumPy functions.
+"""The systems of `first_answer.py`: those of the gallery with a prior, and fifteen others.
 
-The NumPy functions share no code with zakai: `drift(x, t)` and `observation(x, t)` take the columns of x (n, N) and give rows,
-`root` (n, r) is the diffusion with the root of the process noise, `noise(t)` (m, m) that of the observations, `prior(rng, N)`
-draws (N, n).
+Each is a model and, written again, NumPy functions that share no code with zakai: `drift(x, t)` and `observation(x, t)` take the
+columns of x (n, N) and give rows, `root` (n, r) is the diffusion with the root of the process noise, or a function of x and t
+that returns it (n, r, N), `noise(t)` (m, m) is that of the observations, `prior(rng, N)` draws (N, n). `law(z, x)` is the log
+density (N,) of a sample that is not Gaussian, up to a constant; `inputs(t)` are the inputs from t to the next time.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+import zakai
 
 
 def gaussian(mean: list[float], cov: Any) -> Callable[..., np.ndarray]:
@@ -30,6 +33,8 @@ class System:
     root: Any
     prior: Callable[..., np.ndarray]
     noise: Callable[[float], Any] = lambda t: [[1.0]]
+    law: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    inputs: Callable[[float], list[float]] | None = None
     angles: tuple[int, ...] = ()
     mean_step: float = 0.05
     irregular: bool = False
@@ -44,9 +49,33 @@ class System:
         gaps = np.random.default_rng(seed).exponential(self.mean_step, self.count)
         return np.cumsum(np.maximum(gaps, self.mean_step / 50))
 
+    def loaded(self) -> zakai.Model:
+        """Return the model."""
+        return zakai.load_model(f"gallery:{self.model}") if isinstance(self.model, str) else zakai.Model(**self.model)
+
+    def record(self, model: zakai.Model, times: np.ndarray, seed: int) -> zakai.Record:
+        """Return a record of a model that is simulated, with missing values."""
+        inputs = None
+        if self.inputs is not None:
+            starts = np.concatenate([[0.0], times[:-1]])
+            inputs = zakai.Inputs(starts, [self.inputs(t) for t in starts])
+        _, record = zakai.simulate(model, times, seed=seed, inputs=inputs)
+        missing = np.random.default_rng(seed).random(record.values.shape) < self.missing
+        return zakai.Record(record.times, np.where(missing, np.nan, record.values), record.kind, inputs=inputs)
+
 
 def _normal(mean: list[float], cov: list[float]) -> dict[str, Any]:
     return {"kind": "gaussian", "mean": mean, "cov": cov}
+
+
+def _heating(t: float) -> list[float]:
+    """Return the power of the heater, by day, and the temperature outdoors."""
+    return [3.0 * float(6.0 <= t % 24.0 < 22.0), 5.0 + 4.0 * np.sin(2 * np.pi * (t - 9.0) / 24.0)]
+
+
+def _room(x: np.ndarray, t: float) -> list[np.ndarray]:
+    heater, outdoor = _heating(t)
+    return [(x[1] - x[0]) / 0.5 + (outdoor - x[0]) / 6 + 4 * heater, (x[0] - x[1]) / 8]
 
 
 def _unit(m: int, size: float = 1.0) -> Callable[[float], Any]:
@@ -59,6 +88,14 @@ GALLERY = {
         "benes-2d", lambda x, t: [np.tanh(x[0] + x[1])] * 2, lambda x, t: [x[0], x[1]], np.eye(2), gaussian([0, 0], [1, 1]),
         _unit(2),
     ),
+    "counted-events": System(
+        "counted-events", lambda x, t: [-0.2 * x[0]], lambda x, t: [3 * np.exp(x[0])], [[0.4]], gaussian([0], [0.4]),
+        law=lambda z, x: z[0] * x[0] - 3 * np.exp(x[0]), mean_step=0.5, substep=0.05,
+    ),
+    "cox-ingersoll-ross": System(
+        "cox-ingersoll-ross", lambda x, t: [2 - x[0]], lambda x, t: [x[0]], lambda x, t: [[np.sqrt(np.maximum(x[0], 0))]],
+        lambda rng, count: rng.gamma(4, 0.5, (count, 1)), _unit(1, 0.04), mean_step=0.1,
+    ),
     "cubic-sensor": System(
         "cubic-sensor", lambda x, t: [np.cos(x[0])], lambda x, t: [x[0] ** 3], [[1]], gaussian([0], [0.05]), mean_step=0.01
     ),
@@ -70,11 +107,24 @@ GALLERY = {
         "falling-body", lambda x, t: [x[1], 9.81 + 0 * x[1]], lambda x, t: [x[0]], [[0], [1]], gaussian([0, 0], [1, 1]),
         mean_step=0.01, substep=0.001,
     ),
+    "geometric-brownian-motion": System(
+        "geometric-brownian-motion", lambda x, t: [0.05 * x[0]], lambda x, t: [x[0]], lambda x, t: [[0.3 * x[0]]],
+        lambda rng, count: np.exp(0.1 * rng.standard_normal((count, 1))), _unit(1, 0.01), mean_step=0.1,
+    ),
+    "heated-room": System(
+        "heated-room", _room, lambda x, t: [x[0]], np.diag([0.3, 0.09]), gaussian([18, 17], [[4, 3], [3, 4]]), _unit(1, 0.01),
+        inputs=_heating, mean_step=0.25, substep=0.005,
+    ),
     "kalman-bucy-1d": System("kalman-bucy-1d", lambda x, t: [-0.5 * x[0]], lambda x, t: [x[0]], [[1]], gaussian([0], [1])),
     "kalman-bucy-2d": System(
         "kalman-bucy-2d", lambda x, t: [x[1], -2.25 * x[0] - 0.3 * x[1]], lambda x, t: [x[0]],
         np.linalg.cholesky([[0.1, 0.05], [0.05, 0.5]]), gaussian([1, 0], [[0.5, 0.1], [0.1, 0.5]]), _unit(1, 0.2),
         substep=0.002,
+    ),
+    "logistic-growth": System(
+        "logistic-growth", lambda x, t: [x[0] * (1 - x[0] / 2)], lambda x, t: [20 * x[0]], lambda x, t: [[0.3 * x[0]]],
+        lambda rng, count: np.exp(0.5 * rng.standard_normal((count, 1)) - 1),
+        law=lambda z, x: z[0] * np.log(np.maximum(x[0], 1e-300)) - 20 * x[0], mean_step=0.1,
     ),
     "lorenz": System(
         "lorenz", lambda x, t: [10 * (x[1] - x[0]), x[0] * (28 - x[2]) - x[1], x[0] * x[1] - 8 / 3 * x[2]],
@@ -89,12 +139,21 @@ GALLERY = {
         ],
         lambda x, t: [2 * x[0]], np.eye(3), gaussian([0, 0, 0], [0.1, 0.1, 0.1]), mean_step=0.02, count=100,
     ),
+    "pendulum": System(
+        "pendulum", lambda x, t: [x[1], -4 * np.sin(x[0]) - 0.2 * x[1]], lambda x, t: [np.sin(x[0])], [[0], [0.8]],
+        lambda rng, count: np.stack([rng.vonmises(0, 4, count), 0.5 * rng.standard_normal(count)], axis=1), _unit(1, 0.04),
+        angles=(0,), mean_step=0.1,
+    ),
     "silent-double-well": System(
         "silent-double-well", lambda x, t: [x[0] - x[0] ** 3], lambda x, t: [0 * x[0]], [[1]], gaussian([0], [1])
     ),
     "spiral-sensor": System(
         "spiral-sensor", lambda x, t: [t / 40 * x[0]], lambda x, t: [x[0] * np.sin(x[0]), x[0] * np.cos(x[0])], [[1]],
         gaussian([0.1], [3]), _unit(2), mean_step=0.01,
+    ),
+    "stochastic-volatility": System(
+        "stochastic-volatility", lambda x, t: [-0.05 * x[0]], lambda x, t: [0 * x[0]], [[0.2]], gaussian([0], [0.4]),
+        law=lambda z, x: -0.5 * (z[0] ** 2 * np.exp(-x[0]) + x[0]), mean_step=1.0, substep=0.1,
     ),
     "unobserved-double-well": System(
         "unobserved-double-well", lambda x, t: [x[0] - x[0] ** 3], lambda x, t: [1 + 0 * x[0]], [[1]], gaussian([0], [1])
@@ -106,6 +165,11 @@ GALLERY = {
     "wind-vane-rate": System(
         "wind-vane-rate", lambda x, t: [x[1], -0.5 * x[1]], lambda x, t: [np.cos(x[0]), np.sin(x[0])], np.diag([0.3, 0.1]),
         gaussian([0, 0], [4, 0.05]), _unit(2, 0.04), angles=(0,), mean_step=0.5, substep=0.05,
+    ),
+    "wright-fisher": System(
+        "wright-fisher", lambda x, t: [1 - 2.5 * x[0]], lambda x, t: [x[0]],
+        lambda x, t: [[0.8 * np.sqrt(np.maximum(x[0] * (1 - x[0]), 0))]],
+        lambda rng, count: rng.beta(3.125, 4.6875, (count, 1)), _unit(1, 0.01), mean_step=0.1,
     ),
 }  # fmt: skip
 
@@ -175,7 +239,7 @@ ORDINARY = {
         lambda x, t: [x[1], -(1 + np.cos(t) / 2) * x[0] - x[1] / 5 + np.sin(2 * t)], lambda x, t: [x[0]], [[0], [0.5]],
         gaussian([0, 0], [1, 1]), _unit(1, 0.1), mean_step=0.2, irregular=True, substep=0.01,
     ),
-    "pendulum": System(
+    "pendulum, both coordinates of its bob, with gaps": System(
         {
             "state": ["a", "w"], "drift": ["w", "-2*sin(a) - w/5"], "diffusion": [["0"], ["1/2"]],
             "observation": ["sin(a)", "cos(a)"], "observation_kind": "samples",
