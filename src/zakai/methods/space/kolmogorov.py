@@ -221,6 +221,7 @@ class Prepared:
         edge, tails = max(report.edges, update.edges), max(report.tails, update.tails)
         made = (report.splitting + report.interpolation) * update.growth + update.interpolation + min(update.cut, 1.0)
         made = made + 1e-15 * np.exp(min(update.depth, 40.0)) + self.bounds.reach**2 * edge * 0.1 + tails
+        made = made + math.hypot(report.removed, update.removed, 0.0 if found is not None else result.removed)
         left = kept * state.error
         error = float(np.sqrt(left**2 + 2 * ALIKE * left * made + made**2))
         if update.truncated or not np.isfinite(gained):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
 import numpy as np
@@ -56,9 +57,10 @@ def predicted_on(
         singles, pairs = control.parts(length, allowed)
     if min(singles, 3 * pairs) > MOST_FIXED:
         return None
-    moved = motion_of(prepared, grid, length)
+    moved, removed = motion_of(prepared, grid, length), 0.0
     if length <= moved.longest and not fits(begin.survey(prepared.bounds), grid, prepared.bounds):
         begin = positive(refitted(begin, prepared.bounds), prepared.bounds)
+        removed = begin.removed
         grid, moved = begin.grid, motion_of(prepared, begin.grid, length)
     if not length <= moved.longest:
         return None
@@ -97,7 +99,8 @@ def predicted_on(
     report = grid_report(found)
     if not (report.edges <= 3 * prepared.bounds.edge and report.tails <= prepared.bounds.tail):
         return None
-    return positive(result, prepared.bounds), report._replace(splitting=splitting), control, found
+    result = positive(result, prepared.bounds)
+    return result, report._replace(splitting=splitting, removed=math.hypot(removed, result.removed)), control, found
 
 
 def motion_of(prepared: Prepared, grid: Grid, length: float) -> Motion:

@@ -92,7 +92,8 @@ def advance(
             if _vanished(field):
                 return before, report.worst(VANISHED), Control(np.inf, 0.0, 0)
             field, spread = stepper.resolved(field, more)
-            field, report = positive(field, stepper.bounds), report.worst(more._replace(splitting=spread))
+            field = positive(field, stepper.bounds)
+            report = report.worst(more._replace(splitting=spread, removed=field.removed))
         return field, report._replace(splitting=report.splitting + error / parts**2), control._replace(age=control.age + 1)
     if not control.fixed and control.measured > 0 and tau > 2 * control.measured:
         doubles = max(doubles, np.ceil(min(tau / (1.5 * control.measured), MOST_PARTS)))
@@ -132,7 +133,8 @@ def _adaptively(
             before, length, growth = (error, length), length * min(change, 0.7), 1.0
             continue
         result, spread = stepper.resolved(result, more)
-        field, report = positive(result, stepper.bounds), report.worst(more._replace(splitting=error + spread))
+        field = positive(result, stepper.bounds)
+        report = report.worst(more._replace(splitting=error + spread, removed=math.hypot(more.removed, field.removed)))
         before = np.inf, 1.0
         growth, rate = 3.0, max(rate, difference * (4 / 3) / max((tau * length) ** 3, 1e-300))
         done, last, length = done + length, length, length * (max(change, 1.0) if stalled else change)

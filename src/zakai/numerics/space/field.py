@@ -28,7 +28,12 @@ class _Fields(NamedTuple):
 
 
 class Field(_Fields):
-    """A density `values` (*sizes), but for exp(`log_scale`), on a grid."""
+    """A density `values` (*sizes), but for exp(`log_scale`), on a grid.
+
+    Its moments are wrong by `removed` because values were set to zero: means in deviations, variances relative to them.
+    """
+
+    removed: float = 0.0
 
     def survey(self, bounds: Bounds) -> Survey:
         """Return the survey with the limit of some bounds, which is kept."""
@@ -46,7 +51,8 @@ class Field(_Fields):
 class Report(NamedTuple):
     """The errors of an interval, relative to the density.
 
-    Those of the splitting in time, of interpolation, at the edges, in the tails of the spectrum, and the negative mass.
+    Those of the splitting in time, of interpolation, at the edges, in the tails of the spectrum, the negative mass, and what
+    values that were set to zero change.
     """
 
     splitting: float
@@ -54,6 +60,7 @@ class Report(NamedTuple):
     edges: float
     tails: float
     negative: float
+    removed: float = 0.0
 
     def of_grid(self, reach: float) -> float:
         """Return the error that the grid makes; a Gaussian has fallen to the bound on edges at `reach` deviations."""
@@ -68,6 +75,7 @@ class Report(NamedTuple):
             max(self.edges, other.edges),
             max(self.tails, other.tails),
             max(self.negative, other.negative),
+            math.hypot(self.removed, other.removed),
         )
 
 
@@ -138,31 +146,72 @@ def finer_by(grid: Grid, last: Grid) -> Array:
     return np.asarray(np.linalg.norm(last.basis, axis=0) / np.linalg.norm(grid.basis, axis=0))
 
 
-@kernel("boolean(float64[::1], float64)", "boolean(complex128[::1], float64)")
-def _make_positive(values: Any, edge: float) -> bool:
-    """Set negative and negligible values to zero, and those that are not larger than the noise; return whether there are any."""
+@kernel("float64(float64[::1], int64[::1], float64)", "float64(complex128[::1], int64[::1], float64)")
+def _make_positive(values: Any, sizes: Any, edge: float) -> float:
+    """Set negative and negligible values to zero, and those that are not larger than the noise.
+
+    Returns:
+        The change of the moments: the largest of the means, in deviations, and of the variances, relative to them; -1.0 where
+        no value changed.
+    """
     top, low = 0.0, 0.0
     for j in range(values.size):
         if values[j].real > top:
             top = values[j].real
         elif values[j].real < low:
             low = values[j].real
-    least, changed = max(NEGLIGIBLE * top, min(-NOISE * low, edge * top)), False
-    for j in range(values.size):
-        if not values[j].real > least and values[j] != 0.0:
-            values[j] = 0.0
-            changed = True
-    return changed
+    least, changed, n = max(NEGLIGIBLE * top, min(-NOISE * low, edge * top)), False, sizes.size
+    # Sums of the values and of those that are set to zero, times one, the index, and its square.
+    whole, removed, last = np.zeros((3, n)), np.zeros((3, n)), sizes[n - 1]
+    for line in range(values.size // last):
+        total, first, second, gone = 0.0, 0.0, 0.0, 0.0
+        for i in range(last):
+            j, z = line * last + i, float(i - last // 2)
+            value = values[j].real
+            total += value
+            first += value * z
+            second += value * z * z
+            if not value > least and values[j] != 0.0:
+                gone += value
+                removed[1, n - 1] += value * z
+                removed[2, n - 1] += value * z * z
+                values[j] = 0.0
+                changed = True
+        whole[0, n - 1] += total
+        whole[1, n - 1] += first
+        whole[2, n - 1] += second
+        removed[0, n - 1] += gone
+        rest = line
+        for d in range(n - 2, -1, -1):
+            z = float(rest % sizes[d] - sizes[d] // 2)
+            rest //= sizes[d]
+            for k in range(3):
+                whole[k, d] += total * z**k
+                removed[k, d] += gone * z**k
+    if not changed:
+        return -1.0
+    change = 0.0
+    for d in range(n):
+        before, after = whole[:, d] / whole[0, d], (whole[:, d] - removed[:, d]) / (whole[0, d] - removed[0, d])
+        variance = max(before[2] - before[1] ** 2, 1e-12)
+        change = max(change, abs(after[1] - before[1]) / math.sqrt(variance))
+        change = max(change, abs((after[2] - after[1] ** 2) / variance - 1.0))
+    return change
 
 
 def positive(field: Field, bounds: Bounds) -> Field:
     """Return the density without negative values, those of denormal size, and the noise of interpolation.
 
-    The noise is what is not larger than a few times the most negative value, and not larger than the bound on edges.
+    The noise is what is not larger than a few times the most negative value, and not larger than the bound on edges.  What that
+    changes is `removed`.
     """
     values = np.array(field.values, order="C")
-    changed = _make_positive(values.reshape(-1), 0.0 if bounds.band_limited else bounds.edge)
-    return field._replace(values=values) if changed else field
+    changed = _make_positive(values.reshape(-1), field.grid.shape, 0.0 if bounds.band_limited else bounds.edge)
+    if changed < 0.0:
+        return field
+    found = field._replace(values=values)
+    found.removed = changed
+    return found
 
 
 def extrapolated(fine: Array, coarse: Array, log_ratio: Any) -> tuple[Array, float]:

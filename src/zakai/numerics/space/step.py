@@ -6,6 +6,7 @@ its error and, extrapolated in the logarithm, a result of order four.
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -278,4 +279,5 @@ class Stepper:
         values, difference = extrapolated(fine.values, coarse.values, coarse.log_scale - fine.log_scale)
         # Moments differ by a few times as much as densities; by more only where rounding far away counts.
         difference = max(difference, min(moments_difference(fine.values, coarse.values, fine.grid), 5 * difference))
-        return Field(values, fine.grid, fine.log_scale), first.worst(second), difference
+        report = first.worst(second)._replace(removed=math.hypot(half.removed, fine.removed))
+        return Field(values, fine.grid, fine.log_scale), report, difference

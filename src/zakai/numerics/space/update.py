@@ -37,7 +37,8 @@ class Update(NamedTuple):
 
     The edges and tails of its grid, how many nats below its maximum the prediction is where the product is largest, whether the
     product reaches the end of the predicted window, by how much an error of the prediction may be larger in the moments of the
-    product, and the errors of these by the interpolation between the grids and by the cut of the density before the interval.
+    product, the errors of these by the interpolation between the grids and by the cut of the density before the interval, and
+    what values of the prediction that were set to zero change in its own moments.
     """
 
     field: Field
@@ -48,6 +49,7 @@ class Update(NamedTuple):
     growth: float = 1.0
     interpolation: float = 0.0
     cut: float = 0.0
+    removed: float = 0.0
 
 
 class _Product(NamedTuple):
@@ -120,14 +122,14 @@ def updated(
     density to those that it has without the noise of the interval before.  A product that is zero, or one point, leaves the
     density as it is; its mass on the grid of the density is that of the result.
     """
-    grid, values = field.grid, field.values
+    grid, here = field.grid, field
     if start is not None:
-        grid, values = start, positive(Field(resampled(values, grid, start, bounds.periodic), start, 0.0), bounds).values
+        grid, here = start, positive(Field(resampled(here.values, grid, start, bounds.periodic), start, 0.0), bounds)
     coefficients, last, before = None, grid, np.ones(grid.n)
     between, sparse, resolved = grid, False, 0
-    best: tuple[float, _Product, Survey] | None = None  # the smallest edges and tails so far: a later grid may be worse
+    best: tuple[float, _Product, Survey, float] | None = None  # the smallest edges and tails so far: a later grid may be worse
     for attempt in range(_TRIES):
-        product = _multiplied(values, grid, log_factor)
+        product = _multiplied(here.values, grid, log_factor)
         if not np.isfinite(product.top):
             return _unchanged(field, log_factor)
         if product.steep.max() <= _STEEP:
@@ -142,7 +144,7 @@ def updated(
             elif best is not None and not good:
                 good = worst < best[0]
             if best is None or good:
-                best = worst, product, found
+                best = worst, product, found, here.removed
             before, last = np.where(coarse & (attempt > 0), found.tails, before), grid
             span = (found.used[:, 1] - found.used[:, 0] + 4) / grid.shape
             sparse = bool(start is None and attempt < 2 and np.prod(np.minimum(span, 1.0)) < 0.35 and grid.n > 1)
@@ -157,17 +159,17 @@ def updated(
         grid = new
         if grid.refines(field.grid):
             values, _ = refined(field.values, field.grid, grid.sizes)
-            values = positive(Field(values, grid, 0.0), bounds).values
+            here = positive(Field(values, grid, 0.0), bounds)
             continue
         if bounds.band_limited:
-            values = triangular_resampled(field.values, field.grid, grid)
+            here = Field(triangular_resampled(field.values, field.grid, grid), grid, 0.0)
             continue
         if coefficients is None:
             finer = _interpolable(field, product, bounds)
             coefficients, between = filtered(finer.values, np.zeros((grid.n, grid.n)), spline=True), finer.grid
         values = gather(coefficients, relative_index(grid, between, bounds.periodic), between).reshape(grid.sizes)
-        values = positive(Field(values, grid, 0.0), bounds).values
-    _, product, found = best or (0.0, product, product.field.survey(bounds))
+        here = positive(Field(values, grid, 0.0), bounds)
+    _, product, found, removed = best or (0.0, product, product.field.survey(bounds), here.removed)
     grid, values = product.field.grid, product.values
     inverse = grid.inverse
     if not np.diagonal(inverse @ found.cov @ inverse.T).min() > POINT**2:
@@ -190,6 +192,7 @@ def updated(
         growth,
         0.0 if between is grid or bounds.band_limited else min(float(_of_spline(field, between, bounds).sum()) * of_spline, 1.0),
         cut,
+        0.0 if product.values is field.values else removed,
     )
 
 
