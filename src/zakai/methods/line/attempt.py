@@ -120,16 +120,17 @@ def _acted(
     matrices, found, error = [window.generator(*one) for one in exponents.generators], values, 0.0
     if any(isinstance(one, FourierOperator) and one.decay > SMOOTHED for one in matrices):
         return Attempt(values, 0.0, 0.0, True)
+    if adjoint:
+        matrices = [one.T for one in matrices[::-1]]
     if len(matrices) == 2:
         # The part of third order that two exponentials contain; they omit one of fifth order, with a factor that was measured.
-        total, difference, now = (matrices[0] + matrices[1]).real, (matrices[1] - matrices[0]).real, values.real
-        if adjoint:
-            total, difference = total.T, (matrices[0] - matrices[1]).real.T
-        commutator = 0.25 * (total @ (difference @ now) - difference @ (total @ now))
+        difference = window.generator(*(late - early for early, late in zip(*exponents.generators, strict=True)))
+        (first, _), difference, now = matrices, difference.T if adjoint else difference, values.real
+        commutator = 0.5 * (first @ (difference @ now) - difference @ (first @ now)).real
         error = 5.0 * float(np.sum(np.abs(commutator))) ** (5.0 / 3.0)
         if error > MAGNUS * prepared.tolerance:
             return Attempt(values, 0.0, error, True)
-    for matrix in [one.T for one in matrices[::-1]] if adjoint else matrices:
+    for matrix in matrices:
         key = ("exponential", window, substep.length, adjoint)
         transition = prepared.once(key, partial(exponential_of, matrix)) if keeps else exponential_of(matrix)
         found, rounding = transition(found)

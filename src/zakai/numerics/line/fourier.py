@@ -37,12 +37,6 @@ class FourierOperator:
     adjoint: bool = False
 
     @property
-    def real(self) -> FourierOperator:
-        """The operator for the real parts of the coefficients."""
-        parts = np.real(self.covariance), self.drift.real, np.real(self.potential)
-        return FourierOperator(*parts, self.length, self.adjoint)
-
-    @property
     def T(self) -> FourierOperator:  # noqa: N802
         """The adjoint."""
         return replace(self, adjoint=not self.adjoint)
@@ -56,16 +50,6 @@ class FourierOperator:
     def decay(self) -> float:
         """The most by which diffusion lets the logarithm of the shortest wave decrease."""
         return 0.5 * self.highest**2 * float(np.max(np.real(self.covariance)))
-
-    def __add__(self, other: FourierOperator) -> FourierOperator:
-        """Return the sum of two operators on a grid."""
-        parts = self.covariance + other.covariance, self.drift + other.drift, self.potential + other.potential
-        return FourierOperator(*parts, self.length, self.adjoint)
-
-    def __sub__(self, other: FourierOperator) -> FourierOperator:
-        """Return the difference of two operators on a grid."""
-        parts = self.covariance - other.covariance, self.drift - other.drift, self.potential - other.potential
-        return FourierOperator(*parts, self.length, self.adjoint)
 
     def __matmul__(self, values: Array) -> Array:
         """Return L u for u (N,)."""
