@@ -49,34 +49,6 @@ class Gaussian:
             logs = self.constant - 0.5 * np.sum(rest * (self.precision @ rest), axis=0)
         return np.where(np.isnan(logs.real), -np.inf, logs)
 
-    def cells(self, ends: Array, prior: Callable[[Array], Array], origin: float) -> tuple[Array, Array, Array]:
-        """Return for cells between offsets `ends` (J, 2) from the origin what the placing of a grid needs.
-
-        The likelihood of a cell is bounded by the range of h over its ends, widened by half of it.
-
-        Args:
-            ends: (J, 2).
-            prior: logarithm of the density at offsets.
-            origin: the point from which offsets count.
-
-        Returns:
-            The logarithm of the product at the ends (J, 2), a bound of it (J,) and by how much it changes, in deviations (J,).
-        """
-        factor = np.linalg.cholesky(self.precision.real).T
-        target = factor @ self.value.real
-        h = self.observation(origin + ends.reshape(-1)).real
-        own = prior(ends)
-        scaled = (factor @ np.where(np.isfinite(h), h, np.inf)).reshape(len(target), -1, 2)
-        with np.errstate(all="ignore"):
-            rest = target[:, None, None] - scaled
-            product = own - 0.5 * np.sum(np.where(np.isfinite(rest), rest, 1e150) ** 2, axis=0)
-            low, high = scaled.min(axis=2), scaled.max(axis=2)
-            more = 0.5 * (high - low)
-            apart = np.maximum(np.maximum(low - more - target[:, None], target[:, None] - high - more), 0.0)
-            bound = own.max(axis=1) + 1.0 - 0.5 * np.sum(np.where(np.isfinite(apart), apart, 0.0) ** 2, axis=0)
-            change = np.max(np.where(np.isfinite(high - low), high - low, np.inf), axis=0)
-        return product, bound, change
-
 
 @dataclass(frozen=True)
 class General:
@@ -89,19 +61,6 @@ class General:
         """Return log l (J,), minus infinity where it has no value."""
         found = self.log_density(points)
         return np.where(np.isnan(found.real), -np.inf, found)
-
-    def cells(self, ends: Array, prior: Callable[[Array], Array], origin: float) -> tuple[Array, Array, Array]:
-        """Return what `Gaussian.cells` returns, from values at five points of each cell.
-
-        A change d of the logarithm counts as the distance from the maximum of a Gaussian between depths D and D + d.
-        """
-        points = ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * np.linspace(0.0, 1.0, 5)
-        logs = np.maximum(self.logs(origin + points.reshape(-1)).real.reshape(points.shape), -1e150)
-        product = prior(points) + logs
-        highest, range_ = product.max(axis=1), logs.max(axis=1) - logs.min(axis=1)
-        depth = np.maximum(product.max() - highest, 0.0)
-        change = np.sqrt(2.0 * (depth + range_)) - np.sqrt(2.0 * depth)
-        return product[:, [0, -1]], highest + 0.5 * range_ + 1.0, change
 
 
 Likelihood = Gaussian | General
@@ -226,6 +185,29 @@ def _placed(values: Array, window: lw.Window, likelihood: Likelihood) -> lw.Wind
     return lw.quantized(window, low, high, spacing, margin=0.3, most=lw.SIZES[-1])
 
 
+def _surveyed(ends: Array, prior: Callable[[Array], Array], likelihood: Likelihood, origin: float) -> tuple[Array, Array, Array]:
+    """Return for cells between offsets `ends` (J, 2) what the placing of a grid needs, from values at five points of each.
+
+    A change d of the logarithm counts as the distance from the maximum of a Gaussian between depths D and D + d.
+
+    Args:
+        ends: (J, 2).
+        prior: logarithm of the density at offsets.
+        likelihood: the likelihood.
+        origin: the point from which offsets count.
+
+    Returns:
+        The logarithm of the product at the ends (J, 2), a bound of it (J,) and by how much it changes, in deviations (J,).
+    """
+    points = ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * np.linspace(0.0, 1.0, 5)
+    logs = np.maximum(likelihood.logs(origin + points.reshape(-1)).real.reshape(points.shape), -1e150)
+    product = prior(points) + logs
+    highest, range_ = product.max(axis=1), logs.max(axis=1) - logs.min(axis=1)
+    depth = np.maximum(product.max() - highest, 0.0)
+    change = np.sqrt(2.0 * (depth + range_)) - np.sqrt(2.0 * depth)
+    return product[:, [0, -1]], highest + 0.5 * range_ + 1.0, change
+
+
 def place(offsets: Array, logs: Array, likelihood: Likelihood, origin: float) -> tuple[float, float, float] | None:
     """Return the ends of the product of a density and a likelihood, and the smallest cell that resolves it.
 
@@ -243,7 +225,7 @@ def place(offsets: Array, logs: Array, likelihood: Likelihood, origin: float) ->
 
     cells = np.stack([offsets[:-1], offsets[1:]], axis=1)
     for _ in range(_LEVELS):
-        product, bound, change = likelihood.cells(cells, prior, origin)
+        product, bound, change = _surveyed(cells, prior, likelihood, origin)
         best = float(product.max())
         if not np.isfinite(best):
             return None
@@ -256,6 +238,6 @@ def place(offsets: Array, logs: Array, likelihood: Likelihood, origin: float) ->
         quarters = cells[divide, :1] + widths[divide, None] * np.linspace(0.0, 1.0, 5)
         parts = np.stack([quarters[:, :-1], quarters[:, 1:]], axis=2).reshape(-1, 2)
         cells = np.concatenate([cells[~divide], parts])
-    product, _, _ = likelihood.cells(cells, prior, origin)
+    product, _, _ = _surveyed(cells, prior, likelihood, origin)
     good = (product >= product.max() - 32.0).any(axis=1)
     return float(cells[good, 0].min()), float(cells[good, 1].max()), float((cells[good, 1] - cells[good, 0]).min())
