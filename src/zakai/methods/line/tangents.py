@@ -30,7 +30,7 @@ from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.exponential_tangents import exponential_tangents
 from zakai.numerics.line.segment import SPLIT
-from zakai.numerics.line.split_tangents import Coefficients, Interval, shifted_by, through
+from zakai.numerics.line.split_tangents import Coefficients, Interval, through
 from zakai.numerics.line.tangents import Varied, extended, resampled_tangents
 
 Array = Any
@@ -168,7 +168,7 @@ class _Walk:
                 self._singly(piece.first + i, states[i], states[i + 1], observed[i])
                 window = states[i + 1].window
             else:
-                before, tangents = shifted_by(states[i].values, shift), shifted_by(self.tangents, shift)
+                before, tangents = (lw.shifted(one, shift, window.size) for one in (states[i].values, self.tangents))
                 _, self.tangents, log_factor = through(interval, coefficients, before, tangents)
                 self._multiply(piece.densities[i], logs[:, i] + log_factor[:, None], gains[i])
                 window = window._replace(centre=float(centres[i]))

@@ -221,12 +221,3 @@ def _samples(variance: float, steepest: float, most: int) -> tuple[Array, Array]
     squares = np.arange(min(np.ceil(np.sqrt(2.0 * _DEPTH * variance) + steepest * variance) + 1.0, most)) ** 2
     taps = np.exp(-0.5 * squares / variance) / np.sqrt(2.0 * np.pi * variance)
     return taps, taps * 0.5 * (squares / variance - 1.0) / variance
-
-
-def shifted_by(values: Array, by: int) -> Array:
-    """Return values (..., N) on a grid of the same size that begins `by` points later, zero where there are none."""
-    found, size = np.zeros_like(values), values.shape[-1]
-    first, last = max(by, 0), min(size + by, size)
-    if last > first:
-        found[..., first - by : last - by] = values[..., first:last]
-    return found

@@ -242,7 +242,7 @@ def resampled(values: Array, window: Window, new: Window) -> Array:
     if not window.closed and new.spacing == window.spacing:
         shift = (new.centre - window.centre) / window.spacing + window.size // 2 - new.size // 2
         if abs(shift - round(shift)) < 1e-6:
-            return _shifted(values, round(shift), new.size)
+            return shifted(values, round(shift), new.size)
     return density_at(values, window, new.offsets) * (new.spacing / window.spacing)
 
 
@@ -259,12 +259,12 @@ def density_at(values: Array, window: Window, offsets: Array) -> Array:
     return found
 
 
-
-def _shifted(values: Array, shift: int, size: int) -> Array:
-    found = np.zeros(size, values.dtype)
-    first, last = max(shift, 0), min(shift + size, len(values))
+def shifted(values: Array, by: int, size: int) -> Array:
+    """Return values (..., N) on a grid of another size that begins `by` points later, zero where there are none."""
+    found = np.zeros((*values.shape[:-1], size), values.dtype)
+    first, last = max(by, 0), min(by + size, values.shape[-1])
     if last > first:
-        found[first - shift : last - shift] = values[first:last]
+        found[..., first - by : last - by] = values[..., first:last]
     return found
 
 
