@@ -17,7 +17,7 @@ from zakai.methods.line.grids import grid_of
 from zakai.methods.line.loop import TOGETHER
 from zakai.methods.line.message import LOWEST, PAD, SURE, Message, support, taper
 from zakai.methods.line.moving import displaced
-from zakai.methods.line.system import Prepared, State
+from zakai.methods.line.system import SHARE, Prepared, State
 from zakai.methods.line.tables import covariance_at
 from zakai.methods.line.update import factor_at_end
 from zakai.methods.line.way import negligible, smoothing_tolerance
@@ -31,7 +31,6 @@ Array = Any
 STRIDES = (1, 2, 4)  # points of psi in a spacing of the filter's grid
 MOST = 64  # intervals that are taken together
 APART = 32  # the ends of a grid for a decomposition are multiples of so many spacings
-SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
 
 
 class Taken(NamedTuple):

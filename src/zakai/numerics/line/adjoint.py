@@ -16,13 +16,12 @@ from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNU
 from zakai.numerics.line.backward import ERROR, LOG_MASS, SMALLEST, Filtered, Limits, Message, Taken, kept, multiplied, spread
 from zakai.numerics.line.density import highest_of, moments, support, waves
 from zakai.numerics.line.segment import SPLIT, Grid, Steps
-from zakai.numerics.line.splitting import differences, residual, split
+from zakai.numerics.line.splitting import STEEPEST, differences, residual, split
 
 Array = NDArray[Any]
 
 MOST_SUBSTEPS = 512
 EXCURSION = 3.9  # standard deviations of the noise that a path between two points goes beyond them, but for exp(-30)
-STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
 _WHOLE = np.ones((1, 5, 1))
 _V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1]
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line.density import circular_moments, highest_of, moments, spectrum, support, waves
-from zakai.numerics.line.modes import propagate
+from zakai.numerics.line.modes import decayed, propagate
 from zakai.numerics.line.window import CUT
 
 Array = NDArray[Any]
@@ -30,7 +30,6 @@ ROUNDING = 1e-15  # of the maximum: smaller values of psi are not kept
 SURE = 100.0  # errors of psi from which its small values count
 LEAST = 1e-11  # of the maximum: the same
 NOISE = 4e-16  # rounding of a decomposition relative to the norm of psi
-NEGLIGIBLE_MODES = 42.0  # -log of the factor of a mode that is negligible
 LOG_MASS, MEAN_AT, VARIANCE, ALIASING, EDGE, ERROR = range(6)  # what is reported of a smoothed density
 
 
@@ -173,15 +172,10 @@ def _decomposed(
             norm += now[j] * now[j]
         for j in range(first, last + 1):
             b[j] *= np.exp(likelihood[place + stride * j] - likelihood[at])
-        between, count = spread(b, first, last), 1
-        while count < longer and tau * (rates[count] - rates[0]) < NEGLIGIBLE_MODES:
-            count += 1
-        decay = np.empty(count)
-        for n in range(count):
-            decay[n] = np.exp(-tau * (rates[n] - rates[0]))
+        between, decay = spread(b, first, last), decayed(rates, tau)
         propagate(modes, decay, now)
         highest = now[highest_of(now)]
-        noise = NOISE * np.sqrt(norm) * max(1.0, np.exp(min(tau * rates[0], 600.0)))
+        noise = NOISE * np.sqrt(norm) * max(1.0, decay[0])
         left, right, _, _, _, aliasing, _, _, _ = spectrum(now, CUT, SMALLEST, long_cosines, long_sines, False)
         level = max(noise, (ROUNDING + 2.0 * aliasing) * highest)
         # b relative to where its product with the density is largest.
@@ -203,7 +197,7 @@ def _decomposed(
         made = level * weight / total + (0.0 if closed else 10.0 * max(left, right))
         if not (made < ROUGH * most):
             return taken, error, scale, reliable
-        row[LOG_MASS] = scale + top + reference - tau * rates[0]
+        row[LOG_MASS] = scale + top + reference
         first, last = multiplied(b, density, floors[i], negligible, closed, cosines, sines, products[i], row)
         if last < 0:
             return taken, error, scale, reliable

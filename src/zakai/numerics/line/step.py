@@ -15,6 +15,7 @@ from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.averages import IMPOSSIBLE
 from zakai.numerics.line.density import spectrum
 from zakai.numerics.line.outlook import FAR
+from zakai.numerics.line.place import log_likelihood
 from zakai.numerics.line.segment import FAILED, OK, RANGE
 from zakai.numerics.line.terms import DRIFT, exponent_added
 
@@ -101,15 +102,10 @@ def copied(table: Array, start: int, to: Array) -> None:
 @helper
 def likelihood(h: Array, centre: Array, precision: Array, observed: Array, b: Array) -> float:
     """Write the logarithm b of the likelihood relative to where h is `centre` (m,); return it there, without its constant."""
-    gained = 0.0
     for j in range(b.size):
         b[j] = 0.0
     exponent_added(h, centre, precision, observed, 1.0, 1.0, b)
-    for i in range(observed.size):
-        for l in range(observed.size):
-            if precision[i, l] != 0.0:
-                gained -= 0.5 * (observed[i] - centre[i]) * precision[i, l] * (observed[l] - centre[l])
-    return gained
+    return log_likelihood(centre, False, precision, observed)
 
 
 @helper
