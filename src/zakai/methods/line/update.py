@@ -105,8 +105,6 @@ def sampled_weakly(
 
 def _finer(prepared: Prepared, values: Array, window: lw.Window) -> tuple[lw.Window, bool]:
     """Return a finer grid for a density, and whether that holds it with the margins that a grid is kept with."""
-    if window.closed:
-        return lw.refined(window), True
     look = figures(prepared, values, window)
     low, high = window.offsets[look.first], window.offsets[look.last]
     new = lw.quantized(window, low, high, window.spacing / 2**0.5 * 1.001, margin=0.16, most=lw.SIZES[-1])
