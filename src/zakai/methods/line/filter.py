@@ -36,8 +36,9 @@ from zakai.methods.line.figures import (
     state_moments,
 )
 from zakai.methods.line.grids import SHARED
+from zakai.methods.line.kernel import by_kernel
 from zakai.methods.line.model import system_of
-from zakai.methods.line.moves import Passage, Report, by_decomposition, by_kernel, by_substeps
+from zakai.methods.line.moves import Passage, Report, by_decomposition, by_substeps
 from zakai.methods.line.moving import SOME, travel
 from zakai.methods.line.parts import parts_of_step, segment_of_parts
 from zakai.methods.line.prior import init as init

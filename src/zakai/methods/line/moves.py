@@ -15,11 +15,8 @@ from zakai.methods.line.coefficients import resolved_parts
 from zakai.methods.line.figures import refitted
 from zakai.methods.line.moving import speed_of
 from zakai.methods.line.system import NOISE, Prepared
-from zakai.methods.line.yau import moved
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.channel import Channel
 from zakai.numerics.line.density import support
-from zakai.numerics.line.filters import WIDE, wrapped
 
 Array = Any
 
@@ -67,29 +64,6 @@ class Moved(NamedTuple):
     gained: Any
     look: lw.Figures | None
     passages: tuple[Passage, ...] = ()
-
-
-def by_kernel(
-    prepared: Prepared, values: Array, window: lw.Window, start: float, length: float, kernel: Channel, report: Report
-) -> Moved | None:
-    """Return the density after an interval with a Gaussian kernel; None where it is too narrow for the grid."""
-    negligible, rough = prepared.negligible, max(1e-10, 1e-3 * prepared.tolerance)
-    if window.closed:
-        around = _around(prepared, values, window, kernel)
-        if around is None:
-            return None
-        look, mass = lw.figures(around, True, negligible), np.sum(around)
-        report.density(look)
-        return Moved(around / mass, window, np.log(mass) + kernel.constant, look)
-    if prepared.yau is None:
-        return None
-    ends = start, start + length
-    direct = moved(prepared.yau, kernel, values, window, *ends, prepared.theta, negligible, rough, prepared.cut)
-    if direct is None:
-        return None
-    report.density(direct.look)
-    mass = np.sum(direct.values)
-    return Moved(direct.values / mass, direct.window, np.log(mass) + direct.offset, direct.look)
 
 
 def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, length: float, report: Report) -> Moved | None:
@@ -256,15 +230,3 @@ def _normalised(
     found = np.where(found.real > 0, found, 0.0)
     mass = np.sum(found)
     return Moved(found / mass, window, np.log(mass), look, (passage._replace(log_mass=np.log(mass)),))
-
-
-def _around(prepared: Prepared, values: Array, window: lw.Window, kernel: Channel) -> Array | None:
-    """Return a density on the circle convolved with a wrapped Gaussian, None where the kernel is none or too narrow."""
-    if np.iscomplexobj(values) or np.iscomplexobj(kernel.variance) or np.iscomplexobj(kernel.shift):
-        return None
-    variance = kernel.variance / window.spacing**2
-    if kernel.scale != 1.0 or kernel.slope != 0.0 or kernel.curvature != 0.0 or not variance >= WIDE:
-        return None
-    moved = np.array(values, float)
-    wrapped(moved, np.empty_like(moved), kernel.shift / window.spacing, variance, 8.0 - np.log(prepared.cut))
-    return moved

@@ -17,14 +17,9 @@ from zakai.methods.series.kernel import PowerSeries
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.numerics.flow import FlowResult, Transition, integrate
-from zakai.numerics.line import window as lw
-from zakai.numerics.line.channel import Channel
-from zakai.numerics.line.filters import applied
 
 Array = Any
 
-KEPT_SPACING = 160  # points up to which the spacing of a grid is kept where it is enlarged
-NARROWEST = 1.4  # spacings that the standard deviation of a kernel must have
 UNRESOLVED = 1e-10  # relative error of a transition from which the coefficients in time are not resolved
 
 
@@ -111,94 +106,3 @@ def _padded(found: Transition, inputs: int) -> Transition:
 def yau_line_of(model: Model) -> YauLine:
     """Return the equation of a model, made once."""
     return YauLine(model)
-
-
-class Moved(NamedTuple):
-    """The density after an interval times exp(-offset), its grid, and its figures."""
-
-    values: Array
-    window: lw.Window
-    offset: Any
-    look: lw.Figures
-
-
-def moved(
-    yau: YauLine,
-    kernel: Channel,
-    values: Array,
-    window: lw.Window,
-    start: float,
-    stop: float,
-    theta: Array,
-    negligible: float,
-    rough: float,
-    cut: float,
-) -> Moved | None:
-    """Return the density after an interval, or None where its kernel is too narrow for the grid or no grid fits.
-
-    Args:
-        yau: the equation.
-        kernel: that of the interval, for x relative to the origin of `window`.
-        values, window: the density (N,) and its grid.
-        start, stop: the ends of the interval.
-        theta: parameters (p,).
-        negligible, rough: the spectrum that need not be resolved, and that of a density with kinks that is accepted.
-        cut: the density relative to its maximum that a grid must hold.
-    """
-    width = np.sqrt(np.abs(kernel.variance.real))
-    if not width > NARROWEST * window.spacing * abs(kernel.scale.real):
-        return None
-    sources = window.offsets
-    positive = values.real > 0
-    with np.errstate(divide="ignore"):
-        logs = np.where(positive, np.log(np.where(positive, values, 1.0)), -np.inf)
-    logs = logs - yau.potential(window.points, start, theta)
-    weights = logs + kernel.constant + sources * (kernel.slope + kernel.curvature * sources)
-    top = float(np.max(np.where(np.isfinite(weights.real), weights.real, -np.inf)))
-    weights = np.where(np.isfinite(weights.real), np.exp(weights - top), 0.0)
-
-    def after(new: lw.Window) -> tuple[Array, float]:
-        first = new.centre - new.spacing * (new.size // 2)
-        found = applied(sources, first, new.spacing, new.size, weights, kernel.scale, kernel.shift, kernel.variance) * new.spacing
-        if not yau.gauged:
-            best = float(np.max(found.real))
-            return found, (0.0 if best > 0 else -np.inf)
-        gauge = yau.potential(new.points, stop, theta)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            total = np.where(found.real > 0, np.log(np.where(found.real > 0, found, 1.0)) + gauge, -np.inf)
-        best = float(np.max(total.real))
-        return (np.exp(total - best), best) if np.isfinite(best) else (np.zeros_like(found), best)
-
-    def good(found: Array) -> tuple[lw.Figures, bool, bool, bool]:
-        look = lw.figures(found, False, negligible, cut)
-        if not found.any():
-            return look, True, True, False
-        coarse = look.aliasing > 30.0 * negligible and (look.aliasing > rough or not look.rough)
-        return look, look.left > 10 * cut, look.right > 10 * cut, coarse
-
-    new = window
-    found, best = after(new)
-    look, *bad = good(found)
-    if any(bad):
-        own = lw.figures(values, False, negligible, cut)
-        first, last = own.first, own.last
-        ends = kernel.scale.real * sources[[first, last]] + kernel.shift.real
-        spacing = float(np.sqrt((kernel.scale.real * window.spacing) ** 2 + kernel.variance.real / 6.0))
-        reach = float(np.sqrt(-2.0 * np.log(cut)))
-        low, high = float(ends.min() - reach * width), float(ends.max() + reach * width)
-        if (high - low) / window.spacing < KEPT_SPACING:
-            spacing = min(spacing, window.spacing)
-        new = lw.quantized(window, low, high, max(spacing, (high - low) / 400), most=lw.SIZES[-1])
-        for _ in range(12):
-            found, best = after(new)
-            look, left, right, coarse = good(found)
-            if not (left or right or coarse):
-                break
-            larger = lw.enlarged(new, left, right) if left or right else new
-            larger = lw.refined(larger) if coarse else larger
-            if larger.size >= lw.SIZES[-1] and larger.size == new.size:
-                return None
-            new = larger
-        else:
-            return None
-    return Moved(found, new, top + best, look)
