@@ -218,7 +218,7 @@ def _longer(prepared: Prepared, window: lw.Window, stride: int, length: float) -
     spacing = window.spacing / stride
     covariance = covariance_at(prepared.system, window.points, prepared.model.start, prepared.theta.real)
     reach = EXCURSION * float(np.sqrt(np.max(covariance) * length)) / spacing
-    reach = PAD + 2.0 ** (1.0 + 2.0 * np.ceil(0.5 * np.log2(np.clip(reach, 8.0, lw.LARGEST_OF_MESSAGES) / 2.0)))
+    reach = PAD + 2.0 ** (1.0 + 2.0 * np.ceil(0.5 * np.log2(np.clip(reach, 8.0, lw.LARGE) / 2.0)))
     begin = stride * _first(window)
     low = int(APART * np.floor((begin - reach) / APART))
     size = int(APART * np.ceil((begin + stride * window.size + reach) / APART)) - low

@@ -55,13 +55,11 @@ def refitted(
         generous: a grid of up to so many points is kept though fewer would do.
         large: whether it may have more points than a matrix of the operator.
     """
-    if not prepared.smoothing:
-        large = large and prepared.largest_for(look, window.size) > prepared.largest
-        new = lw.fitted(look, window, lw.SIZES[-1] if large else lw.LARGEST, generous)
-        return lw.resampled(values, window, new), new
-    new = lw.fitted(look._replace(resolving=1.0), window, lw.LARGEST, generous)
+    large = large and prepared.largest_for(look, window.size) > prepared.largest
+    look = look._replace(resolving=1.0) if prepared.smoothing else look
+    new = lw.fitted(look, window, lw.SIZES[-1] if large else lw.LARGEST, generous)
     moved = resampled(prepared, values, window, new)
-    return moved / np.sum(moved), new
+    return moved / np.sum(moved) if prepared.smoothing else moved, new  # an imaginary part need not have the sum zero
 
 
 def on_fitting_grid(

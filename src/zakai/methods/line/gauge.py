@@ -40,7 +40,7 @@ def gauged(prepared: Prepared, window: lw.Window) -> Spectral | None:
         ends = slope / window.spacing, curvature / window.spacing**2
 
     def make() -> tuple[Spectral | None]:
-        found = decomposed(prepared, window, lw.LARGEST_OF_MESSAGES, ends)
+        found = decomposed(prepared, window, lw.LARGE, ends)
         if found is not None:
             found.modes = np.asfortranarray(found.modes)  # the loop reads rows of U'
         return (found,)

@@ -76,7 +76,7 @@ def init(prepared: Prepared, prior: Any) -> State:
         grid = prior_grid(lambda points: evaluate(points).real, 1, [closed], tolerance=tolerance)
         low, high = (float(grid.points[i, 0]) for i in (0, -1))
         # Rather too coarse than without a part of the mass.
-        spacing = max(float(grid.basis[0, 0]), (high - low) / (lw.LARGEST_OF_MESSAGES - 2 * lw.ALIGNMENT))
+        spacing = max(float(grid.basis[0, 0]), (high - low) / (lw.LARGE - 2 * lw.ALIGNMENT))
     else:
         depth = float(np.sqrt(-2.0 * np.log(cut))) + 0.1
         low, high = float(np.min(means[:, 0] - depth * deviations)), float(np.max(means[:, 0] + depth * deviations))
@@ -87,7 +87,7 @@ def init(prepared: Prepared, prior: Any) -> State:
     else:
         origin = 0.5 * (low + high)
         window = Window(origin, 0.0, spacing, 0, False, spacing)
-        window = lw.quantized(window, low - origin, high - origin, spacing, margin=0.0, most=lw.LARGEST_OF_MESSAGES)
+        window = lw.quantized(window, low - origin, high - origin, spacing, margin=0.0, most=lw.LARGE)
     for attempt in range(8):
         if log_density is None:
             points = window.points[:, None]
@@ -98,7 +98,7 @@ def init(prepared: Prepared, prior: Any) -> State:
         values = np.exp(logs - np.max(logs.real))
         values = values / np.sum(values)
         look = lw.figures(values, closed, cut=cut)
-        new = lw.fitted(look, window, lw.LARGEST_OF_MESSAGES)
+        new = lw.fitted(look, window, lw.LARGE)
         if new == window or attempt == 7:  # the values belong to this window
             break
         window = new

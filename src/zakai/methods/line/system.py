@@ -22,7 +22,6 @@ Array = Any
 NOISE = 3e-15  # error of a density relative to its maximum, which matters in its tails
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
-FINEST = 1024  # points of the largest grid for Gaussian kernels and splitting
 KEPT_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are kept for a model
 
 
@@ -181,11 +180,6 @@ class Prepared:
             return 1e-280  # a grid around the circle holds every value
         return 1e-32 if self.system.samples else lw.DEEP
 
-    @property
-    def finest(self) -> float:
-        """The points of the largest grid that is taken so that kernels are filters of positive numbers."""
-        return 512.0 if self.system.samples else 256.0
-
     @cached_property
     def coefficients(self) -> Coefficients:
         """The coefficients in time of all intervals."""
@@ -203,7 +197,7 @@ class Prepared:
     @property
     def largest(self) -> int:
         """The points of the largest grid of the compiled loop, and of any grid where a larger one does not help."""
-        return FINEST if self.gaussian else lw.LARGEST
+        return lw.LARGE if self.gaussian else lw.LARGEST
 
     def largest_for(self, look: lw.Figures | None = None, size: int = 0) -> int:
         """Return the points of the largest grid for a density with some figures on a grid of some size.
@@ -235,8 +229,9 @@ class Prepared:
     def limits(self) -> Array:
         """What a step of the compiled loop must keep, as the fields of `line_segment.Limits`."""
         splitting = SHARE * self.tolerance if self.yau is None else KERNEL_SHARE * self.promised
-        generous = FINEST if self.timed and self.model.periodic else self.generous
-        return np.array(Limits(self.negligible, self.promised, splitting, self.cut, generous, self.finest), float)
+        generous = lw.LARGE if self.timed and self.model.periodic else self.generous
+        finest = 512.0 if self.system.samples else 256.0
+        return np.array(Limits(self.negligible, self.promised, splitting, self.cut, generous, finest), float)
 
     @cached_property
     def mechanisms(self) -> Mechanisms:

@@ -122,7 +122,7 @@ def _by_modes(
     spacing = max(later.needed, RESOLVED * least)
     for attempt in range(MOST_GRIDS):
         window = covering(later.window, low, high, spacing)
-        if window.size > lw.LARGEST_OF_MESSAGES:
+        if window.size > lw.LARGE:
             return None
         operator = gauged(prepared, window)
         if operator is None:

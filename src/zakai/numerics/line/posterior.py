@@ -103,7 +103,7 @@ def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: 
             return product
         look = lw.figures(product.values, new.closed)
         noisy = look.rough and look.aliasing < lw.GROSS
-        if look.aliasing <= 1e-11 or new.size >= (lw.LARGEST_OF_MESSAGES if noisy else lw.SIZES[-1]):
+        if look.aliasing <= 1e-11 or new.size >= (lw.LARGE if noisy else lw.SIZES[-1]):
             break
         finer = _finer(product.values, look, new)
         if finer == new:

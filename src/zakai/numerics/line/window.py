@@ -25,7 +25,7 @@ Operator = Array | FourierOperator
 
 SIZES = (32, 48, 64, 80, 96, 112, 128, 160, 192, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
 LARGEST = 384  # points of a grid on which densities are moved by matrices
-LARGEST_OF_MESSAGES = 1024  # points of a grid on which functions are moved by matrices
+LARGE = 1024  # points of a grid on which messages are moved by matrices, and densities by kernels and splitting
 CUT = 1e-13  # density relative to its maximum that a new grid must hold
 DEEP = 1e-20  # the same of densities whose small values are accurate
 SMALL = 1e-8  # density relative to its maximum below which its logarithm is interpolated
@@ -123,7 +123,7 @@ def figures(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: fl
         cut: the smallest value that counts, relative to the largest.
     """
     real = np.ascontiguousarray(values.real)
-    large = len(real) > LARGEST_OF_MESSAGES
+    large = len(real) > LARGE
     found = spectrum_of_many(real, cut, negligible) if large else spectrum(real, cut, negligible, *waves(len(real)), True)
     left, right, first, last, negative, aliasing, middle, highest, nyquist = found
     rough = middle < 6.0 * aliasing
@@ -198,7 +198,7 @@ def refined(window: Window, factor: float = 2**0.5) -> Window:
 
 def interpolated(values: Array, window: Window, offsets: Array) -> Array:
     """Return the interpolants of values (..., N) at offsets (J,) from the origin."""
-    if len(offsets) > TOGETHER and window.size > LARGEST_OF_MESSAGES:
+    if len(offsets) > TOGETHER and window.size > LARGE:
         parts = np.array_split(offsets, -(-len(offsets) // TOGETHER))
         return np.concatenate([interpolated(values, window, part) for part in parts], axis=-1)
     at = (offsets - window.centre) / window.spacing + window.size // 2
