@@ -107,9 +107,11 @@ def is_quadratic(q: sp.Expr, x: Sequence[sp.Symbol]) -> bool | None:
                 return False
             vanished += not any(_underflows(one) for one in known)
     if q.count_ops() <= SHORT:
+        # Unlike the differences they are free of the quadratic part, which hides a term with a coefficient like 1e-40.
         thirds = (sp.diff(q, a, b, c) for i, a in enumerate(x) for j, b in enumerate(x[i:], i) for c in x[j:])
-        if is_in_one_piece(q, x) and all(_provably_zero(third) for third in thirds):
-            return True
+        vanish = all_zero(thirds)
+        if vanish is False or (vanish and is_in_one_piece(q, x)):
+            return vanish
     return True if vanished >= POINTS and _is_analytic(q) else None
 
 
@@ -259,15 +261,18 @@ def _provably_zero(expression: sp.Expr) -> bool:
 def _as_rational(expression: sp.Expr) -> sp.Expr:
     """The expression as a rational function of symbols that stand for independent exponentials and other functions.
 
-    exp(sum_k c_k m_k), c_k rational and m_k monomials, becomes prod_k e_k^c_k.  Arguments are treated before what contains them.
+    exp(sum_k c_k m_k), c_k rational and m_k monomials, becomes prod_k e_k^(c_k / d_k), d_k the greatest common divisor of the
+    factors of m_k.  Arguments are treated before what contains them.
     """
     generators: dict[sp.Expr, sp.Symbol] = {}
+    divisors: dict[sp.Symbol, sp.Rational] = {}
 
     def exponential(argument: sp.Expr) -> sp.Expr:
         result = sp.Integer(1)
         for term in sp.Add.make_args(sp.expand(argument)):
             number, monomial = term.as_coeff_Mul(rational=True)
             symbol = generators.setdefault(monomial, sp.Dummy(f"e{len(generators)}", positive=True))
+            divisors[symbol] = sp.gcd(divisors.get(symbol, sp.Integer(0)), number)
             result *= symbol**number
         return result
 
@@ -277,4 +282,6 @@ def _as_rational(expression: sp.Expr) -> sp.Expr:
         arguments = [convert(argument) for argument in e.args]
         return exponential(arguments[0]) if isinstance(e, sp.exp) else e.func(*arguments)
 
-    return convert(expression.rewrite((*CIRCULAR, *HYPERBOLIC), sp.exp))
+    converted = convert(expression.rewrite((*CIRCULAR, *HYPERBOLIC), sp.exp))
+    # Powers such as e^(10^10), of a state in small units, would have more terms than any memory.
+    return converted.xreplace({symbol: symbol ** (1 / divisor) for symbol, divisor in divisors.items()})
