@@ -62,25 +62,11 @@ class Exponents(NamedTuple):
     lift: float  # nats by which V is larger where there is no mass, infinite where G is negative
 
 
-def attempted(
-    prepared: Prepared,
-    values: Array,
-    window: lw.Window,
-    start: float,
-    first: float,
-    last: float,
-    inside: np.ndarray,
-    rates: np.ndarray,
-    adjoint: bool = False,
-    speed: float = 0.0,
-) -> Attempt:
-    """Return the density after the part from start + first to start + last of an interval, on a grid that moves with a speed.
-
-    The `adjoint` of the transition takes a message from the end of that part to its start.
-    """
-    substep = Substep(start + first, last - first, inside, rates, speed)
-    if prepared.system.varying or speed:
-        return magnus(prepared, values, window, substep, _at_points(prepared, values, window, substep), adjoint, bool(speed))
+def attempted(prepared: Prepared, values: Array, window: lw.Window, substep: Substep, adjoint: bool = False) -> Attempt:
+    """Return the density after a substep; the `adjoint` of the transition takes a message from its end to its start."""
+    inside, moving = substep.inside, bool(substep.speed)
+    if prepared.system.varying or moving:
+        return magnus(prepared, values, window, substep, _at_points(prepared, values, window, substep), adjoint, moving)
     modes = None if adjoint or inside.any() else by_modes(prepared, values, window, substep.length)
     if modes is not None:
         return Attempt(modes[0], 0.0, modes[1], False)

@@ -150,7 +150,7 @@ def _by_substeps(
         while True:
             if moving:
                 speed = speed_of(prepared, values, window, start + first, last - first)
-            attempt = attempted(prepared, values, window, start, first, last, inside, rates, speed=speed)
+            attempt = attempted(prepared, values, window, Substep(start + first, last - first, inside, rates, speed))
             report.decomposed = attempt.substep is None
             total = float(np.sum(attempt.values.real))
             lost = not 1e-100 < total < 1e6 or (not inside.any() and abs(total - 1.0) > 1e-3)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from zakai.methods.line.attempt import attempted, parts_of_split
+from zakai.methods.line.attempt import Substep, attempted, parts_of_split
 from zakai.methods.line.coefficients import resolved_parts
 from zakai.methods.line.message import Message, covering, reliable
 from zakai.methods.line.moves import MOST_SUBSTEPS
@@ -61,7 +61,7 @@ def _transposed(
         stack, error = resolved_parts(prepared, values, window, start, length, inside)
     while stack:
         first, last = stack.pop()
-        attempt = attempted(prepared, values, window, start, first, last, inside, rates, True)
+        attempt = attempted(prepared, values, window, Substep(start + first, last - first, inside, rates), True)
         count += 1
         if attempt.split and count + len(stack) < MOST_SUBSTEPS:
             stack += parts_of_split(prepared, first, last, attempt.error)
