@@ -16,7 +16,7 @@ from zakai.methods.line.figures import refitted
 from zakai.methods.line.moving import speed_of
 from zakai.methods.line.system import NOISE, Prepared
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.density import support
+from zakai.numerics.line.posterior import finer
 
 Array = Any
 
@@ -171,7 +171,7 @@ def _by_substeps(
             elif left or right:
                 new, grown = lw.enlarged(new, left, right), True
             if coarse and window.size < most and not (look.aliasing > lw.GROSS and smooth):
-                new = lw.refined(new) if grown else _finer(values, window, look)
+                new = lw.refined(new) if grown else finer(values, window, look)
             if new.size <= most and new != window and not window.size == new.size == lw.SIZES[-1]:
                 values = lw.resampled(values, window, new)
                 window = new
@@ -210,15 +210,6 @@ def _by_substeps(
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
     return Moved(values, window, gained, look, tuple(passages)), tails
-
-
-def _finer(values: Array, window: lw.Window, look: lw.Figures) -> lw.Window:
-    """Return a finer grid around a density, of which what is seen after a substep has the figures `look`."""
-    factor = float(np.clip(1.0 / look.resolving, 2**0.5, 4.0))
-    if window.closed:
-        return lw.refined(window, factor)
-    low, high = window.offsets[list(support(np.ascontiguousarray(values.real), lw.CUT))]
-    return lw.quantized(window, low, high, 1.001 * window.spacing / factor, most=lw.SIZES[-1])
 
 
 def _normalised(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.density import support
 
 Array = NDArray[Any]
 
@@ -105,24 +106,24 @@ def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: 
         noisy = look.rough and look.aliasing < lw.GROSS
         if look.aliasing <= 1e-11 or new.size >= (lw.LARGE if noisy else lw.SIZES[-1]):
             break
-        finer = _finer(product.values, look, new)
-        if finer == new:
+        before, new = new, finer(product.values, new, look)
+        if new == before:
             break
-        new = finer
     return product
 
 
-def _finer(values: Array, look: lw.Figures, window: lw.Window) -> lw.Window:
-    """Return a finer grid that holds all of a density, of which modes may be far apart; the same grid where there is none."""
-    used = window.offsets[np.flatnonzero(values.real > lw.CUT * values.real.max())]
-    factor = float(np.clip(1.0 / look.resolving, 2**0.5, 8.0))
+def finer(values: Array, window: lw.Window, look: lw.Figures) -> lw.Window:
+    """Return a finer grid that holds a density, of which modes may be far apart; the same grid where there is none."""
+    low, high = window.offsets[list(support(np.ascontiguousarray(values.real), lw.CUT))]
+    factor = max(1.0 / look.resolving, 2**0.5)
     while factor > 1.1:
         if window.closed:
-            finer = lw.refined(window, factor)
+            new, holds = lw.refined(window, factor), True
         else:
-            finer = lw.quantized(window, used[0], used[-1], 1.001 * window.spacing / factor, most=lw.SIZES[-1])
-        if finer.spacing < 0.95 * window.spacing and finer.size * finer.spacing > 1.04 * (used[-1] - used[0]):
-            return finer
+            new = lw.quantized(window, low, high, 1.001 * window.spacing / factor, most=lw.SIZES[-1])
+            holds = new.size * new.spacing > 1.04 * (high - low)
+        if holds and new.spacing < 0.95 * window.spacing:
+            return new
         factor /= 2**0.25
     return window
 
