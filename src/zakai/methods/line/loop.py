@@ -164,14 +164,10 @@ def _covering(prepared: Prepared, state: State, low: float, high: float, spacing
         new = lw.quantized(window, low + window.centre, high + window.centre, spacing, LARGER, prepared.largest_for())
         if new.spacing * new.size < high - low:
             return None
-    return None if new == window else moved_to(prepared, state, new)
-
-
-def moved_to(prepared: Prepared, state: State, new: lw.Window) -> State:
-    """Return a state on another grid."""
-    window = state.window
-    moved, floor = resampled(prepared, np.asarray(state.values), window, new), float(state.log_floor)
-    return state._replace(values=moved / np.sum(moved), centre=new.centre, spacing=new.spacing, log_floor=floor)
+    if new == window:
+        return None
+    moved = resampled(prepared, np.asarray(state.values), window, new)
+    return state._replace(values=moved / np.sum(moved), centre=new.centre, spacing=new.spacing)
 
 
 def regridded(prepared: Prepared, state: State) -> State:
