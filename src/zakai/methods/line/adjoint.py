@@ -15,7 +15,7 @@ from zakai.methods.line.figures import state_moments
 from zakai.methods.line.gauge import gauged
 from zakai.methods.line.grids import grid_of
 from zakai.methods.line.loop import TOGETHER
-from zakai.methods.line.message import LOWEST, PAD, SURE, Message, support, taper
+from zakai.methods.line.message import LOWEST, PAD, SURE, Message, taper
 from zakai.methods.line.moving import displaced
 from zakai.methods.line.system import SHARE, Prepared, State
 from zakai.methods.line.tables import covariance_at
@@ -24,6 +24,7 @@ from zakai.methods.line.way import negligible, smoothing_tolerance
 from zakai.numerics.line import backward as lb
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.adjoint import EXCURSION, by_adjoints
+from zakai.numerics.line.density import support
 from zakai.numerics.line.segment import SPLIT, SPLIT_FACTOR
 
 Array = Any
@@ -136,8 +137,8 @@ def _taken(
     first, last = found.first, found.last
     logs = (np.log(np.maximum(found.values, 1e-300)) - gauge)[first : last + 1] + found.scale + reports[0, lb.LOG_MASS]
     middle = found.start - start + first + len(logs) // 2 - longer.size // 2
-    origin, centre, spacing, _, closed, unit = longer
-    kept = Message(logs, origin, centre + spacing * middle, spacing, unit, closed, spacing, found.error)
+    own = longer._replace(centre=longer.centre + longer.spacing * middle)
+    kept = Message.of(logs, own, longer.spacing, found.error)
     errors = np.array([float(state.error) for state in before[len(before) - taken.number + 1 :]])
     centres = centres[len(centres) - taken.number + 1 :]
     return Taken(kept, taken.number, _infos(prepared, window, centres, errors, taken.products[1:], reports[1:]))
@@ -171,7 +172,7 @@ def log_likelihoods(prepared: Prepared, here: slice, observed: Array, points: Ar
 def _shared(state: State, after: lw.Window, later: Message, product: Array, grid: lw.Window) -> list[lw.Window]:
     """Return the grids that may serve for all of an interval: those before and after it, and finer ones."""
     own = state.window
-    first, last = support(np.asarray(state.values).real, lb.SMALLEST)
+    first, last = support(np.ascontiguousarray(state.values.real), lb.SMALLEST)
     low, high = min(own.offsets[first], later.ends[0]), max(own.offsets[last], later.ends[1])
     found = []
     for window in sorted({own, after}, key=lambda window: window.spacing, reverse=True):

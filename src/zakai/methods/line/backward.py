@@ -21,13 +21,15 @@ from zakai.methods.line import filter as line_filter
 from zakai.methods.line.adjoint import back
 from zakai.methods.line.figures import state_moments
 from zakai.methods.line.loop import joined
-from zakai.methods.line.message import Message, points_of, reliable, support
+from zakai.methods.line.message import Message, points_of, reliable
 from zakai.methods.line.parts import cut
 from zakai.methods.line.paths import draw
+from zakai.methods.line.prior import state_of
 from zakai.methods.line.system import Parts, Prepared, State
-from zakai.methods.line.update import exponential_factor, factor_at_end
+from zakai.methods.line.update import acting_inside, factor_of
 from zakai.methods.line.way import negligible, pulled, smoothing_tolerance
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.density import support
 
 Array = Any
 
@@ -37,8 +39,7 @@ SMALLEST = 1e-13  # value of a smoothed density relative to its maximum that is 
 
 def message(prepared: Prepared, state: State) -> Message:
     """Return the message one at the last time."""
-    origin, centre, spacing, size, closed, unit = state.window
-    return Message(np.zeros(size), origin, centre, spacing, unit, closed, spacing, 0.0)
+    return Message.of(np.zeros(len(state.values)), state.window, state.window.spacing, 0.0)
 
 
 class _Product(NamedTuple):
@@ -147,14 +148,9 @@ def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state
     finer = KINKED if prepared.weak and prepared.schedule.seen[k].any() else 1.0
     later = later.on(points_of(later.window, *later.ends, later.needed / finer)).between(*later.ends)
     before = later.variance
-    inside = prepared.inside[k]
-    if prepared.lie and not inside.all():
-        inside = np.zeros_like(inside)
-    at_end = prepared.schedule.seen[k] & ~inside
-    if at_end.any() or (prepared.lie and inside.any()):
-        exact, window = bool(at_end.any()), later.window
-        likelihood = factor_at_end(prepared, k, at_end, observed, window) if exact else exponential_factor(prepared, k, observed)
-        later = later._replace(logs=later.logs + likelihood.logs(window.points).real)
+    inside, likelihood = acting_inside(prepared, k), factor_of(prepared, k, observed, later.window)
+    if likelihood is not None:
+        later = later._replace(logs=later.logs + likelihood.logs(later.window.points).real)
     if length == 0:
         return later
     between = later.variance
@@ -168,8 +164,7 @@ def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state
 def density(prepared: Prepared, state: State, later: Message) -> Density:
     """Return the smoothed density."""
     found = _product(state, later)
-    origin, centre, spacing, _, closed, unit = found.window
-    return line_filter.density(prepared, State(found.values, origin, centre, spacing, unit, closed, state.error, state.log_floor))
+    return line_filter.density(prepared, state_of(found.values, found.window, state.error, state.log_floor))
 
 
 def accuracy(prepared: Prepared) -> float:

@@ -21,6 +21,7 @@ from zakai.methods.line.attempt import Attempt, Coefficients, Substep, magnus, p
 from zakai.methods.line.coefficients import coefficients, resolved_parts
 from zakai.methods.line.message import FEWEST, Message, reliable
 from zakai.methods.line.moves import MOST_SUBSTEPS, Report, by_substeps
+from zakai.methods.line.prior import state_of
 from zakai.methods.line.psi import RELAXED, Psi, part_of, placed
 from zakai.methods.line.system import Prepared, State
 from zakai.methods.line.tables import covariance_at, finite
@@ -89,9 +90,7 @@ def _states(prepared: Prepared, interval: _Interval, cuts: list[float], state: S
     found, (start, inside, rates) = [state], interval
     for first, last in zip(cuts[:-2], cuts[1:-1], strict=True):
         moved = by_substeps(prepared, found[-1].values, found[-1].window, start + first, last - first, inside, rates, Report())
-        origin, centre, spacing, _, closed, unit = moved.window
-        floor = max(float(state.log_floor), NOISE)
-        found.append(State(moved.values, origin, centre, spacing, unit, closed, state.error, floor))
+        found.append(state_of(moved.values, moved.window, state.error, max(float(state.log_floor), NOISE)))
     return found
 
 

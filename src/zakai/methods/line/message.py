@@ -133,7 +133,3 @@ def reliable(state: State, window: lw.Window) -> Array:
     floor = SURE * float(np.exp(min(state.log_floor, LOWEST))) * float(np.max(values))
     return lw.resampled(np.where(values > floor, values, 0.0), state.window, window)
 
-
-def support(values: Array, cut: float) -> tuple[int, int]:
-    counts = np.flatnonzero(values > cut * np.max(values))
-    return (int(counts[0]), int(counts[-1])) if len(counts) else (0, len(values) - 1)

@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import expit
 
-from zakai.methods.line.message import Message, reliable, support
+from zakai.methods.line.message import Message, reliable
 from zakai.methods.line.system import State
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.density import support
 
 Array = Any
 

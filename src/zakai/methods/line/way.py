@@ -17,7 +17,7 @@ from zakai.methods.line import filter as line_filter
 from zakai.methods.line.course import course_of, ends_of
 from zakai.methods.line.gauge import gauged
 from zakai.methods.line.gauged import by_moving_grid, by_standing_grids
-from zakai.methods.line.message import FEWEST, Message, covering, points_of, reliable, support, taper
+from zakai.methods.line.message import FEWEST, Message, covering, points_of, reliable, taper
 from zakai.methods.line.moves import Report
 from zakai.methods.line.moving import travel
 from zakai.methods.line.system import Prepared, State
@@ -26,6 +26,7 @@ from zakai.methods.line.transposed import by_exponentials
 from zakai.methods.line.volumes import pulled_back
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.adjoint import EXCURSION
+from zakai.numerics.line.density import support
 from zakai.numerics.line.polynomial import local_polynomial
 
 Array = Any
@@ -61,7 +62,7 @@ def pulled(
         later: the message at its end.
     """
     own, accepted = state.window, negligible(prepared)
-    low, high = support(np.asarray(state.values).real, 1e-13)
+    low, high = support(np.ascontiguousarray(state.values.real), 1e-13)
     ends = float(own.offsets[low]), float(own.offsets[high])
     found = _by_kernel(prepared, k, rates, ends, later)
     if found is not None:

@@ -14,7 +14,7 @@ from zakai.densities import IntervalDensity
 from zakai.methods._protocol import Backward, Info
 from zakai.methods.line.backward import accuracy
 from zakai.methods.line.course import course_of
-from zakai.methods.line.message import SURE, Message, points_of, support
+from zakai.methods.line.message import SURE, Message, points_of
 from zakai.methods.line.system import NOISE, Prepared
 from zakai.methods.line.tables import covariance_at
 from zakai.methods.line.update import factor_at_end
@@ -38,6 +38,7 @@ from zakai.methods.reflecting.elements import (
 from zakai.methods.reflecting.filter import State
 from zakai.methods.reflecting.paths import draw
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.density import support
 from zakai.numerics.lobatto import Element
 
 Array = Any
@@ -58,8 +59,8 @@ def _window(prepared: Prepared, lower: float, upper: float) -> lw.Window:
 
 def message(prepared: Prepared, state: State) -> Message:
     """Return the message one at the last time."""
-    origin, centre, spacing, size, closed, unit = _window(prepared, float(state.lower), float(state.upper))
-    return Message(np.zeros(size), origin, centre, spacing, unit, closed, spacing, 0.0)
+    window = _window(prepared, float(state.lower), float(state.upper))
+    return Message.of(np.zeros(window.size), window, window.spacing, 0.0)
 
 
 class _Product(NamedTuple):
@@ -193,10 +194,9 @@ def _by_volumes(
 def _on(prepared: Prepared, state: State, worth: Callable[[Array], Array], log_scale: float, error: float) -> Message:
     """Return a message by its values, of some scale, where the density is."""
     window = _window(prepared, float(state.lower), float(state.upper))
-    origin, centre, spacing, _, closed, unit = window
     values = worth(np.clip(window.points, state.lower, state.upper))
     logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + log_scale
-    return Message(logs, origin, centre, spacing, unit, closed, spacing, error)
+    return Message.of(logs, window, window.spacing, error)
 
 
 @np.errstate(all="ignore")
