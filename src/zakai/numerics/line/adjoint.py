@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, averaged, averaging, operators
 from zakai.numerics.line.backward import ERROR, LOG_MASS, SMALLEST, Filtered, Limits, Message, Taken, kept, multiplied, spread
-from zakai.numerics.line.density import highest_of, moments, support, waves
+from zakai.numerics.line.density import highest_of, moments, shifted, support, waves
 from zakai.numerics.line.segment import SPLIT, Grid, Steps
 from zakai.numerics.line.splitting import STEEPEST, differences, residual, split
+from zakai.numerics.line.step import copied
 
 Array = NDArray[Any]
 
@@ -24,15 +25,6 @@ MOST_SUBSTEPS = 512
 EXCURSION = 3.9  # standard deviations of the noise that a path between two points goes beyond them, but for exp(-30)
 _WHOLE = np.ones((1, 5, 1))
 _V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1]
-
-
-@helper
-def _shifted(values: Array, by: int) -> Array:
-    """Return the values on a grid of the same size that begins `by` points later."""
-    found = np.zeros(values.size)
-    for j in range(max(0, by), min(values.size, by + values.size)):
-        found[j - by] = values[j]
-    return found
 
 
 @helper
@@ -126,10 +118,7 @@ def _adjoint(
             high = min(max(last, ends + starts[i] - start) + margin, high)
         points = high - low + 1
         local, now, found = np.empty((table.shape[1], table.shape[2], points)), np.empty(points), np.zeros(size)
-        for r in range(local.shape[0]):
-            for l in range(local.shape[1]):
-                for j in range(points):
-                    local[r, l, j] = table[i if timed else 0, r, l, start + low + j]
+        copied(table[i if timed else 0], start + low, local)
         at, before = highest_of(product), spread(b, first, last)
         row[LOG_MASS] = logs[i, at]
         for j in range(first, last + 1):
@@ -147,7 +136,7 @@ def _adjoint(
         if not (made < np.inf):
             return taken, first, last, start, error
         if starts[i] != start:
-            found = _shifted(found, starts[i] - start)
+            found = shifted(found, starts[i] - start)
         begins, ends = multiplied(found, densities[i], floors[i], negligible, closed, cosines, sines, products[i], row)
         if ends < 0:
             return taken, first, last, start, error

@@ -69,6 +69,15 @@ def highest_of(values: Array) -> int:
     return at
 
 
+@helper
+def shifted(values: Array, by: int) -> Array:
+    """Return values on a grid of the same size that begins `by` points later, zero where there are none."""
+    found = np.zeros(values.size)
+    for j in range(max(0, by), min(values.size, by + values.size)):
+        found[j - by] = values[j]
+    return found
+
+
 @kernel(types.UniTuple(int64, 2)(float64[::1], float64))  # type: ignore[no-untyped-call]
 def support(values: Array, cut: float) -> tuple[int, int]:
     """Return the first and last index of values above `cut` times their maximum."""

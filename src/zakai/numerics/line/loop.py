@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
 from zakai.numerics.line.averages import AVERAGES
-from zakai.numerics.line.density import circular_rows, highest_of, moments, separated, spectrum, support, waves
+from zakai.numerics.line.density import circular_rows, highest_of, moments, separated, shifted, spectrum, support, waves
 from zakai.numerics.line.filters import BAND, convolved, kernel_of
 from zakai.numerics.line.segment import (
     AFTER,
@@ -104,10 +104,7 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
                     if abs(by) > length or start + by < 0 or start + by + size > length or (near and abs(by) > MARGIN // 2):
                         status = RANGE
                         break
-                    for j in range(size):
-                        b[j] = now[j]
-                    for j in range(size):
-                        now[j] = b[j + by] if 0 <= j + by < size else 0.0
+                    now = shifted(now, by)
                     start, place = start + by, start + by
                     copied(table[own], start, local)
                     low, high = support(now, cut)
@@ -187,8 +184,6 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
             row[12], row[13], row[14], row[15] = start, move.pairs, move.substeps, move.needed
             home, done = start, i + 1
             # Whether the same grid serves for the next step: as in `line_window.fitted`.
-            low, high = int(answer[0]), int(answer[1])
-            low, high = support(now, cut)
             resolving = BAND * (size // 2) / (max(highest, 0.0) + 1.0)
             if resolving < 0.97 or (not near and abs(home + half - length // 2) > length // 4):
                 status = AFTER
