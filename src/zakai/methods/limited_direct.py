@@ -13,7 +13,7 @@ import numpy as np
 
 from zakai.algebra.theorems import limited_direct
 from zakai.errors import InputError
-from zakai.methods._options import one_of
+from zakai.methods._options import one_of, tolerance_of
 from zakai.methods._protocol import Method
 from zakai.methods._yau_system import power_series_of
 from zakai.methods.line import filter as line_filter
@@ -70,7 +70,7 @@ def prepare(
 
         options: dict[str, Any] = {"splitting": splitting, "tolerance": tolerance, "kernel": kernel, "order": order}
         return space_direct.prepare(model, schedule, theta, **options)
-    prepared = line_filter.prepare(model, schedule, theta, 1e-9 if tolerance is None else tolerance, in_pieces(model))
+    prepared = line_filter.prepare(model, schedule, theta, tolerance_of(tolerance, 1e-9), in_pieces(model))
     prepared.promised = 1e-7 if tolerance is None else prepared.tolerance
     yau, lie = yau_line_of(model), splitting == "lie"
     prior = model.prior

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from zakai.algebra.theorems import any_smooth_system
+from zakai.methods._options import tolerance_of
 from zakai.methods._protocol import Method
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line import tangents as line_tangents
@@ -59,7 +60,7 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, *, tolerance: f
     Raises:
         InputError: the tolerance is out of range.
     """
-    return line_filter.prepare(model, schedule, theta, 1e-5 if tolerance is None else tolerance, in_pieces(model))
+    return line_filter.prepare(model, schedule, theta, tolerance_of(tolerance, 1e-5), in_pieces(model))
 
 
 def variant(model: Model, options: Mapping[str, Any]) -> Method[Any, Any]:

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities import Density, GridDensity, MappedDensity
-from zakai.errors import InputError
 from zakai.methods._protocol import Info, Infos
 from zakai.methods._states import Joined
 from zakai.methods.line import loop
@@ -64,22 +63,16 @@ PILED = 0.5  # density at an end of the grid, relative to the maximum, of a prod
 
 
 def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: float, pieces: bool = False) -> Prepared:
-    """Return what `step` needs for the intervals of a schedule; `pieces` is whether that is the one of `reflecting/filter.py`.
-
-    Raises:
-        InputError: the tolerance is not a number from 1e-12 to .1.
-    """
-    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 1e-12 <= tolerance <= 0.1:
-        raise InputError(f"option tolerance: {tolerance!r} must be a number from 1e-12 to 0.1")
+    """Return what `step` needs for the intervals of a schedule; `pieces` is whether that is the one of `reflecting/filter.py`."""
     check_ends(model, theta, None if schedule.inputs is None else schedule.inputs.values)
     system = system_of(on_the_line(model)).given(schedule.inputs)
     # A sample may lead deep into the tails, where a small error counts; increments do not.
     negligible = 1e-13 if system.samples else float(np.clip(1e-6 * tolerance, 1e-13, 1e-10))
     if system.kinked_drift and not pieces:  # the spectrum of a density falls slowly
-        negligible = max(negligible, SLOW * float(tolerance))
+        negligible = max(negligible, SLOW * tolerance)
     generous = SHARED if system.samples and not system.moving else GENEROUS
     lengths, inside = schedule.lengths, schedule.inside
-    found = Prepared(model, schedule, theta, system, float(tolerance), lengths, inside, negligible, generous, float(tolerance))
+    found = Prepared(model, schedule, theta, system, tolerance, lengths, inside, negligible, generous, tolerance)
     found.pieces = pieces
     if found.kinked:  # a grid is finer, and another one takes long to prepare
         found.generous = SLOW_GENEROUS
