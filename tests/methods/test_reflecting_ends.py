@@ -293,11 +293,15 @@ def test_an_exponential_prior_at_an_end_that_it_has_flux_through_is_the_folded_p
     assert not result.warnings
 
 
-@pytest.mark.parametrize(("level", "bound"), [("0.5", 1e-6), ("0.4", 1e-3)])  # 2 a b / sigma^2 is 1 and 0.8
-def test_a_square_root_process_that_reaches_zero_has_chi_square_transitions(level, bound):
+@pytest.mark.parametrize(
+    ("level", "boundary", "bound"),  # 2 a b / sigma^2 is 1, 0.8 and 1.01
+    [("0.5", "reflecting", 1e-6), ("0.4", "reflecting", 1e-3), ("0.505", "natural", 2e-5)],
+)
+def test_a_square_root_process_near_zero_has_chi_square_transitions(level, boundary, bound):
     times, values, noise = np.array([0.3, 0.8, 1.0, 2.0]), [0.9, 0.3, 0.1, 0.4], 0.04
     model = model_of(f"{level} - x", diffusion=[["sqrt(x)"]], observation_noise=[[str(noise)]],
-                     prior={"kind": "density", "log_density": "3*log(x) - 4*x"})  # fmt: skip
+                     prior={"kind": "density", "log_density": "3*log(x) - 4*x"},
+                     domain={"x": {"lower": 0.0, "boundary": boundary}})  # fmt: skip
     result = zakai.filter(model, samples(times, values), "yau-yau")
     nodes, weights = np.polynomial.legendre.leggauss(800)
     root, weights = 1.75 * (nodes + 1), 1.75 * weights  # the density of the root has no pole

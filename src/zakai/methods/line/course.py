@@ -57,7 +57,7 @@ class Course(NamedTuple):
 
 def course_of(
     prepared: Prepared, values: Array, window: lw.Window, ends: Array, start: float, length: float, inside: np.ndarray,
-    aim: tuple[float, float] = (0.0, np.inf),
+    aim: tuple[float, float] = (0.0, np.inf), widening: float = np.inf,
 ) -> Course | None:  # fmt: skip
     """Return the course of a density between two offsets, None where the drift leads beyond all numbers.
 
@@ -68,6 +68,7 @@ def course_of(
         start, length: the interval.
         inside: which increments act within it.
         aim: the mean and the standard deviation of a function of the state at the end that is taken back to the start.
+        widening: the most by which the range of the density grows on each side.
     """
     width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(drift_along(prepared, window, ends, start))))
     fastest = FASTEST * width / (length * prepared.tolerance)
@@ -82,6 +83,7 @@ def course_of(
     ratio = float(np.log2(length / min(quick, float(last)))) / LEVELS[0][1]  # steps grow at most by a factor of two
     share = 1.0 if speed * length > FAST * width else max(GENTLE, min(ratio, 1.0))
     way = _way(prepared, window, ends, start, np.union1d(bounds, ends_of_steps(length, quick, int(share * _FLOW_STEPS))))
+    way = way._replace(low=max(way.low, float(ends[0]) - widening), high=min(way.high, float(ends[1]) + widening))
     if not np.isfinite([way.low, way.high]).all() or not way.high > way.low:
         return None
     centre, scale, walls = 0.5 * (way.low + way.high), 0.5 * (way.high - way.low), walls_of(prepared, window.origin)

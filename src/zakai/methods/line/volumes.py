@@ -17,6 +17,7 @@ from zakai.methods.line.course import FAST, LEVELS, Course, course_of, drift_alo
 from zakai.methods.line.model import within
 from zakai.methods.line.moves import Moved, Report
 from zakai.methods.line.system import Prepared
+from zakai.methods.line.tables import covariance_at
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.panels import GAUSS_NODES, interpolation
 from zakai.numerics.line.polynomial import local_polynomial
@@ -32,6 +33,8 @@ EDGE = 1e-9  # density in the outermost cells, relative to the maximum, beyond w
 SETTLED = 1e-2  # error above which volumes do not serve
 NARROWEST = 40.0  # range of a density in cells
 SHARE = 0.1  # of the tolerance that volumes may leave
+ROUNDING = 4e-16  # error of the exponential of an operator, relative to its norm
+WIDENINGS = 0.5, 2.0  # ranges of a density by which it grows on each side, where that error is too large
 SMOOTH = 1e-7  # error of a backward interval at which more cells are not taken
 
 
@@ -60,18 +63,13 @@ def contracted(
     drift = drift_along(prepared, window, ends, start)
     width, speed = float(ends[1] - ends[0]), 0.5 * float(np.ptp(drift)) if moving else float(np.max(np.abs(drift)))
     fine = window.size > lw.LARGEST and np.pi * speed * length > FINE * window.spacing
+    # The noise of the logarithm of a state grows without limit towards a natural end.
+    noise = float(np.max(covariance_at(prepared.system, window.points, start, prepared.theta.real)))
+    rounding = ROUNDING * 0.5 * (np.pi / window.spacing) ** 2 * noise * length
     general = rough(prepared, inside) or fine
-    if not (general or speed * length > FAST * width):
+    stiff_noise = not general and rounding > SHARE * prepared.tolerance
+    if not (general or stiff_noise or speed * length > FAST * width):
         return None
-    course = course_of(prepared, values, window, ends, start, length, inside)
-    if course is None:
-        return None
-    stiff = speed * length > STIFF * width
-    if not (general or stiff or (course.way.travel > MOST_TRAVEL and not moving) or course.way.deviations > MOST_DEVIATIONS):
-        return None
-    if width < NARROWEST * course.finest:  # sharper than the cells where it begins
-        return None
-
     # Cells do not bring back what the grid does not resolve.
     unresolved = lw.figures(values, False, prepared.negligible).aliasing  # where the density is smaller, it may not end
     allowed = SHARE * max(prepared.tolerance, unresolved)
@@ -79,12 +77,23 @@ def contracted(
     def density(offsets: Array) -> Array:
         return lw.density_at(values, window, offsets)
 
-    found = advanced_by(prepared, density, course, start, inside, rates, allowed)
-    if found is None:
-        return None
-    masses, cells, gained, error = found
-    after = np.abs((masses / cells.widths).real)
-    if max(after[0], after[-1]) > max(EDGE, unresolved) * np.max(after):  # the cells do not hold it
+    # Where noise falls that fast, a Gaussian widens less than its own noise says.
+    for widening in WIDENINGS if stiff_noise else (np.inf,):
+        course = course_of(prepared, values, window, ends, start, length, inside, widening=widening * width)
+        if course is None:
+            return None
+        stiff = stiff_noise or speed * length > STIFF * width
+        far = (course.way.travel > MOST_TRAVEL and not moving) or course.way.deviations > MOST_DEVIATIONS
+        if not (general or stiff or far) or width < NARROWEST * course.finest:  # sharper than the cells where it begins
+            return None
+        found = advanced_by(prepared, density, course, start, inside, rates, allowed)
+        if found is None:
+            return None
+        masses, cells, gained, error = found
+        after = np.abs((masses / cells.widths).real)
+        if max(after[0], after[-1]) <= max(EDGE, unresolved) * np.max(after):
+            break
+    else:  # the cells do not hold it
         return None
     report.time, report.noise = report.time + error + course.unresolved, max(report.noise, min(error, 1.0))
     resampled = _resampled(prepared, cells, masses, window, error)
