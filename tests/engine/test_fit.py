@@ -90,6 +90,36 @@ def test_parameters_that_the_record_does_not_tell_apart_have_no_standard_errors(
     assert "does not determine c, d" in fitted.warnings[0]
 
 
+def limited(**values):
+    """Return a model whose noise exists for r > q**2, and a record."""
+    keys = {**LINE, "observation": ["x"], "process_noise": [["q"]]}
+    times = np.cumsum(np.random.default_rng(1).uniform(0.05, 0.3, 100))
+    true = zakai.Model(**{**keys, "observation_noise": [["r"]], "parameters": {"a": 0.5, "q": 1.0, "r": 0.02}})
+    model = zakai.Model(**{**keys, "observation_noise": [["r - q**2"]], "parameters": values})
+    return model, zakai.simulate(true, times, seed=2)[1]
+
+
+def test_a_maximum_at_a_limit_of_the_parameters_is_found_and_said():
+    model, record = limited(a=3.0, q=2.0, r=5.0)
+    fitted = zakai.fit(model, record, ["q", "r"], method="kalman-bucy")
+    best = max(
+        zakai.filter(model.with_parameters(q=q, r=q**2 + 1e-6), record, "kalman-bucy").log_likelihood
+        for q in np.linspace(3.0, 3.5, 11)
+    )
+    assert not fitted.converged and best - 0.2 < fitted.log_likelihood < best
+    assert "a limit of the parameters" in fitted.warnings[0] and "a limit of the parameters" in fitted.message
+    assert "q = 3.2" in fitted.warnings[0] and "observation_noise: is not positive definite" in fitted.warnings[0]
+    assert len(fitted.warnings) == 1
+
+
+def test_a_limit_in_the_way_does_not_end_the_search():
+    model, record = limited(a=3.0, q=2.0, r=5.0)
+    fitted = zakai.fit(model, record, method="kalman-bucy")
+    near = zakai.fit(model.with_parameters(a=0.5, q=1.0, r=1.1), record, method="kalman-bucy")
+    assert fitted.converged and near.converged
+    assert np.isclose(fitted.log_likelihood, near.log_likelihood, rtol=0, atol=1e-6)
+
+
 def test_a_fit_that_does_not_converge_says_so(line, monkeypatch):
     monkeypatch.setattr(maximum, "ITERATIONS", 1)
     monkeypatch.setattr(maximum, "NEAR", 0.0)

@@ -141,14 +141,17 @@ def fit(
                 known[key] = function.unwarned(theta)
             return known[key]
 
-        found = maximum(counted, values, box, names, model)
+        found = maximum(counted, values, box, names, model, function.exists)
     values = found.values
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
     result = run_filter(now, record, method, keep="moments", **options)
     warnings = list(result.warnings)
     if found.problem:
         warnings.insert(0, found.problem)
-    if not found.converged:
+    if found.beyond is not None:
+        beyond = dict(zip(names, found.beyond.tolist(), strict=True))
+        warnings.insert(0, _limit(now, beyond, record, method, options))
+    elif not found.converged:
         warnings.insert(0, "the fit did not converge; these are the best values that were found")
     errors = np.sqrt(np.where(np.diag(found.covariance) > 0, np.diag(found.covariance), np.nan))
     return Fit(
@@ -163,6 +166,20 @@ def fit(
         method=result.method,
         observations=len(record.times),
         warnings=warnings,
+    )
+
+
+def _limit(model: Model, beyond: dict[str, float], record: Record, method: str, options: dict[str, Any]) -> str:
+    """Return which limit of the parameters the fit has reached, from values beyond it."""
+    at = ", ".join(f"{name} = {value:.6g}" for name, value in beyond.items())
+    try:
+        run_filter(model.with_parameters(**beyond), record, method, keep="moments", **options)
+        reason = "the log-likelihood is not finite"
+    except InputError as error:
+        reason = str(error)
+    return (
+        f"the fit ended at a limit of the parameters, towards which the log-likelihood rises: at {at} it does not exist, because "
+        f"{reason}; change the model, or fix a parameter inside the limit"
     )
 
 

@@ -25,7 +25,6 @@ from zakai.models.checks import COEFFICIENTS, depends_on_state, noise_check
 from zakai.models.features import formulas_of
 from zakai.models.functions import Floor
 from zakai.models.model import Model
-from zakai.models.prior import DensityPrior
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.one_thread import one_thread
 from zakai.records import Record
@@ -163,12 +162,10 @@ class LogLikelihood:
             raise InputError(f"log_likelihood: the values have shape {given.shape}; expected ({len(self.names)},)")
         if derivatives and self._jump:
             raise InputError(self._jump)
-        theta = self.model.theta()
-        theta[self._where] = given
         missing: tuple[float, np.ndarray, set[str]] = np.nan, np.full(len(given), np.nan), set()
-        with np.errstate(all="ignore"):
-            if not np.isfinite(given).all() or any(check(self._times, theta) for check in self._checks):
-                return missing
+        theta = self._theta(given)
+        if theta is None:
+            return missing
 
         def shifted(direction: int) -> np.ndarray:
             found = theta.astype(complex)
@@ -185,6 +182,25 @@ class LogLikelihood:
         except InputError:
             return missing
         return value, gradient, exceeded
+
+    def exists(self, values: np.ndarray) -> bool:
+        """Return whether the model holds at the values (p,), by preparing its first interval, which takes little time."""
+        theta = self._theta(values)
+        if theta is None:
+            return False
+        try:
+            for part in self._parts:
+                part.setting._replace(theta=theta).prepared(part.schedule.part(slice(0, 1)))
+        except InputError:
+            return False
+        return True
+
+    def _theta(self, values: np.ndarray) -> np.ndarray | None:
+        """Return all parameters of the model, None where a noise is not a covariance."""
+        theta = self.model.theta()
+        theta[self._where] = values
+        with np.errstate(all="ignore"):
+            return theta if np.isfinite(values).all() and not any(check(self._times, theta) for check in self._checks) else None
 
     @cached_property
     def _in_jax(self) -> Callable[[Any], Any]:
@@ -204,7 +220,7 @@ class _Part(NamedTuple):
 
     @classmethod
     def of(cls, run: Run) -> _Part:
-        return cls(run.setting, run.schedule, run.values, _parameters_of(run.setting))
+        return cls(run.setting, run.schedule, run.values, run.setting.parameters)
 
     def evidence(self, theta: np.ndarray) -> tuple[Any, set[str]]:
         """Return the log-likelihood at the parameters, complex where they are, and the figures beyond their bounds."""
@@ -274,15 +290,3 @@ def _each(function: Callable[[Any], Any], arguments: Sequence[Any]) -> list[Any]
         return found + [function(argument) for argument in rest]
     with ThreadPoolExecutor(min(os.cpu_count() or 1, len(rest))) as pool:
         return found + list(pool.map(function, rest))
-
-
-def _parameters_of(setting: Setting) -> set[str]:
-    """Return the names of the parameters on which a part of the likelihood depends."""
-    model, prior = setting.model, setting.prior
-    coefficients = [model.diffusion, model.process_noise, model.observation_noise, model.cross_noise]
-    law = [*model.family_parameters.values(), *([] if model.log_density is None else [model.log_density])]
-    parts = [model.drift, model.observation, *coefficients, *law]
-    symbols = set().union(*(part.free_symbols for part in parts))
-    if isinstance(prior, DensityPrior):
-        symbols |= prior.log_density.free_symbols
-    return {symbol.name for symbol in symbols}

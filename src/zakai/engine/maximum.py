@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
+from zakai.engine.limit import Exists, Limit
 from zakai.errors import InputError
 from zakai.models._errors import listing
 from zakai.models.model import Model
@@ -16,6 +18,9 @@ ITERATIONS = 200
 FIRST = 0.1  # length of the first step of L-BFGS-B, relative to the parameters
 GAIN = 1e-6  # nats, by which an iteration of L-BFGS-B must raise the log-likelihood; Newton's steps do the rest
 NEAR = 1e-3  # the distance to the maximum, in standard errors, that counts as none
+LIMIT = 0.1  # nats: the most that can be gained before values without a log-likelihood, at which the search ends
+ROUNDS = 4  # of a search in all parameters and one along a limit
+HALVINGS = 20  # of a step that leads to such values
 SINGULAR = 1e-6  # the smallest eigenvalue of the information scaled to a unit diagonal; differences leave 1e-8
 
 
@@ -24,7 +29,10 @@ Function = Callable[[np.ndarray], tuple[float, np.ndarray]]  # a value and its g
 
 @dataclass
 class Found:
-    """The best values, the log-likelihood and the covariance there, and what is wrong with them."""
+    """The best values, the log-likelihood and the covariance there, and what is wrong with them.
+
+    `beyond`: values close by without a log-likelihood, where the search ended at such a limit.
+    """
 
     values: np.ndarray
     log_likelihood: float
@@ -33,33 +41,58 @@ class Found:
     message: str
     problem: str
     iterations: int
+    beyond: np.ndarray | None
+
+
+class _LimitReached(Exception):  # noqa: N818  # ends the search
+    pass
 
 
 class _Objective:
-    """The negative log-likelihood of the parameters in units of `scale`, and its gradient; finite everywhere."""
+    """The negative log-likelihood of the parameters in units of `scale`, and its gradient.
+
+    `beyond`: the last values without a log-likelihood.
+    """
 
     def __init__(self, function: Function, origin: np.ndarray, scale: np.ndarray):
         self._both = function
         self.origin, self.scale = origin, scale
         self.best: tuple[float, np.ndarray, np.ndarray] | None = None
-        self.refused = 0
+        self.beyond: np.ndarray | None = None
+
+    def values(self, u: np.ndarray) -> np.ndarray:
+        """Return the parameters."""
+        return np.asarray(self.origin + self.scale * u)
 
     def exact(self, u: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = self._both(self.origin + self.scale * u)
+        """Return the function and its gradient, NaN where they do not exist."""
+        value, gradient = self._both(self.values(u))
+        if not (np.isfinite(value) and np.isfinite(gradient).all()):
+            self.beyond = self.values(u)
+            return np.nan, np.full(len(u), np.nan)
         return -float(value), -self.scale * np.asarray(gradient, float)
 
     def __call__(self, u: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the same, finite everywhere.
+
+        Raises:
+            _LimitReached: the values have no log-likelihood, and there is nothing to be gained before them.
+        """
         value, gradient = self.exact(u)
-        if np.isfinite(value) and np.isfinite(gradient).all():
+        if np.isfinite(value):
             if self.best is None or value < self.best[0]:
                 self.best = value, np.array(u), gradient
             return value, gradient
-        # Beyond the domain the function rises ten times as fast as it fell at the best point, so that the search turns back.
         assert self.best is not None
-        self.refused += 1
         best, at, slope = self.best
-        rise = -10.0 * slope
-        return best + abs(rise @ (u - at)) + 1e-3, rise
+        if self.at_limit(at, slope):
+            raise _LimitReached
+        # The gradient of the best point in reverse and about its value, by which the line search halves its step.
+        return best + LIMIT * abs(slope @ (u - at)), -slope
+
+    def at_limit(self, u: np.ndarray, gradient: np.ndarray) -> bool:
+        """Return whether the log-likelihood rises from u towards values where it does not exist, but by next to nothing."""
+        return self.beyond is not None and bool(0.0 < gradient @ (u - (self.beyond - self.origin) / self.scale) < LIMIT)
 
 
 def hessian(gradient: Callable[[np.ndarray], np.ndarray], u: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -68,27 +101,86 @@ def hessian(gradient: Callable[[np.ndarray], np.ndarray], u: np.ndarray, steps: 
     return np.asarray(0.5 * (matrix + matrix.T))
 
 
-def maximum(function: Function, values: np.ndarray, box: np.ndarray, names: tuple[str, ...], model: Model) -> Found:
-    """Return the maximum of the likelihood from `values`: L-BFGS-B, and then Newton's steps in the free parameters."""
-    scale = FIRST * np.where(values != 0, np.abs(values), 1.0)
-    objective = _Objective(function, values, scale)
-    value, gradient = objective.exact(np.zeros(len(values)))
-    if not (np.isfinite(value) and np.isfinite(gradient).all()):
-        at = ", ".join(f"{name} = {float(number):g}" for name, number in zip(names, values, strict=True))
-        raise InputError(f"{model.source}: start: the log-likelihood does not exist at {at}; give another start")
-    limits = (box - values[:, None]) / scale[:, None]
+def _search(function: Function, start: np.ndarray, value: float, gradient: np.ndarray, limits: np.ndarray) -> OptimizeResult:
+    """Return what L-BFGS-B finds from a start with this value and gradient, without success where it reaches a limit."""
     gtol = 1e-7 * max(FIRST, np.abs(gradient).max() * 1e-3)
     settings = {"maxiter": ITERATIONS, "ftol": GAIN / max(1.0, abs(value)), "gtol": gtol}
-    search = minimize(objective, np.zeros(len(values)), jac=True, method="L-BFGS-B", bounds=limits, options=settings)
+    path: list[np.ndarray] = []
+    try:
+        return minimize(function, start, jac=True, method="L-BFGS-B", bounds=limits, options=settings, callback=path.append)
+    except _LimitReached:
+        return OptimizeResult(success=False, nit=len(path), hess_inv=None, message="at a limit of the parameters")
+
+
+def _along(objective: _Objective, limit: Limit, gap: float, limits: np.ndarray) -> int:
+    """Search by the parameters but one, which is held at a distance from its limit; return the number of iterations."""
     assert objective.best is not None
-    # The search may have moved far: the best point gives the new units.
-    values, old = np.clip(values + scale * objective.best[1], box[:, 0], box[:, 1]), scale
-    scale = np.where(values != 0, np.abs(values), scale / FIRST)
-    limits = (box - values[:, None]) / scale[:, None]
+    others = np.arange(len(limits)) != limit.axis
+
+    def held(z: np.ndarray) -> tuple[float, np.ndarray]:
+        u = np.zeros(len(limits))
+        u[others] = z
+        end = limit.at(u)
+        u[limit.axis] = np.clip((limit.last if end is None else end) - limit.side * gap, *limits[limit.axis])
+        value, gradient = objective(u)
+        return value, (gradient + gradient[limit.axis] * limit.slope(u))[others]
+
+    value, u, gradient = objective.best
+    return int(_search(held, u[others], value, gradient, limits[others]).nit)
+
+
+class _Searched(NamedTuple):
+    """The last search in all parameters, the number of iterations of all, and values beyond the limit where it ended."""
+
+    last: OptimizeResult
+    iterations: int
+    beyond: np.ndarray | None
+
+
+def _searched(objective: _Objective, exists: Exists, limits: np.ndarray) -> _Searched:
+    """Search in all parameters, and along a limit that is in the way, until there is none or the maximum lies at it."""
+    iterations, end = 0, None
+    for _ in range(ROUNDS):
+        assert objective.best is not None
+        value, u, gradient = objective.best
+        search = _search(objective, u, value, gradient, limits)
+        iterations += int(search.nit)
+        if search.hess_inv is not None:
+            return _Searched(search, iterations, None)
+        value, u, gradient = objective.best
+        limit, end = Limit(lambda v: exists(objective.values(v)), u, gradient, 2.0 * LIMIT), None
+        if not limit.found:  # each parameter alone may still change, so that another direction may lead on
+            continue
+        if len(u) > 1:
+            iterations += _along(objective, limit, 0.5 * LIMIT / abs(gradient[limit.axis]), limits)
+            value, u, gradient = objective.best
+        if gradient[limit.axis] * limit.side <= 0.0:  # the log-likelihood still rises towards the limit
+            end = limit.at(u)
+            break
+    beyond = objective.beyond if end is None else objective.values(np.where(np.arange(len(u)) == limit.axis, end, u))
+    return _Searched(search, iterations, beyond)
+
+
+def maximum(
+    function: Function, values: np.ndarray, box: np.ndarray, names: tuple[str, ...], model: Model, exists: Exists
+) -> Found:
+    """Return the maximum of the likelihood from `values`: L-BFGS-B, and then Newton's steps in the free parameters."""
+    scale = FIRST * np.where(values != 0, np.abs(values), 1.0)
     objective, u = _Objective(function, values, scale), np.zeros(len(values))
     value, gradient = objective.exact(u)
-    iterations = int(search.nit)
-    deviations = np.sqrt(np.abs(np.diag(search.hess_inv.todense()))) * old / scale
+    if not np.isfinite(value):
+        at = ", ".join(f"{name} = {float(number):g}" for name, number in zip(names, values, strict=True))
+        raise InputError(f"{model.source}: start: the log-likelihood does not exist at {at}; give another start")
+    objective.best = value, u, gradient
+    search, iterations, beyond = _searched(objective, exists, (box - values[:, None]) / scale[:, None])
+    deviations = np.zeros(len(values)) if search.hess_inv is None else np.sqrt(np.abs(np.diag(search.hess_inv.todense())))
+    # The search may have moved far: the best point gives the new units.
+    values, old = np.clip(objective.values(objective.best[1]), box[:, 0], box[:, 1]), scale
+    scale = np.where(values != 0, np.abs(values), scale / FIRST)
+    limits = (box - values[:, None]) / scale[:, None]
+    objective.origin, objective.scale = values, scale
+    value, gradient = objective.exact(u)
+    deviations = deviations * old / scale
     information, place = np.zeros((0, 0)), u
     for _ in range(8):
         held = ((u <= limits[:, 0]) & (gradient > 0)) | ((u >= limits[:, 1]) & (gradient < 0))
@@ -102,22 +194,28 @@ def maximum(function: Function, values: np.ndarray, box: np.ndarray, names: tupl
             information, deviations = np.zeros((0, 0)), np.sqrt(np.diag(cov))  # of the place where the search has ended
             continue
         # Newton's step, in the box; where it gains nothing, rounding has been reached.
-        trial = np.clip(u - np.nan_to_num(cov) @ np.where(free, gradient, 0.0), limits[:, 0], limits[:, 1])
-        new, slope = objective.exact(trial)
-        if not (new <= value + 1e-13 * abs(value)) or not np.isfinite(slope).all():
+        step = np.nan_to_num(cov) @ np.where(free, gradient, 0.0)
+        for halvings in range(HALVINGS):
+            trial = np.clip(u - 0.5**halvings * step, limits[:, 0], limits[:, 1])
+            new, slope = objective.exact(trial)
+            if np.isfinite(new) or objective.at_limit(u, gradient):
+                break
+        if not new <= value + 1e-13 * abs(value):
             break
         value, u, gradient, iterations = new, trial, slope, iterations + 1
     converged = bool(distance < NEAR) if np.isfinite(distance) else bool(search.success and not problem.startswith("the log"))
+    if converged or u.any():  # Newton's steps have left the limit
+        beyond = objective.beyond if not converged and objective.at_limit(u, gradient) else None
+    problem = problem if beyond is None else ""
     if held.any():
-        at = ", ".join(f"{name} = {values[i] + scale[i] * u[i]:g}" for i, name in enumerate(names) if held[i])
+        at = ", ".join(f"{name} = {objective.values(u)[i]:g}" for i, name in enumerate(names) if held[i])
         problem = "; ".join(filter(None, [f"at a bound ({at}), where there is no standard error", problem]))
     covariance = np.where(np.outer(free, free), cov * np.outer(scale, scale), np.nan)
     message = f"converged after {iterations} iterations" if converged else f"not converged after {iterations} iterations"
     if not converged:
-        said = search.message if isinstance(search.message, str) else search.message.decode()
-        message += f" ({said.strip().lower()})"
-    values = np.clip(values + scale * u, box[:, 0], box[:, 1])
-    return Found(values, -value, covariance, converged, message, problem, iterations)
+        message += f" ({search.message.strip().lower() if beyond is None else 'at a limit of the parameters'})"
+    values = np.clip(objective.values(u), box[:, 0], box[:, 1])
+    return Found(values, -value, covariance, converged, message, problem, iterations, beyond)
 
 
 def _information(objective: _Objective, u: np.ndarray, deviations: np.ndarray, free: np.ndarray) -> np.ndarray:

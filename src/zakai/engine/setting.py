@@ -40,6 +40,17 @@ class Setting(NamedTuple):
         method = method if method.variant is None else method.variant(model, options)
         return cls(model, prior, method, options, model.theta(), not (model.depends_on_time or method.absolute))
 
+    @property
+    def parameters(self) -> set[str]:
+        """The names of the parameters on which the likelihood depends."""
+        model, prior = self.model, self.prior
+        coefficients = [model.diffusion, model.process_noise, model.observation_noise, model.cross_noise]
+        law = [*model.family_parameters.values(), *([] if model.log_density is None else [model.log_density])]
+        symbols = set().union(*(part.free_symbols for part in [model.drift, model.observation, *coefficients, *law]))
+        if isinstance(prior, DensityPrior):
+            symbols |= prior.log_density.free_symbols
+        return {symbol.name for symbol in symbols}
+
     @one_thread
     def prepared(self, schedule: Schedule) -> Any:
         """Return what the method prepares for a schedule, kept for the last schedules of each model.
