@@ -23,6 +23,7 @@ from zakai.methods._states import Joined
 from zakai.methods.line import loop
 from zakai.methods.line.cross import OMITTED
 from zakai.methods.line.domain import on_the_line, variable_of
+from zakai.methods.line.drift_grid import showing_drift
 from zakai.methods.line.ends import check_ends
 from zakai.methods.line.figures import (
     edge_of_moments,
@@ -186,6 +187,7 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> St
                 look = lw.figures(values, window.closed, prepared.negligible)
                 values, window = refitted(prepared, values, window, look, prepared.generous)
             report.positive = False
+            values, window = showing_drift(prepared, values, window, start, length)
             interval = start, length, inside, rates, report
             ranges = travel(prepared, values, window, start, length)
             if not (ranges > FAR or prepared.system.varying or inside.any()):

@@ -14,6 +14,7 @@ import numpy as np
 from zakai.methods._protocol import Info, Infos
 from zakai.methods._states import Joined, StackedStates
 from zakai.methods.line import modal
+from zakai.methods.line.drift_grid import hides_drift, showing_drift
 from zakai.methods.line.figures import edge_of_moments, figures, on_fitting_grid, outside_tables, resampled, state_moments
 from zakai.methods.line.grids import grid_of
 from zakai.methods.line.system import Prepared, State
@@ -99,11 +100,18 @@ def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -
     most = prepared.largest
     while first < rows.stop and attempts < ATTEMPTS and state.window.size <= most:
         attempts += 1
-        now = observed[first - rows.start :]
+        stop = rows.stop
+        if hides_drift(prepared, state.window):
+            interval = float(prepared.schedule.starts[first]), float(prepared.lengths[first])
+            values, window = showing_drift(prepared, np.asarray(state.values), state.window, *interval)
+            state, stop = state._replace(values=values, centre=window.centre, spacing=window.spacing), first + 1
+            if window.size > most:
+                break
+        now = observed[first - rows.start : stop - rows.start]
         if prepared.gaussian:
-            piece, why, answer = _on_one_table(prepared, slice(first, rows.stop), state, now)
+            piece, why, answer = _on_one_table(prepared, slice(first, stop), state, now)
         else:
-            found = modal.advanced(prepared, first, rows.stop, state, now, way)
+            found = modal.advanced(prepared, first, stop, state, now, way)
             why, answer = found.why, found.answer
             piece = Piece.of(first, state, *found[:4])._replace(coarse=found.coarse) if len(found.reports) else None
         if piece is not None:

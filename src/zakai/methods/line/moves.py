@@ -12,6 +12,7 @@ import numpy as np
 from zakai.methods.line.attempt import Substep, attempted, by_modes, parts_of_split
 from zakai.methods.line.coarse import EDGE, coarsened
 from zakai.methods.line.coefficients import resolved_parts
+from zakai.methods.line.drift_grid import showing_drift
 from zakai.methods.line.figures import refitted
 from zakai.methods.line.moving import speed_of
 from zakai.methods.line.system import NOISE, Prepared
@@ -189,6 +190,7 @@ def _by_substeps(
                 stack += [(middle, last), (first, middle)]
             look = lw.figures(values, window.closed, negligible)
             values, window = refitted(prepared, values, window, look, large=substeps < FEW)
+            values, window = showing_drift(prepared, values, window, start + first, length - first)
             continue
         assert look is not None
         if prepared.smoothing and stack:  # what a kink leaves everywhere
@@ -207,6 +209,7 @@ def _by_substeps(
         gained = gained + np.log(mass) + attempt.offset
         if stack:
             values, window = refitted(prepared, values, window, look, large=substeps < FEW)
+            values, window = showing_drift(prepared, values, window, start + last, length - last)
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
     return Moved(values, window, gained, look, tuple(passages)), tails
