@@ -12,7 +12,7 @@ from zakai.numerics.line import window as lw
 
 Array = Any
 
-HIDDEN = 0.1  # share of the drift that interpolation between the points may miss: a wave has at least four points
+HIDDEN = 0.05  # share of the drift that interpolation between the points may miss: a wave has at least five points
 SLIGHT = 1e-4  # of the largest drift: less is rounding
 BETWEEN = 0.5 * (np.sqrt(5.0) - 1.0)  # place in a spacing: the golden ratio is far from every fraction of a period
 _CUBIC = np.array([np.prod([(BETWEEN - m) / (j - m) for m in range(-1, 3) if m != j]) for j in range(-1, 3)])
