@@ -57,8 +57,8 @@ def test_an_angle_and_a_rate_agree_with_bayes_rule_on_a_grid_of_both():
     numbers = {name: float(value) for name, value in model.parameters.items()}
     numbers |= {"angle_variance": model.prior.cov[0, 0], "rate_variance": model.prior.cov[1, 1]}
     direction, rate, increments = reference.grid_filter_with_rate(record.times, record.values, numbers)
-    result = zakai.filter(model, record, keep="moments")
-    assert result.method == "limited-direct" and result.warnings == []
+    result = zakai.filter(model, record, "limited-direct", keep="moments")
+    assert result.warnings == []
     # An angle in two states is filtered to the tolerance 1e-5.
     np.testing.assert_allclose(result.log_likelihood_increments[1:], increments, atol=2e-5)
     np.testing.assert_allclose(result.mean[1:, 1], rate, atol=1e-6)

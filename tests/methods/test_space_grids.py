@@ -126,3 +126,26 @@ def test_a_sample_that_leaves_several_narrow_peaks(wave, noise):
     assert np.allclose(result.mean[1], found, atol=1e-3 * np.sqrt(spread[0]))
     assert np.allclose(result.variance[1], spread, rtol=2e-3)
     assert abs(result.log_likelihood - evidence) < 1e-3
+
+
+def test_two_precise_ranges_leave_two_peaks_by_the_method_of_auto():
+    model = zakai.Model(
+        state=["x", "y"], drift=["-x/10", "-y/10"], diffusion=[["1/2", "0"], ["0", "1/2"]], observation_kind="samples",
+        observation=["sqrt(x**2 + y**2)", "sqrt((x - 3)**2 + y**2)"], observation_noise=[["1/400", "0"], ["0", "1/400"]],
+        prior={"kind": "gaussian", "mean": [1, 0], "cov": [4, 4]},
+    )  # fmt: skip
+    result = zakai.filter(model, zakai.Record([2.0], [[1.99, 3.23]], "samples"))
+    mean, variance = np.exp(-0.2), 4 * np.exp(-0.4) + 1.25 * (1 - np.exp(-0.4))
+    axis = np.linspace(-8, 8, 3200)
+    x, y = axis[:, None], axis
+    prior = np.exp(-((x - mean) ** 2 + y**2) / (2 * variance)) / (2 * np.pi * variance)
+    ranges = np.hypot(x, y), np.hypot(x - 3, y)
+    product = prior * np.exp(-200 * ((1.99 - ranges[0]) ** 2 + (3.23 - ranges[1]) ** 2)) * 200 / np.pi
+    mass = product.sum()
+    assert abs(result.log_likelihood - np.log(mass * (axis[1] - axis[0]) ** 2)) < 1e-3
+    along = product.sum(axis=1) / mass
+    middle = along @ axis
+    deviations = np.sqrt([along @ (axis - middle) ** 2, product.sum(axis=0) @ axis**2 / mass])
+    assert abs(result.mean[1, 0] - middle) < 1e-3 * deviations[0]
+    assert np.abs(np.sqrt(result.variance[1]) / deviations - 1).max() < 1e-3
+    assert not result.warnings

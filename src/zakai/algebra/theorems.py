@@ -228,13 +228,16 @@ def in_order(model: Model) -> tuple[str, ...]:
 
     With a nonlinear h, or a sample with a law of its own, a Gaussian sum is less accurate than a density on a grid, which takes
     up to four states; with four and a sample of a known h it is taken first, as it is faster.  "limited-direct" needs many times
-    the work of "yau-yau" with three states, and for increments of an h with a kink in several.
+    the work of "yau-yau" with three states, for increments of an h with a kink in several, and for precise samples of a nonlinear h
+    in two, of which its grid does not hold narrow peaks and rings.
     """
     last: tuple[str, ...] = ()
-    if model.features or (model.n < 4 and affine_observation(model) is None):
+    bent, samples = affine_observation(model) is None, model.observation_kind == "samples"
+    lawful = features.OF_OBSERVATION & model.features.keys()
+    if model.features or (model.n < 4 and bent):
         last = ("general-direct",)
-    kinks = model.observation_kind != "samples" and model.observation.has(sp.Abs, sp.sign)
-    if model.n == 3 or (model.n > 1 and kinks):
+    kinks = not samples and model.observation.has(sp.Abs, sp.sign)
+    if model.n == 3 or (model.n > 1 and kinks) or (model.n == 2 and samples and (bent or lawful)):
         last = ("limited-direct", "general-direct")
     return (*(name for name in _registry.AUTO if name not in last), *last)
 
