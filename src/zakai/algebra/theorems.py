@@ -228,8 +228,8 @@ def in_order(model: Model) -> tuple[str, ...]:
 
     With a nonlinear h, or a sample with a law of its own, a Gaussian sum is less accurate than a density on a grid, which takes
     up to four states; with four and a sample of a known h it is taken first, as it is faster.  "limited-direct" needs many times
-    the work of "yau-yau" with three states, for increments of an h with a kink in several, and for precise samples of a nonlinear h
-    in two, of which its grid does not hold narrow peaks and rings.
+    the work of "yau-yau" with three states, and for increments of an h with a kink in several; in two its grid does not hold the
+    narrow peaks and rings that precise samples of a nonlinear h leave.
     """
     last: tuple[str, ...] = ()
     bent, samples = affine_observation(model) is None, model.observation_kind == "samples"
