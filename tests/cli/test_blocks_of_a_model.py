@@ -29,8 +29,8 @@ def test_a_prior_that_couples_the_blocks_is_seen(zakai, tmp_path):
     coupled = "cov = [[1, 0.5, 0, 0], [0.5, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
     (tmp_path / "blocks.toml").write_text(BLOCKS.replace("cov = [1, 1, 1, 1]", coupled))
     printed = " ".join(zakai("methods", "blocks.toml").out.split())
-    assert "auto takes: blocks: limited-direct, kalman-bucy" in printed
-    assert "(a, b) by limited-direct; (p, v) by kalman-bucy" in printed
+    assert "auto takes: blocks: yau-yau, kalman-bucy" in printed
+    assert "(a, b) by yau-yau; (p, v) by kalman-bucy" in printed
 
 
 def test_a_system_of_blocks_is_filtered_stored_and_reported(zakai, tmp_path):

@@ -40,12 +40,12 @@ def test_a_warning_has_the_time_the_size_and_the_count():
     ("observation", "kind", "states", "method"),
     [
         ("abs(x)", "increments", 2, "yau-yau"),
-        ("abs(x)", "samples", 2, "limited-direct"),
+        ("abs(x)", "samples", 2, "yau-yau"),
         ("abs(x)", "increments", 1, "limited-direct"),
         ("sqrt(1 + x**2)", "increments", 2, "limited-direct"),
     ],
 )
-def test_auto_leaves_the_direct_method_where_a_kink_of_h_needs_many_substeps(observation, kind, states, method):
+def test_auto_leaves_the_direct_method_where_h_needs_many_substeps_or_points(observation, kind, states, method):
     keys = {"state": ["x", "y"][:states], "drift": ["-x + y/2", "-y"] if states == 2 else ["-x"]}
     prior = {"kind": "gaussian", "mean": [0.5] * states, "cov": [0.5] * states}
     model = zakai.Model(**keys, observation=[observation], observation_kind=kind, observation_noise=[["0.1"]], prior=prior)

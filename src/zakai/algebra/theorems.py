@@ -232,12 +232,12 @@ def in_order(model: Model) -> tuple[str, ...]:
     narrow peaks and rings that precise samples of a nonlinear h leave.
     """
     last: tuple[str, ...] = ()
-    bent, samples = affine_observation(model) is None, model.observation_kind == "samples"
-    lawful = features.OF_OBSERVATION & model.features.keys()
-    if model.features or (model.n < 4 and bent):
+    nonlinear, samples = affine_observation(model) is None, model.observation_kind == "samples"
+    laws = features.OF_OBSERVATION & model.features.keys()
+    if model.features or (model.n < 4 and nonlinear):
         last = ("general-direct",)
     kinks = not samples and model.observation.has(sp.Abs, sp.sign)
-    if model.n == 3 or (model.n > 1 and kinks) or (model.n == 2 and samples and (bent or lawful)):
+    if model.n == 3 or (model.n > 1 and kinks) or (model.n == 2 and samples and (nonlinear or laws)):
         last = ("limited-direct", "general-direct")
     return (*(name for name in _registry.AUTO if name not in last), *last)
 
