@@ -158,8 +158,7 @@ def updated(
             break
         grid = new
         if grid.refines(field.grid):
-            values, _ = refined(field.values, field.grid, grid.sizes)
-            here = positive(Field(values, grid, 0.0), bounds)
+            here = positive(Field(*refined(field.values, field.grid, grid.sizes), 0.0), bounds)
             continue
         if bounds.band_limited:
             here = Field(triangular_resampled(field.values, field.grid, grid), grid, 0.0)
