@@ -29,7 +29,12 @@ def text(analysis: Analysis) -> str:
         "eta": None if analysis.eta is None else _text(analysis.eta),
         "yau_form": None
         if form is None
-        else {"L": _rows(form.matrix), "l": _list(form.offset), "phi": _text(form.potential)},
+        else {
+            "L": _rows(form.matrix),
+            "l": _list(form.offset),
+            "phi": None if form.potential is None else _text(form.potential),
+            "grad_phi": _list(form.gradient),
+        },
         "no_yau_form": analysis.no_yau_form,
         "q": None if analysis.q is None else _text(analysis.q),
         "algebra": _algebra(analysis.algebra),

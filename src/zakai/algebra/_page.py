@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import sympy as sp
 
-from zakai.algebra._readable import for_latex, readable, times
+from zakai.algebra._readable import brief, for_latex, readable, times
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.wei_norman import WeiNorman, path_symbols
+from zakai.algebra.yau import is_regular
 from zakai.models.model import Model
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 WIDTH = 110
 _WORDS = {True: "holds", False: "fails", None: "undecided"}
+_TOO_LONG = "a formula that is too long to show"
 _SINGULAR = "not defined: G = g Q g' is singular"
 _MEANING = {
     "increments": "the record holds the increments of y",
@@ -33,12 +35,12 @@ def text(analysis: Analysis) -> str:
     """The page that `print(analysis)` shows."""
     model = analysis.model
     title = "".join(character if character.isprintable() else " " for character in model.name)
-    energy = analysis.eta
+    energy = _undefined(model) if analysis.eta is None else f"eta = {brief(readable(analysis.eta))}"
     blocks = [
         [title, "=" * len(title), *_equations(model)],
         *([["Explosion", *_wrapped("  ", str(analysis.explosion), 4)]] if analysis.explosion is not None else []),
         ["Omega_ij = d_i g_j - d_j g_i  with g = G^-1 f", *_omega(analysis)],
-        ["eta = f'G^-1 f + div f + h'S^-1 h", f"  {_undefined(model)}" if energy is None else f"  eta = {readable(energy)}"],
+        ["eta = f'G^-1 f + div f + h'S^-1 h", f"  {energy}"],
         ["Yau form  f = L x + l + G grad phi", *_yau_form(analysis)],
         ["Estimation algebra", *_algebra(analysis)],
     ]
@@ -96,18 +98,20 @@ def _equations(model: Model) -> Iterator[str]:
 
 
 def _undefined(model: Model) -> str:
-    return f"not defined: {'; '.join(model.features.values())}" if model.features else _SINGULAR
+    if model.features:
+        return f"not defined: {'; '.join(model.features.values())}"
+    return _TOO_LONG if is_regular(model) else _SINGULAR
 
 
 def _omega(analysis: Analysis) -> Iterator[str]:
     omega, n = analysis.omega, analysis.model.n
     if omega is None:
         yield f"  {_undefined(analysis.model)}"
-    elif omega.is_zero_matrix:
+    elif not any(e != 0 for e in omega):
         yield "  Omega = 0" + ("" if n > 1 else "  (as for every system with one state)")
     else:
         for i in range(n):
-            yield from (f"  omega_{i + 1},{j + 1} = {readable(omega[i, j])}" for j in range(i + 1, n) if omega[i, j] != 0)
+            yield from (f"  omega_{i + 1},{j + 1} = {brief(readable(omega[i, j]))}" for j in range(i + 1, n) if omega[i, j] != 0)
 
 
 def _yau_form(analysis: Analysis) -> Iterator[str]:
@@ -116,11 +120,11 @@ def _yau_form(analysis: Analysis) -> Iterator[str]:
         yield f"  none was found: {analysis.no_yau_form}"
         return
     yield f"  L = {_flat(form.matrix)},  l = {[*form.offset]}"
-    yield f"  phi = {form.potential}"
+    yield f"  phi = {form.phi}"
     sampled = analysis.model.observation_kind == "samples"
     energy = "" if sampled else " + h'S^-1 h"
     yield f"  q = 2 phi_t + G:Hess phi + grad phi'G grad phi + 2 (L x + l).grad phi + 2 tr L{energy}"
-    yield f"    = {analysis.q}"
+    yield f"    = {_TOO_LONG if analysis.q is None else brief(analysis.q)}"
 
 
 def _algebra(analysis: Analysis) -> Iterator[str]:
@@ -241,11 +245,13 @@ def latex(analysis: Analysis) -> str:
         path, _ = path_symbols(1, {*model.state, *model.parameters, *model.functions})
         lines.append(rf"d{tex(path[0])} &= {in_dt(model.observation)} + dw, & \mathrm E\,dw\,dw^\top &= {S}\,dt")
     if analysis.omega is not None:
-        lines.append(rf"\Omega &= {tex(analysis.omega)}, & \eta &= {tex(analysis.eta)}")
+        eta = "" if analysis.eta is None else rf", & \eta &= {tex(analysis.eta)}"
+        lines.append(rf"\Omega &= {tex(analysis.omega)}{eta}")
     form = analysis.yau_form
     if form is not None:
         lines.append(rf"L &= {tex(form.matrix)}, & l &= {tex(form.offset)}")
-        lines.append(rf"\phi &= {tex(form.potential)}, & q &= {tex(analysis.q)}")
+        phi = rf"\nabla\phi &= {tex(form.gradient)}" if form.potential is None else rf"\phi &= {tex(form.potential)}"
+        lines.append(phi if analysis.q is None else rf"{phi}, & q &= {tex(analysis.q)}")
     block = analysis.observed_block
     if block is not None and 0 < len(block.symbols) < model.n:
         z, coordinates = tex(sp.Matrix(block.symbols)), tex(sp.Matrix(block.coordinates))

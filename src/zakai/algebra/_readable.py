@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import islice
 
 import sympy as sp
 from sympy.core.function import AppliedUndef
 
+_LONG = 400  # parts of a formula that is not printed whole
 
 def readable(expression: sp.Basic) -> sp.Basic:
     """The expression with primes, or the numbers of the arguments, for derivatives of undetermined functions.
@@ -62,6 +64,28 @@ def times(factor: sp.Expr, noise: str) -> str:
         return ""
     short = factor.is_Symbol or factor.is_Integer or factor.is_Function
     return noise if factor == 1 else f"{factor} {noise}" if short else f"({factor}) {noise}"
+
+
+def tidy(expression: sp.Expr) -> sp.Expr:
+    """Return a shorter form of a coefficient that depends on time and parameters only."""
+    if expression.is_number or expression.is_Symbol or expression.count_ops() > 80:
+        return expression
+    return min((expression, sp.cancel(sp.together(expression))), key=sp.count_ops)
+
+
+def brief(expression: sp.Basic) -> str:
+    """Return a formula as text, and of a long one, which takes long to print, its first terms."""
+    if is_short(expression):
+        return str(expression)
+    terms = sp.Add.make_args(expression)
+    if len(terms) > 1 and all(map(is_short, terms[:2])):
+        return f"{terms[0]} + {terms[1]} + ... ({len(terms)} terms)"
+    return "a formula of many terms"
+
+
+def is_short(expression: sp.Basic) -> bool:
+    """Return whether a formula has few parts."""
+    return sum(1 for _ in islice(sp.preorder_traversal(expression), _LONG)) < _LONG
 
 
 def short(text: str) -> str:

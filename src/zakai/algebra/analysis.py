@@ -20,10 +20,9 @@ from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
 from zakai.algebra.explosion import Explosion, explosion
 from zakai.algebra.observed_block import ObservedBlock, observed_block
-from zakai.algebra.quadratics import as_quadratic, quadratic_expression
-from zakai.algebra.systems import cached_yau_form
+from zakai.algebra.quadratics import displayed_q
 from zakai.algebra.theorems import THEOREMS, conditions_of
-from zakai.algebra.yau import NoYauForm, YauForm, observation_energy, q_without_observation, tidy_state, wong_omega
+from zakai.algebra.yau import NoYauForm, YauForm, wong_omega, yau_form
 from zakai.algebra.yau import eta as wong_eta
 from zakai.errors import InputError
 from zakai.models.model import Model
@@ -46,13 +45,25 @@ class Analysis:
     """
 
     model: Model
-    omega: sp.ImmutableMatrix | None
-    eta: sp.Expr | None
     yau_form: YauForm | None
     no_yau_form: str
-    q: sp.Expr | None
     methods: Mapping[str, tuple[Condition, ...]]
     recommended: str | None
+
+    @cached_property
+    def omega(self) -> sp.ImmutableMatrix | None:
+        """Wong's matrix (n, n)."""
+        return wong_omega(self.model)
+
+    @cached_property
+    def eta(self) -> sp.Expr | None:
+        """Wong's eta."""
+        return wong_eta(self.model)
+
+    @cached_property
+    def q(self) -> sp.Expr | None:
+        """The q of the Yau form."""
+        return None if self.yau_form is None else displayed_q(self.model, self.model.observation_kind != "samples")
 
     @cached_property
     def algebra(self) -> EstimationAlgebra:
@@ -144,16 +155,12 @@ def analyze(model: Model) -> Analysis:
     """
     if not isinstance(model, Model):
         raise InputError(f"analyze: expected a Model, got a {type(model).__name__}; zakai.load_model reads one from a file")
-    form = cached_yau_form(model)
-    omega, energy = wong_omega(model), wong_eta(model)
+    form = yau_form(model)
     methods = {name: conditions_of(name, model) for name in THEOREMS}
     return Analysis(
         model=model,
-        omega=None if omega is None else sp.ImmutableMatrix(omega),
-        eta=None if energy is None else _shortest(energy, model),
         yau_form=None if isinstance(form, NoYauForm) else form,
         no_yau_form=form.evidence if isinstance(form, NoYauForm) else "",
-        q=None if isinstance(form, NoYauForm) else _q(model, form),
         methods=methods,
         recommended=recommended(model),
     )
@@ -163,16 +170,3 @@ def _first_failure(conditions: tuple[Condition, ...]) -> str:
     """Return the first condition that does not hold, else the first undecided one."""
     listed = sorted((one for one in conditions if one.holds is not True), key=lambda one: one.holds is None)
     return listed[0].statement if listed else ""
-
-
-def _q(model: Model, form: YauForm) -> sp.Expr:
-    q = q_without_observation(model, form)
-    return _shortest(q if model.observation_kind == "samples" else q + observation_energy(model), model)
-
-
-def _shortest(expression: sp.Expr, model: Model) -> sp.Expr:
-    """The quadratic that the expression is, in whatever way it was written; or else its like terms collected."""
-    quadratic, _, _ = as_quadratic(expression, model.x)
-    if quadratic is not None:
-        return quadratic_expression(quadratic, model.x)
-    return tidy_state(expression, model.x)

@@ -8,7 +8,7 @@ from typing import Any
 
 import sympy as sp
 
-from zakai.algebra.grouping import tidy
+from zakai.algebra._readable import tidy
 from zakai.models.features import (
     DOMAIN,
     JUMPS,

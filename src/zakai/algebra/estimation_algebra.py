@@ -14,12 +14,12 @@ from functools import cached_property
 import sympy as sp
 
 from zakai import _display
+from zakai.algebra._readable import tidy
 from zakai.algebra.affine_elements import dimension_and_rank
 from zakai.algebra.certificates import CLOSED, Certificate, affine_functions, certificate, finite_by_theorem, infinite
 from zakai.algebra.closure import NO_JETS, Budget, Closure, close
 from zakai.algebra.dmz_operators import DmzOperators
 from zakai.algebra.generators import Unreadable
-from zakai.algebra.grouping import tidy
 from zakai.algebra.normal_form import Basis, basis_of
 from zakai.algebra.operators import JetTowerEnds
 from zakai.algebra.ratios import TooLarge

@@ -7,10 +7,12 @@ from collections.abc import Iterator
 import sympy as sp
 
 from zakai.algebra._readable import short
+from zakai.algebra.affine import affine
 from zakai.algebra.conditions import Condition
-from zakai.algebra.gauges import affine_system, gauge
-from zakai.algebra.systems import affine_observation, affine_parts, cached_yau_form, definite_covariance, determined
-from zakai.algebra.yau import NoYauForm, form_text
+from zakai.algebra.gauges import gauge
+from zakai.algebra.quadratics import decided_q
+from zakai.algebra.systems import definite_covariance, determined
+from zakai.algebra.yau import NoYauForm, affine_drift, affine_h, no_form_text, yau_form
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
@@ -41,12 +43,12 @@ def benes(model: Model) -> tuple[Condition, ...]:
     conditions = _yau_conditions(model, _BENES, "G")
     if any(condition.holds is not True for condition in conditions):
         return conditions
-    form = gauge(model)
-    potential = affine_system(model)[0].potential  # type: ignore[index]
+    form, own = gauge(model), yau_form(model)
+    assert not isinstance(own, NoYauForm)
     statement = "phi = log cosh(q(t).x + delta(t)) but for an affine function, which is part of l"
     return (
         *conditions,
-        Condition(statement, form is not None and form.is_log_cosh, f"phi = {short(str(potential))}", _BENES),
+        Condition(statement, form is not None and form.is_log_cosh, f"phi = {short(own.phi)}", _BENES),
         *_posterior_on_the_line(model),
     )
 
@@ -85,27 +87,25 @@ def _yau_conditions(model: Model, source: str, covariance: str) -> tuple[Conditi
         return (first,)
     observed = _affine("h = C(t) x + c(t)", model.observation, model, source)
     statement = f"f = L(t) x + l(t) + {covariance}(t) grad phi(t, x)"
-    if affine_parts(model.drift, model.x) is not None:
+    if affine_drift(model).slope is not None:
         return first, observed, Condition(statement, True, "f is affine, phi = 0", source)
-    form = cached_yau_form(model)
+    form = yau_form(model)
     if isinstance(form, NoYauForm):
         # With inputs in G there is no Yau form, and no number to decide whether G is definite.
         known = () if model.covariance.free_symbols & set(model.u) else (definite_covariance(model),)
-        return first, observed, *known, Condition(statement, form.holds, form.evidence, source)
+        return first, observed, *known, Condition(statement, form.holds, no_form_text(form), source)
     definite = definite_covariance(model)
-    system = affine_system(model)
-    assert system is not None
-    _, _, holds, evidence = system
+    _, holds, evidence = decided_q(model, False)
     quadratic = "2 phi_t + G:Hess phi + grad phi'G grad phi + 2 (L x + l).grad phi + 2 tr L is quadratic in x"
-    found = Condition(statement, True, form_text(form), source)
+    found = Condition(statement, True, form.text, source)
     return first, observed, definite, found, Condition(quadratic, holds, evidence, source)
 
 
 def _affine(statement: str, field: sp.MatrixBase, model: Model, source: str) -> Condition:
-    parts = affine_observation(model) if field is model.observation else affine_parts(field, model.x)
-    curved = next((entry for entry in field if affine_parts(sp.Matrix([entry]), model.x) is None), None)
-    evidence = "affine" if parts is not None else f"{short(str(curved))} is not affine in {', '.join(map(str, model.x))}"
-    return Condition(statement, parts is not None, evidence, source)
+    holds = (affine_h(model) if field is model.observation else affine_drift(model)).slope is not None
+    curved = None if holds else next((e for e in field if affine(sp.Matrix([e]), model.x).slope is None), None)
+    evidence = "affine" if holds else f"{short(str(curved))} is not affine in {', '.join(map(str, model.x))}"
+    return Condition(statement, holds, evidence, source)
 
 
 def _posterior_on_the_line(model: Model) -> Iterator[Condition]:

@@ -8,11 +8,12 @@ import numpy as np
 import sympy as sp
 from sympy.functions.elementary.hyperbolic import HyperbolicFunction
 
-from zakai.algebra.grouping import tidy
+from zakai.algebra._readable import tidy
+from zakai.algebra.affine import affine
 from zakai.algebra.identities import is_zero
-from zakai.algebra.quadratics import Quadratic, as_quadratic
-from zakai.algebra.systems import affine_parts, cached_yau_form
-from zakai.algebra.yau import YauForm, q_without_observation
+from zakai.algebra.quadratics import Quadratic, decided_q
+from zakai.algebra.tower import OutOfBounds
+from zakai.algebra.yau import YauForm, affine_drift, yau_decision, yau_form
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
@@ -22,12 +23,12 @@ _MOST_TERMS = 32
 
 @dataclass(frozen=True)
 class Gauge:
-    """e^phi, a function of `directions` x (k, n) alone.
+    """e^phi of the Yau form `form`, a function of `directions` x (k, n) alone.
 
     Where e^phi = sum_j e^{c_j + q_j.x}, `logs` c (K, 1) and `slopes` q (K, n) are given, else None.
     """
 
-    potential: sp.Expr
+    form: YauForm
     directions: sp.ImmutableMatrix
     logs: sp.ImmutableMatrix | None
     slopes: sp.ImmutableMatrix | None
@@ -39,19 +40,18 @@ class Gauge:
 
 
 @once_for_a_model
-def affine_system(model: Model) -> tuple[YauForm, Quadratic | None, bool | None, str] | None:
-    """The Yau form with -q/2 without the observation's energy, whether that q is quadratic, and why; None without a Yau form."""
-    form: object
-    parts = affine_parts(model.drift, model.x)
-    if parts is not None:
+def affine_system(model: Model) -> tuple[YauForm, Quadratic | None] | None:
+    """Return the Yau form with -q/2 without the observation's energy, where that is quadratic; None without a Yau form.
+
+    An affine drift has one whatever other features the model has.
+    """
+    drift = affine_drift(model)
+    if drift.slope is not None and drift.intercept is not None:
         zero = sp.ImmutableMatrix.zeros(model.n, 1)
-        form = YauForm(*parts, sp.Integer(0), zero)
-        quadratic = Quadratic(sp.ImmutableMatrix.zeros(model.n, model.n), zero, -parts[0].trace())
-        return form, quadratic, True, "f is affine"
-    form = cached_yau_form(model)
-    if not isinstance(form, YauForm):
-        return None
-    return form, *as_quadratic(q_without_observation(model, form), model.x)
+        form = YauForm(drift.slope, drift.intercept, sp.Integer(0), zero, zero)
+        return form, Quadratic(sp.ImmutableMatrix.zeros(model.n, model.n), zero, -drift.slope.trace())
+    found = yau_form(model)
+    return (found, decided_q(model, False).quadratic) if isinstance(found, YauForm) else None
 
 
 @once_for_a_model
@@ -59,17 +59,17 @@ def gauge(model: Model) -> Gauge | None:
     """The gauge of a model with a Yau form, or None where phi depends on more than two directions."""
     system = affine_system(model)
     assert system is not None
-    potential = system[0].potential
-    if potential == 0:
+    form = system[0]
+    if not form.curved:
         none, flat = sp.ImmutableMatrix.zeros(0, model.n), sp.ImmutableMatrix.zeros(1, model.n)
-        return Gauge(potential, none, sp.ImmutableMatrix([0]), flat)
-    terms = exponential_terms(potential, model)
+        return Gauge(form, none, sp.ImmutableMatrix([0]), flat)
+    terms = None if form.potential is None else exponential_terms(form.potential, model)
     if terms is not None:
         logs, slopes = terms
         rows = _independent(slopes, model)
-        return None if len(rows) > 2 else Gauge(potential, slopes.extract(rows, range(model.n)), logs, slopes)
-    directions = _directions(system[0], model)
-    return None if directions is None else Gauge(potential, directions, None, None)
+        return None if len(rows) > 2 else Gauge(form, slopes.extract(rows, range(model.n)), logs, slopes)
+    directions = _directions(form, model)
+    return None if directions is None else Gauge(form, directions, None, None)
 
 
 Terms = dict[tuple[sp.Expr, ...], sp.Expr]
@@ -150,11 +150,11 @@ def _sum_of_exponentials(expression: sp.Expr, x: tuple[sp.Symbol, ...]) -> Terms
             if not factor.has(*x):
                 coefficient *= factor
                 continue
-            parts = affine_parts(sp.Matrix([factor.args[0]]), x) if isinstance(factor, sp.exp) else None
-            if parts is None:
+            parts = affine(sp.Matrix([factor.args[0]]), x) if isinstance(factor, sp.exp) else None
+            if parts is None or parts.slope is None or parts.intercept is None:
                 return None
-            slope += parts[0].T
-            coefficient *= sp.exp(parts[1][0])
+            slope += parts.slope.T
+            coefficient *= sp.exp(parts.intercept[0])
         key = tuple(sp.expand(entry) for entry in slope)
         found[key] = found.get(key, sp.Integer(0)) + coefficient
     return found
@@ -202,12 +202,26 @@ def _independent(slopes: sp.MatrixBase, model: Model) -> list[int]:
 
 def _directions(form: YauForm, model: Model) -> sp.ImmutableMatrix | None:
     """One or two directions on which phi depends: a common one of its gradient, or coordinates."""
-    x = model.x
-    used = [i for i, entry in enumerate(form.gradient) if is_zero(entry) is not True]
-    first = form.gradient[used[0]]
-    ratios = [sp.simplify(entry / first) for entry in form.gradient] if model.n > 1 else [sp.Integer(1)]
-    if not any(ratio.has(*x) for ratio in ratios):
+    used = [i for i, entry in enumerate(form.gradient) if entry != 0]
+    ratios = _ratios(model) if model.n > 1 else [sp.Integer(1)]
+    if ratios is not None:
         return sp.ImmutableMatrix([ratios])
     if len(used) <= 2:
         return sp.ImmutableMatrix(sp.eye(model.n).extract(used, range(model.n)))
     return None
+
+
+def _ratios(model: Model) -> list[sp.Expr] | None:
+    """Return a direction that the gradient of phi always has, as ratios to its first entry, or None."""
+    proof = yau_decision(model).proof
+    if proof is None:
+        return None
+    T = proof.reader
+    T.begin()
+    try:
+        below = next(p for p in proof.p if p).inverse()
+        ratios = [p * below for p in proof.p]
+        still = not any(T.diff(ratio, s) for ratio in ratios for s in model.x)
+        return [T.expression(ratio) for ratio in ratios] if still else None
+    except OutOfBounds:
+        return None

@@ -11,9 +11,8 @@ import sympy as sp
 from zakai.algebra._readable import readable, short
 from zakai.algebra.conditions import Condition
 from zakai.algebra.estimation_algebra import estimation_algebra
-from zakai.algebra.identities import all_zero
+from zakai.algebra.identities import all_zero, is_quadratic
 from zakai.algebra.normal_form import operator_symbols
-from zakai.algebra.quadratics import as_quadratic
 from zakai.algebra.systems import affine_parts
 from zakai.algebra.yau import eta, observation_energy, wong_omega
 from zakai.algebra.yau_theorems import DONG, TheoremCheck
@@ -104,9 +103,8 @@ def survey_conditions(model: Model) -> tuple[Condition, ...]:
 
 
 def _quadratic(name: str, expression: sp.Expr, model: Model, label: str) -> Condition:
-    _, holds, evidence = as_quadratic(expression, model.x)
-    found = f"{name}{evidence[1:]}" if evidence.startswith("q ") else evidence
-    return Condition(f"{name} is quadratic", holds, found, f"{SURVEY}, {label}")
+    found = f"{name} = {short(str(expression))}"
+    return Condition(f"{name} is quadratic", is_quadratic(expression, model.x), found, f"{SURVEY}, {label}")
 
 
 def _constant_in_time(model: Model, source: str) -> Condition:

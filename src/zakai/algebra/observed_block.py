@@ -16,9 +16,9 @@ from typing import Any
 
 import sympy as sp
 
+from zakai.algebra._readable import tidy
 from zakai.algebra.dmz_operators import DmzOperators
 from zakai.algebra.generators import Unreadable
-from zakai.algebra.grouping import tidy
 from zakai.algebra.linear_span import Span, Vector
 from zakai.algebra.operators import JetTowerEnds, Symbol
 from zakai.algebra.ratios import TooLarge

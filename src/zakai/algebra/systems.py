@@ -8,15 +8,16 @@ import numpy as np
 import sympy as sp
 
 from zakai.algebra._readable import short
+from zakai.algebra.affine import affine
 from zakai.algebra.conditions import Condition
-from zakai.algebra.identities import all_zero, is_in_one_piece, is_zero
-from zakai.algebra.quadratics import Quadratic, as_quadratic
-from zakai.algebra.yau import NoYauForm, YauForm, observation_energy, q_without_observation, yau_form
-from zakai.models.kept import once_for_a_model
+from zakai.algebra.quadratics import Quadratic, decided_q
+from zakai.algebra.yau import YauForm, affine_h, is_regular, yau_form
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 
 CLY = "Chen, Luo and Yau 2017"
+_TIMES = 40  # at which a covariance that depends on time is checked
+_MOST_SHOWN = 3  # states up to which det G is written out
 
 
 @dataclass(frozen=True)
@@ -34,52 +35,26 @@ class YauSystem:
     intercept: sp.ImmutableMatrix | None
 
 
-@once_for_a_model
-def cached_yau_form(model: Model) -> YauForm | NoYauForm:
-    """`yau_form`, computed once for each model."""
-    return yau_form(model)
-
-
-@once_for_a_model
-def q_parts(model: Model):
-    """(-q/2 as a quadratic, whether q is one, why) without and with the observation's energy."""
-    form = cached_yau_form(model)
-    assert isinstance(form, YauForm)
-    unobserved = q_without_observation(model, form)
-    first = as_quadratic(unobserved, model.x)
-    return first, as_quadratic(unobserved + observation_energy(model), model.x)
-
-
-@once_for_a_model
 def affine_observation(model: Model) -> tuple[sp.ImmutableMatrix, sp.ImmutableMatrix] | None:
-    """C and c if h = C x + c, else None."""
-    return affine_parts(model.observation, model.x)
+    """Return C and c if h = C x + c, else None."""
+    found = affine_h(model)
+    return None if found.slope is None or found.intercept is None else (found.slope, found.intercept)
 
 
 def affine_parts(
     field: sp.MatrixBase, x: tuple[sp.Symbol, ...]
 ) -> tuple[sp.ImmutableMatrix, sp.ImmutableMatrix] | None:
-    """C and c if the field is C x + c for all x, else None."""
-    slope = sp.Matrix([[sp.diff(entry, symbol) if entry.has(symbol) else sp.Integer(0) for symbol in x] for entry in field])
-    # Where a derivative still contains the state it may do so in name only.
-    seconds = (sp.diff(entry, symbol) for entry in slope for symbol in entry.free_symbols & set(x))
-    if all_zero(seconds) is not True:
-        return None
-    origin = {symbol: sp.Integer(0) for symbol in x}
-    slope, intercept = slope.xreplace(origin), field.xreplace(origin)
-    # The slope of asin(sin(x)) is constant in each of its pieces, and not the same in all.
-    if not all(is_in_one_piece(entry, x) for entry in field):
-        if all_zero(list(field - slope * sp.Matrix(x) - intercept)) is not True:
-            return None
-    return sp.ImmutableMatrix(slope), sp.ImmutableMatrix(intercept)
+    """Return C and c if the field is C x + c for all x, else None."""
+    found = affine(field, x)
+    return None if found.slope is None or found.intercept is None else (found.slope, found.intercept)
 
 
 def yau_system(model: Model) -> YauSystem | None:
     """What the direct methods compute with, or None where the drift has no Yau form."""
-    form = cached_yau_form(model)
+    form = yau_form(model)
     if not isinstance(form, YauForm):
         return None
-    (unobserved, _, _), (full, _, _) = q_parts(model)
+    unobserved, full = (decided_q(model, energy).quadratic for energy in (False, True))
     slope, intercept = affine_observation(model) or (None, None)
     return YauSystem(form, unobserved, full, slope, intercept)
 
@@ -98,17 +73,24 @@ def definite_covariance(model: Model) -> Condition:
     """G = g Q g' is positive definite; at the times of a record it is checked again."""
     source = f"{CLY}, Assumption 1"
     statement = "G = g Q g' is positive definite"
-    determinant = model.covariance.det()
-    if determinant.is_polynomial(*determinant.free_symbols):  # a factor exp(-1000 t) would be one of degree 1000
-        determinant = sp.factor(determinant)
-    if is_zero(determinant):
+    if is_regular(model) is False:
         return Condition(statement, False, "det G = 0", source)
     evaluate = numpy_function(model.covariance, model, model.covariance.shape)
-    times = model.start + np.concatenate([[0.0], np.geomspace(1e-3, 1e2, 40)])
+    times = model.start + np.concatenate([[0.0], np.geomspace(1e-3, 1e2, _TIMES)])
     for time in times:
         matrix = evaluate(np.zeros(model.n), time, model.theta())
         if not np.all(np.isfinite(matrix)) or np.linalg.eigvalsh(matrix)[0] <= 0:
             # The record may never reach this time, so that only the start refutes.
             holds = False if time == model.start else None
             return Condition(statement, holds, f"G is not positive definite at t = {time:g}", source)
-    return Condition(statement, True, f"det G = {short(str(determinant))}", source)
+    return Condition(statement, True, _determinant(model.covariance), source)
+
+
+def _determinant(G: sp.MatrixBase) -> str:
+    """Return det G in words, where it is short."""
+    if len(G.free_symbols) and G.rows > _MOST_SHOWN and not G.is_diagonal():
+        return f"at {_TIMES} times after the start"
+    determinant = sp.prod(G.diagonal()) if G.is_diagonal() else G.det()
+    if determinant.is_polynomial(*determinant.free_symbols):  # a factor exp(-1000 t) would be one of degree 1000
+        determinant = sp.factor(determinant)
+    return f"det G = {short(str(determinant))}"

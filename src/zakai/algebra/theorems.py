@@ -23,8 +23,9 @@ from zakai.algebra.feature_conditions import (
     reflecting_ends,
 )
 from zakai.algebra.identities import all_zero
-from zakai.algebra.systems import CLY, affine_observation, cached_yau_form, definite_covariance, determined, q_parts
-from zakai.algebra.yau import YauForm, form_text
+from zakai.algebra.quadratics import decided_q
+from zakai.algebra.systems import CLY, affine_observation, definite_covariance, determined
+from zakai.algebra.yau import YauForm, no_form_text, yau_form
 from zakai.models import features
 from zakai.models.features import ASSUMPTIONS
 from zakai.models.kept import once_for_a_model
@@ -59,27 +60,26 @@ def _fits_on_a_grid(model: Model, most: int, words: str) -> Condition:
 
 def _yau_conditions(model: Model, source: str, further: Callable[[YauForm], Condition]) -> Iterator[Condition]:
     """Yield what the direct methods ask of a time-varying Yau system; `further` is a condition of one method."""
-    form = cached_yau_form(model)
+    form = yau_form(model)
     statement = "f = L(t) x + l(t) + G(t) grad phi(t, x)"
     if not isinstance(form, YauForm):
-        yield Condition(statement, form.holds, form.evidence, source)
+        yield Condition(statement, form.holds, no_form_text(form), source)
         return
-    yield Condition(statement, True, form_text(form), source)
+    yield Condition(statement, True, form.text, source)
     yield further(form)
     yield _quadratic_condition(model)
     yield from _angle_conditions(model, form)
 
 
 def _quadratic_condition(model: Model) -> Condition:
-    unobserved, full = q_parts(model)
     sampled = model.observation_kind == "samples"
-    _, holds, evidence = unobserved if sampled else full
+    _, holds, evidence = decided_q(model, not sampled)
     statement = (
         "q = 2 phi_t + G:Hess phi + grad phi'G grad phi + 2 (L x + l).grad phi + 2 tr L"
         + ("" if sampled else " + h'S^-1 h")
         + " is quadratic in x"
     )
-    if sampled and unobserved[1]:
+    if sampled and holds:
         evidence += " (a sample enters only at its time, so that h may be any function)"
     return Condition(statement, holds, evidence, f"{CLY}, Assumption 3 with 2 phi_t")
 
@@ -90,17 +90,19 @@ def _angle_conditions(model: Model, form: YauForm) -> Iterator[Condition]:
         i = model.state.index(name)
         symbol = model.x[i]
         column = [form.matrix[j, i] for j in range(model.n)]
-        turned = form.potential.subs(symbol, symbol + 2 * sp.pi) - form.potential
-        (unobserved, _, _), (full, _, _) = q_parts(model)
-        q = unobserved if model.observation_kind == "samples" else full
-        parts = [*column, turned]
-        if q is not None:
-            parts += [*q.matrix.row(i), q.linear[i]]
+        q = decided_q(model, model.observation_kind != "samples").quadratic
+        parts = [*column] if q is None else [*column, *q.matrix.row(i), q.linear[i]]
+        turned: sp.Expr | None = None
+        if form.potential is not None:
+            turned = form.potential.subs(symbol, symbol + 2 * sp.pi) - form.potential
+            parts.append(turned)
         holds = all_zero(parts)
+        if holds and turned is None:
+            holds = None
         yield Condition(
             f"L, phi and q are the same after a turn of {name}",
             holds,
-            "column of L: " + str(column) + f", phi({name} + 2 pi) - phi({name}) = {turned if not holds else 0}",
+            "column of L: " + str(column) + f", phi({name} + 2 pi) - phi({name}) = {0 if holds else turned or 'an integral'}",
             "a density on the circle",
         )
 
@@ -138,7 +140,7 @@ def _few_directions(model: Model, form: YauForm) -> Condition:
     law += [] if model.log_density is None else [model.log_density]
     nonlinear = law if features.OF_OBSERVATION & model.features.keys() else []
     nonlinear = nonlinear or ([] if affine_observation(model) else list(model.observation))
-    used = {name for name, symbol in zip(model.state, model.x) if any(f.has(symbol) for f in (*nonlinear, form.potential))}
+    used = {name for name, symbol in zip(model.state, model.x) if any(f.has(symbol) for f in (*nonlinear, *form.gradient))}
     listed = ", ".join(name for name in model.state if name in used) or "none"
     return Condition(
         "a nonlinear h and phi depend on at most five coordinates, in which quadrature is done",

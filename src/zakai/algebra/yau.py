@@ -7,43 +7,83 @@ Kolmogorov equation to one whose drift is affine and whose potential is -q/2, wi
     q = 2 phi_t + G:Hess phi + grad phi'G grad phi + 2 (L x + l).grad phi + 2 tr L + h'S^-1 h.
 
 The printed q (Chen, Luo and Yau 2017, (20)) lacks 2 phi_t and its Yau form (17) lacks the G before grad phi.
+
+Both are decided by values first, then by a proof in a tower of generators, which gives the coefficients; each once for a model.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import sympy as sp
 
-from zakai.algebra._readable import readable, short
-from zakai.algebra.grouping import MANY_TERMS, grouped, terms_of, tidy
-from zakai.algebra.identities import is_zero
+from zakai.algebra._readable import brief, readable, short, tidy
+from zakai.algebra.affine import Affine, affine
+from zakai.algebra.balls import LINES, POINTS, sampled
+from zakai.algebra.identities import NOT_ZERO, evidence
+from zakai.algebra.tower import OutOfBounds
+from zakai.algebra.yau_proof import YauProof
+from zakai.algebra.yau_values import YauValues
 from zakai.models.features import INPUTS, JUMP_FUNCTIONS, of_dynamics
+from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 
-DEEPEST = 4  # functions inside of each other that are integrated
+DISPLAYED = 8  # what is only displayed may take this part of the work of a proof
 
 
 @dataclass(frozen=True)
 class YauForm:
-    """f = `matrix` x + `offset` + G grad `potential`: L (n, n), l (n, 1), phi; `gradient` is grad phi (n, 1)."""
+    """f = `matrix` x + `offset` + G grad `potential`: L (n, n), l (n, 1), phi; `gradient` is grad phi (n, 1).
+
+    `potential` is None where no closed form of phi was found: phi is then the integral of its gradient along the line from
+    `base` (n, 1), where it is zero.
+    """
 
     matrix: sp.ImmutableMatrix
     offset: sp.ImmutableMatrix
-    potential: sp.Expr
+    potential: sp.Expr | None
     gradient: sp.ImmutableMatrix
+    base: sp.ImmutableMatrix
+
+    @cached_property
+    def curved(self) -> bool:
+        """Whether phi is more than zero."""
+        return any(entry != 0 for entry in self.gradient)
+
+    @cached_property
+    def phi(self) -> str:
+        """The potential in words."""
+        if self.potential is not None:
+            return str(self.potential)
+        return f"the line integral of ({', '.join(map(brief, self.gradient))}), for which no closed form was found"
+
+    @cached_property
+    def text(self) -> str:
+        """The form for a sentence."""
+        matrix = ", ".join(f"[{', '.join(map(brief, row))}]" for row in self.matrix.tolist())
+        return f"L = {short(f'[{matrix}]')}, l = {short(str(list(map(brief, self.offset))))}, phi = {short(self.phi)}"
 
 
 @dataclass(frozen=True)
 class NoYauForm:
-    """Why no Yau form was found: `holds` is False if there is none, None if that is not known."""
+    """Why no Yau form was found: `holds` is False if there is none, None if that is not known; `witness` is a point or empty."""
 
     holds: bool | None
     evidence: str
+    witness: str = ""
+
+
+class YauDecision(NamedTuple):
+    """The form of a model, with its proof where there is one."""
+
+    form: YauForm | NoYauForm
+    proof: YauProof | None
 
 
 def inverse(matrix: sp.MatrixBase) -> sp.MatrixBase:
-    """The inverse, by cofactors and with tidied entries where they are not numbers."""
+    """Return the inverse, by cofactors and with tidied entries where they are not numbers."""
     if matrix.is_diagonal():
         return sp.diag(*[1 / entry for entry in matrix.diagonal()])
     if all(entry.is_Rational for entry in matrix):
@@ -51,194 +91,166 @@ def inverse(matrix: sp.MatrixBase) -> sp.MatrixBase:
     return matrix.inv(method="ADJ").applyfunc(tidy)
 
 
-def wong_omega(model: Model) -> sp.Matrix | None:
-    """Wong's matrix omega_ij = d_i g_j - d_j g_i with g = G^-1 f, or None where G is singular."""
-    if of_dynamics(model) or is_zero(model.covariance.det()) is not False:
-        return None
-    g = inverse(model.covariance) * model.drift
-    return curl(g, model.x)
+@once_for_a_model
+def affine_drift(model: Model) -> Affine:
+    """Return whether the drift is affine, decided once for a model."""
+    return affine(model.drift, model.x)
 
 
-def curl(field: sp.MatrixBase, x: tuple[sp.Symbol, ...]) -> sp.Matrix:
-    """The matrix d_i field_j - d_j field_i, with what is provably zero set to zero."""
-    n = len(x)
-    omega = sp.zeros(n, n)
-    for i in range(n):
-        for j in range(i + 1, n):
-            entry = sp.expand(sp.diff(field[j], x[i]) - sp.diff(field[i], x[j]))
-            omega[i, j] = sp.Integer(0) if is_zero(entry) else tidy_state(entry, x)
-            omega[j, i] = -omega[i, j]
-    return omega
+@once_for_a_model
+def affine_h(model: Model) -> Affine:
+    """Return whether h is affine, decided once for a model."""
+    return affine(model.observation, model.x)
 
 
-def tidy_state(expression: sp.Expr, x: tuple[sp.Symbol, ...]) -> sp.Expr:
-    """Like terms in the state collected, with tidied coefficients."""
-    return sp.Add(*[c * function for function, c in grouped(expression, x).items()])
+@once_for_a_model
+def is_regular(model: Model) -> bool | None:
+    """Return whether G is regular at almost every time; None if that is not decided."""
+    if all(e.is_Rational for e in model.covariance):
+        return bool(model.covariance.rank() == model.n)
+    return YauValues(model).regular(POINTS)
 
 
 def yau_form(model: Model) -> YauForm | NoYauForm:
-    """The Yau form of the drift; affine parts, and quadratic parts of the potential, are kept in L and l."""
-    x, n = model.x, model.n
-    features = [words for feature, words in of_dynamics(model).items() if feature != INPUTS]
-    if features:
-        return NoYauForm(False, f"{'; '.join(features)}: the Yau form is for f(x, u, t) with g(u, t)")
-    matrix, offset, rest = _affine_and_rest(model.drift, x)
-    if all(term == 0 for term in rest):
-        zero = sp.ImmutableMatrix.zeros(n, 1)
-        return YauForm(sp.ImmutableMatrix(matrix), sp.ImmutableMatrix(offset), sp.Integer(0), zero)
-    covariance, inputs = model.covariance, set(model.u)
-    if driven := (covariance.free_symbols | rest.free_symbols) & inputs:
-        return NoYauForm(False, f"phi would depend on the input {min(map(str, driven))}, and jump where it jumps")
-    if is_zero(covariance.det()) is not False:
-        return NoYauForm(False, "the drift is not affine and G is singular, so that G grad phi cannot be solved for phi")
-    gradient = (inverse(covariance) * rest).applyfunc(lambda e: tidy_state(e, x))
-    omega = curl(gradient, x)
-    for i in range(n):
-        for j in range(i + 1, n):
-            for symbol in x:
-                answer = is_zero(sp.diff(omega[i, j], symbol))
-                if answer is not True:
-                    what = f"omega_{i + 1}{j + 1} = {readable(omega[i, j])} depends on {symbol}"
-                    return NoYauForm(answer, what if answer is False else f"it is not decided whether {what}")
-    # A constant curl belongs to L: f contains -G omega x / 2.
-    matrix = matrix - covariance * omega / 2
-    gradient = gradient + omega * sp.Matrix(x) / 2
-    potential = _potential(gradient, x)
-    if potential is None:
-        return NoYauForm(None, f"no closed form was found for phi with grad phi = {list(gradient)}")
-    if jumps := potential.atoms(*JUMP_FUNCTIONS):
-        return NoYauForm(False, f"phi contains {readable(min(jumps, key=str))}, and would jump in time")
-    return YauForm(
-        sp.ImmutableMatrix(matrix.applyfunc(tidy)),
-        sp.ImmutableMatrix(offset.applyfunc(tidy)),
-        potential,
-        sp.ImmutableMatrix(gradient),
+    """Return the Yau form of the drift, or why there is none."""
+    return yau_decision(model).form
+
+
+@once_for_a_model
+def yau_decision(model: Model) -> YauDecision:
+    """Return the Yau form of the drift with its proof, or why there is none."""
+    n, zero = model.n, sp.ImmutableMatrix.zeros(model.n, 1)
+    if features := [words for feature, words in of_dynamics(model).items() if feature != INPUTS]:
+        return _refused(False, f"{'; '.join(features)}: the Yau form is for f(x, u, t) with g(u, t)")
+    drift = affine_drift(model)
+    if drift.slope is not None and drift.intercept is not None:
+        return YauDecision(YauForm(drift.slope, drift.intercept, sp.Integer(0), zero, zero), None)
+    driven = model.drift.free_symbols | model.covariance.free_symbols
+    if driven & set(model.u) and (driven := (model.covariance.free_symbols | _curved_part(model).free_symbols) & set(model.u)):
+        return _refused(False, f"phi would depend on the input {min(map(str, driven))}, and jump where it jumps")
+    if is_regular(model) is not True:
+        return _refused(False, "the drift is not affine and G is singular, so that G grad phi cannot be solved for phi")
+    values = YauValues(model)
+    if n > 1:
+        refuted = sampled(values.curl, values.symbols, model.x, LINES)
+        if refuted.holds is False:
+            return _refused(False, _moving_omega(model), refuted.witness)
+    jumps = model.covariance.row_join(model.drift).atoms(*JUMP_FUNCTIONS)
+    if jumps and (jumps := model.covariance.row_join(_curved_part(model)).atoms(*JUMP_FUNCTIONS)):
+        return _refused(False, f"phi contains {readable(min(jumps, key=str))}, and would jump in time")
+    try:
+        proof, why = prove_form(model, False), NOT_ZERO
+        if proof is not None:
+            return _formed(proof)
+    except OutOfBounds as bound:
+        why = str(bound)
+    found = evidence(values.curl, [*model.drift, *model.covariance], model.x, why)
+    if found.holds is False:
+        return _refused(False, _moving_omega(model), found.why)
+    return _refused(None, f"it is not proved that Omega is constant: {found.why}")
+
+
+def prove_form(model: Model, energy: bool) -> YauProof | None:
+    """Return a proof of the Yau form in a tower, which holds h and S where `energy` is set, or None.
+
+    Raises:
+        OutOfBounds: the work is beyond its bound.
+    """
+    curved = affine_drift(model).slope is None
+    proof = YauProof(model, energy, curved)
+    if proof.form():
+        return proof
+    joint = proof.reader.joint_arguments()
+    proof = YauProof(model, energy, curved, joint)
+    return proof if joint and proof.form() else None
+
+
+def _refused(holds: bool | None, words: str, witness: str = "") -> YauDecision:
+    return YauDecision(NoYauForm(holds, words, witness), None)
+
+
+def _curved_part(model: Model) -> sp.Matrix:
+    """Return the terms of the drift that are not affine."""
+    return sp.Matrix(
+        [
+            sp.Add(*[term for term in sp.Add.make_args(e) if affine(sp.Matrix([term]), model.x).slope is None])
+            for e in model.drift
+        ]
     )
 
 
-def _affine_and_rest(field, x):
-    """A field as matrix x + offset + rest, no term of the rest being affine."""
-    n = len(x)
-    matrix, offset, rest = sp.zeros(n, n), sp.zeros(n, 1), sp.zeros(n, 1)
-    own = set(x)
-    for i in range(n):
-        constant, other = [], []  # added at once: of thousands of terms one by one each would be sorted into all before
-        for function, coefficient in grouped(field[i], x).items():
-            if function in own:
-                matrix[i, x.index(function)] += coefficient
-            elif own.isdisjoint(function.free_symbols):
-                constant.append(coefficient * function)
-            else:
-                other.append(coefficient * function)
-        offset[i], rest[i] = sp.Add(*constant), sp.Add(*other)
-    return matrix, offset, rest
-
-
-def _potential(gradient: sp.MatrixBase, x: tuple[sp.Symbol, ...]) -> sp.Expr | None:
-    """phi with the given gradient, coordinate by coordinate, normalised to vanish nowhere in particular."""
-    phi = sp.Integer(0)
-    for i, symbol in enumerate(x):
-        left = tidy_state(gradient[i] - sp.diff(phi, symbol), x)
-        part = _antiderivative(left, symbol, x)
-        if part is None:
-            return None
-        phi += part
-    for i, symbol in enumerate(x):
-        if is_zero(gradient[i] - sp.diff(phi, symbol)) is not True:
-            return None
-    return phi
-
-
-def _antiderivative(expression: sp.Expr, symbol: sp.Symbol, x: tuple[sp.Symbol, ...]) -> sp.Expr | None:
-    terms = []
-    for function, coefficient in grouped(expression, x).items():
-        part = _known_antiderivative(function, symbol)
-        if part is None:
-            if _nested(function, symbol) > DEEPEST or terms_of(function) > MANY_TERMS // 10:
-                return None
-            part = sp.integrate(function, symbol, conds="none")
-            if part.has(sp.Integral) or part.has(sp.Piecewise):
-                return None
-        terms.append(coefficient * part)
-    return sp.Add(*terms)
-
-
-def _nested(expression: sp.Expr, symbol: sp.Symbol) -> int:
-    """How many functions of the symbol stand inside of each other, at most."""
-    if not expression.has(symbol) or not expression.args:
-        return 0
-    own = isinstance(expression, sp.Function) or (expression.is_Pow and not expression.exp.is_Integer)
-    return int(own) + max(_nested(part, symbol) for part in expression.args)
-
-
-def _known_antiderivative(function: sp.Expr, symbol: sp.Symbol) -> sp.Expr | None:
-    """Antiderivatives of powers, and of F(a x + b) in the forms that stay smooth on the whole line, such as log cosh for tanh."""
-    if not function.has(symbol):
-        return function * symbol
-    base, exponent = function.as_independent(symbol, as_Add=False)[1].as_base_exp()
-    if base == symbol and exponent.is_Integer and exponent > 0:
-        return function * symbol / (exponent + 1)
-    rules = {
-        sp.tanh: lambda u: sp.log(sp.cosh(u)),
-        sp.coth: lambda u: sp.log(sp.sinh(u)),
-        sp.sin: lambda u: -sp.cos(u),
-        sp.cos: sp.sin,
-        sp.sinh: sp.cosh,
-        sp.cosh: sp.sinh,
-        sp.tan: lambda u: -sp.log(sp.cos(u)),
-        sp.exp: sp.exp,
-    }
-    rule = rules.get(function.func)
-    if rule is None:
-        return _logarithm(function, symbol)
-    argument = function.args[0]
-    slope = sp.diff(argument, symbol)
-    if slope.has(symbol) or slope == 0:
-        return None
-    return rule(argument) / slope
-
-
-def _logarithm(function: sp.Expr, symbol: sp.Symbol) -> sp.Expr | None:
-    """Return c log D where the function is c D' / D."""
-    denominator = sp.denom(sp.together(function))
-    if not denominator.has(symbol) or terms_of(denominator) > 8:
-        return None
-    for inner in sp.Mul.make_args(sp.factor(denominator)):
-        if inner.is_Add and inner.has(symbol):
-            ratio = sp.powsimp(sp.cancel(function / sp.diff(sp.log(inner), symbol)))
-            if not ratio.has(symbol):
-                return ratio * sp.log(inner)
-    return None
-
-
-def q_without_observation(model: Model, form: YauForm) -> sp.Expr:
-    """2 phi_t + G:Hess phi + grad phi'G grad phi + 2 (L x + l).grad phi + 2 tr L."""
-    x, G, gradient = model.x, model.covariance, form.gradient
-    hessian = gradient.jacobian(x)
-    affine = form.matrix * sp.Matrix(x) + form.offset
-    return (
-        2 * sp.diff(form.potential, model.t)
-        + sp.expand(sum(G[i, j] * hessian[j, i] for i in range(model.n) for j in range(model.n)))
-        + (gradient.T * G * gradient)[0, 0]
-        + 2 * (affine.T * gradient)[0, 0]
-        + 2 * form.matrix.trace()
+def _formed(proof: YauProof) -> YauDecision:
+    T, x = proof.reader, proof.x
+    gradient = sp.ImmutableMatrix(list(map(T.expression, proof.p)))
+    form = YauForm(
+        sp.ImmutableMatrix([list(map(T.expression, row)) for row in proof.L]),
+        sp.ImmutableMatrix(list(map(T.expression, proof.l))),
+        None if proof.phi is None else proof.phi.formula,
+        gradient,
+        _base(gradient, x),
     )
+    return YauDecision(form, proof)
+
+
+def _base(gradient: sp.MatrixBase, x: tuple[sp.Symbol, ...]) -> sp.ImmutableMatrix:
+    """Return a point where the gradient has a value; the origin reads best."""
+    for value in (sp.Integer(0), sp.Rational(1, 2), sp.Rational(7, 5)):
+        values = gradient.xreplace(dict.fromkeys(x, value))
+        if not values.has(sp.nan, sp.zoo, sp.oo):
+            break
+    return sp.ImmutableMatrix([value] * len(x))
+
+
+def _moving_omega(model: Model) -> str:
+    """Return the entry of Omega that depends on the state, in words."""
+    try:
+        proof = YauProof(model, False, True)
+        T, omega = proof.reader, proof.omega(proof.r)
+        for i in range(model.n):
+            for j in range(i + 1, model.n):
+                for symbol in model.x:
+                    if T.diff(omega[i][j], symbol):
+                        entry = readable(T.expression(omega[i][j]))
+                        return f"omega_{i + 1}{j + 1} = {short(str(entry))} depends on {symbol}"
+    except OutOfBounds:
+        pass
+    return "Omega is not constant"
+
+
+@once_for_a_model
+def wong_omega(model: Model) -> sp.ImmutableMatrix | None:
+    """Return Wong's matrix omega_ij = d_i g_j - d_j g_i with g = G^-1 f, or None where G is singular or it is too long."""
+    if of_dynamics(model) or is_regular(model) is not True:
+        return None
+    if model.n == 1:
+        return sp.ImmutableMatrix.zeros(1, 1)
+    try:
+        proof = YauProof(model, False, True)
+        T = proof.reader
+        T.begin(DISPLAYED)
+        return sp.ImmutableMatrix([list(map(T.expression, row)) for row in proof.omega(list(map(T, model.drift)))])
+    except OutOfBounds:
+        return None
+
+
+@once_for_a_model
+def eta(model: Model) -> sp.Expr | None:
+    """Return Wong's eta = f'G^-1 f + div f + h'S^-1 h, or None where G is singular or the model has other features."""
+    if model.features or is_regular(model) is not True:
+        return None
+    try:
+        proof = YauProof(model, True, True)
+        proof.reader.begin(DISPLAYED)
+        return proof.reader.expression(proof.eta())
+    except OutOfBounds:
+        return None
 
 
 def observation_energy(model: Model) -> sp.Expr:
-    """h'S^-1 h."""
+    """Return h'S^-1 h."""
     return (model.observation.T * inverse(model.observation_noise) * model.observation)[0, 0]
 
 
-def eta(model: Model) -> sp.Expr | None:
-    """Wong's eta = f'G^-1 f + div f + h'S^-1 h, or None where G is singular or the model has other features."""
-    if model.features or is_zero(model.covariance.det()) is not False:
-        return None
-    kinetic = (model.drift.T * inverse(model.covariance) * model.drift)[0, 0]
-    divergence = sum(sp.diff(model.drift[i], symbol) for i, symbol in enumerate(model.x))
-    return kinetic + divergence + observation_energy(model)
-
-
-def form_text(form: YauForm) -> str:
-    """A Yau form for a sentence."""
-    return f"L = {short(str(form.matrix.tolist()))}, l = {short(str(list(form.offset)))}, phi = {short(str(form.potential))}"
+def no_form_text(form: NoYauForm) -> str:
+    """Return why there is no Yau form, with the witness, for a sentence."""
+    return f"{form.evidence} (J G - (J G)' changes by {form.witness})" if form.witness else form.evidence

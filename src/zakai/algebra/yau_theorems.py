@@ -20,8 +20,8 @@ from zakai.algebra.dmz_operators import DmzOperators
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
 from zakai.algebra.normal_form import operator_symbols
 from zakai.algebra.operators import Symbol
-from zakai.algebra.systems import affine_observation, cached_yau_form, definite_covariance
-from zakai.algebra.yau import YauForm
+from zakai.algebra.systems import affine_observation, definite_covariance
+from zakai.algebra.yau import YauForm, yau_form
 from zakai.errors import InputError
 from zakai.models.model import Model
 
@@ -53,9 +53,9 @@ class TheoremCheck:
 
 def theorem_1(model: Model) -> TheoremCheck:
     """Omega is constant if and only if f = L x + l + G grad phi."""
-    form = cached_yau_form(model)
+    form = yau_form(model)
     holds = isinstance(form, YauForm)
-    evidence = f"phi = {short(str(form.potential))}" if isinstance(form, YauForm) else form.evidence
+    evidence = f"phi = {short(form.phi)}" if isinstance(form, YauForm) else form.evidence
     found = Condition("f = L x + l + G grad phi", True if holds else form.holds, evidence, YAU)  # type: ignore[union-attr]
     statement = "Omega is constant if and only if f is affine plus G times a gradient"
     return TheoremCheck(f"{YAU}, Theorem 1", statement, (_omega_is_constant(model),), found)

@@ -8,11 +8,11 @@ import numpy as np
 import sympy as sp
 
 from zakai.algebra.systems import yau_system
+from zakai.methods._potential import potential_of
 from zakai.methods.gaussian.affine_system import Matrices, precision_of
 from zakai.methods.series.kernel import PowerSeries
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
-from zakai.models.numeric import numpy_function
 from zakai.numerics.flow import Coefficients
 
 Array = Any
@@ -40,9 +40,9 @@ class YauSystem:
         self.blocks = [entry for block in blocks for entry in block.flat()]
         self.matrices = Matrices([*blocks, slope, intercept], model)
         self._noise = Matrices([model.observation_noise], model)
-        self.gauged = yau.form.potential != 0
-        self.gauge_varies = yau.form.potential.has(model.t)
-        self._potential = numpy_function([yau.form.potential], model, ())
+        self.gauged = yau.form.curved
+        self.gauge_varies = yau.form.gradient.has(model.t)
+        self._potential = potential_of(yau.form, model)
 
     def potential(self, points: Array, t: float, theta: Array) -> Array:
         """Return phi (J,)."""
@@ -81,6 +81,8 @@ def _unexpanded(model: Model, yau: Any) -> list[sp.Expr] | None:
     """
     x, t, G = model.x[0], model.t, model.covariance[0, 0]
     phi, slope = yau.form.potential, yau.form.gradient[0]
+    if phi is None:
+        return None
     rest = model.drift[0] - G * slope
     matrix = sp.diff(rest, x).subs(x, 0)
     offset = rest.subs(x, 0)

@@ -88,7 +88,7 @@ class AffineSystem:
     def __init__(self, model: Model):
         found, observed = affine_system(model), affine_observation(model)
         assert found is not None and observed is not None
-        (form, unobserved, _, _), (slope, intercept) = found, observed
+        (form, unobserved), (slope, intercept) = found, observed
         assert unobserved is not None
         constant = sp.Matrix([unobserved.constant])
         equation = [form.matrix, form.offset, model.covariance, unobserved.matrix, unobserved.linear, constant]

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.algebra.gauges import gauge
+from zakai.methods._potential import potential_of
 from zakai.methods.gaussian.affine_system import Matrices
 from zakai.models.kept import kept
 from zakai.models.model import Model
-from zakai.models.numeric import numpy_function
 from zakai.numerics.complex_step import cholesky
 from zakai.numerics.families import Family, log_terms
 from zakai.numerics.transition import Array, symmetric, transposed
@@ -40,10 +40,10 @@ class _Formulas:
     def __init__(self, model: Model):
         form = gauge(model)
         assert form is not None
-        self.trivial = form.potential == 0
+        self.trivial = not form.form.curved
         self.exact = form.slopes is not None
         self.count = form.directions.rows
-        self.potential = numpy_function(form.potential, model)
+        self.potential = potential_of(form.form, model)
         blocks = [form.directions]
         if form.slopes is not None and form.logs is not None:
             blocks += [form.slopes, form.logs]

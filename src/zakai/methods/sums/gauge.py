@@ -12,6 +12,8 @@ import numpy as np
 import sympy as sp
 
 from zakai.algebra.gauges import exponential_terms
+from zakai.algebra.yau import YauForm
+from zakai.methods._potential import potential_of
 from zakai.models.features import JUMP_FUNCTIONS
 from zakai.models.functions import Maximum, Minimum, TableFunction
 from zakai.models.model import Model
@@ -77,11 +79,11 @@ def span(directions: Array) -> Array:
 class SumGauge:
     """phi of a model as functions of z = x - origin: `exact` where e^phi is a sum of exponentials, `directions` (n, k)."""
 
-    def __init__(self, phi: sp.Expr, model: Model, origin: Array):
-        self.n, self.none, self.origin = model.n, phi == 0, origin
-        self.directions = directions_of([phi], model)
-        self._potential = numpy_function(phi, model)
-        terms = exponential_terms(phi, model)
+    def __init__(self, form: YauForm, model: Model, origin: Array):
+        self.n, self.none, self.origin = model.n, not form.curved, origin
+        self.directions = directions_of([*form.gradient] if form.potential is None else [form.potential], model)
+        self._potential = potential_of(form, model)
+        terms = None if form.potential is None else exponential_terms(form.potential, model)
         self.exact, self.count = terms is not None, 1 if terms is None else terms[0].rows
         if terms is not None:
             logs, slopes = terms

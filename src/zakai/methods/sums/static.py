@@ -30,7 +30,7 @@ class Sum:
     def __init__(self, model: Model, splitting: str, components: int | None, reduction: str, tolerance: float, alpha: float):
         self.model = model
         self.system: System = system_of(model, splitting)
-        self.gauge = SumGauge(self.system.potential, model, self.system.origin)
+        self.gauge = SumGauge(self.system.form, model, self.system.origin)
         self.angles = tuple(model.state.index(name) for name in model.periodic)
         self.affine = self.system.affine
         formulas = list(model.observation) if self.system.law is None else self.system.law.formulas

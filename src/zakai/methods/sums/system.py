@@ -77,7 +77,7 @@ class System:
         self.halves = not self.lie and not self.rates and not self.sampled
         self.origin, self.scale = _centre(model)
         self.probes = self.origin + np.random.default_rng(0).standard_normal((8, n)) * self.scale
-        self.potential, self.sensors = yau.form.potential, Sensors.of(model)
+        self.form, self.sensors = yau.form, Sensors.of(model)
         centre = sp.Matrix([sp.Rational(float(value)) for value in self.origin])
         blocks = [yau.form.matrix, yau.form.offset + yau.form.matrix * centre, model.covariance]
         for q in (yau.unobserved or yau.full, yau.full or yau.unobserved):
