@@ -44,13 +44,33 @@ class FactoredTower(Tower):
         """Return whether a polynomial of one term is a power of an exponential."""
         return all(("exponent", self.generated(k).key) in self._made for k in self.used(p))
 
-    def _note_sign(self, e: Element) -> None:
-        """An argument that is not negative fixes the sign of its only factor of odd power."""
+    def note_sign(self, e: Element) -> None:
+        """Note that an argument is not negative, which fixes the sign of its factors of odd power together."""
         c, factors = self._factors(e)
-        odd = [f for f, k in factors if k % 2 and not self._sign_of(f)]
-        known = math.prod(self._sign_of(f) for f, k in factors if k % 2 and self._sign_of(f))
-        if len(odd) == 1:
-            self._signs[odd[0].key] = known * (1 if c > 0 else -1)
+        odd, known = self._unsigned(factors)
+        if odd:
+            self._signs[odd.key] = known * (1 if c > 0 else -1)
+
+    def _unsigned(self, factors: Sequence[tuple[Element, int]]) -> tuple[Element, int]:
+        """Return the product of the factors of odd power whose signs are not known, or zero, and the sign of the others."""
+        signs = [self._sign_of(f) if k % 2 else 1 for f, k in factors]
+        unknown = [f for (f, _), sign in zip(factors, signs) if not sign]
+        product = reduce(Element.__mul__, unknown) if unknown else self.zero
+        return product, math.prod(sign for sign in signs if sign)
+
+    def root(self, e: Element, power: fmpq) -> Element:
+        """Return e^power, which has a value where e is not negative: factors of even power and known signs leave the root."""
+        if not e:
+            return e
+        c, factors = self._factors(e)
+        result = self.one
+        for prime, k in sp.factorrat(sp.Rational(abs(int(c.p)), int(c.q))).items():
+            result = result * self._root(self.number(prime), power * int(k))
+        odd, _ = self._unsigned(factors)
+        for f, k in factors:
+            even = k - (k % 2 if not self._sign_of(f) else 0)
+            result = result * self._root(f, power * even) if even else result
+        return result * self._root(odd, power) if odd else result
 
     def _root(self, f: Element, power: fmpq) -> Element:
         """Return |f|^power for an irreducible f."""

@@ -73,8 +73,8 @@ class Reader(FactoredTower):
         for e, _ in sorted(self._functions.items(), key=lambda item: item[1]):
             if isinstance(e, HYPERBOLIC):
                 self._note_user(e)
-            elif isinstance(e, sp.log) or (e.is_Pow and e.exp.is_Rational and int(e.exp.q) % 2 == 0):
-                self._note_sign(self._read(e.args[0]))
+            elif isinstance(e, sp.log) or (e.is_Pow and e.exp.is_Rational):
+                self.note_sign(self._read(e.args[0]))
 
     def _note_user(self, e: sp.Expr) -> None:
         inner = self._read(e.args[0])
@@ -118,13 +118,7 @@ class Reader(FactoredTower):
             return self._read(e.base) ** int(e.exp)
         if not e.exp.is_Rational:
             return self._exponential(sp.expand(e.exp * sp.log(e.base)), 1)
-        k, result = int(e.exp.q), self.one
-        c, factors = self._factors(self._read(e.base))
-        for prime, times in sp.factorrat(sp.Rational(abs(int(c.p)), int(c.q))).items():
-            result = result * self._root(self.number(prime), fmpq(int(times * e.exp.p), k))
-        for f, times in factors:
-            result = result * self._root(f, fmpq(times * int(e.exp.p), k))
-        return result
+        return self.root(self._read(e.base), rational(e.exp))
 
     # Exponentials and circular functions.
 
