@@ -51,6 +51,7 @@ class Reader(FactoredTower):
         self.log_cosh: list[tuple[sp.Expr, Element]] = []
         self.arguments: dict[str, dict[sp.Expr, Element]] = {"hyperbolic": {}, "circular": {}}
         self._known: dict[sp.Expr, Element] = {}
+        self._open: set[sp.Expr] = set()
         self._users: dict[tuple[str, str], set[type]] = {}
         self._orientation: dict[tuple[str, str], int] = {}
         self._whole = {kind: _unit(functions, kinds) for kind, kinds in (("e", (sp.exp,)), ("circle", CIRCULAR))}
@@ -66,7 +67,10 @@ class Reader(FactoredTower):
         if not self._prepared:
             self._prepared = True
             self._prepare()
-        return self._read(e)
+        try:
+            return self._read(e)
+        except RecursionError:
+            raise OutOfBounds("a formula is too deep") from None
 
     def _prepare(self) -> None:
         """Note who uses each argument of an exponential, and the signs that roots and logarithms need, from the inside out."""
@@ -87,7 +91,11 @@ class Reader(FactoredTower):
 
     def _read(self, e: sp.Expr) -> Element:
         if e not in self._known:
+            if e in self._open:  # over a basis of arguments that stand inside of each other
+                raise OutOfBounds("arguments contain each other")
+            self._open.add(e)
             self._known[e] = self._make(e)
+            self._open.discard(e)
         return self._known[e]
 
     def _make(self, e: sp.Expr) -> Element:
