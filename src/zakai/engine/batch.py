@@ -14,8 +14,8 @@ from zakai.engine.loop import Run
 from zakai.numerics.compiled import working_time
 
 LONG = 10.0  # seconds of work that are announced
-FIRST = 10.0  # seconds after which a first observation that is not done is announced
-SURE = 1.0  # seconds after which the rest can be estimated
+FIRST = 5.0  # seconds after which long work is announced by what is known then
+SURE = 0.5  # seconds after which the rest can be estimated
 
 _LOG = logging.getLogger("zakai")
 Progress = Callable[[int, int], None]
@@ -33,45 +33,67 @@ def filter_all(runs: Sequence[Run], progress: Progress | None, blocks: float = 1
     with bar("filtering") if progress is None else nullcontext(progress) as advance:
         watch = _Watch(sum(len(run.schedule) for run in runs), threads, advance, blocks)
         finished = Event()
-        Thread(target=watch.report_nothing, args=(runs[:1], finished), daemon=True).start()
+        Thread(target=watch.report_early, args=(runs[:1], finished), daemon=True).start()
         try:
             if threads == 1:
                 for run in runs:
-                    run.all(watch.report)
+                    run.all(watch.report, watch.step)
                 return
             with ThreadPoolExecutor(threads) as pool:
-                for one in [pool.submit(run.all, watch.report) for run in runs]:
+                for one in [pool.submit(run.all, watch.report, watch.step) for run in runs]:
                     one.result()
         finally:
             finished.set()
 
 
 class _Watch:
-    """How much of all runs is done, and whether the rest takes long."""
+    """How much of all runs is done, and whether the rest takes long.
+
+    The estimates decide what is logged and nothing else. `done` are the observations of finished segments, `steps` the others.
+    """
 
     def __init__(self, total: int, threads: int, progress: Progress | None, blocks: float):
         self.total, self.progress, self.blocks = total, progress, blocks
         self.lock = Lock()
-        self.done = self.counted = 0
+        self.done = self.counted = self.steps = 0
         self.began, self.waiting = 0.0, threads
+        self.first = 0.0  # when the first observation was done, by the clock of `report_early`
         self.slow = 0  # successive measurements by which the rest takes long
 
-    def report_nothing(self, runs: Sequence[Run], finished: Event) -> None:
-        """Log that the first observation of runs takes long, with what shortens it, unless they finish before."""
+    def step(self, run: Run) -> None:
+        """Add one observation within a segment that a run has begun."""
+        with self.lock:
+            run.steps += 1
+            self.steps += 1
+
+    def report_early(self, runs: Sequence[Run], finished: Event) -> None:
+        """Log after `FIRST` seconds how long runs take at least or about, if it is long and they were not announced before."""
         began = working_time()
-        while runs and self.done == 0:
-            left = FIRST - (working_time() - began)
-            if left <= 0.0:
-                name, shorter = runs[0].setting.method.name, runs[0].setting.method.shorter
+        while runs and working_time() - began < FIRST:
+            if self.done + self.steps > 0 and not self.first:
+                self.first = working_time()
+            if finished.wait(0.1):
+                return
+        with self.lock:
+            if not runs or self.slow == 2 or finished.is_set():
+                return
+            name, shorter, now = runs[0].setting.method.name, runs[0].setting.method.shorter, working_time()
+            count = self.done + self.steps
+            if count == 0:
                 _LOG.warning("%s: the first observation takes more than %.0f s; to shorten it, %s", name, FIRST, shorter)
                 return
-            if finished.wait(max(left, 0.1)):
-                return
+            # The first observation waits for what is prepared.
+            rate = (now - (self.first or began)) / max(count - 1, 1)
+            left, more = rate * (self.total - count), round((self.total - count) / self.blocks)
+            if now - began + left > LONG:
+                self.slow = 2
+                about = "about" if count > 1 else "at least about"
+                _LOG.warning("%s: %d more observations take %s %.0f s; to shorten it, %s", name, more, about, left, shorter)
 
     def report(self, run: Run, count: int) -> None:
         """Add intervals that a run has done; log once that the rest takes long, with what shortens it."""
         with self.lock:
-            self.done += count
+            self.done, self.steps, run.steps = self.done + count, self.steps - run.steps, 0
             done, total = round(self.done / self.blocks), round(self.total / self.blocks)
             if self.progress is not None:
                 self.progress(min(done, total), total)
