@@ -71,6 +71,16 @@ def test_analyze_prints_a_page_json_or_latex(zakai, name):
     assert zakai("analyze", f"gallery:{name}", "--latex").out.startswith("\\begin{align*}")
 
 
+def test_methods_of_a_record_adds_the_expected_time_of_those_that_hold(zakai):
+    lines = zakai("methods", "model.toml", "record.csv").out.splitlines()
+    assert all("s for this record" in line for line in lines if "  holds" in line)
+    assert not any("for this record" in line for line in lines if "fails" in line)
+    assert any(line.startswith("kalman-bucy") and "holds; about 0." in line for line in lines)
+    assert "for this record" not in zakai("methods", "model.toml").out
+    wrong = zakai("methods", "model.toml", "nowhere.csv")
+    assert wrong.code == 2 and "nowhere.csv" in wrong.err
+
+
 def test_methods_lists_every_method_and_says_which_hold(zakai):
     assert all(name in zakai("methods").out for name in (*_registry.METHODS, *_registry.AUTO))
     answer = zakai("methods", "gallery:cubic-sensor").out

@@ -3,6 +3,7 @@
 import logging
 from itertools import chain, repeat
 from threading import get_ident
+from time import sleep
 
 import numpy as np
 import pytest
@@ -68,3 +69,39 @@ def test_a_first_observation_that_takes_long_is_announced(monkeypatch, caplog):
     with caplog.at_level(logging.WARNING, "zakai"):
         zakai.filter(model, zakai.simulate(model, [0.5], seed=0)[1])
     assert "the first observation takes more than 0 s; to shorten it" in caplog.text
+
+
+def test_slow_steps_are_announced_within_a_segment_and_on_the_way_back(monkeypatch, caplog):
+    for name, value in (("LONG", 0.0), ("EARLY", 0.0), ("FEW", 2)):
+        monkeypatch.setattr(batch, name, value)
+    model = zakai.load_model("gallery:pendulum")
+    _, record = zakai.simulate(model, 0.5 * np.arange(1, 41), seed=0)
+    with caplog.at_level(logging.WARNING, "zakai"):
+        zakai.smooth(model, record)
+    words = [one.getMessage() for one in caplog.records if "more observations take" in one.getMessage()]
+    assert len(words) == 2 and all("to shorten it, raise the option tolerance" in line for line in words)
+
+
+def test_what_takes_longer_than_was_announced_is_announced_again(monkeypatch, caplog):
+    model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], prior=PRIOR)
+    record = zakai.Record(0.01 * np.arange(1, 1001), np.zeros(1000), "increments")
+    # 64 observations take 16 s, so that 927 take 232 s; the next 128 take 1000 s, and so do those after them.
+    clock, own = chain((100, 102, 118, 1118, 2118, 3118), repeat(3119)), get_ident()
+    monkeypatch.setattr(batch, "working_time", lambda: next(clock) if get_ident() == own else 0.0)
+    with caplog.at_level(logging.WARNING, "zakai"):
+        zakai.filter(model, record)
+    words = [one.getMessage() for one in caplog.records]
+    assert len(words) == 2 and "927 more observations take about 232 s" in words[0]
+    assert "543 more observations take about 4242 s" in words[1]
+
+
+def test_a_decision_that_takes_long_is_announced(monkeypatch, caplog):
+    from zakai.engine import driver
+
+    monkeypatch.setattr(batch, "FIRST", 0.01)
+    own = driver.plan_of
+    monkeypatch.setattr(driver, "plan_of", lambda *arguments: (sleep(0.2), own(*arguments))[1])
+    model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], prior=PRIOR)
+    with caplog.at_level(logging.WARNING, "zakai"):
+        zakai.filter(model, zakai.Record([0.1], [0.0], "increments"))
+    assert "deciding which method holds takes more than" in caplog.text

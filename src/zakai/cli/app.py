@@ -176,11 +176,13 @@ def stream(
 @app.command()
 def methods(
     model: Annotated[str | None, typer.Argument(metavar="MODEL", help="Print which hold for this model.")] = None,
+    record: Annotated[Path | None, typer.Argument(metavar="RECORD", help="Add how long those take for this record.")] = None,
+    inputs: _Inputs = None,
 ) -> None:
-    """List the methods; for a model, print whether each holds."""
+    """List the methods; for a model, print whether each holds; for a record, how long those take that hold."""
     from zakai.cli import inspecting
 
-    inspecting.methods(model)
+    inspecting.methods(model, record, inputs)
 
 
 @app.command()

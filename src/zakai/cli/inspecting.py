@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import textwrap
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from zakai import _registry
-from zakai.errors import InputError
+from zakai.errors import InputError, ZakaiError
+
+if TYPE_CHECKING:
+    from zakai.models.model import Model
+    from zakai.records import Record
+
+EACH, MOST_SECONDS = 2.5, 8.0  # for which expected times are measured: of one method, and of all
 
 
 def analyze(source: str, json: bool, latex: bool) -> None:
@@ -19,8 +28,8 @@ def analyze(source: str, json: bool, latex: bool) -> None:
     print(analysis.to_json() if json else analysis.to_latex() if latex else analysis)
 
 
-def methods(source: str | None) -> None:
-    """Print the methods and, for a model, whether each holds and what fails."""
+def methods(source: str | None, record_path: Path | None = None, inputs_path: Path | None = None) -> None:
+    """Print the methods and, for a model, whether each holds and what fails; for a record, how long those take that hold."""
     if source is None:
         _columns([(name, entry.summary) for name, entry in _registry.METHODS.items()])
         print(f"\nauto takes the first that holds of: {', '.join(_registry.AUTO)}")
@@ -31,17 +40,42 @@ def methods(source: str | None) -> None:
     from zakai.algebra.conditions import all_hold
     from zakai.models.files import load_model
 
-    analysis = analyze(load_model(source))
-    rows = []
+    model = load_model(source)
+    record = None if record_path is None else _record(record_path, model, inputs_path)
+    analysis = analyze(model)
+    rows, ends = [], time.monotonic() + MOST_SECONDS
     for name, conditions in analysis.methods.items():
         held = all_hold(conditions)
         open_ones = [c for c in conditions if c.holds is held]
         verdict = {True: "holds", False: "fails: ", None: "undecided: "}[held]
-        rows.append((name, verdict + ("" if held else f"{open_ones[0].statement} ({open_ones[0].evidence})")))
+        words = verdict + ("" if held else f"{open_ones[0].statement} ({open_ones[0].evidence})")
+        if held and record is not None:
+            words += f"; {_expected(model, record, name, ends)} for this record"
+        rows.append((name, words))
     _columns(rows)
     print(f"\nauto takes: {analysis.recommended or 'none, for none that it tries holds'}")
     if analysis.division is not None:
         print(textwrap.fill(analysis.division.why, 110, break_on_hyphens=False))
+
+
+def _record(path: Path, model: Model, inputs_path: Path | None) -> Record:
+    """Read a record with its inputs."""
+    from zakai.cli.filtering import record_with_inputs
+
+    return record_with_inputs(path, model, inputs_path)
+
+
+def _expected(model: Model, record: Record, name: str, ends: float) -> str:
+    """Return the expected time of a method for a record, or why there is none; it is measured before `ends`."""
+    from zakai.engine.expected_time import expected_seconds
+
+    left = ends - time.monotonic()
+    if left <= 0.0:
+        return "time not measured"
+    try:
+        return str(expected_seconds(model, record, name, most=min(EACH, left)))
+    except ZakaiError as error:
+        return f"no time, for it refuses this record ({error})"
 
 
 def gallery(name: str | None) -> None:

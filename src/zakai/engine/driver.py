@@ -8,7 +8,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from zakai.engine.batch import Progress, filter_all
+from zakai.engine.batch import Progress, announced, filter_all
 from zakai.engine.loop import KEPT_BYTES
 from zakai.engine.plan import Plan, plan_of
 from zakai.engine.results import FilterResult
@@ -133,7 +133,8 @@ def planned(model: Model, prior: Any, method: str, options: Mapping[str, Any], b
     """Return how a system is filtered from a prior; None stands for the model's own."""
     if prior is not None:
         check_prior(model, prior)
-    return plan_of(model, model.prior if prior is None else prior, method, options, by_value)
+    with announced(f"{model.source}: deciding which method holds"):
+        return plan_of(model, model.prior if prior is None else prior, method, options, by_value)
 
 
 def check_noise(plans: Iterable[Plan], records: Sequence[Record]) -> None:

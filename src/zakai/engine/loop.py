@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,8 +32,12 @@ KEPT_BYTES = 512 * 2**20  # of densities that are kept by default
 
 
 @one_thread
-def advance(setting: Setting, prepared: Any, rows: slice, state: Any, values: np.ndarray) -> tuple[Sequence[Any], Infos]:
+def advance(
+    setting: Setting, prepared: Any, rows: slice, state: Any, values: np.ndarray, stepped: Callable[[], None] | None = None
+) -> tuple[Sequence[Any], Infos]:
     """Advance a state over the intervals `rows` of what is prepared; `values` (rows, m) are their observations.
+
+    `stepped` is called after every single step.
 
     Returns the state after each interval and what the steps report.
     """
@@ -45,6 +50,8 @@ def advance(setting: Setting, prepared: Any, rows: slice, state: Any, values: np
         state, info = method.step(prepared, k, state, value)
         states.append(state)
         infos.append(info)
+        if stepped is not None:
+            stepped()
     return states, stacked(infos)
 
 
@@ -63,7 +70,14 @@ class Segment(NamedTuple):
     infos: Infos
 
 
-def segments(setting: Setting, schedule: Schedule, state: Any, values: np.ndarray, size: int = PIECE) -> Iterator[Segment]:
+def segments(
+    setting: Setting,
+    schedule: Schedule,
+    state: Any,
+    values: np.ndarray,
+    size: int = PIECE,
+    stepped: Callable[[], None] | None = None,
+) -> Iterator[Segment]:
     """Advance a state over a schedule; None stands for the state at the model's start.
 
     Args:
@@ -72,6 +86,7 @@ def segments(setting: Setting, schedule: Schedule, state: Any, values: np.ndarra
         state: the state at the start of the first.
         values: (K, m).
         size: the number of intervals of the first segment.
+        stepped: called after every single step.
     """
     for start in range(0, len(schedule), CHUNK):
         chunk = schedule.part(slice(start, start + CHUNK))
@@ -80,7 +95,7 @@ def segments(setting: Setting, schedule: Schedule, state: Any, values: np.ndarra
         while begin < len(chunk):
             rows = slice(begin, min(begin + size, len(chunk)))
             with np.errstate(all="ignore"):  # what is not finite is reported by who receives it
-                states, infos = advance(setting, prepared, rows, state, values[start + rows.start : start + rows.stop])
+                states, infos = advance(setting, prepared, rows, state, values[start + rows.start : start + rows.stop], stepped)
             yield Segment(start + begin, prepared, rows, state, states, infos)
             state, begin, size = states[-1], rows.stop, min(GROWTH * size, PIECE)
 
@@ -120,10 +135,12 @@ class Run:
         )
         self.bytes = 0
         self.done = 0
+        self.steps = 0  # of the segment that has begun
 
-    def all(self, report: Callable[[Run, int], None] | None = None) -> None:
-        """Filter the record; `report` receives the run and how many intervals have been added."""
-        for segment in segments(self.setting, self.schedule, self.state, self.values, 1):
+    def all(self, report: Callable[[Run, int], None] | None = None, step: Callable[[Run], None] | None = None) -> None:
+        """Filter the record; `report` receives the run and how many intervals have been added, `step` every single step."""
+        stepped = None if step is None else partial(step, self)
+        for segment in segments(self.setting, self.schedule, self.state, self.values, 1, stepped):
             self.notes.update(dict.fromkeys(segment.prepared.notes))
             self._explain(segment.infos)
             self._take(segment.states, segment.infos)

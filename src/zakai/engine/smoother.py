@@ -6,8 +6,9 @@ the message p(later observations | x) through a segment, whose states it filters
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from zakai import _registry
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.theorems import conditions_of
 from zakai.densities import Density
-from zakai.engine.batch import Progress, filter_all
+from zakai.engine.batch import Progress, announced, filter_all, smooth_all
 from zakai.engine.driver import check_noise, check_records
 from zakai.engine.health_warnings import warnings_of_run
 from zakai.engine.loop import CHUNK, KEPT_BYTES, Run, advance, joined, size_of
@@ -105,14 +106,14 @@ def smooth(
         smoothed.mean[0], smoothed.density(0).quantile([0.025, 0.975])
     """
     check_records(model, record)
-    plan = plan_of(model, model.prior, method, options, unfit=_unfit)
+    with announced(f"{model.source}: deciding which method holds"):
+        plan = plan_of(model, model.prior, method, options, unfit=_unfit)
     check_noise([plan], [record])
     runs = [SmoothingRun(run.setting, run.record) for run in plan.runs(record, "moments")]
     filter_all(runs, progress, len(runs))
     filtered = plan.result(runs)
     filtered.record = record
-    for run in runs:
-        run.smooth()
+    smooth_all(runs)
     result = plan.result(runs)
     result.record = record
     result.attributes["kind"] = "smoothed"
@@ -178,26 +179,36 @@ class SmoothingRun(Run):
                 states, _ = advance(self.setting, prepared, slice(first - begin, last - begin), state, self.values[first:last])
         return range(first, last), prepared, begin, Joined([[state], states])
 
-    def smooth(self) -> None:
-        """Replace the filter's moments by the smoothed ones."""
+    def smooth(self, report: Callable[[Run, int], None], step: Callable[[Run], None]) -> None:
+        """Replace the filter's moments by the smoothed ones; `report` and `step` are called as by `all`."""
         forward = joined(self.parts).log_likelihood_increment
         message = self.backward.message(self.empty, self.state)
         expected, self.parts, self.messages = 0.0, [], [None] * len(self.segments)
         for number in reversed(range(len(self.segments))):
             rows, prepared, begin, states = self._segment(number)
             self.messages[number] = message
-            message, infos = self._backward(prepared, slice(rows.start - begin, rows.stop - begin), states, message, rows)
+            here = slice(rows.start - begin, rows.stop - begin)
+            message, infos = self._backward(prepared, here, states, message, rows, partial(step, self))
             errors = np.abs(infos.log_likelihood_increment - np.append(forward[rows.start + 1 : rows.stop], expected))
             health = {**infos.health, "evidence_error": errors}
             self.parts.append(infos._replace(log_likelihood_increment=forward[rows.start : rows.stop], health=health))
             expected = float(forward[rows.start])
+            report(self, len(rows))
         self.parts.reverse()
         _, info = self.backward.smoothed(self.empty, self.first, message)
         error = abs(float(info.log_likelihood_increment) - expected)
         self.start = info._replace(health={**info.health, "evidence_error": error})
 
     @one_thread
-    def _backward(self, prepared: Any, rows: slice, states: Sequence[Any], message: Any, observed: range) -> tuple[Any, Infos]:
+    def _backward(
+        self,
+        prepared: Any,
+        rows: slice,
+        states: Sequence[Any],
+        message: Any,
+        observed: range,
+        stepped: Callable[[], None] | None = None,
+    ) -> tuple[Any, Infos]:
         """Return the message at the start of the intervals `rows` of what is prepared, and the smoothed moments after each."""
         values = self.values[observed.start : observed.stop]
         found = None
@@ -210,6 +221,8 @@ class SmoothingRun(Run):
             message, info = self.backward.smoothed(self.empty, states[i + 1], message)
             infos.append(info)
             message = self.backward.step(prepared, rows.start + i, message, values[i], states[i])
+            if stepped is not None:
+                stepped()
         return message, stacked(infos[::-1])
 
     def density(self, index: int) -> Density:

@@ -104,10 +104,11 @@ class Prepared(base.Prepared):
         update = Update(predicted, report.edges, report.tails, 0.0, False)
         if factors:
             update = updated(predicted, lambda grid: sum(one(grid) for one in factors), bounds, report.tails)
-        update = update._replace(field=regridded(self._folded(update.field), bounds))
+        update = update._replace(field=regridded(self._folded(update.field), bounds, stepper.lifted))
         if potential is None:
             after = Control(state.rate, state.measured, state.age)
         noise = 1e-15 * float(np.exp(min(stepper.exponent, 50.0))) + max(stepper.error, 0.0)
+        noise += 0.1 * bounds.reach**2 * min(stepper.rounding, 1.0)
         report = report._replace(interpolation=noise)
         kept = self._kept(begin, predicted, update.field)
         new, info = self._reported(state, update, report, after, constant, kept, None)

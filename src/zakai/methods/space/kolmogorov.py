@@ -228,7 +228,7 @@ class Prepared:
             error = max(error, 1.0)
         health = {
             "error_estimate": error,
-            "tolerance_ratio": float(max(error / self.tolerance, edge / (100 * self.bounds.edge), tails / self.tolerance)),
+            "tolerance_ratio": float(max(error / self.tolerance, edge / (0.1 * self.tolerance), tails / self.tolerance)),
             "splitting_error": report.splitting,
             "tail_depth": float(update.depth) / ACCURATE_DEPTH,
             "edge_mass": edge,
