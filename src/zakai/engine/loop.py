@@ -17,6 +17,7 @@ from zakai.engine.results import FilterResult
 from zakai.engine.setting import KEPT, Setting
 from zakai.engine.versions import versions
 from zakai.errors import InputError
+from zakai.methods._escape import EscapeError
 from zakai.methods._protocol import Infos, stacked
 from zakai.methods._states import Joined
 from zakai.numerics.one_thread import one_thread
@@ -80,7 +81,10 @@ def segments(setting: Setting, schedule: Schedule, state: Any, values: np.ndarra
         while begin < len(chunk):
             rows = slice(begin, min(begin + size, len(chunk)))
             with np.errstate(all="ignore"):  # what is not finite is reported by who receives it
-                states, infos = advance(setting, prepared, rows, state, values[start + rows.start : start + rows.stop])
+                try:
+                    states, infos = advance(setting, prepared, rows, state, values[start + rows.start : start + rows.stop])
+                except EscapeError as error:
+                    raise error.moved(float(chunk.starts[error.row])) if setting.autonomous else error from None
             yield Segment(start + begin, prepared, rows, state, states, infos)
             state, begin, size = states[-1], rows.stop, min(GROWTH * size, PIECE)
 
