@@ -17,6 +17,7 @@ from zakai.models._errors import named
 from zakai.models.checks import check_noise_at, check_noise_within
 from zakai.models.domain import check_prior
 from zakai.models.model import Model
+from zakai.models.possible import check_possible
 from zakai.records import Record
 
 
@@ -156,6 +157,8 @@ def check_records(model: Model, record: Record | Sequence[Record]) -> None:
         with named(f"records[{index}]") if isinstance(record, list | tuple) else nullcontext():
             check_model(model)
             one.check(model)
+            time = float(one.times[0])
+            check_possible(model, time, None if one.inputs is None else one.inputs.at(time, model.input_hold))
 
 
 def check_model(model: Model) -> None:

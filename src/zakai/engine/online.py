@@ -18,6 +18,7 @@ from zakai.errors import InputError
 from zakai.models._errors import named
 from zakai.models.checks import check_noise_at
 from zakai.models.model import Model
+from zakai.models.possible import check_possible
 from zakai.records.checkpoint import read_checkpoint, write_checkpoint
 from zakai.records.dates import Clock, date_of
 from zakai.records.inputs import Inputs, known_inputs
@@ -59,6 +60,7 @@ class Online:
 
     def __init__(self, model: Model, method: str, options: dict[str, Any], clock: Clock | None = None):
         check_model(model)
+        check_possible(model, model.start)
         if options.get("form") == "one-shot":
             raise InputError('option form: "one-shot" needs all times from the start on; an online filter takes "stepwise"')
         plan = planned(model, None, method, options)
