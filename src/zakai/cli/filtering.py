@@ -66,7 +66,7 @@ def filter(
     if report is not None:
         write_report(result, report, truth=truth)
     lines = [
-        ("observations", f"{len(record):,}, times {record.times[0]:g} to {record.times[-1]:g}"),
+        ("observations", f"{len(record):,}, times {record.times[0]:.12g} to {record.times[-1]:.12g}"),
         ("log-likelihood", f"{result.log_likelihood:.6f}"),
     ]
     _summarise(result, lines, (0, "start") if smoothed else (-1, "end"), [output, report])
@@ -92,14 +92,14 @@ def forecast(
     model, record, options = _given(source, record_path, settings, inputs_path, unit, origin)
     last = float(record.times[-1])
     if not until > last:
-        raise InputError(f"--until {until:g}: must be after the end of the record, {last:g}")
+        raise InputError(f"--until {until:.12g}: must be after the end of the record, {last:.12g}")
     times = clock(last, until, step)
     with progress("filtering") as advance:
         result = run(model, record, method, keep="moments", progress=advance, **options)
     found = result.forecast(times)
     _warn(dict.fromkeys([*result.warnings, *found.warnings]))
     found.save(output)
-    _summarise(found, [("forecast times", f"{len(times):,}, {times[0]:g} to {times[-1]:g}")], (-1, "end"), [output])
+    _summarise(found, [("forecast times", f"{len(times):,}, {times[0]:.12g} to {times[-1]:.12g}")], (-1, "end"), [output])
 
 
 def fit(

@@ -112,7 +112,7 @@ class _Stream:
             kind = _NUMBERS.sub("0", warning)
             if kind not in self.warned:
                 self.warned.add(kind)
-                print(f"warning: from t = {estimate.time:g} on: {warning}", file=sys.stderr, flush=True)
+                print(f"warning: from t = {estimate.time:.12g} on: {warning}", file=sys.stderr, flush=True)
         if self.accepted % self.every == 0:
             sys.stdout.write(json.dumps({name: FIELDS[name](estimate) for name in self.fields}, allow_nan=False) + "\n")
             sys.stdout.flush()

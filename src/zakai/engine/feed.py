@@ -98,7 +98,7 @@ class Feed:
             raise error.moved(start) from None
         if not isfinite(info.log_likelihood_increment):
             raise InputError(
-                f"{self.setting.model.source}: at t = {time:g} the observation leaves nothing of the density, or takes it "
+                f"{self.setting.model.source}: at t = {time:.12g} the observation leaves nothing of the density, or takes it "
                 "beyond double precision; it is not used. Where it ends a gap of many times the system's own time, report "
                 "that time as unobserved, and go on from there"
             )

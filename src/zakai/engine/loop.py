@@ -12,7 +12,14 @@ from zakai.densities import Density
 from zakai.engine.health_warnings import warnings_of_run
 from zakai.engine.lengths import notes_on_lengths
 from zakai.engine.misfit import notes_on_law
-from zakai.engine.notes import notes_on_angles, notes_on_domain, notes_on_formulas, notes_on_tables, why_not_finite
+from zakai.engine.notes import (
+    notes_on_angles,
+    notes_on_domain,
+    notes_on_formulas,
+    notes_on_start,
+    notes_on_tables,
+    why_not_finite,
+)
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import KEPT, Setting
 from zakai.engine.versions import versions
@@ -115,6 +122,7 @@ class Run:
         self.parts: list[Infos] = []
         self.notes: dict[str, None] = dict.fromkeys(
             [
+                *notes_on_start(self.schedule),
                 *_after_gaps(self.schedule),
                 *notes_on_noise(setting.model, self.schedule),
                 *notes_on_angles(setting.model, record),

@@ -71,7 +71,7 @@ class Online:
         self.lock = RLock()
 
     def __repr__(self) -> str:
-        return f"Online({self.method} of {self.model.source}, at t = {self.time:g})"
+        return f"Online({self.method} of {self.model.source}, at t = {self.time:.12g})"
 
     def _repr_html_(self) -> str:
         return self.last._repr_html_()
@@ -104,7 +104,7 @@ class Online:
             try:
                 moments = tuple([feed.moved(time, part, known) for feed, part in parts])
             except (MemoryError, OverflowError):
-                fault = f"the time from {self.time:g} to {time:g} is too long for this filter; check its unit"
+                fault = f"the time from {self.time:.12g} to {time:.12g} is too long for this filter; check its unit"
                 raise InputError(f"update: {fault}") from None
             for feed, moment in zip(self.feeds, moments, strict=True):
                 feed.now = moment
@@ -215,7 +215,7 @@ class Online:
             raise InputError(f"update: the time {time!r} must be after the model's start {now!r}")
         if time == now:
             raise InputError(f"update: the time {time!r} repeats that of the last observation")
-        raise InputError(f"update: the time {time!r} is late by {now - time:g}: the last observation was at {now!r}")
+        raise InputError(f"update: the time {time!r} is late by {now - time:.12g}: the last observation was at {now!r}")
 
     def _values(self, value: Any) -> list[float]:
         m = self.model.m

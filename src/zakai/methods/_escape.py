@@ -42,7 +42,7 @@ class EscapeError(InputError):
     """A density escapes in an interval: `words` says so, with START and STOP for its times."""
 
     def __init__(self, words: str, row: int, start: float, length: float):
-        super().__init__(words.replace("START", f"{start:.10g}").replace("STOP", f"{start + length:.10g}"))
+        super().__init__(words.replace("START", f"{start:.12g}").replace("STOP", f"{start + length:.12g}"))
         self.words, self.row, self.start, self.length = words, row, start, length
 
     def moved(self, start: float) -> EscapeError:
