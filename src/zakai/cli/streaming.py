@@ -75,7 +75,8 @@ class _Stream:
                 self.skip_until = self.online.time
                 self.show(self.online.last)
         _interrupt.insist()
-        for line in lines_of(sys.stdin.buffer, self.online.model.m, self.online.model.inputs, self.online.clock):
+        model = self.online.model
+        for line in lines_of(sys.stdin.buffer, model.m, model.inputs, self.online.clock, model.observation_names):
             _interrupt.check()
             try:
                 estimate = self.used(line)

@@ -23,6 +23,7 @@ from zakai.records.checkpoint import read_checkpoint, write_checkpoint
 from zakai.records.dates import Clock, date_of
 from zakai.records.inputs import Inputs, known_inputs
 from zakai.records.numbers import LARGEST
+from zakai.records.record import check_kind
 from zakai.records.writing import shown
 
 
@@ -60,6 +61,7 @@ class Online:
 
     def __init__(self, model: Model, method: str, options: dict[str, Any], clock: Clock | None = None):
         check_model(model)
+        check_kind(model)
         check_possible(model, model.start)
         if options.get("form") == "one-shot":
             raise InputError('option form: "one-shot" needs all times from the start on; an online filter takes "stepwise"')
