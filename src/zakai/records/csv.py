@@ -36,11 +36,11 @@ def read_record(
 ) -> Record:
     r"""Read the observations of `model` from a CSV file.
 
-    The first line is a header: `time`, then one column for each of the model's m observations. They are matched by
-    the names of the observations, or y1 to ym, in any order, if these are their names, and else taken in their order; with
-    `columns` there may be others. Every other line is one time and its m observations, in what the model's `observation_kind` says. Times
-    increase strictly, need not be regular, and begin after the model's `start` (samples: at or after). An empty cell or `nan` is
-    "not observed". The text is UTF-8; a byte-order mark, Windows line ends and blank lines are accepted.
+    The first line is a header: `time`, then one column for each of the model's m observations. They are matched by the names of
+    the observations, or y1 to ym, in any order, if these are their names, and else taken in their order; with `columns` there may
+    be others. Every other line is one time and its m observations, in what the model's `observation_kind` says. Times increase
+    strictly, need not be regular, and begin after the model's `start` (samples: at or after). An empty cell or `nan` is "not
+    observed". The text is UTF-8; a byte-order mark, Windows line ends and blank lines are accepted.
 
     Columns with the names of the model's inputs, in addition to the m observations, are the inputs at these times; the first
     row with inputs holds from the model's start, and a row with empty inputs changes nothing.
