@@ -262,3 +262,45 @@ def test_parameters_of_the_law_of_samples_have_gradients(law):
     expected = [(float(likelihood(at + h)) - float(likelihood(at - h))) / (2 * h.sum()) for h in steps]
     assert min(np.abs(expected)) > 1e-3
     np.testing.assert_allclose(likelihood.value_and_gradient(at)[1], expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("start", [{"r": 3.0, "s": 3.0}, {"r": 8.0, "s": 10.0}, {"r": 1.0, "s": 10.0}, {"r": -3.0, "s": 3.0}])
+def test_a_standard_deviation_keeps_the_sign_of_its_start(start):
+    model = zakai.Model(
+        state=["x"],
+        drift=["-x"],
+        diffusion=[["s"]],
+        observation=["x"],
+        observation_noise=[["r**2"]],
+        observation_kind="samples",
+        parameters={"r": 0.145, "s": 0.41},
+        prior={"kind": "gaussian", "mean": [0.0], "cov": [[0.2]]},
+    )
+    _, record = zakai.simulate(model, 0.1 * np.arange(1, 61), seed=1)
+    found = zakai.fit(model, record, start=start, method="kalman-bucy")
+    r, s = np.sign(start["r"]), np.sign(start["s"])
+    assert np.allclose([r * found.estimates["r"], s * found.estimates["s"]], [0.12706, 0.49669], rtol=1e-4)
+    plain = zakai.fit(model, record, start={"r": 0.1, "s": 0.4}, method="kalman-bucy")
+    assert np.allclose(found.covariance, plain.covariance * np.outer([r, s], [r, s]), rtol=1e-3)
+
+
+def test_signs_that_only_change_together_are_those_of_the_start():
+    """The cross noise s c, the noise s^2 and c^2 < 1: (s, c) and (-s, -c) are one system."""
+    model = zakai.Model(
+        state=["x"],
+        drift=["-x"],
+        diffusion=[["s"]],
+        observation=["x"],
+        cross_noise=[["c"]],
+        parameters={"s": 0.8, "c": 0.6},
+        prior={"kind": "gaussian", "mean": [0.0], "cov": [[0.5]]},
+    )
+    _, record = zakai.simulate(model, 0.05 * np.arange(1, 401), seed=4)
+    from zakai.engine.maximum import Found, with_signs_of
+
+    function, values = zakai.log_likelihood(model, record, "kalman-bucy").value_and_gradient, np.array([0.8, 0.6])
+    mirrored = Found(-values, function(values)[0], np.eye(2), True, "", "", 1, None)
+    box = np.array([[-np.inf, np.inf]] * 2)
+    assert np.array_equal(with_signs_of(np.array([0.5, 0.5]), mirrored, function, box).values, values)
+    assert np.array_equal(with_signs_of(np.array([0.5, -0.5]), mirrored, function, box).values, -values)  # s alone is not even
+    assert np.array_equal(with_signs_of(np.array([0.5, 0.5]), mirrored, function, np.array([[-np.inf, 0.0]] * 2)).values, -values)

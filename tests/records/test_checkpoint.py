@@ -169,11 +169,11 @@ def test_a_window_that_moves_goes_on_with_the_same_bits(tmp_path):
 
 def test_the_checkpoint_of_another_filter_is_refused_and_changes_nothing(tmp_path):
     path = tmp_path / "state"
-    online = zakai.online(zakai.Model(**WALK), "kalman-bucy")
+    online = zakai.online(zakai.Model(**WALK, observation_kind="increments"), "kalman-bucy")
     online.update(0.1, 0.2)
     online.save(path)
     for keys, method, words in [(WALK, "extended-kalman-bucy", "another method"), (TIMED, "kalman-bucy", "another model")]:
-        other = zakai.online(zakai.Model(**keys), method)
+        other = zakai.online(zakai.Model(**keys, observation_kind="increments"), method)
         with pytest.raises(zakai.InputError, match=words):
             other.restore(path)
         assert other.time == 0
@@ -186,7 +186,7 @@ def test_the_checkpoint_of_another_filter_is_refused_and_changes_nothing(tmp_pat
 
 def test_a_state_that_somebody_made_up_is_refused_and_nothing_of_it_is_run(tmp_path):
     path = tmp_path / "state"
-    online = zakai.online(zakai.Model(**WALK), "kalman-bucy")
+    online = zakai.online(zakai.Model(**WALK, observation_kind="increments"), "kalman-bucy")
     online.update(0.1, 0.2)
     before = values_of(online.last)
     online.save(path)

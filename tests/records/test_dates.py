@@ -127,7 +127,8 @@ def test_a_record_with_wrong_dates_is_refused_in_one_line(times, keys, says):
 
 
 def test_increments_need_an_origin_before_the_first_date():
-    model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], prior={"kind": "gaussian", "mean": [0], "cov": [[1]]})
+    prior = {"kind": "gaussian", "mean": [0], "cov": [[1]]}
+    model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], observation_kind="increments", prior=prior)
     with pytest.raises(InputError, match="give the date at which t = 0 as origin"):
         zakai.filter(model, zakai.Record(DATES, VALUES, unit="d"))
     found = zakai.filter(model, zakai.Record(DATES, VALUES, unit="d", origin=datetime.date(2024, 3, 30)))

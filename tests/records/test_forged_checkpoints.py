@@ -22,7 +22,7 @@ BLOCKS = dict(
 )
 
 def model_of(name):
-    return zakai.Model(**BLOCKS) if name == "two blocks" else zakai.load_model(f"gallery:{name}")
+    return zakai.Model(**BLOCKS, observation_kind="increments") if name == "two blocks" else zakai.load_model(f"gallery:{name}")
 
 
 def places(said, path=()):

@@ -29,6 +29,7 @@ _Truth = Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="The true
 _Report = Annotated[Path | None, typer.Option(metavar="REPORT.html", help="Write a report with pictures.")]
 _Inputs = Annotated[Path | None, typer.Option("--inputs", metavar="FILE.csv", help="The known inputs: time, a column for each.")]
 _Origin = Annotated[str | None, typer.Option(metavar="DATE", help="The date at which t = 0; by default the first one.")]
+_Columns = Annotated[str, typer.Option(metavar="a,b", help="The columns of the record, in the order of the observations.")]
 _Unit = Annotated[str | None, typer.Option(metavar="UNIT", help="The unit of time, for a record with dates: s, min, h, d.")]
 _Output = Annotated[Path, typer.Option("-o", "--output", metavar="RESULT.nc", help="Where the result goes (NetCDF).")]
 
@@ -89,11 +90,14 @@ def filter(
     inputs: _Inputs = None,
     unit: _Unit = None,
     origin: _Origin = None,
+    columns: _Columns = "",
 ) -> None:
     """Compute the conditional density of the state at every time of a record."""
     from zakai.cli import filtering
 
-    filtering.filter(model, record, output, method, option or [], truth, report, inputs, unit=unit, origin=origin)
+    filtering.filter(
+        model, record, output, method, option or [], truth, report, inputs, unit=unit, origin=origin, columns=columns
+    )
 
 
 @app.command()
@@ -108,11 +112,15 @@ def smooth(
     inputs: _Inputs = None,
     unit: _Unit = None,
     origin: _Origin = None,
+    columns: _Columns = "",
 ) -> None:
     """Compute the conditional density of the state given all observations, at every time of the record."""
     from zakai.cli import filtering
 
-    filtering.filter(model, record, output, method, option or [], truth, report, inputs, smoothed=True, unit=unit, origin=origin)
+    settings = option or []
+    filtering.filter(
+        model, record, output, method, settings, truth, report, inputs, True, unit=unit, origin=origin, columns=columns
+    )
 
 
 @app.command()
@@ -127,11 +135,12 @@ def forecast(
     inputs: _Inputs = None,
     unit: _Unit = None,
     origin: _Origin = None,
+    columns: _Columns = "",
 ) -> None:
     """Compute the density of the state at times after a record."""
     from zakai.cli import filtering
 
-    filtering.forecast(model, record, until, step, output, method, option or [], inputs, unit, origin)
+    filtering.forecast(model, record, until, step, output, method, option or [], inputs, unit, origin, columns=columns)
 
 
 @app.command()
@@ -147,11 +156,12 @@ def fit(
     inputs: _Inputs = None,
     unit: _Unit = None,
     origin: _Origin = None,
+    columns: _Columns = "",
 ) -> None:
     """Estimate parameters of a model by maximum likelihood, with their standard errors."""
     from zakai.cli import filtering
 
-    filtering.fit(model, record, parameters, output, method, option or [], inputs, unit, origin)
+    filtering.fit(model, record, parameters, output, method, option or [], inputs, unit, origin, columns=columns)
 
 
 @app.command()

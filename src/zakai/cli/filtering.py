@@ -36,6 +36,7 @@ def filter(
     smoothed: bool = False,
     unit: str | None = None,
     origin: str | None = None,
+    columns: str = "",
 ) -> None:
     """Filter or smooth a record, print a summary, and write the result and the report.
 
@@ -47,7 +48,7 @@ def filter(
         from zakai.report._extra import plotting
 
         plotting("plotly")
-    model, record, options = _given(source, record_path, settings, inputs_path, unit, origin)
+    model, record, options = _given(source, record_path, settings, inputs_path, unit, origin, columns)
     truth = None if truth_path is None else _truth(truth_path, model, record)
 
     if smoothed:
@@ -66,7 +67,7 @@ def filter(
     if report is not None:
         write_report(result, report, truth=truth)
     lines = [
-        ("observations", f"{len(record):,}, times {record.times[0]:g} to {record.times[-1]:g}"),
+        ("observations", f"{len(record):,}, times {record.times[0]:.12g} to {record.times[-1]:.12g}"),
         ("log-likelihood", f"{result.log_likelihood:.6f}"),
     ]
     _summarise(result, lines, (0, "start") if smoothed else (-1, "end"), [output, report])
@@ -83,23 +84,24 @@ def forecast(
     inputs_path: Path | None = None,
     unit: str | None = None,
     origin: str | None = None,
+    columns: str = "",
 ) -> None:
     """Filter a record, and write the density of the state at times after it."""
     from zakai.engine.driver import filter as run
     from zakai.models.clock import clock
 
     check_outputs([output], [source, record_path, inputs_path])
-    model, record, options = _given(source, record_path, settings, inputs_path, unit, origin)
+    model, record, options = _given(source, record_path, settings, inputs_path, unit, origin, columns)
     last = float(record.times[-1])
     if not until > last:
-        raise InputError(f"--until {until:g}: must be after the end of the record, {last:g}")
+        raise InputError(f"--until {until:.12g}: must be after the end of the record, {last:.12g}")
     times = clock(last, until, step)
     with progress("filtering") as advance:
         result = run(model, record, method, keep="moments", progress=advance, **options)
     found = result.forecast(times)
     _warn(dict.fromkeys([*result.warnings, *found.warnings]))
     found.save(output)
-    _summarise(found, [("forecast times", f"{len(times):,}, {times[0]:g} to {times[-1]:g}")], (-1, "end"), [output])
+    _summarise(found, [("forecast times", f"{len(times):,}, {times[0]:.12g} to {times[-1]:.12g}")], (-1, "end"), [output])
 
 
 def fit(
@@ -112,13 +114,14 @@ def fit(
     inputs_path: Path | None = None,
     unit: str | None = None,
     origin: str | None = None,
+    columns: str = "",
 ) -> None:
     """Print the parameters of largest likelihood, and write the model with them."""
     from zakai.engine.fit import fit as run
     from zakai.records.writing import atomic_write
 
     check_outputs([output], [source, record_path, inputs_path])
-    model, record, options = _given(source, record_path, settings, inputs_path, unit, origin)
+    model, record, options = _given(source, record_path, settings, inputs_path, unit, origin, columns)
     names = [name.strip() for name in parameters.split(",") if name.strip()] or None
     found = run(model, record, names, method, **options)
     _warn(found.warnings)
@@ -131,21 +134,28 @@ def fit(
 
 
 def _given(
-    source: str, path: Path, settings: list[str], inputs_path: Path | None, unit: str | None, origin: str | None
+    source: str,
+    path: Path,
+    settings: list[str],
+    inputs_path: Path | None,
+    unit: str | None,
+    origin: str | None,
+    columns: str,
 ) -> tuple[Model, Record, dict[str, Any]]:
     """Read the model, the record with its inputs, and the options."""
     options = options_of(settings)
     model = load_model(source)
-    return model, record_with_inputs(path, model, inputs_path, unit, origin), options
+    return model, record_with_inputs(path, model, inputs_path, unit, origin, columns), options
 
 
 def record_with_inputs(
-    path: Path, model: Any, inputs_path: Path | None, unit: str | None = None, origin: str | None = None
+    path: Path, model: Any, inputs_path: Path | None, unit: str | None = None, origin: str | None = None, columns: str = ""
 ) -> Record:
     """Read a record, and its inputs from a file of their own where there is one."""
     if origin is not None and unit is None:
         raise InputError("--origin: is the date at which t = 0, and needs --unit, the unit of the model's time, as in --unit h")
-    record = read_record(path, model, unit, origin)
+    wanted = [name.strip() for name in columns.split(",")] if columns else None
+    record = read_record(path, model, unit, origin, columns=wanted)
     if inputs_path is None:
         return record
     if record.inputs is not None:

@@ -75,7 +75,8 @@ class _Stream:
                 self.skip_until = self.online.time
                 self.show(self.online.last)
         _interrupt.insist()
-        for line in lines_of(sys.stdin.buffer, self.online.model.m, self.online.model.inputs, self.online.clock):
+        model = self.online.model
+        for line in lines_of(sys.stdin.buffer, model.m, model.inputs, self.online.clock, model.observation_names):
             _interrupt.check()
             try:
                 estimate = self.used(line)
@@ -112,7 +113,7 @@ class _Stream:
             kind = _NUMBERS.sub("0", warning)
             if kind not in self.warned:
                 self.warned.add(kind)
-                print(f"warning: from t = {estimate.time:g} on: {warning}", file=sys.stderr, flush=True)
+                print(f"warning: from t = {estimate.time:.12g} on: {warning}", file=sys.stderr, flush=True)
         if self.accepted % self.every == 0:
             sys.stdout.write(json.dumps({name: FIELDS[name](estimate) for name in self.fields}, allow_nan=False) + "\n")
             sys.stdout.flush()

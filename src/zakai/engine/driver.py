@@ -17,6 +17,7 @@ from zakai.models._errors import named
 from zakai.models.checks import check_noise_at, check_noise_within
 from zakai.models.domain import check_prior
 from zakai.models.model import Model
+from zakai.models.possible import check_possible
 from zakai.records import Record
 
 
@@ -102,11 +103,10 @@ def _filter(
     many = isinstance(record, list | tuple)
     if many and not record:
         return []
-    records: list[Any] = list(record) if many else [record]  # type: ignore[arg-type]
+    records = check_records(model, record)
     priors = list(prior) if many and isinstance(prior, list | tuple) else [prior] * len(records)
     if len(priors) != len(records):
         raise InputError(f"filter_from: {len(priors)} priors do not go with {len(records)} records; give one for each")
-    check_records(model, record)
     plans = {key: planned(model, own, method, options) for key, own in {id(own): own for own in priors}.items()}
     check_noise(plans.values(), records)
     results = filter_planned([plans[id(own)] for own in priors], records, keep, progress)
@@ -126,6 +126,7 @@ def filter_planned(
     for plan, one, of_one in zip(plans, records, runs, strict=True):
         results.append(plan.result(of_one))
         results[-1].record = one
+        results[-1].warnings[:0] = [one._note] if one._note else []
     return results
 
 
@@ -147,16 +148,27 @@ def check_noise(plans: Iterable[Plan], records: Sequence[Record]) -> None:
         check_noise_within(part, together)
 
 
-def check_records(model: Model, record: Record | Sequence[Record]) -> None:
-    """Raise InputError unless the model and the record, or every record of a list, go together."""
-    records: list[Any] = list(record) if isinstance(record, list | tuple) else [record]
+def check_records(model: Model, record: Record | Sequence[Record]) -> list[Record]:
+    """Return the record, or the records of a list, with the kind and the order of the model's observations.
+
+    Raises:
+        InputError: the model and a record do not go together.
+    """
+    many = isinstance(record, list | tuple)
+    records: list[Any] = list(record) if many else [record]  # type: ignore[arg-type]
+    found: list[Record] = []
     for index, one in enumerate(records):
         for given, kind, how in ((model, Model, "zakai.load_model"), (one, Record, "zakai.read_record")):
             if not isinstance(given, kind):
                 raise InputError(f"filter: expected a {kind.__name__}, got a {type(given).__name__}; {how} reads one from a file")
-        with named(f"records[{index}]") if isinstance(record, list | tuple) else nullcontext():
+        with named(f"records[{index}]") if many else nullcontext():
             check_model(model)
-            one.check(model)
+            own = one.of(model)
+            own.check(model)
+            time = float(own.times[0])
+            check_possible(model, time, None if own.inputs is None else own.inputs.at(time, model.input_hold))
+        found.append(own)
+    return found
 
 
 def check_model(model: Model) -> None:

@@ -34,7 +34,7 @@ class Estimate:
         names = self._online.model.state
         deviations = np.sqrt(np.maximum(np.diag(self.cov), 0.0))
         parts = [f"{name} = {mean:.6g} +- {deviation:.3g}" for name, mean, deviation in zip(names, self.mean, deviations)]
-        return f"Estimate(t = {self.time:g}: {_display.short_names(parts)})"
+        return f"Estimate(t = {self.time:.12g}: {_display.short_names(parts)})"
 
     def _repr_html_(self) -> str:
         deviations = np.sqrt(np.maximum(np.diag(self.cov), 0.0))

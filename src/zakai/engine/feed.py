@@ -14,6 +14,7 @@ from zakai.engine.lengths import notes_on_lengths
 from zakai.engine.misfit import notes_on_law
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
+from zakai.methods._escape import EscapeError
 from zakai.methods._protocol import Info, stacked
 from zakai.numerics.one_thread import one_thread
 from zakai.records.inputs import Inputs
@@ -91,10 +92,13 @@ class Feed:
             prepared, notes = self._prepared(start, time, seen, elapsed, inputs)
         else:
             prepared, notes = self._kept(length, seen, elapsed)
-        state, info = self.setting.method.step(prepared, 0, state, np.array(values))
+        try:
+            state, info = self.setting.method.step(prepared, 0, state, np.array(values))
+        except EscapeError as error:
+            raise error.moved(start) from None
         if not isfinite(info.log_likelihood_increment):
             raise InputError(
-                f"{self.setting.model.source}: at t = {time:g} the observation leaves nothing of the density, or takes it "
+                f"{self.setting.model.source}: at t = {time:.12g} the observation leaves nothing of the density, or takes it "
                 "beyond double precision; it is not used. Where it ends a gap of many times the system's own time, report "
                 "that time as unobserved, and go on from there"
             )

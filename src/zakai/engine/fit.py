@@ -13,7 +13,7 @@ from zakai._progress import bar
 from zakai.densities import GaussianMixture
 from zakai.engine.driver import filter as run_filter
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
-from zakai.engine.maximum import maximum
+from zakai.engine.maximum import maximum, with_signs_of
 from zakai.errors import InputError
 from zakai.models._errors import listing
 from zakai.models.model import Model
@@ -141,7 +141,7 @@ def fit(
                 known[key] = function.unwarned(theta)
             return known[key]
 
-        found = maximum(counted, values, box, names, model, function.exists)
+        found = with_signs_of(values, maximum(counted, values, box, names, model, function.exists), counted, box)
     values = found.values
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
     result = run_filter(now, record, method, keep="moments", **options)

@@ -40,7 +40,8 @@ def forecast(result: FilterResult, times: Any, inputs: Inputs | None = None) -> 
     future = Record(times, values, record.kind, known, record.unit, record.origin)
     last = float(record.times[-1])
     if future.times[0] <= last:
-        raise InputError(f"forecast: the time {future.times[0]:g} is not after the end of the record, {last:g}; give later times")
+        when = f"the time {future.times[0]:.12g} is not after the end of the record, {last:.12g}"
+        raise InputError(f"forecast: {when}; give later times")
     if result.model is not None:
         check_inputs(result.model, future.inputs, float(future.times[-1]))
     runs = [ForecastRun(run, state, last) for run, state in zip(plan.runs(future, None), states, strict=True)]

@@ -58,7 +58,7 @@ def warnings_of_run(result: FilterResult) -> list[str]:
     if bad.any():
         time = result.times[np.argmax(bad)]
         said.append(
-            f"the density was lost at t = {time:g}: nothing after that time can be trusted; check that "
+            f"the density was lost at t = {time:.12g}: nothing after that time can be trusted; check that "
             "observation and its noise, and whether the drift leads to infinity in a finite time"
         )
     else:
@@ -66,7 +66,7 @@ def warnings_of_run(result: FilterResult) -> list[str]:
         if lost.any():
             first = result.times[np.argmax(lost)]
             said.append(
-                f"no moments were found at {int(lost.sum())} of {len(lost)} times, first at t = {first:g}: "
+                f"no moments were found at {int(lost.sum())} of {len(lost)} times, first at t = {first:.12g}: "
                 f"nothing there can be trusted; {_OTHER_METHOD}"
             )
     for name, (bound, what) in result.bounds.items():
@@ -76,7 +76,7 @@ def warnings_of_run(result: FilterResult) -> list[str]:
             worst = int(np.nanargmax(np.where(over, result.health[name], -np.inf)))
             said.append(
                 f"{name} exceeds {bound:g} at {int(over.sum())} of {times} times, most at t = "
-                f"{result.times[worst]:g} ({result.health[name][worst]:.2g}): {advised(name, what)}"
+                f"{result.times[worst]:.12g} ({result.health[name][worst]:.2g}): {advised(name, what)}"
             )
     return said
 

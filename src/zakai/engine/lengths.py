@@ -44,7 +44,7 @@ def notes_on_lengths(model: Model, theta: Array, schedule: Schedule, infos: Info
     over = np.maximum(means, nats) > DIFFERS
     if not over.any():
         return []
-    where = f"within {int(over.sum())} of {len(over)} intervals (first at t = {schedule.stops[np.argmax(over)]:g})"
+    where = f"within {int(over.sum())} of {len(over)} intervals (first at t = {schedule.stops[np.argmax(over)]:.12g})"
     return [
         f"y is taken as linear between observations, but h changes {where} so much that the exact law of the increments differs, "
         f"means by up to about {_size(means)} standard deviations, the log-likelihood of an interval by about {_size(nats)}: "

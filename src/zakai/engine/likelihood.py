@@ -104,7 +104,7 @@ class LogLikelihood:
     """A function of the parameters' values (p,); see `log_likelihood`."""
 
     def __init__(self, model: Model, record: Record, method: str, names: tuple[str, ...], options: dict[str, Any]):
-        check_records(model, record)
+        (record,) = check_records(model, record)
         plan = planned(model, None, method, options, by_value=False)
         check_noise([plan], [record])
         for setting in plan.settings:

@@ -13,11 +13,19 @@ from zakai.densities import Density
 from zakai.engine.health_warnings import warnings_of_run
 from zakai.engine.lengths import notes_on_lengths
 from zakai.engine.misfit import notes_on_law
-from zakai.engine.notes import notes_on_angles, notes_on_domain, notes_on_formulas, notes_on_tables, why_not_finite
+from zakai.engine.notes import (
+    notes_on_angles,
+    notes_on_domain,
+    notes_on_formulas,
+    notes_on_start,
+    notes_on_tables,
+    why_not_finite,
+)
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import KEPT, Setting
 from zakai.engine.versions import versions
 from zakai.errors import InputError
+from zakai.methods._escape import EscapeError
 from zakai.methods._protocol import Infos, stacked
 from zakai.methods._states import Joined
 from zakai.numerics.one_thread import one_thread
@@ -95,7 +103,12 @@ def segments(
         while begin < len(chunk):
             rows = slice(begin, min(begin + size, len(chunk)))
             with np.errstate(all="ignore"):  # what is not finite is reported by who receives it
-                states, infos = advance(setting, prepared, rows, state, values[start + rows.start : start + rows.stop], stepped)
+                try:
+                    states, infos = advance(
+                        setting, prepared, rows, state, values[start + rows.start : start + rows.stop], stepped
+                    )
+                except EscapeError as error:
+                    raise error.moved(float(chunk.starts[error.row])) if setting.autonomous else error from None
             yield Segment(start + begin, prepared, rows, state, states, infos)
             state, begin, size = states[-1], rows.stop, min(GROWTH * size, PIECE)
 
@@ -126,6 +139,7 @@ class Run:
         self.parts: list[Infos] = []
         self.notes: dict[str, None] = dict.fromkeys(
             [
+                *notes_on_start(self.schedule),
                 *_after_gaps(self.schedule),
                 *notes_on_noise(setting.model, self.schedule),
                 *notes_on_angles(setting.model, record),

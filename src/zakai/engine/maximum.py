@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ NEAR = 1e-3  # the distance to the maximum, in standard errors, that counts as n
 LIMIT = 0.1  # nats: the most that can be gained before values without a log-likelihood, at which the search ends
 ROUNDS = 4  # of a search in all parameters and one along a limit
 HALVINGS = 20  # of a step that leads to such values
+EVEN = 1e-9  # relative difference of log-likelihoods that are the same
 SINGULAR = 1e-6  # the smallest eigenvalue of the information scaled to a unit diagonal; differences leave 1e-8
 
 
@@ -216,6 +217,29 @@ def maximum(
         message += f" ({search.message.strip().lower() if beyond is None else 'at a limit of the parameters'})"
     values = np.clip(objective.values(u), box[:, 0], box[:, 1])
     return Found(values, -value, covariance, converged, message, problem, iterations, beyond)
+
+
+def with_signs_of(start: np.ndarray, found: Found, function: Function, box: np.ndarray) -> Found:
+    """Return what was found with the signs of the start (p,), where other signs have the same log-likelihood.
+
+    A standard deviation r that enters as r^2 is found at r and at -r. Each parameter is tried alone, then all that are left.
+    """
+    value = function(found.values)[0]
+
+    def same(values: np.ndarray) -> bool:
+        inside = bool(np.all((box[:, 0] <= values) & (values <= box[:, 1])))
+        return inside and bool(abs(function(values)[0] - value) <= EVEN * max(1.0, abs(value)))
+
+    signs = np.ones(len(start))
+    others = np.flatnonzero(start * found.values < 0)
+    for group in [*others[:, None], others]:
+        trial = signs.copy()
+        trial[group] = np.where(start[group] * found.values[group] < 0, -1.0, 1.0)
+        if not np.array_equal(trial, signs) and same(trial * found.values):
+            signs = trial
+    if (signs > 0).all():
+        return found
+    return replace(found, values=signs * found.values, covariance=np.outer(signs, signs) * found.covariance)
 
 
 def _information(objective: _Objective, u: np.ndarray, deviations: np.ndarray, free: np.ndarray) -> np.ndarray:

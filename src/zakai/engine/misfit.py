@@ -94,7 +94,7 @@ def _note_on_misfits(short: Array, times: Array) -> list[str]:
     worst, count = int(np.argmax(short)), int(np.count_nonzero(short))
     which = f"{_display.counted(count, 'observation')} of {len(short)} cannot be explained by the model, most at "
     which = which if len(short) > 1 else "the observation cannot be explained by the model, at "
-    deviations = f"t = {times[worst]:g} ({np.sqrt(2 * short[worst]):.2g} standard deviations)"
+    deviations = f"t = {times[worst]:.12g} ({np.sqrt(2 * short[worst]):.2g} standard deviations)"
     return [f"{which}{deviations}; check that observation and its noise"]
 
 

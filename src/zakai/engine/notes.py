@@ -14,8 +14,10 @@ from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import explain_nonfinite, numpy_function
 from zakai.records import Inputs, Record
+from zakai.records.schedule import Schedule
 
 _KEYS = ("drift", "diffusion", "observation")
+FORGOTTEN = 1000.0  # ratio of the first interval to the longest other, which no schedule of observations has
 _REACH, _TIMES = 3.0, 32  # deviations from the mean, and number of times, that are checked
 
 
@@ -57,6 +59,22 @@ def why_not_finite(model: Model, key: str, points: np.ndarray, t: float, theta: 
     return explain_nonfinite(model, key, formulas, points[wrong][0], t, u) if wrong.any() else ""
 
 
+def notes_on_start(schedule: Schedule) -> list[str]:
+    """Return a sentence where the first interval is a thousand times as long as all others: a start that was forgotten.
+
+    Times in seconds since 1970 with a start of zero begin with an interval of fifty years.
+    """
+    lengths = schedule.lengths
+    if len(lengths) < 2 or not schedule.seen.any() or not lengths[0] > FORGOTTEN * lengths[1:].max():
+        return []
+    first, last = float(schedule.starts[0]), float(schedule.stops[0])
+    return [
+        f"the first interval, from the model's start {first:.12g} to the first time {last:.12g}, is "
+        f"{lengths[0] / lengths[1:].max():.2g} times as long as the longest other; unless it is meant, give a start next to the "
+        f"first time, as start = {last - float(lengths[1:].max()):.12g}"
+    ]
+
+
 def notes_on_angles(model: Model, record: Record) -> list[str]:
     """Return a sentence where samples of an angle exceed a turn, as they do in degrees."""
     if "von-mises" not in model.observation_family:
@@ -78,7 +96,7 @@ def notes_on_tables(model: Model, theta: np.ndarray, record: Record) -> list[str
         arguments = numpy_function(list(call.args), model)(np.zeros(model.n), times, theta, u)
         beyond = call.table.outside(*np.moveaxis(arguments, -1, 0))
         if beyond.any():
-            when = f"at {int(beyond.sum())} of {len(times)} times, first at t = {times[beyond][0]:g}"
+            when = f"at {int(beyond.sum())} of {len(times)} times, first at t = {times[beyond][0]:.12g}"
             notes.append(f"{formula(call)} is beyond the range of the table, where that is constant, {when}; extend the table")
     return notes
 

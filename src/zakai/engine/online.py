@@ -18,10 +18,12 @@ from zakai.errors import InputError
 from zakai.models._errors import named
 from zakai.models.checks import check_noise_at
 from zakai.models.model import Model
+from zakai.models.possible import check_possible
 from zakai.records.checkpoint import read_checkpoint, write_checkpoint
 from zakai.records.dates import Clock, date_of
 from zakai.records.inputs import Inputs, known_inputs
 from zakai.records.numbers import LARGEST
+from zakai.records.record import check_kind
 from zakai.records.writing import shown
 
 
@@ -59,6 +61,8 @@ class Online:
 
     def __init__(self, model: Model, method: str, options: dict[str, Any], clock: Clock | None = None):
         check_model(model)
+        check_kind(model)
+        check_possible(model, model.start)
         if options.get("form") == "one-shot":
             raise InputError('option form: "one-shot" needs all times from the start on; an online filter takes "stepwise"')
         plan = planned(model, None, method, options)
@@ -69,7 +73,7 @@ class Online:
         self.lock = RLock()
 
     def __repr__(self) -> str:
-        return f"Online({self.method} of {self.model.source}, at t = {self.time:g})"
+        return f"Online({self.method} of {self.model.source}, at t = {self.time:.12g})"
 
     def _repr_html_(self) -> str:
         return self.last._repr_html_()
@@ -102,7 +106,7 @@ class Online:
             try:
                 moments = tuple([feed.moved(time, part, known) for feed, part in parts])
             except (MemoryError, OverflowError):
-                fault = f"the time from {self.time:g} to {time:g} is too long for this filter; check its unit"
+                fault = f"the time from {self.time:.12g} to {time:.12g} is too long for this filter; check its unit"
                 raise InputError(f"update: {fault}") from None
             for feed, moment in zip(self.feeds, moments, strict=True):
                 feed.now = moment
@@ -213,7 +217,7 @@ class Online:
             raise InputError(f"update: the time {time!r} must be after the model's start {now!r}")
         if time == now:
             raise InputError(f"update: the time {time!r} repeats that of the last observation")
-        raise InputError(f"update: the time {time!r} is late by {now - time:g}: the last observation was at {now!r}")
+        raise InputError(f"update: the time {time!r} is late by {now - time:.12g}: the last observation was at {now!r}")
 
     def _values(self, value: Any) -> list[float]:
         m = self.model.m

@@ -46,7 +46,7 @@ def prepare(model: Model, times: Any, method: str = "auto", **options: Any) -> P
     """
     check_model(model)
     record = times if isinstance(times, Record) else _unobserved(model, times)
-    check_records(model, record)
+    (record,) = check_records(model, record)
     return Prepared(model, method, options, record)
 
 
@@ -57,7 +57,7 @@ def _unobserved(model: Model, times: Any) -> Record:
         raise InputError(f"prepare: the times are a {type(times).__name__}; give a vector of numbers or a Record") from None
     if times.ndim != 1 or not len(times):
         raise InputError(f"prepare: the times have the shape {times.shape}; give a vector of at least one")
-    return Record(times, np.zeros((len(times), model.m)), model.observation_kind)
+    return Record(times, np.zeros((len(times), model.m)))
 
 
 class Prepared:
@@ -85,7 +85,7 @@ class Prepared:
 
     def filter(self, record: Record, *, keep: str | None = None, progress: Progress | None = None) -> FilterResult:
         """Return what `zakai.filter` returns for this model, method and options, to the bit."""
-        check_records(self.model, record)
+        (record,) = check_records(self.model, record)
         check_noise([self._plan], [record])
         return filter_planned([self._plan], [record], keep, progress)[0]
 

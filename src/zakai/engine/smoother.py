@@ -105,7 +105,7 @@ def smooth(
         smoothed = zakai.smooth(model, record)
         smoothed.mean[0], smoothed.density(0).quantile([0.025, 0.975])
     """
-    check_records(model, record)
+    (record,) = check_records(model, record)
     with announced(f"{model.source}: deciding which method holds"):
         plan = plan_of(model, model.prior, method, options, unfit=_unfit)
     check_noise([plan], [record])
@@ -116,6 +116,8 @@ def smooth(
     smooth_all(runs)
     result = plan.result(runs)
     result.record = record
+    for one in (filtered, result):
+        one.warnings[:0] = [record._note] if record._note else []
     result.attributes["kind"] = "smoothed"
     shared = {field.name: getattr(result, field.name) for field in fields(result)}
     return SmoothingResult(**shared, filtered=filtered, _runs=tuple(runs))

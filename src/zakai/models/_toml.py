@@ -13,7 +13,6 @@ import sympy
 from zakai.models.expressions import MAX_DIGITS
 
 _OPTIONAL: dict[str, Any] = {
-    "observation_kind": "increments",
     "start": 0.0,
     "periodic": (),
     "functions": (),
@@ -28,6 +27,7 @@ _ORDER = (
     "drift",
     "observation",
     "observation_kind",
+    "observation_names",
     "diffusion",
     "process_noise",
     "observation_noise",

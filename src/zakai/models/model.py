@@ -26,7 +26,7 @@ from zakai.models.tables import Table, read_tables
 KEYS = (
     "name", "state", "drift", "observation", "observation_kind", "diffusion", "process_noise", "observation_noise", "start",
     "periodic", "functions", "parameters", "prior", "inputs", "input_hold", "cross_noise", "observation_family",
-    "degrees_of_freedom", "concentration", "observation_log_density", "observed", "domain", "tables",
+    "degrees_of_freedom", "concentration", "observation_log_density", "observed", "domain", "tables", "observation_names",
 )  # fmt: skip
 Formulas = Sequence[str | float | sympy.Expr]
 FormulaRows = Sequence[Formulas]
@@ -44,7 +44,9 @@ class Model:
     meant by name:
 
     * `state`: n names; `drift`: f, n formulas; `observation`: h, m formulas (these three are required);
-    * `observation_kind`: increments (the default), path, rates or samples;
+    * `observation_kind`: increments, path, rates or samples; it may be left out for analysis and simulation, which then take
+      increments; `observation_names`: m names for the columns of records, by default the state where h is just a state, else
+      y1, y2, ...;
     * `diffusion`: g, n rows of r formulas (Ito); `process_noise`: Q, r x r; `observation_noise`: S, m x m; `cross_noise`:
       C, r x m; Q, C and S in t and parameters only, S of samples in the state and inputs too; by default identities, and
       zero for C; covariances are per unit time, or per observation for samples;
@@ -79,6 +81,8 @@ class Model:
     observation: sympy.ImmutableMatrix
     observation_noise: sympy.ImmutableMatrix
     observation_kind: str
+    observation_names: tuple[str, ...]
+    kind_given: bool
     start: float
     periodic: tuple[str, ...]
     functions: tuple[str, ...]
@@ -122,6 +126,7 @@ class Model:
         domain: Mapping[str, Mapping[str, Any]] | None = None,
         tables: Mapping[str, Any] | None = None,
         functions: Sequence[str] | None = None,
+        observation_names: Sequence[str] | None = None,
         **unknown: Any,
     ):
         given = {key: value for key, value in locals().items() if key in KEYS and value is not None}

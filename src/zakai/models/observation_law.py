@@ -48,6 +48,11 @@ class ObservationLaw:
     def _log_density(self) -> Callable[..., Array]:
         return numpy_function([self._model.log_density], self._model, ())
 
+    def parameters(self, x: Any, t: Any, theta: Any, u: Any = None) -> tuple[Array, Array, Array]:
+        """Return h (..., m), S (..., m, m) and the shapes of the families (..., m), zero where there is none."""
+        h, S, shapes = (function(x, t, theta, u) for function in self._functions)
+        return h, S if self._coupled else S[..., None] * np.eye(S.shape[-1]), shapes
+
     def log_density(self, values: Any, x: Any, t: Any, theta: Any, u: Any = None) -> Array:
         """Return log p(z | x, u, t) of one row at many points.
 

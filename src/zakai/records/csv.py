@@ -14,25 +14,33 @@ import numpy as np
 
 from zakai.errors import InputError
 from zakai.models._errors import named
+from zakai.records.columns import observed_columns
 from zakai.records.dates import Clock, date_of, unit_name
-from zakai.records.header import LONGEST_LINE, cells_of, columns_fault, columns_with_inputs, header_names, header_of, quoted
+from zakai.records.header import LONGEST_LINE, cells_of, columns_fault, header_names, header_of, quoted
 from zakai.records.inputs import Inputs
 from zakai.records.numbers import NUMBER
 from zakai.records.record import Record, early, first_fault
-from zakai.records.writing import shown
+from zakai.records.writing import default_names, shown
 
 _AT_ONCE = 1 << 18  # characters
 _NO_TEXT = re.compile("[\ud800-\udfff]")
 
 
-def read_record(path: str | os.PathLike[str], model: Any, unit: str | None = None, origin: Any = None) -> Record:
+def read_record(
+    path: str | os.PathLike[str],
+    model: Any,
+    unit: str | None = None,
+    origin: Any = None,
+    *,
+    columns: Sequence[str] | None = None,
+) -> Record:
     r"""Read the observations of `model` from a CSV file.
 
-    The first line is a header: `time`, then one column for each of the model's m observations in their order,
-    of any names, but not of y1 to ym in another order. Every other line is one time and its m observations, in
-    what the model's `observation_kind` says. Times increase strictly, need not be regular, and begin after the
-    model's `start` (samples: at or after). An empty cell or `nan` is "not observed". The text is UTF-8; a
-    byte-order mark, Windows line ends and blank lines are accepted.
+    The first line is a header: `time`, then one column for each of the model's m observations. They are matched by the names of
+    the observations, or y1 to ym, in any order, if these are their names, and else taken in their order; with `columns` there may
+    be others. Every other line is one time and its m observations, in what the model's `observation_kind` says. Times increase
+    strictly, need not be regular, and begin after the model's `start` (samples: at or after). An empty cell or `nan` is "not
+    observed". The text is UTF-8; a byte-order mark, Windows line ends and blank lines are accepted.
 
     Columns with the names of the model's inputs, in addition to the m observations, are the inputs at these times; the first
     row with inputs holds from the model's start, and a row with empty inputs changes nothing.
@@ -42,6 +50,7 @@ def read_record(path: str | os.PathLike[str], model: Any, unit: str | None = Non
         model: a `zakai.Model`; its `m`, `start`, `observation_kind` and `observation_law` say what the file must hold.
         unit: the model's unit of time, for a file whose first column has ISO dates; see `Record`.
         origin: the date at which t = 0, by default the first date.
+        columns: the names of the columns to take, in the order of the observations.
 
     Raises:
         InputError: the file, or its first bad row by its line number (the header is line 1), cannot be used.
@@ -54,14 +63,22 @@ def read_record(path: str | os.PathLike[str], model: Any, unit: str | None = Non
         Record(3 rows x 1 increments, times 0.1 to 0.4)
     """
     path = Path(path)
-    names = header_of(path) if model.inputs else []
+    names = header_of(path)
     dates = None if unit is None else Dates(unit, origin)
-    if set(model.inputs) & set(names[1:]):
-        record, row = _with_inputs(path, model, names, dates)
-    else:
-        table, row = read_table(path, model.m, "observations", dates=dates)
-        record = Record(table[:, 0], table[:, 1:], model.observation_kind, **clock_of(dates))
-    fault = early(record.times[0], record.kind, model.start)
+    if names[:1] != ["time"]:  # `read_table` says what is wrong
+        read_table(path, model.m, "observations", dates=dates)
+    observed = getattr(model, "observation_names", default_names(model.m))
+    with named(f"{shown(path)}: row 1"):
+        places, note = observed_columns(names[1:], observed, model.inputs, columns)
+        known = _input_columns(names, model)
+    used = [0, *(place + 1 for place in places), *known]
+    table, row = read_table(path, len(names) - 1, "observations", dates=dates, used=used)
+    values, rest = table[:, 1 : 1 + model.m], table[:, 1 + model.m :]
+    inputs = _inputs_of(path, model, row, table[:, 0], rest) if known else None
+    kind = model.observation_kind if getattr(model, "kind_given", True) else None
+    record = Record(table[:, 0], values, kind, inputs, **clock_of(dates))
+    object.__setattr__(record, "_note", note)
+    fault = early(record.times[0], kind or "samples", model.start)
     if fault is not None:
         hint = "" if dates is None else "; give the date at which t = 0 as origin"
         raise InputError(f"{shown(path)}: row {row}: {fault}{hint}")
@@ -71,12 +88,19 @@ def read_record(path: str | os.PathLike[str], model: Any, unit: str | None = Non
     return record
 
 
-def _with_inputs(path: Path, model: Any, names: list[str], dates: Dates | None) -> tuple[Record, int]:
-    """The record in a file that has columns for the inputs too, and the line of its first row."""
-    with named(f"{shown(path)}: row 1"):
-        observed, placed = columns_with_inputs(names, model.m, model.inputs)
-    table, row = read_table(path, len(names) - 1, "observations and inputs", dates=dates)
-    values = table[:, placed]
+def _input_columns(names: list[str], model: Any) -> list[int]:
+    """Return the places of the model's inputs in a header; none where the file has none of them."""
+    if not set(model.inputs) & set(names[1:]):
+        return []
+    for name in model.inputs:
+        if list(names[1:]).count(name) != 1:
+            what = "no column for the input" if name not in names else "two columns for the input"
+            raise InputError(f"{what} {quoted(name)[1:-1]}; give one for each input")
+    return [names.index(name) for name in model.inputs]
+
+
+def _inputs_of(path: Path, model: Any, row: int, times: np.ndarray, values: np.ndarray) -> Inputs:
+    """The inputs in the rows of a record; `row` is the line of the first."""
     given = ~np.isnan(values)
     partial = given.any(axis=1) & ~given.all(axis=1)
     if partial.any():
@@ -84,10 +108,10 @@ def _with_inputs(path: Path, model: Any, names: list[str], dates: Dates | None) 
     rows = given.all(axis=1)
     if not rows.any():
         raise InputError(f"{shown(path)}: no row has the inputs {', '.join(model.inputs)}; fill their columns")
-    times, values = table[rows, 0], values[rows]
+    times, values = times[rows], values[rows]
     if times[0] > model.start:
         times, values = np.concatenate([[model.start], times]), np.concatenate([values[:1], values])
-    return Record(table[:, 0], table[:, observed], model.observation_kind, Inputs(times, values), **clock_of(dates)), row
+    return Inputs(times, values)
 
 
 class Dates:
@@ -126,12 +150,17 @@ def clock_of(dates: Dates | None) -> dict[str, Any]:
 
 
 def read_table(
-    path: Path, columns: int, what: str, names: Sequence[str] | None = None, dates: Dates | None = None
+    path: Path,
+    columns: int,
+    what: str,
+    names: Sequence[str] | None = None,
+    dates: Dates | None = None,
+    used: Sequence[int] | None = None,
 ) -> tuple[np.ndarray, int]:
     """The times and the `columns` numbers of every row of a CSV file, (K, 1 + columns), and the line of the first row.
 
-    `what` is what a column holds, in the plural; with `names` the columns must have just these. Raises
-    InputError as `read_record` does.
+    `what` is what a column holds, in the plural; with `names` the columns must have just these; `used` are the places of the
+    columns that are read, the first of which is 0, in the order of the table. Raises InputError as `read_record` does.
     """
     try:
         # A pipe or a device could be endless.
@@ -140,7 +169,7 @@ def read_table(
             raise InputError(f"{shown(path)}: is {kind}; give a CSV file")
         # Bytes that are not UTF-8 become lone surrogates, which no number has; so their row is found.
         with path.open(encoding="utf-8-sig", errors="surrogateescape", newline=None) as file:
-            return table_of(file, shown(path), columns, what, names, dates)
+            return table_of(file, shown(path), columns, what, names, dates, used)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{shown(path)}: cannot be read: {reason}; give a CSV file") from None
@@ -153,19 +182,21 @@ def table_of(
     what: str,
     names: Sequence[str] | None = None,
     dates: Dates | None = None,
+    used: Sequence[int] | None = None,
 ) -> tuple[np.ndarray, int]:
     """`read_table` of an open file, which is read once, a part at a time; `source` is what errors call it."""
     parts = _parts(file, source)
     first = next(parts, None)
     if first is None:
         raise InputError(f"{source}: is empty; expected a header of {columns + 1} names, the first of them time, then rows")
-    header = _header(source, first.lines[0], columns, what, names)
-    numbers, row, before = array("d"), 0, np.empty((0, len(header)))
+    header = _header(source, first.lines[0], columns, what, names, used is not None)
+    used = range(len(header)) if used is None else used
+    numbers, row, before = array("d"), 0, np.empty((0, len(used)))
     for part in chain([first._replace(number=2, lines=first.lines[1:])], parts):
         part, wrong = (part, None) if dates is None else dates.numbered(part)
-        rows = _fast(part.lines, len(header))
+        rows = _fast(part.lines, len(header), used)
         if rows is None:
-            rows, other = _careful(part, header)
+            rows, other = _careful(part, header, used)
             wrong = other or wrong
         # The first bad row is the one to name: an earlier one may break a rule about its numbers.
         both = np.vstack([before, rows])
@@ -180,7 +211,7 @@ def table_of(
             before = rows[-1:]
     if not numbers:
         raise InputError(f"{source}: has a header but no row; a record needs at least one observation")
-    return np.frombuffer(numbers).reshape(-1, len(header)), row
+    return np.frombuffer(numbers).reshape(-1, len(used)), row
 
 
 class _Part(NamedTuple):
@@ -207,7 +238,7 @@ def _parts(file: TextIO, source: str) -> Iterator[_Part]:
         yield _Part(number, [rest], False)
 
 
-def _header(source: str, line: str, m: int, what: str, expected: Sequence[str] | None) -> list[str]:
+def _header(source: str, line: str, m: int, what: str, expected: Sequence[str] | None, known: bool = False) -> list[str]:
     if (fault := _not_text(line)) is not None:
         raise InputError(f"{source}: row 1: {fault}")
     names = header_names(line)
@@ -215,16 +246,16 @@ def _header(source: str, line: str, m: int, what: str, expected: Sequence[str] |
         hint = " (is the header missing?)" if NUMBER.fullmatch(names[0]) else ""
         fault = f"the first column is {quoted(names[0])}; the header must begin with time{hint}"
         raise InputError(f"{source}: row 1: {fault}")
-    if (fault := columns_fault(names, m, what, expected)) is not None:
+    if not known and (fault := columns_fault(names, m, what, expected)) is not None:
         raise InputError(f"{source}: row 1: {fault}")
     return names
 
 
-def _fast(lines: list[str], columns: int) -> np.ndarray | None:
-    """The rows as a table (k, columns); None if they are not all plain numbers and gaps."""
+def _fast(lines: list[str], columns: int, used: Sequence[int]) -> np.ndarray | None:
+    """The rows as a table (k, used columns); None if they are not all plain numbers and gaps."""
     text = "\n".join(lines)
     if not text.strip():
-        return np.empty((0, columns))
+        return np.empty((0, len(used)))
     if "\0" in text:
         return None
     text = f"{text}\n".replace(",,", ",nan,").replace(",,", ",nan,").replace(",\n", ",nan\n")
@@ -232,29 +263,29 @@ def _fast(lines: list[str], columns: int) -> np.ndarray | None:
         table = np.loadtxt(text.split("\n"), delimiter=",", comments=None, ndmin=2)
     except ValueError:
         return None
-    return table if table.shape[1] == columns else None
+    return table[:, used] if table.shape[1] == columns else None
 
 
-def _careful(part: _Part, names: list[str]) -> tuple[np.ndarray, tuple[int, str] | None]:
+def _careful(part: _Part, names: list[str], used: Sequence[int]) -> tuple[np.ndarray, tuple[int, str] | None]:
     """The same table, cell by cell, up to the first row that cannot be read; the line of that one, and why."""
     table, wrong = array("d"), None
     for number, line in enumerate(part.lines, start=part.number):
         if not line.strip():
             continue
         cells = [cell.strip() for cell in cells_of(line)]
-        what = _not_text(line) or _not_numbers(cells, names, part.whole)
+        what = _not_text(line) or _not_numbers(cells, names, part.whole, used)
         if what is not None:
             wrong = number, what
             break
-        table.extend(float(cell) if cell else np.nan for cell in cells)
-    return np.array(table, dtype=np.float64).reshape(-1, len(names)), wrong
+        table.extend(float(cells[i]) if cells[i] else np.nan for i in used)
+    return np.array(table, dtype=np.float64).reshape(-1, len(used)), wrong
 
 
-def _not_numbers(cells: list[str], names: list[str], whole: bool) -> str | None:
+def _not_numbers(cells: list[str], names: list[str], whole: bool, used: Sequence[int]) -> str | None:
     if len(cells) != len(names):
         cut = "" if whole else " (the file ends in this row; was it cut off?)"
         return f"{len(cells)} columns; expected {len(names)}: {quoted(','.join(names))}{cut}"
-    for name, cell in zip(names, cells):
+    for name, cell in ((names[i], cells[i]) for i in used):
         if cell and not NUMBER.fullmatch(cell):
             what = f"{quoted(cell)} in column {quoted(name)} is not a number"
             if name == "time" and date_of(cell) is not None:

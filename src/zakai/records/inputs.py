@@ -59,7 +59,8 @@ class Inputs:
         late = np.flatnonzero(np.diff(times) <= 0)
         if len(late):
             row = int(late[0]) + 1
-            raise InputError(f"inputs: row {row}, counted from 0: time {times[row]:g} does not increase; sort the rows by time")
+            fault = f"time {times[row]:.12g} does not increase; sort the rows by time"
+            raise InputError(f"inputs: row {row}, counted from 0: {fault}")
         times.flags.writeable = values.flags.writeable = False
         found = {"times": times, "values": values, "unit": None, "origin": None}
         for name, value in (found if clock is None else {**found, **clock._asdict()}).items():
@@ -134,12 +135,12 @@ class Inputs:
         first = float(self.times[0])
         if first > start:
             raise InputError(
-                f"{name}: the first time {first:g} is after the start {start:g} of {model.source}; "
+                f"{name}: the first time {first:.12g} is after the start {start:.12g} of {model.source}; "
                 f"give {', '.join(model.inputs)} from the start on"
             )
         if model.input_hold == "linear" and self.times[-1] < last:
             raise InputError(
-                f'{name}: the last time {float(self.times[-1]):g} is before {last:g}; with input_hold = "linear" give '
+                f'{name}: the last time {float(self.times[-1]):.12g} is before {last:.12g}; with input_hold = "linear" give '
                 f"{', '.join(model.inputs)} up to {last:g}"
             )
 

@@ -52,7 +52,7 @@ def notes_on_noise(model: Model, schedule: Schedule) -> list[str]:
     if not count:
         return []
     return [
-        f"observation_noise varies within {count} of {len(schedule)} intervals (first at t = {first:g}): y is taken as linear "
+        f"observation_noise varies within {count} of {len(schedule)} intervals (first at t = {first:.12g}): y is taken as linear "
         f"between observations, whose precision exceeds that of the exact law of the increments by up to {worst:.0%}; "
         "give shorter intervals"
     ]

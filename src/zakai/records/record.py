@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -11,6 +13,8 @@ import numpy as np
 
 from zakai import _display
 from zakai.errors import InputError
+from zakai.models._errors import listing, named
+from zakai.records.columns import observed_columns
 from zakai.records.dates import Clock, read_times
 from zakai.records.inputs import Inputs, check_inputs
 from zakai.records.numbers import LARGEST, numbers_in_time, real_numbers
@@ -32,10 +36,12 @@ class Record:
             texts), with a `unit`.
         values: (K, m), in the model's units; nan, or a masked cell, is "this coordinate was not observed here". (K,) is taken
             as (K, 1).
-        kind: "increments" (the default), "path", "rates" or "samples".
+        kind: "increments", "path", "rates" or "samples"; by default that of the model with which it is used.
         inputs: a `zakai.Inputs` for a model with known inputs.
         unit: the model's unit of time, for dates: "ns", "us", "ms", "s", "min", "h", "d", "week" or "year" (365.25 days).
         origin: the date at which t = 0, by default the first date.  Dates with a time zone are taken in UTC.
+        names: the names of the columns of `values`, by which they are matched to the observations of a model; without names they
+            are in the order of the observations.
 
     Both arrays are copied to float64 and cannot be written to.
 
@@ -54,14 +60,16 @@ class Record:
 
     times: np.ndarray
     values: np.ndarray
-    kind: str = "increments"
+    kind: str | None = None
     inputs: Inputs | None = None
     unit: str | None = None
     origin: Any = None
+    names: Sequence[str] | None = None
+    _note: str = field(default="", init=False)
     _dates: np.ndarray | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
+        if self.kind is not None and self.kind not in KINDS:
             raise InputError(f"record: kind is {self.kind!r}; it must be one of {', '.join(KINDS)}")
         given, clock, dates = read_times(self.times, self.unit, self.origin)
         times, values = numbers_in_time(given, self.values, "record", "(K,)", "m")
@@ -74,6 +82,10 @@ class Record:
             if not isinstance(self.inputs, Inputs):
                 raise InputError(f"record: inputs: expected zakai.Inputs(times, values), got a {type(self.inputs).__name__}")
             found["inputs"] = self.inputs.on(clock)
+        if self.names is not None:
+            found["names"] = tuple(map(str, self.names))
+            if len(found["names"]) != values.shape[1]:
+                raise InputError(f"record: {len(found['names'])} names for {values.shape[1]} columns; give one for each")
         found |= {"unit": None, "origin": None} if clock is None else clock._asdict()
         for name, value in found.items():
             object.__setattr__(self, name, value)
@@ -83,11 +95,11 @@ class Record:
 
     def __repr__(self) -> str:
         first, last = self._when(0), self._when(-1)
-        return f"Record({len(self)} rows x {self.values.shape[1]} {self.kind}, times {first} to {last})"
+        return f"Record({len(self)} rows x {self.values.shape[1]} {self.kind or 'observations'}, times {first} to {last})"
 
     def _repr_html_(self) -> str:
         rows = [(self._when(k), *map(_display.number, self.values[k])) for k in range(min(len(self), _display.MOST_ROWS))]
-        header = ["time" if self.clock is None else "date", *(f"y{i + 1}" for i in range(self.values.shape[1]))]
+        header = ["time" if self.clock is None else "date", *(self.names or default_names(self.values.shape[1]))]
         return _display.html_table(repr(self), header, rows, total=len(self))
 
     def _when(self, row: int) -> str:
@@ -105,6 +117,31 @@ class Record:
             return self._dates
         return self.clock.dates(self.times)
 
+    def of(self, model: Any) -> Record:
+        """Return the record with the kind of a model and its columns in the order of the model's observations.
+
+        Raises:
+            InputError: neither says the kind, they differ, or the columns are not the observations.
+        """
+        kind = self.kind
+        if kind is None:
+            check_kind(model)
+            kind = model.observation_kind
+        elif kind != model.observation_kind and not model.kind_given:
+            raise InputError(f'record: holds {kind}, and the model does not say so; give it observation_kind = "{kind}"')
+        if self.names is None and kind == self.kind:
+            return self
+        found = copy(self)
+        object.__setattr__(found, "kind", kind)
+        if self.names is not None:
+            with named("record"):
+                places, note = observed_columns(self.names, model.observation_names, model.inputs)
+            values = self.values[:, places]
+            values.flags.writeable = False
+            for name, value in (("values", values), ("names", None), ("_note", note)):
+                object.__setattr__(found, name, value)
+        return found
+
     def check(self, model: Any) -> None:
         """Refuse a record that `model` cannot have made.
 
@@ -115,7 +152,7 @@ class Record:
             raise InputError(f"record: holds {self.kind}; the model observes {wanted}; give the record kind={wanted!r}")
         if self.values.shape[1] != model.m:
             raise InputError(f"record: values has shape {self.values.shape}; the model needs ({len(self)}, {model.m})")
-        too_early = early(self.times[0], self.kind, model.start)
+        too_early = early(self.times[0], model.observation_kind, model.start)
         if too_early is not None:
             hint = "" if self.unit is None else "; give the date at which t = 0 as origin"
             raise InputError(f"record: row 0, counted from 0: {too_early}{hint}")
@@ -131,7 +168,15 @@ class Record:
         return None if lawless else model.observation_law.fault(self.values)
 
     @classmethod
-    def from_pandas(cls, frame: Any, kind: str, unit: str | None = None, origin: Any = None) -> Record:
+    def from_pandas(
+        cls,
+        frame: Any,
+        kind: str | None = None,
+        unit: str | None = None,
+        origin: Any = None,
+        *,
+        columns: Sequence[str] | None = None,
+    ) -> Record:
         """Return a record from a DataFrame: its column `time` or else its index, and the other columns as values.
 
         Args:
@@ -139,6 +184,8 @@ class Record:
             kind: as for `Record`.
             unit: as for `Record`, for dates.
             origin: as for `Record`, for dates.
+            columns: the columns to take, in the order of the observations; without it they are matched by the names of the
+                observations, in any order, if these are their names, and else taken by their position.
 
         Raises:
             InputError: as `Record` does, or pandas is not installed.
@@ -157,12 +204,15 @@ class Record:
             raise InputError(f"Record.from_pandas takes a DataFrame, not {type(frame).__name__}")
         times = frame["time"] if "time" in frame.columns else frame.index.to_series()
         rest = frame.drop(columns="time", errors="ignore")
-        columns = [_column(rest.iloc[:, i], f"column {rest.columns[i]!r}") for i in range(rest.shape[1])]
-        values = np.column_stack(columns) if columns else np.empty((len(frame), 0))
-        return cls(times if times.dtype.kind in "mM" else _column(times, "time"), values, kind, unit=unit, origin=origin)
+        if columns is not None:
+            rest = rest[_known_columns(columns, list(rest.columns))]
+        read = [_column(rest.iloc[:, i], f"column {rest.columns[i]!r}") for i in range(rest.shape[1])]
+        values = np.column_stack(read) if read else np.empty((len(frame), 0))
+        when = times if times.dtype.kind in "mM" else _column(times, "time")
+        return cls(when, values, kind, unit=unit, origin=origin, names=None if columns is not None else list(rest.columns))
 
     @classmethod
-    def from_xarray(cls, data: Any, kind: str, unit: str | None = None, origin: Any = None) -> Record:
+    def from_xarray(cls, data: Any, kind: str | None = None, unit: str | None = None, origin: Any = None) -> Record:
         """Return a record from a DataArray over (time,) or (time, channel), or a Dataset of variables over `time`.
 
         Args:
@@ -187,20 +237,22 @@ class Record:
         if "time" not in data.coords or "time" not in data.dims:
             raise InputError("Record.from_xarray: there is no dimension time with a coordinate of that name")
         parts = list(data.data_vars.values()) if isinstance(data, xarray.Dataset) else [data]
-        columns = []
+        columns, names = [], list[str]()
         for part in parts:
             if "time" not in part.dims or part.ndim > 2:
                 what = f"{part.name} has dimensions {part.dims}; expected (time,) or (time, channel)"
                 raise InputError(f"Record.from_xarray: {what}")
             values = real_numbers(part.transpose("time", ...).values, str(part.name))
             columns.append(values.reshape(data.sizes["time"], -1))
+            names += _names_of(part)
         values = np.concatenate(columns, axis=1) if columns else np.empty((data.sizes["time"], 0))
-        return cls(data["time"].values, values, kind, unit=unit, origin=origin)
+        known = names if len(names) == values.shape[1] else None
+        return cls(data["time"].values, values, kind, unit=unit, origin=origin, names=known)
 
     def to_csv(self, path: str | os.PathLike[str], names: list[str] | None = None) -> None:
         """Write the record as the CSV that `read_record` reads back bit for bit; see `write_record`."""
-        m = self.values.shape[1]
-        write_table(path, self.times, self.values, default_names(m) if names is None else list(names), self.dates)
+        own = self.names or default_names(self.values.shape[1])
+        write_table(path, self.times, self.values, list(own if names is None else names), self.dates)
 
 
 def write_record(path: str | os.PathLike[str], record: Record, names: list[str] | None = None) -> None:
@@ -261,6 +313,33 @@ def early(first: float, kind: str, start: float) -> str | None:
         return None
     need = "at or after" if kind == "samples" else "after"
     return f"the time {float(first)!r} must be {need} the model's start {float(start)!r}"
+
+
+def check_kind(model: Any) -> None:
+    """Raise InputError where a model does not say of what kind an observation is."""
+    if not model.kind_given:
+        raise InputError(
+            f'{model.source}: observation_kind: missing; give "samples" if an observation is h + noise at its time, and for '
+            'dy = h dt + dw "increments" if it is the change of y since the last one, "path" if it is y, "rates" if it is that '
+            "change over its time"
+        )
+
+
+def _known_columns(columns: Any, known: list[Any]) -> list[Any]:
+    wanted = [columns] if isinstance(columns, str) else list(columns)
+    for name in wanted:
+        if known.count(name) != 1 or wanted.count(name) != 1:
+            what = "is not one of" if name not in known else "is there twice among"
+            raise InputError(f"Record.from_pandas: columns: {name!r} {what} the columns {listing(map(str, known))}")
+    return wanted
+
+
+def _names_of(part: Any) -> list[str]:
+    """The name of a variable over time, or the labels of its channels where these are texts."""
+    if part.ndim == 1:
+        return [] if part.name is None else [str(part.name)]
+    labels = part.coords.get(next(name for name in part.dims if name != "time"))
+    return [] if labels is None or labels.dtype.kind not in "UO" else list(map(str, labels.values))
 
 
 def _column(series: Any, name: str) -> np.ndarray:

@@ -12,9 +12,11 @@ from typing import Any, BinaryIO, NamedTuple
 
 from zakai.errors import InputError
 from zakai.models._errors import named
+from zakai.records.columns import observed_columns
 from zakai.records.dates import Clock, date_of
-from zakai.records.header import columns_with_inputs, header_names, quoted
+from zakai.records.header import header_names, quoted
 from zakai.records.numbers import NUMBER
+from zakai.records.writing import default_names
 
 LONGEST = 2**20  # bytes of a line
 MOST_DIGITS = 640  # of an integer: what Python always reads, however it is set
@@ -35,7 +37,9 @@ class Line(NamedTuple):
     fault: str | None = None
 
 
-def lines_of(file: BinaryIO, m: int, inputs: Sequence[str] = (), clock: Clock | None = None) -> Iterator[Line]:
+def lines_of(
+    file: BinaryIO, m: int, inputs: Sequence[str] = (), clock: Clock | None = None, names: Sequence[str] = ()
+) -> Iterator[Line]:
     r"""Yield the lines of a stream of observations, each as soon as it is there.
 
     JSON lines are {"time": 0.1, "y": [0.5, null], "inputs": {"u": 1.0}}; other keys are ignored, and no key may stand twice. A
@@ -47,6 +51,7 @@ def lines_of(file: BinaryIO, m: int, inputs: Sequence[str] = (), clock: Clock | 
         m: how many values an observation has.
         inputs: the names of the known inputs.
         clock: the times are ISO dates, which become times of this clock.
+        names: the names of the observations, by which the columns of a CSV are matched.
 
     Raises:
         InputError: the header of a CSV does not fit, or what looks like CSV has none.
@@ -73,7 +78,7 @@ def lines_of(file: BinaryIO, m: int, inputs: Sequence[str] = (), clock: Clock | 
         if not text.strip():
             continue
         if parse is None:
-            columns = _columns(text, number, m, inputs)
+            columns = _columns(text, number, names or default_names(m), inputs)
             parse = partial(_json, clock) if columns is None else partial(_csv, clock, inputs, columns)
             if columns is not None:
                 continue
@@ -171,15 +176,15 @@ def _csv(
         raise ValueError("the time is missing")
     numbers = [float(cell) if cell else None for cell in cells]
     observed, placed = columns
-    if not placed:
+    if not placed and observed == list(range(1, 1 + len(observed))):
         return numbers[0], numbers[1:], None
-    if len(cells) != 1 + len(observed) + len(placed):
-        raise ValueError(f"{len(cells)} columns; the header has {1 + len(observed) + len(placed)}")
+    if len(cells) <= max(*observed, *placed):
+        raise ValueError(f"{len(cells)} columns; the header has more")
     given = {name: numbers[place] for name, place in zip(inputs, placed, strict=True) if cells[place]}
     return numbers[0], [numbers[place] for place in observed], given or None
 
 
-def _columns(text: str, number: int, m: int, inputs: Sequence[str]) -> tuple[list[int], list[int]] | None:
+def _columns(text: str, number: int, observed: Sequence[str], inputs: Sequence[str]) -> tuple[list[int], list[int]] | None:
     """Return the places of the observations and of the inputs if the first line is the header of a CSV, None if it is JSON.
 
     Raises:
@@ -189,10 +194,15 @@ def _columns(text: str, number: int, m: int, inputs: Sequence[str]) -> tuple[lis
     with named(f"standard input: line {number}"):
         if names[0] == "time":
             given = inputs if set(inputs) & set(names[1:]) else ()
-            return columns_with_inputs(names, m, given)
+            missing = [name for name in given if names.count(name) != 1]
+            if missing:
+                raise InputError(f"no column, or two, for the input {', '.join(missing)}; give a column for each input")
+            places = observed_columns(names[1:], observed, inputs).places
+            return [place + 1 for place in places], [names.index(name) for name in given]
         if _looks_like_csv(text):
             header = (
-                f"whose first line must be a header: first the column time, then {m} for the observations, with commas between"
+                f"whose first line must be a header: first the column time, then {len(observed)} for the observations, with "
+                "commas between"
             )
             raise InputError(f"{quoted(text.strip())} looks like CSV, {header}")
     return None

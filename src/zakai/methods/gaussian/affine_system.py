@@ -253,7 +253,7 @@ class Setup:
         time = pieces.stops[np.argmax(found.error)]
         return whole, (
             f"the coefficients vary so fast within an interval that its transition is known to {worst:.1g} only (first at "
-            f"t = {time:g}); give shorter intervals",
+            f"t = {time:.12g}); give shorter intervals",
         )
 
     def _repeated(self, pieces: Pieces, inside: Array) -> Transition:
@@ -270,7 +270,7 @@ class Setup:
         if wrong.any():
             row = int(np.argmax(wrong))
             raise InputError(
-                f"{self.system.source}: a coefficient is not finite between t = {starts[row]:g} and {stops[row]:g}"
+                f"{self.system.source}: a coefficient is not finite between t = {starts[row]:.12g} and {stops[row]:.12g}"
             )
 
 

@@ -47,7 +47,7 @@ def ends_of(
         factor = cholesky(np.where(both, noise * shared, 0.0) + np.eye(at_end.shape[1]) * ~at_end[:, None, :])
     except np.linalg.LinAlgError:
         first, last = schedule.stops[0], schedule.stops[-1]
-        raise InputError(f"observation_noise: is not positive definite between t = {first:g} and {last:g}") from None
+        raise InputError(f"observation_noise: is not positive definite between t = {first:.12g} and {last:.12g}") from None
     whiten = np.linalg.inv(factor)
     logs = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1) + 0.5 * np.log(2 * np.pi) * at_end.sum(axis=1)
     constant = -logs if sampled else np.zeros(len(logs))

@@ -110,7 +110,7 @@ def prepare(model: Model, schedule: Schedule, theta: Array, kind: type[AffineSys
         estimate = np.finfo(float).eps * np.exp(2.0 * rate * (stop - model.start))
     if estimate > tolerance:
         raise InputError(
-            f'{model.source}: option form: "one-shot" would lose its digits by t = {stop:g}: its error estimate '
+            f'{model.source}: option form: "one-shot" would lose its digits by t = {stop:.12g}: its error estimate '
             f'eps exp(2 mu t) = {estimate:.1e} with mu = {rate:.3g} passes {tolerance:g} (option tolerance); take form="stepwise"'
         )
     return Prepared(base, found, _maps(found, base.lengths))

@@ -25,6 +25,7 @@ from zakai.methods.line.cross import OMITTED
 from zakai.methods.line.domain import on_the_line, variable_of
 from zakai.methods.line.drift_grid import showing_drift
 from zakai.methods.line.ends import check_ends
+from zakai.methods.line.escape import check_escape
 from zakai.methods.line.figures import (
     edge_of_moments,
     figures,
@@ -169,6 +170,7 @@ def alone(info: Info) -> Infos:
 def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Stepped:
     schedule, length = prepared.schedule, float(prepared.lengths[k])
     values, window, report, look = np.asarray(state.values), state.window, Report(), None
+    check_escape(prepared, k, window.points, values)
     inside = acting_inside(prepared, k)
     parts = parts_of_step(prepared, k, values, window)
     if parts is not None:

@@ -15,6 +15,7 @@ import numpy as np
 from zakai.densities import IntervalDensity
 from zakai.errors import InputError
 from zakai.methods._protocol import Info
+from zakai.methods.line.escape import check_escape
 from zakai.methods.line.figures import forgetting, outside_tables, spread
 from zakai.methods.line.moves import Report
 from zakai.methods.line.system import NOISE, Prepared
@@ -167,6 +168,7 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
     schedule, length, inside = prepared.schedule, float(prepared.lengths[k]), prepared.inside[k]
     values, report, gained = np.asarray(state.values), Report(), 0.0
     element: Any = state.element  # in the place of a grid
+    check_escape(prepared, k, element.points, values)
     before, negligible = moments(values, element), negligible_of(prepared, float(state.error))
     if length > 0:
         rates = np.where(inside, observed, 0.0) / length

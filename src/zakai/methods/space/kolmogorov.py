@@ -18,6 +18,7 @@ from zakai.methods._options import tolerance_of
 from zakai.methods._protocol import Info
 from zakai.methods.line.cross import OMITTED
 from zakai.methods.space.cross import CrossSystem, potential_of
+from zakai.methods.space.escape import check_escape
 from zakai.methods.space.filter import State
 from zakai.methods.space.observed import MOST_PANELS, Observations
 from zakai.methods.space.short import predicted_on
@@ -101,6 +102,7 @@ class Prepared:
 
     def step(self, k: int, state: State, values: np.ndarray) -> tuple[State, Info]:
         """Return the state after interval k and its observation, and what the step reports."""
+        check_escape(self, k, state)
         observations = self.observations
         begin = Field(state.values, grid_of(state, self.bounds.periodic), 0.0)
         length, inside = float(observations.lengths[k]), observations.inside[k]
