@@ -234,11 +234,13 @@ def in_order(model: Model) -> tuple[str, ...]:
     last: tuple[str, ...] = ()
     nonlinear, samples = affine_observation(model) is None, model.observation_kind == "samples"
     laws = features.OF_OBSERVATION & model.features.keys()
-    if model.features or (model.n < 4 and nonlinear):
+    if model.features.keys() - {features.OBSERVED_ANGLES} or (model.n < 4 and nonlinear):
         last = ("general-direct",)
     kinks = not samples and model.observation.has(sp.Abs, sp.sign)
     if model.n == 3 or (model.n > 1 and kinks) or (model.n == 2 and samples and (nonlinear or laws)):
         last = ("limited-direct", "general-direct")
+    if features.OBSERVED_ANGLES in model.features:
+        last = (*last, "kalman-bucy")  # it takes the nearest image alone
     return (*(name for name in _registry.AUTO if name not in last), *last)
 
 

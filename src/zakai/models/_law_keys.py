@@ -11,6 +11,7 @@ import sympy
 from zakai.errors import InputError
 from zakai.models import _entries
 from zakai.models._errors import did_you_mean, listing, named
+from zakai.models.angles import LINEAR, observed_angles
 from zakai.models.families import FAMILIES
 from zakai.models.formulas import parse_expression
 
@@ -20,7 +21,9 @@ if TYPE_CHECKING:
 
 def read_observed(model: Model, keys: Mapping[str, Any]) -> int:
     """Read the names in `observed`, and return how many there are."""
-    for key in ("observation", "observation_noise", "observation_family", "degrees_of_freedom", "concentration"):
+    for key in (
+        "observation", "observation_noise", "observation_family", "degrees_of_freedom", "concentration", "observed_angles",
+    ):  # fmt: skip
         if keys.get(key) is not None:
             raise InputError(f"{key}: describes the observation, as observation_log_density does; leave one of them out")
     if model.observation_kind != "samples":
@@ -79,6 +82,8 @@ def read_law(model: Model, keys: Mapping[str, Any], read: Callable[..., sympy.Ex
                         raise InputError(f"expected a positive number, got {text}")
     vars(model).update(observation_family=families, family_parameters=parameters)
     _check_noise_of_families(model, keys)
+    vars(model)["observation_names"] = _observation_names(model, keys)
+    vars(model)["observed_angles"] = _observed_angles(model, keys)
 
 
 def _families(model: Model, keys: Mapping[str, Any]) -> tuple[str, ...]:
@@ -109,3 +114,55 @@ def _check_noise_of_families(model: Model, keys: Mapping[str, Any]) -> None:
                 raise InputError(f"[{i}][{j}]: the family {other} has no correlations; give 0")
             if i == j and not FAMILIES[families[i]].noise and entry != 1:
                 raise InputError(f"[{i}][{i}]: the family {families[i]} has no noise of its own; give 1, or leave it out")
+
+
+def _observation_names(model: Model, keys: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of the observations: those given, else the state where one is just a state, else y1, y2, ..."""
+    if keys.get("observation_names") is not None:
+        with named("observation_names"):
+            names = _entries.names(keys["observation_names"], f"a list of {model.m} names (one an observation)")
+            if len(names) != model.m:
+                raise InputError(f"expected a list of {model.m} names (one an observation), got {len(names)}")
+        vars(model)["_keys"]["observation_names"] = list(names)
+        return names
+    if model.observed:
+        return model.observed
+    formulas, states = list(model.observation), dict(zip(model.x, model.state, strict=True))
+    found = [states.get(formula) if formulas.count(formula) == 1 else None for formula in formulas]
+    defaults = [f"y{j + 1}" for j in range(model.m)]
+    return tuple(
+        name or (f"{default}_" if default in found else default) for name, default in zip(found, defaults, strict=True)
+    )
+
+
+_WIDEST = 0.5  # standard deviation, in radians, of an angle whose noise is correlated: its images are then negligible
+
+
+def _observed_angles(model: Model, keys: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names in `observed_angles`, and check the noise of angles."""
+    given = keys.get("observed_angles")
+    with named("observed_angles"):
+        angles = _entries.names(() if given is None else given, "a list of names of observations that are angles")
+        if angles and model.observation_kind != "samples":
+            kind = model.observation_kind
+            raise InputError(f'is for samples; give observation_kind = "samples", not "{kind}"')
+        for name in angles:
+            if name not in model.observation_names:
+                hint = did_you_mean(name, model.observation_names)
+                raise InputError(f"{name!r} is no observation{hint} (the observations are {listing(model.observation_names)})")
+            family = model.observation_family[model.observation_names.index(name)]
+            if family not in (*LINEAR, "von-mises"):
+                raise InputError(f"{name!r} has the family {family}, whose values are {FAMILIES[family].support}, not angles")
+    if angles:
+        vars(model)["_keys"]["observed_angles"] = list(angles)
+    vars(model)["observed_angles"] = angles
+    if model.log_density is None and model.observation_kind == "samples":
+        for (i, j), entry in model.observation_noise.todok().items():
+            angle = next((k for k in (i, j) if i != j and entry != 0 and observed_angles(model)[k]), None)
+            variance = None if angle is None else model.observation_noise[angle, angle]
+            if variance is not None and variance.is_number and float(variance) > _WIDEST**2:
+                raise InputError(
+                    f"observation_noise: [{i}][{j}]: correlates an angle whose standard deviation is "
+                    f"{float(variance) ** 0.5:.3g}; up to {_WIDEST} the noise of an angle may be correlated; give 0"
+                )
+    return angles

@@ -42,6 +42,8 @@ _ORDER = (
     "concentration",
     "observation_log_density",
     "observed",
+    "observation_names",
+    "observed_angles",
 )
 
 

@@ -108,6 +108,11 @@ def sinc(x: Any, order: int) -> NDArray[Any]:
     return np.asarray(np.where(near, integral, recursion))
 
 
+def without_jumps(formula: sympy.Expr, symbol: sympy.Symbol) -> sympy.Expr:
+    """Return the derivative of a formula almost everywhere: apart from its jumps."""
+    return sympy.diff(formula, symbol).replace(sympy.DiracDelta, lambda *_: sympy.S.Zero)
+
+
 def pairwise(function: Callable[[Any, Any], Any], arguments: list[Any]) -> Any:
     """Return f(f(a, b), c) and so on: a function of two arguments, of several."""
     result = arguments[0]

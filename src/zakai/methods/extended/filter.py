@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities import GaussianMixture
+from zakai.densities._density import wrap
 from zakai.errors import InputError
 from zakai.methods._input_pieces import Pieces, pieces_of
 from zakai.methods._moments import prior_moments, wrapped
@@ -240,6 +241,7 @@ def _update(prepared: Prepared, state: State, observed: _Observed, t: float, u: 
     mean, cov = state
     value, slope = prepared.formulas.observe(mean, t, prepared.theta, u)
     H, residual, noise = observed.spans[:, None] * slope, observed.values - observed.spans * value, observed.noise
+    residual = np.where(prepared.model.observation_law.angles, wrap(residual), residual)
     across = H @ cov
     white, log_factor = _log_normal(np.column_stack([residual, across]), across @ H.T + noise)
     gain = white[1:]
