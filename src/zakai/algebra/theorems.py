@@ -250,7 +250,8 @@ def conditions_of(name: str, model: Model) -> tuple[Condition, ...]:
     Features of the model that the method does not handle fail first, and its theorem, which does not know them, is not asked.
     """
     if model.features:
-        handled = _registry.load(name).handles if name in _registry.METHODS else frozenset()
+        # Filters of other libraries handle the same, and are not loaded for an answer.
+        handled = _registry.load(name).handles if name in _registry.METHODS else features.LINEARISED
         refused = tuple(
             Condition(ASSUMPTIONS[feature], False, words, NOT_HANDLED)
             for feature, words in model.features.items()

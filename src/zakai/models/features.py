@@ -39,6 +39,12 @@ _OF_FORMULAS: dict[str, tuple[type, ...]] = {
 }
 
 
+# The features that leave a model with a derivative almost everywhere, and with Gaussian noise in a small step.
+LINEARISED = frozenset(
+    {STATE_DEPENDENT_DIFFUSION, STATE_DEPENDENT_OBSERVATION_NOISE, OBSERVED_ANGLES, TABLES, KINKS, JUMPS, SINC}
+)
+
+
 # What the theorem of a method assumes that does not handle the feature.
 ASSUMPTIONS = {
     STATE_DEPENDENT_DIFFUSION: "g does not depend on the state",

@@ -23,6 +23,7 @@ from zakai.peers._translation import (
     compiled,
     in_deviations,
     innovations,
+    seen_from,
     system_of,
 )
 from zakai.records.schedule import Schedule
@@ -35,7 +36,10 @@ BOUNDS = {
     "indefinite_cov": (1e-9, "the covariance has a negative eigenvalue (its share of the largest), or is not finite"),
     "innovation_excess": (DOUBTFUL, DIVERGED),
 }
-FIRST_ORDER = "of first order in the interval for increments, and in a substep of second (midpoint) or first (euler)"
+FIRST_ORDER = (
+    "of first order in the interval for increments, and in a substep of second (midpoint) or first (euler, or where noise "
+    "depends on the state)"
+)
 
 
 class Rule(NamedTuple):
@@ -74,25 +78,34 @@ def _advanced(system: System, interval: Interval, state: State, observation: Obs
 
     def substep(index: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
         t = interval.start + index * length
-        G = system.covariance(jnp.zeros(system.n), system.noise_time(t, length), theta)
+        zero, when = jnp.zeros((system.n, system.n)), system.noise_time(t, length)
+        G = system.covariance(jnp.zeros(system.n), when, theta) if system.diffusion is None else zero
+        before = carry
         carry = predict(*carry, lambda x: system.before_noise(x, t, length, theta), length * G)
+        if system.diffusion is not None:
+            at = before if system.scheme == "euler" else carry
+            carry = carry[0], carry[1] + length * _expected(system, *at, lambda x: system.covariance(x, when, theta))
         if system.scheme == "euler":
             return carry
-        return predict(*carry, lambda x: system.after_noise(x, t, length, theta), jnp.zeros_like(G))
+        return predict(*carry, lambda x: system.after_noise(x, t, length, theta), zero)
 
     count = jnp.where(interval.length > 0, system.substeps, 0)
     mean, cov = jax.lax.fori_loop(0, count, substep, (state.mean, state.cov))
     return _conditioned(system, mean, cov, state.sums, observation, interval.stop, theta)
 
 
+def _expected(system: System, mean: Any, cov: Any, matrix: Callable[[Any], Any]) -> Any:
+    """Return the expected value of a matrix that depends on the state, as the library takes expectations."""
+    shape = matrix(mean).shape
+    noise = jnp.zeros((shape[0] * shape[1],) * 2)
+    return system.rule.predict(mean, cov, lambda x: matrix(x).ravel(), noise)[0].reshape(shape)
+
+
 def _conditioned(
     system: System, mean: Any, cov: Any, sums: Innovations, observation: Observation, t: Any, theta: Any
 ) -> tuple[State, Info]:
     """Return the Gaussian given the observation, the evidence and the size of the innovation."""
-
-    def h(x: Any) -> Any:
-        return observation.whiten @ system.observation(x, t, theta)
-
+    observation, h = seen_from(system, observation, mean, t, theta)
     unit, zero = jnp.eye(system.m), jnp.zeros(system.m)
     expected, spread = system.rule.predict(mean, cov, h, unit)
     evidence = MultivariateNormalFullCovariance(expected, spread).log_prob(observation.values)
