@@ -7,9 +7,10 @@ Between observations an interval is divided into `substeps`; one of length d fro
 
 (Ito; first order where g depends on the state), where half of the flow is one step of the explicit midpoint rule.  An increment
 dy = h dt + dw over a time T is the observation dy / T = h(x) + noise of covariance S / T at the end of its interval, which is
-first order in the interval; a sample is used as it is.  Observations are whitened, so that every library receives z = h(x) + N(0, I): with R = L L' the covariance of the observed
-coordinates, z is L^-1 times the observation.  An unobserved coordinate has z = 0 and h = 0, which carries no information.
-Where S depends on the state, R is taken at a state near the one in question; an observed angle has the image nearest to h there.
+first order in the interval; a sample is used as it is.  Observations are whitened, so that every library receives
+z = h(x) + N(0, I): with R = L L' the covariance of the observed coordinates, z is L^-1 times the observation.  An unobserved
+coordinate has z = 0 and h = 0, which carries no information.  Where S depends on the state, R is taken at a state near the one in
+question; an observed angle has the image nearest to h there.
 """
 
 from __future__ import annotations
