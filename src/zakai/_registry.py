@@ -58,7 +58,7 @@ METHODS = {
     ),
     "extended-kalman-bucy": Entry(
         "zakai.methods.extended_kalman_bucy",
-        "approximate for any smooth system: linearised at the mean, one Gaussian; only when it is named",
+        "approximate for formulas with a derivative almost everywhere: linearised at the mean; only when it is named",
     ),
 }
 # Filters of other libraries, to compare with: never taken by "auto", and each needs the extra `peers`.

@@ -7,8 +7,8 @@ from zakai.methods._protocol import Backward, Method
 from zakai.methods.extended.backward import density as smoothed_density
 from zakai.methods.extended.backward import message, smoothed
 from zakai.methods.extended.backward import step as step_back
-from zakai.methods.extended.filter import Prepared, State, density, init, prepare, step, valid
-from zakai.models.features import CROSS_NOISE, INPUTS, JUMPS, KINKS, OBSERVED_ANGLES, SINC, STATE_DEPENDENT_DIFFUSION, TABLES
+from zakai.methods.extended.filter import Prepared, State, density, init, prepare, segment, step, valid
+from zakai.models.features import CROSS_NOISE, INPUTS, LINEARISED
 
 METHOD: Method[Prepared, State] = Method(
     name="extended-kalman-bucy",
@@ -28,5 +28,6 @@ METHOD: Method[Prepared, State] = Method(
     },
     valid=valid,
     backward=Backward(message, step_back, smoothed, smoothed_density),
-    handles=frozenset({CROSS_NOISE, INPUTS, JUMPS, KINKS, OBSERVED_ANGLES, SINC, STATE_DEPENDENT_DIFFUSION, TABLES}),
+    handles=LINEARISED | {CROSS_NOISE, INPUTS},
+    segment=segment,
 )

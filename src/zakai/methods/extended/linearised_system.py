@@ -25,11 +25,12 @@ class Formulas:
         n, m = model.n, model.m
         drift, observation = sp.Matrix(model.drift), sp.Matrix(model.observation)
         slope, change = jacobian(drift, model.x), [jacobian(drift, [symbol]) for symbol in (model.t, *model.u)]
-        self.shapes = (n, m)
+        self.shapes, self.angles = (n, m), model.observation_law.angles
         self.motion = numpy_function([*drift, *slope, *model.covariance, *sp.Matrix.hstack(*change)], model)
         self.sensor = numpy_function([*observation, *jacobian(observation, model.x)], model)
         self.noise = numpy_function(model.observation_noise, model, (m, m))
         self.cross = None if model.cross_noise.is_zero_matrix else self._cross(model)
+        self.noise_of_state = bool(model.observation_noise.free_symbols & set(model.x))
         self.noise_varies = bool(model.observation_noise.has(model.t)) and model.observation_kind != "samples"
 
     @staticmethod
