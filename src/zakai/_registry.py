@@ -24,6 +24,10 @@ METHODS = {
         "zakai.methods.kalman_bucy",
         "exact for linear systems in any number of states, whatever the prior; singular noise is allowed",
     ),
+    "conditionally-gaussian": Entry(
+        "zakai.methods.conditionally_gaussian",
+        "exact for f and h that are affine in x, with coefficients that depend on what is observed",
+    ),
     "benes": Entry(
         "zakai.methods.benes",
         "exact for affine h and a drift L x + l + G grad log cosh(q.x + delta), in any number of states",
@@ -72,7 +76,7 @@ PEERS = {
     ),
 }
 # What "auto" tries, most exact and cheapest first; the last holds for any smooth system of few states.
-AUTO = ("kalman-bucy", "benes", "hu-yau", "limited-direct", "general-direct", "yau-yau")
+AUTO = ("kalman-bucy", "conditionally-gaussian", "benes", "hu-yau", "limited-direct", "general-direct", "yau-yau")
 
 
 def load(name: str) -> Any:

@@ -11,6 +11,7 @@ import sympy as sp
 
 from zakai import _registry
 from zakai.algebra._readable import short
+from zakai.algebra.conditional import conditionally_gaussian
 from zakai.algebra.conditions import Condition
 from zakai.algebra.exact_theorems import benes, hu_yau, kalman_bucy
 from zakai.algebra.exponentials import wei_norman_filter
@@ -201,6 +202,7 @@ def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
 # The theorem that says when a method holds, by the method's name.
 THEOREMS: Mapping[str, Callable[[Model], tuple[Condition, ...]]] = {
     "kalman-bucy": kalman_bucy,
+    "conditionally-gaussian": conditionally_gaussian,
     "benes": benes,
     "hu-yau": hu_yau,
     "limited-direct": limited_direct,

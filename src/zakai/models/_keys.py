@@ -11,7 +11,7 @@ import sympy
 from zakai.errors import InputError
 from zakai.models import _entries, checks
 from zakai.models._errors import did_you_mean, listing, named
-from zakai.models._law_keys import read_law, read_observed
+from zakai.models._law_keys import read_law, read_observed, read_path
 from zakai.models.expressions import MAX_LENGTH
 from zakai.models.formulas import parse_expression
 
@@ -127,6 +127,8 @@ def read_formulas(model: Model, keys: Mapping[str, Any]) -> None:
             rows = f"{size} rows of {size} formulas (one a {what})"
             canonical[key] = _entries.matrix_of_formulas(given[key], size, size, rows)
     _refuse_long(canonical)
+    if not custom:
+        read_path(model, keys)
     read = reader(model)
     for key in ("drift", "observation"):
         with named(key):
@@ -151,6 +153,8 @@ def reader(model: Model, in_time: bool = True) -> Callable[..., sympy.Expr]:
     symbols = dict(zip((*model.state, *model.parameters), (*model.x, *model.parameter_symbols), strict=True))
     if in_time:
         symbols |= {"t": model.t, **dict(zip(model.inputs, model.u, strict=True))}
+        if model.observation_kind != "samples":
+            symbols |= dict(zip(model.observed, model.z, strict=True))
     known: dict[str, sympy.Expr] = {}
 
     def read(text: str, place: str = "") -> sympy.Expr:

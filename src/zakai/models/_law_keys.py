@@ -29,11 +29,36 @@ def read_observed(model: Model, keys: Mapping[str, Any]) -> int:
     if model.observation_kind != "samples":
         kind = model.observation_kind
         raise InputError(f'observation_log_density: is for samples; give observation_kind = "samples", not "{kind}"')
+    _read_names(model, keys, "used in observation_log_density")
+    if not 1 <= len(model.observed) <= _MOST_OBSERVED:
+        words = f"expected a list of 1 to {_MOST_OBSERVED} names of what is observed, used in observation_log_density"
+        raise InputError(f"observed: {words}")
+    return len(model.observed)
+
+
+_MOST_OBSERVED = 64
+
+
+def read_path(model: Model, keys: Mapping[str, Any]) -> None:
+    """Read the names in `observed` that stand in formulas for the current values y(t) of the m observations."""
+    if keys.get("observed") is None:
+        return
+    if model.observation_kind == "samples":
+        raise InputError(
+            "observed: goes with observation_log_density; samples have no value between their times, so that names of "
+            "observations in formulas are for increments, path and rates"
+        )
+    _read_names(model, keys, "one an observation, which formulas may contain")
+    if len(model.observed) != model.m:
+        raise InputError(f"observed: expected {model.m} names (one an observation), got {len(model.observed)}")
+    vars(model)["_keys"]["observed"] = list(model.observed)
+
+
+def _read_names(model: Model, keys: Mapping[str, Any], what: str) -> None:
+    """Read the names in `observed`."""
     with named("observed"):
-        observed = _entries.names(keys.get("observed", ()), 'a list of names such as ["z"]')
-        if not 1 <= len(observed) <= 64:
-            raise InputError("expected a list of 1 to 64 names of what is observed, used in observation_log_density")
-        for names, what in (
+        observed = _entries.names(keys.get("observed", ()), f'a list of names such as ["z"], {what}')
+        for names, kind in (
             (model.state, "a state"),
             (model.parameters, "a parameter"),
             (model.inputs, "an input"),
@@ -42,15 +67,14 @@ def read_observed(model: Model, keys: Mapping[str, Any]) -> int:
         ):
             for name in observed:
                 if name in names:
-                    raise InputError(f"the name {name!r} is already {what}")
+                    raise InputError(f"the name {name!r} is already {kind}")
     vars(model).update(observed=observed, z=tuple(sympy.Symbol(name, real=True) for name in observed))
-    return len(observed)
 
 
 def read_law(model: Model, keys: Mapping[str, Any], read: Callable[..., sympy.Expr]) -> None:
     """Read the family of each coordinate and its parameters, or the log density; `read` reads a formula."""
     canonical: dict[str, Any] = vars(model)["_keys"]
-    if model.z:
+    if keys.get("observation_log_density") is not None:
         with named("observation_log_density"):
             text = _entries.formula(keys["observation_log_density"])
             symbols = {symbol.name: symbol for symbol in (*model.x, *model.parameter_symbols, *model.u, *model.z, model.t)}
@@ -58,8 +82,6 @@ def read_law(model: Model, keys: Mapping[str, Any], read: Callable[..., sympy.Ex
             if not model.log_density.has(*model.z):  # type: ignore[union-attr]
                 raise InputError(f"does not contain {listing(model.observed)}; it is log p({', '.join(model.observed)} | x)")
         canonical.update(observation_log_density=text, observed=list(model.observed))
-    elif "observed" in keys:
-        raise InputError("observed: goes with observation_log_density, which is missing")
     families = _families(model, keys)
     parameters: dict[tuple[str, int], sympy.Expr] = {}
     for key in ("degrees_of_freedom", "concentration"):

@@ -133,8 +133,8 @@ def joint_covariance(model: Model) -> NumericFunction:
 
 
 def depends_on_state(matrix: sympy.MatrixBase, model: Model) -> bool:
-    """Return whether a matrix depends on the state or on inputs."""
-    return bool(matrix.free_symbols & {*model.x, *model.u})
+    """Return whether a matrix depends on the state, on inputs or on the observed path."""
+    return bool(matrix.free_symbols & {*model.x, *model.u, *model.z})
 
 
 def check_periodic(model: Model) -> None:

@@ -20,6 +20,7 @@ STATE_DEPENDENT_OBSERVATION_NOISE = "state-dependent observation noise"
 OBSERVATION_FAMILY = "observation family"
 OBSERVATION_LOG_DENSITY = "observation log density"
 OBSERVED_ANGLES = "observed angles"
+OBSERVED_PATH = "observed path"
 DOMAIN = "domain"
 TABLES = "tables"
 KINKS = "kinks"
@@ -54,6 +55,7 @@ ASSUMPTIONS = {
     OBSERVATION_FAMILY: "the noise of observations is Gaussian",
     OBSERVATION_LOG_DENSITY: "the noise of observations is Gaussian",
     OBSERVED_ANGLES: "no observation is an angle",
+    OBSERVED_PATH: "no formula contains the observed path (conditionally-gaussian takes such formulas)",
     DOMAIN: "every state is free to take any value",
     TABLES: "formulas are without tables",
     KINKS: "formulas are without min and max",
@@ -95,6 +97,8 @@ def features_of(model: Model) -> dict[str, str]:
         found[OBSERVED_ANGLES] = f"observed angles: {', '.join(names)}"
     if model.log_density is not None:
         found[OBSERVATION_LOG_DENSITY] = f"observation_log_density: {_short(model.log_density)}"
+    if model.log_density is None and (entry := next((f for f in formulas_of(model) if f.free_symbols & set(model.z)), None)):
+        found[OBSERVED_PATH] = f"a formula contains what is observed: {_short(entry)}"
     if model.domain:
         found[DOMAIN] = f"domain: {', '.join(f'{name} {interval}' for name, interval in model.domain.items())}"
     return found | _of_formulas(formulas_of(model, without_branch(model)), model)
