@@ -24,7 +24,7 @@ from zakai.models.model import Model
 
 
 def _variant(model: Model, options: Mapping[str, Any]) -> Method[Any, Any]:
-    return OF_ANGLES if OBSERVED_ANGLES in model.features else PLAIN
+    return OF_ANGLES if OBSERVED_ANGLES in model.features else METHOD
 
 
 METHOD: Method[Any, families.State] = Method(
@@ -45,7 +45,6 @@ METHOD: Method[Any, families.State] = Method(
     backward=BACKWARD,
     variant=_variant,
 )
-PLAIN = METHOD
 OF_ANGLES: Method[Any, families.State] = replace(
     METHOD,
     exactness=f"{METHOD.exactness}; of an observed angle the nearest image is taken",
