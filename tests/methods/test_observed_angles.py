@@ -94,10 +94,13 @@ def test_a_wide_angle_has_the_sum_over_its_images(method, error):
     assert np.isclose(found.log_likelihood, evidence, rtol=0, atol=error)
 
 
-def test_one_gaussian_warns_of_another_image():
-    model = line("2", observed_angles=["x"])
+@pytest.mark.parametrize("method", ["kalman-bucy", "extended-kalman-bucy", "ekf", "ukf", "enkf"])
+def test_one_gaussian_warns_of_another_image(method):
+    model, narrow = line("2", observed_angles=["x"]), line("1/50", observed_angles=["x"], diffusion=[["0.5"]])
     _, record = zakai.simulate(model, np.linspace(0.3, 4.5, 15), seed=5)
-    assert any("another image" in words for words in zakai.filter(model, record, "kalman-bucy").warnings)
+    assert any("another image" in words for words in zakai.filter(model, record, method).warnings)
+    _, record = zakai.simulate(narrow, np.linspace(0.1, 1.5, 15), seed=5)
+    assert not any("another image" in words for words in zakai.filter(narrow, record, method).warnings)
 
 
 def test_smoothing_residuals_and_online_know_of_turns():

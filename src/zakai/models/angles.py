@@ -54,6 +54,18 @@ def nearest(values: Array, expected: Array, angles: Any) -> Array:
     return np.where(angles, expected + wrap(values - expected), values) if angles.any() else values
 
 
+def other_image(apart: Array, variance: Array) -> float:
+    """Return the largest weight of another image of angles at differences in (-pi, pi], relative to the nearest.
+
+        exp(-((r + 2 pi k)^2 - r^2) / 2 s),    s the variance with which z - h is expected
+    """
+    weights = np.exp(-TURN * np.maximum(TURN - 2.0 * np.abs(np.real(apart)), 0.0) / (2.0 * np.real(variance)))
+    return float(np.max(weights, initial=0.0))
+
+
+ONE_IMAGE = 1e-6, "weight of another image of an observed angle (z + 2 pi) relative to the nearest, the only one that is taken"
+
+
 class Wrapped:
     """The law of an angle whose difference from its location is a variable of `family` modulo 2 pi."""
 

@@ -217,7 +217,7 @@ def worse(worst: float, change: float, scale: float) -> float:  # pragma: no cov
     "void(UniTuple(Tuple((i8[:, ::1], f8[::1], i8[::1], i8[::1])), 5), b1[::1], b1[::1], b1,"
     " Tuple((i8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, :, ::1])),"
     " Tuple((f8[::1], f8[::1], f8[:, ::1], b1[:, ::1], b1[:, ::1], f8[:, ::1], f8[:, :, ::1])),"
-    " f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1], f8[::1])"
+    " f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1])"
 )
 def segment(
     programs: Any, periodic: Array, angles: Array, samples: bool, parts: Any, intervals: Any, values: Array,
@@ -241,7 +241,8 @@ def segment(
         means: The means (R, n) after each interval.
         covs: The covariances (R, n, n).
         gains: The increments (R,) of the log-likelihood.
-        figures: How far from linear the system is (R,), as in `methods/extended/linearisation.py`.
+        figures: How far from linear the system is, as in `methods/extended/linearisation.py`, and the largest weight of another
+            image of an angle, as in `models/angles.py` (2, R).
     """
     motion, sensor, drift, observation, noise = programs
     first, starts, lengths, inputs, rates, rate_noise = parts
@@ -260,6 +261,7 @@ def segment(
 
     for row in range(len(values)):
         total, any_inside, any_end, inside_figure = 0.0, False, False, 0.0
+        figures[1, row] = 0.0
         for i in range(m):
             any_inside, any_end = any_inside or inside[row, i], any_end or at_end[row, i]
         for i in range(n):
@@ -348,7 +350,7 @@ def segment(
                         for i in range(n):
                             worst = worse(worst, shift[i], np.sqrt(max(cov[i, i], 0.0)))
                             worst = worse(worst, excess[i], cov[i, i])
-                    figures[row] = worst
+                    figures[0, row] = worst
                 if not (any_end if last_one else any_inside):
                     continue
                 # What is observed: values, spans, and the covariance of its noise.
@@ -393,7 +395,7 @@ def segment(
                         worst = worse(worst, bias, np.sqrt(max(variance, 0.0)))
                         worst = worse(worst, square - bias * bias - linear, variance)
                     if last_one:
-                        figures[row] = max(figures[row], worst)
+                        figures[0, row] = max(figures[0, row], worst)
                     else:
                         inside_figure = worst
                 # The Kalman update in Joseph's form.
@@ -407,6 +409,10 @@ def segment(
                 for i in range(m):
                     for d in range(m):
                         V[i, d] = dot(across[i], H[d]) + S[i, d]
+                for i in range(m):
+                    if angles[i] and weights[i] != 0.0:
+                        least = max(2.0 * np.pi - 2.0 * abs(residual[i]), 0.0)
+                        figures[1, row] = max(figures[1, row], np.exp(-np.pi * least / V[i, i]))
                 positive = root(V, factor)
                 total += log_normal(factor, positive, residual)
                 for d in range(n):
@@ -448,7 +454,7 @@ def segment(
                     positive = root(S, factor)
                     total -= log_normal(factor, positive, observed)
         if any_inside:
-            figures[row] = max(figures[row], inside_figure)
+            figures[0, row] = max(figures[0, row], inside_figure)
         gains[row] = total
         for i in range(n):
             means[row, i] = mean[i]

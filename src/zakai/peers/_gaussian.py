@@ -10,6 +10,7 @@ import numpy as np
 from zakai.densities import GaussianMixture
 from zakai.methods._moments import prior_moments, wrapped
 from zakai.methods._protocol import Info
+from zakai.models.angles import ONE_IMAGE
 from zakai.models.model import Model
 from zakai.peers import _float64  # noqa: F401
 from zakai.peers._translation import (
@@ -21,6 +22,7 @@ from zakai.peers._translation import (
     Prepared,
     System,
     compiled,
+    image_health,
     in_deviations,
     innovations,
     seen_from,
@@ -35,6 +37,7 @@ from tensorflow_probability.substrates.jax.distributions import MultivariateNorm
 BOUNDS = {
     "indefinite_cov": (1e-9, "the covariance has a negative eigenvalue (its share of the largest), or is not finite"),
     "innovation_excess": (DOUBTFUL, DIVERGED),
+    "other_image": ONE_IMAGE,
 }
 FIRST_ORDER = (
     "of first order in the interval for increments, and in a substep of second (midpoint) or first (euler, or where noise "
@@ -120,6 +123,7 @@ def _conditioned(
     indefinite = jnp.where(size > 0, jnp.maximum(-jnp.min(values), 0.0) / size, 0.0)
     lost = jnp.where(jnp.isfinite(size) & jnp.all(jnp.isfinite(mean)), indefinite, jnp.inf)
     health = {"indefinite_cov": lost, "smallest_eigenvalue": jnp.min(values), "innovation_excess": in_deviations(sums)}
+    health |= image_health(system, observation, expected, spread)
     return State(mean, cov, sums), Info(evidence, mean, cov, health)
 
 

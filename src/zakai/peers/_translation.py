@@ -218,6 +218,21 @@ def seen_from(system: System, observation: Observation, x: Any, t: Any, theta: A
     return found, lambda y: whiten @ near(system.observation(y, t, theta))
 
 
+def image_health(system: System, observation: Observation, expected: Any, spread: Any) -> dict[str, Any]:
+    """Return the largest weight of another image of an angle relative to the nearest, where there are angles.
+
+    `expected` (m,) and `spread` (m, m) are the mean and the covariance of the white observation.
+    """
+    if not len(system.turning):
+        return {}
+    unit = jnp.eye(system.m) - jnp.diag(1.0 * observation.mask)
+    back = jnp.linalg.inv(observation.whiten + unit)
+    variance = jnp.diag(back @ spread @ back.T)
+    apart = jnp.abs(back @ (observation.values - expected))
+    weights = jnp.exp(-np.pi * jnp.maximum(2 * np.pi - 2 * apart, 0.0) / variance)
+    return {"other_image": jnp.max((observation.mask * weights)[system.turning])}
+
+
 def log_density(system: System, observation: Observation, x: Any, t: Any, theta: Any) -> Any:
     """Return log p(z | x) relative to the constant of the observation; of angles the sum over their images."""
     seen, h = seen_from(system, observation, x, t, theta)

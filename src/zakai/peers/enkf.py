@@ -18,6 +18,7 @@ from zakai.algebra.theorems import smooth_system as theorem
 from zakai.densities import PointMasses
 from zakai.methods._options import real_number, whole_number
 from zakai.methods._protocol import Info, Method
+from zakai.models.angles import ONE_IMAGE
 from zakai.models.model import Model
 from zakai.peers import _float64  # noqa: F401
 from zakai.peers._sampling import ahead, draws, first_key, moments, moved, prepared_by
@@ -30,6 +31,7 @@ from zakai.peers._translation import (
     Prepared,
     System,
     compiled,
+    image_health,
     in_deviations,
     innovations,
     seen_from,
@@ -120,6 +122,7 @@ def _advanced(system: System, interval: Interval, state: State, observation: Obs
     pure_noise = -0.5 * jnp.sum(observation.values**2) - 0.5 * system.m * jnp.log(2 * jnp.pi)
     evidence = after.log_normalizing_constant - pure_noise + observation.constant
     health = {"smallest_deviation": jnp.sqrt(jnp.min(jnp.diag(cov))), "innovation_excess": in_deviations(sums)}
+    health |= image_health(system, observation, expected, spread + jnp.eye(system.m))
     return State(jax.random.key_data(after.key), after.ensemble, sums), Info(evidence, mean, cov, health)
 
 
@@ -155,7 +158,7 @@ METHOD: Method[Prepared, State] = Method(
     segment=segment,
     density=density,
     state=State,
-    bounds={"innovation_excess": (DOUBTFUL, DIVERGED)},
+    bounds={"innovation_excess": (DOUBTFUL, DIVERGED), "other_image": ONE_IMAGE},
     differentiable=False,
     valid=valid,
 )

@@ -77,9 +77,9 @@ def _programs(model: Model, theta: Array) -> tuple[Any, ...] | None:
 
 
 def advance(loop: Loop, rows: slice, mean: Array, cov: Array, values: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the means (R, n), the covariances (R, n, n), the gains (R,) and the figures (R,) after the intervals of a slice."""
+    """Return the means (R, n), the covariances (R, n, n), the gains (R,) and the figures (2, R) of a slice of intervals."""
     count, n = len(values), len(mean)
-    means, covs, gains, figures = np.empty((count, n)), np.empty((count, n, n)), np.empty(count), np.empty(count)
+    means, covs, gains, figures = np.empty((count, n)), np.empty((count, n, n)), np.empty(count), np.empty((2, count))
     parts = (loop.first[rows.start : rows.stop + 1], *loop.parts)
     intervals = tuple(part[rows] for part in loop.intervals)
     segment(

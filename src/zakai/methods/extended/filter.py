@@ -36,6 +36,7 @@ from zakai.methods.extended.compiled import Loop, advance, loop_of
 from zakai.methods.extended.linearisation import linearisation
 from zakai.methods.extended.linearised_system import Formulas, Part, formulas_of, part_of, rate_noise_of, subdivided
 from zakai.methods.line.cross import OMITTED
+from zakai.models.angles import other_image
 from zakai.models.model import Model
 from zakai.numerics.complex_step import cholesky, is_complex
 from zakai.numerics.flow import Coefficients, integrate
@@ -164,18 +165,30 @@ def step(
                 observed = [_Observed(rates, inside.astype(float), noise) for noise in prepared.rate_noise[j]]
             part = part_of(prepared.parts, j)
             if prepared.riccati == "euler":
-                state, more = _euler(prepared, state, observed, part)
+                state, gained = _euler(prepared, state, observed, part)
             else:
-                state, more = _stable(prepared, state, observed, part, keep)
-            log_factor = log_factor + more
+                state, gained = _stable(prepared, state, observed, part, keep)
+            log_factor = log_factor + gained
     at_end, noise = prepared.at_end[k], _noise_at_end(prepared, k, state)
     curved = linearisation(prepared, k, before, state, noise)
+    more: dict[str, float] = {}
+    if any(prepared.formulas.angles):
+        more["other_image"] = _other_image(prepared, k, state, values, noise)
     if at_end.any():
         observed_end = _Observed(np.where(at_end, values, 0.0), prepared.spans[k], noise)
-        state, more = _update(prepared, state, observed_end, stop, prepared.end_inputs[k])
-        log_factor = log_factor + more
+        state, gained = _update(prepared, state, observed_end, stop, prepared.end_inputs[k])
+        log_factor = log_factor + gained
     info = info_of(state, log_factor)
-    return state, info._replace(health={**info.health, "linearisation": curved})
+    return state, info._replace(health={**info.health, "linearisation": curved, **more})
+
+
+def _other_image(prepared: Prepared, k: int, state: State, values: Array, noise: Array) -> float:
+    """Return the largest weight of another image of an angle that is observed at the end of interval k."""
+    which = prepared.at_end[k] & np.array(prepared.formulas.angles)
+    stop, u = float(prepared.schedule.stops[k]), prepared.end_inputs[k]
+    value, slope = prepared.formulas.observe(state.mean, stop, prepared.theta, u)
+    variance = np.diagonal(slope @ state.cov @ slope.T + noise)
+    return other_image(wrap(values - value)[which], variance[which])
 
 
 def _noise_at_end(prepared: Prepared, k: int, state: State) -> Array:
@@ -196,7 +209,9 @@ def advance_many(prepared: Prepared, rows: slice, state: State, values: Array) -
     eigenvalues = covs[finite][:, 0] if means.shape[1] == 1 else np.linalg.eigvalsh(covs[finite])
     least[finite], size = eigenvalues.min(axis=1), np.abs(eigenvalues).max(axis=1)
     indefinite[finite] = np.where(size > 0, np.maximum(-least[finite], 0.0) / np.where(size > 0, size, 1.0), 0.0)
-    health = {"indefinite_cov": indefinite, "smallest_eigenvalue": least, "linearisation": figures}
+    health = {"indefinite_cov": indefinite, "smallest_eigenvalue": least, "linearisation": figures[0]}
+    if any(prepared.formulas.angles):
+        health["other_image"] = figures[1]
     return [State(*pair) for pair in zip(means, covs, strict=True)], Infos(gains, means, covs, health)
 
 

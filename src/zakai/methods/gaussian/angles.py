@@ -20,7 +20,7 @@ from zakai.methods._protocol import Backward, Info
 from zakai.methods.gaussian import families
 from zakai.methods.gaussian.backward import BACKWARD as PLAIN
 from zakai.methods.gaussian.ends import Ends
-from zakai.models.angles import TURN, nearest
+from zakai.models.angles import ONE_IMAGE, nearest, other_image
 from zakai.models.model import Model
 from zakai.numerics.gaussian.exponents import Exponents
 from zakai.numerics.transition import Array
@@ -28,11 +28,7 @@ from zakai.records.schedule import Schedule
 
 BOUNDS = {
     **families.BOUNDS,
-    "other_image": (
-        1e-6,
-        "weight of another image of an observed angle (z + 2 pi) relative to the nearest, the only one that this method takes; "
-        'method="general-direct" takes all of them',
-    ),
+    "other_image": (ONE_IMAGE[0], f'{ONE_IMAGE[1]}; method="general-direct" takes all of them'),
 }
 
 
@@ -78,11 +74,9 @@ def _nearest(prepared: Prepared, k: int, state: families.State, values: Array) -
     _, info = families.step(prepared.ahead, k, state, np.zeros(len(values)))
     C, c, S = (part[k] for part in prepared.observation)
     expected = C @ (info.mean - prepared.own.setup.origin) + c
-    variance = np.real(np.diagonal(C @ info.cov @ C.T + S))[angles]
-    apart = np.abs(np.real(wrap(values - expected)))[angles]
-    weight = np.exp(-TURN * np.maximum(TURN - 2.0 * apart, 0.0) / (2.0 * variance))
+    weight = other_image(wrap(values - expected)[angles], np.diagonal(C @ info.cov @ C.T + S)[angles])
     # The image is a whole number of turns away, whatever the derivatives of what is expected.
-    return values + np.real(nearest(values, expected, angles) - values), float(weight.max())
+    return values + np.real(nearest(values, expected, angles) - values), weight
 
 
 def step(prepared: Prepared, k: int, state: families.State, values: Array) -> tuple[families.State, Info]:
