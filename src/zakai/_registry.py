@@ -24,6 +24,10 @@ METHODS = {
         "zakai.methods.kalman_bucy",
         "exact for linear systems in any number of states, whatever the prior; singular noise is allowed",
     ),
+    "conditionally-gaussian": Entry(
+        "zakai.methods.conditionally_gaussian",
+        "exact for f and h that are affine in x, with coefficients that depend on what is observed",
+    ),
     "benes": Entry(
         "zakai.methods.benes",
         "exact for affine h and a drift L x + l + G grad log cosh(q.x + delta), in any number of states",
@@ -58,7 +62,7 @@ METHODS = {
     ),
     "extended-kalman-bucy": Entry(
         "zakai.methods.extended_kalman_bucy",
-        "approximate for any smooth system: linearised at the mean, one Gaussian; only when it is named",
+        "approximate for formulas with a derivative almost everywhere: linearised at the mean; only when it is named",
     ),
 }
 # Filters of other libraries, to compare with: never taken by "auto", and each needs the extra `peers`.
@@ -72,7 +76,7 @@ PEERS = {
     ),
 }
 # What "auto" tries, most exact and cheapest first; the last holds for any smooth system of few states.
-AUTO = ("kalman-bucy", "benes", "hu-yau", "limited-direct", "general-direct", "yau-yau")
+AUTO = ("kalman-bucy", "conditionally-gaussian", "benes", "hu-yau", "limited-direct", "general-direct", "yau-yau")
 
 
 def load(name: str) -> Any:

@@ -13,6 +13,7 @@ from zakai.errors import InputError
 # The entries of citations.bib by method; each paper is in the `source` of the method too.
 PAPERS = {
     "kalman-bucy": ("kalman-bucy-1961", "makowski-1986"),
+    "conditionally-gaussian": ("liptser-shiryaev-1977", "makowski-1986"),
     "benes": ("benes-1981", "makowski-1986"),
     "hu-yau": ("hu-yau-2002", "makowski-1986"),
     "limited-direct": ("chen-luo-yau-2017",),

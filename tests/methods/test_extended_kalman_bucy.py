@@ -328,7 +328,6 @@ def test_noise_that_depends_on_the_state_is_that_at_the_mean():
     ("keys", "words"),
     [
         ({"observation_kind": "samples", "observation_family": "poisson", "observation_noise": None}, "is Gaussian"),
-        ({"drift": ["v", "-sign(x)"]}, "without sign"),
         ({"domain": {"x": {"lower": -50.0}}}, "every state is free"),
     ],
 )

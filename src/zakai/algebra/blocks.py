@@ -14,6 +14,7 @@ from zakai.models.features import (
     JUMPS,
     KINKS,
     OBSERVATION_FAMILY,
+    OBSERVED_ANGLES,
     SINC,
     STATE_DEPENDENT_DIFFUSION,
     STATE_DEPENDENT_OBSERVATION_NOISE,
@@ -24,8 +25,11 @@ from zakai.models.model import Model
 
 # The features with which a model is divided.
 DIVIDED = frozenset(
-    {STATE_DEPENDENT_DIFFUSION, STATE_DEPENDENT_OBSERVATION_NOISE, OBSERVATION_FAMILY, DOMAIN, TABLES, KINKS, JUMPS, SINC}
-)
+    {
+        STATE_DEPENDENT_DIFFUSION, STATE_DEPENDENT_OBSERVATION_NOISE, OBSERVATION_FAMILY, OBSERVED_ANGLES, DOMAIN, TABLES, KINKS,
+        JUMPS, SINC,
+    }
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -146,6 +150,8 @@ def part_of(model: Model, states: tuple[int, ...], rows: tuple[int, ...], prior:
         **_noise(model, states),
         "observation": observed,
         "observation_noise": model.observation_noise.extract(rows, rows).tolist() if rows else None,
+        "observation_names": [model.observation_names[i] for i in rows] or None,
+        "observed_angles": [model.observation_names[i] for i in rows if model.observation_names[i] in model.observed_angles],
         "observation_kind": model.observation_kind,
         "start": model.start,
         "periodic": [name for name in model.periodic if name in names],

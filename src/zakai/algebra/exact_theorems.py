@@ -33,7 +33,7 @@ def kalman_bucy(model: Model) -> tuple[Condition, ...]:
         *conditions,
         _affine("f = L(t) x + l(t)", model.drift, model, _KALMAN),
         _affine("h = C(t) x + c(t)", model.observation, model, _KALMAN),
-        *_posterior_on_the_line(model),
+        *posterior_on_the_line(model),
     )
 
 
@@ -49,7 +49,7 @@ def benes(model: Model) -> tuple[Condition, ...]:
     return (
         *conditions,
         Condition(statement, form is not None and form.is_log_cosh, f"phi = {short(own.phi)}", _BENES),
-        *_posterior_on_the_line(model),
+        *posterior_on_the_line(model),
     )
 
 
@@ -76,7 +76,7 @@ def hu_yau(model: Model) -> tuple[Condition, ...]:
             words,
             "the nodes of this method",
         ),
-        *_posterior_on_the_line(model),
+        *posterior_on_the_line(model),
     )
 
 
@@ -108,7 +108,7 @@ def _affine(statement: str, field: sp.MatrixBase, model: Model, source: str) -> 
     return Condition(statement, holds, evidence, source)
 
 
-def _posterior_on_the_line(model: Model) -> Iterator[Condition]:
+def posterior_on_the_line(model: Model) -> Iterator[Condition]:
     """What Gaussians need of the prior and of the states."""
     fits = not isinstance(model.prior, DensityPrior) or model.n <= _MOST_STATES
     kind = "no prior" if model.prior is None else type(model.prior).__name__.removesuffix("Prior").lower()

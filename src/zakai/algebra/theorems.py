@@ -11,6 +11,7 @@ import sympy as sp
 
 from zakai import _registry
 from zakai.algebra._readable import short
+from zakai.algebra.conditional import conditionally_gaussian
 from zakai.algebra.conditions import Condition
 from zakai.algebra.exact_theorems import benes, hu_yau, kalman_bucy
 from zakai.algebra.exponentials import wei_norman_filter
@@ -203,6 +204,7 @@ def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
 # The theorem that says when a method holds, by the method's name.
 THEOREMS: Mapping[str, Callable[[Model], tuple[Condition, ...]]] = {
     "kalman-bucy": kalman_bucy,
+    "conditionally-gaussian": conditionally_gaussian,
     "benes": benes,
     "hu-yau": hu_yau,
     "limited-direct": limited_direct,
@@ -236,11 +238,13 @@ def in_order(model: Model) -> tuple[str, ...]:
     last: tuple[str, ...] = ()
     nonlinear, samples = affine_observation(model) is None, model.observation_kind == "samples"
     laws = features.OF_OBSERVATION & model.features.keys()
-    if model.features or (model.n < 4 and nonlinear):
+    if model.features.keys() - {features.OBSERVED_ANGLES} or (model.n < 4 and nonlinear):
         last = ("general-direct",)
     kinks = not samples and model.observation.has(sp.Abs, sp.sign)
     if model.n == 3 or (model.n > 1 and kinks) or (model.n == 2 and samples and (nonlinear or laws)):
         last = ("limited-direct", "general-direct")
+    if features.OBSERVED_ANGLES in model.features:
+        last = (*last, "kalman-bucy")  # it takes the nearest image alone
     return (*(name for name in _registry.AUTO if name not in last), *last)
 
 
@@ -250,7 +254,8 @@ def conditions_of(name: str, model: Model) -> tuple[Condition, ...]:
     Features of the model that the method does not handle fail first, and its theorem, which does not know them, is not asked.
     """
     if model.features:
-        handled = _registry.load(name).handles if name in _registry.METHODS else frozenset()
+        # Filters of other libraries handle the same, and are not loaded for an answer.
+        handled = _registry.load(name).handles if name in _registry.METHODS else features.LINEARISED
         refused = tuple(
             Condition(ASSUMPTIONS[feature], False, words, NOT_HANDLED)
             for feature, words in model.features.items()

@@ -14,6 +14,7 @@ import numpy as np
 
 from zakai.engine.feed import Feed, Moment
 from zakai.methods._protocol import Info
+from zakai.models.features import OBSERVED_PATH
 from zakai.models.model import Model
 from zakai.records.inputs import Inputs
 
@@ -109,7 +110,9 @@ def _check_believable(feed: Feed, moment: Moment) -> None:
     if moment.length > 0:
         follower = Feed(feed.setting)
         follower.now = moment
-        follower.moved(moment.time + moment.length, [math.nan] * feed.m, moment.inputs)
+        # Where formulas contain what is observed, the next step needs an observation: y stays what it is.
+        given = list(moment.values) if OBSERVED_PATH in model.features else [math.nan] * feed.m
+        follower.moved(moment.time + moment.length, given, moment.inputs)
 
 
 def _inputs(model: Model, time: float, data: Any, arrays: Iterator[tuple[int, np.ndarray]]) -> Inputs | None:

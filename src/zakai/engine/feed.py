@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities import Density
+from zakai.engine.along_path import along_path
 from zakai.engine.lengths import notes_on_lengths
 from zakai.engine.misfit import notes_on_law
 from zakai.engine.setting import Setting
@@ -112,7 +113,9 @@ class Feed:
             return moment.notes
         (values, seen, elapsed), stop = moment.observed, np.array([moment.time])
         schedule = Schedule(stop - moment.length, stop, np.array([seen]), np.array([elapsed]), moment.inputs)
-        model, theta, infos = self.setting.model, self.setting.theta.real, stacked([moment.info])
+        theta, infos = self.setting.theta.real, stacked([moment.info])
+        path = getattr(moment.state, "path", None)
+        model, schedule = along_path(self.setting.model, schedule, np.array([values]), None if path is None else path - values)
         lengths = notes_on_lengths(model, theta, schedule, infos)
         return (*moment.notes, *lengths, *notes_on_law(model, theta, schedule, np.array([values]), infos))
 

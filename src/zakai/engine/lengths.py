@@ -75,7 +75,7 @@ def _distances(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> 
     length = np.max(inside, axis=1)
     with np.errstate(all="ignore"):
         reach = np.sqrt(np.diagonal(np.real(infos.cov), axis1=1, axis2=2))
-        precision = np.linalg.inv(np.broadcast_to(S(np.zeros(n), times, theta), (len(times), m, m)))
+        precision = np.linalg.inv(np.broadcast_to(S(np.zeros(n), times, theta, u), (len(times), m, m)))
         sides = [mean, *(mean + side * axis for side in (reach, -reach) for axis in np.eye(n))]
         seen, drift = np.stack([h(x, times, theta, u) for x in sides]), np.stack([f(x, times, theta, u) for x in sides])
         rate = np.nan_to_num(np.abs(drift[1:] - drift[0]) / reach).max(axis=(0, 2))  # fast changes of the drift end within it

@@ -10,6 +10,7 @@ import numpy as np
 
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
+from zakai.engine.along_path import along_path, record_along
 from zakai.engine.health_warnings import warnings_of_run
 from zakai.engine.lengths import notes_on_lengths
 from zakai.engine.misfit import notes_on_law
@@ -132,6 +133,7 @@ class Run:
     def __init__(self, setting: Setting, record: Record, keep: str | None, most: float = KEPT_BYTES):
         self.setting, self.record, self.most = setting, record, most
         self.schedule, self.values = schedule_of(setting.model, record)
+        self.noted = along_path(setting.model, self.schedule, self.values)
         self.keep, self.must_keep = keep != "moments", keep == "densities"
         self.empty, self.state = setting.begin()
         self.first = self.state
@@ -141,9 +143,9 @@ class Run:
             [
                 *notes_on_start(self.schedule),
                 *_after_gaps(self.schedule),
-                *notes_on_noise(setting.model, self.schedule),
+                *notes_on_noise(*self.noted),
                 *notes_on_angles(setting.model, record),
-                *notes_on_tables(setting.model, setting.theta.real, record),
+                *notes_on_tables(self.noted[0], setting.theta.real, record_along(record, self.noted[1])),
                 *self.empty.notes,
             ]
         )
@@ -183,7 +185,7 @@ class Run:
         bad = ~np.isfinite(infos.log_likelihood_increment)
         if not bad.any():
             return
-        model, k = self.setting.model, int(np.argmax(bad))
+        (model, schedule), k = self.noted, int(np.argmax(bad))
         stop = float(self.schedule.stops[self.done + k])
         density = self.setting.method.density(self.empty, self.state)
         with np.errstate(all="ignore"):
@@ -193,7 +195,7 @@ class Run:
         points = centre + np.linspace(-8.0, 8.0, 257)[:, None, None] * np.diag(width)
         points = points.reshape(-1, model.n)
         for key in ("drift", "observation"):
-            reason = why_not_finite(model, key, points, stop, self.setting.theta.real, self.schedule.inputs)
+            reason = why_not_finite(model, key, points, stop, self.setting.theta.real, schedule.inputs)
             if reason:
                 raise InputError(f"{model.source}: {reason}, which the density reaches")
 
@@ -232,11 +234,12 @@ class Run:
             _density=self.density if kept else None,
             _no_density=self._no_density(),
         )
-        theta = self.setting.theta.real
-        undefined = notes_on_formulas(model, theta, self.record, result.mean, result.variance)
-        undefined += notes_on_domain(model, theta, self.record, result.mean, result.variance)
-        lengths = notes_on_lengths(model, theta, self.schedule, infos)
-        misfit = notes_on_law(model, theta, self.schedule, self.values, infos)
+        theta, (noted, schedule) = self.setting.theta.real, self.noted
+        record = record_along(self.record, schedule)
+        undefined = notes_on_formulas(noted, theta, record, result.mean, result.variance)
+        undefined += notes_on_domain(noted, theta, record, result.mean, result.variance)
+        lengths = notes_on_lengths(noted, theta, schedule, infos)
+        misfit = notes_on_law(noted, theta, schedule, self.values, infos)
         result.warnings.extend([*undefined, *self.notes, *lengths, *misfit, *warnings_of_run(result)])
         return result
 

@@ -101,7 +101,8 @@ def _note_on_misfits(short: Array, times: Array) -> list[str]:
 def _largest_of_increments(model: Model, theta: Array, schedule: Schedule, values: Array) -> Array:
     seen, spans, m = schedule.seen, schedule.elapsed, model.m
     function = kept(model, _largest_of_increments, lambda: numpy_function(model.observation_noise, model, (m, m)))
-    noise = function(np.zeros(model.n), schedule.stops, theta)
+    u = None if schedule.inputs is None else schedule.inputs.at(schedule.stops, model.input_hold)
+    noise = function(np.zeros(model.n), schedule.stops, theta, u)
     both = seen[:, :, None] & seen[:, None, :]
     cov = np.where(both, noise * np.minimum(spans[:, :, None], spans[:, None, :]), np.eye(m) * ~seen[:, None, :])
     return np.asarray(0.5 * (values * np.linalg.solve(cov, values[:, :, None])[:, :, 0]).sum(axis=1))

@@ -8,6 +8,7 @@ import numpy as np
 import sympy as sp
 
 from zakai.models._entries import formula
+from zakai.models.angles import observed_angles
 from zakai.models.features import formulas_of
 from zakai.models.functions import TableFunction
 from zakai.models.kept import kept
@@ -77,9 +78,9 @@ def notes_on_start(schedule: Schedule) -> list[str]:
 
 def notes_on_angles(model: Model, record: Record) -> list[str]:
     """Return a sentence where samples of an angle exceed a turn, as they do in degrees."""
-    if "von-mises" not in model.observation_family:
+    angles = np.array(observed_angles(model)) | (np.array(model.observation_family) == "von-mises")
+    if not angles.any():
         return []
-    angles = np.array([family == "von-mises" for family in model.observation_family])
     largest = float(np.nanmax(np.abs(np.asarray(record.values, float)[:, angles]), initial=0.0))
     if largest <= 2 * np.pi + 1e-6:
         return []

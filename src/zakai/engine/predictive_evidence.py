@@ -18,7 +18,7 @@ from zakai.numerics.tangent_quadrature import distribution
 from zakai.records.schedule import Schedule
 
 Array = NDArray[Any]
-COUNTS, ANGLES = ("poisson", "bernoulli"), ("von-mises",)
+COUNTS = ("poisson", "bernoulli")
 WIDTH = 3.0  # predictive standard deviations to which half of the nodes are given
 SUMMED = 64  # the largest count whose probabilities are summed one by one
 
@@ -32,7 +32,9 @@ class PredictiveEvidence:
     def __init__(self, setting: Setting, schedule: Schedule, sums: PredictiveSums, spread: list[tuple[float, float]]):
         self.setting, self.model, self.sums, self.spread = setting, setting.model, sums, spread
         self.samples = self.model.observation_kind == "samples"
-        self.families = self.model.observation_law.families if self.samples else ("gaussian",) * self.model.m
+        law = self.model.observation_law
+        self.families = law.families if self.samples else ("gaussian",) * self.model.m
+        self.angles = [angle or family == "von-mises" for angle, family in zip(law.angles, self.families, strict=True)]
         self.prefixes = _prefixes(schedule, schedule.stops if self.samples else schedule.starts)
         self.prepared: dict[int, Any] = {}
         self.mass_error = 0.0
@@ -106,7 +108,7 @@ class PredictiveEvidence:
         if family in COUNTS and z <= SUMMED:
             terms = np.exp([log_density(float(count)) for count in range(int(z) + 1)])
             return float(terms[:-1].sum()), float(terms.sum())
-        if family in ANGLES:
+        if self.angles[j]:
             z = pi - (pi - z) % (2 * pi)
             location = 0.0, 0.0
         # The sum over many counts is the integral between halves.

@@ -20,6 +20,7 @@ from zakai.engine.loop import CHUNK, Run, segments
 from zakai.engine.predictive import Pair, PredictiveSums
 from zakai.engine.predictive_evidence import PredictiveEvidence
 from zakai.errors import InputError
+from zakai.models.features import OBSERVED_PATH
 from zakai.numerics.tangent_quadrature import MASS_ERROR
 
 if TYPE_CHECKING:
@@ -62,6 +63,8 @@ def _laws(run: Run, first: int) -> Iterator[tuple[int, Pair, float, float]]:
     setting, model = run.setting, run.setting.model
     if model.observation_kind == "samples" and model.log_density is not None and model.m > 1:
         raise InputError(f"{model.source}: residuals: observation_log_density of several coordinates gives no law of one of them")
+    if OBSERVED_PATH in model.features:
+        raise InputError(f"{model.source}: residuals: an increment has no law here where formulas contain what is observed")
     spread = [_spread(run.values[run.schedule.seen[:, j], j]) for j in range(model.m)]
     for segment in segments(setting, run.schedule, run.state, run.values):
         if segment.rows.start == 0:

@@ -22,4 +22,5 @@ METHOD = replace(
     exactness="exact for y that is linear between observations, and for samples; the prior to 1e-12",
     theorem=theorem,
     handles=frozenset({INPUTS}),
+    variant=None,
 )

@@ -7,8 +7,9 @@ from zakai.methods._protocol import Backward, Method
 from zakai.methods.extended.backward import density as smoothed_density
 from zakai.methods.extended.backward import message, smoothed
 from zakai.methods.extended.backward import step as step_back
-from zakai.methods.extended.filter import Prepared, State, density, init, prepare, step, valid
-from zakai.models.features import CROSS_NOISE, INPUTS, KINKS, SINC, STATE_DEPENDENT_DIFFUSION, TABLES
+from zakai.methods.extended.filter import Prepared, State, density, init, prepare, segment, step, valid
+from zakai.models.angles import ONE_IMAGE
+from zakai.models.features import CROSS_NOISE, INPUTS, LINEARISED
 
 METHOD: Method[Prepared, State] = Method(
     name="extended-kalman-bucy",
@@ -24,9 +25,11 @@ METHOD: Method[Prepared, State] = Method(
     state=State,
     bounds={
         "indefinite_cov": (1e-9, "the covariance has a negative eigenvalue (its share of the largest), or is not finite"),
+        "other_image": ONE_IMAGE,
         "linearisation": (0.05, "deviations, or a share of a variance, by which a prediction of the linearised system is off"),
     },
     valid=valid,
     backward=Backward(message, step_back, smoothed, smoothed_density),
-    handles=frozenset({CROSS_NOISE, INPUTS, KINKS, SINC, STATE_DEPENDENT_DIFFUSION, TABLES}),
+    handles=LINEARISED | {CROSS_NOISE, INPUTS},
+    segment=segment,
 )

@@ -11,13 +11,23 @@ one, and a density becomes a family of them (Makowski 1986).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
 from zakai.algebra.exact_theorems import kalman_bucy as theorem
 from zakai.methods._protocol import Method
-from zakai.methods.gaussian import families
+from zakai.methods.gaussian import angles, families
 from zakai.methods.gaussian.backward import BACKWARD
-from zakai.models.features import CROSS_NOISE, INPUTS, JUMPS, KINKS, SINC
+from zakai.models.features import CROSS_NOISE, INPUTS, JUMPS, KINKS, OBSERVED_ANGLES, SINC
+from zakai.models.model import Model
 
-METHOD: Method[families.Prepared, families.State] = Method(
+
+def _variant(model: Model, options: Mapping[str, Any]) -> Method[Any, Any]:
+    return OF_ANGLES if OBSERVED_ANGLES in model.features else METHOD
+
+
+METHOD: Method[Any, families.State] = Method(
     name="kalman-bucy",
     source="Kalman and Bucy 1961; other priors: Makowski 1986",
     exactness="exact for y that is linear between observations, and for samples",
@@ -30,7 +40,21 @@ METHOD: Method[families.Prepared, families.State] = Method(
     state=families.State,
     bounds=families.BOUNDS,
     valid=families.valid,
-    handles=frozenset({CROSS_NOISE, INPUTS, JUMPS, KINKS, SINC}),
+    handles=frozenset({CROSS_NOISE, INPUTS, JUMPS, KINKS, OBSERVED_ANGLES, SINC}),
     segment=families.segment_of_families,
     backward=BACKWARD,
+    variant=_variant,
+)
+OF_ANGLES: Method[Any, families.State] = replace(
+    METHOD,
+    exactness=f"{METHOD.exactness}; of an observed angle the nearest image is taken",
+    prepare=angles.prepare,
+    init=angles.init,
+    step=angles.step,
+    density=angles.density,
+    bounds=angles.BOUNDS,
+    valid=angles.valid,
+    segment=None,
+    backward=angles.BACKWARD,
+    variant=None,
 )

@@ -11,7 +11,7 @@ import sympy
 from zakai.errors import InputError
 from zakai.models import _entries, checks
 from zakai.models._errors import did_you_mean, listing, named
-from zakai.models._law_keys import read_law, read_observed
+from zakai.models._law_keys import read_law, read_observed, read_path
 from zakai.models.expressions import MAX_LENGTH
 from zakai.models.formulas import parse_expression
 
@@ -22,7 +22,6 @@ HOLDS = ("zero", "linear")
 MOST_STATES = 1024  # of states, sensors and noises: a default identity matrix has this many squared entries
 MOST_CHARACTERS = 250_000  # of all different formulas together: what a computer reads in seconds
 MOST_PARENTHESES = 8_192
-MAX_NAME = 100  # characters of the name of an observation
 OBSERVATION_KINDS = ("increments", "path", "rates", "samples")
 
 
@@ -131,6 +130,8 @@ def read_formulas(model: Model, keys: Mapping[str, Any]) -> None:
             rows = f"{size} rows of {size} formulas (one a {what})"
             canonical[key] = _entries.matrix_of_formulas(given[key], size, size, rows)
     _refuse_long(canonical)
+    if not custom:
+        read_path(model, keys)
     read = reader(model)
     for key in ("drift", "observation"):
         with named(key):
@@ -148,32 +149,6 @@ def read_formulas(model: Model, keys: Mapping[str, Any]) -> None:
             if key != "diffusion" and not (key == "observation_noise" and model.observation_kind == "samples"):
                 checks.check_independent_of_state(key, model)
     read_law(model, keys, read)
-    with named("observation_names"):
-        vars(model)["observation_names"] = _observation_names(model, keys.get("observation_names"))
-        if keys.get("observation_names") is not None:
-            canonical["observation_names"] = model.observation_names
-
-
-def _observation_names(model: Model, given: Any) -> tuple[str, ...]:
-    """Return the names of the observations: those given, or the state where h is just a state, else y1, y2, ..."""
-    if given is None:
-        if model.observed:
-            return model.observed
-        default = [f"y{j + 1}" for j in range(model.m)]
-        # A state that is called like the observation at another place would exchange the two.
-        own = [formula.name if formula in model.x and formula.name not in default else "" for formula in model.observation]
-        return tuple(name if own.count(name) == 1 and name else other for name, other in zip(own, default, strict=True))
-    names = _entries.items(given, model.m, f"a list of {model.m} names")
-    for name in names:
-        if not isinstance(name, str) or not name.strip() or len(name) > MAX_NAME or not name.isprintable():
-            raise InputError(f"expected a name, got {_entries.kind_of(name)}")
-        if name == "time" or name in model.inputs:
-            raise InputError(
-                f"{name!r} is the name of {'the column of times' if name == 'time' else 'an input'}; give another one"
-            )
-        if names.count(name) > 1:
-            raise InputError(f"{name!r} is there twice")
-    return tuple(names)
 
 
 def reader(model: Model, in_time: bool = True) -> Callable[..., sympy.Expr]:
@@ -181,6 +156,8 @@ def reader(model: Model, in_time: bool = True) -> Callable[..., sympy.Expr]:
     symbols = dict(zip((*model.state, *model.parameters), (*model.x, *model.parameter_symbols), strict=True))
     if in_time:
         symbols |= {"t": model.t, **dict(zip(model.inputs, model.u, strict=True))}
+        if model.observation_kind != "samples":
+            symbols |= dict(zip(model.observed, model.z, strict=True))
     known: dict[str, sympy.Expr] = {}
 
     def read(text: str, place: str = "") -> sympy.Expr:

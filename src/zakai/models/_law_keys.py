@@ -11,6 +11,7 @@ import sympy
 from zakai.errors import InputError
 from zakai.models import _entries
 from zakai.models._errors import did_you_mean, listing, named
+from zakai.models.angles import LINEAR, observed_angles
 from zakai.models.families import FAMILIES
 from zakai.models.formulas import parse_expression
 
@@ -20,17 +21,44 @@ if TYPE_CHECKING:
 
 def read_observed(model: Model, keys: Mapping[str, Any]) -> int:
     """Read the names in `observed`, and return how many there are."""
-    for key in ("observation", "observation_noise", "observation_family", "degrees_of_freedom", "concentration"):
+    for key in (
+        "observation", "observation_noise", "observation_family", "degrees_of_freedom", "concentration", "observed_angles",
+    ):  # fmt: skip
         if keys.get(key) is not None:
             raise InputError(f"{key}: describes the observation, as observation_log_density does; leave one of them out")
     if model.observation_kind != "samples":
         kind = model.observation_kind
         raise InputError(f'observation_log_density: is for samples; give observation_kind = "samples", not "{kind}"')
+    _read_names(model, keys, "used in observation_log_density")
+    if not 1 <= len(model.observed) <= _MOST_OBSERVED:
+        words = f"expected a list of 1 to {_MOST_OBSERVED} names of what is observed, used in observation_log_density"
+        raise InputError(f"observed: {words}")
+    return len(model.observed)
+
+
+_MOST_OBSERVED = 64
+
+
+def read_path(model: Model, keys: Mapping[str, Any]) -> None:
+    """Read the names in `observed` that stand in formulas for the current values y(t) of the m observations."""
+    if keys.get("observed") is None:
+        return
+    if model.observation_kind == "samples":
+        raise InputError(
+            "observed: goes with observation_log_density; samples have no value between their times, so that names of "
+            "observations in formulas are for increments, path and rates"
+        )
+    _read_names(model, keys, "one an observation, which formulas may contain")
+    if len(model.observed) != model.m:
+        raise InputError(f"observed: expected {model.m} names (one an observation), got {len(model.observed)}")
+    vars(model)["_keys"]["observed"] = list(model.observed)
+
+
+def _read_names(model: Model, keys: Mapping[str, Any], what: str) -> None:
+    """Read the names in `observed`."""
     with named("observed"):
-        observed = _entries.names(keys.get("observed", ()), 'a list of names such as ["z"]')
-        if not 1 <= len(observed) <= 64:
-            raise InputError("expected a list of 1 to 64 names of what is observed, used in observation_log_density")
-        for names, what in (
+        observed = _entries.names(keys.get("observed", ()), f'a list of names such as ["z"], {what}')
+        for names, kind in (
             (model.state, "a state"),
             (model.parameters, "a parameter"),
             (model.inputs, "an input"),
@@ -39,15 +67,14 @@ def read_observed(model: Model, keys: Mapping[str, Any]) -> int:
         ):
             for name in observed:
                 if name in names:
-                    raise InputError(f"the name {name!r} is already {what}")
+                    raise InputError(f"the name {name!r} is already {kind}")
     vars(model).update(observed=observed, z=tuple(sympy.Symbol(name, real=True) for name in observed))
-    return len(observed)
 
 
 def read_law(model: Model, keys: Mapping[str, Any], read: Callable[..., sympy.Expr]) -> None:
     """Read the family of each coordinate and its parameters, or the log density; `read` reads a formula."""
     canonical: dict[str, Any] = vars(model)["_keys"]
-    if model.z:
+    if keys.get("observation_log_density") is not None:
         with named("observation_log_density"):
             text = _entries.formula(keys["observation_log_density"])
             symbols = {symbol.name: symbol for symbol in (*model.x, *model.parameter_symbols, *model.u, *model.z, model.t)}
@@ -55,8 +82,6 @@ def read_law(model: Model, keys: Mapping[str, Any], read: Callable[..., sympy.Ex
             if not model.log_density.has(*model.z):  # type: ignore[union-attr]
                 raise InputError(f"does not contain {listing(model.observed)}; it is log p({', '.join(model.observed)} | x)")
         canonical.update(observation_log_density=text, observed=list(model.observed))
-    elif "observed" in keys:
-        raise InputError("observed: goes with observation_log_density, which is missing")
     families = _families(model, keys)
     parameters: dict[tuple[str, int], sympy.Expr] = {}
     for key in ("degrees_of_freedom", "concentration"):
@@ -79,6 +104,12 @@ def read_law(model: Model, keys: Mapping[str, Any], read: Callable[..., sympy.Ex
                         raise InputError(f"expected a positive number, got {text}")
     vars(model).update(observation_family=families, family_parameters=parameters)
     _check_noise_of_families(model, keys)
+    given = keys.get("observation_names")
+    with named("observation_names"):
+        vars(model)["observation_names"] = _observation_names(model, given)
+    if given is not None:
+        vars(model)["_keys"]["observation_names"] = list(model.observation_names)
+    vars(model)["observed_angles"] = _observed_angles(model, keys)
 
 
 def _families(model: Model, keys: Mapping[str, Any]) -> tuple[str, ...]:
@@ -109,3 +140,59 @@ def _check_noise_of_families(model: Model, keys: Mapping[str, Any]) -> None:
                 raise InputError(f"[{i}][{j}]: the family {other} has no correlations; give 0")
             if i == j and not FAMILIES[families[i]].noise and entry != 1:
                 raise InputError(f"[{i}][{i}]: the family {families[i]} has no noise of its own; give 1, or leave it out")
+
+
+def _observation_names(model: Model, given: Any) -> tuple[str, ...]:
+    """Return the names of the observations: those given, or the state where h is just a state, else y1, y2, ..."""
+    if given is None:
+        if model.observed:
+            return model.observed
+        default = [f"y{j + 1}" for j in range(model.m)]
+        # A state that is called like the observation at another place would exchange the two.
+        own = [formula.name if formula in model.x and formula.name not in default else "" for formula in model.observation]
+        return tuple(name if own.count(name) == 1 and name else other for name, other in zip(own, default, strict=True))
+    names = _entries.items(given, model.m, f"a list of {model.m} names")
+    for name in names:
+        if not isinstance(name, str) or not name.strip() or len(name) > MAX_NAME or not name.isprintable():
+            raise InputError(f"expected a name, got {_entries.kind_of(name)}")
+        if name == "time" or name in model.inputs:
+            raise InputError(
+                f"{name!r} is the name of {'the column of times' if name == 'time' else 'an input'}; give another one"
+            )
+        if names.count(name) > 1:
+            raise InputError(f"{name!r} is there twice")
+    return tuple(names)
+
+
+MAX_NAME = 100  # characters of the name of an observation
+_WIDEST = 0.5  # standard deviation, in radians, of an angle whose noise is correlated: its images are then negligible
+
+
+def _observed_angles(model: Model, keys: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names in `observed_angles`, and check the noise of angles."""
+    given = keys.get("observed_angles")
+    with named("observed_angles"):
+        angles = _entries.names(() if given is None else given, "a list of names of observations that are angles")
+        if angles and model.observation_kind != "samples":
+            kind = model.observation_kind
+            raise InputError(f'is for samples; give observation_kind = "samples", not "{kind}"')
+        for name in angles:
+            if name not in model.observation_names:
+                hint = did_you_mean(name, model.observation_names)
+                raise InputError(f"{name!r} is no observation{hint} (the observations are {listing(model.observation_names)})")
+            family = model.observation_family[model.observation_names.index(name)]
+            if family not in (*LINEAR, "von-mises"):
+                raise InputError(f"{name!r} has the family {family}, whose values are {FAMILIES[family].support}, not angles")
+    if angles:
+        vars(model)["_keys"]["observed_angles"] = list(angles)
+    vars(model)["observed_angles"] = angles
+    if model.log_density is None and model.observation_kind == "samples":
+        for (i, j), entry in model.observation_noise.todok().items():
+            angle = next((k for k in (i, j) if i != j and entry != 0 and observed_angles(model)[k]), None)
+            variance = None if angle is None else model.observation_noise[angle, angle]
+            if variance is not None and variance.is_number and float(variance) > _WIDEST**2:
+                raise InputError(
+                    f"observation_noise: [{i}][{j}]: correlates an angle whose standard deviation is "
+                    f"{float(variance) ** 0.5:.3g}; up to {_WIDEST} the noise of an angle may be correlated; give 0"
+                )
+    return angles

@@ -159,7 +159,7 @@ class Program:
             elif operation == "constant":
                 value = constant
             elif operation == "table":
-                value = constant(*operands)
+                value = functions["table"](constant, *operands) if "table" in functions else constant(*operands)
             elif constant is None:
                 value = functions[operation](*operands)
             else:

@@ -42,6 +42,7 @@ _ORDER = (
     "concentration",
     "observation_log_density",
     "observed",
+    "observed_angles",
 )
 
 

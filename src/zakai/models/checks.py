@@ -11,6 +11,7 @@ from sympy.core.function import AppliedUndef
 
 from zakai.errors import InputError
 from zakai.models._definite import ROUNDING, is_symmetric, smallest_eigenvalue
+from zakai.models.angles import observed_angles
 from zakai.models.kept import kept
 from zakai.models.numeric import NumericFunction, numpy_function
 from zakai.models.prior import DensityPrior
@@ -132,8 +133,8 @@ def joint_covariance(model: Model) -> NumericFunction:
 
 
 def depends_on_state(matrix: sympy.MatrixBase, model: Model) -> bool:
-    """Return whether a matrix depends on the state or on inputs."""
-    return bool(matrix.free_symbols & {*model.x, *model.u})
+    """Return whether a matrix depends on the state, on inputs or on the observed path."""
+    return bool(matrix.free_symbols & {*model.x, *model.u, *model.z})
 
 
 def check_periodic(model: Model) -> None:
@@ -145,9 +146,10 @@ def check_periodic(model: Model) -> None:
         return
     rng = np.random.default_rng(0)
     entries = [(f"drift[{i}]", expr) for i, expr in enumerate(model.drift)]
-    for i, (expr, family) in enumerate(zip(model.observation, model.observation_family, strict=True)):
+    families, angles = model.observation_family, observed_angles(model)
+    for i, (expr, family, wraps) in enumerate(zip(model.observation, families, angles, strict=True)):
         # The mean direction of an angle is an angle.
-        parts = (sympy.sin(expr), sympy.cos(expr)) if family == "von-mises" else (expr,)
+        parts = (sympy.sin(expr), sympy.cos(expr)) if family == "von-mises" or wraps else (expr,)
         entries += [(f"observation[{i}]", part) for part in parts]
     for key in ("diffusion", "observation_noise"):
         entries += [(f"{key}[{i}][{j}]", expr) for (i, j), expr in sorted(getattr(model, key).todok().items())]
@@ -177,7 +179,7 @@ def check_periodic(model: Model) -> None:
 def _instead(model: Model, place: str, expr: sympy.Expr, angle: str) -> str:
     """Return what to write instead of a formula that is not periodic."""
     if place.startswith("observation[") and expr == model.x[model.state.index(angle)] and model.observation_kind == "samples":
-        return f'observe cos({angle}) and sin({angle}), or set observation_family = "von-mises"'
+        return 'list the observation in observed_angles, or set observation_family = "von-mises"'
     return f"write it in cos({angle}) and sin({angle}), or leave {angle} out of periodic"
 
 

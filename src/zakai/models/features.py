@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import sympy
 
 from zakai.models._entries import formula
+from zakai.models.angles import observed_angles, without_branch
 from zakai.models.functions import Floor, Maximum, Minimum, Sinc, TableFunction
 
 if TYPE_CHECKING:
@@ -18,6 +19,8 @@ CROSS_NOISE = "cross noise"
 STATE_DEPENDENT_OBSERVATION_NOISE = "state-dependent observation noise"
 OBSERVATION_FAMILY = "observation family"
 OBSERVATION_LOG_DENSITY = "observation log density"
+OBSERVED_ANGLES = "observed angles"
+OBSERVED_PATH = "observed path"
 DOMAIN = "domain"
 TABLES = "tables"
 KINKS = "kinks"
@@ -25,7 +28,9 @@ JUMPS = "jumps"
 SINC = "sinc"
 
 # The features that belong to the observation alone: the law of the state is that of an ordinary model.
-OF_OBSERVATION = frozenset({STATE_DEPENDENT_OBSERVATION_NOISE, OBSERVATION_FAMILY, OBSERVATION_LOG_DENSITY})
+OF_OBSERVATION = frozenset(
+    {STATE_DEPENDENT_OBSERVATION_NOISE, OBSERVATION_FAMILY, OBSERVATION_LOG_DENSITY, OBSERVED_ANGLES}
+)
 JUMP_FUNCTIONS: tuple[type, ...] = (sympy.sign, Floor, sympy.atan2)
 _OF_FORMULAS: dict[str, tuple[type, ...]] = {
     TABLES: (TableFunction,),
@@ -33,6 +38,12 @@ _OF_FORMULAS: dict[str, tuple[type, ...]] = {
     JUMPS: JUMP_FUNCTIONS,
     SINC: (Sinc,),
 }
+
+
+# The features that leave a model with a derivative almost everywhere, and with Gaussian noise in a small step.
+LINEARISED = frozenset(
+    {STATE_DEPENDENT_DIFFUSION, STATE_DEPENDENT_OBSERVATION_NOISE, OBSERVED_ANGLES, TABLES, KINKS, JUMPS, SINC}
+)
 
 
 # What the theorem of a method assumes that does not handle the feature.
@@ -43,6 +54,8 @@ ASSUMPTIONS = {
     STATE_DEPENDENT_OBSERVATION_NOISE: "S does not depend on the state",
     OBSERVATION_FAMILY: "the noise of observations is Gaussian",
     OBSERVATION_LOG_DENSITY: "the noise of observations is Gaussian",
+    OBSERVED_ANGLES: "no observation is an angle",
+    OBSERVED_PATH: "no formula contains the observed path (conditionally-gaussian takes such formulas)",
     DOMAIN: "every state is free to take any value",
     TABLES: "formulas are without tables",
     KINKS: "formulas are without min and max",
@@ -79,17 +92,22 @@ def features_of(model: Model) -> dict[str, str]:
         found[STATE_DEPENDENT_OBSERVATION_NOISE] = f"observation_noise contains {_short(entry)}"
     if set(model.observation_family) != {"gaussian"}:
         found[OBSERVATION_FAMILY] = f"observation_family: {', '.join(dict.fromkeys(model.observation_family))}"
+    if any(observed_angles(model)):
+        names = [name for name, angle in zip(model.observation_names, observed_angles(model), strict=True) if angle]
+        found[OBSERVED_ANGLES] = f"observed angles: {', '.join(names)}"
     if model.log_density is not None:
         found[OBSERVATION_LOG_DENSITY] = f"observation_log_density: {_short(model.log_density)}"
+    if model.log_density is None and (entry := next((f for f in formulas_of(model) if f.free_symbols & set(model.z)), None)):
+        found[OBSERVED_PATH] = f"a formula contains what is observed: {_short(entry)}"
     if model.domain:
         found[DOMAIN] = f"domain: {', '.join(f'{name} {interval}' for name, interval in model.domain.items())}"
-    return found | _of_formulas(formulas_of(model), model)
+    return found | _of_formulas(formulas_of(model, without_branch(model)), model)
 
 
-def formulas_of(model: Model) -> list[sympy.Expr]:
-    """Return the formulas of a model that are not zero, those of the prior apart."""
+def formulas_of(model: Model, observation: list[sympy.Expr] | None = None) -> list[sympy.Expr]:
+    """Return the formulas of a model that are not zero, those of the prior apart; `observation` may stand for its own."""
     matrices = (model.diffusion, model.process_noise, model.observation_noise, model.cross_noise)
-    formulas = [*model.drift, *model.observation, *model.family_parameters.values()]
+    formulas = [*model.drift, *(observation or model.observation), *model.family_parameters.values()]
     formulas += [entry for matrix in matrices for entry in matrix.todok().values()]
     return formulas + ([] if model.log_density is None else [model.log_density])
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from zakai.models.table import Table
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-_NEAR = 8.0  # |x| up to which the integral of sinc is taken; the recursion loses digits for small |x|
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
+NEAR = 8.0  # |x| up to which the integral of sinc is taken; the recursion loses digits for small |x|
 
 
 class _Real(sympy.Function):  # type: ignore[misc]
@@ -97,8 +97,8 @@ def sinc(x: Any, order: int) -> NDArray[Any]:
     S_k(x) = int_0^1 s^k cos(x s + k pi/2) ds, and x S_k = sin(x + k pi/2) - k S_(k-1) where |x| is large.
     """
     x = np.asarray(x)
-    near = np.abs(x.real) <= _NEAR + 2 * order
-    nodes, weights = (_NODES + 1) / 2, _WEIGHTS / 2
+    near = np.abs(x.real) <= NEAR + 2 * order
+    nodes, weights = (NODES + 1) / 2, WEIGHTS / 2
     small = np.where(near, x, 0.0)[..., None]
     integral = (np.cos(small * nodes + order * np.pi / 2) * (weights * nodes**order)).sum(axis=-1)
     large = np.where(near, 1.0, x)
@@ -106,6 +106,11 @@ def sinc(x: Any, order: int) -> NDArray[Any]:
     for k in range(1, order + 1):
         recursion = (np.sin(large + k * np.pi / 2) - k * recursion) / large
     return np.asarray(np.where(near, integral, recursion))
+
+
+def without_jumps(formula: sympy.Expr, symbol: sympy.Symbol) -> sympy.Expr:
+    """Return the derivative of a formula almost everywhere: apart from its jumps."""
+    return sympy.diff(formula, symbol).replace(sympy.DiracDelta, lambda *_: sympy.S.Zero)
 
 
 def pairwise(function: Callable[[Any, Any], Any], arguments: list[Any]) -> Any:

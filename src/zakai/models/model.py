@@ -27,6 +27,7 @@ KEYS = (
     "name", "state", "drift", "observation", "observation_kind", "diffusion", "process_noise", "observation_noise", "start",
     "periodic", "functions", "parameters", "prior", "inputs", "input_hold", "cross_noise", "observation_family",
     "degrees_of_freedom", "concentration", "observation_log_density", "observed", "domain", "tables", "observation_names",
+    "observed_angles",
 )  # fmt: skip
 Formulas = Sequence[str | float | sympy.Expr]
 FormulaRows = Sequence[Formulas]
@@ -54,6 +55,7 @@ class Model:
     * `observation_family`, for samples: "gaussian", "student-t" (`degrees_of_freedom`), "poisson", "bernoulli" or "von-mises"
       (`concentration`), for all coordinates or a list; or `observation_log_density` instead of `observation`: log p(z | x) in
       the state and the names in `observed`, normalised over z if the evidence is to mean something;
+    * `observed_angles`: names of samples that are angles, with differences modulo 2 pi, as those of an `atan2(...)` always are;
     * `domain`: state -> {"lower": a, "upper": b, "boundary": "natural" or "reflecting"};
     * `tables`: name -> (x, values), (x, y, values) or a table as in a model file;
     * `start`: the time at which the prior holds; `periodic`: states that are angles (period 2 pi);
@@ -97,6 +99,7 @@ class Model:
     log_density: sympy.Expr | None
     observed: tuple[str, ...]
     z: tuple[sympy.Symbol, ...]
+    observed_angles: tuple[str, ...]
     domain: dict[str, Interval]
     tables: dict[str, Table]
 
@@ -123,6 +126,7 @@ class Model:
         concentration: Any = None,
         observation_log_density: str | sympy.Expr | None = None,
         observed: Sequence[str] | None = None,
+        observed_angles: Sequence[str] | None = None,
         domain: Mapping[str, Mapping[str, Any]] | None = None,
         tables: Mapping[str, Any] | None = None,
         functions: Sequence[str] | None = None,
@@ -144,7 +148,7 @@ class Model:
             if keys.get(key) is None and not (key == "observation" and keys.get("observation_log_density") is not None):
                 raise InputError(f"{key}: missing; a model needs state, drift and observation")
         canonical: dict[str, Any] = {}
-        vars(self).update(source=source, _keys=canonical, log_density=None, z=(), observed=())
+        vars(self).update(source=source, _keys=canonical, log_density=None, z=(), observed=(), observed_angles=())
         with named("tables"):
             vars(self)["tables"] = read_tables(keys.get("tables") or {}, folder)
             canonical["tables"] = {name: table.keys() for name, table in self.tables.items()}

@@ -10,8 +10,10 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
+from zakai.densities._density import wrap
 from zakai.errors import InputError
-from zakai.models.families import FAMILIES
+from zakai.models.angles import Wrapped, observed_angles
+from zakai.models.families import FAMILIES, Family
 from zakai.models.numeric import numpy_function
 
 if TYPE_CHECKING:
@@ -24,13 +26,18 @@ _DRAW_POINTS = 4001  # of the grid on which an observation is drawn from a log d
 class ObservationLaw:
     """The law of the m coordinates of a sample of one model; for increments it is that of the noise, and is not used.
 
-    Coordinates of a row are taken in order, each given the state and those before it.
+    Coordinates of a row are taken in order, each given the state and those before it.  Of `angles` (m,) the differences from
+    their locations are taken modulo 2 pi (`models/angles.py`).
     """
 
     def __init__(self, model: Model):
         self._model = model
         self.families = model.observation_family
-        self.is_gaussian = model.log_density is None and set(self.families) == {"gaussian"}
+        self.angles = observed_angles(model)
+        self._laws: list[Family | Wrapped] = [
+            Wrapped(FAMILIES[name]) if angle else FAMILIES[name] for name, angle in zip(self.families, self.angles, strict=True)
+        ]
+        self.is_gaussian = model.log_density is None and set(self.families) == {"gaussian"} and not any(self.angles)
         self._coupled = not model.observation_noise.is_diagonal()
 
     @cached_property
@@ -80,7 +87,7 @@ class ObservationLaw:
         values = np.asarray(values, dtype=float)
         seen = ~np.isnan(values)
         parts = self._parts(values, x, t, theta, u)
-        terms = [FAMILIES[name].log_density(*part) for name, part in zip(self.families, parts, strict=True)]
+        terms = [law.log_density(*part) for law, part in zip(self._laws, parts, strict=True)]
         return np.where(seen, np.stack(np.broadcast_arrays(*terms), axis=-1), 0.0)
 
     def largest(self, seen: Array, x: Any, t: Any, theta: Any, u: Any = None) -> Array:
@@ -92,9 +99,9 @@ class ObservationLaw:
         if self._model.log_density is not None:
             raise InputError("observation_log_density: a law given by its log density has no most probable row here")
         h, *rest = (function(x, t, theta, u) for function in self._functions)
-        modes = np.stack([FAMILIES[name].mode(h[..., j]) for j, name in enumerate(self.families)], axis=-1)
+        modes = np.stack([law.mode(h[..., j]) for j, law in enumerate(self._laws)], axis=-1)
         parts = self._conditional(np.where(seen, modes, np.nan), h, *rest)
-        terms = [FAMILIES[name].log_density(*part) for name, part in zip(self.families, parts, strict=True)]
+        terms = [law.log_density(*part) for law, part in zip(self._laws, parts, strict=True)]
         return np.sum(np.where(seen, np.stack(terms, axis=-1), 0.0), axis=-1)
 
     def cdf(self, values: Any, x: Any, t: Any, theta: Any, u: Any = None) -> tuple[Array, Array]:
@@ -107,7 +114,7 @@ class ObservationLaw:
             raise InputError("observation_log_density: a law given by its log density has no distribution function here")
         values = np.asarray(values, dtype=float)
         parts = self._parts(values, x, t, theta, u)
-        pairs = [FAMILIES[name].cdf(*part) for name, part in zip(self.families, parts, strict=True)]
+        pairs = [law.cdf(*part) for law, part in zip(self._laws, parts, strict=True)]
         seen = ~np.isnan(values)
         below, upto = (np.stack(np.broadcast_arrays(*side), axis=-1) for side in zip(*pairs, strict=True))
         return np.where(seen, below, np.nan), np.where(seen, upto, np.nan)
@@ -136,7 +143,8 @@ class ObservationLaw:
             deviation = np.sqrt(variance)
             parts.append((z[..., j], mean, variance, shape[..., j]))
             columns.append([*factors, deviation])
-            whitened.append(np.where(seen[..., j], (z[..., j] - mean) / deviation, 0.0))
+            apart = wrap(z[..., j] - mean) if self.angles[j] else z[..., j] - mean
+            whitened.append(np.where(seen[..., j], apart / deviation, 0.0))
         return parts
 
     def sample(self, rng: np.random.Generator, x: Array, t: Any, theta: Any, u: Any = None) -> Array:
@@ -150,20 +158,21 @@ class ObservationLaw:
         h, S, shape = (np.broadcast_to(a, (len(x), *a.shape[1:])) for a in (f(x, t, theta, u) for f in self._functions))
         variance = np.diagonal(S, axis1=-2, axis2=-1) if self._coupled else S
         columns = []
-        for j, name in enumerate(self.families):
+        for j, (name, law) in enumerate(zip(self.families, self._laws, strict=True)):
             with np.errstate(all="ignore"):
                 likely = np.round(np.clip(h[:, j], 0, 1))
-                valid = np.isfinite(h[:, j] + FAMILIES[name].log_density(likely, h[:, j], variance[:, j], shape[:, j]))
-                valid &= (variance[:, j] > 0) | (not FAMILIES[name].noise)
+                valid = np.isfinite(h[:, j] + law.log_density(likely, h[:, j], variance[:, j], shape[:, j]))
+                valid &= (variance[:, j] > 0) | (not law.noise)
             if not valid.all():
                 self._refuse(j, name, x[int(np.argmin(valid))])
-            columns.append(FAMILIES[name].sample(rng, h[:, j], variance[:, j], shape[:, j]))
+            columns.append(law.sample(rng, h[:, j], variance[:, j], shape[:, j]))
         draws = np.stack(columns, axis=-1)
         gaussian = [j for j, name in enumerate(self.families) if name == "gaussian"]
         if self._coupled:  # which only Gaussian coordinates are
             factor = np.linalg.cholesky(S[:, gaussian][:, :, gaussian])
             normal = rng.standard_normal((len(x), len(gaussian), 1))
             draws[:, gaussian] = h[:, gaussian] + (factor @ normal)[..., 0]
+            draws[:, list(self.angles)] = wrap(draws[:, list(self.angles)])
         return draws
 
     def _refuse(self, column: int, name: str, x: Array) -> None:
@@ -207,8 +216,7 @@ class ObservationLaw:
 
     def fault(self, values: Array) -> tuple[int, str] | None:
         """Return the row of the first observation (K, m) that the law cannot have made, and why, or None."""
-        for j, name in enumerate(self.families):
-            family = FAMILIES[name]
+        for j, (name, family) in enumerate(zip(self.families, self._laws, strict=True)):
             wrong = ~(np.isnan(values[:, j]) | family.inside(values[:, j]))
             if wrong.any():
                 row = int(np.argmax(wrong))

@@ -13,6 +13,7 @@ from zakai.models._definite import square_root
 from zakai.models._density_draw import draw_from_density
 from zakai.models._entries import kind_of
 from zakai.models.numeric import explain_nonfinite, numpy_function, program_of
+from zakai.models.observed_path import observed_in_formulas, with_path_as_states
 from zakai.models.prior import DensityPrior
 from zakai.models.stepper import Stepper, outside_domain
 
@@ -39,8 +40,9 @@ def simulate(
         x_{j+1} = x_j + f(x_j, t_j) d + g(t_j) Q(t_j)^{1/2} sqrt(d) e_j        e_j ~ N(0, I)
         y_{j+1} = y_j + h(x_j, t_j) d + S(t_j)^{1/2} sqrt(d) e'_j
 
-    Samples are drawn from the model's observation family. A step that would leave a domain with natural ends is halved, with
-    the Brownian bridge between; at reflecting ends the state is mirrored.
+    Formulas that contain the observed values receive those of the path. Samples are drawn from the model's observation family. A
+    step that would leave a domain with natural ends is halved, with the Brownian bridge between; at reflecting ends the state is
+    mirrored.
 
     Args:
         model: the system.
@@ -68,6 +70,8 @@ def simulate(
     from zakai.records import Record, Truth
     from zakai.records.inputs import check_inputs
 
+    if observed_in_formulas(model).any():
+        return _with_path(model, times, seed, initial, substeps, inputs)
     grid = _checked_times(model, times)
     check_inputs(model, inputs, float(grid[-1]))
     counts = _substeps(np.diff(grid), substeps, model)
@@ -90,6 +94,21 @@ def simulate(
             values[:, column] = np.pi - np.mod(np.pi - values[:, column], 2 * np.pi)
     observed = _reading(model, grid, np.concatenate(rows))
     return Truth(grid, values, model.state), Record(grid[1:], observed, model.observation_kind, inputs)
+
+
+def _with_path(
+    model: Model, times: Any, seed: Any, initial: Any, substeps: int | None, inputs: Inputs | None
+) -> tuple[Truth, Record]:
+    """Simulate the state and the path together, where formulas contain what is observed."""
+    from zakai.records import Record, Truth
+
+    grid, both = _checked_times(model, times), with_path_as_states(model)
+    rng = np.random.default_rng(seed)
+    start = np.append(_initial_state(model, initial, rng), np.zeros(model.m))
+    truth, _ = simulate(both, grid[1:], rng, start, substeps, inputs)
+    path = np.diff(truth.values[:, model.n :], axis=0)
+    values = _reading(model, grid, path)
+    return Truth(grid, truth.values[:, : model.n], model.state), Record(grid[1:], values, model.observation_kind, inputs)
 
 
 class _Path:

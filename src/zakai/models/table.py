@@ -61,6 +61,23 @@ class Table:
             self._spline = NdBSpline(tuple(knots), np.ascontiguousarray(coefficients), self.degree)
         return self._spline
 
+    def pieces(self) -> tuple[list[tuple[NDArray[Any], NDArray[Any]]], NDArray[Any]]:
+        """Return for each axis the knots (k) and the polynomials of the B-splines, and the coefficients of their products.
+
+        Between the knots p + degree and p + degree + 1 the splines p, ..., p + degree are polynomials in the distance from the
+        former knot, with coefficients (k - 2 degree - 1, degree + 1, degree + 1), that of the highest power first.
+        """
+        from scipy.interpolate import BSpline, PPoly
+
+        spline, found = self._interpolant(), []
+        for knots in spline.t:
+            count = len(knots) - self.degree - 1
+            splines = [PPoly.from_spline(BSpline(knots, row, self.degree)).c for row in np.eye(count)]
+            near = range(self.degree + 1)
+            polynomials = [[splines[p + i][:, p + self.degree] for i in near] for p in range(count - self.degree)]
+            found.append((knots, np.array(polynomials)))
+        return found, spline.c
+
     def outside(self, *arguments: Any) -> NDArray[np.bool_]:
         """Return where an argument is outside of the range of the table; a periodic table has none."""
         if self.periodic:

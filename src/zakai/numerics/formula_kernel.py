@@ -19,7 +19,7 @@ UNARY = (
 )  # fmt: skip
 BLOCK = 256  # points that are evaluated together
 LARGE = 4096  # points for which NumPy is as fast
-CLOCK, NEITHER = -1, -2  # what a slot holds that holds no coordinate
+CLOCK, NEITHER, FIRST_INPUT = -1, -2, -3  # what a slot holds that holds no coordinate; the input i has FIRST_INPUT - i
 
 
 @helper

@@ -10,6 +10,7 @@ import numpy as np
 from zakai.densities import GaussianMixture
 from zakai.methods._moments import prior_moments, wrapped
 from zakai.methods._protocol import Info
+from zakai.models.angles import ONE_IMAGE
 from zakai.models.model import Model
 from zakai.peers import _float64  # noqa: F401
 from zakai.peers._translation import (
@@ -21,8 +22,10 @@ from zakai.peers._translation import (
     Prepared,
     System,
     compiled,
+    image_health,
     in_deviations,
     innovations,
+    seen_from,
     system_of,
 )
 from zakai.records.schedule import Schedule
@@ -34,8 +37,12 @@ from tensorflow_probability.substrates.jax.distributions import MultivariateNorm
 BOUNDS = {
     "indefinite_cov": (1e-9, "the covariance has a negative eigenvalue (its share of the largest), or is not finite"),
     "innovation_excess": (DOUBTFUL, DIVERGED),
+    "other_image": ONE_IMAGE,
 }
-FIRST_ORDER = "of first order in the interval for increments, and in a substep of second (midpoint) or first (euler)"
+FIRST_ORDER = (
+    "of first order in the interval for increments, and in a substep of second (midpoint) or first (euler, or where noise "
+    "depends on the state)"
+)
 
 
 class Rule(NamedTuple):
@@ -74,25 +81,34 @@ def _advanced(system: System, interval: Interval, state: State, observation: Obs
 
     def substep(index: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
         t = interval.start + index * length
-        G = system.covariance(jnp.zeros(system.n), system.noise_time(t, length), theta)
+        zero, when = jnp.zeros((system.n, system.n)), system.noise_time(t, length)
+        G = system.covariance(jnp.zeros(system.n), when, theta) if system.diffusion is None else zero
+        before = carry
         carry = predict(*carry, lambda x: system.before_noise(x, t, length, theta), length * G)
+        if system.diffusion is not None:
+            at = before if system.scheme == "euler" else carry
+            carry = carry[0], carry[1] + length * _expected(system, *at, lambda x: system.covariance(x, when, theta))
         if system.scheme == "euler":
             return carry
-        return predict(*carry, lambda x: system.after_noise(x, t, length, theta), jnp.zeros_like(G))
+        return predict(*carry, lambda x: system.after_noise(x, t, length, theta), zero)
 
     count = jnp.where(interval.length > 0, system.substeps, 0)
     mean, cov = jax.lax.fori_loop(0, count, substep, (state.mean, state.cov))
     return _conditioned(system, mean, cov, state.sums, observation, interval.stop, theta)
 
 
+def _expected(system: System, mean: Any, cov: Any, matrix: Callable[[Any], Any]) -> Any:
+    """Return the expected value of a matrix that depends on the state, as the library takes expectations."""
+    shape = matrix(mean).shape
+    noise = jnp.zeros((shape[0] * shape[1],) * 2)
+    return system.rule.predict(mean, cov, lambda x: matrix(x).ravel(), noise)[0].reshape(shape)
+
+
 def _conditioned(
     system: System, mean: Any, cov: Any, sums: Innovations, observation: Observation, t: Any, theta: Any
 ) -> tuple[State, Info]:
     """Return the Gaussian given the observation, the evidence and the size of the innovation."""
-
-    def h(x: Any) -> Any:
-        return observation.whiten @ system.observation(x, t, theta)
-
+    observation, h = seen_from(system, observation, mean, t, theta)
     unit, zero = jnp.eye(system.m), jnp.zeros(system.m)
     expected, spread = system.rule.predict(mean, cov, h, unit)
     evidence = MultivariateNormalFullCovariance(expected, spread).log_prob(observation.values)
@@ -107,6 +123,7 @@ def _conditioned(
     indefinite = jnp.where(size > 0, jnp.maximum(-jnp.min(values), 0.0) / size, 0.0)
     lost = jnp.where(jnp.isfinite(size) & jnp.all(jnp.isfinite(mean)), indefinite, jnp.inf)
     health = {"indefinite_cov": lost, "smallest_eigenvalue": jnp.min(values), "innovation_excess": in_deviations(sums)}
+    health |= image_health(system, observation, expected, spread)
     return State(mean, cov, sums), Info(evidence, mean, cov, health)
 
 

@@ -32,7 +32,10 @@ def prepared_by(
     seed: int,
     notes: tuple[str, ...] = (),
 ) -> Prepared:
-    """Return the intervals with a root of each substep's noise, R R' = G times its length, (K, substeps, n, r)."""
+    """Return the intervals with a root of each substep's noise, R R' = G times its length, (K, substeps, n, r).
+
+    Where g depends on the state, it is R R' = Q times the length, (K, substeps, r, r).
+    """
     system = system_of(model, scheme, substeps, rule)
     lengths = (schedule.lengths / system.substeps)[:, None]
     times = system.noise_time(schedule.starts[:, None] + np.arange(system.substeps) * lengths, lengths)
@@ -40,7 +43,8 @@ def prepared_by(
         numpy_function(matrix, model, matrix.shape)(np.zeros(model.n), times, theta)
         for matrix in (model.diffusion, model.process_noise)
     )
-    roots = np.broadcast_to(diffusion @ square_root(noise), (*times.shape, model.n, model.process_noise.shape[0]))
+    root = square_root(noise) if system.diffusion is not None else diffusion @ square_root(noise)
+    roots = np.broadcast_to(root, (*times.shape, *root.shape[-2:]))
     roots = roots * np.sqrt(lengths)[:, :, None, None]
     seed = whole_number("seed", seed, 0, 2**63 - 1)
     return Prepared.of(model, system, schedule, theta, roots=roots, seed=seed, notes=notes)
@@ -77,11 +81,25 @@ def moved(system: System, interval: Interval, key: Any, x: Any) -> Any:
     def substep(x: Any, slices: Any) -> tuple[Any, None]:
         index, root, white = slices
         t = interval.start + index * length
-        x = system.before_noise(x, t, length, theta) + root @ white
-        return system.after_noise(x, t, length, theta), None
+        shock, middle = root @ white, system.before_noise(x, t, length, theta)
+        if system.diffusion is not None:
+            at = x if system.scheme == "euler" else middle
+            shock = system.diffusion(at, system.noise_time(t, length), theta) @ shock
+        return system.after_noise(middle + shock, t, length, theta), None
 
     slices = (jnp.arange(system.substeps), interval.roots, noise)
     return jax.lax.scan(substep, x, slices)[0]
+
+
+def ahead(system: System, interval: Interval, x: Any) -> Any:
+    """Return one state (n,) after the interval without noise."""
+    length = interval.length / system.substeps
+
+    def substep(index: Any, x: Any) -> Any:
+        t = interval.start + index * length
+        return system.after_noise(system.before_noise(x, t, length, interval.theta), t, length, interval.theta)
+
+    return jax.lax.fori_loop(0, system.substeps, substep, x)
 
 
 def moments(share: Any, points: Any, angles: tuple[int, ...]) -> tuple[Any, Any]:

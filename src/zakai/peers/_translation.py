@@ -5,10 +5,12 @@ Between observations an interval is divided into `substeps`; one of length d fro
     scheme "euler"       x -> x + f(x, t) d + noise,  noise ~ N(0, G(t) d)                    first order in d
     scheme "midpoint"    half of the flow of f, noise ~ N(0, G(t + d/2) d), the other half    second order in d, in law
 
-where half of the flow is one step of the explicit midpoint rule.  An increment dy = h dt + dw over a time T is the observation
-dy / T = h(x) + noise of covariance S / T at the end of its interval, which is first order in the interval; a sample is used as
-it is.  Observations are whitened, so that every library receives z = h(x) + N(0, I): with R = L L' the covariance of the observed
-coordinates, z is L^-1 times the observation.  An unobserved coordinate has z = 0 and h = 0, which carries no information.
+(Ito; first order where g depends on the state), where half of the flow is one step of the explicit midpoint rule.  An increment
+dy = h dt + dw over a time T is the observation dy / T = h(x) + noise of covariance S / T at the end of its interval, which is
+first order in the interval; a sample is used as it is.  Observations are whitened, so that every library receives
+z = h(x) + N(0, I): with R = L L' the covariance of the observed coordinates, z is L^-1 times the observation.  An unobserved
+coordinate has z = 0 and h = 0, which carries no information.  Where S depends on the state, R is taken at a state near the one in
+question; an observed angle has the image nearest to h there.
 """
 
 from __future__ import annotations
@@ -22,6 +24,8 @@ import numpy as np
 
 from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info, Infos
+from zakai.models.angles import observed_angles
+from zakai.models.checks import depends_on_state
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.peers import _float64  # noqa: F401
@@ -32,6 +36,7 @@ import jax  # isort: skip
 import jax.numpy as jnp  # isort: skip
 
 SCHEMES = ("midpoint", "euler")
+_IMAGES = 4  # of an observed angle on each side
 # The sums of squared innovations forget over 500 observations.  They are reported where they exceed what is expected by so many
 # of their standard deviations, which are taken as those of at least 25 coordinates: one rare observation is no divergence.
 MEMORY, LEAST, DOUBTFUL = 500, 25, 4.5
@@ -49,6 +54,11 @@ class System:
         self.covariance = jax_function(model.covariance, model, (model.n, model.n))
         self.scheme, self.substeps, self.rule = scheme, substeps, rule
         self.n, self.m = model.n, model.m
+        # g where it depends on the state, and S of samples where that does.
+        g, S = model.diffusion, model.observation_noise
+        self.diffusion = jax_function(g, model, g.shape) if depends_on_state(g, model) else None
+        self.noise = jax_function(S, model, S.shape) if depends_on_state(S, model) else None
+        self.turning = np.flatnonzero(observed_angles(model))
         self.angles = tuple(model.state.index(name) for name in model.periodic)
         self.noiseless = model.covariance.is_zero_matrix is True
 
@@ -92,8 +102,10 @@ def system_of(model: Model, scheme: str, substeps: int, rule: Any) -> System:
         InputError: an unknown scheme or number of substeps.
     """
     one_of("scheme", scheme, SCHEMES)
-    matrices = (model.drift, model.covariance, model.observation)
-    names = (model.state, model.parameter_symbols, model.periodic, model.functions)
+    noise = model.observation_noise if depends_on_state(model.observation_noise, model) else None
+    matrices = (model.drift, model.diffusion, model.covariance, model.observation, noise, observed_angles(model))
+    tables = tuple(model.tables.items())
+    names = (model.state, model.parameter_symbols, model.periodic, model.functions, tables)
     return _system(_Formulas((names, matrices), model), scheme, whole_number("substeps", substeps, 1), rule)
 
 
@@ -111,13 +123,16 @@ class Observation(NamedTuple):
     """A white observation.
 
     `values` (m,); `whiten` (m, m) with z = whiten (h + noise); `seen`, the number of observed coordinates; `constant`, the
-    logarithm of the density under pure noise for samples, and zero for increments, whose evidence is relative to that.
+    logarithm of the density under pure noise for samples, and zero for increments, whose evidence is relative to that; `raw`
+    (m,), the values before they are whitened; `mask` (m,), which of them are observed.
     """
 
     values: Any
     whiten: Any
     seen: Any
     constant: Any
+    raw: Any
+    mask: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,10 +159,10 @@ class Prepared:
     def of(cls, model: Model, system: System, schedule: Schedule, theta: np.ndarray, **extra: Any) -> Prepared:
         """Return what is prepared for a schedule."""
         seen, count = schedule.seen, len(schedule)
-        noise = np.broadcast_to(
-            numpy_function(model.observation_noise, model, (model.m, model.m))(np.zeros(model.n), schedule.stops, theta),
-            (count, model.m, model.m),
-        )
+        noise = np.broadcast_to(np.eye(model.m), (count, model.m, model.m))
+        if system.noise is None:
+            function = numpy_function(model.observation_noise, model, (model.m, model.m))
+            noise = np.broadcast_to(function(np.zeros(model.n), schedule.stops, theta), noise.shape)
         spans = np.ones(seen.shape)
         if model.observation_kind != "samples":
             spans = np.where(seen, schedule.elapsed, 1.0)
@@ -170,10 +185,66 @@ class Prepared:
     def observations(self, rows: slice, values: np.ndarray) -> Observation:
         """Return what is observed at the ends of intervals, with a leading axis."""
         whiten, constants = self.whiten[rows], self.constants[rows]
-        white = (whiten @ (values / self.spans[rows])[:, :, None])[:, :, 0]
+        raw, mask = values / self.spans[rows], self.schedule.seen[rows]
+        white = (whiten @ raw[:, :, None])[:, :, 0]
         if self.model.observation_kind == "samples":
             constants = constants - 0.5 * (white[:, None, :] @ white[:, :, None])[:, 0, 0]
-        return Observation(white, whiten, self.schedule.seen[rows].sum(axis=1).astype(float), constants)
+        return Observation(white, whiten, mask.sum(axis=1).astype(float), constants, raw, mask)
+
+
+def seen_from(system: System, observation: Observation, x: Any, t: Any, theta: Any) -> tuple[Observation, Callable[[Any], Any]]:
+    """Return an observation whitened by the noise at a state x (n,), with images of angles near to h(x), and the white h.
+
+    Of angles h is the image near to h(x) too.  Without such noise and angles both are the same from every state.
+    """
+    whiten, constant, raw = observation.whiten, observation.constant, observation.raw
+    if system.noise is None and not len(system.turning):
+        return observation, lambda y: whiten @ system.observation(y, t, theta)
+    constant = constant + 0.5 * observation.values @ observation.values
+    if system.noise is not None:
+        both = observation.mask[:, None] & observation.mask
+        factor = jnp.linalg.cholesky(jnp.where(both, system.noise(x, t, theta), 0.0) + jnp.diag(1.0 - observation.mask))
+        whiten = jnp.where(both, jnp.linalg.inv(factor), 0.0)
+        constant = constant - jnp.sum(jnp.log(jnp.diag(factor)))
+    centre = system.observation(x, t, theta)
+
+    def near(values: Any) -> Any:
+        apart = (values - centre)[system.turning]
+        return values.at[system.turning].set(centre[system.turning] + jnp.pi - jnp.mod(jnp.pi - apart, 2 * jnp.pi))
+
+    raw = jnp.where(observation.mask, near(raw), 0.0)
+    values = whiten @ raw
+    found = observation._replace(values=values, whiten=whiten, constant=constant - 0.5 * values @ values, raw=raw)
+    return found, lambda y: whiten @ near(system.observation(y, t, theta))
+
+
+def image_health(system: System, observation: Observation, expected: Any, spread: Any) -> dict[str, Any]:
+    """Return the largest weight of another image of an angle relative to the nearest, where there are angles.
+
+    `expected` (m,) and `spread` (m, m) are the mean and the covariance of the white observation.
+    """
+    if not len(system.turning):
+        return {}
+    unit = jnp.eye(system.m) - jnp.diag(1.0 * observation.mask)
+    back = jnp.linalg.inv(observation.whiten + unit)
+    variance = jnp.diag(back @ spread @ back.T)
+    apart = jnp.abs(back @ (observation.values - expected))
+    weights = jnp.exp(-np.pi * jnp.maximum(2 * np.pi - 2 * apart, 0.0) / variance)
+    return {"other_image": jnp.max((observation.mask * weights)[system.turning])}
+
+
+def log_density(system: System, observation: Observation, x: Any, t: Any, theta: Any) -> Any:
+    """Return log p(z | x) relative to the constant of the observation; of angles the sum over their images."""
+    seen, h = seen_from(system, observation, x, t, theta)
+    value = h(x)
+    found = seen.values @ value - 0.5 * value @ value + (seen.constant - observation.constant)
+    for j in system.turning:
+        apart = seen.raw[j] - system.observation(x, t, theta)[j]
+        turns = 2 * np.pi * np.concatenate([np.arange(-_IMAGES, 0), np.arange(1, _IMAGES + 1)])
+        # The noise of an angle with many images is independent of others, so that its precision is on the diagonal.
+        others = jnp.exp(-0.5 * seen.whiten[j, j] ** 2 * turns * (turns + 2 * apart))
+        found = found + jnp.log1p(observation.mask[j] * jnp.sum(others))
+    return found
 
 
 Advance = Callable[[System, Interval, Any, Observation], tuple[Any, Info]]

@@ -18,9 +18,10 @@ from zakai.algebra.theorems import smooth_system as theorem
 from zakai.densities import PointMasses
 from zakai.methods._options import real_number, whole_number
 from zakai.methods._protocol import Info, Method
+from zakai.models.angles import ONE_IMAGE
 from zakai.models.model import Model
 from zakai.peers import _float64  # noqa: F401
-from zakai.peers._sampling import draws, first_key, moments, moved, prepared_by
+from zakai.peers._sampling import ahead, draws, first_key, moments, moved, prepared_by
 from zakai.peers._translation import (
     DIVERGED,
     DOUBTFUL,
@@ -30,8 +31,10 @@ from zakai.peers._translation import (
     Prepared,
     System,
     compiled,
+    image_health,
     in_deviations,
     innovations,
+    seen_from,
 )
 from zakai.records.schedule import Schedule
 
@@ -94,9 +97,11 @@ def init(prepared: Prepared, prior: Any) -> State:
 def _advanced(system: System, interval: Interval, state: State, observation: Observation) -> tuple[State, Info]:
     """Advance an ensemble over an interval: cuthbert's forecast and analysis, and their health."""
     rule, key = system.rule, jax.random.wrap_key_data(state.key)
-
-    def h(x: Any) -> Any:
-        return observation.whiten @ system.observation(x, interval.stop, interval.theta)
+    equal = jnp.full(rule.members, 1.0 / rule.members)
+    centre = state.members[0]
+    if system.noise is not None or len(system.turning):
+        centre = ahead(system, interval, moments(equal, state.members, system.angles)[0])
+    observation, h = seen_from(system, observation, centre, interval.stop, interval.theta)
 
     # cuthbert asks the first function for nothing but the shape of a member.
     built = build_filter(
@@ -111,13 +116,13 @@ def _advanced(system: System, interval: Interval, state: State, observation: Obs
     before = EnKFState(key, state.members, inputs, jnp.array(0.0), state.members)
     after = built.filter_combine(before, built.filter_prepare(inputs, key=key))
 
-    equal = jnp.full(rule.members, 1.0 / rule.members)
     mean, cov = moments(equal, after.ensemble, system.angles)
     expected, spread = moments(equal, jax.vmap(h)(after.predicted_ensemble), ())
     sums = innovations(state.sums, observation, expected, spread * rule.members / (rule.members - 1) + jnp.eye(system.m))
     pure_noise = -0.5 * jnp.sum(observation.values**2) - 0.5 * system.m * jnp.log(2 * jnp.pi)
     evidence = after.log_normalizing_constant - pure_noise + observation.constant
     health = {"smallest_deviation": jnp.sqrt(jnp.min(jnp.diag(cov))), "innovation_excess": in_deviations(sums)}
+    health |= image_health(system, observation, expected, spread + jnp.eye(system.m))
     return State(jax.random.key_data(after.key), after.ensemble, sums), Info(evidence, mean, cov, health)
 
 
@@ -153,7 +158,7 @@ METHOD: Method[Prepared, State] = Method(
     segment=segment,
     density=density,
     state=State,
-    bounds={"innovation_excess": (DOUBTFUL, DIVERGED)},
+    bounds={"innovation_excess": (DOUBTFUL, DIVERGED), "other_image": ONE_IMAGE},
     differentiable=False,
     valid=valid,
 )

@@ -33,6 +33,8 @@ from zakai.peers._translation import (
     compiled,
     in_deviations,
     innovations,
+    log_density,
+    seen_from,
 )
 from zakai.records.schedule import Schedule
 
@@ -117,12 +119,8 @@ def _advanced(system: System, interval: Interval, state: State, observation: Obs
     rule = system.rule
     own, following = jax.random.split(jax.random.wrap_key_data(state.key))
 
-    def h(x: Any) -> Any:
-        return observation.whiten @ system.observation(x, interval.stop, interval.theta)
-
     def log_potential(before: Any, x: Any, inputs: Any) -> Any:
-        value = h(x)
-        return observation.values @ value - 0.5 * value @ value
+        return log_density(system, observation, x, interval.stop, interval.theta)
 
     # cuthbert asks the first function for nothing but the shape of a particle.
     built = build_filter(
@@ -141,10 +139,12 @@ def _advanced(system: System, interval: Interval, state: State, observation: Obs
     log_weights = after.log_weights - jax.nn.logsumexp(after.log_weights)
     share = jnp.exp(log_weights)
     mean, cov = moments(share, after.particles, system.angles)
-    seen = jax.vmap(h)(after.particles)
-    predicted = jax.nn.softmax(after.log_weights - seen @ observation.values + 0.5 * jnp.sum(seen**2, axis=1))
-    expected, spread = moments(predicted, seen, ())
-    sums = innovations(state.sums, observation, expected, spread + jnp.eye(system.m))
+    potentials = jax.vmap(lambda x: log_density(system, observation, x, interval.stop, interval.theta))(after.particles)
+    predicted = jax.nn.softmax(after.log_weights - potentials)
+    centre = moments(predicted, after.particles, system.angles)[0]
+    white, h = seen_from(system, observation, centre, interval.stop, interval.theta)
+    expected, spread = moments(predicted, jax.vmap(h)(after.particles), ())
+    sums = innovations(state.sums, white, expected, spread + jnp.eye(system.m))
     family, parts = None, share
     if state.family is not None:
         family = state.family[after.ancestor_indices]

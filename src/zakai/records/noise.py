@@ -19,7 +19,8 @@ AT_ONCE = 4096  # intervals that are checked together
 
 def noise_varies(model: Model) -> bool:
     """Return whether the noise may vary within an interval over which an increment is gathered."""
-    return model.observation_kind != "samples" and bool(model.observation_noise.has(model.t))
+    varying = model.t in model.observation_noise.free_symbols
+    return model.observation_kind != "samples" and varying and not model.observation_noise.free_symbols & set(model.z)
 
 
 def notes_on_noise(model: Model, schedule: Schedule) -> list[str]:
@@ -42,7 +43,8 @@ def notes_on_noise(model: Model, schedule: Schedule) -> list[str]:
     for begin in range(0, len(schedule), AT_ONCE):
         part = schedule.part(slice(begin, begin + AT_ONCE))
         times = part.starts[:, None] + (part.stops - part.starts)[:, None] * places
-        values = noise(origin, times, theta)
+        u = None if part.inputs is None else part.inputs.at(times, model.input_hold)
+        values = noise(origin, times, theta, u)
         excess = (np.mean(values, axis=1) * np.mean(1.0 / values, axis=1)).max(axis=1) - 1.0
         over = (excess > DIFFERS) & part.seen.any(axis=1) & (part.stops > part.starts)
         count += int(over.sum())

@@ -65,7 +65,7 @@ def observations(result: Any) -> str:
         if expected is not None:
             title += f": h = {_short(model.observation[j])}"
             line = times, expected[rows, j]
-            if model.observation_family[j] == "von-mises":
+            if model.observation_family[j] == "von-mises" or model.observation_law.angles[j]:
                 seen, line = wrap(seen), circle_line(times, wrap(expected[rows, j]))
         series.append((title, times, seen, line))
     if not series:

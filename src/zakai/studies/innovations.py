@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from zakai.models.angles import nearest
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.records import Record
@@ -50,7 +51,9 @@ class Innovations:
         """
         schedule, values = schedule_of(self.model, record)
         n, m = self.model.n, self.model.m
-        u, undefined = self._inputs(schedule, schedule.stops, schedule.stops), not self.model.observation_law.is_gaussian
+        law = self.model.observation_law
+        u = self._inputs(schedule, schedule.stops, schedule.stops)
+        undefined = self.model.log_density is not None or set(law.families) != {"gaussian"}
         with np.errstate(invalid="ignore", over="ignore"):
             x, sigma = self._moved(schedule, np.asarray(mean, float)[:-1], np.asarray(cov, float)[:-1])
             if record.kind == "samples":
@@ -62,7 +65,8 @@ class Innovations:
             else:
                 expected, spread = x[:, n:], sigma[:, n:, n:]
                 late = schedule.elapsed > _LATE * (schedule.stops - schedule.starts)[:, None]
-        return np.where(late | ~schedule.seen | undefined, np.nan, values - expected), spread
+        apart = nearest(values, expected, law.angles) - expected
+        return np.where(late | ~schedule.seen | undefined, np.nan, apart), spread
 
     def nis(self, record: Record, mean: np.ndarray, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return nu' S^-1 nu (K,), and the number of observed coordinates (K,), the degrees of freedom of its chi-square law.

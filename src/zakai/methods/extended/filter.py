@@ -9,7 +9,7 @@ term outruns P: in one dimension as soon as P H'S^-1 H dt > 1.  `riccati="stable
 prediction, each half a Kalman update (Joseph's form), and predicts by the exact flow of the system linearised in the middle of
 the step; P stays positive semidefinite whatever the step, and the error is of second order in it.  The precision of a part of an
 interval is the integral of S^-1 over it.  An interval is cut where known inputs jump, or their slope does; G(x) is taken at the
-mean.
+mean, S(x) of samples at the predicted mean, and derivatives almost everywhere: that of sign(x) is zero.
 
 With correlated noise E dv dw' = C dt and a = g C the gain is (P H' + a) S^-1 in both equations (1).  What is observed enters the
 prediction, f + a S^-1 (dy/dt - h) with the noise G - a S^-1 a', which leaves independent noises; for `riccati="stable"` alone.
@@ -26,14 +26,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities import GaussianMixture
+from zakai.densities._density import wrap
 from zakai.errors import InputError
 from zakai.methods._input_pieces import Pieces, pieces_of
 from zakai.methods._moments import prior_moments, wrapped
 from zakai.methods._options import one_of, whole_number
-from zakai.methods._protocol import Info
+from zakai.methods._protocol import Info, Infos
+from zakai.methods.extended.compiled import Loop, advance, loop_of
 from zakai.methods.extended.linearisation import linearisation
 from zakai.methods.extended.linearised_system import Formulas, Part, formulas_of, part_of, rate_noise_of, subdivided
 from zakai.methods.line.cross import OMITTED
+from zakai.models.angles import other_image
 from zakai.models.model import Model
 from zakai.numerics.complex_step import cholesky, is_complex
 from zakai.numerics.flow import Coefficients, integrate
@@ -70,7 +73,8 @@ class Prepared:
 
     The formulas; the parts of the intervals, of which those of interval k begin at `first`[k]; the coordinates that act inside an
     interval and those at its end (K, m) with their `spans` (K, m) and the inputs there; the covariance of the rates in each half
-    of a part (J, 2, m, m) and that at the end (K, m, m).
+    of a part (J, 2, m, m) and that at the end (K, m, m).  `loop` is what the compiled loop receives, None where there is none:
+    for tables and sinc, correlated noise, derivatives and riccati="euler".
     """
 
     model: Model
@@ -87,6 +91,7 @@ class Prepared:
     rate_noise: Array
     end_noise: Array
     notes: tuple[str, ...]
+    loop: Loop | None
 
 
 def prepare(model: Model, schedule: Schedule, theta: Array, *, riccati: str = "stable", substeps: int = 1) -> Prepared:
@@ -115,17 +120,24 @@ def prepare(model: Model, schedule: Schedule, theta: Array, *, riccati: str = "s
     ends = np.zeros((len(schedule), len(model.u)))
     if schedule.inputs is not None:
         ends = schedule.inputs.at(schedule.stops, model.input_hold, before=not sampled)
-    noise = formulas.noise(np.zeros(model.n), schedule.stops, theta, ends)
+    noise: Array = np.eye(model.m)  # where it depends on the state it is taken at the prediction
+    if not formulas.noise_of_state:
+        noise = formulas.noise(np.zeros(model.n), schedule.stops, theta, ends)
     shared = 1.0 if sampled else np.minimum(spans[:, :, None], spans[:, None, :])
     both = at_end[:, :, None] & at_end[:, None, :]
     end_noise = np.where(both, noise * shared, 0.0) + np.eye(model.m) * ~at_end[:, None, :]
     parts = subdivided(pieces_of(schedule, model.input_hold, len(model.u)), substeps)
     rate_noise, notes = rate_noise_of(model, formulas, parts, theta, inside[parts.row])
     notes = (*notes, OMITTED) if formulas.cross is not None and at_end.any() else notes
+    first = np.searchsorted(parts.row, np.arange(len(schedule) + 1))
+    loop = None
+    if riccati == "stable" and formulas.cross is None and not is_complex(theta):
+        each = (schedule.stops, schedule.lengths, ends, inside, at_end, spans, end_noise)
+        loop = loop_of(model, theta, first, parts, rate_noise, each)
+    inputs: list[Array | None] = list(ends) if model.inputs else [None] * len(schedule)
     return Prepared(
-        model, formulas, theta, schedule, riccati, parts, np.searchsorted(parts.row, np.arange(len(schedule) + 1)),
-        list(ends) if model.inputs else [None] * len(schedule), inside, at_end, spans, rate_noise, end_noise, notes,
-    )  # fmt: skip
+        model, formulas, theta, schedule, riccati, parts, first, inputs, inside, at_end, spans, rate_noise, end_noise, notes, loop
+    )
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -138,6 +150,10 @@ def step(
     prepared: Prepared, k: int, state: State, values: Array, keep: Callable[[Moved], None] | None = None
 ) -> tuple[State, Info]:
     """Advance one interval, in equal parts, and then use what is observed at its end; `keep` receives the motion of each part."""
+    if keep is None and prepared.loop is not None and not is_complex(*state):
+        (state,), infos = advance_many(prepared, slice(k, k + 1), state, values[None])
+        health = {name: float(part[0]) for name, part in infos.health.items()}
+        return state, Info(infos.log_likelihood_increment[0], infos.mean[0], infos.cov[0], health)
     start, stop = prepared.schedule.starts[k], prepared.schedule.stops[k]
     inside = prepared.inside[k]
     log_factor, before = 0.0, state
@@ -149,18 +165,59 @@ def step(
                 observed = [_Observed(rates, inside.astype(float), noise) for noise in prepared.rate_noise[j]]
             part = part_of(prepared.parts, j)
             if prepared.riccati == "euler":
-                state, more = _euler(prepared, state, observed, part)
+                state, gained = _euler(prepared, state, observed, part)
             else:
-                state, more = _stable(prepared, state, observed, part, keep)
-            log_factor = log_factor + more
-    at_end = prepared.at_end[k]
-    curved = linearisation(prepared, k, before, state)
+                state, gained = _stable(prepared, state, observed, part, keep)
+            log_factor = log_factor + gained
+    at_end, noise = prepared.at_end[k], _noise_at_end(prepared, k, state)
+    curved = linearisation(prepared, k, before, state, noise)
+    more: dict[str, float] = {}
+    if any(prepared.formulas.angles):
+        more["other_image"] = _other_image(prepared, k, state, values, noise)
     if at_end.any():
-        observed_end = _Observed(np.where(at_end, values, 0.0), prepared.spans[k], prepared.end_noise[k])
-        state, more = _update(prepared, state, observed_end, stop, prepared.end_inputs[k])
-        log_factor = log_factor + more
+        observed_end = _Observed(np.where(at_end, values, 0.0), prepared.spans[k], noise)
+        state, gained = _update(prepared, state, observed_end, stop, prepared.end_inputs[k])
+        log_factor = log_factor + gained
     info = info_of(state, log_factor)
-    return state, info._replace(health={**info.health, "linearisation": curved})
+    return state, info._replace(health={**info.health, "linearisation": curved, **more})
+
+
+def _other_image(prepared: Prepared, k: int, state: State, values: Array, noise: Array) -> float:
+    """Return the largest weight of another image of an angle that is observed at the end of interval k."""
+    which = prepared.at_end[k] & np.array(prepared.formulas.angles)
+    stop, u = float(prepared.schedule.stops[k]), prepared.end_inputs[k]
+    value, slope = prepared.formulas.observe(state.mean, stop, prepared.theta, u)
+    variance = np.diagonal(slope @ state.cov @ slope.T + noise)
+    return other_image(wrap(values - value)[which], variance[which])
+
+
+def _noise_at_end(prepared: Prepared, k: int, state: State) -> Array:
+    """Return the covariance (m, m) of what is observed at the end of interval k, at the predicted mean where S depends on it."""
+    if not prepared.formulas.noise_of_state:
+        return np.asarray(prepared.end_noise[k])
+    stop, at_end = np.asarray(prepared.schedule.stops[k]), prepared.at_end[k]
+    noise = prepared.formulas.noise(state.mean, stop, prepared.theta, prepared.end_inputs[k])
+    return np.asarray(np.where(at_end[:, None] & at_end, noise, 0.0) + np.diag(1.0 * ~at_end))
+
+
+def advance_many(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[list[State], Infos]:
+    """Return the states after the intervals of a slice, and their reports, by the compiled loop."""
+    assert prepared.loop is not None
+    means, covs, gains, figures = advance(prepared.loop, rows, *state, values)
+    least, indefinite = np.full(len(means), np.inf), np.full(len(means), np.inf)
+    finite = np.isfinite(covs).all(axis=(1, 2)) & np.isfinite(means).all(axis=1)
+    eigenvalues = covs[finite][:, 0] if means.shape[1] == 1 else np.linalg.eigvalsh(covs[finite])
+    least[finite], size = eigenvalues.min(axis=1), np.abs(eigenvalues).max(axis=1)
+    indefinite[finite] = np.where(size > 0, np.maximum(-least[finite], 0.0) / np.where(size > 0, size, 1.0), 0.0)
+    health = {"indefinite_cov": indefinite, "smallest_eigenvalue": least, "linearisation": figures[0]}
+    if any(prepared.formulas.angles):
+        health["other_image"] = figures[1]
+    return [State(*pair) for pair in zip(means, covs, strict=True)], Infos(gains, means, covs, health)
+
+
+def segment(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[list[State], Infos] | None:
+    """Return `advance_many` where the compiled loop serves."""
+    return None if prepared.loop is None or is_complex(*state) else advance_many(prepared, rows, state, values)
 
 
 def _stable(
@@ -240,6 +297,7 @@ def _update(prepared: Prepared, state: State, observed: _Observed, t: float, u: 
     mean, cov = state
     value, slope = prepared.formulas.observe(mean, t, prepared.theta, u)
     H, residual, noise = observed.spans[:, None] * slope, observed.values - observed.spans * value, observed.noise
+    residual = np.where(prepared.model.observation_law.angles, wrap(residual), residual)
     across = H @ cov
     white, log_factor = _log_normal(np.column_stack([residual, across]), across @ H.T + noise)
     gain = white[1:]

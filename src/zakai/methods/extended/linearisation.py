@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import expm
 
+from zakai.densities._density import wrap
 from zakai.methods.extended.linearised_system import Formulas, Part, part_of
 from zakai.numerics.transition import Array
 
@@ -19,8 +20,11 @@ if TYPE_CHECKING:
     from zakai.methods.extended.filter import Prepared, State
 
 
-def linearisation(prepared: Prepared, k: int, before: State, predicted: State) -> float:
-    """Return how far the system is from linear over the density, in the motion of interval k and what is observed then."""
+def linearisation(prepared: Prepared, k: int, before: State, predicted: State, end_noise: Array) -> float:
+    """Return how far the system is from linear over the density, in the motion of interval k and what is observed then.
+
+    `end_noise` (m, m) is the covariance of what is observed at the end.
+    """
     formulas, theta, schedule = prepared.formulas, prepared.theta.real, prepared.schedule
     (mean, cov), (later, after) = ((one.mean.real, one.cov.real) for one in (before, predicted))
     if not np.isfinite(cov).all() or not np.isfinite(after).all():
@@ -33,7 +37,7 @@ def linearisation(prepared: Prepared, k: int, before: State, predicted: State) -
             spans, noise = prepared.inside[k].astype(float), 0.5 * prepared.rate_noise[j][0].real
             curved = max(curved, _of_sensor(formulas, mean, cov, spans, noise, part.start, theta, part.u))
     if prepared.at_end[k].any():
-        spans, noise, u = prepared.spans[k], prepared.end_noise[k].real, prepared.end_inputs[k]
+        spans, noise, u = prepared.spans[k], end_noise.real, prepared.end_inputs[k]
         curved = max(curved, _of_sensor(formulas, later, after, spans, noise, float(schedule.stops[k]), theta, u))
     return curved
 
@@ -55,6 +59,7 @@ def _of_sensor(
     """Return the figure of `spans` (m,) times h with a noise (m, m), relative to what is expected to be observed."""
     value, slope = formulas.observe(mean, t, theta, u)
     apart = spans * (formulas.sensor(_points(mean, cov), np.asarray(t), theta, u)[:, : len(value)] - value)
+    apart = np.where(formulas.angles, wrap(apart), apart)
     bias, H = apart.mean(axis=0), spans[:, None] * slope
     linear = np.einsum("in,nk,ik->i", H, cov, H)
     return _largest(bias, np.mean((apart - bias) ** 2, axis=0) - linear, linear + np.diagonal(noise))
@@ -69,9 +74,18 @@ def _gathered(matrix: Array, rate: Array, length: float) -> Array:
 
 
 def _points(mean: Array, cov: Array) -> Array:
-    values, vectors = np.linalg.eigh(cov)
-    steps = np.sqrt(len(mean) * np.maximum(values, 0.0))[:, None] * vectors.T
+    steps = np.sqrt(len(mean)) * _root(cov).T
     return np.concatenate([mean + steps, mean - steps])
+
+
+def _root(cov: Array) -> Array:
+    """Return Cholesky's factor, with a column of zeros where no variance is left."""
+    factor = np.zeros_like(cov)
+    for j in range(len(cov)):
+        rest = cov[j:, j] - factor[j:, :j] @ factor[j, :j]
+        if rest[0] > 1e-14 * cov[j, j]:
+            factor[j:, j] = rest / np.sqrt(rest[0])
+    return factor
 
 
 def _largest(shift: Array, spread: Array, variance: Array) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ import sympy as sp
 
 from zakai.methods._input_pieces import Pieces
 from zakai.methods.gaussian.affine_system import RESOLVED, precision_of
+from zakai.models.functions import without_jumps
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import NumericFunction, numpy_function
@@ -20,15 +22,15 @@ class Formulas:
     """The formulas of a model, and their derivatives, as functions of x, t, the parameters and the inputs."""
 
     def __init__(self, model: Model):
-        n, m, x = model.n, model.m, list(model.x)
+        n, m = model.n, model.m
         drift, observation = sp.Matrix(model.drift), sp.Matrix(model.observation)
-        slope, change = drift.jacobian(x), [drift.diff(symbol) for symbol in (model.t, *model.u)]
-        change = [column.replace(sp.DiracDelta, lambda *_: sp.S.Zero) for column in change]  # sign(t) has no slope but its jump
-        self.shapes = (n, m)
+        slope, change = jacobian(drift, model.x), [jacobian(drift, [symbol]) for symbol in (model.t, *model.u)]
+        self.shapes, self.angles = (n, m), model.observation_law.angles
         self.motion = numpy_function([*drift, *slope, *model.covariance, *sp.Matrix.hstack(*change)], model)
-        self.sensor = numpy_function([*observation, *observation.jacobian(x)], model)
+        self.sensor = numpy_function([*observation, *jacobian(observation, model.x)], model)
         self.noise = numpy_function(model.observation_noise, model, (m, m))
         self.cross = None if model.cross_noise.is_zero_matrix else self._cross(model)
+        self.noise_of_state = bool(model.observation_noise.free_symbols & set(model.x))
         self.noise_varies = bool(model.observation_noise.has(model.t)) and model.observation_kind != "samples"
 
     @staticmethod
@@ -36,7 +38,7 @@ class Formulas:
         """Return a = g C (n, m) and (a_j.grad) a_i (n) for all i and j, one after the other."""
         a, x = model.diffusion * model.cross_noise, model.x
         columns = range(model.m)
-        along = [sum((a[l, j] * sp.diff(a[k, i], x[l]) for l in range(model.n)), sp.S.Zero)
+        along = [sum((a[l, j] * without_jumps(a[k, i], x[l]) for l in range(model.n)), sp.S.Zero)
                  for k in range(model.n) for i in columns for j in columns]  # fmt: skip
         return numpy_function([*a, *along], model)
 
@@ -59,6 +61,11 @@ class Formulas:
         n, m = self.shapes
         values = self.sensor(x, np.asarray(t), theta, u)
         return values[:m], values[m:].reshape(m, n)
+
+
+def jacobian(field: sp.MatrixBase, symbols: Sequence[sp.Symbol]) -> sp.Matrix:
+    """Return the derivatives of a column of formulas almost everywhere."""
+    return sp.Matrix([[without_jumps(formula, symbol) for symbol in symbols] for formula in field])
 
 
 def formulas_of(model: Model) -> Formulas:

@@ -116,7 +116,7 @@ def prepare(model: Model, schedule: Schedule, theta: Array, kind: type[AffineSys
         notes = (*notes, _LATE)
     ends = ends_of(sampled, schedule, at_end, model.n, setup.observation)
     loop = None
-    if gauge.trivial and kind is AffineSystem:
+    if gauge.trivial and setup.quadratic is None:
         # The Gaussian itself may carry a derivative where nothing else does.
         dtype = complex if is_complex(setup.theta) else float
         parts = [np.ascontiguousarray(part, dtype) for part in (*transitions, ends.whiten, ends.slope, ends.intercept)]

@@ -10,6 +10,7 @@ import numpy as np
 import sympy as sp
 
 from zakai.methods._outside_tables import OutsideTables
+from zakai.models.angles import without_branch
 from zakai.models.features import CROSS_NOISE, OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
 from zakai.models.functions import Floor, Maximum, Minimum, TableFunction
 from zakai.models.kept import once_for_a_model
@@ -72,7 +73,7 @@ def _roots(model: Model) -> list[sp.Expr]:
     """
     dynamics = [model.drift[0], model.covariance[0]]
     found = _zeros(model, [*dynamics, *([] if model.observation_kind == "samples" else model.observation)])
-    return sorted(found | _zeros(model, [*dynamics, *model.observation]), key=str) if found else []
+    return sorted(found | _zeros(model, [*dynamics, *without_branch(model)]), key=str) if found else []
 
 
 def _zeros(model: Model, formulas: list[sp.Expr]) -> set[sp.Expr]:
@@ -169,10 +170,10 @@ class System:
         self.reflecting = any(interval.reflecting for interval in model.domain.values())
         self.general = bool(OF_OBSERVATION & model.features.keys())
         # Whether h, or the law of what is observed, has no jump and no kink.
-        law = [*model.observation, *([] if model.log_density is None else [model.log_density])]
+        law = [*without_branch(model), *([] if model.log_density is None else [model.log_density])]
         self.smooth_observation = not any(not _continuous(part, x) or _rough(part, x) for part in law)
         # Whether h has kinks, but no jump.
-        self.kinked_observation = not self.smooth_observation and all(_continuous(part, x) for part in model.observation)
+        self.kinked_observation = not self.smooth_observation and all(_continuous(part, x) for part in without_branch(model))
         self.kinked_drift = self.slope is not None and _rough(model.drift[0], x)
         self.rough = any(not _continuous(part, x) or _rough(part, x) for part in (model.drift[0], model.covariance[0]))
         self.moving = bool((model.drift.free_symbols | model.covariance.free_symbols) & given)

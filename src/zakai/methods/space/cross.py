@@ -20,7 +20,8 @@ import sympy
 
 from zakai.methods.space.functions import PointFunction
 from zakai.methods.space.observed import Observations
-from zakai.methods.space.system import System, without_jumps
+from zakai.methods.space.system import System
+from zakai.models.functions import without_jumps
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function

@@ -9,10 +9,11 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
+from zakai.methods._formula_arrays import translated
 from zakai.models.model import Model
 from zakai.models.numeric import COMPLEX, REAL, program_of
 from zakai.numerics.complex_step import is_complex
-from zakai.numerics.formula_kernel import BINARY, CLOCK, NEITHER, UNARY, Formulas
+from zakai.numerics.formula_kernel import FIRST_INPUT, Formulas
 
 Array = NDArray[Any]
 SOURCES = ("x", "t", "theta", "u")
@@ -29,7 +30,7 @@ class PointFunction:
 
     def __init__(self, expressions: Sequence[sympy.Expr], model: Model, shape: tuple[int, ...]):
         program = program_of(list(expressions), model)
-        self._shape, self._outputs, self._instructions = shape, program.outputs, program.instructions
+        self._shape, self._outputs, self._program = shape, program.outputs, program
         self._fixed: list[Any] = [i.constant if i.operation == "constant" else None for i in program.instructions]
         self._sources = [
             (slot, SOURCES.index(i.operation), i.constant)
@@ -92,32 +93,6 @@ class PointFunction:
         return Formulas(found.code, given, found.coordinates, found.outputs)
 
     def _translated(self) -> Formulas | None:
-        """Return the program as arrays, without parameters."""
-        operations, count = (*BINARY, *UNARY), len(self._instructions)
-        code: list[tuple[int, int, int, int]] = []
-        constants: list[float] = []
-        for slot, instruction in enumerate(self._instructions):
-            operation, operands, constant = instruction.operation, instruction.operands, instruction.constant
-            if operation in ("constant", "x", "t", "theta"):
-                continue
-            if operation == "power" and not (isinstance(constant, int) and 2 <= constant <= 64):
-                constants.append(float(constant))
-                code.append((operations.index("general_power"), slot, operands[0], count + len(constants) - 1))
-            elif operation == "power":
-                code.append((operations.index("power"), slot, operands[0], constant))
-            elif operation not in operations:
-                return None
-            elif len(operands) == 1:
-                code.append((operations.index(operation), slot, operands[0], 0))
-            else:
-                first = operands[0]
-                for other in operands[1:]:
-                    code.append((operations.index(operation), slot, first, other))
-                    first = slot
-        given = np.array([0.0 if value is None else float(value) for value in self._fixed] + constants)
-        coordinates = np.full(len(given), NEITHER)
-        for slot, source, index in self._sources:
-            if source < 2:
-                coordinates[slot] = index if source == 0 else CLOCK
-        lines = np.array(code, np.int64).reshape(-1, 4)
-        return Formulas(lines, given, coordinates, np.array(self._outputs, np.int64))
+        """Return the program as arrays, without parameters; None where it has tables, sinc or inputs."""
+        found = translated(self._program)
+        return None if found is None or (found[0].coordinates <= FIRST_INPUT).any() else found[0]

@@ -13,7 +13,7 @@ import sympy
 from zakai.methods.space.filter import State
 from zakai.methods.space.functions import PointFunction
 from zakai.models.features import OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
-from zakai.models.functions import TableFunction
+from zakai.models.functions import TableFunction, without_jumps
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
@@ -113,11 +113,6 @@ def valid_noise(noise: Array) -> Array:
     """Return which matrices (J, n, n) are finite and have no negative variance."""
     variances = np.diagonal(noise.real, axis1=1, axis2=2)
     return np.asarray(np.isfinite(noise.real).all(axis=(1, 2)) & (variances >= 0).all(axis=1))
-
-
-def without_jumps(formula: sympy.Expr, symbol: sympy.Symbol) -> sympy.Expr:
-    """Return the derivative apart from jumps."""
-    return sympy.diff(formula, symbol).replace(sympy.DiracDelta, lambda *_: sympy.S.Zero)
 
 
 def _table_calls(model: Model) -> list[Any]:

@@ -37,7 +37,10 @@ def statistics_of(model: Model) -> list[tuple[int, sp.Expr]]:
             found.append((i, sp.sqrt(model.family_parameters["concentration", i]) * h))
         else:
             freedom = model.family_parameters.get(("degrees_of_freedom", i))
-            found.append((i, h / sp.sqrt(S) * (1 if freedom is None else sp.sqrt((freedom + 1) / (freedom + 3)))))
+            scale = (1 if freedom is None else sp.sqrt((freedom + 1) / (freedom + 3))) / sp.sqrt(S)
+            # An angle has the information of its sine and cosine together, which do not jump after half a turn.
+            parts = (sp.sin(h), sp.cos(h)) if model.observation_law.angles[i] else (h,)
+            found.extend((i, part * scale) for part in parts)
             if S.free_symbols & set(model.x):
                 found.append((i, sp.log(S) / sp.sqrt(2)))
     return found
