@@ -89,7 +89,8 @@ def joined(parts: Sequence[Infos]) -> Infos:
     """Return the reports of consecutive segments as one."""
     health = {name: np.concatenate([part.health[name] for part in parts]) for name in parts[0].health}
     increments, means, covs = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    return Infos(increments, means, covs, health)
+    errors = [None if parts[0][i] is None else np.concatenate([part[i] for part in parts]) for i in (4, 5)]
+    return Infos(increments, means, covs, health, *errors)
 
 
 def size_of(state: Any) -> int:
@@ -197,6 +198,8 @@ class Run:
             bounds={name: bound for name, bound in method.bounds.items() if name in infos.health},
             state=model.state,
             attributes={"source": method.source, "exactness": method.exactness, **versions()},
+            mean_standard_error=_with_start(infos.mean_standard_error),
+            log_likelihood_standard_error=_last(infos.log_likelihood_standard_error),
             _cov=cov,
             _density=self.density if kept else None,
             _no_density=self._no_density(),
@@ -216,6 +219,15 @@ class Run:
                 f'{self.most / 2**20:.3g} MiB; keep="densities" keeps them all'
             )
         return 'the densities were not kept; keep="densities" keeps them'
+
+
+def _with_start(errors: np.ndarray | None) -> np.ndarray | None:
+    """Return standard errors with those of the start, which are those of draws of the prior and not reported."""
+    return None if errors is None else np.concatenate([np.full((1, errors.shape[1]), np.nan), errors])
+
+
+def _last(errors: np.ndarray | None) -> float | None:
+    return None if errors is None else float(errors[-1])
 
 
 def _after_gaps(schedule: Schedule) -> list[str]:

@@ -22,7 +22,7 @@ import numpy as np
 
 from zakai.densities._density import wrap
 from zakai.methods._protocol import Info
-from zakai.methods.particles.errors import Genealogy, of_log_likelihood, variances
+from zakai.methods.particles.errors import DEPTH, Genealogy, of_log_likelihood, variances
 from zakai.methods.particles.interval import PILOTS, Events, Interval, Motion, substeps
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import System, drawn, gaussian_prior
@@ -41,6 +41,7 @@ GUIDE_SHARE, FIRST_SHARE = 0.1, 0.2  # of plain noise in draws from the linearis
 FIRST_WIDER, FIRST_ROUNDS = 1.5, 6
 INFORMED = 0.25  # log det of the linearised posterior of the noise, below which the observation says nothing about the noise
 MOST_LEVELS = 60
+FEW_FAMILIES = 20  # of the oldest generation that is looked back to, below which they are too few to show their spread
 # Standard error of a mean times sqrt(N) in standard deviations (1 for independent draws) from which the past is moved, and after
 # how many times as many intervals it is moved again; after that many intervals where the start of the window does not move.
 MOVE_ABOVE, MOVE_AGAIN, MOVE_EVERY = 2.5, 1.4, 3
@@ -54,7 +55,8 @@ class Control(NamedTuple):
     """What decides the next step beside the particles.
 
     `interval` counts intervals, `substeps` per unit time, `variance` of a mean times N, `last` intervals of the window at the last
-    move, `since` intervals since then, `wait` how many times the usual waiting, `levels` of all powers that were taken.
+    move, `since` intervals since then, `wait` how many times the usual waiting, and `doubtful_until` the number of resamplings until
+    which standard errors are lower bounds.
     """
 
     interval: int
@@ -63,7 +65,7 @@ class Control(NamedTuple):
     last: int
     since: int
     wait: float
-    doubtful: bool
+    doubtful_until: int
 
 
 class State(NamedTuple):
@@ -141,7 +143,7 @@ def init(prepared: Prepared, prior: Any) -> State:
     terms = len(prepared.motion.law[3])
     window = Window.begin(particles, first, gaussian, (width, terms))
     logs = np.full(count, -np.log(count))
-    control = Control(0, 0.0, VARIANCE, 0, 0, 1.0, False)
+    control = Control(0, 0.0, VARIANCE, 0, 0, 1.0, 0)
     _, deviations = moments(particles, np.exp(logs), system.angles)[:2]
     spread = np.sqrt(np.mean(deviations**2, axis=1))
     return State(particles, logs, window, Genealogy.begin(count), control, np.zeros(n), spread)
@@ -202,7 +204,8 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
         return _step(prepared, k, state, values)
     except np.linalg.LinAlgError:
         n = prepared.system.n
-        return state, Info(np.nan, np.full(n, np.nan), np.full((n, n), np.nan), dict.fromkeys(FIGURES, np.nan))
+        none = np.full(n, np.nan)
+        return state, Info(np.nan, none, np.full((n, n), np.nan), dict.fromkeys(FIGURES, np.nan), none, np.nan)
 
 
 FIGURES = (
@@ -230,7 +233,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     size, largest = effective(weights), float(weights.max())
     mean, deviations, cov = moments(cloud.particles, weights, angles)
     found = variances(cloud.genealogy, weights, deviations)
-    doubtful = control.doubtful or size < TEMPER_BELOW * len(weights) or done.levels > 3
+    doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
     acceptance, moved = done.acceptance, 0.0
     wait, last, since = control.wait, control.last, control.since + 1
     if _worth_moving(found.largest, cov, cloud, (wait, last, since)):
@@ -250,26 +253,24 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     cloud = cloud._replace(genealogy=genealogy)
     positive = np.where(spread > 0, spread, np.inf)
     share = found.largest / positive**2
-    families = float(found.families[-1])
+    until = cloud.genealogy.age + DEPTH if doubtful else control.doubtful_until
     health = {
         "effective_sample_size": size,
         "particles": float(len(weights)),
-        "founders": families,
+        "founders": float(found.families[-1]),
         "largest_weight": largest,
         "tempering_levels": float(done.levels),
         "acceptance": acceptance,
         "time_error": float((shift / positive).max()),
         "monte_carlo_error": float(np.sqrt(share.max())),
         "log_likelihood_error": float(np.sqrt(evidence)),
-        "lower_bound": float(doubtful or families < 20),
+        "lower_bound": float(doubtful or cloud.genealogy.age < until or found.families[-2] < FEW_FAMILIES),
         "guided": float(done.guided),
         "moved": moved,
     }
-    errors = np.sqrt(found.largest + shift**2)
-    health |= {f"standard_error_{i}": float(error) for i, error in enumerate(errors)}
-    info = Info(done.gained, mean, cov, health)
+    info = Info(done.gained, mean, cov, health, np.sqrt(found.largest + shift**2), float(np.sqrt(evidence)))
     variance = 0.8 * control.variance + 0.2 * len(weights) * float(share.mean())
-    control = Control(number, rate, variance, last, since, wait, doubtful)
+    control = Control(number, rate, variance, last, since, wait, until)
     return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, spread), info
 
 
