@@ -23,7 +23,7 @@ import numpy as np
 from zakai.densities._density import wrap
 from zakai.methods._protocol import Info
 from zakai.methods.particles.errors import DEPTH, Genealogy, of_log_likelihood, variances
-from zakai.methods.particles.interval import PILOTS, Events, Interval, Motion, substeps
+from zakai.methods.particles.interval import PILOTS, TIME_ERROR, Events, Interval, Motion, Steps, substeps
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import System, drawn, gaussian_prior
 from zakai.methods.particles.window import Observed, Target, Window, taken
@@ -49,18 +49,23 @@ MOVE_CONTROL = (1.0, 1.2, 8.0, 0.4)  # power, change, most sweeps, rho
 GAIN = 0.8  # of the variance by a move, above which moves are waited for twice as long
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
+SURE, TRUSTED = 0.1, 4  # share of the allowed time error below which its measurement is trusted in so many more intervals
 
 
 class Control(NamedTuple):
     """What decides the next step beside the particles.
 
-    `interval` counts intervals, `substeps` per unit time, `variance` of a mean times N, `last` intervals of the window at the last
+    `interval` counts intervals; `substeps` per unit time, whose `error` was measured in an interval of this `length` and is trusted
+    in so many more that are no longer; `variance` of a mean times N, `last` intervals of the window at the last
     move, `since` intervals since then, `wait` how many times the usual waiting, and `doubtful_until` the number of resamplings until
     which standard errors are lower bounds.
     """
 
     interval: int
     substeps: float
+    error: float
+    length: float
+    trusted: int
     variance: float
     last: int
     since: int
@@ -72,7 +77,7 @@ class State(NamedTuple):
     """The weighted particles and what continues them.
 
     `particles` (n, N), `log_weights` (N,) that sum to one, the past, the ancestors, the controls, `shift` (n,), the error of the
-    mean by the time step, and `deviations` (n,) of the states.
+    mean by the time step, and `last_shift` (n,), that of the last interval in which it was measured.
     """
 
     particles: Array
@@ -81,7 +86,7 @@ class State(NamedTuple):
     genealogy: Genealogy
     control: Control
     shift: Array
-    deviations: Array
+    last_shift: Array
 
 
 @dataclass(frozen=True)
@@ -143,10 +148,8 @@ def init(prepared: Prepared, prior: Any) -> State:
     terms = len(prepared.motion.law[3])
     window = Window.begin(particles, first, gaussian, (width, terms))
     logs = np.full(count, -np.log(count))
-    control = Control(0, 0.0, VARIANCE, 0, 0, 1.0, 0)
-    _, deviations = moments(particles, np.exp(logs), system.angles)[:2]
-    spread = np.sqrt(np.mean(deviations**2, axis=1))
-    return State(particles, logs, window, Genealogy.begin(count), control, np.zeros(n), spread)
+    control = Control(0, 0.0, np.inf, 0.0, 0, VARIANCE, 0, 0, 1.0, 0)
+    return State(particles, logs, window, Genealogy.begin(count), control, np.zeros(n), np.zeros(n))
 
 
 def moments(particles: Array, weights: Array, angles: Array) -> tuple[Array, Array, Array]:
@@ -221,7 +224,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     weights = np.exp(cloud.logs)
     before, apart, _ = moments(cloud.particles, weights, angles)
     scale = np.maximum(np.sqrt(apart**2 @ weights), 1e-12)
-    events, shift, rate = _events(prepared, interval, values, state, (before, scale), number)
+    steps, control = _steps(prepared, interval, values, state, (before, scale))
+    events = motion.events(interval, steps.count, values, before, scale)
     observed = _observed(prepared, interval, values)
     wanted = _wanted(rule, len(weights), control.variance)
     if effective(weights) < RESAMPLE_BELOW * len(weights) or wanted != len(weights):
@@ -248,7 +252,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     spread = np.sqrt(np.maximum(np.diag(cov), 0.0))
     # What the data says of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
     contraction = np.minimum(1.0, spread / np.maximum(done.predicted, 1e-300)) ** 2
-    shift = (state.shift + shift) * contraction
+    shift = (state.shift + steps.shift) * contraction
     genealogy, evidence = of_log_likelihood(cloud.genealogy, found)
     cloud = cloud._replace(genealogy=genealogy)
     positive = np.where(spread > 0, spread, np.inf)
@@ -270,25 +274,30 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     }
     info = Info(done.gained, mean, cov, health, np.sqrt(found.largest + shift**2), float(np.sqrt(evidence)))
     variance = 0.8 * control.variance + 0.2 * len(weights) * float(share.mean())
-    control = Control(number, rate, variance, last, since, wait, until)
-    return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, spread), info
+    control = control._replace(
+        interval=number, variance=variance, last=last, since=since, wait=wait, doubtful_until=until
+    )
+    return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, steps.shift), info
 
 
-def _events(
-    prepared: Prepared, interval: Interval, values: Array, state: State, about: tuple[Array, Array], number: int
-) -> tuple[Events, Array, float]:
-    """Return the events of an interval, the shift of the mean (n,) by its time step, and the substeps per unit time."""
-    motion, (mean, scale) = prepared.motion, about
-    weights = np.exp(state.log_weights)
-    key = prepared.key(number, PILOT)
-    chosen = np.empty(PILOTS, np.int32)
-    systematic(weights, uniform_number(key), chosen)
+def _steps(
+    prepared: Prepared, interval: Interval, values: Array, state: State, about: tuple[Array, Array]
+) -> tuple[Steps, Control]:
+    """Return the substeps of an interval, measured where the last measurement does not hold any more, and the controls."""
+    control, (mean, scale) = state.control, about
     length = interval.stop - interval.start
-    guess = max(1, round(state.control.substeps * length))
+    guess = max(1, round(control.substeps * length))
+    if length <= 0:
+        return Steps(1, np.zeros(len(mean)), 0.0), control
+    if control.trusted and length <= control.length * (1.0 + 1e-9):
+        return Steps(guess, state.last_shift, control.error), control._replace(trusted=control.trusted - 1)
+    key = prepared.key(control.interval + 1, PILOT)
+    chosen = np.empty(PILOTS, np.int32)
+    systematic(np.exp(state.log_weights), uniform_number(key), chosen)
     pilots = taken(state.particles, chosen)
-    found = substeps(motion, interval, values, pilots, (mean, scale, scale), guess, int(key[0]))
-    events = motion.events(interval, found.count, values, mean, scale)
-    return events, found.shift, found.count / length if length > 0 else state.control.substeps
+    found = substeps(prepared.motion, interval, values, pilots, (mean, scale, scale), guess, int(key[0]))
+    trusted = TRUSTED if found.error <= SURE * TIME_ERROR else 0
+    return found, control._replace(substeps=found.count / length, error=found.error, length=length, trusted=trusted)
 
 
 def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed:

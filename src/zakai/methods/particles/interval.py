@@ -20,6 +20,7 @@ from zakai.records.inputs import Inputs
 PILOTS = 64  # particles by which the time step is measured
 TIME_ERROR = 0.01  # of a mean or a standard deviation by one interval, in standard deviations, that a step is chosen for
 MOST_SUBSTEPS = 64
+KEPT_LENGTHS = 64  # of substeps whose noise is kept
 _SERIES = 4.0  # norm of A times the substep up to which the covariance of its noise is a series
 
 
@@ -87,6 +88,34 @@ class Motion:
         return out
 
     @cached_property
+    def _kept_roots(self) -> dict[float, Array]:
+        return {}
+
+    def _root_of(self, step: float) -> Array:
+        """Return the root of the noise of a substep of an affine system without time."""
+        if step not in self._kept_roots:
+            if len(self._kept_roots) >= KEPT_LENGTHS:
+                self._kept_roots.clear()
+            nothing = np.zeros((self.system.m, self.system.m))
+            G = self._covariance(float(self.system.model.start), nothing, None)
+            self._kept_roots[step] = root(noise_about_middle(self.constant_matrix, G, step))
+        return self._kept_roots[step]
+
+    def _covariance(self, t: float, P: Array, u: Array | None) -> Array:
+        """Return g (Q - C P C') g' (n, n) for noise that does not depend on the state."""
+        system = self.system
+        if system.cross is None and not system.timed:
+            return self._constant_covariance
+        g = system.diffusion(np.zeros(system.n), t, self.theta, u)
+        return np.asarray(g @ system.own_noise(t, P, self.theta, u) @ g.T)
+
+    @cached_property
+    def _constant_covariance(self) -> Array:
+        system, t = self.system, float(self.system.model.start)
+        g, Q = system.diffusion(np.zeros(system.n), t, self.theta), system.process_noise(np.zeros(system.n), t, self.theta)
+        return np.asarray(g @ Q @ g.T)
+
+    @cached_property
     def constant_matrix(self) -> Array:
         """The matrix of an affine drift."""
         model = self.system.model
@@ -143,6 +172,8 @@ class Motion:
         system, length = self.system, interval.stop - interval.start
         given = np.zeros((len(times), 2, system.drift.width))
         known: Array | None = None
+        if not given.shape[2]:
+            return given
         for e, pair in enumerate(times):
             for side, t in enumerate(pair):
                 if known is not None and not system.timed:
@@ -165,7 +196,11 @@ class Motion:
     ) -> Array:
         """Return the roots of the noise of all substeps, (J, n, d), or (J, r, d) for the coefficients of fields."""
         system, found = self.system, list[Array]()
-        known: Array | None = None
+        if system.kind == ADDITIVE and system.affine and not system.timed and system.cross is None:
+            # Nothing but the length decides, and equal lengths are frequent.
+            known = self._root_of(step)
+            return np.repeat(known[None], int(places[:, 0].max()) + 1, axis=0)
+        known = None
         A = self._slopes(times, places, given, mean, scale)
         for e in np.flatnonzero(places[:, 0] >= 0):
             if known is None or system.timed or A is not None and not system.affine:
@@ -173,13 +208,12 @@ class Motion:
                 P = np.zeros((system.m, system.m))
                 if system.cross is not None:
                     P = system.precision(times[e, 1], interval.inside, self.theta, u)
-                Q = system.own_noise(times[e, 1], P, self.theta, u)
                 if system.kind == ADDITIVE:
-                    g = system.diffusion(np.zeros(system.n), times[e, 1], self.theta, u)
+                    G = self._covariance(times[e, 1], P, u)
                     assert A is not None
-                    known = root(noise_about_middle(A[len(found)], g @ Q @ g.T, step))
+                    known = root(noise_about_middle(A[len(found)], G, step))
                 else:
-                    known = root(Q) * np.sqrt(step)
+                    known = root(system.own_noise(times[e, 1], P, self.theta, u)) * np.sqrt(step)
             found.append(known)
         width = max(one.shape[1] for one in found)
         roots = np.zeros((len(found), system.r if system.kind else system.n, width))
@@ -213,7 +247,7 @@ def noise_about_middle(A: Array, G: Array, length: float) -> Array:
             if k % 2 == 0:
                 change = factor * term
                 total = total + change
-                if np.abs(change).max() <= 1e-17 * np.abs(total).max():
+                if np.abs(change).max() <= 1e-15 * np.abs(total).max():
                     break
         return 0.5 * (total + total.T)
     n = len(A)
@@ -226,13 +260,11 @@ def noise_about_middle(A: Array, G: Array, length: float) -> Array:
 
 
 class Steps(NamedTuple):
-    """The number of substeps of an interval and what is left of the time error.
-
-    `shift` (n,) of the mean, in units of the state.
-    """
+    """The number of substeps of an interval, the shift (n,) of the mean that they leave, and it in standard deviations."""
 
     count: int
     shift: Array
+    error: float
 
 
 def substeps(
@@ -253,7 +285,7 @@ def substeps(
     n = system.n
     mean, scale, unit = moments
     if interval.stop <= interval.start or (system.sampled and system.affine and not _driven(system)):
-        return Steps(1, np.zeros(n))
+        return Steps(1, np.zeros(n), 0.0)
     count, shift = max(1, guess), np.full(n, np.inf)
     for turn in range(4):
         found = _time_error(motion, interval, values, pilots, (mean, scale, unit), count, key + turn)
@@ -267,10 +299,10 @@ def substeps(
         if wanted < count:
             wanted = max(wanted, (count + 1) // 2)
         if wanted <= 2 * count:
-            return Steps(wanted, shift * (count / wanted) ** 2)
+            return Steps(wanted, shift * (count / wanted) ** 2, error * (count / wanted) ** 2)
         shift = shift * (count / wanted) ** 2
         count = wanted
-    return Steps(count, shift)
+    return Steps(count, shift, float((shift / unit).max()))
 
 
 def _driven(system: System) -> bool:

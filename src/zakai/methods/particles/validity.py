@@ -13,7 +13,7 @@ from zakai.methods.particles.window import INTERVALS, Window
 def valid(prepared: Prepared, state: State) -> bool:
     """Return whether a state has the shapes and the indices that a step of this filter makes."""
     n, count = prepared.system.n, len(state.log_weights)
-    shapes = state.particles.shape == (n, count) and state.shift.shape == state.deviations.shape == (n,)
+    shapes = state.particles.shape == (n, count) and state.shift.shape == state.last_shift.shape == (n,)
     return count > 0 and shapes and _window(prepared, state.window, count) and _genealogy(state, count)
 
 

@@ -12,13 +12,18 @@ _ALONE = 8192  # particles up to which threads cost more than they save
 
 
 @cache
+def _cores() -> int:
+    return os.cpu_count() or 1
+
+
+@cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="zakai-particles")
+    return ThreadPoolExecutor(_cores(), thread_name_prefix="zakai-particles")
 
 
 def over_chunks(work: Callable[[int, int], None], count: int) -> None:
     """Call `work(low, high)` for parts of `count` particles that are multiples of `CHUNK`, on all cores where there are many."""
-    cores = os.cpu_count() or 1
+    cores = _cores()
     if count <= _ALONE or cores == 1:
         work(0, count)
         return
