@@ -42,11 +42,12 @@ FIRST_WIDER, FIRST_ROUNDS = 1.5, 6
 INFORMED = 0.25  # log det of the linearised posterior of the noise, below which the observation says nothing about the noise
 MOST_LEVELS = 60
 FEW_FAMILIES = 20  # of the oldest generation that is looked back to, below which they are too few to show their spread
-# Standard error of a mean times sqrt(N) in standard deviations (1 for independent draws) from which the past is moved, and after
-# how many times as many intervals it is moved again; after that many intervals where the start of the window does not move.
-MOVE_ABOVE, MOVE_AGAIN, MOVE_EVERY = 2.5, 1.4, 3
+# Standard error of a mean times sqrt(N) in standard deviations (1 for independent draws) from which the past is moved.  A move costs
+# as much as the intervals of its window: it waits until the squares of these figures, in units of that of `MOVE_ABOVE`, add up to
+# this share of the intervals of the last move.
+MOVE_ABOVE, MOVE_SHARE = 2.5, 0.4
 MOVE_CONTROL = (1.0, 1.2, 8.0, 0.4)  # power, change, most sweeps, rho
-GAIN = 0.8  # of the variance by a move, above which moves are waited for twice as long
+GAIN = 0.7  # of the largest variance by a move, above which moves are waited for twice as long
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
 SURE, TRUSTED = 0.1, 4  # share of the allowed time error below which its measurement is trusted in so many more intervals
@@ -57,7 +58,7 @@ class Control(NamedTuple):
 
     `interval` counts intervals; `substeps` per unit time, whose `error` was measured in an interval of this `length` and is trusted
     in so many more that are no longer; `variance` of a mean times N, `last` intervals of the window at the last
-    move, `since` intervals since then, `wait` how many times the usual waiting, and `doubtful_until` the number of resamplings until
+    move, `urgency` what has added up since then, `wait` how many times the usual waiting, and `doubtful_until` the number of resamplings until
     which standard errors are lower bounds.
     """
 
@@ -68,7 +69,7 @@ class Control(NamedTuple):
     trusted: int
     variance: float
     last: int
-    since: int
+    urgency: float
     wait: float
     doubtful_until: int
 
@@ -148,7 +149,7 @@ def init(prepared: Prepared, prior: Any) -> State:
     terms = len(prepared.motion.law[3])
     window = Window.begin(particles, first, gaussian, (width, terms))
     logs = np.full(count, -np.log(count))
-    control = Control(0, 0.0, np.inf, 0.0, 0, VARIANCE, 0, 0, 1.0, 0)
+    control = Control(0, 0.0, np.inf, 0.0, 0, VARIANCE, 0, 0.0, 1.0, 0)
     return State(particles, logs, window, Genealogy.begin(count), control, np.zeros(n), np.zeros(n))
 
 
@@ -239,15 +240,16 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     found = variances(cloud.genealogy, weights, deviations)
     doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
     acceptance, moved = done.acceptance, 0.0
-    wait, last, since = control.wait, control.last, control.since + 1
-    if _worth_moving(found.largest, cov, cloud, (wait, last, since)):
+    wait, last = control.wait, control.last
+    factor = _excess(found.largest, cov, len(weights))
+    urgency = control.urgency + factor
+    if factor > 1.0 and urgency >= MOVE_SHARE * wait * last and cloud.window.width:
         cloud, acceptance, doubtful_move = _moved(prepared, cloud, weights, number)
-        old = found
         weights = np.exp(cloud.logs)
         mean, deviations, cov = moments(cloud.particles, weights, angles)
         found = variances(cloud.genealogy, weights, deviations)
-        ratio = float(np.sum(found.largest / np.diag(cov)) / np.sum(old.largest / np.diag(cov)))
-        wait, last, since, moved = 2 * wait if ratio > GAIN else max(1.0, 0.5 * wait), cloud.window.count, 0, 1.0
+        ratio = _excess(found.largest, cov, len(weights)) / factor
+        wait, last, urgency, moved = 2 * wait if ratio > GAIN else max(1.0, 0.5 * wait), cloud.window.count, 0.0, 1.0
         doubtful = doubtful or doubtful_move
     spread = np.sqrt(np.maximum(np.diag(cov), 0.0))
     # What the data says of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
@@ -275,7 +277,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     info = Info(done.gained, mean, cov, health, np.sqrt(found.largest + shift**2), float(np.sqrt(evidence)))
     variance = 0.8 * control.variance + 0.2 * len(weights) * float(share.mean())
     control = control._replace(
-        interval=number, variance=variance, last=last, since=since, wait=wait, doubtful_until=until
+        interval=number, variance=variance, last=last, urgency=urgency, wait=wait, doubtful_until=until
     )
     return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, steps.shift), info
 
@@ -372,7 +374,7 @@ def _guided(prepared: Prepared, target: Target, cloud: Cloud, plain: Advanced, n
     weights = np.exp(cloud.logs)
     wider, rounds, share = (FIRST_WIDER, FIRST_ROUNDS, FIRST_SHARE) if moving else (1.0, 2, GUIDE_SHARE)
     gaussian = target.gaussian(begin, weights, rounds=rounds, wider=wider)
-    if gaussian is None or np.log(np.diag(gaussian[3])).sum() + 0.5 * len(begin) * np.log(wider) < INFORMED:
+    if gaussian is None or np.log(gaussian[4] * np.sqrt(wider)).sum() < INFORMED:
         return None
     path, ratio = target.draw(gaussian, share, prepared.key(number, GUIDE))
     particles, logs = target.follow(path)
@@ -409,7 +411,7 @@ def _tempered(
         gaussian = target.gaussian(path, None, power=high)
         if gaussian is None:
             n, D = cloud.particles.shape[0], len(path)
-            gaussian = (np.zeros(D), np.zeros((D, n)), np.zeros(n), np.eye(D), np.eye(D))
+            gaussian = (np.zeros(D), np.zeros((D, n)), np.zeros(n), np.zeros((0, D)), np.zeros(0))
         path, particles, logs, rate, _ = target.sweep(gaussian, path, (high, *control, 0.4), prepared.key(number, LEVELS, levels))
         rates.append(rate)
     window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
@@ -418,14 +420,11 @@ def _tempered(
     return Advanced(after, gained, noise, plain.predicted, levels, acceptance=float(np.mean(rates)))
 
 
-def _worth_moving(variance: Array, cov: Array, cloud: Cloud, waiting: tuple[float, int, int]) -> bool:
-    """Return whether the past is moved: a mean is known much worse than by independent draws, and it is long since the last."""
-    wait, last, since = waiting
-    spread, window = np.diag(cov), cloud.window
+def _excess(variance: Array, cov: Array, count: int) -> float:
+    """Return the largest variance of a mean over that of independent draws, in units of `MOVE_ABOVE` squared."""
+    spread = np.diag(cov)
     wide = spread > 0
-    factor = np.sqrt((variance[wide] / spread[wide]).max(initial=0.0) * len(cloud.logs))
-    long = window.count >= MOVE_AGAIN * wait * last if len(window.first) else since >= MOVE_EVERY * wait
-    return bool(factor > MOVE_ABOVE and long and window.width)
+    return float((variance[wide] / spread[wide]).max(initial=0.0)) * count / MOVE_ABOVE**2
 
 
 def _moved(prepared: Prepared, cloud: Cloud, weights: Array, number: int) -> tuple[Cloud, float, bool]:

@@ -10,17 +10,19 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from zakai.methods.particles.interval import Events, Motion
 from zakai.methods.particles.programs import Array
 from zakai.numerics.particles import moves
 from zakai.numerics.particles.chunks import CHUNK, over_chunks
 
-INTERVALS = 40  # of a window
-NUMBERS = 80  # normal numbers of a particle in a window: a move costs their square
+INTERVALS = 64  # of a window
+# Normal numbers of a particle in a window, at least and at most: a move costs their square.  Between these it is as many as all
+# particles together may have: while the window begins at the prior, moves reach what never changes, such as a parameter.
+FEWEST, MOST, TOGETHER = 80, 240, 2**23
 _STEP = 1e-4  # of forward differences, in standard deviations
 _WIDER = 1.15  # variance of the Gaussian over that of the linearised posterior
+_INFORMED = 0.1  # information of a direction of the noise, over that of N(0, 1), from which moves follow it
 _EMPTY = np.zeros(0, np.int32)
 _NO_EVENTS = Events(np.zeros((0, 2)), np.zeros((0, 2), np.int64), np.zeros((0, 2, 0)), np.zeros((0, 0, 0)), np.zeros((0, 3), np.int64))
 
@@ -79,7 +81,8 @@ class Window(NamedTuple):
     def appended(self, motion: Motion, events: Events, observed: Observed, noise: Array, end: Array) -> Window:
         """Return the window with one interval more, without the oldest ones where it is too long."""
         window = self
-        while window.count and (window.count == INTERVALS or window.width + len(noise) > NUMBERS):
+        most = min(max(TOGETHER // noise.shape[1], FEWEST), MOST)
+        while window.count and (window.count == INTERVALS or window.width + len(noise) > most):
             window = window._shortened(motion)
         k = window.count
         return window._replace(
@@ -258,14 +261,12 @@ class Target:
             if not (np.isfinite(A).all() and np.isfinite(right).all() and np.isfinite(across).all()):
                 return None
             point = np.linalg.solve(A, right)
-        try:
-            U = np.ascontiguousarray(np.linalg.cholesky(A).T) / np.sqrt(wider)
-        except np.linalg.LinAlgError:
-            return None
         if moving:
             gain = -np.linalg.solve(A, across)
-        inverse = np.ascontiguousarray(solve_triangular(U, np.eye(D)))
-        return point, np.ascontiguousarray(gain), centre, U, inverse
+        values, vectors = np.linalg.eigh(A)
+        informed = values > 1.0 + _INFORMED
+        directions = np.ascontiguousarray(vectors[:, informed].T)
+        return point, np.ascontiguousarray(gain), centre, directions, np.sqrt(values[informed] / wider)
 
     def _information(self, k: int, x: Array, scale: Array) -> tuple[Array, Array]:
         """Return the slope (n,) and the information (n, n) of the log-likelihood of observation k at a state."""

@@ -1,9 +1,10 @@
 """Moves of the noise of particles over several intervals, and draws of it, by a Gaussian that approximates its posterior.
 
 The noise p of a window has the law N(0, I) times the likelihood L(p) of what is observed in it.  A move is reversible in a Gaussian
-N(m, (U'U)^-1), whose mean m may be an affine function of the state at the start of the window,
+N(m, U^-2), whose mean m may be an affine function of the state at the start of the window, and which differs from N(0, I) in the few
+directions V (orthonormal) that the observations inform,
 
-    w = U (p - m),   w* = rho w + sqrt(1 - rho^2) e,   e ~ N(0, I),    p* = m + U^-1 w*
+    U = I + V diag(s - 1) V',    w = U (p - m),   w* = rho w + sqrt(1 - rho^2) e,   e ~ N(0, I),    p* = m + U^-1 w*
 
 and is accepted with the exact ratio, so that the Gaussian decides how well the moves mix, and never what they converge to.
 
@@ -31,8 +32,8 @@ Array = Any
 OBSERVED = types.Tuple((PROGRAM, F1, F2, F2))
 # The mean (n,) and a root (n, d0) of the prior; without columns the window starts from states that do not move.
 PRIOR = types.Tuple((F1, F2))
-# The mean (D,), its derivative by the start (D, n), the start to which that refers (n,), U (D, D) and its inverse.
-GAUSSIAN = types.Tuple((F1, F2, F1, F2, F2))
+# The mean (D,), its derivative by the start (D, n), the start to which that refers (n,), the rows of V' (r, D), and s (r,).
+GAUSSIAN = types.Tuple((F1, F2, F1, F2, F1))
 _ACCEPTANCE = np.uint64(1 << 60)  # counters from here on are those of acceptance
 _WORST, _BEST = 0.2, 0.4  # acceptance below which steps become shorter, and above which they become longer
 _LONGEST = 0.96  # of the share of the old noise
@@ -96,14 +97,21 @@ def _mean(gaussian: Any, start: Array, out: Array, size: int) -> None:
 
 
 @helper
-def _times_upper(matrix: Array, given: Array, out: Array, size: int) -> None:
-    """Add an upper triangular matrix (D, D) times columns (D, size) to `out`."""
-    for r in range(matrix.shape[0]):
-        for c in range(r, matrix.shape[0]):
-            factor = matrix[r, c]
-            if factor != 0.0:
-                for i in range(size):
-                    out[r, i] += factor * given[c, i]
+def _scale(gaussian: Any, inverse: bool, given: Array, along: Array, size: int) -> None:
+    """Multiply columns (D, size) by U, or by its inverse; `along` (size,) is overwritten."""
+    V, factors = gaussian[3], gaussian[4]
+    for k in range(factors.size):
+        factor = (1.0 / factors[k] if inverse else factors[k]) - 1.0
+        for i in range(size):
+            along[i] = 0.0
+        for r in range(V.shape[1]):
+            entry = V[k, r]
+            for i in range(size):
+                along[i] += entry * given[r, i]
+        for r in range(V.shape[1]):
+            entry = factor * V[k, r]
+            for i in range(size):
+                given[r, i] += entry * along[i]
 
 
 @kernel(types.void(MOTION, EVENTS, OBSERVED, PRIOR, F2, F2, types.int64, types.int64, F2, F1))
@@ -124,18 +132,21 @@ def follow(motion: Any, events: Any, observed: Any, prior: Any, start: Array, pa
 
 @kernel(types.void(GAUSSIAN, types.float64, KEY, F2, types.int64, types.int64, F2, F1))
 def draw(gaussian: Any, share: float, key: Array, start: Array, low: int, high: int, path: Array, ratio: Array) -> None:
-    """Write noise (D, N) drawn from share N(0, I) + (1 - share) N(m, (U'U)^-1), and log N(0, I) less the log of that density."""
-    D, U, inverse = path.shape[0], gaussian[3], gaussian[4]
-    w, p, m, white = np.empty((D, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK))
+    """Write noise (D, N) drawn from share N(0, I) + (1 - share) N(m, U^-2), and log N(0, I) less the log of that density."""
+    D, along = path.shape[0], np.empty(BLOCK)
+    w, p, m = np.empty((D, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK))
     log_det = 0.0
-    for r in range(D):
-        log_det += math.log(abs(U[r, r]))
+    for factor in gaussian[4]:
+        log_det += math.log(factor)
     for first in range(low, high, BLOCK):
         size = min(BLOCK, high - first)
         fill_normals(key, first, size, w)
         _mean(gaussian, start[:, first : first + size], m, size)
-        p[:, :size] = m[:, :size]
-        _times_upper(inverse, w, p, size)
+        p[:, :size] = w[:, :size]
+        _scale(gaussian, True, p, along, size)
+        for r in range(D):
+            for i in range(size):
+                p[r, i] += m[r, i]
         for i in range(size):
             if uniform(key, _ACCEPTANCE + np.uint64(first + i)) < share:
                 for r in range(D):
@@ -143,13 +154,12 @@ def draw(gaussian: Any, share: float, key: Array, start: Array, low: int, high: 
         for r in range(D):
             for i in range(size):
                 m[r, i] = p[r, i] - m[r, i]
-        white[:, :size] = 0.0
-        _times_upper(U, m, white, size)
+        _scale(gaussian, False, m, along, size)
         for i in range(size):
             q = log_det
             phi = 0.0
             for r in range(D):
-                q -= 0.5 * white[r, i] ** 2
+                q -= 0.5 * m[r, i] ** 2
                 phi -= 0.5 * p[r, i] ** 2
             top = max(q, phi)
             ratio[first + i] = phi - top - math.log((1.0 - share) * math.exp(q - top) + share * math.exp(phi - top))
@@ -181,7 +191,7 @@ def sweep(motion: Any, events: Any, observed: Any, prior: Any, gaussian: Any, co
     n, D = start.shape[0], path.shape[0]
     power, enough, most = control[0], control[1], int(control[2])
     blocks, buffers = _blocks(motion, observed), buffers_of(motion, events)
-    U, inverse = gaussian[3], gaussian[4]
+    along = np.empty(BLOCK)
     x, found = np.empty((motion[0][3].size, BLOCK)), np.empty(BLOCK)
     begin, new, fresh, m = np.empty((n, BLOCK)), np.empty((D + 1, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK))
     w, target = np.empty((D, CHUNK)), np.empty(CHUNK)
@@ -198,20 +208,19 @@ def sweep(motion: Any, events: Any, observed: Any, prior: Any, gaussian: Any, co
                 if turn < 0:
                     new[:D, :size] = path[:, first : first + size]
                     fresh[:, :size] = new[:D, :size] - m[:, :size]
-                    own = w[:, at : at + size]
-                    own[:, :] = 0.0
-                    _times_upper(U, fresh, own, size)
-                    for r in range(D):
-                        for i in range(size):
-                            fresh[r, i] = own[r, i]
+                    _scale(gaussian, False, fresh, along, size)
+                    w[:, at : at + size] = fresh[:, :size]
                 else:
                     row = turn * D
                     for r in range(D):
                         fill_row(key, row + r, first, size, fresh[r])
                         for i in range(size):
                             fresh[r, i] = rho * w[r, at + i] + s * fresh[r, i]
-                    new[:D, :size] = m[:, :size]
-                    _times_upper(inverse, fresh, new, size)
+                    new[:D, :size] = fresh[:, :size]
+                    _scale(gaussian, True, new, along, size)
+                    for r in range(D):
+                        for i in range(size):
+                            new[r, i] += m[r, i]
                 _follow(motion, events, observed, prior, blocks, begin, new, x, found, buffers, size)
                 for i in range(size):
                     value = power * found[i]
