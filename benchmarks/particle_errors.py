@@ -2,8 +2,8 @@
 
     python benchmarks/particle_errors.py [SYSTEM ...] [--seeds N]
 
-The reference of each system is the mean of runs of our own with many particles and of plain bootstrap filters in NumPy, weighted by
-the squares of their spreads; `disagreement` is the distance of the two in standard deviations.
+The reference of each system is the mean of runs of our own with many particles and of plain bootstrap filters in NumPy, weighted
+by the squares of their spreads; `disagreement` is the distance of the two in standard deviations.
 """
 
 from __future__ import annotations

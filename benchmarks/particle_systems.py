@@ -16,7 +16,8 @@ def _model(state: str, drift: list[str], noise: dict[str, str], observation: lis
     rows = [[noise[name] if name == other else "0" for other in noise] for name in names]
     keys = {"observation_kind": "samples", "observation_noise": np.diag(variances).tolist()} | more
     return zakai.Model(
-        state=names, drift=drift, diffusion=rows, observation=observation, prior={"kind": "gaussian", "mean": mean, "cov": cov}, **keys
+        state=names, drift=drift, diffusion=rows, observation=observation, prior={"kind": "gaussian", "mean": mean, "cov": cov},
+        **keys
     )
 
 
@@ -63,14 +64,16 @@ def car() -> zakai.Model:
 
 def epidemic() -> zakai.Model:
     """Susceptible and infected shares of a population, with noise that depends on them; infections are counted."""
-    return _model("s i", ["-0.9*s*i", "0.9*s*i - 0.3*i"], {"s": "0", "i": "0.15*i"}, ["1000*i"], [1.0], [0.95, 0.02], [4e-4, 2.5e-5],
-                  observation_family="poisson", domain={"s": {"lower": 0.0}, "i": {"lower": 0.0}})  # fmt: skip
+    return _model("s i", ["-0.9*s*i", "0.9*s*i - 0.3*i"], {"s": "0", "i": "0.15*i"}, ["1000*i"], [1.0],
+                  [0.95, 0.02], [4e-4, 1.6e-5], observation_family="poisson",
+                  domain={"s": {"lower": 0.0}, "i": {"lower": 0.0}})  # fmt: skip
 
 
 def robot() -> zakai.Model:
     """A robot on a circle around two beacons, with its heading as an angle."""
     return _model("x y a", ["cos(a)", "sin(a)", "0.3"], {"x": "0.05", "y": "0.05", "a": "0.15"},
-                  ["sqrt((x - 4)**2 + y**2)", "sqrt(x**2 + (y - 5)**2)"], [0.04, 0.04], [0, 0, 0], [1, 1, 0.5], periodic=["a"])  # fmt: skip
+                  ["sqrt((x - 4)**2 + y**2)", "sqrt(x**2 + (y - 5)**2)"], [0.04, 0.04], [0, 0, 0], [1, 1, 0.5], periodic=["a"])
+                  # fmt: skip
 
 
 def volatility() -> zakai.Model:
@@ -106,8 +109,8 @@ def chain_8() -> zakai.Model:
     for i in range(4):
         sides = [f"x{j} - x{i}" for j in (i - 1, i + 1) if 0 <= j < 4]
         drift.append(f"{' + '.join(sides)} - x{i} - 0.3*x{i}**3 - 0.2*v{i}")
-    return _model(" ".join(names), drift, {f"v{i}": "0.4" for i in range(4)}, ["x0", "sin(x3)"], [0.02, 0.02], [0.5] * 4 + [0.0] * 4,
-                  [0.2] * 8)  # fmt: skip
+    return _model(" ".join(names), drift, {f"v{i}": "0.4" for i in range(4)}, ["x0", "sin(x3)"], [0.02, 0.02],
+                  [0.5] * 4 + [0.0] * 4, [0.2] * 8)  # fmt: skip
 
 
 # The model, the mean length of an interval, and Euler's steps of the bootstrap filter in it.
@@ -140,7 +143,9 @@ def problem(name: str, count: int = 40, seed: int = 0) -> tuple[zakai.Model, zak
     return model, zakai.Record(times, values, record.kind)
 
 
-def bootstrap(model: zakai.Model, record: zakai.Record, count: int, seed: int, steps: int) -> tuple[np.ndarray, np.ndarray, float]:
+def bootstrap(
+    model: zakai.Model, record: zakai.Record, count: int, seed: int, steps: int
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Return means and deviations (K, n) and the log-likelihood of a plain bootstrap filter in NumPy."""
     from zakai.models.numeric import numpy_function
 

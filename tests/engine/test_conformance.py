@@ -30,7 +30,8 @@ SYSTEMS = {
         parameters={"a": 0.3, "c": 0.9},
     ),
 }
-# Particles have a random error, about 0.03 standard deviations of a mean. A Gaussian sum has few components: it stands near the density, and how near says its own test. On the spiral system two starts
+# Particles have a random error, about 0.03 standard deviations of a mean.  A Gaussian sum has few
+# components: it stands near the density, and how near says its own test. On the spiral system two starts
 # that differ in rounding come to differ by as much as each is off; on the other system both sums are exact but for the cut prior.
 NEAR = {"general-direct": 2e-2, "gaussian-sum": 5e-4, "guided-particles": 0.1}
 # A method with a tolerance is asked for more where rounding is compared.

@@ -27,6 +27,7 @@ from zakai.records.schedule import ROUNDING, Schedule, schedule_of
 CHUNK = 1024  # intervals that are prepared together, at most
 PIECE = 128  # intervals between two reports of progress, at most
 GROWTH = 8  # the first report comes after one interval
+AT_ONCE = 64 * 2**20  # bytes of the states of a segment
 KEPT_BYTES = 512 * 2**20  # of densities that are kept by default
 
 
@@ -82,7 +83,8 @@ def segments(setting: Setting, schedule: Schedule, state: Any, values: np.ndarra
             with np.errstate(all="ignore"):  # what is not finite is reported by who receives it
                 states, infos = advance(setting, prepared, rows, state, values[start + rows.start : start + rows.stop])
             yield Segment(start + begin, prepared, rows, state, states, infos)
-            state, begin, size = states[-1], rows.stop, min(GROWTH * size, PIECE)
+            state, begin = states[-1], rows.stop
+            size = max(1, min(GROWTH * size, PIECE, AT_ONCE // max(size_of(state), 1)))
 
 
 def joined(parts: Sequence[Infos]) -> Infos:
@@ -142,6 +144,8 @@ class Run:
         self.done += len(states)
         if not self.keep:
             return
+        reduced = self.setting.method.reduced
+        states = states if reduced is None else [reduced(state) for state in states]
         self.states.append(states)
         self.bytes += size_of(states[-1]) * len(states)
         # Densities that will not fit are not kept to begin with.

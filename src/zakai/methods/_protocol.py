@@ -205,6 +205,9 @@ class Method(Generic[P, S]):
     the sum of what they gained, and the last shifted states; or None, where `step` is to carry them.
 
     Optional: `backward` is the backward pass of `zakai.smooth`.
+
+    Optional: `reduced(state)` returns a state of which only the density and the backward pass are asked, without what the next
+    step needs: those are the states that a result keeps.
     """
 
     name: str
@@ -227,3 +230,4 @@ class Method(Generic[P, S]):
     segment: Callable[[P, slice, S, np.ndarray], tuple[Sequence[S], Infos] | None] | None = None
     tangents: Callable[[P, Sequence[P], slice, S, Sequence[S], np.ndarray], Tangents[S] | None] | None = None
     backward: Backward[P, S, Any] | None = None
+    reduced: Callable[[S], S] | None = None

@@ -6,8 +6,6 @@ are exact for any law of the observations, any g(x) and any number of substeps. 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from zakai.algebra.theorems import any_model as theorem
@@ -56,7 +54,7 @@ def prepare(
     if particles is not None:
         count = whole_number("particles", particles, 2, 10**8)
         if count > most:
-            raise InputError(f"option particles: {count} is more than most_particles, {most}; raise most_particles or leave it out")
+            raise InputError(f"option particles: {count} is more than most_particles, {most}; leave one of them out")
         rule = Rule(count, count, None, seed)
     else:
         count = min(int(np.ceil(VARIANCE / tolerance**2)), most)
@@ -75,12 +73,12 @@ def density(prepared: Prepared, state: State) -> ParticleDensity:
 BOUNDS = {
     "monte_carlo_error": (0.1, "standard error of a mean, in standard deviations; lower the tolerance or name more particles"),
     "lower_bound": (
-        0.5, "the standard errors are lower bounds from here on, because an observation left few particles or few ancestors; "
-        "run another seed and compare, or name more particles",
+        0.5, "the standard errors are lower bounds here, because an observation left few particles or few ancestors; run another "
+        "seed and compare, or name more particles",
     ),
     "tempering_levels": (
-        6.0, "powers of the likelihood that one observation needed: it is far from what was predicted; check it and its noise, or "
-        "give more frequent observations",
+        6.0, "powers of the likelihood that one observation needed: it is far from what was predicted; check it and its noise, "
+        "or give more frequent observations",
     ),
     "time_error": (0.1, "shift of a mean by the time step, in standard deviations; give more frequent observations"),
     "log_likelihood_error": (1.0, "standard error of the log-likelihood so far; name more particles before comparing models"),

@@ -82,12 +82,12 @@ def variances(genealogy: Genealogy, weights: Array, deviations: Array) -> Varian
     n, count = deviations.shape
     mass, sums = weights, np.ascontiguousarray((deviations * weights).T)
     alive, out = np.arange(count, dtype=np.int32), np.empty(n)
-    means, evidence, families = [], [], []
+    means, evidence, families = list[Array](), list[float](), list[float]()
     later, size = 0.0, count
 
     def add(alive: Array, mass: Array, sums: Array, size: int, noise: float) -> None:
         square, number = spread(alive, mass, sums, out)
-        means.append(size / max(size - 1, 1) * out)
+        means.append(np.asarray(size / max(size - 1, 1) * out))
         evidence.append(square - 1.0 / size - noise)
         families.append(number)
 
@@ -105,8 +105,9 @@ def variances(genealogy: Genealogy, weights: Array, deviations: Array) -> Varian
         merge(genealogy.founders, weights, np.ascontiguousarray((deviations * weights).T), older_mass, older_sums, alive)
         add(alive, older_mass, older_sums, size, genealogy.all_rounding)
     else:
-        for values in (means, evidence, families):
-            values.append(values[-1])
+        means.append(means[-1])
+        evidence.append(evidence[-1])
+        families.append(families[-1])
     return Variances(np.array(means), np.array(evidence), np.array(families))
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from zakai.densities._density import wrap
 from zakai.methods._protocol import Info
 from zakai.methods.particles.errors import DEPTH, Genealogy, of_log_likelihood, variances
-from zakai.methods.particles.interval import PILOTS, TIME_ERROR, Events, Interval, Motion, Steps, substeps
+from zakai.methods.particles.interval import PILOTS, TIME_ERROR, Events, Interval, Motion, Pilots, Scheme, Steps, steps_of
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import System, drawn, gaussian_prior
 from zakai.methods.particles.window import Observed, Target, Window, taken
@@ -42,28 +42,29 @@ FIRST_WIDER, FIRST_ROUNDS = 1.5, 6
 INFORMED = 0.25  # log det of the linearised posterior of the noise, below which the observation says nothing about the noise
 MOST_LEVELS = 60
 FEW_FAMILIES = 20  # of the oldest generation that is looked back to, below which they are too few to show their spread
-# Standard error of a mean times sqrt(N) in standard deviations (1 for independent draws) from which the past is moved.  A move costs
-# as much as the intervals of its window: it waits until the squares of these figures, in units of that of `MOVE_ABOVE`, add up to
-# this share of the intervals of the last move.
+# Standard error of a mean times sqrt(N) in standard deviations (1 for independent draws) from which the past is moved.  A move
+# costs as much as the intervals of its window: it waits until the squares of these figures, in units of that of `MOVE_ABOVE`,
+# add up to this share of the intervals of the last move.
 MOVE_ABOVE, MOVE_SHARE = 2.5, 0.4
-MOVE_CONTROL = (1.0, 1.2, 8.0, 0.4)  # power, change, most sweeps, rho
+MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4)  # power, change, most sweeps, rho
 GAIN = 0.7  # of the largest variance by a move, above which moves are waited for twice as long
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
-SURE, TRUSTED = 0.1, 4  # share of the allowed time error below which its measurement is trusted in so many more intervals
+SURE, TRUSTED = 0.5, 4  # share of the allowed time error below which its measurement is trusted in so many more intervals
 
 
 class Control(NamedTuple):
     """What decides the next step beside the particles.
 
-    `interval` counts intervals; `substeps` per unit time, whose `error` was measured in an interval of this `length` and is trusted
-    in so many more that are no longer; `variance` of a mean times N, `last` intervals of the window at the last
-    move, `urgency` what has added up since then, `wait` how many times the usual waiting, and `doubtful_until` the number of resamplings until
-    which standard errors are lower bounds.
+    `interval` counts intervals; `substeps` per unit time, whose `error` was measured in an interval of this `length` and is
+    trusted in so many more that are no longer; `variance` of a mean times N, `last` intervals of the window at the last move,
+    `urgency` what has added up since then, `wait` how many times the usual waiting, and `doubtful_until` the number of
+    resamplings until which standard errors are lower bounds.
     """
 
     interval: int
     substeps: float
+    stages: int
     error: float
     length: float
     trusted: int
@@ -92,7 +93,7 @@ class State(NamedTuple):
 
 @dataclass(frozen=True)
 class Rule:
-    """The options: the particles at the start, their largest number, the wanted standard error (none if it is given), the seed."""
+    """The options: the particles at the start, their largest number, the wanted standard error or none, and the seed."""
 
     particles: int
     most: int
@@ -149,7 +150,7 @@ def init(prepared: Prepared, prior: Any) -> State:
     terms = len(prepared.motion.law[3])
     window = Window.begin(particles, first, gaussian, (width, terms))
     logs = np.full(count, -np.log(count))
-    control = Control(0, 0.0, np.inf, 0.0, 0, VARIANCE, 0, 0.0, 1.0, 0)
+    control = Control(0, 0.0, 4, np.inf, 0.0, 0, VARIANCE, 0, 0.0, 1.0, 0)
     return State(particles, logs, window, Genealogy.begin(count), control, np.zeros(n), np.zeros(n))
 
 
@@ -226,7 +227,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     before, apart, _ = moments(cloud.particles, weights, angles)
     scale = np.maximum(np.sqrt(apart**2 @ weights), 1e-12)
     steps, control = _steps(prepared, interval, values, state, (before, scale))
-    events = motion.events(interval, steps.count, values, before, scale)
+    events = motion.events(interval, steps.scheme, values, before, scale)
     observed = _observed(prepared, interval, values)
     wanted = _wanted(rule, len(weights), control.variance)
     if effective(weights) < RESAMPLE_BELOW * len(weights) or wanted != len(weights):
@@ -249,7 +250,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         mean, deviations, cov = moments(cloud.particles, weights, angles)
         found = variances(cloud.genealogy, weights, deviations)
         ratio = _excess(found.largest, cov, len(weights)) / factor
-        wait, last, urgency, moved = 2 * wait if ratio > GAIN else max(1.0, 0.5 * wait), cloud.window.count, 0.0, 1.0
+        wait, last, urgency, moved = 2 * wait if ratio > GAIN else max(1.0, 0.5 * wait), cloud.window.length, 0.0, 1.0
         doubtful = doubtful or doubtful_move
     spread = np.sqrt(np.maximum(np.diag(cov), 0.0))
     # What the data says of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
@@ -290,16 +291,20 @@ def _steps(
     length = interval.stop - interval.start
     guess = max(1, round(control.substeps * length))
     if length <= 0:
-        return Steps(1, np.zeros(len(mean)), 0.0), control
+        return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0), control
     if control.trusted and length <= control.length * (1.0 + 1e-9):
-        return Steps(guess, state.last_shift, control.error), control._replace(trusted=control.trusted - 1)
+        return Steps(Scheme(guess, control.stages), state.last_shift, control.error), control._replace(trusted=control.trusted - 1)
     key = prepared.key(control.interval + 1, PILOT)
     chosen = np.empty(PILOTS, np.int32)
     systematic(np.exp(state.log_weights), uniform_number(key), chosen)
-    pilots = taken(state.particles, chosen)
-    found = substeps(prepared.motion, interval, values, pilots, (mean, scale, scale), guess, int(key[0]))
+    pilots = Pilots(taken(state.particles, chosen), mean, scale, int(key[0] >> np.uint64(2)))
+    found = steps_of(prepared.motion, interval, values, pilots, guess)
     trusted = TRUSTED if found.error <= SURE * TIME_ERROR else 0
-    return found, control._replace(substeps=found.count / length, error=found.error, length=length, trusted=trusted)
+    scheme = found.scheme
+    changed = control._replace(
+        substeps=scheme.substeps / length, stages=scheme.stages, error=found.error, length=length, trusted=trusted
+    )
+    return found, changed
 
 
 def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed:
@@ -338,7 +343,7 @@ def _advanced(prepared: Prepared, cloud: Cloud, events: Events, observed: Observ
     plain = Advanced(cloud._replace(particles=particles, logs=cloud.logs + logs - top), top, noise, predicted)
     if effective(weights) >= GUIDE_BELOW * count and np.isfinite(top):
         return plain
-    moving = cloud.window.count == 0 and len(cloud.window.first) > 0
+    moving = cloud.window.length == 0 and len(cloud.window.first) > 0
     prior = (cloud.window.mean, cloud.window.root) if moving else None
     single = (np.array([observed.time]), observed.given[None], observed.counted[None])
     target = Target(motion, events, *single, prior, cloud.particles)

@@ -50,6 +50,13 @@ class Events(NamedTuple):
         return int(self.rows[-1].sum()) if len(self.rows) else 0
 
 
+class Scheme(NamedTuple):
+    """The number of substeps of an interval, and the evaluations of the drift in a flow, 2 or 4."""
+
+    substeps: int
+    stages: int
+
+
 @dataclass(frozen=True)
 class Motion:
     """The formulas of a system for given parameters, as the kernels take them."""
@@ -78,7 +85,8 @@ class Motion:
         """Return states (n, N) after the events, and the integrated log weights (N,)."""
         out, gained = np.empty_like(start), np.empty(start.shape[1])
         ends = np.empty((0, *start.shape)) if ends is None else ends
-        over_chunks(lambda low, high: advance(self.arrays, tuple(events), start, noise, low, high, out, gained, ends), len(gained))
+        arrays = self.arrays, tuple(events), start, noise
+        over_chunks(lambda low, high: advance(*arrays, low, high, out, gained, ends), len(gained))
         return out, gained
 
     def values(self, program: tuple[Any, ...], x: Array, t: float, given: Array) -> Array:
@@ -132,22 +140,22 @@ class Motion:
         found = (f[:, 1:] - f[:, :1]) / step
         return np.where(np.isfinite(found), found, 0.0)
 
-    def events(self, interval: Interval, count: int, values: Array, mean: Array, scale: Array) -> Events:
+    def events(self, interval: Interval, scheme: Scheme, values: Array, mean: Array, scale: Array) -> Events:
         """Return the events of an interval in equal substeps.
 
         Args:
             interval: the interval.
-            count: the number of substeps.
+            scheme: the number of substeps, and the evaluations of the drift in a flow.
             values: the increments (m,), zero where nothing is observed.
             mean: the state (n,) about which the drift is linearised for the covariance of the noise.
             scale: standard deviations of the states (n,).
         """
-        system, start, stop = self.system, interval.start, interval.stop
+        system, start, stop, count = self.system, interval.start, interval.stop, scheme.substeps
         length = stop - start
         if length <= 0:
             none = np.zeros((0, system.r if system.kind else system.n, 0))
             row = np.array([[start, start]])
-            return Events(row, np.array([[-1, 0]]), np.zeros((1, 2, system.drift.width)), none, np.zeros((0, 3), np.int64))
+            return Events(row, np.array([[-1, 0, 4]]), np.zeros((1, 2, system.drift.width)), none, np.zeros((0, 3), np.int64))
         step = length / count
         kicks = start + (np.arange(count) + 0.5) * step
         jumps = np.zeros(0) if interval.inputs is None else interval.inputs.within(start, stop)
@@ -155,7 +163,7 @@ class Motion:
         times = np.column_stack([np.append(start, ends[:-1]), ends])
         kicked = np.searchsorted(kicks, ends)
         kicked = np.where((kicked < count) & (kicks[np.minimum(kicked, count - 1)] == ends), kicked, -1)
-        places = np.column_stack([kicked, np.where(ends == stop, 0, -1)]).astype(np.int64)
+        places = np.column_stack([kicked, np.where(ends == stop, 0, -1), np.full(len(ends), scheme.stages)]).astype(np.int64)
         given = self._given(interval, times, values)
         roots = self._roots(interval, times, places, given, step, mean, scale)
         coin = int(system.kind == ORDERED)
@@ -229,7 +237,7 @@ class Motion:
             return None
         if system.affine:
             return [self.constant_matrix] * len(kicks)
-        marked = np.column_stack([np.full(len(places), -1), places[:, 0]]).astype(np.int64)
+        marked = np.column_stack([np.full(len(places), -1), places[:, 0], places[:, 2]]).astype(np.int64)
         none = Events(times, marked, given, np.zeros((0, system.n, 0)), np.zeros((0, 3), np.int64))
         ends = np.zeros((len(kicks), system.n, 1))
         self.advanced(none, np.ascontiguousarray(mean[:, None]), np.zeros((0, 1)), ends)
@@ -260,81 +268,84 @@ def noise_about_middle(A: Array, G: Array, length: float) -> Array:
 
 
 class Steps(NamedTuple):
-    """The number of substeps of an interval, the shift (n,) of the mean that they leave, and it in standard deviations."""
+    """The scheme of an interval, the shift (n,) of the mean that it leaves, and that in standard deviations."""
 
-    count: int
+    scheme: Scheme
     shift: Array
     error: float
 
 
-def substeps(
-    motion: Motion, interval: Interval, values: Array, pilots: Array, moments: tuple[Array, Array, Array], guess: int, key: int
-) -> Steps:
-    """Return the substeps whose error in the mean and the spread is at most `TIME_ERROR` standard deviations.
+class Pilots(NamedTuple):
+    """What the time step is measured with: states (n, PILOTS), the mean (n,), deviations (n,), and a whole number for the noise."""
+
+    states: Array
+    mean: Array
+    scale: Array
+    key: int
+
+
+def steps_of(motion: Motion, interval: Interval, values: Array, pilots: Pilots, guess: int) -> Steps:
+    """Return the cheapest scheme whose error in the mean and the spread is at most `TIME_ERROR` standard deviations.
 
     Args:
         motion: the formulas.
         interval: the interval.
         values: the increments (m,).
-        pilots: states (n, PILOTS) drawn from the filter.
-        moments: the mean (n,), its standard deviations (n,), and those in which the error counts (n,).
-        guess: the first number to try.
-        key: a whole number that decides the noise.
+        pilots: what it is measured with.
+        guess: the first number of substeps to try.
     """
-    system = motion.system
-    n = system.n
-    mean, scale, unit = moments
-    if interval.stop <= interval.start or (system.sampled and system.affine and not _driven(system)):
-        return Steps(1, np.zeros(n), 0.0)
-    count, shift = max(1, guess), np.full(n, np.inf)
+    n, count = motion.system.n, max(1, guess)
+    shift = np.full(n, np.inf)
     for turn in range(4):
-        found = _time_error(motion, interval, values, pilots, (mean, scale, unit), count, key + turn)
-        if not np.isfinite(found).all():
+        found = _time_errors(motion, interval, values, pilots._replace(key=pilots.key + turn), count)
+        fewer, shift = found
+        if not np.isfinite(shift).all():
             if count >= MOST_SUBSTEPS:
                 break
             count = min(4 * count, MOST_SUBSTEPS)
             continue
-        error, shift = float((found / unit).max()), found
+        error, other = (float((one / pilots.scale).max()) for one in (shift, fewer))
         wanted = int(np.clip(np.ceil(count * np.sqrt(error / TIME_ERROR)), 1, MOST_SUBSTEPS))
         if wanted < count:
             wanted = max(wanted, (count + 1) // 2)
+        reduced = (count / wanted) ** 2
+        if other * reduced <= TIME_ERROR:
+            return Steps(Scheme(wanted, 2), fewer * reduced, other * reduced)
         if wanted <= 2 * count:
-            return Steps(wanted, shift * (count / wanted) ** 2, error * (count / wanted) ** 2)
-        shift = shift * (count / wanted) ** 2
-        count = wanted
-    return Steps(count, shift, float((shift / unit).max()))
+            return Steps(Scheme(wanted, 4), shift * reduced, error * reduced)
+        count, shift = wanted, shift * reduced
+    return Steps(Scheme(count, 4), shift, float((shift / pilots.scale).max()))
 
 
-def _driven(system: System) -> bool:
-    """Return whether the drift depends on time, so that one substep is not exact."""
-    return bool(system.model.drift.free_symbols & {system.model.t, *system.model.u}) or system.timed
-
-
-def _time_error(
-    motion: Motion, interval: Interval, values: Array, pilots: Array, moments: tuple[Array, Array, Array], count: int, key: int
-) -> Array:
-    """Return the change of means or of standard deviations (n,) from `count` substeps to twice as many, times 4/3."""
-    mean, scale, unit = moments
-    system = motion.system
-    coarse, fine = (motion.events(interval, k, values, mean, scale) for k in (count, 2 * count))
-    noise = np.empty((fine.width, pilots.shape[1]))
-    normals(key_of(key), 0, noise.shape[1], noise)
-    shared = _coarse_noise(motion, coarse, fine, noise, (interval.stop - interval.start) / count)
-    x, gained = motion.advanced(coarse, pilots, shared)
-    y, finer = motion.advanced(fine, pilots, noise)
-    d = y - x
-    if system.angles.any():
-        d[system.angles] = np.remainder(d[system.angles] + np.pi, 2 * np.pi) - np.pi
+def _time_errors(
+    motion: Motion, interval: Interval, values: Array, pilots: Pilots, count: int
+) -> tuple[Array, Array]:
+    """Return the changes of means or deviations (n,) from `count` substeps to twice as many, times 4/3, for 2 and 4 stages."""
+    system, mean, scale = motion.system, pilots.mean, pilots.scale
+    coarse, fine = (motion.events(interval, Scheme(k, 4), values, mean, scale) for k in (count, 2 * count))
+    noise = np.empty((fine.width, pilots.states.shape[1]))
+    normals(key_of(pilots.key), 0, noise.shape[1], noise)
+    shared = _coarse_noise(motion, coarse, fine, noise)
+    y, finer = motion.advanced(fine, pilots.states, noise)
     centred = y - y.mean(axis=1, keepdims=True)
     spread = np.maximum(centred.std(axis=1), 1e-300)
-    weight = finer - gained
-    parts = (d, d * centred / spread[:, None], (weight - weight.mean()) * centred)
-    # What the finite number of pilots adds to a mean of zero is subtracted.
-    found = [np.maximum(part.mean(axis=1) ** 2 - part.var(axis=1) / part.shape[1], 0.0) for part in parts]
-    return np.asarray(np.sqrt(np.max(found, axis=0)) * 4 / 3)
+
+    def change(stages: int) -> Array:
+        places = coarse.places.copy()
+        places[:, 2] = stages
+        x, gained = motion.advanced(coarse._replace(places=places), pilots.states, shared)
+        d, weight = y - x, finer - gained
+        if system.angles.any():
+            d[system.angles] = np.remainder(d[system.angles] + np.pi, 2 * np.pi) - np.pi
+        parts = (d, d * centred / spread[:, None], (weight - weight.mean()) * centred)
+        # What the finite number of pilots adds to a mean of zero is subtracted.
+        found = [np.maximum(part.mean(axis=1) ** 2 - part.var(axis=1) / part.shape[1], 0.0) for part in parts]
+        return np.asarray(np.sqrt(np.max(found, axis=0)) * 4 / 3)
+
+    return change(2), change(4)
 
 
-def _coarse_noise(motion: Motion, coarse: Events, fine: Events, noise: Array, length: float) -> Array:
+def _coarse_noise(motion: Motion, coarse: Events, fine: Events, noise: Array) -> Array:
     """Return the noise of the substeps that makes the same kicks as that of their halves."""
     system = motion.system
     shared = np.zeros((coarse.width, noise.shape[1]))

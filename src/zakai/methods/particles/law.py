@@ -1,7 +1,7 @@
 """The law of a sample given the state, as formulas in the state and in numbers that are known when it is observed.
 
-The numbers are z (m,), the precision P of the observed Gaussian coordinates, the constants c (m,) that normalise the laws, and the
-marks e (m,) of what is observed.  P and c are computed once for an observation where the noise does not depend on the state.
+The numbers are z (m,), the precision P of the observed Gaussian coordinates, the constants c (m,) that normalise the laws, and
+the marks e (m,) of what is observed.  P and c are computed once for an observation where the noise does not depend on the state.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 import sympy as sp
 
+from zakai.methods.particles.programs import Array, Expressions, LogBessel, LogGamma
 from zakai.models.functions import Floor, Maximum
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.particles.formulas import Program
-from zakai.methods.particles.programs import Array, Expressions, LogBessel, LogGamma
 
 # Deviation of an angle above which the law sums over its images; the next image of a deviation of pi / 2 is at 3 pi / 2, where
 # the Gaussian is e^-27 of that at pi / 2.
@@ -84,8 +84,6 @@ class Law:
         used = set().union(*(term.free_symbols for term in terms))
         self.reads = np.array([symbol in used for symbol in model.x])
         self.is_gaussian = model.log_density is None and set(model.observation_family) == {"gaussian"}
-        # Whether a small set of the observations' coordinates is enough to form working observations.
-        self._observe = Expressions(list(model.observation) if model.log_density is None else [sp.S.Zero], model)
 
     @property
     def width(self) -> int:
@@ -95,10 +93,6 @@ class Law:
     def program(self, theta: Array) -> Program:
         """Return the law as a program."""
         return self._expressions.at(theta)
-
-    def observation(self, theta: Array) -> Program:
-        """Return h as a program; its given numbers are the inputs."""
-        return self._observe.at(theta)
 
     def noise(self, x: Array, t: float, theta: Array, u: Array | None) -> Array:
         """Return S (m, m) at a state."""
@@ -164,8 +158,10 @@ class Law:
         precision = numbers.P[j, j] if self.fixed else 1 / S
         if family in ("gaussian", "student-t"):
             power = (shape + 1) / 2
-            law = (lambda v: -precision * v**2 / 2) if family == "gaussian" else (
-                lambda v: -power * sp.log(1 + precision * v**2 / shape))  # fmt: skip
+
+            def law(v: sp.Expr) -> sp.Expr:
+                return -precision * v**2 / 2 if family == "gaussian" else -power * sp.log(1 + precision * v**2 / shape)
+
             result = law(d)
             if self.angles[j] and self._wide(S):
                 shifts = [2 * sp.pi * k for k in range(-_IMAGES, _IMAGES + 1) if k]

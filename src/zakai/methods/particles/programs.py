@@ -90,8 +90,8 @@ class Expressions:
                     first = slot
         rows, numbers = table_rows([_polynomials(table, orders) for table, orders in tables])
         self._program = Program(
-            np.array(lines, np.int64).reshape(-1, 5), np.array(values + constants), np.array(coordinates + [NEITHER] * len(constants)),
-            np.array(program.outputs, np.int64), rows, numbers,
+            np.array(lines, np.int64).reshape(-1, 5), np.array(values + constants),
+            np.array(coordinates + [NEITHER] * len(constants)), np.array(program.outputs, np.int64), rows, numbers,
         )  # fmt: skip
 
     def at(self, theta: Array) -> Program:
@@ -113,7 +113,7 @@ def _polynomials(table: Table, orders: tuple[int, ...]) -> tuple[Any, ...]:
     """Return the axes of a table, the polynomials of a derivative in its cells, and how it goes on beyond its range."""
     terms = table.degree + 1
     corners = np.stack(np.meshgrid(*[axis[:-1] for axis in table.axes], indexing="ij"), axis=-1)
-    coefficients = np.zeros((*corners.shape[:-1], *(terms,) * len(table.axes)))
+    coefficients: Any = np.zeros((*corners.shape[:-1], *(terms,) * len(table.axes)))
     for powers in itertools.product(range(terms), repeat=len(table.axes)):
         derivative = tuple(power + order for power, order in zip(powers, orders, strict=True))
         if max(derivative) <= table.degree:

@@ -39,9 +39,9 @@ def _genealogy(state: State, count: int) -> bool:
 def _window(prepared: Prepared, window: Window, count: int) -> bool:
     system = prepared.system
     n, rows = system.n, system.r if system.kind else system.n
-    if not 0 <= window.count <= INTERVALS or window.mean.shape != (n,) or window.root.ndim != 2:
+    if not 0 <= window.length <= INTERVALS or window.mean.shape != (n,) or window.root.ndim != 2:
         return False
-    I = window.count
+    I = window.length
     if window.times.shape != (I,) or len(window.given) != I or len(window.counted) != I:
         return False
     later = count
@@ -53,12 +53,12 @@ def _window(prepared: Prepared, window: Window, count: int) -> bool:
         if window.ends[k].size and window.ends[k].shape != (n, own):
             return False
         E, J = len(events.times), len(events.rows)
-        if events.times.shape != (E, 2) or events.places.shape != (E, 2) or events.given.shape != (E, 2, system.drift.width):
+        if events.times.shape != (E, 2) or events.places.shape != (E, 3) or events.given.shape != (E, 2, system.drift.width):
             return False
         if events.roots.shape[:2] != (J, rows) or events.rows.shape != (J, 3) or not E:
             return False
         places = events.places
-        if places[:, 0].min() < -1 or places[:, 0].max() >= J or places[:, 1].min() < -1 or places[:, 1].max() > 0:
+        if places[:, 0].min() < -1 or places[:, 0].max() >= J or places[:, 1].min() < -1 or places[:, 1].max() > 0 or not np.isin(places[:, 2], (2, 4)).all():
             return False
         first = np.cumsum(events.rows[:, 1:].sum(axis=1))
         if J and (events.rows.min() < 0 or events.rows[:, 1].max() > events.roots.shape[2]):

@@ -24,7 +24,9 @@ _STEP = 1e-4  # of forward differences, in standard deviations
 _WIDER = 1.15  # variance of the Gaussian over that of the linearised posterior
 _INFORMED = 0.1  # information of a direction of the noise, over that of N(0, 1), from which moves follow it
 _EMPTY = np.zeros(0, np.int32)
-_NO_EVENTS = Events(np.zeros((0, 2)), np.zeros((0, 2), np.int64), np.zeros((0, 2, 0)), np.zeros((0, 0, 0)), np.zeros((0, 3), np.int64))
+_NO_EVENTS = Events(
+    np.zeros((0, 2)), np.zeros((0, 3), np.int64), np.zeros((0, 2, 0)), np.zeros((0, 0, 0)), np.zeros((0, 3), np.int64)
+)  # fmt: skip
 
 
 class Observed(NamedTuple):
@@ -38,17 +40,18 @@ class Observed(NamedTuple):
 class Window(NamedTuple):
     """The past since the prior, or since the states `start` where that is too long.
 
-    `start` (n, N) are the states at its beginning, `first` (d, N) the noise of a Gaussian prior with `mean` (n,) and `root` (n, d),
-    with no rows where the start does not move.  Of `count` intervals, each for its own particles: `noises` (d, N), `ends` (n, N) the states at the end, none where
-    they have been moved, `ancestors` (N,) from the particles of the next interval to those of this one, none where they are the
-    same, `events`, and what was observed: `times` (I,), `given` (I, L), `counted` (I, T).
+    `start` (n, N) are the states at its beginning, `first` (d, N) the noise of a Gaussian prior with `mean` (n,) and `root` (n,
+    d), with no rows where the start does not move.  Of `length` intervals, each for its own particles: `noises` (d, N), `ends`
+    (n, N) the states at the end, none where they have been moved, `ancestors` (N,) from the particles of the next interval to
+    those of this one, none where they are the same, `events`, and what was observed: `times` (I,), `given` (I, L), `counted` (I,
+    T).
     """
 
     start: Array
     first: Array
     mean: Array
     root: Array
-    count: int
+    length: int
     noises: tuple[Array, ...]
     ends: tuple[Array, ...]
     ancestors: tuple[Array, ...]
@@ -69,24 +72,24 @@ class Window(NamedTuple):
     @property
     def width(self) -> int:
         """The number of normal numbers of a particle."""
-        return len(self.first) + sum(len(noise) for noise in self.noises[: self.count])
+        return len(self.first) + sum(len(noise) for noise in self.noises[: self.length])
 
     def resampled(self, ancestors: Array) -> Window:
         """Return the window of particles with these ancestors."""
-        if self.count == 0:
+        if self.length == 0:
             return self._replace(start=taken(self.start, ancestors), first=taken(self.first, ancestors))
-        last = self.ancestors[self.count - 1]
-        return self._replace(ancestors=_with(self.ancestors, self.count - 1, last[ancestors] if len(last) else ancestors))
+        last = self.ancestors[self.length - 1]
+        return self._replace(ancestors=_with(self.ancestors, self.length - 1, last[ancestors] if len(last) else ancestors))
 
     def appended(self, motion: Motion, events: Events, observed: Observed, noise: Array, end: Array) -> Window:
         """Return the window with one interval more, without the oldest ones where it is too long."""
         window = self
         most = min(max(TOGETHER // noise.shape[1], FEWEST), MOST)
-        while window.count and (window.count == INTERVALS or window.width + len(noise) > most):
+        while window.length and (window.length == INTERVALS or window.width + len(noise) > most):
             window = window._shortened(motion)
-        k = window.count
+        k = window.length
         return window._replace(
-            count=k + 1, noises=_with(window.noises, k, noise), ends=_with(window.ends, k, end),
+            length=k + 1, noises=_with(window.noises, k, noise), ends=_with(window.ends, k, end),
             ancestors=_with(window.ancestors, k, _EMPTY), events=_with(window.events, k, events),
             times=np.append(window.times, observed.time), given=np.vstack([window.given, observed.given]),
             counted=np.vstack([window.counted, observed.counted]),
@@ -105,7 +108,8 @@ class Window(NamedTuple):
         none = np.zeros((0, 0))
         start = taken(end, self.ancestors[0]) if len(self.ancestors[0]) else end
         return Window(
-            start, np.zeros((0, start.shape[1])), self.mean, np.zeros((len(start), 0)), self.count - 1, rest(self.noises, none), rest(self.ends, none),
+            start, np.zeros((0, start.shape[1])), self.mean, np.zeros((len(start), 0)), self.length - 1,
+            rest(self.noises, none), rest(self.ends, none),
             rest(self.ancestors, _EMPTY), rest(self.events, _NO_EVENTS), self.times[1:], self.given[1:], self.counted[1:],
         )  # fmt: skip
 
@@ -113,7 +117,7 @@ class Window(NamedTuple):
         """Return the noise (D, N) of the particles, and the states (n, N) at the start of the window."""
         index: Array | None = None
         parts = []
-        for k in reversed(range(self.count)):
+        for k in reversed(range(self.length)):
             ancestors = self.ancestors[k]
             if len(ancestors):
                 index = ancestors if index is None else ancestors[index]
@@ -124,17 +128,17 @@ class Window(NamedTuple):
     def moved(self, path: Array, start: Array, end: Array) -> Window:
         """Return the window of particles with this noise (D, N), from these starts, that end there."""
         none, place, noises = np.zeros((0, 0)), len(self.first), list(self.noises)
-        for k in range(self.count):
+        for k in range(self.length):
             noises[k] = np.ascontiguousarray(path[place : place + len(noises[k])])
             place += len(noises[k])
-        ends = _with((none,) * INTERVALS, self.count - 1, end)
+        ends = _with((none,) * INTERVALS, self.length - 1, end)
         first = np.ascontiguousarray(path[: len(self.first)])
         return self._replace(start=start, first=first, noises=tuple(noises), ends=ends, ancestors=(_EMPTY,) * INTERVALS)
 
     def target(self, motion: Motion, start: Array) -> Target:
         """Return what the noise of this window must follow."""
         prior = (self.mean, self.root) if len(self.first) else None
-        return Target(motion, joined(self.events[: self.count]), self.times, self.given, self.counted, prior, start)
+        return Target(motion, joined(self.events[: self.length]), self.times, self.given, self.counted, prior, start)
 
 
 def taken(columns: Array, index: Array) -> Array:
@@ -202,14 +206,15 @@ class Target:
         over_chunks(lambda low, high: moves.draw(gaussian, share, key, self.start, low, high, path, ratio), count)
         return path, ratio
 
-    def sweep(self, gaussian: Any, path: Array, control: tuple[float, ...], key: Array) -> tuple[Array, Array, Array, float, float]:
+    def sweep(
+        self, gaussian: Any, path: Array, control: tuple[float, ...], key: Array
+    ) -> tuple[Array, Array, Array, float, float]:
         """Return moved noise, states, log-likelihoods, the mean acceptance, and the smallest change of a chunk."""
         path = path.copy()
         out, total, arrays = np.empty_like(self.start), np.empty(path.shape[1]), self.arrays
         moved, numbers = np.zeros((-(-len(total) // CHUNK), 2)), np.array(control)
-        over_chunks(
-            lambda low, high: moves.sweep(*arrays, gaussian, numbers, key, low, high, self.start, path, out, total, moved), len(total)
-        )
+        found = self.start, path, out, total, moved
+        over_chunks(lambda low, high: moves.sweep(*arrays, gaussian, numbers, key, low, high, *found), len(total))
         return path, out, total, float(moved[:, 0].mean()), float(moved[:, 1].min())
 
     def gaussian(self, path: Array, weights: Array | None, power: float = 1.0, rounds: int = 2, wider: float = _WIDER) -> Any:
@@ -231,7 +236,7 @@ class Target:
         spread = np.sqrt(np.mean(apart**2, axis=1) if weights is None else apart**2 @ weights)
         spread = _STEP * np.maximum(spread, 1e-9 * (1.0 + np.abs(centre)))
         moving = 0 if self.prior is not None else n
-        gain = np.zeros((D, n))
+        gain: Array = np.zeros((D, n))
         A = np.eye(D)
         for _ in range(rounds):
             points = np.repeat(point[:, None], 1 + D + moving, axis=1)

@@ -1,9 +1,9 @@
 """Formulas as data in compiled loops: a program of the operations of `formula_kernel`, with tables, sinc and known numbers.
 
 A program is a tuple of arrays: the lines (operation, result, operand, operand, number), the values of all slots before the first
-line, what each slot holds, the slots of the outputs, and the tables.  A slot holds a coordinate of the point (0, 1, ...), the time
-(CLOCK), a constant (NEITHER), or a number that is given for the whole block, such as an input or an observation (GIVEN, GIVEN - 1,
-...).
+line, what each slot holds, the slots of the outputs, and the tables.  A slot holds a coordinate of the point (0, 1, ...), the
+time (CLOCK), a constant (NEITHER), or a number that is given for the whole block, such as an input or an observation (GIVEN,
+GIVEN - 1, ...).
 """
 
 from __future__ import annotations

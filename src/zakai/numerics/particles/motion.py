@@ -2,10 +2,11 @@
 
     x <- flow of the drift from t_e to t_(e+1);   x <- x + R w,   w ~ N(0, I)
 
-An interval is a list of events: a Runge-Kutta step of order four, and a kick of noise after some of them.  Where the noise depends
-on the state a kick is the flow of the fields g_j(x) sqrt(d) w_j over unit time, together where the fields commute, else one after
-the other in an order that a further normal number decides.  With half of a substep's flow before and half after its kick the law
-is that of the equation to second order in the substep.  The drift's outputs after the first n are integrated along the way.
+An interval is a list of events: a Runge-Kutta step of order two or four, and a kick of noise after some of them.  Where the noise
+depends on the state a kick is the flow of the fields g_j(x) sqrt(d) w_j over unit time, together where the fields commute, else
+one after the other in an order that a further normal number decides.  With half of a substep's flow before and half after its
+kick the law is that of the equation to second order in the substep.  The drift's outputs after the first n are integrated along
+the way.
 
 References:
     Ninomiya and Victoir 2008, Weak approximation of stochastic differential equations.
@@ -26,19 +27,20 @@ Array = Any
 ADDITIVE, COMMUTING, ORDERED = 0, 1, 2
 # Drift, fields of the noise, ends of the domain, and the kind of the noise.
 MOTION = types.Tuple((PROGRAM, PROGRAM, BOX, types.int64))
-# Times (E, 2), [root, observation] (E, 2) after each flow or -1, given numbers at both ends (E, 2, L), roots (J, n or r, d),
-# and the first row of the noise of each root, its width, and 1 where a coin follows (J, 3).
+# Times (E, 2), [root, observation, stages] (E, 3): what follows each flow or -1, and its evaluations, 2 or 4; given numbers at
+# both ends (E, 2, L), roots (J, n or r, d), and the first row of the noise of each root, its width, and 1 where a coin follows
+# (J, 3).
 EVENTS = types.Tuple((F2, I2, F3, F3, I2))
 
 
 @helper
 def _flow(program: Any, values: Array, x: Array, work: Array, box: Any, length: float, times: Array, given: Array, row: Array,
-          size: int) -> None:  # fmt: skip
-    """Advance the first rows of x (rows, size) by one Runge-Kutta step of order four; `times` and `given` at both ends."""
+          stages: int, size: int) -> None:  # fmt: skip
+    """Advance the first rows of x (rows, size) by one Runge-Kutta step; `times` and `given` at both ends."""
     outputs = program[3]
     count, rows = outputs.size, x.shape[0]
     point, slopes, total = work[:rows], work[rows : rows + count], work[rows + count : rows + 2 * count]
-    for stage in range(4):
+    for stage in range(stages):
         share = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
         if stage == 0:
             for d in range(rows):
@@ -53,6 +55,8 @@ def _flow(program: Any, values: Array, x: Array, work: Array, box: Any, length: 
         load_point(program, values, point, box, times[0] + share * (times[1] - times[0]), row, size)
         run_program(program, values, size)
         weight = length / 6.0 if stage == 0 or stage == 3 else length / 3.0
+        if stages == 2:
+            weight = 0.0 if stage == 0 else length
         for d in range(count):
             result = values[outputs[d]]
             for i in range(size):
@@ -94,7 +98,7 @@ def _kick(motion: Any, values: Array, x: Array, work: Array, root: Array, noise:
                     j = turn if noise[width, i] > 0.0 else width - 1 - turn
                     value = root[a, j] * noise[j, i]
                 point[n + a, i] = value
-        _flow(fields, values, point, rest, motion[2], 1.0, time, given, row, size)
+        _flow(fields, values, point, rest, motion[2], 1.0, time, given, row, 4, size)
     for d in range(n):
         for i in range(size):
             x[d, i] = point[d, i]
@@ -107,7 +111,7 @@ def run_event(motion: Any, events: Any, e: int, blocks: Any, x: Array, noise: Ar
     work, row, time = buffers
     n, box = motion[2][0].size, motion[2]
     if times[e, 1] != times[e, 0]:
-        _flow(motion[0], blocks[0], x, work, box, times[e, 1] - times[e, 0], times[e], given[e], row, size)
+        _flow(motion[0], blocks[0], x, work, box, times[e, 1] - times[e, 0], times[e], given[e], row, places[e, 2], size)
     r = places[e, 0]
     if r >= 0:
         width = rows[r, 1]

@@ -1,8 +1,8 @@
 """Moves of the noise of particles over several intervals, and draws of it, by a Gaussian that approximates its posterior.
 
-The noise p of a window has the law N(0, I) times the likelihood L(p) of what is observed in it.  A move is reversible in a Gaussian
-N(m, U^-2), whose mean m may be an affine function of the state at the start of the window, and which differs from N(0, I) in the few
-directions V (orthonormal) that the observations inform,
+The noise p of a window has the law N(0, I) times the likelihood L(p) of what is observed in it.  A move is reversible in a
+Gaussian N(m, U^-2), whose mean m may be an affine function of the state at the start of the window, and which differs from
+N(0, I) in the few directions V (orthonormal) that the observations inform,
 
     U = I + V diag(s - 1) V',    w = U (p - m),   w* = rho w + sqrt(1 - rho^2) e,   e ~ N(0, I),    p* = m + U^-1 w*
 

@@ -17,6 +17,7 @@ import numpy as np
 from numba import types
 
 from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.formula_kernel import BLOCK
 
 Array = Any
 KEY = types.uint64[::1]
@@ -51,18 +52,23 @@ def uniform(key: Array, counter: Any) -> float:
 
 
 @helper
-def quantile(p: float) -> float:
-    """Return the quantile of the standard normal distribution for a probability."""
+def _central(p: float) -> float:
+    """Return the quantile of the standard normal distribution for a probability from 0.075 to 0.925."""
     q = p - 0.5
-    if abs(q) <= 0.425:
-        r = 0.180625 - q * q
-        above = ((((((2.5090809287301226727e3 * r + 3.3430575583588128105e4) * r + 6.7265770927008700853e4) * r
-                   + 4.5921953931549871457e4) * r + 1.3731693765509461125e4) * r + 1.9715909503065514427e3) * r
-                 + 1.3314166789178437745e2) * r + 3.3871328727963666080e0  # fmt: skip
-        below = ((((((5.2264952788528545610e3 * r + 2.8729085735721942674e4) * r + 3.9307895800092710610e4) * r
-                   + 2.1213794301586595867e4) * r + 5.3941960214247511077e3) * r + 6.8718700749205790830e2) * r
-                 + 4.2313330701600911252e1) * r + 1.0  # fmt: skip
-        return q * above / below
+    r = 0.180625 - q * q
+    above = ((((((2.5090809287301226727e3 * r + 3.3430575583588128105e4) * r + 6.7265770927008700853e4) * r
+               + 4.5921953931549871457e4) * r + 1.3731693765509461125e4) * r + 1.9715909503065514427e3) * r
+             + 1.3314166789178437745e2) * r + 3.3871328727963666080e0  # fmt: skip
+    below = ((((((5.2264952788528545610e3 * r + 2.8729085735721942674e4) * r + 3.9307895800092710610e4) * r
+               + 2.1213794301586595867e4) * r + 5.3941960214247511077e3) * r + 6.8718700749205790830e2) * r
+             + 4.2313330701600911252e1) * r + 1.0  # fmt: skip
+    return q * above / below
+
+
+@helper
+def _tail(p: float) -> float:
+    """Return the quantile for a probability below 0.075 or above 0.925."""
+    q = p - 0.5
     r = math.sqrt(-math.log(p if q < 0 else 1.0 - p))
     if r <= 5.0:
         r -= 1.6
@@ -87,8 +93,15 @@ def quantile(p: float) -> float:
 def fill_row(key: Array, row: int, first: int, size: int, out: Array) -> None:
     """Write one row (size,) of standard normal numbers for the particles from `first` on; row and particle are the counter."""
     counter = (np.uint64(row) << np.uint64(32)) + np.uint64(first)
+    p = np.empty(size)
     for i in range(size):
-        out[i] = quantile(uniform(key, counter + np.uint64(i)))
+        p[i] = uniform(key, counter + np.uint64(i))
+    # Loops without branches are vectorised: most numbers are central.
+    for i in range(size):
+        out[i] = _central(p[i])
+    for i in range(size):
+        if abs(p[i] - 0.5) > 0.425:
+            out[i] = _tail(p[i])
 
 
 @helper
@@ -101,7 +114,9 @@ def fill_normals(key: Array, first: int, size: int, out: Array) -> None:
 @kernel(types.void(KEY, types.int64, types.int64, types.float64[:, ::1]))
 def normals(key: Array, low: int, high: int, out: Array) -> None:
     """Write the columns from `low` to `high` of standard normal numbers (d, N)."""
-    fill_normals(key, low, high - low, out[:, low:high])
+    for first in range(low, high, BLOCK):
+        size = min(BLOCK, high - first)
+        fill_normals(key, first, size, out[:, first : first + size])
 
 
 def uniform_number(key: Array) -> float:
