@@ -60,6 +60,10 @@ METHODS = {
         "zakai.methods.kolmogorov_series",
         "convergent for one state and any smooth f without time: the explicit series of the kernel; only when it is named",
     ),
+    "guided-particles": Entry(
+        "zakai.methods.guided_particles",
+        "convergent for any model in any number of states: particles, with standard errors of what they give",
+    ),
     "extended-kalman-bucy": Entry(
         "zakai.methods.extended_kalman_bucy",
         "approximate for formulas with a derivative almost everywhere: linearised at the mean; only when it is named",

@@ -30,9 +30,10 @@ SYSTEMS = {
         parameters={"a": 0.3, "c": 0.9},
     ),
 }
-# A Gaussian sum has few components: it stands near the density, and how near says its own test. On the spiral system two starts
+# Particles have a random error, about 0.03 standard deviations of a mean.  A Gaussian sum has few
+# components: it stands near the density, and how near says its own test. On the spiral system two starts
 # that differ in rounding come to differ by as much as each is off; on the other system both sums are exact but for the cut prior.
-NEAR = {"general-direct": 2e-2, "gaussian-sum": 5e-4}
+NEAR = {"general-direct": 2e-2, "gaussian-sum": 5e-4, "guided-particles": 0.1}
 # A method with a tolerance is asked for more where rounding is compared.
 OPTIONS = {"yau-yau": {"tolerance": 1e-8}}
 TIMES = np.cumsum([0.1, 0.05, 0.2, 0.1, 0.1, 0.05, 0.3])
@@ -153,7 +154,8 @@ def test_the_gradient_is_that_of_differences(method, name, kind):
     if not holds(method, name, kind):
         pytest.skip(f"the theorem of {method} does not hold for {kind}")
     model, record, options = system(name, kind), record_of(name, kind, gaps=True), OPTIONS.get(method, {})
-    assert _registry.load(method).differentiable
+    if not _registry.load(method).differentiable:
+        pytest.skip(f"{method} samples, and has no gradient")
     likelihood = log_likelihood(model, record, method, **options)
     theta = model.theta()
     value, gradient = likelihood.value_and_gradient(theta)

@@ -158,6 +158,12 @@ def smooth_system(model: Model) -> tuple[Condition, ...]:
 
 
 @once_for_a_model
+def any_model(model: Model) -> tuple[Condition, ...]:
+    """Any model without undetermined functions: what a method that samples asks for."""
+    return (determined(model),)
+
+
+@once_for_a_model
 def any_smooth_system(model: Model) -> tuple[Condition, ...]:
     """Any smooth system whose density fits on a grid."""
     return (
@@ -213,6 +219,7 @@ THEOREMS: Mapping[str, Callable[[Model], tuple[Condition, ...]]] = {
     "wei-norman": wei_norman_filter,
     "yau-yau": any_smooth_system,
     "kolmogorov-series": kolmogorov_series,
+    "guided-particles": any_model,
     "extended-kalman-bucy": smooth_system,
 }
 # Filters of other libraries; an analysis is about the system, and leaves them out.

@@ -5,7 +5,11 @@ from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
 from zakai.densities.interval import IntervalDensity
 from zakai.densities.mapped import MappedDensity
+from zakai.densities.particles import ParticleDensity
 from zakai.densities.points import PointMasses
 from zakai.densities.product import ProductDensity
 
-__all__ = ["Density", "GaussianMixture", "GridDensity", "IntervalDensity", "MappedDensity", "PointMasses", "ProductDensity"]
+__all__ = [
+    "Density", "GaussianMixture", "GridDensity", "IntervalDensity", "MappedDensity", "ParticleDensity", "PointMasses",
+    "ProductDensity",
+]  # fmt: skip

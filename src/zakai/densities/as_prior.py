@@ -12,6 +12,7 @@ from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
 from zakai.densities.interval import IntervalDensity
 from zakai.densities.mapped import MappedDensity
+from zakai.densities.particles import ParticleDensity
 from zakai.densities.points import PointMasses
 from zakai.densities.product import ProductDensity
 from zakai.errors import InputError
@@ -21,6 +22,7 @@ _POINTS = {1: (128, 256, 512, 1024, 2048), 2: (64, 96, 136, 196)}  # along an ax
 _REACH = 9.0  # standard deviations on each side
 _RESOLVED = 1e-11  # error of the mass with every second point, at which the grid is fine enough
 _ACCEPTED = 1e-6  # at which the finest grid is taken
+MOST_KERNELS = 1000  # of a mixture that stands for particles
 _MOST_COMPONENTS = 64
 
 
@@ -45,6 +47,8 @@ def plain(density: Density) -> GaussianMixture | GridDensity | IntervalDensity |
     """Return the same density as a mixture with positive weights, on a grid, or between the ends of a domain."""
     if isinstance(density, IntervalDensity | MappedDensity):
         return density
+    if isinstance(density, ParticleDensity):
+        return density.thinned(MOST_KERNELS).smoothed
     if isinstance(density, PointMasses):
         return density.smoothed
     if isinstance(density, GaussianMixture) and np.all(density.weights > 0):

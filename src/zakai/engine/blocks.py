@@ -35,6 +35,7 @@ def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> Filt
     mean = np.empty((len(runs[0].record) + 1, model.n))
     variance = np.empty_like(mean)
     increments = np.zeros(len(mean))
+    errors, squares = np.zeros_like(mean), 0.0
     health: dict[str, np.ndarray] = {}
     bounds: dict[str, tuple[float, str]] = {}
     for run, block in zip(runs, blocks, strict=True):
@@ -42,12 +43,16 @@ def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> Filt
         _rename(part, block)
         parts.append(part)
         mean[:, block.states], variance[:, block.states] = part.mean, part.variance
+        if part.mean_standard_error is not None:
+            errors[:, block.states] = part.mean_standard_error
+            squares += (part.log_likelihood_standard_error or 0.0) ** 2
         increments += part.log_likelihood_increments
         for name, values in part.health.items():
             worse = np.fmin if name in SMALLEST_IS_WORST else np.fmax
             health[name] = worse(health[name], values) if name in health else values
         for name, bound in part.bounds.items():
             bounds[name] = min(bound, bounds.get(name, bound))
+    random = any(part.mean_standard_error is not None for part in parts)
     kept = all(part.has_densities for part in parts)
     return FilterResult(
         times=parts[0].times,
@@ -64,6 +69,8 @@ def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> Filt
         state=model.state,
         attributes={**{key: _all_of(parts, key) for key in ("source", "exactness")}, **versions()},
         blocks=tuple(parts),
+        mean_standard_error=errors if random else None,
+        log_likelihood_standard_error=squares**0.5 if random else None,
         _density=_Densities(model, blocks, runs) if kept else None,
         _no_density=_no_density(runs),
     )

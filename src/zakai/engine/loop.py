@@ -37,6 +37,7 @@ from zakai.records.schedule import ROUNDING, Schedule, schedule_of
 CHUNK = 1024  # intervals that are prepared together, at most
 PIECE = 128  # intervals between two reports of progress, at most
 GROWTH = 8  # the first report comes after one interval
+AT_ONCE = 64 * 2**20  # bytes of the states of a segment
 KEPT_BYTES = 512 * 2**20  # of densities that are kept by default
 
 
@@ -111,14 +112,16 @@ def segments(
                 except EscapeError as error:
                     raise error.moved(float(chunk.starts[error.row])) if setting.autonomous else error from None
             yield Segment(start + begin, prepared, rows, state, states, infos)
-            state, begin, size = states[-1], rows.stop, min(GROWTH * size, PIECE)
+            state, begin = states[-1], rows.stop
+            size = max(1, min(GROWTH * size, PIECE, AT_ONCE // max(size_of(state), 1)))
 
 
 def joined(parts: Sequence[Infos]) -> Infos:
     """Return the reports of consecutive segments as one."""
     health = {name: np.concatenate([part.health[name] for part in parts]) for name in parts[0].health}
     increments, means, covs = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    return Infos(increments, means, covs, health)
+    errors = [None if parts[0][i] is None else np.concatenate([part[i] for part in parts]) for i in (4, 5)]
+    return Infos(increments, means, covs, health, *errors)
 
 
 def size_of(state: Any) -> int:
@@ -174,6 +177,8 @@ class Run:
         self.done += len(states)
         if not self.keep:
             return
+        reduced = self.setting.method.reduced
+        states = states if reduced is None else [reduced(state) for state in states]
         self.states.append(states)
         self.bytes += size_of(states[-1]) * len(states)
         # Densities that will not fit are not kept to begin with.
@@ -230,6 +235,8 @@ class Run:
             bounds={name: bound for name, bound in method.bounds.items() if name in infos.health},
             state=model.state,
             attributes={"source": method.source, "exactness": method.exactness, **versions()},
+            mean_standard_error=_with_start(infos.mean_standard_error),
+            log_likelihood_standard_error=_last(infos.log_likelihood_standard_error),
             _cov=cov,
             _density=self.density if kept else None,
             _no_density=self._no_density(),
@@ -250,6 +257,15 @@ class Run:
                 f'{self.most / 2**20:.3g} MiB; keep="densities" keeps them all'
             )
         return 'the densities were not kept; keep="densities" keeps them'
+
+
+def _with_start(errors: np.ndarray | None) -> np.ndarray | None:
+    """Return standard errors with those of the start, which are those of draws of the prior and not reported."""
+    return None if errors is None else np.concatenate([np.full((1, errors.shape[1]), np.nan), errors])
+
+
+def _last(errors: np.ndarray | None) -> float | None:
+    return None if errors is None else float(errors[-1])
 
 
 def _after_gaps(schedule: Schedule) -> list[str]:

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from zakai.engine.plan import Plan
     from zakai.records import Inputs
 
+# Health figures that estimate the error of a mean, in standard deviations.
+_ERRORS_OF_MEANS = ("mean_error", "error_estimate", "time_error")
+_EXACT = ("kalman-bucy", "benes", "hu-yau")
 _MOST_ASSEMBLED = 4 * 2**30  # bytes of the covariances of independent blocks, when they are put together
 
 
@@ -36,7 +39,8 @@ class FilterResult:
 
     Index 0 is the prior at the model's start; index k is after observation k has been used. `times` (K+1,), `mean` and
     `variance` (K+1, n), `cov` (K+1, n, n), `log_likelihood_increments` (K+1,) with entry 0 zero, and `health`, figures of each
-    step (K+1,). `warnings` are sentences; none means that every bound was kept. `method` and `why` say which filter ran
+    step (K+1,). `mean_standard_error` (K+1, n) and `log_likelihood_standard_error` are those of methods with random errors, None
+    elsewhere. `warnings` are sentences; none means that every bound was kept. `method` and `why` say which filter ran
     and on what grounds, `conditions` those of every method that was considered. Of a system that was filtered block by block
     `blocks` are the results of the blocks; `health` is the worst of theirs, and `cov` is put together when it is asked for.
     """
@@ -57,6 +61,8 @@ class FilterResult:
     attributes: dict[str, str] = field(default_factory=dict)
     blocks: tuple[FilterResult, ...] = ()
     origin: tuple[Plan, tuple[Any, ...]] | None = None
+    mean_standard_error: np.ndarray | None = None
+    log_likelihood_standard_error: float | None = None
     _cov: np.ndarray | None = None
     _density: Callable[[int], Density] | None = None
     _no_density: str = "the densities were not kept"
@@ -105,6 +111,24 @@ class FilterResult:
     def log_likelihood(self) -> float:
         """The logarithm of the evidence of the whole record."""
         return float(np.sum(self.log_likelihood_increments))
+
+    @property
+    def error_estimate(self) -> np.ndarray:
+        """The estimated error of the mean (K+1,), in standard deviations, the largest over the states.
+
+        It is 0 for exact methods and NaN where the method has no estimate.
+        """
+        if self.blocks:
+            return np.asarray(np.fmax.reduce([block.error_estimate for block in self.blocks]))
+        if self.mean_standard_error is not None:
+            with np.errstate(all="ignore"):
+                share = self.mean_standard_error / np.sqrt(self.variance)
+            share[self.variance <= 0] = 0.0
+            return np.asarray(share.max(axis=1))
+        for name in _ERRORS_OF_MEANS:
+            if name in self.health:
+                return np.asarray(self.health[name])
+        return np.full(len(self.times), 0.0 if self.method in _EXACT else np.nan)
 
     @property
     def clock(self) -> Clock | None:

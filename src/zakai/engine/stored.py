@@ -78,9 +78,17 @@ def result_of(variables: Mapping[str, Any], attributes: Mapping[str, Any], sourc
         model=read_model(text, source) if text else None,
         state=state,
         attributes=_clock_attributes(attributes, source) | ({"kind": kind} if kind in _KINDS else {}),
+        mean_standard_error=arrays.get("mean_standard_error"),
+        log_likelihood_standard_error=_number(attributes, "log_likelihood_standard_error"),
         _cov=arrays.get("cov"),
         _no_density=f"{source}: a stored result has no densities; filter again to have them",
     )
+
+
+def _number(attributes: Mapping[str, Any], name: str) -> float | None:
+    """Return a number among the attributes of a file, None where there is none."""
+    value = attributes.get(name)
+    return float(value) if isinstance(value, float | int | np.number) and not isinstance(value, bool) else None
 
 
 def _clock_attributes(attributes: Mapping[str, Any], source: str) -> dict[str, str]:

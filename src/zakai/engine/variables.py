@@ -13,7 +13,7 @@ _LARGEST_COV = 32  # number of states up to which covariances are stored
 # All others are over the time.
 DIMENSIONS = {
     **{name: (name,) for name in ("time", "state", "state_")},
-    **{name: ("time", "state") for name in ("mean", "variance")},
+    **{name: ("time", "state") for name in ("mean", "variance", "mean_standard_error")},
     "cov": ("time", "state", "state_"),
 }
 
@@ -29,6 +29,8 @@ def variables_of(result: FilterResult) -> dict[str, tuple[list[str], np.ndarray,
         "variance": result.variance,
         "log_likelihood_increment": result.log_likelihood_increments,
     }
+    if result.mean_standard_error is not None:
+        found["mean_standard_error"] = result.mean_standard_error
     if len(names) <= _LARGEST_COV:
         found["cov"] = result.cov
     variables: dict[str, Any] = {name: (list(DIMENSIONS.get(name, ("time",))), array, {}) for name, array in found.items()}
@@ -40,8 +42,10 @@ def variables_of(result: FilterResult) -> dict[str, tuple[list[str], np.ndarray,
 def attributes_of(result: FilterResult) -> dict[str, Any]:
     """Return the attributes of a file."""
     clock = {} if result.clock is None else {f"time_{name}": str(value) for name, value in result.clock._asdict().items()}
+    error = result.log_likelihood_standard_error
     return {
         **clock,
+        **({} if error is None else {"log_likelihood_standard_error": error}),
         "method": result.method,
         "why": result.why,
         "log_likelihood": result.log_likelihood,

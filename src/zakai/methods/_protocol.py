@@ -36,12 +36,17 @@ from zakai.models.model import Model
 
 
 class Info(NamedTuple):
-    """What one step reports: the increment of the log-likelihood, `mean` (n,), `cov` (n, n), and the health figures."""
+    """What one step reports: the increment of the log-likelihood, `mean` (n,), `cov` (n, n), and the health figures.
+
+    Methods with random errors report the standard errors of the mean (n,) and of the log-likelihood until now.
+    """
 
     log_likelihood_increment: Any
     mean: np.ndarray
     cov: np.ndarray
     health: Mapping[str, float]
+    mean_standard_error: np.ndarray | None = None
+    log_likelihood_standard_error: float | None = None
 
 
 class Infos(NamedTuple):
@@ -51,6 +56,8 @@ class Infos(NamedTuple):
     mean: np.ndarray
     cov: np.ndarray
     health: Mapping[str, np.ndarray]
+    mean_standard_error: np.ndarray | None = None
+    log_likelihood_standard_error: np.ndarray | None = None
 
 
 S = TypeVar("S")
@@ -58,11 +65,14 @@ S = TypeVar("S")
 
 def stacked(infos: Sequence[Info]) -> Infos:
     """Return the reports of single steps as arrays with a leading axis."""
+    random = infos[0].mean_standard_error is not None
     return Infos(
         np.array([info.log_likelihood_increment for info in infos]),
         np.array([info.mean for info in infos]),
         np.array([info.cov for info in infos]),
         {name: np.array([info.health[name] for info in infos]) for name in infos[0].health},
+        np.array([info.mean_standard_error for info in infos]) if random else None,
+        np.array([info.log_likelihood_standard_error for info in infos]) if random else None,
     )
 
 
@@ -195,6 +205,9 @@ class Method(Generic[P, S]):
     the sum of what they gained, and the last shifted states; or None, where `step` is to carry them.
 
     Optional: `backward` is the backward pass of `zakai.smooth`.
+
+    Optional: `reduced(state)` returns a state of which only the density and the backward pass are asked, without what the next
+    step needs: those are the states that a result keeps.
     """
 
     name: str
@@ -217,3 +230,4 @@ class Method(Generic[P, S]):
     segment: Callable[[P, slice, S, np.ndarray], tuple[Sequence[S], Infos] | None] | None = None
     tangents: Callable[[P, Sequence[P], slice, S, Sequence[S], np.ndarray], Tangents[S] | None] | None = None
     backward: Backward[P, S, Any] | None = None
+    reduced: Callable[[S], S] | None = None

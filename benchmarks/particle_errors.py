@@ -1,0 +1,106 @@
+"""Standard errors that `guided-particles` reports, against the spread over seeds, and error and time against a bootstrap filter.
+
+    python benchmarks/particle_errors.py [SYSTEM ...] [--seeds N]
+
+The reference of each system is the mean of runs of our own with many particles and of plain bootstrap filters in NumPy, weighted
+by the squares of their spreads; `disagreement` is the distance of the two in standard deviations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from particle_systems import SYSTEMS, bootstrap, problem
+
+import zakai
+
+REFERENCE, PEER = 60_000, 100_000
+
+
+def apart(model: zakai.Model, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return differences, those of angles wrapped."""
+    d = a - b
+    angles = [name in model.periodic for name in model.state]
+    d[..., angles] -= 2 * np.pi * np.round(d[..., angles] / (2 * np.pi))
+    return d
+
+
+def rms(values: np.ndarray) -> float:
+    """Return the root of the mean of squares."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def measure(name: str, seeds: int) -> dict[str, float]:
+    """Return the figures of one system."""
+    model, record = problem(name)
+    steps = SYSTEMS[name][2]
+    big = [zakai.filter(model, record, "guided-particles", particles=REFERENCE, seed=1000 + i, keep="moments") for i in range(2)]
+    clock = time.process_time()
+    peers = [bootstrap(model, record, PEER, i, steps) for i in range(2)]
+    peer_time = (time.process_time() - clock) / len(peers)
+    sd = np.sqrt(np.mean([one.variance[1:] for one in big], axis=0))
+    ours, theirs = np.mean([one.mean[1:] for one in big], axis=0), np.mean([one[0] for one in peers], axis=0)
+    own = rms(apart(model, big[0].mean[1:], big[1].mean[1:]) / sd) / 2
+    other = rms(apart(model, peers[0][0], peers[1][0]) / sd) / 2
+    reference, likelihood = ours, float(np.mean([one.log_likelihood for one in big]))
+    runs, spent = [], []
+    for seed in range(seeds):
+        clock = time.process_time()
+        runs.append(zakai.filter(model, record, "guided-particles", seed=seed, keep="moments"))
+        spent.append(time.process_time() - clock)
+    errors = np.array([apart(model, run.mean[1:], reference) / sd for run in runs])
+    reported = np.array([run.mean_standard_error[1:] / sd for run in runs])
+    log_errors = np.array([run.log_likelihood - likelihood for run in runs])
+    log_reported = np.array([run.log_likelihood_standard_error for run in runs])
+    spread = errors.std(axis=0, ddof=1) if seeds > 1 else errors[0]
+    peer_error = rms(np.array([apart(model, one[0], reference) / sd for one in peers]))
+    marked = np.mean([np.nanmean(run.health["lower_bound"]) for run in runs])
+    ours_time = float(np.median(spent))
+    return {
+        "particles": float(np.mean([np.nanmean(run.health["particles"]) for run in runs])),
+        "error": rms(errors),
+        "reported": rms(reported),
+        "ratio": rms(reported) / rms(errors),
+        "spread": rms(spread),
+        "coverage": float(np.mean(np.abs(errors) < 1.96 * reported)),
+        "marked": float(marked),
+        "own": own,
+        "disagreement": rms(apart(model, ours, theirs) / sd),
+        "other": other,
+        "log error": rms(log_errors),
+        "log reported": rms(log_reported),
+        "log z": float(np.abs(log_errors / log_reported).max()),
+        "peer log": float(np.mean([one[2] for one in peers]) - likelihood),
+        "ms": ours_time / len(record) * 1e3,
+        "peer ms": peer_time / len(record) * 1e3,
+        "peer error": peer_error,
+        "gain": peer_error**2 * peer_time / (rms(errors) ** 2 * ours_time),
+        "moves": float(np.mean([np.nansum(run.health["moved"]) for run in runs])),
+        "tempered": float(np.mean([np.nansum(run.health["tempering_levels"] > 0) for run in runs])),
+        "guided": float(np.mean([np.nansum(run.health["guided"]) for run in runs])),
+        "time error": float(np.mean([np.nanmax(run.health["time_error"]) for run in runs])),
+    }
+
+
+def main() -> None:
+    """Print a line for each system."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("systems", nargs="*", default=list(SYSTEMS))
+    parser.add_argument("--seeds", type=int, default=8)
+    given = parser.parse_args()
+    first = True
+    for name in given.systems or SYSTEMS:
+        found = measure(name, given.seeds)
+        if first:
+            print(f"{'':10}", *(f"{key:>12}" for key in found))
+            first = False
+        print(f"{name:10}", *(f"{value:12.4g}" for value in found.values()), flush=True)
+
+
+if __name__ == "__main__":
+    main()

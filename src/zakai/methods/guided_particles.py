@@ -1,0 +1,109 @@
+"""Particles for any model: weights that are exact, proposals where they pay, moves of the past, and standard errors.
+
+A particle's next state is a function of standard normal noise.  Every proposal and every move acts on that noise, so that weights
+are exact for any law of the observations, any g(x) and any number of substeps.  Substeps are of second order in law.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from zakai.algebra.theorems import any_model as theorem
+from zakai.densities import ParticleDensity
+from zakai.errors import InputError
+from zakai.methods._options import real_number, whole_number
+from zakai.methods._protocol import Method
+from zakai.methods.particles.filter import MOST_GROWTH, VARIANCE, Prepared, Rule, State, init, step
+from zakai.methods.particles.system import system_of
+from zakai.methods.particles.validity import valid
+from zakai.models import features
+from zakai.models.model import Model
+from zakai.numerics.complex_step import is_complex
+from zakai.records.schedule import Schedule
+
+TOLERANCE = 0.03
+
+
+def prepare(
+    model: Model,
+    schedule: Schedule,
+    theta: np.ndarray,
+    *,
+    tolerance: float = TOLERANCE,
+    particles: int | None = None,
+    most_particles: int | None = None,
+    seed: int = 0,
+) -> Prepared:
+    """Return the programs of the formulas.
+
+    Args:
+        model: the system.
+        schedule: its K intervals.
+        theta: values of the parameters (p,).
+        tolerance: the wanted standard error of a mean, in standard deviations of the state; it decides the number of particles.
+        particles: a fixed number of particles instead.
+        most_particles: the largest number; by default four times that of the start.
+        seed: of the draws.
+
+    Raises:
+        InputError: another value of an option.
+    """
+    tolerance = real_number("tolerance", tolerance, "a number from 0.001 to 0.5", lambda value: 0.001 <= value <= 0.5)
+    seed = whole_number("seed", seed, 0, 2**63 - 1)
+    most = 10**8 if most_particles is None else whole_number("most_particles", most_particles, 2, 10**8)
+    if particles is not None:
+        count = whole_number("particles", particles, 2, 10**8)
+        if count > most:
+            raise InputError(f"option particles: {count} is more than most_particles, {most}; leave one of them out")
+        rule = Rule(count, count, None, seed)
+    else:
+        count = min(int(np.ceil(VARIANCE / tolerance**2)), most)
+        rule = Rule(count, min(most, MOST_GROWTH * count), tolerance, seed)
+    assert not is_complex(theta)
+    return Prepared(system_of(model), np.asarray(theta, float), schedule, rule)
+
+
+def density(prepared: Prepared, state: State) -> ParticleDensity:
+    """Return the weighted particles."""
+    model, weights = prepared.model, np.exp(state.log_weights)
+    periodic = tuple(name in model.periodic for name in model.state)
+    return ParticleDensity(weights / weights.sum(), state.particles.T, model.state, periodic)
+
+
+BOUNDS = {
+    "monte_carlo_error": (0.1, "standard error of a mean, in standard deviations; lower the tolerance or name more particles"),
+    "lower_bound": (
+        0.5, "the standard errors are lower bounds here, because an observation left few particles or few ancestors; run another "
+        "seed and compare, or name more particles",
+    ),
+    "tempering_levels": (
+        6.0, "powers of the likelihood that one observation needed: it is far from what was predicted; check it and its noise, "
+        "or give more frequent observations",
+    ),
+    "time_error": (0.1, "shift of a mean by the time step, in standard deviations; give more frequent observations"),
+    "log_likelihood_error": (1.0, "standard error of the log-likelihood so far; name more particles before comparing models"),
+}  # fmt: skip
+
+METHOD: Method[Prepared, State] = Method(
+    name="guided-particles",
+    source="Gordon, Salmond and Smith 1993; moves of the past: Gilks and Berzuini 2001; standard errors: Lee and Whiteley 2018",
+    exactness="convergent: in 1 / sqrt(particles), with a standard error that is reported, and of second order in a substep",
+    theorem=theorem,
+    options={"tolerance": TOLERANCE, "particles": None, "most_particles": None, "seed": 0},
+    prepare=prepare,
+    init=init,
+    step=step,
+    density=density,
+    state=State,
+    bounds=BOUNDS,
+    differentiable=False,
+    valid=valid,
+    shorter="raise the tolerance",
+    handles=frozenset(
+        {
+            features.STATE_DEPENDENT_DIFFUSION, features.INPUTS, features.CROSS_NOISE, features.STATE_DEPENDENT_OBSERVATION_NOISE,
+            features.OBSERVATION_FAMILY, features.OBSERVATION_LOG_DENSITY, features.DOMAIN, features.TABLES, features.KINKS,
+            features.JUMPS, features.SINC,
+        }
+    ),
+)  # fmt: skip

@@ -1,0 +1,455 @@
+"""One step of the particle filter: motion, weights, resampling, moves of the past, and standard errors.
+
+    x_i <- F(x_i, noise_i);   w_i <- w_i p(z | x_i);   resample where 1 / sum w^2 is below half of the particles
+
+A step whose plain weights leave few particles draws the noise again from the Gaussian posterior of the linearised interval, and
+where that fails too, carries plain particles to the posterior by powers of the likelihood with moves between them.  What is drawn
+depends on the seed, the number of the interval and the particle alone.
+
+References:
+    Gordon, Salmond and Smith 1993, Novel approach to nonlinear/non-Gaussian Bayesian state estimation.
+    Del Moral, Doucet and Jasra 2006, Sequential Monte Carlo samplers (powers of the likelihood).
+    Gilks and Berzuini 2001, Following a moving target (moves of the past).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.densities._density import wrap
+from zakai.methods._protocol import Info
+from zakai.methods.particles.errors import DEPTH, Genealogy, of_log_likelihood, variances
+from zakai.methods.particles.interval import PILOTS, TIME_ERROR, Events, Interval, Motion, Pilots, Scheme, Steps, steps_of
+from zakai.methods.particles.programs import Array
+from zakai.methods.particles.system import System, drawn, gaussian_prior
+from zakai.methods.particles.window import Observed, Target, Window, taken
+from zakai.models.model import Model
+from zakai.numerics.particles.chunks import over_chunks
+from zakai.numerics.particles.population import effective, next_power, normalised, systematic
+from zakai.numerics.particles.random import key_of, normals, uniform_number
+from zakai.records.schedule import Schedule
+
+NOISE, RESAMPLING, PILOT, GUIDE, MOVE, PRIOR, RESIZE, LEVELS = range(8)  # uses of random numbers
+RESAMPLE_BELOW = 0.5  # effective share of the particles
+GUIDE_BELOW = 0.3  # effective share below which the noise is drawn again from the linearised posterior
+TEMPER_BELOW, TEMPER_FLOOR = 0.1, 400  # effective share and number below which powers of the likelihood are taken
+GUIDE_SHARE, FIRST_SHARE = 0.1, 0.2  # of plain noise in draws from the linearised posterior, of an interval and of the prior
+FIRST_WIDER, FIRST_ROUNDS = 1.5, 6
+INFORMED = 0.25  # log det of the linearised posterior of the noise, below which the observation says nothing about the noise
+MOST_LEVELS = 60
+FEW_FAMILIES = 20  # of the oldest generation that is looked back to, below which they are too few to show their spread
+# Standard error of a mean times sqrt(N) in standard deviations (1 for independent draws) from which the past is moved.  A move
+# costs as much as the intervals of its window: it waits until the squares of these figures, in units of that of `MOVE_ABOVE`,
+# add up to this share of the intervals of the last move.
+MOVE_ABOVE, MOVE_SHARE = 2.5, 0.4
+MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4)  # power, change, most sweeps, rho
+GAIN = 0.7  # of the largest variance by a move, above which moves are waited for twice as long
+VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
+MOST_GROWTH = 4
+SURE, TRUSTED = 0.5, 4  # share of the allowed time error below which its measurement is trusted in so many more intervals
+
+
+class Control(NamedTuple):
+    """What decides the next step beside the particles.
+
+    `interval` counts intervals; `substeps` per unit time, whose `error` was measured in an interval of this `length` and is
+    trusted in so many more that are no longer; `variance` of a mean times N, `last` intervals of the window at the last move,
+    `urgency` what has added up since then, `wait` how many times the usual waiting, and `doubtful_until` the number of
+    resamplings until which standard errors are lower bounds.
+    """
+
+    interval: int
+    substeps: float
+    stages: int
+    error: float
+    length: float
+    trusted: int
+    variance: float
+    last: int
+    urgency: float
+    wait: float
+    doubtful_until: int
+
+
+class State(NamedTuple):
+    """The weighted particles and what continues them.
+
+    `particles` (n, N), `log_weights` (N,) that sum to one, the past, the ancestors, the controls, `shift` (n,), the error of the
+    mean by the time step, and `last_shift` (n,), that of the last interval in which it was measured.
+    """
+
+    particles: Array
+    log_weights: Array
+    window: Window
+    genealogy: Genealogy
+    control: Control
+    shift: Array
+    last_shift: Array
+
+
+@dataclass(frozen=True)
+class Rule:
+    """The options: the particles at the start, their largest number, the wanted standard error or none, and the seed."""
+
+    particles: int
+    most: int
+    tolerance: float | None
+    seed: int
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A system with its parameters, a schedule and the options."""
+
+    system: System
+    theta: Array
+    schedule: Schedule
+    rule: Rule
+    notes: tuple[str, ...] = ()
+
+    @property
+    def model(self) -> Model:
+        """The model."""
+        return self.system.model
+
+    @cached_property
+    def motion(self) -> Motion:
+        """The programs for these parameters."""
+        return Motion(self.system, self.theta)
+
+    def interval(self, k: int) -> Interval:
+        """Return an interval of the schedule."""
+        schedule = self.schedule
+        start, stop = float(schedule.starts[k]), float(schedule.stops[k])
+        inputs = None if schedule.inputs is None else schedule.inputs.part(start, stop)
+        return Interval(start, stop, schedule.seen[k], schedule.inside[k], schedule.elapsed[k], inputs)
+
+    def key(self, interval: int, use: int, more: int = 0) -> Array:
+        """Return the key of the random numbers of one use in one interval."""
+        return key_of(self.rule.seed, interval, use, more)
+
+
+def init(prepared: Prepared, prior: Any) -> State:
+    """Return draws of the prior with equal weights."""
+    n, count, system = prepared.system.n, prepared.rule.particles, prepared.system
+    gaussian = gaussian_prior(prior)
+    key = prepared.key(0, PRIOR)
+    if gaussian is None:
+        rng = np.random.Generator(np.random.Philox(key=key))
+        particles, first = drawn(prepared.model, prior, prepared.theta, count, rng), np.zeros((0, count))
+        gaussian = np.zeros(n), np.zeros((n, 0))
+    else:
+        first = np.empty((gaussian[1].shape[1], count))
+        normals(key, 0, count, first)
+        particles = np.ascontiguousarray(gaussian[0][:, None] + gaussian[1] @ first)
+    width = system.law.width if system.law is not None else system.factor.width  # type: ignore[union-attr]
+    terms = len(prepared.motion.law[3])
+    window = Window.begin(particles, first, gaussian, (width, terms))
+    logs = np.full(count, -np.log(count))
+    control = Control(0, 0.0, 4, np.inf, 0.0, 0, VARIANCE, 0, 0.0, 1.0, 0)
+    return State(particles, logs, window, Genealogy.begin(count), control, np.zeros(n), np.zeros(n))
+
+
+def moments(particles: Array, weights: Array, angles: Array) -> tuple[Array, Array, Array]:
+    """Return the mean (n,), the deviations from it (n, N), and the covariance (n, n); angles have their mean direction."""
+    mean = particles @ weights
+    if angles.any():
+        resultant = np.exp(1j * particles[angles]) @ weights
+        mean[angles] = np.where(np.abs(resultant) < 1e-9, 0.0, np.angle(resultant))
+    deviations = particles - mean[:, None]
+    if angles.any():
+        deviations[angles] = wrap(deviations[angles])
+    return mean, deviations, (deviations * weights) @ deviations.T
+
+
+class Cloud(NamedTuple):
+    """Particles with their past while a step works on them."""
+
+    particles: Array
+    logs: Array
+    window: Window
+    genealogy: Genealogy
+
+    def resampled(self, weights: Array, count: int, key: Array) -> tuple[Cloud, Array]:
+        """Return equally weighted particles by systematic resampling, and their ancestors."""
+        ancestors = np.empty(count, np.int32)
+        systematic(weights, uniform_number(key), ancestors)
+        return self.taken(ancestors, weights), ancestors
+
+    def taken(self, ancestors: Array, weights: Array) -> Cloud:
+        """Return equally weighted particles with these ancestors."""
+        logs = np.full(len(ancestors), -np.log(len(ancestors)))
+        window, genealogy = self.window.resampled(ancestors), self.genealogy.resampled(ancestors, weights)
+        return Cloud(taken(self.particles, ancestors), logs, window, genealogy)
+
+
+class Advanced(NamedTuple):
+    """Particles after an interval, with what was needed.
+
+    `gained` is the increment of the log-likelihood, `noise` (D, N) that of the interval, `predicted` (n,) the standard deviations
+    before the observation, `acceptance` that of moves between powers of the likelihood.
+    """
+
+    cloud: Cloud
+    gained: float
+    noise: Array
+    predicted: Array
+    levels: int = 0
+    guided: bool = False
+    acceptance: float = np.nan
+
+
+def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
+    """Advance by interval k of the schedule, then use what is observed at its stop."""
+    try:
+        return _step(prepared, k, state, values)
+    except np.linalg.LinAlgError:
+        n = prepared.system.n
+        none = np.full(n, np.nan)
+        return state, Info(np.nan, none, np.full((n, n), np.nan), dict.fromkeys(FIGURES, np.nan), none, np.nan)
+
+
+FIGURES = (
+    "effective_sample_size", "particles", "founders", "largest_weight", "tempering_levels", "acceptance", "time_error",
+    "monte_carlo_error", "log_likelihood_error", "lower_bound", "guided", "moved",
+)  # fmt: skip
+
+
+def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
+    motion, interval, control = prepared.motion, prepared.interval(k), state.control
+    angles, number, rule = prepared.system.angles, control.interval + 1, prepared.rule
+    cloud = Cloud(state.particles, state.log_weights, state.window, state.genealogy)
+    weights = np.exp(cloud.logs)
+    before, apart, _ = moments(cloud.particles, weights, angles)
+    scale = np.maximum(np.sqrt(apart**2 @ weights), 1e-12)
+    steps, control = _steps(prepared, interval, values, state, (before, scale))
+    events = motion.events(interval, steps.scheme, values, before, scale)
+    observed = _observed(prepared, interval, values)
+    wanted = _wanted(rule, len(weights), control.variance)
+    if effective(weights) < RESAMPLE_BELOW * len(weights) or wanted != len(weights):
+        cloud, _ = cloud.resampled(weights, wanted, prepared.key(number, RESAMPLING))
+    done = _advanced(prepared, cloud, events, observed, number)
+    cloud = done.cloud
+    cloud = cloud._replace(window=cloud.window.appended(motion, events, observed, done.noise, cloud.particles))
+    weights = np.exp(cloud.logs)
+    size, largest = effective(weights), float(weights.max())
+    mean, deviations, cov = moments(cloud.particles, weights, angles)
+    found = variances(cloud.genealogy, weights, deviations)
+    doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
+    acceptance, moved = done.acceptance, 0.0
+    wait, last = control.wait, control.last
+    factor = _excess(found.largest, cov, len(weights))
+    urgency = control.urgency + factor
+    if factor > 1.0 and urgency >= MOVE_SHARE * wait * last and cloud.window.width:
+        cloud, acceptance, doubtful_move = _moved(prepared, cloud, weights, number)
+        weights = np.exp(cloud.logs)
+        mean, deviations, cov = moments(cloud.particles, weights, angles)
+        found = variances(cloud.genealogy, weights, deviations)
+        ratio = _excess(found.largest, cov, len(weights)) / factor
+        wait, last, urgency, moved = 2 * wait if ratio > GAIN else max(1.0, 0.5 * wait), cloud.window.length, 0.0, 1.0
+        doubtful = doubtful or doubtful_move
+    spread = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    # What the data says of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
+    contraction = np.minimum(1.0, spread / np.maximum(done.predicted, 1e-300)) ** 2
+    shift = (state.shift + steps.shift) * contraction
+    genealogy, evidence = of_log_likelihood(cloud.genealogy, found)
+    cloud = cloud._replace(genealogy=genealogy)
+    positive = np.where(spread > 0, spread, np.inf)
+    share = found.largest / positive**2
+    until = cloud.genealogy.age + DEPTH if doubtful else control.doubtful_until
+    health = {
+        "effective_sample_size": size,
+        "particles": float(len(weights)),
+        "founders": float(found.families[-1]),
+        "largest_weight": largest,
+        "tempering_levels": float(done.levels),
+        "acceptance": acceptance,
+        "time_error": float((shift / positive).max()),
+        "monte_carlo_error": float(np.sqrt(share.max())),
+        "log_likelihood_error": float(np.sqrt(evidence)),
+        "lower_bound": float(doubtful or cloud.genealogy.age < until or found.families[-2] < FEW_FAMILIES),
+        "guided": float(done.guided),
+        "moved": moved,
+    }
+    info = Info(done.gained, mean, cov, health, np.sqrt(found.largest + shift**2), float(np.sqrt(evidence)))
+    variance = 0.8 * control.variance + 0.2 * len(weights) * float(share.mean())
+    control = control._replace(
+        interval=number, variance=variance, last=last, urgency=urgency, wait=wait, doubtful_until=until
+    )
+    return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, steps.shift), info
+
+
+def _steps(
+    prepared: Prepared, interval: Interval, values: Array, state: State, about: tuple[Array, Array]
+) -> tuple[Steps, Control]:
+    """Return the substeps of an interval, measured where the last measurement does not hold any more, and the controls."""
+    control, (mean, scale) = state.control, about
+    length = interval.stop - interval.start
+    guess = max(1, round(control.substeps * length))
+    if length <= 0:
+        return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0), control
+    if control.trusted and length <= control.length * (1.0 + 1e-9):
+        return Steps(Scheme(guess, control.stages), state.last_shift, control.error), control._replace(trusted=control.trusted - 1)
+    key = prepared.key(control.interval + 1, PILOT)
+    chosen = np.empty(PILOTS, np.int32)
+    systematic(np.exp(state.log_weights), uniform_number(key), chosen)
+    pilots = Pilots(taken(state.particles, chosen), mean, scale, int(key[0] >> np.uint64(2)))
+    found = steps_of(prepared.motion, interval, values, pilots, guess)
+    trusted = TRUSTED if found.error <= SURE * TIME_ERROR else 0
+    scheme = found.scheme
+    changed = control._replace(
+        substeps=scheme.substeps / length, stages=scheme.stages, error=found.error, length=length, trusted=trusted
+    )
+    return found, changed
+
+
+def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed:
+    """Return what the law of the observations at the end of an interval receives."""
+    system, theta, t = prepared.system, prepared.theta, interval.stop
+    u = None if interval.inputs is None else interval.inputs.at(t, system.model.input_hold)
+    if system.law is not None:
+        return Observed(t, *system.law.given(values, interval.seen, t, theta, u))
+    m, late = system.m, np.flatnonzero(interval.seen & ~interval.inside)
+    P = np.zeros((m, m))
+    if len(late):
+        S, spans = system.noise(np.zeros(system.n), t, theta, u), interval.elapsed
+        P[np.ix_(late, late)] = np.linalg.inv((S * np.minimum(spans[:, None], spans))[np.ix_(late, late)])
+    r = interval.elapsed * (P @ values)
+    P = P * np.outer(interval.elapsed, interval.elapsed)
+    row = np.concatenate([[] if u is None else u, r, [P[pair] for pair in system.numbers.pairs]])
+    return Observed(t, row, np.array([float(len(late) > 0)]))
+
+
+def _advanced(prepared: Prepared, cloud: Cloud, events: Events, observed: Observed, number: int) -> Advanced:
+    """Return the particles after an interval and its observation."""
+    motion, count = prepared.motion, len(cloud.logs)
+    noise = np.empty((events.width, count))
+    key = prepared.key(number, NOISE)
+    over_chunks(lambda low, high: normals(key, low, high, noise), count)
+    particles, gained = motion.advanced(events, cloud.particles, noise)
+    lost = ~np.isfinite(particles).all(axis=0)
+    if lost.any():
+        particles[:, lost] = cloud.particles[:, lost]
+    predicted = _spread(particles, cloud.logs, prepared.system.angles)
+    if not (observed.counted.any() or len(motion.arrays[0][3]) > prepared.system.n) and not lost.any():
+        return Advanced(cloud._replace(particles=particles), 0.0, noise, predicted)
+    logs = gained + _log_likelihood(motion, particles, observed)
+    logs[lost | np.isnan(logs)] = -np.inf
+    weights, top = normalised(cloud.logs + logs)
+    plain = Advanced(cloud._replace(particles=particles, logs=cloud.logs + logs - top), top, noise, predicted)
+    if effective(weights) >= GUIDE_BELOW * count and np.isfinite(top):
+        return plain
+    moving = cloud.window.length == 0 and len(cloud.window.first) > 0
+    prior = (cloud.window.mean, cloud.window.root) if moving else None
+    single = (np.array([observed.time]), observed.given[None], observed.counted[None])
+    target = Target(motion, events, *single, prior, cloud.particles)
+    guided = _guided(prepared, target, cloud, plain, number)
+    best = plain if guided is None else guided
+    size = effective(np.exp(best.cloud.logs)) if np.isfinite(best.gained) else 0.0
+    if size >= min(TEMPER_BELOW * count, TEMPER_FLOOR) or not np.isfinite(logs).any():
+        return best
+    return _tempered(prepared, target, cloud, plain, logs, number)
+
+
+def _spread(particles: Array, logs: Array, angles: Array) -> Array:
+    weights = np.exp(logs)
+    _, deviations, _ = moments(particles, weights, angles)
+    return np.sqrt(deviations**2 @ weights)
+
+
+def _log_likelihood(motion: Motion, particles: Array, observed: Observed) -> Array:
+    """Return log p(z | x) (N,), -inf where there is no law."""
+    if not observed.counted.any():
+        return np.zeros(particles.shape[1])
+    terms = motion.values(motion.law, particles, observed.time, observed.given)
+    return np.asarray(terms[observed.counted > 0].sum(axis=0))
+
+
+def _guided(prepared: Prepared, target: Target, cloud: Cloud, plain: Advanced, number: int) -> Advanced | None:
+    """Return the particles whose noise is drawn from the linearised posterior, None where that is no better."""
+    count, moving = len(cloud.logs), target.prior is not None
+    d0 = len(cloud.window.first) if moving else 0
+    begin = np.zeros((d0 + len(plain.noise), 1))
+    if not len(begin):
+        return None
+    weights = np.exp(cloud.logs)
+    wider, rounds, share = (FIRST_WIDER, FIRST_ROUNDS, FIRST_SHARE) if moving else (1.0, 2, GUIDE_SHARE)
+    gaussian = target.gaussian(begin, weights, rounds=rounds, wider=wider)
+    if gaussian is None or np.log(gaussian[4] * np.sqrt(wider)).sum() < INFORMED:
+        return None
+    path, ratio = target.draw(gaussian, share, prepared.key(number, GUIDE))
+    particles, logs = target.follow(path)
+    logs = logs + ratio
+    lost = ~np.isfinite(particles).all(axis=0)
+    particles[:, lost] = plain.cloud.particles[:, lost]
+    logs[lost | np.isnan(logs)] = -np.inf
+    found, top = normalised(cloud.logs + logs)
+    if not np.isfinite(top) or np.isfinite(plain.gained) and effective(found) <= effective(np.exp(plain.cloud.logs)):
+        return None
+    window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
+    after = Cloud(particles, cloud.logs + logs - top, window, cloud.genealogy)
+    assert len(logs) == count
+    return Advanced(after, top, np.ascontiguousarray(path[d0:]), plain.predicted, guided=True)
+
+
+def _tempered(
+    prepared: Prepared, target: Target, cloud: Cloud, plain: Advanced, logs: Array, number: int
+) -> Advanced:
+    """Return plain particles carried to the posterior by powers of the likelihood, with moves of the interval's noise between."""
+    count, moving = len(cloud.logs), target.prior is not None
+    d0 = len(cloud.window.first) if moving else 0
+    path = np.concatenate([cloud.window.first, plain.noise]) if moving else plain.noise
+    gained, low, levels, rates = 0.0, 0.0, 0, list[float]()
+    particles = plain.cloud.particles
+    control = (2.0, 20.0) if moving else (1.5, 12.0)
+    while low < 1.0 and levels < MOST_LEVELS:
+        high = next_power(cloud.logs, logs, 0.5 * count, low)
+        weights, top = normalised(cloud.logs + (high - low) * np.maximum(logs, -1e300))
+        gained, levels, low = gained + top, levels + 1, high
+        cloud, ancestors = cloud.resampled(weights, count, prepared.key(number, RESAMPLING, levels))
+        path, particles, logs = taken(path, ancestors), taken(particles, ancestors), logs[ancestors]
+        target = Target(target.motion, target.events, target.times, target.given, target.counted, target.prior, cloud.particles)
+        gaussian = target.gaussian(path, None, power=high)
+        if gaussian is None:
+            n, D = cloud.particles.shape[0], len(path)
+            gaussian = (np.zeros(D), np.zeros((D, n)), np.zeros(n), np.zeros((0, D)), np.zeros(0))
+        path, particles, logs, rate, _ = target.sweep(gaussian, path, (high, *control, 0.4), prepared.key(number, LEVELS, levels))
+        rates.append(rate)
+    window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
+    after = Cloud(particles, cloud.logs, window, cloud.genealogy)
+    noise = np.ascontiguousarray(path[d0:])
+    return Advanced(after, gained, noise, plain.predicted, levels, acceptance=float(np.mean(rates)))
+
+
+def _excess(variance: Array, cov: Array, count: int) -> float:
+    """Return the largest variance of a mean over that of independent draws, in units of `MOVE_ABOVE` squared."""
+    spread = np.diag(cov)
+    wide = spread > 0
+    return float((variance[wide] / spread[wide]).max(initial=0.0)) * count / MOVE_ABOVE**2
+
+
+def _moved(prepared: Prepared, cloud: Cloud, weights: Array, number: int) -> tuple[Cloud, float, bool]:
+    """Return equally weighted particles whose past has been moved, the acceptance, and whether they have moved too little."""
+    cloud, _ = cloud.resampled(weights, len(weights), prepared.key(number, RESAMPLING, MOST_LEVELS + 1))
+    path, start = cloud.window.path()
+    target = cloud.window.target(prepared.motion, start)
+    gaussian = target.gaussian(path, None)
+    if gaussian is None:
+        return cloud, 0.0, True
+    path, particles, _, rate, change = target.sweep(gaussian, path, MOVE_CONTROL, prepared.key(number, MOVE))
+    window = cloud.window.moved(path, start, particles)
+    return cloud._replace(particles=particles, window=window), rate, rate < 0.1 or change < 0.5
+
+
+def _wanted(rule: Rule, count: int, variance: float) -> int:
+    """Return the number of particles from here on, changed slowly: copies do not lower the error at once."""
+    if rule.tolerance is None:
+        return count
+    need = variance / rule.tolerance**2
+    if count / 1.3 < need < 1.2 * count:
+        return count
+    return int(np.clip(min(max(need, 0.7 * count, 500.0), 1.5 * count), min(500, rule.most), rule.most))

@@ -1,0 +1,365 @@
+"""The events of an interval: flows of the drift, kicks of noise in the middle of substeps, and the observation at the end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import expm
+
+from zakai.methods.particles.programs import Array
+from zakai.methods.particles.system import System, root
+from zakai.numerics.particles.chunks import over_chunks
+from zakai.numerics.particles.formulas import evaluate
+from zakai.numerics.particles.motion import ADDITIVE, ORDERED, advance
+from zakai.numerics.particles.random import key_of, normals
+from zakai.records.inputs import Inputs
+
+PILOTS = 64  # particles by which the time step is measured
+TIME_ERROR = 0.01  # of a mean or a standard deviation by one interval, in standard deviations, that a step is chosen for
+MOST_SUBSTEPS = 64
+KEPT_LENGTHS = 64  # of substeps whose noise is kept
+_SERIES = 4.0  # norm of A times the substep up to which the covariance of its noise is a series
+
+
+class Interval(NamedTuple):
+    """One interval of a schedule: its ends, what is observed at its stop, and the inputs."""
+
+    start: float
+    stop: float
+    seen: Array
+    inside: Array
+    elapsed: Array
+    inputs: Inputs | None
+
+
+class Events(NamedTuple):
+    """What the kernels run; see `numerics/particles/motion.py`."""
+
+    times: Array
+    places: Array
+    given: Array
+    roots: Array
+    rows: Array
+
+    @property
+    def width(self) -> int:
+        """The number of standard normal numbers of a particle."""
+        return int(self.rows[-1].sum()) if len(self.rows) else 0
+
+
+class Scheme(NamedTuple):
+    """The number of substeps of an interval, and the evaluations of the drift in a flow, 2 or 4."""
+
+    substeps: int
+    stages: int
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The formulas of a system for given parameters, as the kernels take them."""
+
+    system: System
+    theta: Array
+
+    @cached_property
+    def arrays(self) -> tuple[Any, ...]:
+        """The drift, the fields of the noise, the ends of the domain, and the kind of the noise."""
+        system = self.system
+        return tuple(system.drift.at(self.theta)), tuple(system.fields.at(self.theta)), system.box, system.kind
+
+    @cached_property
+    def law(self) -> tuple[Any, ...]:
+        """The law of a sample, or the factor of an increment gathered over more than its interval."""
+        system = self.system
+        return tuple(system.law.program(self.theta) if system.law is not None else system.factor.at(self.theta))  # type: ignore[union-attr]
+
+    @cached_property
+    def observe(self) -> tuple[Any, ...]:
+        """The observation h."""
+        return tuple(self.system.observe.at(self.theta))
+
+    def advanced(self, events: Events, start: Array, noise: Array, ends: Array | None = None) -> tuple[Array, Array]:
+        """Return states (n, N) after the events, and the integrated log weights (N,)."""
+        out, gained = np.empty_like(start), np.empty(start.shape[1])
+        ends = np.empty((0, *start.shape)) if ends is None else ends
+        arrays = self.arrays, tuple(events), start, noise
+        over_chunks(lambda low, high: advance(*arrays, low, high, out, gained, ends), len(gained))
+        return out, gained
+
+    def values(self, program: tuple[Any, ...], x: Array, t: float, given: Array) -> Array:
+        """Return the outputs (k, N) of a program at points (n, N)."""
+        out = np.empty((len(program[3]), x.shape[1]))
+        over_chunks(lambda low, high: evaluate(program, self.system.box, x, t, given, low, high, out), x.shape[1])
+        return out
+
+    @cached_property
+    def _kept_roots(self) -> dict[float, Array]:
+        return {}
+
+    def _root_of(self, step: float) -> Array:
+        """Return the root of the noise of a substep of an affine system without time."""
+        if step not in self._kept_roots:
+            if len(self._kept_roots) >= KEPT_LENGTHS:
+                self._kept_roots.clear()
+            nothing = np.zeros((self.system.m, self.system.m))
+            G = self._covariance(float(self.system.model.start), nothing, None)
+            self._kept_roots[step] = root(noise_about_middle(self.constant_matrix, G, step))
+        return self._kept_roots[step]
+
+    def _covariance(self, t: float, P: Array, u: Array | None) -> Array:
+        """Return g (Q - C P C') g' (n, n) for noise that does not depend on the state."""
+        system = self.system
+        if system.cross is None and not system.timed:
+            return self._constant_covariance
+        g = system.diffusion(np.zeros(system.n), t, self.theta, u)
+        return np.asarray(g @ system.own_noise(t, P, self.theta, u) @ g.T)
+
+    @cached_property
+    def _constant_covariance(self) -> Array:
+        system, t = self.system, float(self.system.model.start)
+        g, Q = system.diffusion(np.zeros(system.n), t, self.theta), system.process_noise(np.zeros(system.n), t, self.theta)
+        return np.asarray(g @ Q @ g.T)
+
+    @cached_property
+    def constant_matrix(self) -> Array:
+        """The matrix of an affine drift."""
+        model = self.system.model
+        given = np.zeros(self.system.drift.width)
+        return self._matrix(np.zeros(model.n), np.ones(model.n), float(model.start), given)
+
+    def _matrix(self, x: Array, scale: Array, t: float, given: Array) -> Array:
+        """Return df/dx (n, n) at a point, by forward differences."""
+        n = len(x)
+        step = 1e-5 * scale
+        points = np.repeat(x[:, None], n + 1, axis=1)
+        points[np.arange(n), np.arange(1, n + 1)] += step
+        f = self.values(self.arrays[0], points, t, given)[:n]
+        found = (f[:, 1:] - f[:, :1]) / step
+        return np.where(np.isfinite(found), found, 0.0)
+
+    def events(self, interval: Interval, scheme: Scheme, values: Array, mean: Array, scale: Array) -> Events:
+        """Return the events of an interval in equal substeps.
+
+        Args:
+            interval: the interval.
+            scheme: the number of substeps, and the evaluations of the drift in a flow.
+            values: the increments (m,), zero where nothing is observed.
+            mean: the state (n,) about which the drift is linearised for the covariance of the noise.
+            scale: standard deviations of the states (n,).
+        """
+        system, start, stop, count = self.system, interval.start, interval.stop, scheme.substeps
+        length = stop - start
+        if length <= 0:
+            none = np.zeros((0, system.r if system.kind else system.n, 0))
+            row = np.array([[start, start]])
+            return Events(row, np.array([[-1, 0, 4]]), np.zeros((1, 2, system.drift.width)), none, np.zeros((0, 3), np.int64))
+        step = length / count
+        kicks = start + (np.arange(count) + 0.5) * step
+        jumps = np.zeros(0) if interval.inputs is None else interval.inputs.within(start, stop)
+        ends = np.unique(np.concatenate([kicks, jumps, [stop]]))
+        times = np.column_stack([np.append(start, ends[:-1]), ends])
+        kicked = np.searchsorted(kicks, ends)
+        kicked = np.where((kicked < count) & (kicks[np.minimum(kicked, count - 1)] == ends), kicked, -1)
+        places = np.column_stack([kicked, np.where(ends == stop, 0, -1), np.full(len(ends), scheme.stages)]).astype(np.int64)
+        given = self._given(interval, times, values)
+        roots = self._roots(interval, times, places, given, step, mean, scale)
+        coin = int(system.kind == ORDERED)
+        width = roots.shape[2]
+        rows = np.column_stack([np.arange(count) * (width + coin), np.full(count, width), np.full(count, coin)]).astype(np.int64)
+        return Events(times, places, given, roots, rows)
+
+    def _inputs(self, interval: Interval, t: float, before: bool) -> Array | None:
+        known = interval.inputs
+        return None if known is None else known.at(t, self.system.model.input_hold, before=before)
+
+    def _given(self, interval: Interval, times: Array, values: Array) -> Array:
+        """Return the given numbers of the drift (E, 2, L) at both ends of each flow."""
+        system, length = self.system, interval.stop - interval.start
+        given = np.zeros((len(times), 2, system.drift.width))
+        known: Array | None = None
+        if not given.shape[2]:
+            return given
+        for e, pair in enumerate(times):
+            for side, t in enumerate(pair):
+                if known is not None and not system.timed:
+                    given[e, side] = known
+                    continue
+                u = self._inputs(interval, t, bool(side))
+                parts = [np.zeros(0) if u is None else u]
+                P = np.zeros((system.m, system.m))
+                if not system.sampled:
+                    P = system.precision(t, interval.inside, self.theta, u)
+                    parts += [P @ np.where(interval.inside, values, 0.0) / length, [P[pair] for pair in system.numbers.pairs]]
+                if system.root_pairs:
+                    Q = system.own_noise(t, P, self.theta, u)
+                    parts.append([Q[pair] for pair in system.root_pairs])
+                given[e, side] = known = np.concatenate(parts)
+        return given
+
+    def _roots(
+        self, interval: Interval, times: Array, places: Array, given: Array, step: float, mean: Array, scale: Array
+    ) -> Array:
+        """Return the roots of the noise of all substeps, (J, n, d), or (J, r, d) for the coefficients of fields."""
+        system, found = self.system, list[Array]()
+        if system.kind == ADDITIVE and system.affine and not system.timed and system.cross is None:
+            # Nothing but the length decides, and equal lengths are frequent.
+            known = self._root_of(step)
+            return np.repeat(known[None], int(places[:, 0].max()) + 1, axis=0)
+        known = None
+        A = self._slopes(times, places, given, mean, scale)
+        for e in np.flatnonzero(places[:, 0] >= 0):
+            if known is None or system.timed or A is not None and not system.affine:
+                u = self._inputs(interval, times[e, 1], True)
+                P = np.zeros((system.m, system.m))
+                if system.cross is not None:
+                    P = system.precision(times[e, 1], interval.inside, self.theta, u)
+                if system.kind == ADDITIVE:
+                    G = self._covariance(times[e, 1], P, u)
+                    assert A is not None
+                    known = root(noise_about_middle(A[len(found)], G, step))
+                else:
+                    known = root(system.own_noise(times[e, 1], P, self.theta, u)) * np.sqrt(step)
+            found.append(known)
+        width = max(one.shape[1] for one in found)
+        roots = np.zeros((len(found), system.r if system.kind else system.n, width))
+        for place, one in enumerate(found):
+            roots[place, :, : one.shape[1]] = one
+        return roots
+
+    def _slopes(self, times: Array, places: Array, given: Array, mean: Array, scale: Array) -> list[Array] | None:
+        """Return df/dx at the kicks along the path of a state without noise."""
+        system = self.system
+        kicks = np.flatnonzero(places[:, 0] >= 0)
+        if system.kind != ADDITIVE:
+            return None
+        if system.affine:
+            return [self.constant_matrix] * len(kicks)
+        marked = np.column_stack([np.full(len(places), -1), places[:, 0], places[:, 2]]).astype(np.int64)
+        none = Events(times, marked, given, np.zeros((0, system.n, 0)), np.zeros((0, 3), np.int64))
+        ends = np.zeros((len(kicks), system.n, 1))
+        self.advanced(none, np.ascontiguousarray(mean[:, None]), np.zeros((0, 1)), ends)
+        return [self._matrix(ends[j, :, 0], scale, times[e, 1], given[e, 1]) for j, e in enumerate(kicks)]
+
+
+def noise_about_middle(A: Array, G: Array, length: float) -> Array:
+    """Return int exp(-s A) G exp(-s A') ds over (-length/2, length/2): the noise of a substep, carried to its middle."""
+    size = float(np.abs(A).sum(axis=1).max(initial=0.0)) * length
+    if size <= _SERIES:
+        term, total, factor = G, length * G, length
+        for k in range(1, 40):
+            term = -(A @ term + term @ A.T)
+            factor = factor * 0.5 * length / (k + 1)
+            if k % 2 == 0:
+                change = factor * term
+                total = total + change
+                if np.abs(change).max() <= 1e-15 * np.abs(total).max():
+                    break
+        return 0.5 * (total + total.T)
+    n = len(A)
+    block = np.block([[-A, G], [np.zeros((n, n)), A.T]])
+    E = expm(block * length)
+    F = E[n:, n:].T
+    back = expm(-0.5 * length * A)
+    Q = back @ (F @ E[:n, n:]) @ back.T
+    return 0.5 * (Q + Q.T)
+
+
+class Steps(NamedTuple):
+    """The scheme of an interval, the shift (n,) of the mean that it leaves, and that in standard deviations."""
+
+    scheme: Scheme
+    shift: Array
+    error: float
+
+
+class Pilots(NamedTuple):
+    """What the time step is measured with: states (n, PILOTS), the mean (n,), deviations (n,), and a whole number for the noise."""
+
+    states: Array
+    mean: Array
+    scale: Array
+    key: int
+
+
+def steps_of(motion: Motion, interval: Interval, values: Array, pilots: Pilots, guess: int) -> Steps:
+    """Return the cheapest scheme whose error in the mean and the spread is at most `TIME_ERROR` standard deviations.
+
+    Args:
+        motion: the formulas.
+        interval: the interval.
+        values: the increments (m,).
+        pilots: what it is measured with.
+        guess: the first number of substeps to try.
+    """
+    n, count = motion.system.n, max(1, guess)
+    shift = np.full(n, np.inf)
+    for turn in range(4):
+        found = _time_errors(motion, interval, values, pilots._replace(key=pilots.key + turn), count)
+        fewer, shift = found
+        if not np.isfinite(shift).all():
+            if count >= MOST_SUBSTEPS:
+                break
+            count = min(4 * count, MOST_SUBSTEPS)
+            continue
+        error, other = (float((one / pilots.scale).max()) for one in (shift, fewer))
+        wanted = int(np.clip(np.ceil(count * np.sqrt(error / TIME_ERROR)), 1, MOST_SUBSTEPS))
+        if wanted < count:
+            wanted = max(wanted, (count + 1) // 2)
+        reduced = (count / wanted) ** 2
+        if other * reduced <= TIME_ERROR:
+            return Steps(Scheme(wanted, 2), fewer * reduced, other * reduced)
+        if wanted <= 2 * count:
+            return Steps(Scheme(wanted, 4), shift * reduced, error * reduced)
+        count, shift = wanted, shift * reduced
+    return Steps(Scheme(count, 4), shift, float((shift / pilots.scale).max()))
+
+
+def _time_errors(
+    motion: Motion, interval: Interval, values: Array, pilots: Pilots, count: int
+) -> tuple[Array, Array]:
+    """Return the changes of means or deviations (n,) from `count` substeps to twice as many, times 4/3, for 2 and 4 stages."""
+    system, mean, scale = motion.system, pilots.mean, pilots.scale
+    coarse, fine = (motion.events(interval, Scheme(k, 4), values, mean, scale) for k in (count, 2 * count))
+    noise = np.empty((fine.width, pilots.states.shape[1]))
+    normals(key_of(pilots.key), 0, noise.shape[1], noise)
+    shared = _coarse_noise(motion, coarse, fine, noise)
+    y, finer = motion.advanced(fine, pilots.states, noise)
+    centred = y - y.mean(axis=1, keepdims=True)
+    spread = np.maximum(centred.std(axis=1), 1e-300)
+
+    def change(stages: int) -> Array:
+        places = coarse.places.copy()
+        places[:, 2] = stages
+        x, gained = motion.advanced(coarse._replace(places=places), pilots.states, shared)
+        d, weight = y - x, finer - gained
+        if system.angles.any():
+            d[system.angles] = np.remainder(d[system.angles] + np.pi, 2 * np.pi) - np.pi
+        parts = (d, d * centred / spread[:, None], (weight - weight.mean()) * centred)
+        # What the finite number of pilots adds to a mean of zero is subtracted.
+        found = [np.maximum(part.mean(axis=1) ** 2 - part.var(axis=1) / part.shape[1], 0.0) for part in parts]
+        return np.asarray(np.sqrt(np.max(found, axis=0)) * 4 / 3)
+
+    return change(2), change(4)
+
+
+def _coarse_noise(motion: Motion, coarse: Events, fine: Events, noise: Array) -> Array:
+    """Return the noise of the substeps that makes the same kicks as that of their halves."""
+    system = motion.system
+    shared = np.zeros((coarse.width, noise.shape[1]))
+    for j in range(len(coarse.rows)):
+        first, width, coin = coarse.rows[j]
+        halves = []
+        for i in (2 * j, 2 * j + 1):
+            begin, own, _ = fine.rows[i]
+            halves.append(noise[begin : begin + own])
+        if system.kind == ADDITIVE:
+            moved = sum(fine.roots[2 * j + i] @ halves[i] for i in range(2))
+            shared[first : first + width] = np.linalg.pinv(coarse.roots[j], rcond=1e-6) @ moved
+        else:
+            shared[first : first + width] = (halves[0] + halves[1]) / np.sqrt(2)
+            if coin:
+                shared[first + width] = noise[fine.rows[2 * j, 0] + fine.rows[2 * j, 1]]
+    return shared

@@ -1,0 +1,177 @@
+"""A model as the particle filter takes it: programs of its formulas, and its coefficients as functions of time.
+
+For increments the law of x given the path y is that of Girsanov's theorem, with y linear between observations and, for correlated
+noise E dv dw' = C dt, with a = g C, K = S^-1,
+
+    dx = (f + a K (dy/dt - h) - sum K_ij (a_j.grad) a_i / 2) dt + g dv~,      E dv~ dv~' = (Q - C K C') dt
+    log weight = int h'K dy/dt - h'K h / 2 - tr(K a'h_x') / 2 dt
+
+Where g depends on the state the drift is that of Stratonovich, f - sum (Q - C K C')_ab (g_b.grad) g_a / 2.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from zakai.methods._moments import density_grid, prior_moments
+from zakai.methods.particles.law import Law, Numbers
+from zakai.methods.particles.programs import Array, Expressions
+from zakai.models.kept import kept
+from zakai.models.model import Model
+from zakai.models.numeric import numpy_function
+from zakai.models.prior import DensityPrior, GaussianPrior, MixturePrior
+from zakai.numerics.particles.motion import ADDITIVE, COMMUTING, ORDERED
+
+_MOST_ENTRIES = 400  # of the Jacobian of a drift that is checked for being affine
+
+
+class System:
+    """The formulas of a model as programs."""
+
+    def __init__(self, model: Model):
+        n, m, x = model.n, model.m, model.x
+        self.model, self.n, self.m, self.inputs = model, n, m, len(model.u)
+        self.sampled = model.observation_kind == "samples"
+        self.law = Law(model) if self.sampled else None
+        g, Q = sp.Matrix(model.diffusion), sp.Matrix(model.process_noise)
+        state_dependent = bool(g.free_symbols & set(x))
+        drift = list(model.drift)
+        self.numbers = Numbers.of(m, not model.observation_noise.is_diagonal() or not model.cross_noise.is_zero_matrix)
+        given: list[sp.Symbol] = []
+        if not self.sampled:
+            given = [*self.numbers.z, *(self.numbers.P[pair] for pair in self.numbers.pairs)]
+            drift = self._with_increments(drift)
+        self.kind, r = ADDITIVE, g.shape[1]
+        fields: list[sp.Expr] = [sp.S.Zero]
+        coefficients = tuple(sp.Dummy(f"c{a}", real=True) for a in range(r))
+        self.root_pairs: list[tuple[int, int]] = []
+        if state_dependent:
+            along = [[[_along(g[i, a], g[:, b], x) for b in range(r)] for a in range(r)] for i in range(n)]
+            diagonal = Q.is_diagonal() and model.cross_noise.is_zero_matrix
+            commute = all(
+                sp.expand(along[i][a][b] - along[i][b][a]) == 0 for i in range(n) for a in range(r) for b in range(a)
+            )
+            self.kind = COMMUTING if commute else ORDERED
+            self.root_pairs = [(a, b) for a in range(r) for b in range(a + 1) if a == b or not diagonal]
+            Q_given = {pair: sp.Dummy(f"Q{pair}", real=True) for pair in self.root_pairs}
+            for i in range(n):
+                terms = [q * (along[i][a][b] + along[i][b][a]) / (4 if a == b else 2) for (a, b), q in Q_given.items()]
+                drift[i] -= sum(terms, sp.S.Zero)
+            given += Q_given.values()
+            fields = [sum((g[i, a] * coefficients[a] for a in range(r)), sp.S.Zero) for i in range(n)]
+        self.drift = Expressions(drift, model, given)
+        self.fields = Expressions(fields, model, given, coefficients)
+        self.observe = Expressions(list(model.observation) if model.log_density is None else [sp.S.Zero], model)
+        h = [*self.numbers.z, *(self.numbers.P[pair] for pair in self.numbers.pairs)]
+        self.factor = None if self.sampled else Expressions([self._factor()], model, h)
+        self.r = r
+        self.diffusion = numpy_function(model.diffusion, model, (n, r))
+        self.process_noise = numpy_function(model.process_noise, model, (r, r))
+        self.noise = numpy_function(model.observation_noise, model, (m, m))
+        self.cross = None if model.cross_noise.is_zero_matrix else numpy_function(model.cross_noise, model, (r, m))
+        self.box = (np.full(n, -np.inf), np.full(n, np.inf))
+        for name, interval in model.domain.items():
+            place = model.state.index(name)
+            self.box[0][place], self.box[1][place] = interval.lower, interval.upper
+        self.angles = np.array([name in model.periodic for name in model.state])
+        self.affine = not state_dependent and _is_affine(model)
+        self.timed = bool(model.inputs) or any(
+            part.has(model.t) for part in (model.diffusion, model.process_noise, model.observation_noise, model.cross_noise)
+        )
+
+    def _with_increments(self, drift: list[sp.Expr]) -> list[sp.Expr]:
+        """Return the drift given the increments, and the logarithm of the weight per unit time."""
+        model, r, P = self.model, self.numbers.z, self.numbers.P
+        h, x, m = list(model.observation), model.x, self.m
+        potential = self._factor()
+        if not model.cross_noise.is_zero_matrix:
+            a = sp.Matrix(model.diffusion * model.cross_noise)
+            innovation = [r[k] - sum((P[k, b] * h[b] for b in range(m)), sp.S.Zero) for k in range(m)]
+            for i in range(self.n):
+                drift[i] += sum((a[i, k] * innovation[k] for k in range(m)), sp.S.Zero)
+                drift[i] -= sum((P[b, c] * _along(a[i, b], a[:, c], x) for b in range(m) for c in range(m)), sp.S.Zero) / 2
+            potential -= sum((P[j, k] * _along(h[j], a[:, k], x) for j in range(m) for k in range(m)), sp.S.Zero) / 2
+        return [*drift, potential]
+
+    def _factor(self) -> sp.Expr:
+        """Return h'r - h'P h / 2."""
+        h, r, P = list(self.model.observation), self.numbers.z, self.numbers.P
+        linear = sum((one * factor for one, factor in zip(h, r, strict=True)), sp.S.Zero)
+        square = [(1 if i == j else 2) * P[i, j] * h[i] * h[j] for i, j in self.numbers.pairs]
+        return linear - sum(square, sp.S.Zero) / 2
+
+    def precision(self, t: float, seen: Array, theta: Array, u: Array | None) -> Array:
+        """Return the inverse (m, m) of the noise of the observed coordinates per unit time, zero elsewhere."""
+        P, which = np.zeros((self.m, self.m)), np.flatnonzero(seen)
+        if len(which):
+            S = self.noise(np.zeros(self.n), t, theta, u)
+            P[np.ix_(which, which)] = np.linalg.inv(S[np.ix_(which, which)])
+        return P
+
+    def own_noise(self, t: float, P: Array, theta: Array, u: Array | None) -> Array:
+        """Return Q - C K C' (r, r): the noise of the state that is independent of that of the observations."""
+        Q = np.asarray(self.process_noise(np.zeros(self.n), t, theta, u))
+        if self.cross is None:
+            return Q
+        C = self.cross(np.zeros(self.n), t, theta, u)
+        return Q - C @ P @ C.T
+
+
+def _along(function: sp.Expr, field: sp.Matrix, x: tuple[sp.Symbol, ...]) -> sp.Expr:
+    """Return the derivative of a function along a field, apart from jumps."""
+    total = sp.S.Zero
+    for place, symbol in enumerate(x):
+        if field[place] != 0 and function.has(symbol):
+            total += sp.diff(function, symbol).replace(sp.DiracDelta, lambda *_: sp.S.Zero) * field[place]
+    return total
+
+
+def _is_affine(model: Model) -> bool:
+    """Return whether f is an affine function of the state with a constant matrix."""
+    if model.n**2 > _MOST_ENTRIES:
+        return False
+    free = {*model.x, model.t, *model.u}
+    return not any((sp.diff(f, symbol)).free_symbols & free for f in model.drift for symbol in model.x if f.has(symbol))
+
+
+def system_of(model: Model) -> System:
+    """Return the programs of a model, made once."""
+    return kept(model, System, lambda: System(model))
+
+
+def gaussian_prior(prior: Any) -> tuple[Array, Array] | None:
+    """Return the mean (n,) and a root (n, d) of the covariance of a Gaussian prior, None for another one."""
+    return (np.array(prior.mean, float), root(prior.cov)) if isinstance(prior, GaussianPrior) else None
+
+
+def drawn(model: Model, prior: Any, theta: Array, count: int, rng: np.random.Generator) -> Array:
+    """Return states (n, count) drawn from a prior that is not Gaussian.
+
+    Raises:
+        InputError: a density in more than four coordinates.
+    """
+    if isinstance(prior, MixturePrior):
+        return np.ascontiguousarray(prior.sample(rng, count).T)
+    assert isinstance(prior, DensityPrior)
+    if model.n > 4:
+        prior_moments(model, prior, theta)  # which says what to do
+    from zakai.densities import GridDensity
+
+    grid = density_grid(model, prior, theta, 1e-9)
+    density = GridDensity(grid.log_values, grid.centre, grid.basis, model.state, (False,) * model.n)
+    return np.ascontiguousarray(density.sample(rng, count).T)
+
+
+def root(Q: Array) -> Array:
+    """Return columns R (n, d) with R R' = Q, without null directions.
+
+    The matrix is scaled to a unit diagonal first, so that a coordinate with little noise keeps it.
+    """
+    spread = np.sqrt(np.maximum(np.diag(Q), 0.0))
+    scale = np.where(spread > 0, spread, 1.0)
+    values, vectors = np.linalg.eigh(Q / np.outer(scale, scale))
+    used = values > 1e-11
+    return np.ascontiguousarray(scale[:, None] * vectors[:, used] * np.sqrt(values[used]))

@@ -1,0 +1,32 @@
+"""Particles in chunks on threads: each chunk is computed alone, so that the number of threads decides nothing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+CHUNK = 1024  # particles that are moved together: their noise stays in the cache
+_ALONE = 8192  # particles up to which threads cost more than they save
+
+
+@cache
+def _cores() -> int:
+    return os.cpu_count() or 1
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(_cores(), thread_name_prefix="zakai-particles")
+
+
+def over_chunks(work: Callable[[int, int], None], count: int) -> None:
+    """Call `work(low, high)` for parts of `count` particles that are multiples of `CHUNK`, on all cores where there are many."""
+    cores = _cores()
+    if count <= _ALONE or cores == 1:
+        work(0, count)
+        return
+    size = -(-count // (cores * CHUNK)) * CHUNK
+    for done in [_pool().submit(work, low, min(low + size, count)) for low in range(0, count, size)]:
+        done.result()

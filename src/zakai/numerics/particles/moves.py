@@ -1,0 +1,256 @@
+"""Moves of the noise of particles over several intervals, and draws of it, by a Gaussian that approximates its posterior.
+
+The noise p of a window has the law N(0, I) times the likelihood L(p) of what is observed in it.  A move is reversible in a
+Gaussian N(m, U^-2), whose mean m may be an affine function of the state at the start of the window, and which differs from
+N(0, I) in the few directions V (orthonormal) that the observations inform,
+
+    U = I + V diag(s - 1) V',    w = U (p - m),   w* = rho w + sqrt(1 - rho^2) e,   e ~ N(0, I),    p* = m + U^-1 w*
+
+and is accepted with the exact ratio, so that the Gaussian decides how well the moves mix, and never what they converge to.
+
+References:
+    Neal 1998, Regression and classification using Gaussian process priors (the move).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import types
+
+from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.formula_kernel import BLOCK
+from zakai.numerics.particles.chunks import CHUNK
+from zakai.numerics.particles.formulas import F1, F2, PROGRAM, block_of, load_point, run_program
+from zakai.numerics.particles.motion import EVENTS, MOTION, buffers_of, run_event
+from zakai.numerics.particles.random import KEY, fill_normals, fill_row, uniform
+
+Array = Any
+# The law, and of each observation its time (I,), given numbers (I, L), and which terms count (I, terms).
+OBSERVED = types.Tuple((PROGRAM, F1, F2, F2))
+# The mean (n,) and a root (n, d0) of the prior; without columns the window starts from states that do not move.
+PRIOR = types.Tuple((F1, F2))
+# The mean (D,), its derivative by the start (D, n), the start to which that refers (n,), the rows of V' (r, D), and s (r,).
+GAUSSIAN = types.Tuple((F1, F2, F1, F2, F1))
+_ACCEPTANCE = np.uint64(1 << 60)  # counters from here on are those of acceptance
+_WORST, _BEST = 0.2, 0.4  # acceptance below which steps become shorter, and above which they become longer
+_LONGEST = 0.96  # of the share of the old noise
+
+
+@helper
+def _follow(motion: Any, events: Any, observed: Any, prior: Any, blocks: Any, start: Array, path: Array, x: Array, total: Array,
+            buffers: Any, size: int) -> None:  # fmt: skip
+    """Write the states x (rows, size) at the end of a window and the log-likelihoods (size,) of what is observed in it."""
+    law, times, given, counted = observed
+    mean, root = prior
+    n, rows, places, d0 = start.shape[0], x.shape[0], events[1], root.shape[1]
+    for d in range(n):
+        for i in range(size):
+            x[d, i] = start[d, i] if d0 == 0 else mean[d]
+        for j in range(d0):
+            for i in range(size):
+                x[d, i] += root[d, j] * path[j, i]
+    for d in range(n, rows):
+        for i in range(size):
+            x[d, i] = 0.0
+    for i in range(size):
+        total[i] = 0.0
+    own = path[d0:]
+    for e in range(places.shape[0]):
+        run_event(motion, events, e, blocks, x, own, buffers, size)
+        k = places[e, 1]
+        if k < 0 or counted[k].sum() == 0.0:
+            continue
+        load_point(law, blocks[2], x, motion[2], times[k], given[k], size)
+        run_program(law, blocks[2], size)
+        for term in range(law[3].size):
+            if counted[k, term] != 0.0:
+                values = blocks[2][law[3][term]]
+                for i in range(size):
+                    total[i] += values[i]
+    for i in range(size):
+        if rows > n:
+            total[i] += x[n, i]
+        if not total[i] < np.inf:  # NaN, too
+            total[i] = -np.inf
+
+
+@helper
+def _blocks(motion: Any, observed: Any) -> Any:
+    return block_of(motion[0]), block_of(motion[1]), block_of(observed[0])
+
+
+@helper
+def _mean(gaussian: Any, start: Array, out: Array, size: int) -> None:
+    """Write the means (D, size) of the Gaussians for their starts (n, size)."""
+    mean, gain, centre = gaussian[0], gaussian[1], gaussian[2]
+    for r in range(mean.size):
+        for i in range(size):
+            out[r, i] = mean[r]
+        for d in range(centre.size):
+            factor = gain[r, d]
+            if factor != 0.0:
+                for i in range(size):
+                    out[r, i] += factor * (start[d, i] - centre[d])
+
+
+@helper
+def _scale(gaussian: Any, inverse: bool, given: Array, along: Array, size: int) -> None:
+    """Multiply columns (D, size) by U, or by its inverse; `along` (size,) is overwritten."""
+    V, factors = gaussian[3], gaussian[4]
+    for k in range(factors.size):
+        factor = (1.0 / factors[k] if inverse else factors[k]) - 1.0
+        for i in range(size):
+            along[i] = 0.0
+        for r in range(V.shape[1]):
+            entry = V[k, r]
+            for i in range(size):
+                along[i] += entry * given[r, i]
+        for r in range(V.shape[1]):
+            entry = factor * V[k, r]
+            for i in range(size):
+                given[r, i] += entry * along[i]
+
+
+@kernel(types.void(MOTION, EVENTS, OBSERVED, PRIOR, F2, F2, types.int64, types.int64, F2, F1))
+def follow(motion: Any, events: Any, observed: Any, prior: Any, start: Array, path: Array, low: int, high: int, out: Array,
+           total: Array) -> None:  # fmt: skip
+    """Write the states (n, N) at the end of a window and the log-likelihoods (N,), for the noise (D, N) from given starts."""
+    n, D = start.shape[0], path.shape[0]
+    blocks, buffers = _blocks(motion, observed), buffers_of(motion, events)
+    x, own, begin, found = np.empty((motion[0][3].size, BLOCK)), np.empty((D + 1, BLOCK)), np.empty((n, BLOCK)), np.empty(BLOCK)
+    for first in range(low, high, BLOCK):
+        size = min(BLOCK, high - first)
+        begin[:, :size] = start[:, first : first + size]
+        own[:D, :size] = path[:, first : first + size]
+        _follow(motion, events, observed, prior, blocks, begin, own, x, found, buffers, size)
+        out[:, first : first + size] = x[:n, :size]
+        total[first : first + size] = found[:size]
+
+
+@kernel(types.void(GAUSSIAN, types.float64, KEY, F2, types.int64, types.int64, F2, F1))
+def draw(gaussian: Any, share: float, key: Array, start: Array, low: int, high: int, path: Array, ratio: Array) -> None:
+    """Write noise (D, N) drawn from share N(0, I) + (1 - share) N(m, U^-2), and log N(0, I) less the log of that density."""
+    D, along = path.shape[0], np.empty(BLOCK)
+    w, p, m = np.empty((D, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK))
+    log_det = 0.0
+    for factor in gaussian[4]:
+        log_det += math.log(factor)
+    for first in range(low, high, BLOCK):
+        size = min(BLOCK, high - first)
+        fill_normals(key, first, size, w)
+        _mean(gaussian, start[:, first : first + size], m, size)
+        p[:, :size] = w[:, :size]
+        _scale(gaussian, True, p, along, size)
+        for r in range(D):
+            for i in range(size):
+                p[r, i] += m[r, i]
+        for i in range(size):
+            if uniform(key, _ACCEPTANCE + np.uint64(first + i)) < share:
+                for r in range(D):
+                    p[r, i] = w[r, i]
+        for r in range(D):
+            for i in range(size):
+                m[r, i] = p[r, i] - m[r, i]
+        _scale(gaussian, False, m, along, size)
+        for i in range(size):
+            q = log_det
+            phi = 0.0
+            for r in range(D):
+                q -= 0.5 * m[r, i] ** 2
+                phi -= 0.5 * p[r, i] ** 2
+            top = max(q, phi)
+            ratio[first + i] = phi - top - math.log((1.0 - share) * math.exp(q - top) + share * math.exp(phi - top))
+        path[:, first : first + size] = p[:, :size]
+
+
+@kernel(types.void(MOTION, EVENTS, OBSERVED, PRIOR, GAUSSIAN, F1, KEY, types.int64, types.int64, F2, F2, F2, F1, F2))
+def sweep(motion: Any, events: Any, observed: Any, prior: Any, gaussian: Any, control: Array, key: Array, low: int, high: int,
+          start: Array, path: Array, out: Array, total: Array, moved: Array) -> None:  # fmt: skip
+    """Move the noise of the particles from `low` to `high`, in chunks, until their noise has changed enough.
+
+    Args:
+        motion: the formulas.
+        events: those of the window.
+        observed: what is observed in it.
+        prior: that of the first state, where its noise moves.
+        gaussian: the Gaussian in which moves are reversible.
+        control: the power of the likelihood, the sum of acceptance (1 - rho^2) after which it is enough, the most sweeps, and the
+            first rho.
+        key: of the random numbers.
+        low: the first particle, a multiple of `CHUNK`.
+        high: the particle after the last one.
+        start: the states (n, N) at the start of the window.
+        path: the noise (D, N), which is replaced.
+        out: receives the states (n, N) at the end.
+        total: receives the log-likelihoods (N,).
+        moved: receives the mean acceptance and the change of each chunk (chunks, 2).
+    """
+    n, D = start.shape[0], path.shape[0]
+    power, enough, most = control[0], control[1], int(control[2])
+    blocks, buffers = _blocks(motion, observed), buffers_of(motion, events)
+    along = np.empty(BLOCK)
+    x, found = np.empty((motion[0][3].size, BLOCK)), np.empty(BLOCK)
+    begin, new, fresh, m = np.empty((n, BLOCK)), np.empty((D + 1, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK))
+    w, target = np.empty((D, CHUNK)), np.empty(CHUNK)
+    for chunk in range(low, high, CHUNK):
+        end = min(chunk + CHUNK, high)
+        rho, done, rates, count = control[3], 0.0, 0.0, 0
+        for turn in range(-1, most):
+            # The first turn only computes the targets of the noise as it is.
+            accepted, s = 0, math.sqrt(1.0 - rho * rho)
+            for first in range(chunk, end, BLOCK):
+                size, at = min(BLOCK, end - first), first - chunk
+                begin[:, :size] = start[:, first : first + size]
+                _mean(gaussian, begin, m, size)
+                if turn < 0:
+                    new[:D, :size] = path[:, first : first + size]
+                    fresh[:, :size] = new[:D, :size] - m[:, :size]
+                    _scale(gaussian, False, fresh, along, size)
+                    w[:, at : at + size] = fresh[:, :size]
+                else:
+                    row = turn * D
+                    for r in range(D):
+                        fill_row(key, row + r, first, size, fresh[r])
+                        for i in range(size):
+                            fresh[r, i] = rho * w[r, at + i] + s * fresh[r, i]
+                    new[:D, :size] = fresh[:, :size]
+                    _scale(gaussian, True, new, along, size)
+                    for r in range(D):
+                        for i in range(size):
+                            new[r, i] += m[r, i]
+                _follow(motion, events, observed, prior, blocks, begin, new, x, found, buffers, size)
+                for i in range(size):
+                    value = power * found[i]
+                    for r in range(D):
+                        value += 0.5 * (fresh[r, i] ** 2 - new[r, i] ** 2)
+                    if not value < np.inf:
+                        value = -np.inf
+                    if turn >= 0:
+                        u = uniform(key, _ACCEPTANCE + (np.uint64(turn) << np.uint64(32)) + np.uint64(first + i))
+                        if not math.log(u) < value - target[at + i]:
+                            continue
+                        accepted += 1
+                    target[at + i] = value
+                    total[first + i] = found[i]
+                    for r in range(D):
+                        w[r, at + i] = fresh[r, i]
+                        path[r, first + i] = new[r, i]
+                    for d in range(n):
+                        out[d, first + i] = x[d, i]
+            if turn < 0:
+                continue
+            rate = accepted / (end - chunk)
+            rates += rate
+            count += 1
+            done += rate * (1.0 - rho * rho)
+            if rate < _WORST:
+                rho = min(_LONGEST, rho + 0.2)
+            elif rate > _BEST:
+                rho = max(0.0, rho - 0.3)
+            if done > enough:
+                break
+        moved[chunk // CHUNK, 0] = rates / max(count, 1)
+        moved[chunk // CHUNK, 1] = done
