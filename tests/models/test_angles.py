@@ -25,7 +25,7 @@ def test_a_sample_of_atan2_is_an_angle_and_others_are_named():
 def test_names_of_observations_are_the_state_or_numbered():
     assert model().observation_names == ("y1", "x")
     clash = model(observation=["sin(x)", "y1"], state=["x", "y1"])
-    assert clash.observation_names == ("y1_", "y1")
+    assert clash.observation_names == ("y1", "y2")
     assert model(observation_names=["bearing", "position"]).observation_names == ("bearing", "position")
 
 

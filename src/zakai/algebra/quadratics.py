@@ -9,7 +9,7 @@ from typing import NamedTuple
 import sympy as sp
 from flint import fmpq
 
-from zakai.algebra._readable import is_short, short
+from zakai.algebra._readable import brief, is_short, readable, short
 from zakai.algebra.balls import LINES, POINTS, sampled
 from zakai.algebra.identities import NOT_ZERO, Answer, evidence
 from zakai.algebra.tower import Element, OutOfBounds
@@ -58,7 +58,7 @@ def decided_q(model: Model, energy: bool) -> QuadraticAnswer:
     test = values.curvature(energy) if form.curved else values.observed
     refuted = sampled(test, values.symbols, x, LINES)
     if refuted.holds is False:
-        return _refuted(refuted.witness)
+        return _refuted(model, energy, refuted.witness)
     try:
         proof, why = _proof(model, decided, energy), NOT_ZERO
         if proof is not None:
@@ -71,7 +71,7 @@ def decided_q(model: Model, energy: bool) -> QuadraticAnswer:
         pieces = sampled(values.pieces(energy), values.symbols, x, POINTS)
         found = Answer(False, "value", pieces.witness) if pieces.holds is False else found
     if found.holds is False:
-        return _refuted(found.why)
+        return _refuted(model, energy, found.why)
     if found.holds is None or model.n > MOST_STATES:
         return QuadraticAnswer(None, None, f"it is not proved that q is quadratic in {', '.join(map(str, x))}: {found.why}")
     quadratic = _by_derivatives(model, form, energy)
@@ -108,8 +108,22 @@ def _found(quadratic: Quadratic, x: Sequence[sp.Symbol]) -> QuadraticAnswer:
     return QuadraticAnswer(quadratic, True, f"q = {words}")
 
 
-def _refuted(witness: str) -> QuadraticAnswer:
-    return QuadraticAnswer(None, False, f"q is not quadratic: its second derivative along a line changes by {witness}")
+def _refuted(model: Model, energy: bool, witness: str) -> QuadraticAnswer:
+    """Return that q is not quadratic, with its terms that are not, where they are soon made, and the witness."""
+    changes = f"its second derivative along a line changes by {witness}"
+    try:
+        proof = prove_form(model, energy)
+        if proof is not None:
+            proof.reader.begin(DISPLAYED)
+            proof.quadratic(energy)
+            q = proof.q if proof.phi is None or proof.phi.rate is None else proof.q + proof.phi.rate * 2
+            terms = brief(readable(proof.reader.expression(proof.reader.beyond(q, 2))))
+            return QuadraticAnswer(
+                None, False, f"q contains {short(terms)}, which is not quadratic in {', '.join(map(str, model.x))}: {changes}"
+            )
+    except OutOfBounds:
+        pass
+    return QuadraticAnswer(None, False, f"q is not quadratic: {changes}")
 
 
 def _proof(model: Model, decided: YauDecision, energy: bool) -> YauProof | None:

@@ -295,6 +295,18 @@ class Tower:
 
         return [element(i) for i in range(n)], element(None), element("rest")
 
+    def beyond(self, e: Element, degree: int) -> Element:
+        """Return the terms that are no polynomials of this degree in the states; all, where a denominator depends on them."""
+        n, count = len(self.x), self.count
+        if not e.denominator.is_constant() and any(k > 0 and self.depends(i) for i, k in enumerate(e.denominator.degrees())):
+            return e
+        kept = {
+            m: c
+            for m, c in e.numerator.to_dict().items()
+            if sum(m[count : count + n]) > degree or any(k and self.depends(i) for i, k in enumerate(m[:count]))
+        }
+        return Element(self, self.ring.from_dict(kept), e.denominator)
+
     def solve(self, matrix: Sequence[Sequence[Element]], columns: Sequence[Sequence[Element]]) -> list[list[Element]]:
         """Return the inverse of a matrix times some columns, by elimination."""
         rows = [[*row, *(column[i] for column in columns)] for i, row in enumerate(matrix)]
