@@ -16,6 +16,7 @@ from zakai.errors import InputError
 from zakai.models._errors import named
 from zakai.models.checks import check_noise_at, check_noise_within
 from zakai.models.domain import check_prior
+from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.possible import check_possible
 from zakai.records import Record
@@ -134,8 +135,11 @@ def planned(model: Model, prior: Any, method: str, options: Mapping[str, Any], b
     """Return how a system is filtered from a prior; None stands for the model's own."""
     if prior is not None:
         check_prior(model, prior)
-    with announced(f"{model.source}: deciding which method holds"):
-        return plan_of(model, model.prior if prior is None else prior, method, options, by_value)
+    decided: set[bool] = kept(model, (planned, str(method)), set)  # once made, a decision needs no thread
+    with nullcontext() if decided else announced(f"{model.source}: deciding which method holds"):
+        plan = plan_of(model, model.prior if prior is None else prior, method, options, by_value)
+    decided.add(True)
+    return plan
 
 
 def check_noise(plans: Iterable[Plan], records: Sequence[Record]) -> None:
