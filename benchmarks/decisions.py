@@ -22,7 +22,6 @@ import zakai
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from algebra.random_formulas import formula, values, zero  # noqa: E402
-
 from zakai.algebra.identities import is_zero  # noqa: E402
 
 T = sp.Symbol("t", real=True)
@@ -130,7 +129,8 @@ def print_formulas(count: int) -> None:
             if proved_falsely or refuted_falsely:
                 false += 1
                 print(f"false answer {answer}: {e}")
-    print(f"formulas: {answers[True]} zero, {answers[False]} not, {answers[None]} undecided; {false} false; largest {slowest:.3f} s")
+    words = f"{answers[True]} zero, {answers[False]} not, {answers[None]} undecided"
+    print(f"formulas: {words}; {false} false; largest {slowest:.3f} s")
 
 
 if __name__ == "__main__":

@@ -110,12 +110,13 @@ def _monomials(reader: Reader, field: Sequence[Element], G: Sequence[Sequence[El
     n, count = len(reader.x), reader.count
     width = count + len(reader.base)
     units = [tuple(int(i == place) for i in range(width)) for place in range(width)]
+    moving = [reader.depends(place) for place in range(width)]
     related: dict[int, list[int]] = {}
     seen: set[tuple[Monomial, str]] = set()
     for i in range(n):
         for e in (field[j] for j in range(n) if G[i][j] or i == j):
             below = _moving_part(reader, e.denominator)
-            own = {_state_part(reader, monomial) for monomial in e.numerator.to_dict()}
+            own = {_state_part(moving, monomial) for monomial in e.numerator.to_dict()}
             found = {units[count + i]}
             for m in own:
                 near = _near(reader, m, related)
@@ -155,8 +156,8 @@ def _moving_part(reader: Reader, denominator: Any) -> Any:
     return result
 
 
-def _state_part(reader: Reader, monomial: Monomial) -> Monomial:
-    return tuple(k if reader.depends(place) else 0 for place, k in enumerate(monomial))
+def _state_part(moving: Sequence[bool], monomial: Monomial) -> Monomial:
+    return tuple(k if depends else 0 for k, depends in zip(monomial, moving))
 
 
 def _plus(a: Monomial, b: Monomial) -> Monomial:
@@ -170,6 +171,7 @@ def _minus(a: Monomial, b: Monomial) -> Monomial:
 def _rows(reader: Reader, columns: Sequence[Sequence[Element]]) -> list[dict[int, Element]]:
     """Return the equations that the coefficients of the columns obey: one for each monomial of the state in each derivative."""
     rows: list[dict[int, Element]] = []
+    moving = [reader.depends(place) for place in range(reader.count + len(reader.base))]
     for i in range(len(reader.x)):
         below = reader.unit
         for column in columns:
@@ -181,7 +183,7 @@ def _rows(reader: Reader, columns: Sequence[Sequence[Element]]) -> list[dict[int
                 continue
             numerator = reader.reduced(reader.times(column[i].numerator, below / column[i].denominator))
             for monomial, c in numerator.to_dict().items():
-                key = _state_part(reader, monomial)
+                key = _state_part(moving, monomial)
                 table.setdefault(key, {}).setdefault(j, {})[_minus(monomial, key)] = c
         rows += [{j: reader.of(terms) for j, terms in row.items()} for row in table.values()]
     return rows

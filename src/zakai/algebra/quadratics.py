@@ -87,11 +87,10 @@ def displayed_q(model: Model, energy: bool) -> sp.Expr | None:
         return quadratic.q(model.x)
     assert isinstance(form, YauForm)
     try:
-        proof = prove_form(model, energy)
+        proof = _begun(model, decided, energy, DISPLAYED)
         if proof is None:
             return None
         T = proof.reader
-        T.begin(DISPLAYED)
         proof.quadratic(energy)
         rate = None if proof.phi is None else proof.phi.rate
         if rate is not None:
@@ -112,9 +111,8 @@ def _refuted(model: Model, energy: bool, witness: str) -> QuadraticAnswer:
     """Return that q is not quadratic, with its terms that are not, where they are soon made, and the witness."""
     changes = f"its second derivative along a line changes by {witness}"
     try:
-        proof = prove_form(model, energy)
+        proof = _begun(model, yau_decision(model), energy, DISPLAYED)
         if proof is not None:
-            proof.reader.begin(DISPLAYED)
             proof.quadratic(energy)
             q = proof.q if proof.phi is None or proof.phi.rate is None else proof.q + proof.phi.rate * 2
             terms = brief(readable(proof.reader.expression(proof.reader.beyond(q, 2))))
@@ -128,10 +126,9 @@ def _refuted(model: Model, energy: bool, witness: str) -> QuadraticAnswer:
 
 def _proof(model: Model, decided: YauDecision, energy: bool) -> YauProof | None:
     """Return the proof that q is quadratic, at first with independent arguments, or None."""
-    proof = prove_form(model, energy) if energy or decided.proof is None else decided.proof
+    proof = _begun(model, decided, energy)
     if proof is None:
         return None
-    proof.reader.begin()
     if proof.quadratic(energy):
         return proof
     joint = {} if proof.reader.joint else proof.reader.joint_arguments()
@@ -139,6 +136,16 @@ def _proof(model: Model, decided: YauDecision, energy: bool) -> YauProof | None:
         return None
     proof = YauProof(model, energy, affine_drift(model).slope is None, joint)
     return proof if proof.form() and proof.quadratic(energy) else None
+
+
+def _begun(model: Model, decided: YauDecision, energy: bool, share: int = 1) -> YauProof | None:
+    """Return the proof of the form with new bounds of its work, in a tower that holds h and S where they are needed."""
+    proof = decided.proof
+    if proof is None or (energy and not proof.energy):
+        proof = prove_form(model, energy)
+    if proof is not None:
+        proof.reader.begin(share)
+    return proof
 
 
 def _quadratic(proof: YauProof, decided: YauDecision, model: Model) -> Quadratic:

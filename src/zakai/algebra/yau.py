@@ -139,7 +139,7 @@ def yau_decision(model: Model) -> YauDecision:
     if jumps and (jumps := model.covariance.row_join(_curved_part(model)).atoms(*JUMP_FUNCTIONS)):
         return _refused(False, f"phi contains {readable(min(jumps, key=str))}, and would jump in time")
     try:
-        proof, why = prove_form(model, False), NOT_ZERO
+        proof, why = prove_form(model, _is_defined(model)), NOT_ZERO
         if proof is not None:
             return _formed(proof)
     except OutOfBounds as bound:
@@ -148,6 +148,15 @@ def yau_decision(model: Model) -> YauDecision:
     if found.holds is False:
         return _refused(False, _moving_omega(model), found.why)
     return _refused(None, f"it is not proved that Omega is constant: {found.why}")
+
+
+def _is_defined(model: Model) -> bool:
+    """Return whether h and S have values everywhere: where they have not, they would bound the states of which f is decided."""
+    return not any(
+        isinstance(e, sp.log) or (e.is_Pow and not e.exp.is_Integer)
+        for part in (model.observation, model.observation_noise)
+        for e in part.atoms(sp.log, sp.Pow)
+    )
 
 
 def prove_form(model: Model, energy: bool) -> YauProof | None:
