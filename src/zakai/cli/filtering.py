@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -161,8 +160,8 @@ def record_with_inputs(
     if record.inputs is not None:
         raise InputError(f"--inputs {inputs_path}: {path} has columns for the inputs too; give them once")
     inputs = read_inputs(inputs_path, model, record.clock)
-    inputs.check(model, float(record.times[-1]), name=shown(inputs_path))
-    return replace(record, inputs=inputs)
+    inputs.check(model, float(record.times[0]), float(record.times[-1]), name=shown(inputs_path))
+    return record.with_inputs(inputs)
 
 
 def _warn(warnings: Iterable[str]) -> None:

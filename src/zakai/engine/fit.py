@@ -12,12 +12,13 @@ from zakai import _display
 from zakai._progress import bar
 from zakai.densities import GaussianMixture
 from zakai.engine.driver import filter as run_filter
+from zakai.engine.driver import with_inputs
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
 from zakai.engine.maximum import maximum, with_signs_of
 from zakai.errors import InputError
 from zakai.models._errors import listing
 from zakai.models.model import Model
-from zakai.records import Record
+from zakai.records import Inputs, Record
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +96,7 @@ def fit(
     *,
     start: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float | None, float | None]] | None = None,
+    inputs: Inputs | None = None,
     **options: Any,
 ) -> Fit:
     """Return the parameters of largest likelihood given the record.
@@ -111,6 +113,7 @@ def fit(
         method: as for `filter`.
         start: values by name from which the search starts instead.
         bounds: (lowest, highest) by name, None for no bound. A noise covariance that is not positive is never accepted.
+        inputs: the known inputs of the model, in place of those of the record.
         **options: as for `filter`.
 
     Returns:
@@ -126,6 +129,7 @@ def fit(
         fitted = zakai.fit(model, record, parameters=["a"], bounds={"a": (0, None)})
         fitted.estimates["a"], fitted.standard_errors["a"], fitted.converged
     """
+    record = with_inputs(record, inputs)
     names = chosen_parameters(model, parameters)
     values = _start(model, names, start)
     box = _box(model, names, values, bounds)

@@ -11,7 +11,7 @@ from zakai.engine.loop import Run
 from zakai.errors import InputError
 from zakai.methods._states import Joined
 from zakai.records import Inputs, Record
-from zakai.records.inputs import check_inputs
+from zakai.records.inputs import check_inputs, expected_inputs
 
 if TYPE_CHECKING:
     from zakai.engine.plan import Plan
@@ -36,14 +36,17 @@ def forecast(result: FilterResult, times: Any, inputs: Inputs | None = None) -> 
     if not np.size(times):
         raise InputError("forecast: no times; give at least one time after the end of the record")
     values = np.full((np.size(times), record.values.shape[1]), np.nan)
-    known = record.inputs if inputs is None or record.inputs is None else record.inputs.followed_by(inputs)
+    known = record.inputs
+    if inputs is not None:
+        later = expected_inputs(inputs, "forecast: inputs").on(record.clock)
+        known = later if known is None else known.followed_by(later)
     future = Record(times, values, record.kind, known, record.unit, record.origin)
     last = float(record.times[-1])
     if future.times[0] <= last:
         when = f"the time {future.times[0]:.12g} is not after the end of the record, {last:.12g}"
         raise InputError(f"forecast: {when}; give later times")
     if result.model is not None:
-        check_inputs(result.model, future.inputs, float(future.times[-1]))
+        check_inputs(result.model, future.inputs, float(record.times[0]), float(future.times[-1]))
     runs = [ForecastRun(run, state, last) for run, state in zip(plan.runs(future, None), states, strict=True)]
     filter_all(runs, None, len(runs))
     found = plan.result(runs)

@@ -18,7 +18,7 @@ from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.theorems import conditions_of
 from zakai.densities import Density
 from zakai.engine.batch import Progress, announced, filter_all, smooth_all
-from zakai.engine.driver import check_noise, check_records
+from zakai.engine.driver import check_noise, check_records, with_inputs
 from zakai.engine.health_warnings import warnings_of_run
 from zakai.engine.loop import CHUNK, KEPT_BYTES, Run, advance, joined, size_of
 from zakai.engine.plan import plan_of
@@ -29,7 +29,7 @@ from zakai.methods._protocol import Info, Infos, stacked
 from zakai.methods._states import Joined
 from zakai.models.model import Model
 from zakai.numerics.one_thread import one_thread
-from zakai.records import Record
+from zakai.records import Inputs, Record
 
 _EVIDENCE = "the evidence of the backward pass differs from the filter's, in nats"
 
@@ -84,7 +84,13 @@ class SmoothingResult(FilterResult):
 
 
 def smooth(
-    model: Model, record: Record, method: str = "auto", *, progress: Progress | None = None, **options: Any
+    model: Model,
+    record: Record,
+    method: str = "auto",
+    *,
+    inputs: Inputs | None = None,
+    progress: Progress | None = None,
+    **options: Any,
 ) -> SmoothingResult:
     """Return the conditional density of the state given all observations, at every time of the record.
 
@@ -92,6 +98,7 @@ def smooth(
         model: the system, with a prior.
         record: K observations of the model's kind.
         method: a method's name, or "auto": the first method that holds and has a backward pass for this system.
+        inputs: the known inputs of the model, in place of those of the record.
         progress: called with the number of observations filtered and K.
         **options: options of the method.
 
@@ -105,7 +112,7 @@ def smooth(
         smoothed = zakai.smooth(model, record)
         smoothed.mean[0], smoothed.density(0).quantile([0.025, 0.975])
     """
-    (record,) = check_records(model, record)
+    (record,) = check_records(model, with_inputs(record, inputs))
     with announced(f"{model.source}: deciding which method holds"):
         plan = plan_of(model, model.prior, method, options, unfit=_unfit)
     check_noise([plan], [record])
