@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -154,6 +154,16 @@ def _refusal(setting: Setting) -> str:
     return f"{said}, and no method that has one holds for this system"
 
 
+class _Opened(NamedTuple):
+    """A segment as `_segment` returns it, and those of its messages that were needed, backward in time from its end."""
+
+    rows: range
+    prepared: Any
+    begin: int
+    states: Sequence[Any]
+    messages: list[Any]
+
+
 class SmoothingRun(Run):
     """One record on its way through one method, and back."""
 
@@ -168,6 +178,7 @@ class SmoothingRun(Run):
         self.after: list[Sequence[Any] | None] = []  # the states after each interval of a segment, while there is memory
         self.messages: list[Any] = []  # at the end of each segment
         self.held = 0
+        self.opened: dict[int, _Opened] = {}  # the segments of which densities were asked, while there is memory
         self.start: Info | None = None  # what is smoothed at the start
 
     def _take(self, states: Sequence[Any], infos: Infos) -> None:
@@ -237,12 +248,16 @@ class SmoothingRun(Run):
     def density(self, index: int) -> Density:
         """Return the smoothed density at an index of the result, made from the nearest checkpoints."""
         number = max(i for i, (first, _) in enumerate(self.segments) if first < max(index, 1))
-        rows, prepared, begin, states = self._segment(number)
-        message, first = self.messages[number], index - rows.start
-        if index < rows.stop:
-            here = slice(index - begin, rows.stop - begin)
-            message, _ = self._backward(prepared, here, states[first:], message, range(index, rows.stop))
-        return self.backward.density(self.empty, states[first], message)
+        if number not in self.opened:
+            while sum(map(size_of, self.opened.values())) > KEPT_BYTES / 4:
+                self.opened.pop(next(iter(self.opened)))
+            self.opened[number] = _Opened(*self._segment(number), [self.messages[number]])
+        rows, prepared, begin, states, messages = self.opened[number]
+        for k in range(rows.stop - len(messages), index - 1, -1):
+            place = k - rows.start
+            here = slice(k - begin, k - begin + 1)
+            messages.append(self._backward(prepared, here, states[place : place + 2], messages[-1], range(k, k + 1))[0])
+        return self.backward.density(self.empty, states[index - rows.start], messages[rows.stop - index])
 
     def start_moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean and the covariance at the start, smoothed once the record is."""
