@@ -195,6 +195,14 @@ def methods(
     inspecting.methods(model, record, inputs)
 
 
+@app.command("warm-up")
+def warm_up() -> None:
+    """Compile what the methods need, once for this machine, and print where it is kept."""
+    from zakai.cli import inspecting
+
+    inspecting.warm_up()
+
+
 @app.command()
 def gallery(
     name: Annotated[str | None, typer.Argument(metavar="NAME", help="Print the file of this model.")] = None,
