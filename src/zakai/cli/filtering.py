@@ -47,6 +47,8 @@ def filter(
         from zakai.report._extra import plotting
 
         plotting("plotly")
+    from zakai.engine.kept_record import MOST_QUANTILES
+
     model, record, options = _given(source, record_path, settings, inputs_path, unit, origin, columns)
     truth = None if truth_path is None else _truth(truth_path, model, record)
 
@@ -59,8 +61,9 @@ def filter(
         from zakai.engine.driver import filter as run
 
         with progress("filtering") as advance:
-            # Only the report uses the densities.
-            result = run(model, record, method, keep=None if report else "moments", progress=advance, **options)
+            # Only the report and quantiles use the densities.
+            kept = report is not None or (len(record) + 1) * model.n <= MOST_QUANTILES
+            result = run(model, record, method, keep=None if kept else "moments", progress=advance, **options)
     _warn(result.warnings)
     result.save(output)
     if report is not None:

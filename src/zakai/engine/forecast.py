@@ -24,8 +24,14 @@ def origin_of(result: FilterResult, what: str) -> tuple[Plan, tuple[Any, ...], R
     Raises:
         InputError: the result was read from a file.
     """
+    if result.origin is None and result._again is not None:
+        computed = result._again()
+        result.origin, result.record = computed.origin, computed.record
     if result.origin is None or result.record is None:
-        raise InputError(f"{what}: a result that was read from a file does not hold its filter; filter the record again")
+        raise InputError(
+            f"{what}: a result that was read from a file does not hold its filter; filter the record again, or save it with "
+            "densities=True"
+        )
     return result.origin[0], result.origin[1], result.record
 
 

@@ -13,6 +13,8 @@ import numpy as np
 from zakai import _display
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
+from zakai.engine.kept_record import Variables, quantiles_of, record_of
+from zakai.engine.table import save_table
 from zakai.engine.variables import attributes_of, variables_of
 from zakai.errors import InputError
 from zakai.models.model import Model
@@ -66,6 +68,8 @@ class FilterResult:
     _cov: np.ndarray | None = None
     _density: Callable[[int], Density] | None = None
     _no_density: str = "the densities were not kept"
+    _quantiles: tuple[np.ndarray, np.ndarray] | None = None  # of a result that was stored: levels (L,) and values (L, K+1, n)
+    _again: Callable[[], FilterResult] | None = None  # computes a result that was stored again
 
     def __repr__(self) -> str:
         return (
@@ -184,6 +188,11 @@ class FilterResult:
         """
         wanted = np.asarray(q, float)
         listed = np.atleast_1d(wanted).tolist()
+        if self._quantiles is not None:
+            levels, values = self._quantiles
+            places = [np.flatnonzero(np.abs(levels - one) < 1e-12) for one in listed]
+            if all(len(place) for place in places):
+                return values[[int(place[0]) for place in places]] if wanted.ndim else values[int(places[0][0])]
         found = np.stack([self.density(k).quantile(listed) for k in range(len(self.times))], axis=1)
         return found if wanted.ndim else found[0]
 
@@ -284,10 +293,10 @@ class FilterResult:
         """Return the result as an xarray Dataset with dimensions `time`, of dates if the record has some, and `state`."""
         import xarray
 
-        variables = variables_of(self)
+        variables: Variables = {**variables_of(self), **({} if self._quantiles is None else quantiles_of(self))}
         if self.dates is not None:
             variables["time"] = (["time"], self.dates, {})
-        coordinates = {name: variables.pop(name) for name in ("time", "state", "state_")}
+        coordinates = {name: variables.pop(name) for name in ("time", "state", "state_", "level") if name in variables}
         return xarray.Dataset(variables, coords=coordinates, attrs=attributes_of(self))
 
     def to_dataframe(self) -> pandas.DataFrame:
@@ -310,6 +319,33 @@ class FilterResult:
         index = pandas.Index(self.times if self.dates is None else self.dates, name="time")
         return pandas.DataFrame(columns, index=index)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result as NetCDF, atomically."""
-        save_variables(variables_of(self), attributes_of(self), path)
+    def save(self, path: str | os.PathLike[str], densities: bool = False) -> None:
+        """Write the result atomically, as NetCDF, or as a table where the path ends in `.csv`.
+
+        Both have the moments and, of up to 20,000 marginal densities that were kept, the quantiles 0.025, 0.05, 0.25, 0.5, 0.75,
+        0.95 and 0.975.
+
+        Args:
+            path: the file.
+            densities: whether `zakai.load_result` is to have `density`, all quantiles, `forecast`, `residuals` and what else a
+                result has.  The file then holds the record and the options, too, from which the densities are computed when they
+                are first asked.
+
+        Raises:
+            InputError: the file cannot be written; or, with `densities`, a CSV file, a forecast, or a result that was read from a
+                file without them.
+        """
+        quantiles = quantiles_of(self)
+        if str(path).lower().endswith(".csv"):
+            if densities:
+                raise InputError("save: densities are stored in a NetCDF file; give a name that ends in .nc")
+            save_table(self, path, quantiles)
+            return
+        record: Variables = {}
+        request: dict[str, str] = {}
+        if densities:
+            from zakai.engine.forecast import origin_of
+
+            plan, _, given = origin_of(self, "save")
+            record, request = record_of(self, plan, given)
+        save_variables({**variables_of(self), **quantiles, **record}, {**attributes_of(self), **request}, path)

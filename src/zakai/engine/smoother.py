@@ -71,8 +71,15 @@ class SmoothingResult(FilterResult):
             paths = smoothed.sample_paths(1000)
             highest = paths[:, :, 0].max(axis=1)  # draws of the largest value that the state has taken
         """
+        if not self._runs and self._again is not None:
+            computed = self._again()
+            if isinstance(computed, SmoothingResult):
+                return computed.sample_paths(count, seed)
         if not self._runs:
-            raise InputError("sample_paths: a result that was read from a file does not hold its filter; smooth the record again")
+            raise InputError(
+                "sample_paths: a result that was read from a file does not hold its filter; smooth the record again, or save it "
+                "with densities=True"
+            )
         from zakai.engine.paths import sample_paths
 
         place = {name: i for i, name in enumerate(self.state)}

@@ -7,7 +7,7 @@ import pkgutil
 from pathlib import Path
 from typing import NamedTuple
 
-import zakai.numerics
+from zakai import numerics
 from zakai._progress import bar
 from zakai.numerics import compiled, kernel_cache
 from zakai.numerics.line.loop import declare_usual
@@ -26,7 +26,7 @@ def warm_up() -> WarmUp:
 
     Kernels that are in the folder already are read.  What only rare models need is left out: samples of an h with kinks.
     """
-    for module in pkgutil.walk_packages(zakai.numerics.__path__, "zakai.numerics."):
+    for module in pkgutil.walk_packages(numerics.__path__, "zakai.numerics."):
         importlib.import_module(module.name)
     declare_usual()
     before = compiled.compilation_time()
