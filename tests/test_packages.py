@@ -82,6 +82,7 @@ CALLED = {
         "zakai.report",
         "zakai.report.axes",
         "zakai.engine.forecast",
+        "zakai.engine.observed_ahead",
         "zakai.engine.residuals",
         "zakai.engine.stored",
     },

@@ -35,24 +35,31 @@ def origin_of(result: FilterResult, what: str) -> tuple[Plan, tuple[Any, ...], R
     return result.origin[0], result.origin[1], result.record
 
 
-def forecast(result: FilterResult, times: Any, inputs: Inputs | None = None) -> FilterResult:
-    """Return the density of the state at times after a record; see `FilterResult.forecast`."""
-    plan, states, record = origin_of(result, "forecast")
+def future_of(result: FilterResult, times: Any, inputs: Inputs | None, what: str) -> Record:
+    """Return a record without observations at times after that of a result; `what` begins the errors."""
+    record = origin_of(result, what)[2]
     times = [times] if np.ndim(times) == 0 else times
     if not np.size(times):
-        raise InputError("forecast: no times; give at least one time after the end of the record")
+        raise InputError(f"{what}: no times; give at least one time after the end of the record")
     values = np.full((np.size(times), record.values.shape[1]), np.nan)
     known = record.inputs
     if inputs is not None:
-        later = expected_inputs(inputs, "forecast: inputs").on(record.clock)
+        later = expected_inputs(inputs, f"{what}: inputs").on(record.clock)
         known = later if known is None else known.followed_by(later)
     future = Record(times, values, record.kind, known, record.unit, record.origin)
     last = float(record.times[-1])
     if future.times[0] <= last:
         when = f"the time {future.times[0]:.12g} is not after the end of the record, {last:.12g}"
-        raise InputError(f"forecast: {when}; give later times")
+        raise InputError(f"{what}: {when}; give later times")
     if result.model is not None:
         check_inputs(result.model, future.inputs, float(record.times[0]), float(future.times[-1]))
+    return future
+
+
+def forecast(result: FilterResult, times: Any, inputs: Inputs | None = None) -> FilterResult:
+    """Return the density of the state at times after a record; see `FilterResult.forecast`."""
+    plan, states, record = origin_of(result, "forecast")
+    future, last = future_of(result, times, inputs, "forecast"), float(record.times[-1])
     runs = [ForecastRun(run, state, last) for run, state in zip(plan.runs(future, None), states, strict=True)]
     filter_all(runs, None, len(runs))
     found = plan.result(runs)

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
+    from zakai.engine.observed_ahead import PredictedObservations
     from zakai.engine.plan import Plan
     from zakai.records import Inputs
 
@@ -248,6 +249,30 @@ class FilterResult:
         from zakai.engine.forecast import forecast
 
         return forecast(self, times, inputs)
+
+    def predict_observations(self, times: Any = None, inputs: Inputs | None = None) -> PredictedObservations:
+        """Return the laws of the observations before they are made.
+
+            p(z_k | all rows before k), or p(z at a later time | all rows)
+
+        Args:
+            times: later times; by default those of the record, each given the rows before it.
+            inputs: as for `forecast`.
+
+        Returns:
+            `mean` (K, m), `quantile(q)` and `sample(count, seed)` of values of the model's `observation_kind`.
+
+        Raises:
+            InputError: as `forecast`, or a law given by `observation_log_density`.
+
+        Example:
+            predicted = result.predict_observations()
+            low, high = predicted.quantile([0.05, 0.95])
+            outside = (record.values < low) | (record.values > high)
+        """
+        from zakai.engine.observed_ahead import predict_observations
+
+        return predict_observations(self, times, inputs)
 
     def residuals(self, seed: int = 0) -> np.ndarray:
         """Return the probability integral transforms (K, m) of the observations.

@@ -181,8 +181,9 @@ class Bernoulli:
 
     @staticmethod
     def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
-        one = np.asarray(z) == 1
-        return np.where(one, 1.0 - h, 0.0), np.where(one, 1.0, 1.0 - h)
+        z = np.asarray(z)
+        upto = np.where(z >= 1, 1.0, np.where(z >= 0, 1.0 - h, 0.0))
+        return np.where(z > 1, 1.0, np.where(z > 0, 1.0 - h, 0.0)), upto
 
 
 class VonMises(_Continuous):
