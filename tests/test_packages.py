@@ -77,11 +77,12 @@ def faults(file: str, found: Iterable[tuple[str, bool]]) -> list[str]:
 
 # What a method of an object needs when it is called: it is written in a later module, which imports the object's.
 CALLED = {
-    "densities/_density.py": {"zakai.report.axes", "zakai.records.density_files"},
+    "densities/_density.py": {"zakai.report.axes", "zakai.records.density_files", "zakai.densities.region"},
     "engine/results.py": {
         "zakai.report",
         "zakai.report.axes",
         "zakai.engine.forecast",
+        "zakai.engine.observed_ahead",
         "zakai.engine.residuals",
         "zakai.engine.stored",
     },

@@ -143,3 +143,17 @@ def test_health_figures_of_version_0_1_are_read_by_their_new_names(zakai, tmp_pa
 def test_the_package_is_a_command_too():
     answer = subprocess.run([sys.executable, "-m", "zakai", "--version"], capture_output=True, text=True, timeout=60)
     assert answer.returncode == 0 and answer.stdout == f"zakai {package.__version__}\n"
+
+
+def test_warm_up_compiles_the_kernels_that_are_declared_and_prints_the_folder(zakai, monkeypatch, tmp_path):
+    from zakai.numerics import compiled, kernel_cache
+
+    taken = []
+    few, usual = [lambda: taken.append("one"), lambda: taken.append("two")], compiled.compile_declared
+    monkeypatch.setattr(compiled, "compile_declared", lambda: (monkeypatch.setattr(compiled, "_declared", few), usual())[1])
+    monkeypatch.setattr(kernel_cache, "folder", lambda: tmp_path)
+    answer = zakai("warm-up")
+    assert (answer.code, answer.err, taken) == (0, "", ["one", "two"])
+    assert answer.out == f"compiled  2 kernels in 0 s\nkept in   {tmp_path}\n"
+    monkeypatch.setattr(kernel_cache, "folder", lambda: None)
+    assert zakai("warm-up").code == 2

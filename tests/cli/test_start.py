@@ -48,8 +48,34 @@ def folder(tmp_path):
 
 
 def test_without_a_cache_folder_a_kernel_is_compiled_and_nothing_is_printed(folder):
-    (folder / "__pycache__").write_text("a file in the way")
-    assert answered(started(folder, HITS)) == ("6.0\n0\n", "")
+    for _ in range(2):
+        assert answered(started(folder, HITS, NUMBA_CACHE_DIR="/proc/nowhere")) == ("6.0\n0\n", "")
+
+
+@pytest.mark.parametrize(
+    ("names", "place"),
+    [({"HOME": "{}"}, ".cache/zakai"), ({"XDG_CACHE_HOME": "{}/own"}, "own/zakai"), ({"TMPDIR": "{}"}, "zakai-*")],
+)
+def test_kernels_are_kept_in_the_folder_of_the_user_and_never_beside_the_source(folder, names, place):
+    own = {name: value.format(folder) for name, value in names.items()}
+    assert answered(started(folder, HITS, **own)) == ("6.0\n0\n", "")
+    assert answered(started(folder, HITS, **own)) == ("6.0\n1\n", "")
+    assert list(folder.glob(f"{place}/**/*.nbi")) and not list(folder.glob("__pycache__/*.nbi"))
+
+
+def test_a_folder_of_temporary_files_that_others_can_write_to_is_not_used(folder):
+    assert answered(started(folder, HITS, TMPDIR=str(folder))) == ("6.0\n0\n", "")
+    (own,) = folder.glob("zakai-*")
+    assert own.stat().st_mode & 0o077 == 0
+    own.chmod(0o777)
+    assert answered(started(folder, HITS, TMPDIR=str(folder))) == ("6.0\n0\n", "")
+
+
+def test_a_line_on_the_terminal_says_that_kernels_are_compiled(folder):
+    slow = "import zakai._progress as p; p.shown = lambda: True; import zakai.numerics.compiled as c; c.LONG = 0.001; "
+    out, error = answered(started(folder, slow + HITS, HOME=str(folder)))
+    assert out == "6.0\n0\n"
+    assert error.splitlines() == ["zakai: compiling, once for this machine (about 10 s; zakai warm-up does it beforehand)"]
 
 
 def test_a_kernel_is_compiled_for_the_declared_types_when_it_first_receives_them(folder):
@@ -72,10 +98,10 @@ def test_a_kernel_refuses_arrays_of_other_types(folder):
 
 
 def test_two_processes_that_compile_at_once_leave_a_whole_cache(folder):
-    for process in [started(folder, USE) for _ in range(2)]:
+    for process in [started(folder, USE, HOME=str(folder)) for _ in range(2)]:
         assert answered(process) == ("6.0\n", "")
-    assert list(folder.glob("__pycache__/*.nbi"))
-    assert answered(started(folder, HITS))[0] == "6.0\n1\n"
+    assert list(folder.glob(".cache/**/*.nbi"))
+    assert answered(started(folder, HITS, HOME=str(folder)))[0] == "6.0\n1\n"
 
 
 def test_a_full_disk_behind_the_cache_costs_compilation_only(folder):

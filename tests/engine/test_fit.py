@@ -304,3 +304,35 @@ def test_signs_that_only_change_together_are_those_of_the_start():
     assert np.array_equal(with_signs_of(np.array([0.5, 0.5]), mirrored, function, box).values, values)
     assert np.array_equal(with_signs_of(np.array([0.5, -0.5]), mirrored, function, box).values, -values)  # s alone is not even
     assert np.array_equal(with_signs_of(np.array([0.5, 0.5]), mirrored, function, np.array([[-np.inf, 0.0]] * 2)).values, -values)
+
+
+def test_profile_intervals_are_where_the_likelihood_has_fallen():
+    model = zakai.Model(
+        state=["x"], drift=["-a*x"], diffusion=[["s"]], observation=["x"], observation_kind="samples",
+        observation_noise=[["0.01"]], parameters={"a": 1, "s": 1}, prior={"kind": "gaussian", "mean": [0], "cov": [[0.5]]},
+    )  # fmt: skip
+    record = zakai.simulate(model, np.arange(0.2, 12, 0.2), seed=4)[1]
+    fitted = zakai.fit(model, record)
+    likelihood = zakai.log_likelihood(model, record)
+    found = fitted.intervals(0.9)
+    drop = 1.6448536269514722**2 / 2
+    for i, name in enumerate(("a", "s")):
+        for end in found[name]:  # the largest value over the other parameter, by brute force
+            grid = fitted.estimates["s" if i == 0 else "a"] * np.linspace(0.3, 1.8, 301)
+            highest = max(likelihood([end, other] if i == 0 else [other, end]) for other in grid)
+            assert fitted.log_likelihood - highest == pytest.approx(drop, abs=0.02)
+    assert found["a"][0] < fitted.estimates["a"] < found["a"][1]
+    wide = fitted.intervals()
+    assert all(wide[name][0] < found[name][0] and wide[name][1] > found[name][1] for name in found)
+    with pytest.raises(zakai.InputError, match="intervals: level is 95"):
+        fitted.intervals(95)
+
+
+def test_an_end_of_an_interval_is_a_bound_or_infinite_where_the_likelihood_does_not_fall():
+    model = zakai.Model(
+        state=["x"], drift=["-x + b*x**2/100"], observation=["x"], observation_kind="samples", observation_noise=[["0.5"]],
+        parameters={"b": 0}, prior={"kind": "gaussian", "mean": [0], "cov": [[0.5]]},
+    )  # fmt: skip
+    record = zakai.simulate(model, [0.2, 0.4, 0.8], seed=4)[1]
+    low, high = zakai.fit(model, record, bounds={"b": (-0.5, 0.7)}).intervals()["b"]
+    assert (low, high) == (-0.5, 0.7)

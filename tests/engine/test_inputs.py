@@ -324,3 +324,81 @@ def test_a_method_of_the_package_agrees_online_and_after_a_checkpoint(model, tmp
     follower.restore(tmp_path / "state")
     rows += [follower.update(times[k], values[k]) for k in range(5, 10)]
     assert rows_of(rows).tobytes() == expected.tobytes()
+
+
+def test_inputs_may_be_given_wherever_a_record_is(model):
+    times, values = times_and_values()
+    inputs, alone = inputs_until(times[-1]), zakai.Record(times, values, "samples")
+    together = zakai.Record(times, values, "samples", inputs)
+    expected = rows_of_result(zakai.filter(model, together, "kalman-bucy")).tobytes()
+    assert rows_of_result(zakai.filter(model, alone, "kalman-bucy", inputs=inputs)).tobytes() == expected
+    two = zakai.filter(model, [alone, alone], "kalman-bucy", inputs=[inputs, inputs])
+    assert [rows_of_result(one).tobytes() for one in two] == [expected, expected]
+    assert rows_of_result(zakai.prepare(model, times, "kalman-bucy", inputs=inputs).filter(together)).tobytes() == expected
+    smoothed = zakai.smooth(model, alone, "kalman-bucy", inputs=inputs)
+    assert smoothed.mean.tobytes() == zakai.smooth(model, together, "kalman-bucy").mean.tobytes()
+    online = zakai.online(model, "kalman-bucy", inputs=inputs)
+    estimates = [online.update(float(time), float(value)) for time, value in zip(times, values, strict=True)]
+    np.testing.assert_array_equal([one.mean for one in estimates], zakai.filter(model, together, "kalman-bucy").mean[1:])
+
+
+def test_an_estimate_of_parameters_takes_inputs_beside_the_record():
+    model = read_model(TEXT.format(hold="zero").replace('["-x + u"]', '["-a*x + u"]') + "[parameters]\na = 1.0\n", "driven.toml")
+    times, values = times_and_values()
+    inputs, alone = inputs_until(times[-1]), zakai.Record(times, values, "samples")
+    together = zakai.Record(times, values, "samples", inputs)
+    assert zakai.log_likelihood(model, alone, inputs=inputs)([0.7]) == zakai.log_likelihood(model, together)([0.7])
+    assert zakai.fit(model, alone, inputs=inputs).estimates == zakai.fit(model, together).estimates
+
+
+def test_an_input_that_acts_only_at_observations_may_begin_at_the_first_one():
+    model = zakai.Model(
+        state=["x"], drift=["-x"], observation=["x"], observation_kind="samples", observation_noise=[["v**2"]], inputs=["v"],
+        prior={"kind": "gaussian", "mean": [0], "cov": [[1]]},
+    )  # fmt: skip
+    plain = zakai.Model(
+        state=["x"], drift=["-x"], observation=["x"], observation_kind="samples", observation_noise=[["0.25"]],
+        prior={"kind": "gaussian", "mean": [0], "cov": [[1]]},
+    )  # fmt: skip
+    times, values = [0.4, 1.0], [0.3, -0.2]
+    record = zakai.Record(times, values, "samples")
+    found = zakai.filter(model, record, inputs=zakai.Inputs(times, [0.5, 0.5]))
+    np.testing.assert_allclose(found.mean, zakai.filter(plain, record).mean, rtol=1e-12)
+    online = zakai.online(model, inputs=zakai.Inputs(times, [0.5, 0.5]))
+    np.testing.assert_array_equal([online.update(t, z).mean for t, z in zip(times, values, strict=True)], found.mean[1:])
+    with pytest.raises(InputError, match="first time 0.5 is after the first observation at 0.4; give v from 0.4 on"):
+        zakai.filter(model, record, inputs=zakai.Inputs([0.5], [0.5]))
+    with pytest.raises(InputError, match="the first time 0.4 is after the start 0 of driven.toml; give u from 0 on"):
+        zakai.filter(driven("zero"), record, inputs=zakai.Inputs(times, [0.5, 0.5]))
+
+
+def test_columns_of_a_frame_are_inputs_that_hold_from_the_start(model, tmp_path):
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"time": [0.5, 1.0, 2.0], "u": [1.0, None, -1.0], "y": [0.2, None, 0.4]})
+    record = zakai.Record.from_pandas(frame, "samples", inputs=["u"])
+    np.testing.assert_array_equal(record.values, [[0.2], [np.nan], [0.4]])
+    equal = zakai.Record([0.5, 1.0, 2.0], record.values, "samples", zakai.Inputs([0.0, 0.5, 2.0], [1.0, 1.0, -1.0]))
+    expected = rows_of_result(zakai.filter(model, equal, "kalman-bucy"))
+    np.testing.assert_array_equal(rows_of_result(zakai.filter(model, record, "kalman-bucy")), expected)
+    online = zakai.online(model, "kalman-bucy", inputs=record.inputs)
+    online.save(tmp_path / "begin")
+    again = zakai.online(model, "kalman-bucy")
+    again.restore(tmp_path / "begin")
+    means = [again.update(*row).mean for row in [(0.5, 0.2), (1.0, None), (2.0, 0.4)]]
+    np.testing.assert_array_equal(means, zakai.filter(model, equal, "kalman-bucy").mean[1:])
+    zakai.prepare(model, record, "kalman-bucy").save(tmp_path / "prepared")
+    np.testing.assert_array_equal(rows_of_result(zakai.Prepared.load(tmp_path / "prepared").filter(record)), expected)
+    with pytest.raises(InputError, match="inputs: 'v' is not one of the columns u, y"):
+        zakai.Record.from_pandas(frame, "samples", inputs=["v"])
+
+
+def test_inputs_of_a_forecast_may_have_dates():
+    model = driven("zero")
+    dates = np.array(["2024-05-01", "2024-05-02"], "M8[D]")
+    known = zakai.Inputs(dates, [0.3, 0.3], unit="d")
+    record = zakai.Record(dates, [0.1, 0.2], "samples", known, unit="d")
+    ahead = np.array(["2024-05-04"], "M8[D]")
+    later = zakai.Inputs(np.array(["2024-05-03"], "M8[D]"), [2.0], unit="d")
+    plain = zakai.filter(model, zakai.Record([0.0, 1.0], [0.1, 0.2], "samples", zakai.Inputs([0.0, 1.0], [0.3, 0.3])))
+    expected = plain.forecast([3.0], zakai.Inputs([2.0], [2.0])).mean
+    np.testing.assert_array_equal(zakai.filter(model, record).forecast(ahead, later).mean, expected)

@@ -277,3 +277,24 @@ def test_the_compiled_backward_pass_is_that_of_single_steps(kind, monkeypatch):
     np.testing.assert_allclose(compiled.mean, stepwise.mean, rtol=0, atol=1e-11)
     np.testing.assert_allclose(compiled.cov, stepwise.cov, rtol=0, atol=1e-12)
     assert compiled.health["evidence_error"].max() < 1e-9
+
+
+@pytest.mark.parametrize("memory", [2**30, 0])
+def test_all_densities_take_each_interval_back_once_and_have_the_smoothed_moments(memory, monkeypatch):
+    from zakai.engine import smoother
+
+    monkeypatch.setattr(smoother, "KEPT_BYTES", memory)
+    model = zakai.Model(
+        state=["x"], drift=["x - x**3"], observation=["x"], observation_kind="samples", observation_noise=[["0.2"]],
+        prior={"kind": "gaussian", "mean": [0.5], "cov": [[0.5]]},
+    )  # fmt: skip
+    record = zakai.simulate(model, np.arange(0.1, 20.05, 0.1), seed=0)[1]
+    result = zakai.smooth(model, record)
+    taken, whole = [], smoother.SmoothingRun._backward
+    monkeypatch.setattr(smoother.SmoothingRun, "_backward", lambda *given: (taken.append(len(given[-1])), whole(*given))[1])
+    for _ in range(1 if memory == 0 else 2):
+        means = [result.density(k).mean() for k in range(len(result.times))]
+    assert sum(taken) <= len(record)
+    np.testing.assert_allclose(means, result.mean, atol=1e-6)
+    taken.clear()
+    assert abs(result.density(-1).mean() - result.mean[-1]) < 1e-6 and taken == []

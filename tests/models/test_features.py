@@ -160,6 +160,9 @@ def test_a_log_density_is_given_as_text_or_as_an_expression():
         ("2*expm1(1e-9*x)", lambda x: 2 * math.expm1(1e-9 * x)),
         ("sinc(5*x)", lambda x: math.sin(5 * x) / (5 * x)),
         ("sinc(0)*x", lambda x: x),
+        ("erfc(-2*x)", lambda x: math.erfc(-2 * x)),
+        ("lgamma(3 + x**2)", lambda x: math.lgamma(3 + x**2)),
+        ("3 + lgamma(1/4 - x)", lambda x: 3 + math.lgamma(0.25 - x)),
     ],
 )  # fmt: skip
 def test_new_functions_agree_with_the_standard_library(formula, expected):
@@ -178,6 +181,31 @@ def test_new_functions_agree_with_the_standard_library(formula, expected):
     if "sign" not in formula and "heaviside" not in formula:
         derivative = numpy_function([model.drift[0].diff(model.x[0])], model)
         np.testing.assert_allclose(derivative(smooth, 0.0, []), slope, rtol=1e-6, atol=1e-9)
+
+
+def test_erfc_and_lgamma_are_functions_of_every_method():
+    prior = {"kind": "gaussian", "mean": [0.5], "cov": [[0.3]]}
+    keys = {"observation_kind": "samples", "observation_noise": [["0.1"]], "prior": prior}
+    record = zakai.Record([0.2, 0.5, 0.7], [0.9, 0.4, 0.8], "samples")
+    near = {"erfc(x)": "1 - erf(x)", "lgamma(2 + x/4)": "log(1 + x/4) + lgamma(1 + x/4)", "x": "x"}
+    for formula, equal in near.items():
+        pair = [zakai.Model(state=["x"], drift=["-x"], observation=[one], **keys) for one in (formula, equal)]
+        one, other = (zakai.filter(model, record, "yau-yau") for model in pair)
+        np.testing.assert_allclose(one.mean, other.mean, atol=1e-8)
+        assert zakai.filter(pair[0], record).log_likelihood == pytest.approx(other.log_likelihood, abs=1e-2)
+    with pytest.raises(InputError, match="lgamma of a whole number that is not positive"):
+        zakai.Model(state=["x"], drift=["lgamma(0)"], observation=["x"])
+    model = zakai.Model(state=["x"], drift=["-erfc(x)"], observation=["lgamma(1 + x**2)"])
+    latex = sympy.latex(model.drift[0]) + sympy.latex(model.observation[0].diff(model.x[0]))
+    assert r"\operatorname{erfc}" in latex and r"\psi" in latex
+    two = zakai.Model(
+        state=["x", "y"], drift=["-erfc(x)/4", "-y"], observation=["x + y"], **{**keys, "prior": {
+            "kind": "gaussian", "mean": [0, 0], "cov": [[1, 0], [0, 1]]}},
+    )  # fmt: skip
+    same = zakai.Model(**{"state": ["x", "y"], "drift": ["(erf(x) - 1)/4", "-y"], "observation": ["x + y"], **keys, "prior": {
+        "kind": "gaussian", "mean": [0, 0], "cov": [[1, 0], [0, 1]]}})  # fmt: skip
+    means = [zakai.filter(one, record, "yau-yau").mean for one in (two, same)]
+    np.testing.assert_allclose(*means, atol=1e-8)
 
 
 def test_the_derivatives_of_sinc_are_right_near_zero_and_far_away():

@@ -18,6 +18,10 @@ LAWS = {
     "poisson": ({}, 3.0, lambda h, x: stats.poisson(h)),
     "bernoulli": ({"observation": ["1/(1 + exp(-x))"]}, 1.0, lambda h, x: stats.bernoulli(1 / (1 + np.exp(-x)))),
     "von-mises": ({"concentration": "c"}, 2.5, lambda h, x: stats.vonmises(3.0, h)),
+    "binomial": ({"observation": ["1/(1 + exp(-x))"], "trials": 5}, 2.0, lambda h, x: stats.binom(5, 1 / (1 + np.exp(-x)))),
+    "negative-binomial": ({"dispersion": "c/6"}, 3.0, lambda h, x: stats.nbinom(2.0, 1 / (1 + h / 2))),
+    "log-normal": ({"observation_noise": [["0.3 + x**2"]]}, 0.7, lambda h, x: stats.lognorm(np.sqrt(0.3 + x**2), 0, np.exp(h))),
+    "exponential": ({}, 0.7, lambda h, x: stats.expon(0, h)),
 }  # fmt: skip
 
 
@@ -30,7 +34,8 @@ def of_family(name):
 @pytest.mark.parametrize("name", LAWS)
 def test_the_log_density_of_a_family_is_that_of_scipy(name):
     model, z, law = of_family(name)
-    expected = law.logpmf(z) if hasattr(law, "pmf") and name in ("poisson", "bernoulli") else law.logpdf(z)
+    counts = ("poisson", "bernoulli", "binomial", "negative-binomial")
+    expected = law.logpmf(z) if hasattr(law, "pmf") and name in counts else law.logpdf(z)
     found = log_likelihood(model, np.array([z]), np.array([True]), X, 0.0, model.theta())
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
     unseen = log_likelihood(model, np.array([z]), np.array([False]), X, 0.0, model.theta())
@@ -120,3 +125,48 @@ def test_where_there_is_no_law_the_log_density_is_nan_and_a_draw_is_refused():
     assert np.isnan(found[0]) and np.isfinite(found[1:]).all()
     with pytest.raises(InputError, match=r"observation\[0\] = x: the family poisson has no such law at x = -1.2"):
         model.observation_law.sample(np.random.default_rng(0), X, 0.0, model.theta())
+
+
+@pytest.mark.parametrize("name", [name for name in LAWS if name != "von-mises"])
+def test_the_mean_and_the_mode_of_a_family_are_those_of_scipy(name):
+    model, _, law = of_family(name)
+    own = model.observation_law
+    np.testing.assert_allclose(own.mean(X, 0.0, model.theta())[:, 0], law.mean() * np.ones(4), rtol=1e-12)
+    z = np.arange(0.0, 60.0) if law.dist.name in ("poisson", "bernoulli", "binom", "nbinom") else np.linspace(1e-9, 20, 400001)
+    for k, x in enumerate(X[:, 0]):
+        if name in ("poisson", "bernoulli", "binomial", "negative-binomial", "log-normal", "exponential"):
+            found = own.largest(np.array([True]), X[k], 0.0, model.theta())
+            one = LAWS[name][2](H[k], x)
+            logs = one.logpmf(z) if hasattr(one.dist, "pmf") and one.dist.name not in ("lognorm", "expon") else one.logpdf(z)
+            np.testing.assert_allclose(found, logs.max(), atol=1e-7)
+
+
+def test_what_a_family_cannot_have_is_refused():
+    binomial = zakai.Model(**{**KEYS, "observation": ["1/(1 + exp(-x))"], "observation_family": "binomial", "trials": 5})
+    with pytest.raises(InputError, match="row 1, counted from 0: observation 1 is 6.0, more than the 5 trials"):
+        zakai.filter(binomial, zakai.Record([1, 2], [3, 6], "samples"))
+    positive = zakai.Model(**{**KEYS, "observation": ["x"], "observation_family": "log-normal"})
+    with pytest.raises(InputError, match="observation 1 is 0.0; the family log-normal has positive numbers"):
+        zakai.filter(positive, zakai.Record([1], [0], "samples"))
+    for keys, words in (({"trials": 2.5}, "expected a whole number"), ({}, "missing; the family binomial needs it")):
+        with pytest.raises(InputError, match=f"trials: {words}"):
+            zakai.Model(**{**KEYS, "observation": ["x"], "observation_family": "binomial", **keys})
+
+
+@pytest.mark.parametrize("name", ["binomial", "negative-binomial", "log-normal", "exponential"])
+@pytest.mark.parametrize("method", ["yau-yau", "gaussian-sum"])
+def test_filters_of_a_family_agree_with_a_sum_over_a_grid(name, method):
+    keys, z, _ = LAWS[name]
+    keys = {**keys, "observation_noise": [[0.4]]} if name == "log-normal" else keys
+    model = zakai.Model(**{**KEYS, "observation": ["exp(x/2)"], "observation_family": name, "parameters": {"c": 3}, **keys})
+    x = np.linspace(-11, 8, 6001)
+    h = np.exp(x / 2)
+    law = LAWS[name][2](h, x) if name != "log-normal" else stats.norm(h, np.sqrt(0.4))
+    likely = law.pmf(z) if "binomial" in name else law.pdf(np.log(z)) / z if name == "log-normal" else law.pdf(z)
+    weights = np.exp(-0.5 * x**2 / 2.0) * likely  # a random walk with the variance 1 + 1 at t = 1
+    mean = np.sum(x * weights) / np.sum(weights)
+    evidence = np.log(np.sum(weights) * (x[1] - x[0]) / np.sqrt(2 * np.pi * 2.0))
+    result = zakai.filter(model, zakai.Record([1.0], [z], "samples"), method)
+    tolerance = 1e-6 if method == "yau-yau" else 1e-2
+    assert abs(result.mean[-1, 0] - mean) < tolerance and abs(result.log_likelihood - evidence) < tolerance
+    assert np.isfinite(zakai.filter(model, zakai.Record([1.0], [z], "samples"), method).residuals()).all()

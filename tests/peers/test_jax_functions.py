@@ -15,7 +15,7 @@ from zakai.peers._jax_functions import jax_function
 GRAMMAR = [
     "sin(3*x)", "cos(3*x)", "tan(x)", "asin(tanh(x))", "acos(tanh(x))", "atan(x)", "atan(5*x + y)", "sinh(x)", "cosh(x)",
     "tanh(x)", "exp(x)", "log(1 + x**2)", "sqrt(1 + x**2)", "abs(x - y)", "erf(x)", "x**3", "1/(1 + x**2)", "(1 + x**2)**(1/3)",
-    "log(cosh(50*x))", "1/tan(2 + tanh(x)/2)",
+    "erfc(2*x)", "lgamma(3 + x**2)", "log(cosh(50*x))", "1/tan(2 + tanh(x)/2)",
 ]  # fmt: skip
 MODEL = zakai.Model(state=["x", "y"], drift=["0", "0"], observation=GRAMMAR)
 GALLERY = [

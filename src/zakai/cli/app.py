@@ -31,7 +31,7 @@ _Inputs = Annotated[Path | None, typer.Option("--inputs", metavar="FILE.csv", he
 _Origin = Annotated[str | None, typer.Option(metavar="DATE", help="The date at which t = 0; by default the first one.")]
 _Columns = Annotated[str, typer.Option(metavar="a,b", help="The columns of the record, in the order of the observations.")]
 _Unit = Annotated[str | None, typer.Option(metavar="UNIT", help="The unit of time, for a record with dates: s, min, h, d.")]
-_Output = Annotated[Path, typer.Option("-o", "--output", metavar="RESULT.nc", help="Where the result goes (NetCDF).")]
+_Output = Annotated[Path, typer.Option("-o", "--output", metavar="RESULT.nc", help="Where the result goes: NetCDF, or CSV.")]
 
 
 def _show_version(asked: bool) -> None:
@@ -193,6 +193,14 @@ def methods(
     from zakai.cli import inspecting
 
     inspecting.methods(model, record, inputs)
+
+
+@app.command("warm-up")
+def warm_up() -> None:
+    """Compile what the methods need, once for this machine, and print where it is kept."""
+    from zakai.cli import inspecting
+
+    inspecting.warm_up()
 
 
 @app.command()

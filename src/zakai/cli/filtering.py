@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,6 +47,8 @@ def filter(
         from zakai.report._extra import plotting
 
         plotting("plotly")
+    from zakai.engine.kept_record import MOST_QUANTILES
+
     model, record, options = _given(source, record_path, settings, inputs_path, unit, origin, columns)
     truth = None if truth_path is None else _truth(truth_path, model, record)
 
@@ -60,8 +61,9 @@ def filter(
         from zakai.engine.driver import filter as run
 
         with progress("filtering") as advance:
-            # Only the report uses the densities.
-            result = run(model, record, method, keep=None if report else "moments", progress=advance, **options)
+            # Only the report and quantiles use the densities.
+            kept = report is not None or (len(record) + 1) * model.n <= MOST_QUANTILES
+            result = run(model, record, method, keep=None if kept else "moments", progress=advance, **options)
     _warn(result.warnings)
     result.save(output)
     if report is not None:
@@ -161,8 +163,8 @@ def record_with_inputs(
     if record.inputs is not None:
         raise InputError(f"--inputs {inputs_path}: {path} has columns for the inputs too; give them once")
     inputs = read_inputs(inputs_path, model, record.clock)
-    inputs.check(model, float(record.times[-1]), name=shown(inputs_path))
-    return replace(record, inputs=inputs)
+    inputs.check(model, float(record.times[0]), float(record.times[-1]), name=shown(inputs_path))
+    return record.with_inputs(inputs)
 
 
 def _warn(warnings: Iterable[str]) -> None:

@@ -92,3 +92,17 @@ def _columns(rows: list[tuple[str, str]]) -> None:
     width = max(len(name) for name, _ in rows) + 2
     for name, words in rows:
         print(textwrap.fill(words, 110, initial_indent=name.ljust(width), subsequent_indent=" " * width, break_long_words=False))
+
+
+def warm_up() -> None:
+    """Compile the kernels, and print how many and where they are kept."""
+    from zakai.engine.warm_up import warm_up as compile_kernels
+
+    found = compile_kernels()
+    print(f"compiled  {found.kernels} kernels in {found.seconds:.0f} s")
+    if found.folder is None:
+        raise InputError(
+            "warm-up: no folder for compiled kernels can be written, so that every process compiles them again; set "
+            "NUMBA_CACHE_DIR to a folder that can be written"
+        )
+    print(f"kept in   {found.folder}")

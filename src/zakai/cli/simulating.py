@@ -32,7 +32,7 @@ def simulate(
     inputs = None
     if inputs_path is not None:
         inputs = read_inputs(inputs_path, model)
-        inputs.check(model, float(times[-1]), name=shown(inputs_path))
+        inputs.check(model, float(times[0]), float(times[-1]), name=shown(inputs_path))
     start = _numbers(initial, model.state) if initial else None
     truth, record = simulate(model, times, seed=seed, initial=start, inputs=inputs)
     if truth_path is not None:

@@ -20,7 +20,8 @@ class Density(Protocol):
 
     `log_density(x)` takes (..., n) and gives (...), `pdf(x)` its exponential; `mean()` (n,), `cov()` (n, n), `mode()` (n,),
     `quantile(q)` (len(q), n) of the marginals, `circular_deviation()` (n,) of the angles, `marginal(...)` the density of some of
-    the coordinates, `sample(key, count)` (count, n).  `plot()` draws one or two coordinates.  `save(path)` writes a file that
+    the coordinates, `sample(key, count)` (count, n), `highest_density_region(level)` the smallest region of one or two
+    coordinates that holds a probability.  `plot()` draws one or two coordinates.  `save(path)` writes a file that
     `zakai.load_density` reads.
     """
 
@@ -51,6 +52,8 @@ class Density(Protocol):
     def circular_deviation(self) -> np.ndarray: ...
 
     def plot(self, coordinates: int | str | Sequence[int | str] | None = None, *, ax: Any = None) -> Any: ...
+
+    def highest_density_region(self, level: float = ...) -> list[tuple[float, float]] | float: ...
 
     def save(self, path: str | os.PathLike[str]) -> None: ...
 
@@ -90,6 +93,27 @@ class DensityMethods:
         from zakai.report.axes import draw_density
 
         return draw_density(self if coordinates is None else self.marginal(coordinates), ax)
+
+    def highest_density_region(self: Density, level: float = 0.95) -> list[tuple[float, float]] | float:
+        """Return the smallest region that holds a probability.
+
+        Args:
+            level: the probability.
+
+        Returns:
+            Of one coordinate the intervals (low, high), rising; of an angle one of them may go through pi, its high end then
+            exceeds pi.  Of two coordinates the value of the density on the border of the region: it is where `pdf` is larger.
+
+        Raises:
+            InputError: more than two coordinates, or a level that is no probability.
+
+        Example:
+            for low, high in result.density(-1).marginal("x").highest_density_region(0.9):
+                print(low, high)
+        """
+        from zakai.densities.region import highest_density_region
+
+        return highest_density_region(self, level)
 
     def save(self: Density, path: str | os.PathLike[str]) -> None:
         """Write the density to a file that `zakai.load_density` reads; it can be the prior of a next record.

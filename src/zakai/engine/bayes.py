@@ -18,12 +18,13 @@ from scipy.optimize import minimize
 
 from zakai._progress import bar
 from zakai.engine.batch import LONG, Progress
+from zakai.engine.driver import with_inputs
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
 from zakai.engine.maximum import hessian
 from zakai.engine.priors import Prior
 from zakai.errors import InputError
 from zakai.models.model import Model
-from zakai.records import Record
+from zakai.records import Inputs, Record
 
 if TYPE_CHECKING:
     import xarray
@@ -44,6 +45,7 @@ def sample(
     *,
     warmup: int = 300,
     method: str = "auto",
+    inputs: Inputs | None = None,
     progress: Progress | None = None,
     **options: Any,
 ) -> xarray.Dataset:
@@ -65,6 +67,7 @@ def sample(
         seed: the same seed gives the same draws.
         warmup: number of draws of each chain for adaptation, which are not kept.
         method: as for `zakai.filter`.
+        inputs: the known inputs of the model, in place of those of the record.
         progress: called with the number of draws done and their total; without it long work has a bar on a terminal.
         **options: options of the method.
 
@@ -89,7 +92,7 @@ def sample(
     for name, number, least in (("draws", draws, 4), ("chains", chains, 1), ("warmup", warmup, 20)):
         if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < least:
             raise InputError(f"sample: {name} is {number!r}; expected a whole number of at least {least}")
-    names = chosen_parameters(model, tuple(priors))
+    names, record = chosen_parameters(model, tuple(priors)), with_inputs(record, inputs)
     posterior = _Posterior(LogLikelihood(model, record, method, names, dict(options)), names, priors)
     try:
         import blackjax

@@ -70,9 +70,10 @@ def _restored(feed: Feed, data: Mapping[str, Any], arrays: list[np.ndarray]) -> 
     else:
         _check(values == (0.0,) * feed.m and times == (start,) * feed.m)
     if data["info"] is None:
-        _check(data["health"] is None and data["inputs"] is None and time == start)
-        moment = Moment(time, length, state, None, values, times, tuple(notes))
-        fresh, own = stored(feed.now), stored(moment)
+        _check(data["health"] is None and time == start)
+        known = None if data["inputs"] is None else _inputs(feed.setting.model, time, data["inputs"], numbered)
+        moment = Moment(time, length, state, None, values, times, tuple(notes), known)
+        fresh, own = stored(feed.now._replace(inputs=known)), stored(moment)
         _check(fresh[0] == own[0] and all(a.tobytes() == b.tobytes() for a, b in zip(fresh[1], own[1], strict=True)))
         return moment
     n = feed.setting.model.n
@@ -121,7 +122,7 @@ def _inputs(model: Model, time: float, data: Any, arrays: Iterator[tuple[int, np
         _check(not model.inputs)
         return None
     inputs = Inputs(*_decoded((np.zeros(0), np.zeros((0, 0))), data, arrays))
-    inputs.check(model, time, time)
+    inputs.check(model, time, time, time)
     return inputs
 
 

@@ -19,12 +19,19 @@ from zakai.models.domain import check_prior
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.possible import check_possible
-from zakai.records import Record
+from zakai.records import Inputs, Record
 
 
 @overload
 def filter(
-    model: Model, record: Record, method: str = ..., *, keep: str | None = ..., progress: Progress | None = ..., **options: Any
+    model: Model,
+    record: Record,
+    method: str = ...,
+    *,
+    inputs: Inputs | None = ...,
+    keep: str | None = ...,
+    progress: Progress | None = ...,
+    **options: Any,
 ) -> FilterResult: ...
 @overload
 def filter(
@@ -32,6 +39,7 @@ def filter(
     record: Sequence[Record],
     method: str = ...,
     *,
+    inputs: Inputs | Sequence[Inputs] | None = ...,
     keep: str | None = ...,
     progress: Progress | None = ...,
     **options: Any,
@@ -41,6 +49,7 @@ def filter(
     record: Record | Sequence[Record],
     method: str = "auto",
     *,
+    inputs: Inputs | Sequence[Inputs] | None = None,
     keep: str | None = None,
     progress: Progress | None = None,
     **options: Any,
@@ -52,6 +61,7 @@ def filter(
         record: K observations of the model's kind, or a list of records, which are filtered on the threads of the machine.
         method: a method's name, or "auto", the first that holds for this system. A system that falls into independent blocks is
             filtered block by block, each by the best method for it.
+        inputs: the known inputs of the model, in place of those of the record; for a list of records a list, or one for all.
         keep: "densities", "moments", or None: densities up to 512 MiB in all.
         progress: called with the number of observations done and K; without it long work has a bar on a terminal.
         **options: options of the method.
@@ -69,7 +79,7 @@ def filter(
         result = zakai.filter(model, record)
         result.mean[-1], result.density(-1).quantile([0.025, 0.975])
     """
-    return _filter(model, record, None, method, keep, progress, options)
+    return _filter(model, with_inputs(record, inputs), None, method, keep, progress, options)
 
 
 @overload
@@ -150,6 +160,18 @@ def check_noise(plans: Iterable[Plan], records: Sequence[Record]) -> None:
         together = np.unique(np.concatenate([[part.start], *times.values()]))
         check_noise_at(part, together)
         check_noise_within(part, together)
+
+
+def with_inputs(record: Any, inputs: Any) -> Any:
+    """Return a record with other inputs, or a list of records with those of a list, or with one for all; as it is for None."""
+    if inputs is None:
+        return record
+    if not isinstance(record, list | tuple):
+        return record.with_inputs(inputs) if isinstance(record, Record) else record
+    every = list(inputs) if isinstance(inputs, list | tuple) else [inputs] * len(record)
+    if len(every) != len(record):
+        raise InputError(f"filter: {len(every)} inputs do not go with {len(record)} records; give one for each, or one for all")
+    return [with_inputs(*pair) for pair in zip(record, every, strict=True)]
 
 
 def check_records(model: Model, record: Record | Sequence[Record]) -> list[Record]:

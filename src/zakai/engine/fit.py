@@ -12,12 +12,14 @@ from zakai import _display
 from zakai._progress import bar
 from zakai.densities import GaussianMixture
 from zakai.engine.driver import filter as run_filter
+from zakai.engine.driver import with_inputs
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
 from zakai.engine.maximum import maximum, with_signs_of
+from zakai.engine.profile import Profile
 from zakai.errors import InputError
 from zakai.models._errors import listing
 from zakai.models.model import Model
-from zakai.records import Record
+from zakai.records import Inputs, Record
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,36 @@ class Fit:
     method: str
     observations: int
     warnings: list[str] = field(default_factory=list)
+    _profile: Profile | None = None
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Return confidence intervals of the parameters by their profile likelihood.
+
+            {x : 2 (l(estimates) - max l(theta | theta_i = x)) <= chi^2_1(level)}
+
+        Where the likelihood does not fall enough, an end is the bound of the parameter, or infinite.  They need not be symmetric,
+        and need no standard errors.
+
+        Args:
+            level: the probability with which an interval covers the true value, for long records.
+
+        Returns:
+            (low, high) by name.
+
+        Raises:
+            InputError: a wrong level; a larger log-likelihood than at the estimates was found.
+
+        References:
+            Venzon and Moolgavkar 1988, A method for computing profile-likelihood-based confidence intervals.
+
+        Example:
+            fitted.intervals(0.9)["a"]
+        """
+        if isinstance(level, bool) or not isinstance(level, int | float | np.number) or not 0.0 < level < 1.0:
+            raise InputError(f"intervals: level is {level!r}; give a probability between 0 and 1")
+        if self._profile is None:
+            raise InputError("intervals: this Fit does not hold its record; fit again")
+        return self._profile.intervals(float(level))
 
     def __str__(self) -> str:
         width = max(map(len, self.estimates))
@@ -95,6 +127,7 @@ def fit(
     *,
     start: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float | None, float | None]] | None = None,
+    inputs: Inputs | None = None,
     **options: Any,
 ) -> Fit:
     """Return the parameters of largest likelihood given the record.
@@ -111,6 +144,7 @@ def fit(
         method: as for `filter`.
         start: values by name from which the search starts instead.
         bounds: (lowest, highest) by name, None for no bound. A noise covariance that is not positive is never accepted.
+        inputs: the known inputs of the model, in place of those of the record.
         **options: as for `filter`.
 
     Returns:
@@ -126,6 +160,7 @@ def fit(
         fitted = zakai.fit(model, record, parameters=["a"], bounds={"a": (0, None)})
         fitted.estimates["a"], fitted.standard_errors["a"], fitted.converged
     """
+    record = with_inputs(record, inputs)
     names = chosen_parameters(model, parameters)
     values = _start(model, names, start)
     box = _box(model, names, values, bounds)
@@ -166,6 +201,7 @@ def fit(
         method=result.method,
         observations=len(record.times),
         warnings=warnings,
+        _profile=Profile(function.unwarned, values, found.covariance, box, names),
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
-from zakai.engine.driver import check_noise, check_records, planned
+from zakai.engine.driver import check_noise, check_records, planned, with_inputs
 from zakai.engine.loop import CHUNK, Run, segments
 from zakai.engine.setting import Setting
 from zakai.errors import ConditionError, InputError
@@ -27,7 +27,7 @@ from zakai.models.functions import Floor
 from zakai.models.model import Model
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.one_thread import one_thread
-from zakai.records import Record
+from zakai.records import Inputs, Record
 from zakai.records.schedule import Schedule
 
 SHORT = 0.02  # seconds of one evaluation below which threads do not pay
@@ -35,7 +35,13 @@ JUMPS = sp.sign, Floor
 
 
 def log_likelihood(
-    model: Model, record: Record, method: str = "auto", parameters: Sequence[str] | None = None, **options: Any
+    model: Model,
+    record: Record,
+    method: str = "auto",
+    parameters: Sequence[str] | None = None,
+    *,
+    inputs: Inputs | None = None,
+    **options: Any,
 ) -> LogLikelihood:
     """Return the log-likelihood of the record as a function of the parameters.
 
@@ -51,6 +57,7 @@ def log_likelihood(
         record: K observations.
         method: as of `filter`.
         parameters: p names, by default all of the model's, in its order.
+        inputs: the known inputs of the model, in place of those of the record.
         **options: as of `filter`.
 
     Raises:
@@ -64,7 +71,7 @@ def log_likelihood(
         l = zakai.log_likelihood(model, record, parameters=["a"])
         value, gradient = l.value_and_gradient([0.5])
     """
-    return LogLikelihood(model, record, method, chosen_parameters(model, parameters), options)
+    return LogLikelihood(model, with_inputs(record, inputs), method, chosen_parameters(model, parameters), options)
 
 
 def _jump_of(model: Model, names: tuple[str, ...]) -> str:

@@ -21,13 +21,21 @@ from zakai.models.model import Model
 from zakai.models.possible import check_possible
 from zakai.records.checkpoint import read_checkpoint, write_checkpoint
 from zakai.records.dates import Clock, date_of
-from zakai.records.inputs import Inputs, known_inputs
+from zakai.records.inputs import Inputs, expected_inputs, known_inputs
 from zakai.records.numbers import LARGEST
 from zakai.records.record import check_kind
 from zakai.records.writing import shown
 
 
-def online(model: Model, method: str = "auto", *, unit: str | None = None, origin: Any = None, **options: Any) -> Online:
+def online(
+    model: Model,
+    method: str = "auto",
+    *,
+    inputs: Inputs | None = None,
+    unit: str | None = None,
+    origin: Any = None,
+    **options: Any,
+) -> Online:
     """Return a filter that receives one observation at a time, and gives the estimate after it.
 
     Its estimates are those of `zakai.filter` for the same record, to the bit.
@@ -35,6 +43,7 @@ def online(model: Model, method: str = "auto", *, unit: str | None = None, origi
     Args:
         model: the system, with a prior.
         method: a method's name, or "auto", as for `zakai.filter`.
+        inputs: the known inputs of the model that are known before; `update` takes later ones.
         unit: the model's unit of time, where times are dates, as for `zakai.Record`.
         origin: the date at which t = 0, with `unit`.
         **options: options of the method.
@@ -50,7 +59,7 @@ def online(model: Model, method: str = "auto", *, unit: str | None = None, origi
     """
     if (unit is None) != (origin is None):
         raise InputError("online: give both the unit of the model's time and the origin, the date at which t = 0, or none")
-    return Online(model, method, options, None if unit is None else Clock.of(origin, unit, "online"))
+    return Online(model, method, options, None if unit is None else Clock.of(origin, unit, "online"), inputs)
 
 
 class Online:
@@ -59,7 +68,9 @@ class Online:
     Several of them do not disturb each other, in threads neither; one that several threads share serves them one after the other.
     """
 
-    def __init__(self, model: Model, method: str, options: dict[str, Any], clock: Clock | None = None):
+    def __init__(
+        self, model: Model, method: str, options: dict[str, Any], clock: Clock | None = None, inputs: Inputs | None = None
+    ):
         check_model(model)
         check_kind(model)
         check_possible(model, model.start)
@@ -71,6 +82,11 @@ class Online:
         check_noise_at(model, [model.start])
         self.feeds = tuple(Feed(setting) for setting in plan.settings)
         self.lock = RLock()
+        if inputs is not None:
+            given = expected_inputs(inputs, "online: inputs").on(clock)
+            given.check(model, max(self.time, float(given.times[0])), self.time, name="online: inputs")
+            for feed in self.feeds:
+                feed.now = feed.now._replace(inputs=given.since(self.time))
 
     def __repr__(self) -> str:
         return f"Online({self.method} of {self.model.source}, at t = {self.time:.12g})"

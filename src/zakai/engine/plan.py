@@ -39,6 +39,7 @@ class Plan(NamedTuple):
     why: str
     considered: Mapping[str, Conditions]
     division: Division | None = None
+    request: tuple[str, Mapping[str, Any]] = ("auto", {})  # the method and the options that were asked for
 
     @property
     def method(self) -> str:
@@ -90,7 +91,7 @@ def plan_of(
         _registry.load(method)  # an unknown name is refused before anything is computed
     division = divided(model, prior, method, by_value)
     if division is None:
-        return _plan_of_whole(model, prior, method, options, unfit)
+        return _plan_of_whole(model, prior, method, options, unfit)._replace(request=(method, options))
     if unfit is not None and method == "auto":
         plans = {block.model: _plan_of_whole(block.model, block.prior, method, {}, unfit) for block in division.blocks}
         own_methods = {part: plan.method for part, plan in plans.items()}
@@ -99,7 +100,7 @@ def plan_of(
     methods = [_registry.load(name) for name in names]
     own = dict(zip(names, zip(methods, _own_options(methods, options), strict=True), strict=True))
     settings = tuple(Setting.of(b.model, b.prior, *own[division.methods[b.model]]) for b in division.blocks)
-    return Plan(model, division.blocks, settings, division.why, {}, division)
+    return Plan(model, division.blocks, settings, division.why, {}, division, (method, options))
 
 
 def _plan_of_whole(

@@ -166,19 +166,27 @@ class PredictiveSums:
         covs = self.noise(np.zeros(model.n), t, self.theta, inputs) + slopes @ mixture.covs @ np.swapaxes(slopes, 1, 2)
         return _gaussian(which, values - self.h(points, t, self.theta, inputs), covs)
 
-    def _increments(self, k: int, which: Array, mixture: Mixture, values: Array) -> tuple[Array, Array, Array] | None:
-        t, span = float(self.unobserved.stops[k]), self.schedule.elapsed[k]
-        points, inputs = mixture.points, self.inputs(t)
-        slopes = span[:, None] * self.slopes(points, t)
-        back = np.swapaxes(slopes, 1, 2)
+    def noise_at(self, k: int, which: Array, mixture: Mixture) -> Array:
+        """Return the covariances (N, m, m) of the increments of interval k given the state in its middle."""
+        t, span, points = float(self.unobserved.stops[k]), self.schedule.elapsed[k], mixture.points
         covs = np.broadcast_to(self.noise_of_increments(k), (len(points), len(span), len(span))).copy()
         if self.inside[k].any():
-            excess = self.lengths[k] / 6.0 * (slopes @ self.spread(points, t, self.theta, inputs) @ back)
+            slopes = span[:, None] * self.slopes(points, t)
+            spread = self.spread(points, t, self.theta, self.inputs(t))
+            excess = self.lengths[k] / 6.0 * (slopes @ spread @ np.swapaxes(slopes, 1, 2))
             block = np.ix_(np.arange(len(points)), which, which)
             noise, total = covs[block], covs[block] + excess[block]
             share = mixture.weights @ np.trace(np.linalg.solve(noise, excess[block]), axis1=1, axis2=2)
             self.length_share = max(self.length_share, float(share))
             covs[block] = noise @ np.linalg.solve(total, noise)
+        return covs
+
+    def _increments(self, k: int, which: Array, mixture: Mixture, values: Array) -> tuple[Array, Array, Array] | None:
+        t, span = float(self.unobserved.stops[k]), self.schedule.elapsed[k]
+        points, inputs = mixture.points, self.inputs(t)
+        slopes = span[:, None] * self.slopes(points, t)
+        back = np.swapaxes(slopes, 1, 2)
+        covs = self.noise_at(k, which, mixture)
         if mixture.covs is not None:
             covs = covs + slopes @ mixture.covs @ back
         return _gaussian(which, values - span * self.h(points, t, self.theta, inputs), covs)

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from zakai.engine.predictive import Pair, PredictiveSums
 from zakai.engine.setting import Setting
+from zakai.models.families import COUNTS
 from zakai.numerics.tangent_quadrature import distribution
 from zakai.records.schedule import Schedule
 
 Array = NDArray[Any]
-COUNTS = ("poisson", "bernoulli")
 WIDTH = 3.0  # predictive standard deviations to which half of the nodes are given
 SUMMED = 64  # the largest count whose probabilities are summed one by one
 
@@ -80,7 +80,8 @@ class PredictiveEvidence:
         """Return the centre and the scale of the nodes: the predictive moments by a rule of degree three."""
         mean, cov = moments
         n, t = len(mean), float(schedule.stops[k])
-        if self.model.log_density is None and np.isfinite(cov).all():
+        near_h = self.families[j] not in ("log-normal", "exponential")  # h is the place of z, and S its variance
+        if self.model.log_density is None and near_h and np.isfinite(cov).all():
             values, vectors = np.linalg.eigh(cov)
             steps = np.sqrt(n + 2) * (vectors * np.sqrt(np.maximum(values, 0.0))).T
             points = np.concatenate([mean[None], mean + steps, mean - steps])

@@ -10,7 +10,7 @@ import numpy as np
 
 from zakai import _display
 from zakai.engine.batch import Progress
-from zakai.engine.driver import check_model, check_noise, check_records, filter_planned
+from zakai.engine.driver import check_model, check_noise, check_records, filter_planned, with_inputs
 from zakai.engine.plan import plan_of
 from zakai.engine.results import FilterResult
 from zakai.engine.versions import other_versions, versions
@@ -24,13 +24,14 @@ from zakai.records.writing import shown
 KIND = "prepared"
 
 
-def prepare(model: Model, times: Any, method: str = "auto", **options: Any) -> Prepared:
+def prepare(model: Model, times: Any, method: str = "auto", *, inputs: Inputs | None = None, **options: Any) -> Prepared:
     """Do what can be done before any observation is known.
 
     Args:
         model: the system, with a prior.
         times: (K,), when all coordinates will be observed, or a Record with those times and gaps, and the known inputs.
         method: as for `filter`.
+        inputs: the known inputs of the model, in place of those of the record.
         **options: as for `filter`.
 
     Raises:
@@ -45,7 +46,7 @@ def prepare(model: Model, times: Any, method: str = "auto", **options: Any) -> P
         result = zakai.Prepared.load("spiral-sensor.prepared").filter(record)
     """
     check_model(model)
-    record = times if isinstance(times, Record) else _unobserved(model, times)
+    record = with_inputs(times if isinstance(times, Record) else _unobserved(model, times), inputs)
     (record,) = check_records(model, record)
     return Prepared(model, method, options, record)
 
@@ -83,9 +84,11 @@ class Prepared:
         rows = [("model", repr(self.model)), ("times", f"{len(self.record):,}, {first} to {last}"), *self.options.items()]
         return _display.html_table(repr(self), ("", ""), rows)
 
-    def filter(self, record: Record, *, keep: str | None = None, progress: Progress | None = None) -> FilterResult:
+    def filter(
+        self, record: Record, *, inputs: Inputs | None = None, keep: str | None = None, progress: Progress | None = None
+    ) -> FilterResult:
         """Return what `zakai.filter` returns for this model, method and options, to the bit."""
-        (record,) = check_records(self.model, record)
+        (record,) = check_records(self.model, with_inputs(record, inputs))
         check_noise([self._plan], [record])
         return filter_planned([self._plan], [record], keep, progress)[0]
 
@@ -96,6 +99,7 @@ class Prepared:
             InputError: the file cannot be written.
         """
         about, inputs = {**self._bound, "source": self.model.source}, self.record.inputs
+        inputs = None if inputs is None else inputs.since(self.model.start)
         arrays = {"times": self.record.times, "seen": ~np.isnan(self.record.values)}
         arrays |= {} if inputs is None else {"input_times": inputs.times, "inputs": inputs.values}
         write_checkpoint(path, about, arrays, KIND)

@@ -13,6 +13,8 @@ import numpy as np
 from zakai import _display
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
+from zakai.engine.kept_record import Variables, quantiles_of, record_of
+from zakai.engine.table import save_table
 from zakai.engine.variables import attributes_of, variables_of
 from zakai.errors import InputError
 from zakai.models.model import Model
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
+    from zakai.engine.observed_ahead import PredictedObservations
     from zakai.engine.plan import Plan
     from zakai.records import Inputs
 
@@ -66,6 +69,8 @@ class FilterResult:
     _cov: np.ndarray | None = None
     _density: Callable[[int], Density] | None = None
     _no_density: str = "the densities were not kept"
+    _quantiles: tuple[np.ndarray, np.ndarray] | None = None  # of a result that was stored: levels (L,) and values (L, K+1, n)
+    _again: Callable[[], FilterResult] | None = None  # computes a result that was stored again
 
     def __repr__(self) -> str:
         return (
@@ -184,6 +189,11 @@ class FilterResult:
         """
         wanted = np.asarray(q, float)
         listed = np.atleast_1d(wanted).tolist()
+        if self._quantiles is not None:
+            levels, values = self._quantiles
+            places = [np.flatnonzero(np.abs(levels - one) < 1e-12) for one in listed]
+            if all(len(place) for place in places):
+                return values[[int(place[0]) for place in places]] if wanted.ndim else values[int(places[0][0])]
         found = np.stack([self.density(k).quantile(listed) for k in range(len(self.times))], axis=1)
         return found if wanted.ndim else found[0]
 
@@ -240,6 +250,30 @@ class FilterResult:
 
         return forecast(self, times, inputs)
 
+    def predict_observations(self, times: Any = None, inputs: Inputs | None = None) -> PredictedObservations:
+        """Return the laws of the observations before they are made.
+
+            p(z_k | all rows before k), or p(z at a later time | all rows)
+
+        Args:
+            times: later times; by default those of the record, each given the rows before it.
+            inputs: as for `forecast`.
+
+        Returns:
+            `mean` (K, m), `quantile(q)` and `sample(count, seed)` of values of the model's `observation_kind`.
+
+        Raises:
+            InputError: as `forecast`, or a law given by `observation_log_density`.
+
+        Example:
+            predicted = result.predict_observations()
+            low, high = predicted.quantile([0.05, 0.95])
+            outside = (record.values < low) | (record.values > high)
+        """
+        from zakai.engine.observed_ahead import predict_observations
+
+        return predict_observations(self, times, inputs)
+
     def residuals(self, seed: int = 0) -> np.ndarray:
         """Return the probability integral transforms (K, m) of the observations.
 
@@ -284,10 +318,10 @@ class FilterResult:
         """Return the result as an xarray Dataset with dimensions `time`, of dates if the record has some, and `state`."""
         import xarray
 
-        variables = variables_of(self)
+        variables: Variables = {**variables_of(self), **({} if self._quantiles is None else quantiles_of(self))}
         if self.dates is not None:
             variables["time"] = (["time"], self.dates, {})
-        coordinates = {name: variables.pop(name) for name in ("time", "state", "state_")}
+        coordinates = {name: variables.pop(name) for name in ("time", "state", "state_", "level") if name in variables}
         return xarray.Dataset(variables, coords=coordinates, attrs=attributes_of(self))
 
     def to_dataframe(self) -> pandas.DataFrame:
@@ -310,6 +344,33 @@ class FilterResult:
         index = pandas.Index(self.times if self.dates is None else self.dates, name="time")
         return pandas.DataFrame(columns, index=index)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result as NetCDF, atomically."""
-        save_variables(variables_of(self), attributes_of(self), path)
+    def save(self, path: str | os.PathLike[str], densities: bool = False) -> None:
+        """Write the result atomically, as NetCDF, or as a table where the path ends in `.csv`.
+
+        Both have the moments and, of up to 20,000 marginal densities that were kept, the quantiles 0.025, 0.05, 0.25, 0.5, 0.75,
+        0.95 and 0.975.
+
+        Args:
+            path: the file.
+            densities: whether `zakai.load_result` is to have `density`, all quantiles, `forecast`, `residuals` and what else a
+                result has.  The file then holds the record and the options, too, from which the densities are computed when they
+                are first asked.
+
+        Raises:
+            InputError: the file cannot be written; or, with `densities`, a CSV file, a forecast, or a result that was read from a
+                file without them.
+        """
+        quantiles = quantiles_of(self)
+        if str(path).lower().endswith(".csv"):
+            if densities:
+                raise InputError("save: densities are stored in a NetCDF file; give a name that ends in .nc")
+            save_table(self, path, quantiles)
+            return
+        record: Variables = {}
+        request: dict[str, str] = {}
+        if densities:
+            from zakai.engine.forecast import origin_of
+
+            plan, _, given = origin_of(self, "save")
+            record, request = record_of(self, plan, given)
+        save_variables({**variables_of(self), **quantiles, **record}, {**attributes_of(self), **request}, path)

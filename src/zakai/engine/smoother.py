@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.theorems import conditions_of
 from zakai.densities import Density
 from zakai.engine.batch import Progress, announced, filter_all, smooth_all
-from zakai.engine.driver import check_noise, check_records
+from zakai.engine.driver import check_noise, check_records, with_inputs
 from zakai.engine.health_warnings import warnings_of_run
 from zakai.engine.loop import CHUNK, KEPT_BYTES, Run, advance, joined, size_of
 from zakai.engine.plan import plan_of
@@ -29,7 +29,7 @@ from zakai.methods._protocol import Info, Infos, stacked
 from zakai.methods._states import Joined
 from zakai.models.model import Model
 from zakai.numerics.one_thread import one_thread
-from zakai.records import Record
+from zakai.records import Inputs, Record
 
 _EVIDENCE = "the evidence of the backward pass differs from the filter's, in nats"
 
@@ -71,8 +71,15 @@ class SmoothingResult(FilterResult):
             paths = smoothed.sample_paths(1000)
             highest = paths[:, :, 0].max(axis=1)  # draws of the largest value that the state has taken
         """
+        if not self._runs and self._again is not None:
+            computed = self._again()
+            if isinstance(computed, SmoothingResult):
+                return computed.sample_paths(count, seed)
         if not self._runs:
-            raise InputError("sample_paths: a result that was read from a file does not hold its filter; smooth the record again")
+            raise InputError(
+                "sample_paths: a result that was read from a file does not hold its filter; smooth the record again, or save it "
+                "with densities=True"
+            )
         from zakai.engine.paths import sample_paths
 
         place = {name: i for i, name in enumerate(self.state)}
@@ -84,7 +91,13 @@ class SmoothingResult(FilterResult):
 
 
 def smooth(
-    model: Model, record: Record, method: str = "auto", *, progress: Progress | None = None, **options: Any
+    model: Model,
+    record: Record,
+    method: str = "auto",
+    *,
+    inputs: Inputs | None = None,
+    progress: Progress | None = None,
+    **options: Any,
 ) -> SmoothingResult:
     """Return the conditional density of the state given all observations, at every time of the record.
 
@@ -92,6 +105,7 @@ def smooth(
         model: the system, with a prior.
         record: K observations of the model's kind.
         method: a method's name, or "auto": the first method that holds and has a backward pass for this system.
+        inputs: the known inputs of the model, in place of those of the record.
         progress: called with the number of observations filtered and K.
         **options: options of the method.
 
@@ -105,7 +119,7 @@ def smooth(
         smoothed = zakai.smooth(model, record)
         smoothed.mean[0], smoothed.density(0).quantile([0.025, 0.975])
     """
-    (record,) = check_records(model, record)
+    (record,) = check_records(model, with_inputs(record, inputs))
     with announced(f"{model.source}: deciding which method holds"):
         plan = plan_of(model, model.prior, method, options, unfit=_unfit)
     check_noise([plan], [record])
@@ -147,6 +161,16 @@ def _refusal(setting: Setting) -> str:
     return f"{said}, and no method that has one holds for this system"
 
 
+class _Opened(NamedTuple):
+    """A segment as `_segment` returns it, and those of its messages that were needed, backward in time from its end."""
+
+    rows: range
+    prepared: Any
+    begin: int
+    states: Sequence[Any]
+    messages: list[Any]
+
+
 class SmoothingRun(Run):
     """One record on its way through one method, and back."""
 
@@ -161,6 +185,7 @@ class SmoothingRun(Run):
         self.after: list[Sequence[Any] | None] = []  # the states after each interval of a segment, while there is memory
         self.messages: list[Any] = []  # at the end of each segment
         self.held = 0
+        self.opened: dict[int, _Opened] = {}  # the segments of which densities were asked, while there is memory
         self.start: Info | None = None  # what is smoothed at the start
 
     def _take(self, states: Sequence[Any], infos: Infos) -> None:
@@ -230,12 +255,16 @@ class SmoothingRun(Run):
     def density(self, index: int) -> Density:
         """Return the smoothed density at an index of the result, made from the nearest checkpoints."""
         number = max(i for i, (first, _) in enumerate(self.segments) if first < max(index, 1))
-        rows, prepared, begin, states = self._segment(number)
-        message, first = self.messages[number], index - rows.start
-        if index < rows.stop:
-            here = slice(index - begin, rows.stop - begin)
-            message, _ = self._backward(prepared, here, states[first:], message, range(index, rows.stop))
-        return self.backward.density(self.empty, states[first], message)
+        if number not in self.opened:
+            while sum(map(size_of, self.opened.values())) > KEPT_BYTES / 4:
+                self.opened.pop(next(iter(self.opened)))
+            self.opened[number] = _Opened(*self._segment(number), [self.messages[number]])
+        rows, prepared, begin, states, messages = self.opened[number]
+        for k in range(rows.stop - len(messages), index - 1, -1):
+            place = k - rows.start
+            here = slice(k - begin, k - begin + 1)
+            messages.append(self._backward(prepared, here, states[place : place + 2], messages[-1], range(k, k + 1))[0])
+        return self.backward.density(self.empty, states[index - rows.start], messages[rows.stop - index])
 
     def start_moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean and the covariance at the start, smoothed once the record is."""

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zakai.engine import kept_record
+
 if TYPE_CHECKING:
     from zakai.engine.results import FilterResult
 
@@ -15,6 +17,7 @@ DIMENSIONS = {
     **{name: (name,) for name in ("time", "state", "state_")},
     **{name: ("time", "state") for name in ("mean", "variance", "mean_standard_error")},
     "cov": ("time", "state", "state_"),
+    **kept_record.DIMENSIONS,
 }
 
 

@@ -46,6 +46,14 @@ class _GrammarPrinter(StrPrinter):
     def _print_Sinc(self, expr: sympy.Expr) -> str:
         return f"sinc({self._print(expr.args[0])})"
 
+    def _print_LogGamma(self, expr: sympy.Expr) -> str:
+        return f"lgamma({self._print(expr.args[0])})"
+
+    def _print_ComplementaryError(self, expr: sympy.Expr) -> str:
+        return f"erfc({self._print(expr.args[0])})"
+
+    _print_loggamma, _print_erfc = _print_LogGamma, _print_ComplementaryError
+
     def _print_Exp1(self, expr: sympy.Expr) -> str:
         return "exp(1)"
 

@@ -24,7 +24,7 @@ from zakai.models.expressions import (
     Product,
     Sum,
 )
-from zakai.models.functions import Floor, Maximum, Minimum, Sinc, pairwise, table_function
+from zakai.models.functions import ComplementaryError, Floor, LogGamma, Maximum, Minimum, Sinc, pairwise, table_function
 from zakai.models.table import Table
 
 MAX_CONSTANT_BITS = 2_200  # of a numerator or denominator: twice what a double's exponent can hold
@@ -44,6 +44,8 @@ _PLAIN: dict[str, Callable[..., sympy.Expr]] = {
     "log1p": lambda u: sympy.log(1 + u, evaluate=False),
     "expm1": lambda u: sympy.exp(u, evaluate=False) - 1,
     "sinc": lambda u: Sinc(u, 0),
+    "lgamma": lambda u: LogGamma(u, 0),
+    "erfc": ComplementaryError,
 }
 _LEVELS = {"heaviside": 2, "log1p": 1, "expm1": 1}  # of the expression that stands for the function, beyond one
 _FLOAT: dict[str, Callable[..., float]] = {name: getattr(math, name) for name in _ELEMENTARY} | {
@@ -57,11 +59,14 @@ _FLOAT: dict[str, Callable[..., float]] = {name: getattr(math, name) for name in
     "log1p": math.log1p,
     "expm1": math.expm1,
     "sinc": lambda u: math.sin(u) / u if u else 1.0,
+    "lgamma": math.lgamma,
+    "erfc": math.erfc,
 }
 _DOMAINS = {
     "log": "log of a number that is not positive",
     "log1p": "log1p of a number that is not above -1",
     "sqrt": "square root of a negative number",
+    "lgamma": "lgamma of a whole number that is not positive",
     "asin": "asin outside [-1, 1]",
     "acos": "acos outside [-1, 1]",
 }

@@ -12,7 +12,7 @@ from zakai.errors import InputError
 from zakai.models import _entries
 from zakai.models._errors import did_you_mean, listing, named
 from zakai.models.angles import LINEAR, observed_angles
-from zakai.models.families import FAMILIES
+from zakai.models.families import FAMILIES, PARAMETERS
 from zakai.models.formulas import parse_expression
 
 if TYPE_CHECKING:
@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 
 def read_observed(model: Model, keys: Mapping[str, Any]) -> int:
     """Read the names in `observed`, and return how many there are."""
-    for key in (
-        "observation", "observation_noise", "observation_family", "degrees_of_freedom", "concentration", "observed_angles",
-    ):  # fmt: skip
+    for key in ("observation", "observation_noise", "observation_family", *PARAMETERS, "observed_angles"):
         if keys.get(key) is not None:
             raise InputError(f"{key}: describes the observation, as observation_log_density does; leave one of them out")
     if model.observation_kind != "samples":
@@ -84,7 +82,7 @@ def read_law(model: Model, keys: Mapping[str, Any], read: Callable[..., sympy.Ex
         canonical.update(observation_log_density=text, observed=list(model.observed))
     families = _families(model, keys)
     parameters: dict[tuple[str, int], sympy.Expr] = {}
-    for key in ("degrees_of_freedom", "concentration"):
+    for key in PARAMETERS:
         columns = [j for j, name in enumerate(families) if FAMILIES[name].parameter == key]
         with named(key):
             if not columns and keys.get(key) is not None:
@@ -102,6 +100,8 @@ def read_law(model: Model, keys: Mapping[str, Any], read: Callable[..., sympy.Ex
                     parameters[key, j] = read(text)
                     if parameters[key, j].is_number and not float(parameters[key, j]) > 0:
                         raise InputError(f"expected a positive number, got {text}")
+                    if key == "trials" and parameters[key, j].is_number and not parameters[key, j].is_Integer:
+                        raise InputError(f"expected a whole number, got {text}")
     vars(model).update(observation_family=families, family_parameters=parameters)
     _check_noise_of_families(model, keys)
     given = keys.get("observation_names")

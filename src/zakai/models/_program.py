@@ -18,11 +18,22 @@ import sympy
 from sympy.core.function import AppliedUndef
 
 from zakai.errors import InputError
-from zakai.models.functions import Floor, Maximum, Minimum, Sinc, TableFunction, sinc
+from zakai.models.functions import (
+    ComplementaryError,
+    Floor,
+    LogGamma,
+    Maximum,
+    Minimum,
+    Sinc,
+    TableFunction,
+    complementary_error,
+    log_gamma,
+    sinc,
+)
 
 _ELEMENTARY = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log")
 _UNARY: dict[type, str] = {getattr(sympy, name): name for name in (*_ELEMENTARY, "erf", "sign")}
-_UNARY |= {sympy.Abs: "abs", Floor: "floor"}
+_UNARY |= {sympy.Abs: "abs", Floor: "floor", ComplementaryError: "erfc"}
 _BINARY: dict[type, str] = {sympy.atan2: "atan2", Minimum: "min", Maximum: "max"}
 # SymPy makes these of the grammar's functions: tan(x + pi/2) becomes -cot(x), and derivatives hold others.
 _QUOTIENTS: dict[type, tuple[Callable, Callable]] = {
@@ -100,6 +111,8 @@ class Program:
             return _BINARY[type(expr)], expr.args, None
         if isinstance(expr, Sinc):
             return "sinc", expr.args[:1], int(expr.args[1])
+        if isinstance(expr, LogGamma):
+            return "lgamma", expr.args[:1], int(expr.args[1])
         if isinstance(expr, TableFunction):
             return "table", expr.args, partial(expr.table, orders=expr.orders)
         if type(expr) in _QUOTIENTS:
@@ -235,6 +248,8 @@ def operations(xp: Any, erf: Callable, **special: Callable) -> dict[str, Callabl
         | {
             "erf": erf,
             "sinc": sinc,
+            "lgamma": log_gamma,
+            "erfc": complementary_error,
             "add": lambda *terms: reduce(operator.add, terms),
             "multiply": lambda *factors: reduce(operator.mul, factors),
             "divide": operator.truediv,
@@ -285,6 +300,8 @@ SCALAR = operations(
     _MATH,
     math.erf,
     sinc=lambda u, order: float(sinc(u, order)),
+    lgamma=lambda u, order: math.lgamma(u) if order == 0 else float(log_gamma(u, order)),
+    erfc=math.erfc,
     power=_float_power,
     general_power=_float_power,
     logcosh=lambda u: abs(u) + math.log1p(math.exp(-2 * abs(u))) - math.log(2),

@@ -40,6 +40,8 @@ _ORDER = (
     "observation_family",
     "degrees_of_freedom",
     "concentration",
+    "trials",
+    "dispersion",
     "observation_log_density",
     "observed",
     "observed_angles",

@@ -80,8 +80,13 @@ class Wrapped:
         return np.isfinite(z)
 
     @staticmethod
-    def mode(h: Array) -> Array:
+    def mode(h: Array, s: Any, shape: Any) -> Array:
         """Return the most probable value."""
+        return h
+
+    @staticmethod
+    def mean(h: Array, s: Any, shape: Any) -> Array:
+        """Return the mean direction."""
         return h
 
     def log_density(self, z: Any, h: Any, s: Any, shape: Any) -> Array:

@@ -49,6 +49,8 @@ FUNCTIONS = (
     "log1p",
     "expm1",
     "sinc",
+    "lgamma",
+    "erfc",
 )
 ARGUMENTS = {"atan2": (2, 2), "min": (2, 64), "max": (2, 64)}  # the least and the largest number; one for all others
 RESERVED = ("t", "pi", *FUNCTIONS)

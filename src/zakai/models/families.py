@@ -1,7 +1,7 @@
 """Families of laws of one coordinate of a sample.
 
 A family is a class of functions of z, the location h, the variance or squared scale s and the shape of the family (degrees of
-freedom or concentration), all of which broadcast.  What is no law (a negative mean of counts) is NaN.
+freedom, concentration, trials or dispersion), all of which broadcast.  What is no law (a negative mean of counts) is NaN.
 """
 
 from __future__ import annotations
@@ -35,8 +35,12 @@ class Family(Protocol):
         """Return where z is a possible value."""
 
     @staticmethod
-    def mode(h: Array) -> Array:
+    def mode(h: Array, s: Any, shape: Any) -> Array:
         """Return the most probable value."""
+
+    @staticmethod
+    def mean(h: Array, s: Any, shape: Any) -> Array:
+        """Return the mean, or the mean direction of an angle."""
 
     @staticmethod
     def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
@@ -59,7 +63,11 @@ class _Continuous:
         return np.isfinite(z)
 
     @staticmethod
-    def mode(h: Array) -> Array:
+    def mode(h: Array, s: Any, shape: Any) -> Array:
+        return h
+
+    @staticmethod
+    def mean(h: Array, s: Any, shape: Any) -> Array:
         return h
 
 
@@ -118,8 +126,12 @@ class Poisson:
         return (z >= 0) & (z == np.floor(z)) & (z <= 2.0**53)
 
     @staticmethod
-    def mode(h: Array) -> Array:
+    def mode(h: Array, s: Any, shape: Any) -> Array:
         return np.floor(h)
+
+    @staticmethod
+    def mean(h: Array, s: Any, shape: Any) -> Array:
+        return h
 
     @staticmethod
     def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
@@ -151,8 +163,12 @@ class Bernoulli:
         return (z == 0) | (z == 1)
 
     @staticmethod
-    def mode(h: Array) -> Array:
+    def mode(h: Array, s: Any, shape: Any) -> Array:
         return np.round(h)
+
+    @staticmethod
+    def mean(h: Array, s: Any, shape: Any) -> Array:
+        return h
 
     @staticmethod
     def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
@@ -165,8 +181,9 @@ class Bernoulli:
 
     @staticmethod
     def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
-        one = np.asarray(z) == 1
-        return np.where(one, 1.0 - h, 0.0), np.where(one, 1.0, 1.0 - h)
+        z = np.asarray(z)
+        upto = np.where(z >= 1, 1.0, np.where(z >= 0, 1.0 - h, 0.0))
+        return np.where(z > 1, 1.0, np.where(z > 0, 1.0 - h, 0.0)), upto
 
 
 class VonMises(_Continuous):
@@ -198,13 +215,171 @@ class VonMises(_Continuous):
         return value, value
 
 
+class Binomial:
+    """Successes among `trials`; h is the probability of one success."""
+
+    parameter, noise, support = "trials", False, "whole numbers from 0 to the number of trials"
+
+    @staticmethod
+    def inside(z: Array) -> Array:
+        return Poisson.inside(z)
+
+    @staticmethod
+    def mode(h: Array, s: Any, shape: Any) -> Array:
+        return np.minimum(np.floor((shape + 1.0) * h), shape)
+
+    @staticmethod
+    def mean(h: Array, s: Any, shape: Any) -> Array:
+        return shape * h
+
+    @staticmethod
+    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+        from scipy.special import gammaln, xlogy
+
+        chance = _where_law(h, (np.real(h) >= 0) & (np.real(h) <= 1))
+        trials, z = np.real(shape), np.asarray(z, float)
+        possible = (z <= trials) & (trials == np.round(trials))
+        failures = np.where(possible, trials - z, 0.0)
+        if np.iscomplexobj(chance):
+            some, other = np.where(z == 0, 1.0, chance), np.where(failures == 0, 1.0, 1.0 - chance)
+            found = z * np.log(some) + failures * np.log(other)
+        else:
+            found = xlogy(z, chance) + xlogy(failures, 1.0 - chance)
+        ways = gammaln(trials + 1.0) - gammaln(z + 1.0) - gammaln(failures + 1.0)
+        return np.asarray(np.where(possible, found + ways, -np.inf + 0.0 * np.real(chance)))
+
+    @staticmethod
+    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+        return rng.binomial(np.round(shape).astype(int), h).astype(float)
+
+    @staticmethod
+    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+        from scipy.stats import binom
+
+        return binom.cdf(np.asarray(z) - 1.0, shape, h), binom.cdf(z, shape, h)
+
+
+class NegativeBinomial:
+    """Counts with mean h >= 0 and variance h + `dispersion` h^2."""
+
+    parameter, noise, support = "dispersion", False, "whole numbers of at least 0"
+
+    @staticmethod
+    def inside(z: Array) -> Array:
+        return Poisson.inside(z)
+
+    @staticmethod
+    def mean(h: Array, s: Any, shape: Any) -> Array:
+        return h
+
+    @staticmethod
+    def mode(h: Array, s: Any, shape: Any) -> Array:
+        return np.floor(np.maximum(h * (1.0 - shape), 0.0))
+
+    @staticmethod
+    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+        from scipy.special import gammaln, loggamma
+
+        mean = _where_law(h, np.real(h) >= 0)
+        size, excess = 1.0 / shape, 1.0 + shape * mean
+        term = z * np.log(np.where(np.real(mean) == 0, 1.0, shape * mean / excess)) if np.any(z) else 0.0
+        ways = _loggamma(loggamma, z + size) - _loggamma(loggamma, size) - gammaln(np.asarray(z) + 1.0)
+        return np.asarray(np.where((np.real(mean) == 0) & (z > 0), -np.inf, ways + term - size * np.log(excess)))
+
+    @staticmethod
+    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+        return rng.poisson(h * shape * rng.gamma(1.0 / shape, 1.0, h.shape)).astype(float)
+
+    @staticmethod
+    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+        from scipy.stats import nbinom
+
+        law = 1.0 / shape, 1.0 / (1.0 + shape * h)
+        return nbinom.cdf(np.asarray(z) - 1.0, *law), nbinom.cdf(z, *law)
+
+
+class _Positive:
+    """A law of positive numbers."""
+
+    @staticmethod
+    def inside(z: Array) -> Array:
+        return np.isfinite(z) & (z > 0)
+
+
+class LogNormal(_Positive):
+    """log z ~ N(h, s)."""
+
+    parameter, noise, support = None, True, "positive numbers"
+
+    @staticmethod
+    def mode(h: Array, s: Any, shape: Any) -> Array:
+        return np.exp(h - s)
+
+    @staticmethod
+    def mean(h: Array, s: Any, shape: Any) -> Array:
+        return np.exp(h + 0.5 * s)
+
+    @staticmethod
+    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+        log_z = np.log(np.where(z > 0, z, 1.0))
+        return np.asarray(np.where(z > 0, Gaussian.log_density(log_z, h, s, shape) - log_z, -np.inf + 0.0 * np.real(h)))
+
+    @staticmethod
+    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+        return np.exp(Gaussian.sample(rng, h, s, shape))
+
+    @staticmethod
+    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+        with np.errstate(divide="ignore"):
+            return Gaussian.cdf(np.log(np.maximum(z, 0.0)), h, s, shape)
+
+
+class Exponential(_Positive):
+    """Waiting times with mean h > 0."""
+
+    parameter, noise, support = None, False, "numbers of at least 0"
+
+    @staticmethod
+    def inside(z: Array) -> Array:
+        return np.isfinite(z) & (z >= 0)
+
+    @staticmethod
+    def mode(h: Array, s: Any, shape: Any) -> Array:
+        return np.zeros_like(h)
+
+    @staticmethod
+    def mean(h: Array, s: Any, shape: Any) -> Array:
+        return h
+
+    @staticmethod
+    def log_density(z: Any, h: Any, s: Any, shape: Any) -> Array:
+        mean = _where_law(h, np.real(h) > 0)
+        return np.asarray(np.where(np.asarray(z) >= 0, -z / mean - np.log(mean), -np.inf))
+
+    @staticmethod
+    def sample(rng: np.random.Generator, h: Array, s: Any, shape: Any) -> Array:
+        return h * rng.standard_exponential(h.shape)
+
+    @staticmethod
+    def cdf(z: Any, h: Any, s: Any, shape: Any) -> tuple[Array, Array]:
+        value = -np.expm1(-np.maximum(z, 0.0) / h)
+        return value, value
+
+
 FAMILIES: dict[str, Family] = {
     "gaussian": Gaussian(),
     "student-t": StudentT(),
     "poisson": Poisson(),
     "bernoulli": Bernoulli(),
     "von-mises": VonMises(),
+    "binomial": Binomial(),
+    "negative-binomial": NegativeBinomial(),
+    "log-normal": LogNormal(),
+    "exponential": Exponential(),
 }
+
+PARAMETERS = tuple(dict.fromkeys(family.parameter for family in FAMILIES.values() if family.parameter is not None))  # the keys
+COUNTS = ("poisson", "bernoulli", "binomial", "negative-binomial")
 
 
 def _where_law(values: Any, good: Any) -> Array:

@@ -8,7 +8,7 @@ import sympy
 
 from zakai.models._entries import formula
 from zakai.models.angles import observed_angles, without_branch
-from zakai.models.functions import Floor, Maximum, Minimum, Sinc, TableFunction
+from zakai.models.functions import ComplementaryError, Floor, LogGamma, Maximum, Minimum, Sinc, TableFunction
 
 if TYPE_CHECKING:
     from zakai.models.model import Model
@@ -36,7 +36,7 @@ _OF_FORMULAS: dict[str, tuple[type, ...]] = {
     TABLES: (TableFunction,),
     KINKS: (Minimum, Maximum),
     JUMPS: JUMP_FUNCTIONS,
-    SINC: (Sinc,),
+    SINC: (Sinc, LogGamma, ComplementaryError),
 }
 
 
@@ -60,7 +60,7 @@ ASSUMPTIONS = {
     TABLES: "formulas are without tables",
     KINKS: "formulas are without min and max",
     JUMPS: "formulas are without sign, floor, heaviside and atan2",
-    SINC: "formulas are without sinc",
+    SINC: "formulas are without sinc, lgamma and erfc",
 }
 
 

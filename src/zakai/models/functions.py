@@ -1,4 +1,4 @@
-"""Functions of formulas that SymPy lacks, or evaluates in ways that a filter cannot use: min, max, floor, sinc and tables."""
+"""Functions that SymPy lacks, or evaluates in ways that a filter cannot use: min, max, floor, sinc, lgamma, erfc and tables."""
 
 from __future__ import annotations
 
@@ -60,6 +60,33 @@ class Sinc(_Real):
         return Sinc(self.args[0], self.args[1] + 1)
 
 
+class LogGamma(_Real):
+    """The derivative of order k of log |Gamma(x)|, as LogGamma(x, k)."""
+
+    nargs = 2
+
+    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+        return LogGamma(self.args[0], self.args[1] + 1)
+
+    def _latex(self, printer: Any, exp: str | None = None) -> str:
+        order = int(self.args[1])
+        name = r"\log\Gamma" if order == 0 else r"\psi" if order == 1 else rf"\psi^{{\left({order - 1}\right)}}"
+        return rf"{name}{{\left({printer.doprint(self.args[0])}\right)}}" + ("" if exp is None else f"^{{{exp}}}")
+
+
+class ComplementaryError(_Real):
+    """erfc(x) = 1 - erf(x), which SymPy would rewrite where digits are lost."""
+
+    nargs = 1
+
+    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+        return -2 * sympy.exp(-(self.args[0] ** 2)) / sympy.sqrt(sympy.pi)
+
+    def _latex(self, printer: Any, exp: str | None = None) -> str:
+        power = "" if exp is None else f"^{{{exp}}}"
+        return rf"\operatorname{{erfc}}{power}{{\left({printer.doprint(self.args[0])}\right)}}"
+
+
 class TableFunction(_Real):
     """A table as a function; `table` and the orders of the derivatives belong to the class, one for each table and orders."""
 
@@ -111,6 +138,25 @@ def sinc(x: Any, order: int) -> NDArray[Any]:
 def without_jumps(formula: sympy.Expr, symbol: sympy.Symbol) -> sympy.Expr:
     """Return the derivative of a formula almost everywhere: apart from its jumps."""
     return sympy.diff(formula, symbol).replace(sympy.DiracDelta, lambda *_: sympy.S.Zero)
+
+
+def log_gamma(x: Any, order: int) -> NDArray[Any]:
+    """Return the derivative of some order of log |Gamma(x)|; complex x keeps a derivative."""
+    from scipy.special import gammaln, polygamma
+
+    def real(k: int) -> NDArray[Any]:
+        return np.asarray(gammaln(np.real(x)) if k == 0 else polygamma(k - 1, np.real(x)))
+
+    return real(order) + 1j * np.imag(x) * real(order + 1) if np.iscomplexobj(x) else real(order)
+
+
+def complementary_error(x: Any) -> NDArray[Any]:
+    """Return erfc(x); complex x keeps a derivative."""
+    from scipy.special import erfc
+
+    if not np.iscomplexobj(x):
+        return np.asarray(erfc(x))
+    return erfc(np.real(x)) - 1j * np.imag(x) * 2.0 / np.sqrt(np.pi) * np.exp(-(np.real(x) ** 2))
 
 
 def pairwise(function: Callable[[Any, Any], Any], arguments: list[Any]) -> Any:

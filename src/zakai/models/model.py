@@ -26,8 +26,8 @@ from zakai.models.tables import Table, read_tables
 KEYS = (
     "name", "state", "drift", "observation", "observation_kind", "diffusion", "process_noise", "observation_noise", "start",
     "periodic", "functions", "parameters", "prior", "inputs", "input_hold", "cross_noise", "observation_family",
-    "degrees_of_freedom", "concentration", "observation_log_density", "observed", "domain", "tables", "observation_names",
-    "observed_angles",
+    "degrees_of_freedom", "concentration", "trials", "dispersion", "observation_log_density", "observed", "domain", "tables",
+    "observation_names", "observed_angles",
 )  # fmt: skip
 Formulas = Sequence[str | float | sympy.Expr]
 FormulaRows = Sequence[Formulas]
@@ -52,9 +52,10 @@ class Model:
       C, r x m; Q, C and S in t and parameters only, S of samples in the state and inputs too; by default identities, and
       zero for C; covariances are per unit time, or per observation for samples;
     * `inputs`: names of known signals u(t); `input_hold`: "zero" (the default) or "linear";
-    * `observation_family`, for samples: "gaussian", "student-t" (`degrees_of_freedom`), "poisson", "bernoulli" or "von-mises"
-      (`concentration`), for all coordinates or a list; or `observation_log_density` instead of `observation`: log p(z | x) in
-      the state and the names in `observed`, normalised over z if the evidence is to mean something;
+    * `observation_family`, for samples: "gaussian", "student-t" (`degrees_of_freedom`), "poisson", "bernoulli", "von-mises"
+      (`concentration`), "binomial" (`trials`), "negative-binomial" (`dispersion`), "log-normal" or "exponential", for all
+      coordinates or a list; or `observation_log_density` instead of `observation`: log p(z | x) in the state and the names in
+      `observed`, normalised over z if the evidence is to mean something;
     * `observed_angles`: names of samples that are angles, with differences modulo 2 pi, as those of an `atan2(...)` always are;
     * `domain`: state -> {"lower": a, "upper": b, "boundary": "natural" or "reflecting"};
     * `tables`: name -> (x, values), (x, y, values) or a table as in a model file;
@@ -124,6 +125,8 @@ class Model:
         observation_family: str | Sequence[str] | None = None,
         degrees_of_freedom: Any = None,
         concentration: Any = None,
+        trials: Any = None,
+        dispersion: Any = None,
         observation_log_density: str | sympy.Expr | None = None,
         observed: Sequence[str] | None = None,
         observed_angles: Sequence[str] | None = None,

@@ -98,9 +98,11 @@ class ObservationLaw:
         """
         if self._model.log_density is not None:
             raise InputError("observation_log_density: a law given by its log density has no most probable row here")
-        h, *rest = (function(x, t, theta, u) for function in self._functions)
-        modes = np.stack([law.mode(h[..., j]) for j, law in enumerate(self._laws)], axis=-1)
-        parts = self._conditional(np.where(seen, modes, np.nan), h, *rest)
+        h, S, shape = (function(x, t, theta, u) for function in self._functions)
+        variance = np.diagonal(S, axis1=-2, axis2=-1) if self._coupled else S
+        laws = zip(self._laws, *(np.moveaxis(part, -1, 0) for part in (h, variance, shape)), strict=True)
+        modes = np.stack(np.broadcast_arrays(*(own.mode(*law) for own, *law in laws)), axis=-1)
+        parts = self._conditional(np.where(seen, modes, np.nan), h, S, shape)
         terms = [law.log_density(*part) for law, part in zip(self._laws, parts, strict=True)]
         return np.sum(np.where(seen, np.stack(terms, axis=-1), 0.0), axis=-1)
 
@@ -118,6 +120,13 @@ class ObservationLaw:
         seen = ~np.isnan(values)
         below, upto = (np.stack(np.broadcast_arrays(*side), axis=-1) for side in zip(*pairs, strict=True))
         return np.where(seen, below, np.nan), np.where(seen, upto, np.nan)
+
+    def mean(self, x: Any, t: Any, theta: Any, u: Any = None) -> Array:
+        """Return the means (..., m) of the coordinates given the state, of an angle the mean direction."""
+        h, S, shape = (function(x, t, theta, u) for function in self._functions)
+        variance = np.diagonal(S, axis1=-2, axis2=-1) if self._coupled else S
+        laws = zip(self._laws, *(np.moveaxis(part, -1, 0) for part in (h, variance, shape)), strict=True)
+        return np.stack(np.broadcast_arrays(*(own.mean(*law) for own, *law in laws)), axis=-1)
 
     def _parts(self, values: Array, x: Any, t: Any, theta: Any, u: Any) -> list[tuple[Any, Any, Any, Any]]:
         """Return for every coordinate z, location, variance and shape, given the coordinates before it."""
@@ -160,7 +169,7 @@ class ObservationLaw:
         columns = []
         for j, (name, law) in enumerate(zip(self.families, self._laws, strict=True)):
             with np.errstate(all="ignore"):
-                likely = np.round(np.clip(h[:, j], 0, 1))
+                likely = law.mode(h[:, j], variance[:, j], shape[:, j])
                 valid = np.isfinite(h[:, j] + law.log_density(likely, h[:, j], variance[:, j], shape[:, j]))
                 valid &= (variance[:, j] > 0) | (not law.noise)
             if not valid.all():
@@ -221,6 +230,10 @@ class ObservationLaw:
             if wrong.any():
                 row = int(np.argmax(wrong))
                 return row, f"observation {j + 1} is {float(values[row, j])!r}; the family {name} has {family.support}"
+            trials = self._model.family_parameters.get(("trials", j))
+            if trials is not None and trials.is_number and (values[:, j] > float(trials)).any():
+                row = int(np.argmax(values[:, j] > float(trials)))
+                return row, f"observation {j + 1} is {float(values[row, j])!r}, more than the {trials} trials"
         if self._model.log_density is not None:
             seen = ~np.isnan(values)
             partial = seen.any(axis=1) & ~seen.all(axis=1)

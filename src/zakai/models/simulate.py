@@ -73,7 +73,7 @@ def simulate(
     if observed_in_formulas(model).any():
         return _with_path(model, times, seed, initial, substeps, inputs)
     grid = _checked_times(model, times)
-    check_inputs(model, inputs, float(grid[-1]))
+    check_inputs(model, inputs, float(grid[1]), float(grid[-1]))
     counts = _substeps(np.diff(grid), substeps, model)
     checks.check_noise_at(model, grid)
     try:

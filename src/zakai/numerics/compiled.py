@@ -1,16 +1,21 @@
-"""Compilation of kernels: once for each machine, kept in Numba's cache where one can be written."""
+"""Compilation of kernels: once for each machine, kept in the user's cache folder where one can be written."""
 
 from __future__ import annotations
 
 import gc
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
+from threading import Timer
 from typing import Any, TypeVar, cast
 
 from numba import njit, types, version_info
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.sigutils import normalize_signature
+
+from zakai._progress import shown
+from zakai.numerics.kernel_cache import caching, folder
 
 F = TypeVar("F", bound=Callable[..., Any])
 R = TypeVar("R")
@@ -25,21 +30,37 @@ _INLINED = (0, 68)  # the version of Numba, of which `numerics/inlined.py` repla
 _REORDERED: Any = frozenset({"reassoc", "nsz", "contract"})
 
 
+LONG = 0.3  # seconds in which a kernel is not read from the cache but compiled
+
+
 class _Compilation:
-    """The seconds that this process has spent compiling, with the garbage collection off, which takes a tenth of them."""
+    """The seconds that this process has spent compiling, with the garbage collection off, which takes a tenth of them.
+
+    The first time that it takes long a line on the terminal says so.
+    """
 
     def __init__(self) -> None:
         self.depth, self.before, self.since, self.collects = 0, 0.0, 0.0, False
+        self.announced, self.timer = False, Timer(0.0, _announce)
 
     def __enter__(self) -> None:
         if self.depth == 0:
             self.since, self.collects = time.monotonic(), gc.isenabled()
             gc.disable()
+            if not self.announced and shown():
+                self.timer = Timer(LONG, self._announce)
+                self.timer.daemon = True
+                self.timer.start()
         self.depth += 1
+
+    def _announce(self) -> None:
+        self.announced = True
+        _announce()
 
     def __exit__(self, *error: object) -> None:
         self.depth -= 1
         if self.depth == 0:
+            self.timer.cancel()
             self.before += time.monotonic() - self.since
             if self.collects:
                 gc.enable()
@@ -49,7 +70,27 @@ class _Compilation:
         return self.before + (time.monotonic() - self.since if self.depth else 0.0)
 
 
+def _announce() -> None:
+    """Write that kernels are compiled."""
+    kept = "once for this machine" if folder() is not None else "in this process: no cache folder can be written"
+    print(f"zakai: compiling, {kept} (about 10 s; zakai warm-up does it beforehand)", file=sys.stderr, flush=True)
+
+
 _compilation = _Compilation()
+_declared: list[Callable[[], None]] = []
+
+
+def compile_declared() -> Iterator[tuple[int, int]]:
+    """Compile all kernels of the modules that are imported, for all of their types; yield how many are done, and their number."""
+    _compilation.announced = True
+    for count, compile_kernel in enumerate(_declared, 1):
+        compile_kernel()
+        yield count, len(_declared)
+
+
+def compilation_time() -> float:
+    """Return the seconds that this process has spent with the compilation of kernels."""
+    return _compilation.seconds()
 
 
 def working_time() -> float:
@@ -60,8 +101,7 @@ def working_time() -> float:
 def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """Return a decorator that compiles a function for one signature when it is first called, by Python or by another kernel.
 
-    The compiled code is kept beside the source, or in the user's cache folder.  Where neither can be written, the function is
-    compiled in every process.
+    The compiled code is kept in `kernel_cache.folder()`.  Where there is none, the function is compiled in every process.
 
     Args:
         signature: the types of the arguments and of the result.
@@ -72,13 +112,14 @@ def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -
     fastmath = set(_REORDERED) if reordered else False
 
     def decorate(function: Callable[..., R]) -> Callable[..., R]:
-        try:
-            dispatcher = _compiler(cache=True, fastmath=fastmath)(function)
-        except RuntimeError:  # no folder for the cache
-            dispatcher = _compiler(fastmath=fastmath)(function)
+        with caching() as kept:
+            try:
+                dispatcher = _compiler(cache=kept, fastmath=fastmath)(function)
+            except RuntimeError:  # a function without a file
+                dispatcher = _compiler(fastmath=fastmath)(function)
         compiled = dispatcher.compile
 
-        def compile_declared(arguments: Any) -> Any:
+        def compile_for(arguments: Any) -> Any:
             """Compile for the declared types, to which these arguments are converted."""
             complex_ = derivative is not None and any(getattr(t, "dtype", t) == types.complex128 for t in arguments)
             declared = derivative if complex_ else signature
@@ -99,7 +140,13 @@ def kernel(signature: Any, derivative: Any = None, *, reordered: bool = False) -
                     dispatcher.disable_compile()
                 return entry
 
-        dispatcher.compile = compile_declared
+        def compile_all() -> None:
+            for one in (signature, derivative):
+                if one is not None and tuple(normalize_signature(one)[0]) not in dispatcher.overloads:
+                    compile_for(tuple(normalize_signature(one)[0]))
+
+        dispatcher.compile = compile_for
+        _declared.append(compile_all)
         return cast("Callable[..., R]", dispatcher)
 
     return decorate

@@ -15,7 +15,7 @@ Array = NDArray[Any]
 BINARY = ("add", "multiply", "divide", "general_power", "atan2", "min", "max", "power")
 UNARY = (
     "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "erf", "sign", "abs", "floor", "sqrt",
-    "log1p", "expm1", "logcosh",
+    "log1p", "expm1", "erfc", "logcosh",
 )  # fmt: skip
 BLOCK = 256  # points that are evaluated together
 LARGE = 4096  # points for which NumPy is as fast
@@ -98,6 +98,8 @@ def _unary(operation: int, a: Any, out: Any) -> None:
             out[i] = math.log1p(u)
         elif operation == 17:
             out[i] = math.expm1(u)
+        elif operation == 18:
+            out[i] = math.erfc(u)
         else:
             out[i] = abs(u) + math.log1p(math.exp(-2.0 * abs(u))) - math.log(2.0)
 

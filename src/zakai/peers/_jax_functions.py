@@ -59,7 +59,13 @@ def _table(evaluated: Any, *arguments: Any) -> jax.Array:
     return jnp.asarray(coefficients)
 
 
-_JAX = operations(jnp, jax.scipy.special.erf, sinc=_sinc, table=_table)
+def _log_gamma(x: Any, order: int) -> jax.Array:
+    return jax.scipy.special.gammaln(x) if order == 0 else jax.scipy.special.polygamma(order - 1, x)
+
+
+_JAX = operations(
+    jnp, jax.scipy.special.erf, sinc=_sinc, table=_table, erfc=jax.scipy.special.erfc, lgamma=_log_gamma
+)
 
 
 def jax_function(expressions: Any, model: Model, shape: Sequence[int] | None = None) -> JaxFunction:

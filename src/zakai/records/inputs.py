@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,6 +45,7 @@ class Inputs:
     values: NDArray[Any]
     unit: str | None = None
     origin: Any = None
+    _extended: bool = field(default=False, repr=False)  # the first row holds from the model's start
 
     def __post_init__(self) -> None:
         given, clock, _ = read_times(self.times, self.unit, self.origin, "inputs")
@@ -65,6 +66,25 @@ class Inputs:
         found = {"times": times, "values": values, "unit": None, "origin": None}
         for name, value in (found if clock is None else {**found, **clock._asdict()}).items():
             object.__setattr__(self, name, value)
+
+    @classmethod
+    def of_rows(cls, times: Any, values: NDArray[Any], unit: str | None = None, origin: Any = None) -> Inputs:
+        """Return the inputs of the rows of a record.
+
+        The first row with inputs holds from the model's start, and a row without inputs (NaN) changes nothing.
+
+        Raises:
+            InputError: a row with only some of the inputs, or no row with inputs.
+        """
+        given = ~np.isnan(values)
+        rows = given.all(axis=1)
+        partial = given.any(axis=1) & ~rows
+        if partial.any():
+            row = int(np.argmax(partial))
+            raise InputError(f"inputs: row {row}, counted from 0: only some inputs are given; give all or none")
+        if not rows.any():
+            raise InputError("inputs: no row has inputs; fill their columns")
+        return cls(times[rows], values[rows], unit, origin, True)
 
     def __len__(self) -> int:
         return len(self.times)
@@ -93,7 +113,8 @@ class Inputs:
             return self
         if clock is None:
             raise InputError("inputs: have dates, but the observations have not; give dates, a unit and an origin to both")
-        return Inputs(clock.times(self.clock.dates(self.times)), self.values, clock.unit, clock.origin)
+        times = clock.times(self.clock.dates(self.times))
+        return Inputs(times, self.values, clock.unit, clock.origin, self._extended)
 
     def at(self, t: Any, hold: str = "zero", before: bool = False) -> NDArray[Any]:
         """Return the inputs (..., number of inputs) at times t (...); `before` takes the limit from the left at a jump.
@@ -118,25 +139,35 @@ class Inputs:
         last = int(np.searchsorted(self.times, stop, "left")) + 1
         return self if first == 0 and last >= len(self) else Inputs(self.times[first:last], self.values[first:last])
 
+    def since(self, start: float) -> Inputs:
+        """Return the inputs with a row at `start`, where their first row holds from there on."""
+        if not self._extended or self.times[0] <= start:
+            return self
+        return Inputs(np.concatenate([[start], self.times]), np.concatenate([self.values[:1], self.values]))
+
     def followed_by(self, later: Inputs) -> Inputs:
         """Return these inputs up to the first time of `later`, and from there on those of `later`."""
         kept = self.times < later.times[0]
-        return Inputs(np.concatenate([self.times[kept], later.times]), np.concatenate([self.values[kept], later.values]))
+        times, values = (np.concatenate([a[kept], b]) for a, b in ((self.times, later.times), (self.values, later.values)))
+        return Inputs(times, values, _extended=self._extended)
 
-    def check(self, model: Model, last: float, start: float | None = None, name: str = "inputs") -> None:
-        """Raise InputError unless the inputs are those of the model from `start`, by default its own, to the time `last`.
+    def check(self, model: Model, first: float, last: float, start: float | None = None, name: str = "inputs") -> None:
+        """Raise InputError unless the inputs are those of the model for observations from the time `first` to `last`.
 
-        `name` is what the message calls the inputs: their file, where they have one.
+        `start` is the time of the state from which the filter begins, by default the model's start.  `name` is what the message
+        calls the inputs: their file, where they have one.
         """
         start = model.start if start is None else start
+        where = f"the start {start:.12g} of {model.source}"
+        if not acts_between_rows(model):
+            start, where = first, f"the first observation at {first:.12g}"
         if self.values.shape[1] != len(model.inputs):
             names = ", ".join(model.inputs) or "none"
             raise InputError(f"{name}: {self.values.shape[1]} columns; {model.source} has {len(model.inputs)}: {names}")
-        first = float(self.times[0])
-        if first > start:
+        begin = float(self.times[0])
+        if begin > start and not self._extended:
             raise InputError(
-                f"{name}: the first time {first:.12g} is after the start {start:.12g} of {model.source}; "
-                f"give {', '.join(model.inputs)} from the start on"
+                f"{name}: the first time {begin:.12g} is after {where}; give {', '.join(model.inputs)} from {start:.12g} on"
             )
         if model.input_hold == "linear" and self.times[-1] < last:
             raise InputError(
@@ -145,17 +176,30 @@ class Inputs:
             )
 
 
-def check_inputs(model: Model, inputs: Any, last: float) -> None:
-    """Raise InputError unless a model and the inputs of a record (or None) go together; `last` is its last time."""
-    if inputs is not None and not isinstance(inputs, Inputs):
-        raise InputError(f"inputs: expected zakai.Inputs(times, values), got a {type(inputs).__name__}")
+def acts_between_rows(model: Model) -> bool:
+    """Return whether an input acts between the observations: not only on what samples say of the state."""
+    moving = (model.drift, model.diffusion)
+    formulas = moving if model.observation_kind == "samples" else (*moving, model.observation)
+    return any(formula.free_symbols & set(model.u) for formula in formulas)
+
+
+def expected_inputs(given: Any, what: str = "inputs") -> Inputs:
+    """Return what is given as inputs; InputError where it is something else."""
+    if not isinstance(given, Inputs):
+        raise InputError(f"{what}: expected zakai.Inputs(times, values), got a {type(given).__name__}")
+    return given
+
+
+def check_inputs(model: Model, inputs: Any, first: float, last: float) -> None:
+    """Raise InputError unless a model and the inputs of a record (or None) go together; it has times from `first` to `last`."""
+    inputs = None if inputs is None else expected_inputs(inputs)
     if inputs is None and model.inputs:
         raise InputError(
             f"inputs: {', '.join(model.inputs)} of {model.source} are missing; give inputs=zakai.Inputs(times, values), "
             "--inputs FILE.csv, or columns of the record with their names"
         )
     if inputs is not None:
-        inputs.check(model, last)
+        inputs.check(model, first, last)
 
 
 def known_inputs(model: Model, known: Inputs | None, given: Any, now: float, time: float) -> Inputs | None:
@@ -185,8 +229,8 @@ def known_inputs(model: Model, known: Inputs | None, given: Any, now: float, tim
     found = known if given is None else given
     if found is None:
         raise InputError(f"inputs: {', '.join(model.inputs)} of {model.source} are missing; give them with the first observation")
-    found.check(model, time, now)
-    return found
+    found.check(model, time, time, now)
+    return found.since(now)
 
 
 def _row(model: Model, given: Any) -> Any:

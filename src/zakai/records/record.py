@@ -16,7 +16,7 @@ from zakai.errors import InputError
 from zakai.models._errors import listing, named
 from zakai.records.columns import observed_columns
 from zakai.records.dates import Clock, read_times
-from zakai.records.inputs import Inputs, check_inputs
+from zakai.records.inputs import Inputs, check_inputs, expected_inputs
 from zakai.records.numbers import LARGEST, numbers_in_time, real_numbers
 from zakai.records.writing import default_names, write_table
 
@@ -79,9 +79,7 @@ class Record:
         times.flags.writeable = values.flags.writeable = False
         found: dict[str, Any] = {"times": times, "values": values, "_dates": dates}
         if self.inputs is not None:
-            if not isinstance(self.inputs, Inputs):
-                raise InputError(f"record: inputs: expected zakai.Inputs(times, values), got a {type(self.inputs).__name__}")
-            found["inputs"] = self.inputs.on(clock)
+            found["inputs"] = expected_inputs(self.inputs, "record: inputs").on(clock)
         if self.names is not None:
             found["names"] = tuple(map(str, self.names))
             if len(found["names"]) != values.shape[1]:
@@ -142,6 +140,18 @@ class Record:
                 object.__setattr__(found, name, value)
         return found
 
+    def with_inputs(self, inputs: Inputs | None) -> Record:
+        """Return the record with these known inputs in place of its own; itself for None.
+
+        Raises:
+            InputError: something else than `zakai.Inputs`, or inputs with dates where the record has none.
+        """
+        if inputs is None:
+            return self
+        other = copy(self)
+        object.__setattr__(other, "inputs", expected_inputs(inputs).on(self.clock))
+        return other
+
     def check(self, model: Any) -> None:
         """Refuse a record that `model` cannot have made.
 
@@ -157,7 +167,7 @@ class Record:
             hint = "" if self.unit is None else "; give the date at which t = 0 as origin"
             raise InputError(f"record: row 0, counted from 0: {too_early}{hint}")
         if self.inputs is not None or model.inputs:
-            check_inputs(model, self.inputs, float(self.times[-1]))
+            check_inputs(model, self.inputs, float(self.times[0]), float(self.times[-1]))
         fault = self.fault_of_law(model)
         if fault is not None:
             raise InputError(f"record: row {fault[0]}, counted from 0: {fault[1]}")
@@ -176,6 +186,7 @@ class Record:
         origin: Any = None,
         *,
         columns: Sequence[str] | None = None,
+        inputs: Sequence[str] = (),
     ) -> Record:
         """Return a record from a DataFrame: its column `time` or else its index, and the other columns as values.
 
@@ -186,6 +197,8 @@ class Record:
             origin: as for `Record`, for dates.
             columns: the columns to take, in the order of the observations; without it they are matched by the names of the
                 observations, in any order, if these are their names, and else taken by their position.
+            inputs: names of the columns that are the model's known inputs, in its order.  The first row holds from the model's
+                start, and a row without inputs changes nothing.
 
         Raises:
             InputError: as `Record` does, or pandas is not installed.
@@ -204,12 +217,21 @@ class Record:
             raise InputError(f"Record.from_pandas takes a DataFrame, not {type(frame).__name__}")
         times = frame["time"] if "time" in frame.columns else frame.index.to_series()
         rest = frame.drop(columns="time", errors="ignore")
+        inputs = [inputs] if isinstance(inputs, str) else list(inputs)
+        for name in inputs:
+            if list(rest.columns).count(name) != 1:
+                raise InputError(f"Record.from_pandas: inputs: {name!r} is not one of the columns {listing(rest.columns)}")
+        known = [_column(rest[name], f"column {name!r}") for name in inputs]
+        rest = rest.drop(columns=inputs)
         if columns is not None:
             rest = rest[_known_columns(columns, list(rest.columns))]
         read = [_column(rest.iloc[:, i], f"column {rest.columns[i]!r}") for i in range(rest.shape[1])]
         values = np.column_stack(read) if read else np.empty((len(frame), 0))
-        when = times if times.dtype.kind in "mM" else _column(times, "time")
-        return cls(when, values, kind, unit=unit, origin=origin, names=None if columns is not None else list(rest.columns))
+        dated = times.dtype.kind in "mM"
+        when = times if dated else _column(times, "time")
+        given = Inputs.of_rows(times.to_numpy() if dated else when, np.column_stack(known), unit, origin) if known else None
+        names = None if columns is not None else list(rest.columns)
+        return cls(when, values, kind, given, unit, origin, names=names)
 
     @classmethod
     def from_xarray(cls, data: Any, kind: str | None = None, unit: str | None = None, origin: Any = None) -> Record:

@@ -78,10 +78,12 @@ def observations(result: Any) -> str:
 
 
 def _expected(result: Any) -> np.ndarray:
-    """Return h at the posterior mean (K, m)."""
+    """Return the mean of the observations at the posterior mean of the state (K, m): h, of most families."""
     model, record = result.model, result.record
     inputs = None if record.inputs is None else record.inputs.at(record.times, model.input_hold)
     function = numpy_function(list(model.observation), model)
+    if record.kind == "samples" and not model.observation_law.is_gaussian:
+        function = model.observation_law.mean
     with np.errstate(all="ignore"):
         return np.asarray(function(np.asarray(result.mean, float)[1:], record.times, model.theta(), inputs))
 

@@ -150,6 +150,7 @@ _RULES: dict[str, Callable[[Jet], Jet]] = {
     "acos": _primitive("acos", lambda u: -_power(1.0 - u * u, -0.5)),
     "atan": _primitive("atan", lambda u: _reciprocal(1.0 + u * u)),
     "erf": _primitive("erf", lambda u: _exp(-(u * u)) * (2.0 / np.sqrt(np.pi))),
+    "erfc": _primitive("erfc", lambda u: _exp(-(u * u)) * (-2.0 / np.sqrt(np.pi))),
     "abs": lambda u: u * _nonzero_sign(u),
     "sign": lambda u: u.constant(_nonzero_sign(u)),
 }

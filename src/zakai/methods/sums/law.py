@@ -1,7 +1,8 @@
 """Samples of a Gaussian-sum method whose law is not N(h(x, t), S(t)): families, and noise that depends on the state.
 
 A component is multiplied by p(z | x) itself.  How far that is from what one Gaussian can follow is measured by statistics s(x)
-whose Fisher information is about one, in the place of S^(-1/2) h: 2 sqrt(h) of a count, 2 asin(sqrt(h)) of a probability.  Of
+whose Fisher information is about one, in the place of S^(-1/2) h: 2 sqrt(h) of a count, 2 asin(sqrt(h)) of a probability, log h
+of a waiting time.  Of
 `observation_log_density` it is the deviance residual of the observation, sqrt(2 (max l - l)) with l = log p(z | x).
 """
 
@@ -31,8 +32,14 @@ def statistics_of(model: Model) -> list[tuple[int, sp.Expr]]:
         S = model.observation_noise[i, i]
         if family == "poisson":
             found.append((i, 2 * sp.sqrt(h)))
-        elif family == "bernoulli":
-            found.append((i, 2 * sp.asin(sp.sqrt(h))))
+        elif family in ("bernoulli", "binomial"):
+            trials = model.family_parameters.get(("trials", i), sp.Integer(1))
+            found.append((i, 2 * sp.sqrt(trials) * sp.asin(sp.sqrt(h))))
+        elif family == "negative-binomial":
+            a = model.family_parameters["dispersion", i]
+            found.append((i, 2 * sp.log(sp.sqrt(a * h) + sp.sqrt(1 + a * h)) / sp.sqrt(a)))
+        elif family == "exponential":
+            found.append((i, sp.log(h)))
         elif family == "von-mises":
             found.append((i, sp.sqrt(model.family_parameters["concentration", i]) * h))
         else:

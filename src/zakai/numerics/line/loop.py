@@ -11,6 +11,7 @@ first step that is not accurate enough, or needs another grid or table, and retu
 from __future__ import annotations
 
 from functools import cache
+from itertools import product as product_of
 from typing import Any
 
 import numpy as np
@@ -199,6 +200,13 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
         return done, status
 
     return advance
+
+
+def declare_usual() -> None:
+    """Declare the loops of all mechanisms but those of samples of an h with kinks, so that they can be compiled beforehand."""
+    for kernels, splits in ((False, True), (True, False), (True, True)):
+        for samples, closed in product_of((False, True), repeat=2):
+            _loop(kernels, splits, samples, False, closed)
 
 
 _WHOLE = np.ones((1, 5, 1))

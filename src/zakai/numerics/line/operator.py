@@ -16,6 +16,7 @@ from numba import complex128, float64
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import kernel
+from zakai.numerics.complex_step import is_complex, real_product
 
 Array = NDArray[Any]
 
@@ -119,10 +120,12 @@ class Exponential:
         matrix = self.matrix
         if not np.isfinite(self.norm):
             return np.full_like(vector, np.nan), np.inf
-        if np.iscomplexobj(matrix) != np.iscomplexobj(vector):
-            matrix, vector = matrix.astype(complex), vector.astype(complex)
+        if not is_complex(matrix) and is_complex(vector):
+            (real, error), (imaginary, _) = self(vector.real), self(vector.imag)
+            return real + 1j * imaginary, error
         if not self.dense:
-            return _taylor(matrix, np.ascontiguousarray(vector), self.shift, self.norm), 1e-16 * (1.0 + self.norm)
+            vector = np.ascontiguousarray(vector, matrix.dtype)
+            return _taylor(matrix, vector, self.shift, self.norm), 1e-16 * (1.0 + self.norm)
         for _ in range(2**self.powers):
             vector = matrix @ vector
         return vector, self.error
@@ -218,8 +221,8 @@ class Spectral:
     def decayed(self, inner: Array, length: float) -> Array:
         """Return U exp(-length lambda) U' inner."""
         decay = np.exp(-length * self.rates)
-        coefficients = self.modes.T @ inner
+        coefficients = real_product(self.modes.T, inner)
         moved = decay * coefficients
         if self.change is not None:
             moved = moved + 1j * ((quotients(self.rates, decay, length) * self.change) @ coefficients.real)
-        return np.asarray(self.modes @ moved)
+        return real_product(self.modes, moved)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.numerics.complex_step import angle
+from zakai.numerics.complex_step import angle, is_complex, real_product
 from zakai.numerics.line.density import spectrum, spectrum_of_many, waves
 from zakai.numerics.line.fourier import FourierOperator
 from zakai.numerics.line.operator import generator
@@ -210,9 +210,9 @@ def interpolated(values: Array, window: Window, offsets: Array) -> Array:
     exact = np.abs(at - nearest) < 1e-12
     with np.errstate(all="ignore"):
         if window.closed:
-            found = ((1.0 / np.tan(np.pi / window.size * distance)) @ signed.T).T * (sine / window.size)
+            found = real_product(1.0 / np.tan(np.pi / window.size * distance), signed.T).T * (sine / window.size)
         else:
-            found = ((1.0 / distance) @ signed.T).T * (sine / np.pi)
+            found = real_product(1.0 / distance, signed.T).T * (sine / np.pi)
     if window.closed:
         return np.asarray(np.where(exact, values[..., nearest.astype(int) % window.size], found))
     inside = (at > -0.5) & (at < window.size - 0.5)
@@ -268,6 +268,12 @@ def shifted(values: Array, by: int, size: int) -> Array:
     return found
 
 
+def _sums_of_waves(values: Array, first: float, k: Array) -> tuple[Array, Array]:
+    """Return the sums of real values (N,) with cos(k x) and sin(k x), for the N points x of a circle from the first one on."""
+    found = np.exp(-1j * k * first) * np.fft.rfft(values)[k]
+    return found.real, -found.imag
+
+
 def moments(values: Array, window: Window) -> tuple[Any, Any]:
     """Return the mean, relative to the origin, and the variance of probabilities with the sum one.
 
@@ -284,5 +290,9 @@ def moments(values: Array, window: Window) -> tuple[Any, Any]:
     mean: Any = 0.0 * cosine if length.real < 1e-9 else angle(sine, cosine)
     # The square of a wrapped deviation d is pi^2 / 3 + 4 sum (-1)^k cos(k d) / k^2.
     k = np.arange(1, window.size // 2)
-    waves = np.cos(k[:, None] * (x - mean)) @ values
+    cosines, sines = _sums_of_waves(values.real, x[0], k)
+    if is_complex(values):
+        others = _sums_of_waves(values.imag, x[0], k)
+        cosines, sines = cosines + 1j * others[0], sines + 1j * others[1]
+    waves = np.cos(k * mean) * cosines + np.sin(k * mean) * sines
     return mean - window.origin, np.pi**2 / 3 + 4.0 * np.sum(np.where(k % 2 == 0, 1.0, -1.0) / k**2 * waves)
