@@ -50,14 +50,14 @@ MOVE_ABOVE, MOVE_SHARE, MOVE_GAIN, FORGOTTEN = 2.5, 0.4, 3.0, 0.98
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4)  # power, change, most sweeps, rho
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
-SURE, TRUSTED = 0.5, 4  # share of the allowed time error below which its measurement is trusted in so many more intervals
+SURE, TRUSTED = 0.5, 8  # share of the allowed time error below which its measurement is trusted in so many more intervals
 
 
 class Control(NamedTuple):
     """What decides the next step beside the particles.
 
     `interval` counts intervals; `substeps` per unit time with `stages`, whose `error` was measured in an interval of this
-    `length` and is trusted in so many more that are no longer; `variance` of a mean times N, `last` intervals of the window at
+    `length` and is trusted in so many more; `variance` of a mean times N, `last` intervals of the window at
     the last move, `urgency` what has added up since then, `floor` what it has left, and `doubtful_until` the
     number of resamplings until which standard errors are lower bounds.
     """
@@ -152,6 +152,13 @@ def init(prepared: Prepared, prior: Any) -> State:
     logs = np.full(count, -np.log(count))
     control = Control(0, 0.0, 4, np.inf, 0.0, 0, VARIANCE, 0, 0.0, 0.0, 0)
     return State(particles, logs, window, Genealogy.begin(count), control, np.zeros(n), np.zeros(n))
+
+
+def reduced(state: State) -> State:
+    """Return a state with its particles, without their past."""
+    nothing = np.zeros((len(state.particles), 0))
+    window = Window.begin(nothing, np.zeros((0, 0)), (np.zeros(0), np.zeros((0, 0))), (0, 0))
+    return state._replace(window=window, genealogy=Genealogy.begin(0))
 
 
 def moments(particles: Array, weights: Array, angles: Array) -> tuple[Array, Array, Array]:
@@ -292,7 +299,9 @@ def _steps(
     guess = max(1, round(control.substeps * length))
     if length <= 0:
         return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0), control
-    if control.trusted and length <= control.length * (1.0 + 1e-9):
+    # The error of an interval is of the third order of its length.
+    ratio = (length / control.length) ** 3 if control.trusted else np.inf
+    if control.error * ratio <= SURE * TIME_ERROR:
         known = Steps(Scheme(guess, control.stages), state.last_shift, control.error)
         return known, control._replace(trusted=control.trusted - 1)
     key = prepared.key(control.interval + 1, PILOT)
