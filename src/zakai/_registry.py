@@ -79,8 +79,17 @@ PEERS = {
         "zakai.peers.particle", "the bootstrap particle filter of cuthbert: convergent for any smooth system, by sampling"
     ),
 }
-# What "auto" tries, most exact and cheapest first; the last holds for any smooth system of few states.
-AUTO = ("kalman-bucy", "conditionally-gaussian", "benes", "hu-yau", "limited-direct", "general-direct", "yau-yau")
+# What "auto" tries, most exact and cheapest first; the last holds for any model.
+AUTO = (
+    "kalman-bucy",
+    "conditionally-gaussian",
+    "benes",
+    "hu-yau",
+    "limited-direct",
+    "general-direct",
+    "yau-yau",
+    "guided-particles",
+)
 
 
 def load(name: str) -> Any:

@@ -16,6 +16,7 @@ from zakai.models.features import DOMAIN, STATE_DEPENDENT_DIFFUSION
 from zakai.models.model import Model
 
 Conditions = tuple[Condition, ...]
+_PARTICLES = "guided-particles"
 _MOST_STATES = 8  # of a model that is rewritten
 _WIDTH = sp.Rational(1, 10)
 _MOST_CHARACTERS = 90  # of a formula in a sentence
@@ -37,11 +38,14 @@ def nearest(considered: Mapping[str, Conditions]) -> str:
 def what_to_do(model: Model, method: str) -> str:
     """Return a sentence: a method that holds, or a rewriting of the model for which one does, or where to read on."""
     parts = []
-    if method != "auto" and (other := _first(model)):
+    other = _first(model)
+    if method != "auto" and other:
         parts.append(f'{other} holds: method="auto" takes it')
+    # Particles hold for any model: a rewriting for which another method holds is worth a sentence beside them.
+    searched = other in (None, _PARTICLES)
     for words, rewritten in _rewritings(model):
         named = method != "auto" and _holds(rewritten, method)
-        if found := method if named else None if parts else _first(rewritten):
+        if found := method if named else _first(rewritten, without=_PARTICLES) if searched else None:
             parts.append(f"{words}, for which {found} holds")
             break
     if not parts and all_hold(conditions_of("extended-kalman-bucy", model)) is True:
@@ -53,9 +57,9 @@ def _holds(model: Model, method: str) -> bool:
     return all_hold(conditions_of(method, model)) is True
 
 
-def _first(model: Model) -> str | None:
-    """Return the first method of "auto" that holds."""
-    return next((name for name in in_order(model) if _holds(model, name)), None)
+def _first(model: Model, without: str = "") -> str | None:
+    """Return the first method of "auto" that holds, apart from one."""
+    return next((name for name in in_order(model) if name != without and _holds(model, name)), None)
 
 
 def _rewritings(model: Model) -> Iterator[tuple[str, Model]]:

@@ -231,6 +231,10 @@ def theorem_of(name: str) -> Callable[[Model], tuple[Condition, ...]]:
     return THEOREMS[name] if name in THEOREMS else PEERS[name]
 
 
+PARTICLES_FROM = 4  # states, from which particles are expected to need less work than a grid
+# Points at which a method evaluates the formulas for an observation, by the number of states n: a grid has some 25 in each
+# direction, and particles are 5,600 for their default tolerance, moved and weighed some ten times.
+WORK: Mapping[str, Callable[[int], float]] = {"yau-yau": lambda n: 25.0**n, "guided-particles": lambda n: 5.6e4}
 NOT_HANDLED = "what this method handles"  # the source of a condition about a feature
 
 
@@ -241,6 +245,9 @@ def in_order(model: Model) -> tuple[str, ...]:
     up to four states; with four and a sample of a known h it is taken first, as it is faster.  "limited-direct" needs many times
     the work of "yau-yau" with three states, and for increments of an h with a kink in several; in two its grid does not hold the
     narrow peaks and rings that precise samples of a nonlinear h leave.
+
+    Particles are the last resort.  With four or more states and a nonlinear h, or a law of its own, they are taken before a grid
+    and a Gaussian sum, whose work grows with a power of the number of states: see `WORK`.
     """
     last: tuple[str, ...] = ()
     nonlinear, samples = affine_observation(model) is None, model.observation_kind == "samples"
@@ -252,6 +259,10 @@ def in_order(model: Model) -> tuple[str, ...]:
         last = ("limited-direct", "general-direct")
     if features.OBSERVED_ANGLES in model.features:
         last = (*last, "kalman-bucy")  # it takes the nearest image alone
+    if model.n >= PARTICLES_FROM and (nonlinear or laws):
+        last = ("guided-particles", "general-direct", "yau-yau")
+    else:
+        last = (*last, "guided-particles")
     return (*(name for name in _registry.AUTO if name not in last), *last)
 
 

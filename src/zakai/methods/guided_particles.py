@@ -13,7 +13,8 @@ from zakai.densities import ParticleDensity
 from zakai.errors import InputError
 from zakai.methods._options import real_number, whole_number
 from zakai.methods._protocol import Method
-from zakai.methods.particles.filter import MOST_GROWTH, VARIANCE, Prepared, Rule, State, init, step
+from zakai.methods.particles.backward import BACKWARD
+from zakai.methods.particles.filter import MOST_GROWTH, VARIANCE, Prepared, Rule, State, init, reduced, step
 from zakai.methods.particles.system import system_of
 from zakai.methods.particles.validity import valid
 from zakai.models import features
@@ -98,6 +99,8 @@ METHOD: Method[Prepared, State] = Method(
     bounds=BOUNDS,
     differentiable=False,
     valid=valid,
+    backward=BACKWARD,
+    reduced=reduced,
     shorter="raise the tolerance",
     handles=frozenset(
         {

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai.methods.particles.programs import Array
-from zakai.numerics.particles.population import merge, spread
+from zakai.numerics.particles.population import lineage
 
 DEPTH = 16  # resamplings that are looked back
 LAG = 6  # resamplings after which a generation's share of the variance of the log-likelihood is settled
@@ -79,36 +79,29 @@ class Variances(NamedTuple):
 
 def variances(genealogy: Genealogy, weights: Array, deviations: Array) -> Variances:
     """Return the variances of the weighted means of deviations (n, N) from the mean."""
-    n, count = deviations.shape
-    mass, sums = weights, np.ascontiguousarray((deviations * weights).T)
-    alive, out = np.arange(count, dtype=np.int32), np.empty(n)
-    means, evidence, families = list[Array](), list[float](), list[float]()
-    later, size = 0.0, count
-
-    def add(alive: Array, mass: Array, sums: Array, size: int, noise: float) -> None:
-        square, number = spread(alive, mass, sums, out)
-        means.append(np.asarray(size / max(size - 1, 1) * out))
-        evidence.append(square - 1.0 / size - noise)
-        families.append(number)
-
-    add(alive, mass, sums, count, 0.0)
-    for back in range(1, min(genealogy.age, DEPTH) + 1):
-        size = genealogy.sizes[-back]
-        older_mass, older_sums = np.zeros(size), np.zeros((size, n))
-        merge(genealogy.parents[-back], mass, sums, older_mass, older_sums, alive)
-        later += genealogy.rounding[-back]
-        mass, sums = older_mass, older_sums
-        add(alive, mass, sums, size, later)
+    count = deviations.shape[1]
+    lags = min(genealogy.age, DEPTH)
+    recent = [genealogy.parents[-back] for back in range(1, lags + 1)]
+    sizes, noise = [count, *(genealogy.sizes[-back] for back in range(1, lags + 1))], [0.0]
+    for back in range(1, lags + 1):
+        noise.append(noise[-1] + genealogy.rounding[-back])
+    parts = [_lineage(recent, sizes, noise, weights, deviations)]
     if genealogy.age > DEPTH:
-        alive, size = np.arange(count, dtype=np.int32), genealogy.first
-        older_mass, older_sums = np.zeros(size), np.zeros((size, n))
-        merge(genealogy.founders, weights, np.ascontiguousarray((deviations * weights).T), older_mass, older_sums, alive)
-        add(alive, older_mass, older_sums, size, genealogy.all_rounding)
+        last = _lineage([genealogy.founders], [count, genealogy.first], [0.0, genealogy.all_rounding], weights, deviations)
+        parts.append(Variances(*(part[1:] for part in last)))
     else:
-        means.append(means[-1])
-        evidence.append(evidence[-1])
-        families.append(families[-1])
-    return Variances(np.array(means), np.array(evidence), np.array(families))
+        parts.append(Variances(*(part[-1:] for part in parts[0])))
+    return Variances(*(np.concatenate(rows) for rows in zip(*parts, strict=True)))
+
+
+def _lineage(
+    parents: list[Array], sizes: list[int], noise: list[float], weights: Array, deviations: Array
+) -> Variances:
+    """Return the variances by generation."""
+    found = Variances(np.empty((len(sizes), len(deviations))), np.empty(len(sizes)), np.empty(len(sizes)))
+    flat = np.concatenate([*parents, _NONE])
+    lineage(flat, np.array(sizes), weights, deviations, np.array(noise), *found)
+    return found
 
 
 def of_log_likelihood(genealogy: Genealogy, found: Variances) -> tuple[Genealogy, float]:

@@ -44,22 +44,22 @@ MOST_LEVELS = 60
 FEW_FAMILIES = 20  # of the oldest generation that is looked back to, below which they are too few to show their spread
 # Standard error of a mean times sqrt(N) in standard deviations (1 for independent draws) from which the past is moved.  A move
 # costs as much as the intervals of its window: it waits until the squares of these figures, in units of that of `MOVE_ABOVE`,
-# add up to this share of the intervals of the last move.
-MOVE_ABOVE, MOVE_SHARE = 2.5, 0.4
+# add up to this share of the intervals of the last move.  What a move leaves is counted as the unit where it is more, for moves
+# cannot lower it: the figure must exceed it by `MOVE_GAIN`, and it is forgotten at a rate.
+MOVE_ABOVE, MOVE_SHARE, MOVE_GAIN, FORGOTTEN = 2.5, 0.4, 3.0, 0.98
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4)  # power, change, most sweeps, rho
-GAIN = 0.7  # of the largest variance by a move, above which moves are waited for twice as long
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
-SURE, TRUSTED = 0.5, 4  # share of the allowed time error below which its measurement is trusted in so many more intervals
+SURE, TRUSTED = 0.5, 8  # share of the allowed time error below which its measurement is trusted in so many more intervals
 
 
 class Control(NamedTuple):
     """What decides the next step beside the particles.
 
-    `interval` counts intervals; `substeps` per unit time, whose `error` was measured in an interval of this `length` and is
-    trusted in so many more that are no longer; `variance` of a mean times N, `last` intervals of the window at the last move,
-    `urgency` what has added up since then, `wait` how many times the usual waiting, and `doubtful_until` the number of
-    resamplings until which standard errors are lower bounds.
+    `interval` counts intervals; `substeps` per unit time with `stages`, whose `error` was measured in an interval of this
+    `length` and is trusted in so many more; `variance` of a mean times N, `last` intervals of the window at
+    the last move, `urgency` what has added up since then, `floor` what it has left, and `doubtful_until` the
+    number of resamplings until which standard errors are lower bounds.
     """
 
     interval: int
@@ -71,7 +71,7 @@ class Control(NamedTuple):
     variance: float
     last: int
     urgency: float
-    wait: float
+    floor: float
     doubtful_until: int
 
 
@@ -150,8 +150,15 @@ def init(prepared: Prepared, prior: Any) -> State:
     terms = len(prepared.motion.law[3])
     window = Window.begin(particles, first, gaussian, (width, terms))
     logs = np.full(count, -np.log(count))
-    control = Control(0, 0.0, 4, np.inf, 0.0, 0, VARIANCE, 0, 0.0, 1.0, 0)
+    control = Control(0, 0.0, 4, np.inf, 0.0, 0, VARIANCE, 0, 0.0, 0.0, 0)
     return State(particles, logs, window, Genealogy.begin(count), control, np.zeros(n), np.zeros(n))
+
+
+def reduced(state: State) -> State:
+    """Return a state with its particles, without their past."""
+    nothing = np.zeros((len(state.particles), 0))
+    window = Window.begin(nothing, np.zeros((0, 0)), (np.zeros(0), np.zeros((0, 0))), (0, 0))
+    return state._replace(window=window, genealogy=Genealogy.begin(0))
 
 
 def moments(particles: Array, weights: Array, angles: Array) -> tuple[Array, Array, Array]:
@@ -241,21 +248,21 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     found = variances(cloud.genealogy, weights, deviations)
     doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
     acceptance, moved = done.acceptance, 0.0
-    wait, last = control.wait, control.last
+    last, floor = control.last, max(FORGOTTEN * control.floor, 1.0 / MOVE_GAIN)
     factor = _excess(found.largest, cov, len(weights))
-    urgency = control.urgency + factor
-    if factor > 1.0 and urgency >= MOVE_SHARE * wait * last and cloud.window.width:
+    urgency = control.urgency + factor / max(floor, 1.0)
+    if factor > MOVE_GAIN * floor and urgency >= MOVE_SHARE * last and cloud.window.width:
         cloud, acceptance, doubtful_move = _moved(prepared, cloud, weights, number)
         weights = np.exp(cloud.logs)
         mean, deviations, cov = moments(cloud.particles, weights, angles)
         found = variances(cloud.genealogy, weights, deviations)
-        ratio = _excess(found.largest, cov, len(weights)) / factor
-        wait, last, urgency, moved = 2 * wait if ratio > GAIN else max(1.0, 0.5 * wait), cloud.window.length, 0.0, 1.0
+        floor = _excess(found.largest, cov, len(weights))
+        last, urgency, moved = cloud.window.length, 0.0, 1.0
         doubtful = doubtful or doubtful_move
     spread = np.sqrt(np.maximum(np.diag(cov), 0.0))
     # What the data says of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
     contraction = np.minimum(1.0, spread / np.maximum(done.predicted, 1e-300)) ** 2
-    shift = (state.shift + steps.shift) * contraction
+    shift = (_carried(motion, events, before, state.shift) + steps.shift) * contraction
     genealogy, evidence = of_log_likelihood(cloud.genealogy, found)
     cloud = cloud._replace(genealogy=genealogy)
     positive = np.where(spread > 0, spread, np.inf)
@@ -268,7 +275,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "largest_weight": largest,
         "tempering_levels": float(done.levels),
         "acceptance": acceptance,
-        "time_error": float((shift / positive).max()),
+        "time_error": float((np.abs(shift) / positive).max()),
         "monte_carlo_error": float(np.sqrt(share.max())),
         "log_likelihood_error": float(np.sqrt(evidence)),
         "lower_bound": float(doubtful or cloud.genealogy.age < until or found.families[-2] < FEW_FAMILIES),
@@ -278,7 +285,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     info = Info(done.gained, mean, cov, health, np.sqrt(found.largest + shift**2), float(np.sqrt(evidence)))
     variance = 0.8 * control.variance + 0.2 * len(weights) * float(share.mean())
     control = control._replace(
-        interval=number, variance=variance, last=last, urgency=urgency, wait=wait, doubtful_until=until
+        interval=number, variance=variance, last=last, urgency=urgency, floor=floor, doubtful_until=until
     )
     return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, steps.shift), info
 
@@ -292,8 +299,11 @@ def _steps(
     guess = max(1, round(control.substeps * length))
     if length <= 0:
         return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0), control
-    if control.trusted and length <= control.length * (1.0 + 1e-9):
-        return Steps(Scheme(guess, control.stages), state.last_shift, control.error), control._replace(trusted=control.trusted - 1)
+    # The error of an interval is of the third order of its length.
+    ratio = (length / control.length) ** 3 if control.trusted else np.inf
+    if control.error * ratio <= SURE * TIME_ERROR:
+        known = Steps(Scheme(guess, control.stages), state.last_shift, control.error)
+        return known, control._replace(trusted=control.trusted - 1)
     key = prepared.key(control.interval + 1, PILOT)
     chosen = np.empty(PILOTS, np.int32)
     systematic(np.exp(state.log_weights), uniform_number(key), chosen)
@@ -305,6 +315,15 @@ def _steps(
         substeps=scheme.substeps / length, stages=scheme.stages, error=found.error, length=length, trusted=trusted
     )
     return found, changed
+
+
+def _carried(motion: Motion, events: Events, mean: Array, shift: Array) -> Array:
+    """Return a shift of the mean (n,) after an interval without noise."""
+    if not shift.any():
+        return shift
+    pair, _ = motion.advanced(events, np.column_stack([mean, mean + shift]), np.zeros((events.width, 2)))
+    found = pair[:, 1] - pair[:, 0]
+    return np.where(np.isfinite(found), found, shift)
 
 
 def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed:

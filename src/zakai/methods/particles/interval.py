@@ -268,7 +268,7 @@ def noise_about_middle(A: Array, G: Array, length: float) -> Array:
 
 
 class Steps(NamedTuple):
-    """The scheme of an interval, the shift (n,) of the mean that it leaves, and that in standard deviations."""
+    """The scheme of an interval, the shift (n,) of the mean that it leaves, and its error in standard deviations."""
 
     scheme: Scheme
     shift: Array
@@ -276,7 +276,7 @@ class Steps(NamedTuple):
 
 
 class Pilots(NamedTuple):
-    """What the time step is measured with: states (n, PILOTS), the mean (n,), deviations (n,), and a whole number for the noise."""
+    """What measures the time step: states (n, PILOTS), their mean (n,), deviations (n,), and a whole number for the noise."""
 
     states: Array
     mean: Array
@@ -295,16 +295,15 @@ def steps_of(motion: Motion, interval: Interval, values: Array, pilots: Pilots, 
         guess: the first number of substeps to try.
     """
     n, count = motion.system.n, max(1, guess)
-    shift = np.full(n, np.inf)
+    shift, error = np.full(n, np.nan), np.inf
     for turn in range(4):
         found = _time_errors(motion, interval, values, pilots._replace(key=pilots.key + turn), count)
-        fewer, shift = found
-        if not np.isfinite(shift).all():
+        (other, fewer), (error, shift) = found
+        if not np.isfinite(error):
             if count >= MOST_SUBSTEPS:
                 break
             count = min(4 * count, MOST_SUBSTEPS)
             continue
-        error, other = (float((one / pilots.scale).max()) for one in (shift, fewer))
         wanted = int(np.clip(np.ceil(count * np.sqrt(error / TIME_ERROR)), 1, MOST_SUBSTEPS))
         if wanted < count:
             wanted = max(wanted, (count + 1) // 2)
@@ -313,14 +312,17 @@ def steps_of(motion: Motion, interval: Interval, values: Array, pilots: Pilots, 
             return Steps(Scheme(wanted, 2), fewer * reduced, other * reduced)
         if wanted <= 2 * count:
             return Steps(Scheme(wanted, 4), shift * reduced, error * reduced)
-        count, shift = wanted, shift * reduced
-    return Steps(Scheme(count, 4), shift, float((shift / pilots.scale).max()))
+        count, shift, error = wanted, shift * reduced, error * reduced
+    return Steps(Scheme(count, 4), shift, error)
 
 
 def _time_errors(
     motion: Motion, interval: Interval, values: Array, pilots: Pilots, count: int
-) -> tuple[Array, Array]:
-    """Return the changes of means or deviations (n,) from `count` substeps to twice as many, times 4/3, for 2 and 4 stages."""
+) -> tuple[tuple[float, Array], tuple[float, Array]]:
+    """Return the errors of `count` substeps of 2 and of 4 stages, by the difference from twice as many, times 4/3.
+
+    The largest error of a mean or a deviation, in standard deviations, and the shift of the mean (n,).
+    """
     system, mean, scale = motion.system, pilots.mean, pilots.scale
     coarse, fine = (motion.events(interval, Scheme(k, 4), values, mean, scale) for k in (count, 2 * count))
     noise = np.empty((fine.width, pilots.states.shape[1]))
@@ -330,17 +332,19 @@ def _time_errors(
     centred = y - y.mean(axis=1, keepdims=True)
     spread = np.maximum(centred.std(axis=1), 1e-300)
 
-    def change(stages: int) -> Array:
+    def change(stages: int) -> tuple[float, Array]:
         places = coarse.places.copy()
         places[:, 2] = stages
         x, gained = motion.advanced(coarse._replace(places=places), pilots.states, shared)
-        d, weight = y - x, finer - gained
+        d, weight = x - y, gained - finer
         if system.angles.any():
             d[system.angles] = np.remainder(d[system.angles] + np.pi, 2 * np.pi) - np.pi
-        parts = (d, d * centred / spread[:, None], (weight - weight.mean()) * centred)
+        weighted = (weight - weight.mean()) * centred
+        parts = (d, d * centred / spread[:, None], weighted)
         # What the finite number of pilots adds to a mean of zero is subtracted.
         found = [np.maximum(part.mean(axis=1) ** 2 - part.var(axis=1) / part.shape[1], 0.0) for part in parts]
-        return np.asarray(np.sqrt(np.max(found, axis=0)) * 4 / 3)
+        largest = np.sqrt(np.max(found, axis=0)) / scale
+        return 4 / 3 * float(largest.max()), 4 / 3 * (d + weighted).mean(axis=1)
 
     return change(2), change(4)
 

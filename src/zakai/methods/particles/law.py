@@ -116,7 +116,10 @@ class Law:
                 S = self.noise(nowhere, t, theta, u) if self.fixed else np.eye(m)
                 shape = self._shapes(nowhere, t, theta, u)
             which = np.flatnonzero(seen)
-            P[np.ix_(which, which)] = np.linalg.inv(S[np.ix_(which, which)])
+            if self.coupled:
+                P[np.ix_(which, which)] = np.linalg.inv(S[np.ix_(which, which)])
+            else:
+                P[which, which] = 1.0 / S[which, which]
             for j in which:
                 if not (self.joint and j in self._gaussian):
                     c[j] = _constant(self.model.observation_family[j], values[j], S[j, j], shape[j])

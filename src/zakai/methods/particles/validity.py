@@ -58,7 +58,9 @@ def _window(prepared: Prepared, window: Window, count: int) -> bool:
         if events.roots.shape[:2] != (J, rows) or events.rows.shape != (J, 3) or not E:
             return False
         places = events.places
-        if places[:, 0].min() < -1 or places[:, 0].max() >= J or places[:, 1].min() < -1 or places[:, 1].max() > 0 or not np.isin(places[:, 2], (2, 4)).all():
+        if not np.isin(places[:, 2], (2, 4)).all():
+            return False
+        if places[:, 0].min() < -1 or places[:, 0].max() >= J or places[:, 1].min() < -1 or places[:, 1].max() > 0:
             return False
         first = np.cumsum(events.rows[:, 1:].sum(axis=1))
         if J and (events.rows.min() < 0 or events.rows[:, 1].max() > events.roots.shape[2]):

@@ -8,10 +8,10 @@ import numpy as np
 from numba import types
 
 from zakai.numerics.compiled import kernel
-from zakai.numerics.particles.formulas import F1, F2
+from zakai.numerics.particles.formulas import F1, F2, F3
 
 Array = Any
-I4 = types.int32[::1]
+I4, I8 = types.int32[::1], types.int64[::1]
 
 
 @kernel(types.void(F1, types.float64, I4))
@@ -28,46 +28,100 @@ def systematic(weights: Array, offset: float, out: Array) -> None:
         j += 1
 
 
-@kernel(types.void(I4, F1, F2, F1, F2, I4))
-def merge(parents: Array, mass: Array, sums: Array, older_mass: Array, older_sums: Array, alive: Array) -> None:
-    """Add masses (N,) and sums (N, n) of the particles `alive` to their ancestors', and write the ancestors that are alive.
+@kernel(types.void(I4, I8, F1, F2, F1, F2, F1, F1))
+def lineage(parents: Array, sizes: Array, weights: Array, deviations: Array, rounding: Array, means: Array, evidence: Array,
+            families: Array) -> None:  # fmt: skip
+    """Write the variances of means (lags, n) and of the log evidence (lags,), and the number of families, by generation.
 
-    `alive` begins with the numbers of the particles, up to the first that is negative; `older_mass` (M,) and `older_sums` (M, n)
-    are zero for all ancestors before.
+    Args:
+        parents: the ancestors of one generation after the other, newest first.
+        sizes: the particles now, then those of each earlier generation (lags,).
+        weights: of the particles (N,).
+        deviations: of the particles from their mean (n, N).
+        rounding: what resampling adds to the spread of the masses until each generation (lags,).
+        means: receives the variances of the means.
+        evidence: receives those of the log evidence.
+        families: receives the numbers of families.
     """
-    kept = 0
-    for place in range(alive.size):
-        f = alive[place]
-        if f < 0:
-            break
-        if mass[f] == 0.0:
-            continue
-        parent = parents[f]
-        if older_mass[parent] == 0.0:
-            alive[kept] = parent
-            kept += 1
-        older_mass[parent] += mass[f]
-        for d in range(sums.shape[1]):
-            older_sums[parent, d] += sums[f, d]
-    if kept < alive.size:
-        alive[kept] = -1
+    n, most, first = deviations.shape[0], sizes.max(), 0
+    mass, sums = weights.copy(), np.empty((most, n))
+    older_mass, older_sums = np.empty(most), np.empty((most, n))
+    alive, count = np.empty(weights.size, np.int32), 0
+    for i in range(weights.size):
+        if weights[i] > 0.0:
+            alive[count] = i
+            count += 1
+        for d in range(n):
+            sums[i, d] = weights[i] * deviations[d, i]
+    for lag in range(sizes.size):
+        if lag:
+            kept = 0
+            for place in range(count):
+                older_mass[parents[first + alive[place]]] = 0.0
+            for place in range(count):
+                f = alive[place]
+                parent = parents[first + f]
+                if older_mass[parent] == 0.0:
+                    alive[kept] = parent
+                    kept += 1
+                    for d in range(n):
+                        older_sums[parent, d] = 0.0
+                older_mass[parent] += mass[f]
+                for d in range(n):
+                    older_sums[parent, d] += sums[f, d]
+            first += sizes[lag - 1]
+            count = kept
+            mass, older_mass = older_mass, mass
+            sums, older_sums = older_sums, sums
+            if older_mass.size < most:
+                older_mass = np.empty(most)
+        square, factor = 0.0, sizes[lag] / max(sizes[lag] - 1, 1)
+        for d in range(n):
+            means[lag, d] = 0.0
+        for place in range(count):
+            f = alive[place]
+            square += mass[f] * mass[f]
+            for d in range(n):
+                means[lag, d] += factor * sums[f, d] * sums[f, d]
+        evidence[lag] = square - 1.0 / sizes[lag] - rounding[lag]
+        families[lag] = count
 
 
-@kernel(types.UniTuple(types.float64, 2)(I4, F1, F2, F1))
-def spread(alive: Array, mass: Array, sums: Array, out: Array) -> tuple[float, float]:
-    """Return the sum of squared masses of families and their number, and write the sums (n,) of the squares of their sums."""
-    total, count = 0.0, 0.0
-    for d in range(out.size):
-        out[d] = 0.0
-    for place in range(alive.size):
-        f = alive[place]
-        if f < 0:
-            break
-        count += 1.0
-        total += mass[f] * mass[f]
-        for d in range(out.size):
-            out[d] += sums[f, d] * sums[f, d]
-    return total, count
+@kernel(types.void(F2, F2, F3, F1, F1, F1, I4))
+def backward_draws(later: Array, centres: Array, whiten: Array, logs: Array, period: Array, uniforms: Array, out: Array) -> None:
+    """Write for each later state (n, M) one of N candidates (M,), drawn with the weights exp(logs) N(later; centre, covariance).
+
+    `whiten` (N, n, n) are the inverses of Cholesky's factors of the covariances, `logs` (N,) contain their determinants, and
+    `period` (n,) is that of an angle, else zero.
+    """
+    n, count = centres.shape
+    found, d = np.empty(count), np.empty(n)
+    for j in range(later.shape[1]):
+        top = -np.inf
+        for i in range(count):
+            value = logs[i]
+            for a in range(n):
+                d[a] = later[a, j] - centres[a, i]
+                if period[a] > 0.0:
+                    d[a] -= period[a] * np.floor(d[a] / period[a] + 0.5)
+            for a in range(n):
+                w = 0.0
+                for b in range(a + 1):
+                    w += whiten[i, a, b] * d[b]
+                value -= 0.5 * w * w
+            found[i] = value
+            top = max(top, value)
+        total = 0.0
+        for i in range(count):
+            found[i] = np.exp(found[i] - top) if top > -np.inf else 1.0
+            total += found[i]
+        rest, place = uniforms[j] * total, count - 1
+        for i in range(count):
+            rest -= found[i]
+            if rest <= 0.0:
+                place = i
+                break
+        out[j] = place
 
 
 def normalised(logs: Array) -> tuple[Array, float]:
