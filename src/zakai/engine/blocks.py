@@ -12,6 +12,7 @@ from zakai.algebra.choice import Division, listed_blocks
 from zakai.algebra.independent import IndependentBlock
 from zakai.densities import Density, ProductDensity
 from zakai.densities.product import renamed
+from zakai.engine.lengths import INCREMENT_LAW
 from zakai.engine.loop import KEPT_BYTES, Run
 from zakai.engine.results import FilterResult
 from zakai.engine.versions import versions
@@ -44,7 +45,7 @@ def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> Filt
         mean[:, block.states], variance[:, block.states] = part.mean, part.variance
         increments += part.log_likelihood_increments
         for name, values in part.health.items():
-            worse = np.fmin if name in SMALLEST_IS_WORST else np.fmax
+            worse = np.fmin if name in SMALLEST_IS_WORST else np.add if name == INCREMENT_LAW else np.fmax
             health[name] = worse(health[name], values) if name in health else values
         for name, bound in part.bounds.items():
             bounds[name] = min(bound, bounds.get(name, bound))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities import Density
-from zakai.engine.lengths import notes_on_lengths
+from zakai.engine.lengths import distances_of_lengths, notes_on_lengths
 from zakai.engine.misfit import notes_on_law
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
@@ -113,7 +113,7 @@ class Feed:
         (values, seen, elapsed), stop = moment.observed, np.array([moment.time])
         schedule = Schedule(stop - moment.length, stop, np.array([seen]), np.array([elapsed]), moment.inputs)
         model, theta, infos = self.setting.model, self.setting.theta.real, stacked([moment.info])
-        lengths = notes_on_lengths(model, theta, schedule, infos)
+        lengths = notes_on_lengths(schedule, distances_of_lengths(model, theta, schedule, infos))
         return (*moment.notes, *lengths, *notes_on_law(model, theta, schedule, np.array([values]), infos))
 
     def density(self, moment: Moment) -> Density:
