@@ -12,7 +12,6 @@ from zakai.algebra.choice import Division, listed_blocks
 from zakai.algebra.independent import IndependentBlock
 from zakai.densities import Density, ProductDensity
 from zakai.densities.product import renamed
-from zakai.engine.lengths import INCREMENT_LAW
 from zakai.engine.loop import KEPT_BYTES, Run
 from zakai.engine.results import FilterResult
 from zakai.engine.versions import versions
@@ -45,11 +44,12 @@ def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> Filt
         mean[:, block.states], variance[:, block.states] = part.mean, part.variance
         increments += part.log_likelihood_increments
         for name, values in part.health.items():
-            worse = np.fmin if name in SMALLEST_IS_WORST else np.add if name == INCREMENT_LAW else np.fmax
+            worse = np.fmin if name in SMALLEST_IS_WORST else np.fmax
             health[name] = worse(health[name], values) if name in health else values
         for name, bound in part.bounds.items():
             bounds[name] = min(bound, bounds.get(name, bound))
     kept = all(part.has_densities for part in parts)
+    lost = [part.increment_law_error for part in parts if part.increment_law_error is not None]
     return FilterResult(
         times=parts[0].times,
         mean=mean,
@@ -65,6 +65,7 @@ def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> Filt
         state=model.state,
         attributes={**{key: _all_of(parts, key) for key in ("source", "exactness")}, **versions()},
         blocks=tuple(parts),
+        increment_law_error=np.sum(lost, axis=0) if lost else None,
         _density=_Densities(model, blocks, runs) if kept else None,
         _no_density=_no_density(runs),
     )

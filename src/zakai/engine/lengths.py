@@ -28,12 +28,7 @@ from zakai.models.numeric import numpy_function
 from zakai.records.schedule import Schedule
 
 Array = NDArray[np.float64]
-INCREMENT_LAW = "increment_law_error"  # the health figure of the sum over a record
-BOUND = (
-    1.0,
-    "nats by which the log-likelihood so far falls short of that of the exact law of the increments, since y is taken as linear "
-    "between observations; give shorter intervals",
-)
+MATTERS = 1.0  # nats of a record that a result reports: a likelihood that is wrong by a factor of e
 STEP = 1e-3  # of the standard deviations, for the slopes of h
 DIFFERS = 0.2  # standard deviations, or nats of an interval, that a result reports
 
@@ -54,6 +49,23 @@ def notes_on_lengths(schedule: Schedule, distances: tuple[Array, Array]) -> list
         f"y is taken as linear between observations, but h changes {where} so much that the exact law of the increments differs, "
         f"means by up to about {_size(means)} standard deviations, the log-likelihood of an interval by about {_size(nats)}: "
         f"give shorter intervals"
+    ]
+
+
+def notes_on_increments(times: Array, lost: Array | None) -> list[str]:
+    """Return a sentence where the intervals of a record together lose more than a nat.
+
+    Args:
+        times: The times (K + 1,) of a result.
+        lost: The nats (K + 1,) that are lost up to these times, None for samples.
+    """
+    if lost is None or not lost[-1] > MATTERS:
+        return []
+    first = times[np.argmax(lost > MATTERS)]
+    return [
+        f"y is taken as linear between observations: the log-likelihood falls short of that of the exact law of the increments "
+        f"by about {lost[-1]:.2g} nats in all (increment_law_error, more than {MATTERS:g} from t = {first:.12g} on); give shorter "
+        "intervals"
     ]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.health_warnings import warnings_of_run
-from zakai.engine.lengths import BOUND, INCREMENT_LAW, distances_of_lengths, notes_on_lengths
+from zakai.engine.lengths import distances_of_lengths, notes_on_lengths
 from zakai.engine.misfit import notes_on_law
 from zakai.engine.notes import (
     notes_on_angles,
@@ -195,23 +195,21 @@ class Run:
         cov = np.concatenate([first_cov[None], infos.cov])
         kept = len(self.states) == len(self.schedule) + 1
         distances = distances_of_lengths(model, self.setting.theta.real, self.schedule, infos)
-        figures, bounds = dict(infos.health), {name: bound for name, bound in method.bounds.items() if name in infos.health}
-        if model.observation_kind != "samples":
-            figures[INCREMENT_LAW], bounds[INCREMENT_LAW] = np.cumsum(distances[1]), BOUND
         result = FilterResult(
             times=np.concatenate([[model.start], self.record.times]),
             mean=np.concatenate([first_mean[None], infos.mean]),
             variance=np.diagonal(cov, axis1=1, axis2=2),
             log_likelihood_increments=np.concatenate([[0.0], infos.log_likelihood_increment]),
-            health={name: np.concatenate([[np.nan], values]) for name, values in figures.items()},
+            health={name: np.concatenate([[np.nan], values]) for name, values in infos.health.items()},
             warnings=[],
             method=method.name,
             why=why,
             model=model,
             record=self.record,
             conditions=considered,
-            bounds=bounds,
+            bounds={name: bound for name, bound in method.bounds.items() if name in infos.health},
             state=model.state,
+            increment_law_error=None if model.observation_kind == "samples" else np.cumsum(np.append(0.0, distances[1])),
             attributes={"source": method.source, "exactness": method.exactness, **versions()},
             _cov=cov,
             _density=self.density if kept else None,
