@@ -63,8 +63,8 @@ def notes_on_increments(times: Array, lost: Array | None) -> list[str]:
         return []
     first = times[np.argmax(lost > MATTERS)]
     return [
-        f"y is taken as linear between observations: the log-likelihood falls short of that of the exact law of the increments "
-        f"by about {lost[-1]:.2g} nats in all (increment_law_error, more than {MATTERS:g} from t = {first:.12g} on); give shorter "
+        "y is taken as linear between observations: the log-likelihood falls short of that of the exact law of the increments by "
+        f"about {lost[-1]:.2g} nats in all (increment_law_error, more than {MATTERS:g} from t = {first:.12g} on); give shorter "
         "intervals"
     ]
 
