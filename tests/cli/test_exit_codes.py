@@ -70,7 +70,7 @@ def test_a_system_for_which_the_method_does_not_hold_is_code_3_and_says_what_fai
     names = ["a", "b", "c", "d", "e"]
     drift = [f"cos({name})" for name in (*names[1:], names[0])]
     prior = {"kind": "gaussian", "mean": [0.0] * 5, "cov": [[float(i == j) for i in range(5)] for j in range(5)]}
-    keys = {"state": names, "drift": drift, "observation": ["a**3"], "prior": prior}
+    keys = {"state": names, "drift": drift, "observation": ["a**3"], "observation_kind": "increments", "prior": prior}
     (tmp_path / "five.toml").write_text(Model(**keys).to_toml())
     answer = zakai("filter", "five.toml", "record.csv", "-o", "result.nc", "--method", "yau-yau")
     assert answer.code == 3

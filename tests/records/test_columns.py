@@ -30,7 +30,7 @@ def test_names_of_observations_are_the_states_else_y1_y2():
     assert model_of(["x", "x"]).observation_names == ("y1", "y2")
     assert model_of(observation_names=["range", "bearing"]).observation_names == ("range", "bearing")
     states = zakai.Model(state=["y1", "y2"], drift=["0", "0"], observation=["y2", "y1"])
-    assert states.observation_names == ("y1", "y2")  # a file of ours has y1 for the first observation
+    assert states.observation_names == ("y1", "y2")  # a file of zakai simulate has y1 for the first observation
     custom = zakai.Model(
         state=["x"], drift=["-x"], observation_kind="samples", observation_log_density="-(z - x)**2", observed=["z"]
     )

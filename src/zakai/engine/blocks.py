@@ -54,6 +54,7 @@ def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> Filt
             bounds[name] = min(bound, bounds.get(name, bound))
     random = any(part.mean_standard_error is not None for part in parts)
     kept = all(part.has_densities for part in parts)
+    lost = [part.increment_law_error for part in parts if part.increment_law_error is not None]
     return FilterResult(
         times=parts[0].times,
         mean=mean,
@@ -71,6 +72,7 @@ def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> Filt
         blocks=tuple(parts),
         mean_standard_error=errors if random else None,
         log_likelihood_standard_error=squares**0.5 if random else None,
+        increment_law_error=np.sum(lost, axis=0) if lost else None,
         _density=_Densities(model, blocks, runs) if kept else None,
         _no_density=_no_density(runs),
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from zakai.densities import Density
 from zakai.engine.along_path import along_path
-from zakai.engine.lengths import notes_on_lengths
+from zakai.engine.lengths import distances_of_lengths, notes_on_lengths
 from zakai.engine.misfit import notes_on_law
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
@@ -116,7 +116,7 @@ class Feed:
         theta, infos = self.setting.theta.real, stacked([moment.info])
         path = getattr(moment.state, "path", None)
         model, schedule = along_path(self.setting.model, schedule, np.array([values]), None if path is None else path - values)
-        lengths = notes_on_lengths(model, theta, schedule, infos)
+        lengths = notes_on_lengths(schedule, distances_of_lengths(model, theta, schedule, infos))
         return (*moment.notes, *lengths, *notes_on_law(model, theta, schedule, np.array([values]), infos))
 
     def density(self, moment: Moment) -> Density:

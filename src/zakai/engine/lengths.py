@@ -12,6 +12,8 @@ change h by D within an interval, the log-likelihood is too small by d D'S^-1 D 
     d |P^1/2 H'S^-1 D| / 12
 
 standard deviations, where P is the covariance of the filter, and by the change of that loss over a standard deviation.
+
+The losses of the log-likelihood have one sign, and add up over a record.
 """
 
 from __future__ import annotations
@@ -26,21 +28,19 @@ from zakai.models.numeric import numpy_function
 from zakai.records.schedule import Schedule
 
 Array = NDArray[np.float64]
+MATTERS = 1.0  # nats of a record that a result reports: a likelihood that is wrong by a factor of e
+STEP = 1e-3  # of the standard deviations, for the slopes of h
 DIFFERS = 0.2  # standard deviations, or nats of an interval, that a result reports
 
 
-def notes_on_lengths(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> list[str]:
+def notes_on_lengths(schedule: Schedule, distances: tuple[Array, Array]) -> list[str]:
     """Return a sentence on the intervals for which one of the formulas above exceeds 0.2, if there are any.
 
     Args:
-        model: The model.
-        theta: The parameters (p,).
         schedule: The K intervals.
-        infos: What the filter reports at their ends.
+        distances: What `distances_of_lengths` returns.
     """
-    if model.observation_kind == "samples" or not len(schedule):
-        return []
-    means, nats = _distances(model, theta, schedule, infos)
+    means, nats = distances
     over = np.maximum(means, nats) > DIFFERS
     if not over.any():
         return []
@@ -52,16 +52,42 @@ def notes_on_lengths(model: Model, theta: Array, schedule: Schedule, infos: Info
     ]
 
 
+def notes_on_increments(times: Array, lost: Array | None) -> list[str]:
+    """Return a sentence where the intervals of a record together lose more than a nat.
+
+    Args:
+        times: The times (K + 1,) of a result.
+        lost: The nats (K + 1,) that are lost up to these times, None for samples.
+    """
+    if lost is None or not lost[-1] > MATTERS:
+        return []
+    first = times[np.argmax(lost > MATTERS)]
+    return [
+        "y is taken as linear between observations: the log-likelihood falls short of that of the exact law of the increments by "
+        f"about {lost[-1]:.2g} nats in all (increment_law_error, more than {MATTERS:g} from t = {first:.12g} on); give shorter "
+        "intervals"
+    ]
+
+
 def _size(distances: Array) -> str:
     return f"{distances.max():.1g}" if distances.max() < 1 else "1 or more"
 
 
-def _distances(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> tuple[Array, Array]:
-    """Return by how much means (K,), in standard deviations, and log-likelihoods (K,) of the intervals differ."""
+def distances_of_lengths(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> tuple[Array, Array]:
+    """Return by how much means (K,), in standard deviations, and log-likelihoods (K,) of the intervals differ.
+
+    Args:
+        model: The model.
+        theta: The parameters (p,).
+        schedule: The K intervals.
+        infos: What the filter reports at their ends.
+    """
     n, m = model.n, model.m
+    if model.observation_kind == "samples" or not len(schedule):
+        return np.zeros(len(schedule)), np.zeros(len(schedule))
     f, h, G, S = kept(
         model,
-        _distances,
+        distances_of_lengths,
         lambda: (
             numpy_function(model.drift, model),
             numpy_function(model.observation, model),
@@ -89,4 +115,23 @@ def _distances(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> 
         noise /= 1.0 + rate * length / 3.0
         pull = length * np.einsum("ka,kab,ikb->ik", change[0], precision, seen[1 : n + 1] - seen[n + 1 :]) / 24.0
         means = noise + np.linalg.norm(np.abs(pull) + np.abs(motion[1 : n + 1] - motion[n + 1 :]) / 2.0, axis=0)
-        return np.nan_to_num(means, posinf=0.0), np.nan_to_num(noise + motion[0], posinf=0.0)
+
+        def loss(x: Array) -> Array:
+            """Return the nats (K,) that an interval loses if its state is x (K, n) at the end."""
+            steps = np.einsum("ki,ij->ikj", STEP * reach, np.eye(n))
+            after = h(x, times, theta, u)
+            change = after - h(x - f(x, times, theta, u) * (length / (1.0 + rate * length))[:, None], times - length, theta, u)
+            change = np.where(inside > 0.0, change, 0.0)
+            ahead, behind = h(x + steps, times, theta, u), h(x - steps, times, theta, u)
+            slopes = inside * (ahead - behind) / (2.0 * STEP * reach.T[:, :, None])
+            noise = np.einsum("ika,kij,kab,jkb->k", slopes, G(x, times, theta, u), precision, slopes)
+            by_motion = length / 24.0 * np.einsum("ka,kab,kb->k", change, precision, change)
+            return np.asarray(noise / (12.0 + 4.0 * rate * length) + by_motion)
+
+        # -log E exp(-loss) over the density, by three Gauss-Hermite points along each axis.
+        centre = nats = loss(mean)
+        for axis in np.eye(n):
+            above, below = (loss(mean + side * np.sqrt(3.0) * reach * axis) - centre for side in (1.0, -1.0))
+            nats = nats - np.log((4.0 + np.exp(-above) + np.exp(-below)) / 6.0)
+        return np.nan_to_num(means, posinf=0.0), np.nan_to_num(nats, posinf=0.0)
+

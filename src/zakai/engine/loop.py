@@ -12,7 +12,7 @@ from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.along_path import along_path, record_along
 from zakai.engine.health_warnings import warnings_of_run
-from zakai.engine.lengths import notes_on_lengths
+from zakai.engine.lengths import distances_of_lengths, notes_on_lengths
 from zakai.engine.misfit import notes_on_law
 from zakai.engine.notes import (
     notes_on_angles,
@@ -220,6 +220,8 @@ class Run:
         infos = joined(self.parts)
         cov = np.concatenate([first_cov[None], infos.cov])
         kept = len(self.states) == len(self.schedule) + 1
+        theta, (noted, schedule) = self.setting.theta.real, self.noted
+        distances = distances_of_lengths(noted, theta, schedule, infos)
         result = FilterResult(
             times=np.concatenate([[model.start], self.record.times]),
             mean=np.concatenate([first_mean[None], infos.mean]),
@@ -234,6 +236,7 @@ class Run:
             conditions=considered,
             bounds={name: bound for name, bound in method.bounds.items() if name in infos.health},
             state=model.state,
+            increment_law_error=None if model.observation_kind == "samples" else np.cumsum(np.append(0.0, distances[1])),
             attributes={"source": method.source, "exactness": method.exactness, **versions()},
             mean_standard_error=_with_start(infos.mean_standard_error),
             log_likelihood_standard_error=_last(infos.log_likelihood_standard_error),
@@ -241,11 +244,10 @@ class Run:
             _density=self.density if kept else None,
             _no_density=self._no_density(),
         )
-        theta, (noted, schedule) = self.setting.theta.real, self.noted
         record = record_along(self.record, schedule)
         undefined = notes_on_formulas(noted, theta, record, result.mean, result.variance)
         undefined += notes_on_domain(noted, theta, record, result.mean, result.variance)
-        lengths = notes_on_lengths(noted, theta, schedule, infos)
+        lengths = notes_on_lengths(schedule, distances)
         misfit = notes_on_law(noted, theta, schedule, self.values, infos)
         result.warnings.extend([*undefined, *self.notes, *lengths, *misfit, *warnings_of_run(result)])
         return result

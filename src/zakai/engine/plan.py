@@ -14,6 +14,7 @@ from zakai.algebra.conditions import all_hold
 from zakai.algebra.independent import IndependentBlock
 from zakai.algebra.theorems import conditions_of, in_order
 from zakai.engine.blocks import joined_blocks, record_of_block
+from zakai.engine.lengths import notes_on_increments
 from zakai.engine.loop import KEPT_BYTES, Run
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import Setting
@@ -61,6 +62,7 @@ class Plan(NamedTuple):
             result = runs[0].result(self.why, self.considered)
         else:
             result = joined_blocks(self.model, self.division, runs)
+        result.warnings.extend(notes_on_increments(result.times, result.increment_law_error))
         result.origin = self, tuple(run.state for run in runs)
         return result
 

@@ -46,6 +46,9 @@ class FilterResult:
     elsewhere. `warnings` are sentences; none means that every bound was kept. `method` and `why` say which filter ran
     and on what grounds, `conditions` those of every method that was considered. Of a system that was filtered block by block
     `blocks` are the results of the blocks; `health` is the worst of theirs, and `cov` is put together when it is asked for.
+
+    `increment_law_error` (K+1,) are the nats by which the log-likelihood up to each time falls short of that of the exact law of
+    the increments, since y is taken as linear between observations; None for samples, and in a result that was read from a file.
     """
 
     times: np.ndarray
@@ -66,6 +69,7 @@ class FilterResult:
     origin: tuple[Plan, tuple[Any, ...]] | None = None
     mean_standard_error: np.ndarray | None = None
     log_likelihood_standard_error: float | None = None
+    increment_law_error: np.ndarray | None = None
     _cov: np.ndarray | None = None
     _density: Callable[[int], Density] | None = None
     _no_density: str = "the densities were not kept"

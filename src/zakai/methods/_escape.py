@@ -34,7 +34,7 @@ NEAR = 0.3  # the same of a pole that is not reached, in those of the prediction
 RARELY_NEAR = 1e-4  # share of paths that may come so near
 UNTIL = "between t = START and STOP"
 REFLECTING = ', boundary = "reflecting"'
-STEEP = 300.0  # growth of |f| or G over a thousandth of the distance from a pole, by which 1 / d is told from d^(-2/3)
+STEEP = 300.0  # growth of |f| or G over a thousandth of the distance from a pole, which separates 1 / d from d^(-2/3)
 EXACT = 1e-5  # by which kappa may miss its limit
 
 

@@ -16,7 +16,7 @@ Array = Any
 FAR = 1e30  # distance that counts as infinity, in units of the density or of the state, whichever is larger
 GROWTH = 0.06  # spacing relative to the distance from the density, or from a pole
 TIME_STEPS = 64  # the time of a passage has a relative spread of an eighth
-LARGEST = 1e150  # coefficient beyond which the square of a rate is no number
+LARGEST = 1e150  # coefficient beyond which the square of a rate overflows
 FASTEST = 1e12  # jumps in a time step: with more, rounding hides how many paths stay
 
 PATHS = 1024
