@@ -105,6 +105,9 @@ def plan_of(
     return Plan(model, division.blocks, settings, division.why, {}, division, (method, options))
 
 
+_LAST = "guided-particles"  # which keeps a prior no better than a grid does
+
+
 def _plan_of_whole(
     model: Model, prior: Any, method: str, options: Mapping[str, Any], unfit: Callable[[Setting], str] | None = None
 ) -> Plan:
@@ -121,7 +124,9 @@ def _plan_of_whole(
         order = in_order(model)
         later = order[order.index(name) + 1 :] if method == "auto" and not exact else ()
         others = [one for one in later if all_hold(conditions_of(one, model)) is True]
-        fault = ((unfit(setting) if unfit else "") or _fault_at_prior(setting)) if others else ""
+        fault = unfit(setting) if unfit and others else ""
+        if not fault and set(others) - {_LAST}:
+            fault = _fault_at_prior(setting)
         if not fault:
             whole = IndependentBlock(tuple(range(model.n)), tuple(range(model.m)), model.state, model, prior)
             return Plan(model, (whole,), (setting,), "; ".join([why, *lost]), considered)
