@@ -66,7 +66,7 @@ def test_auto_goes_on_where_a_method_loses_the_prior():
 
 def test_auto_leaves_a_method_that_loses_a_formula_s_density():
     model = zakai.Model(
-        state=["x", "y"], drift=["y - x", "-y"], observation=["x"],
+        state=["x", "y"], drift=["y - x", "-y"], observation=["x"], observation_kind="increments",
         prior={"kind": "density", "log_density": "-x**2/2 - y**2/2 + log(heaviside(x))"},
     )  # fmt: skip
     start = zakai.online(model)
@@ -77,7 +77,7 @@ def test_auto_leaves_a_method_that_loses_a_formula_s_density():
 @pytest.mark.parametrize("variance", [0.3, 30.0])
 def test_auto_keeps_the_first_method_for_an_angle_of_any_width(variance):
     model = zakai.Model(
-        state=["x"], drift=["1"], observation=["sin(x)", "cos(x)"], periodic=["x"],
+        state=["x"], drift=["1"], observation=["sin(x)", "cos(x)"], observation_kind="increments", periodic=["x"],
         prior={"kind": "gaussian", "mean": [3], "cov": [[variance]]},
     )  # fmt: skip
     assert zakai.online(model).method == "limited-direct"

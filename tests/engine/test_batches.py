@@ -34,7 +34,7 @@ def test_many_records_give_what_each_gives_alone_to_the_bit(method):
 
 
 def test_the_length_of_a_chunk_changes_no_bit():
-    model = zakai.Model(state=["x"], prior=GAUSSIAN, **SYSTEMS["kalman-bucy"])
+    model = zakai.Model(state=["x"], prior=GAUSSIAN, observation_kind="increments", **SYSTEMS["kalman-bucy"])
     times = np.cumsum(np.random.default_rng(0).uniform(0.001, 0.1, 2500))
     record = zakai.simulate(model, times, seed=1, substeps=1)[1]
     whole = zakai.filter(model, record, keep="moments")

@@ -175,9 +175,9 @@ def test_an_enormous_gap_is_filtered_or_refused_in_one_line_and_then_leaves_the_
 
 def test_an_option_that_needs_all_times_is_refused():
     with pytest.raises(zakai.InputError, match="one-shot"):
-        zakai.online(zakai.Model(**WALK), "hu-yau", form="one-shot")
+        zakai.online(zakai.Model(**WALK, observation_kind="increments"), "hu-yau", form="one-shot")
     with pytest.raises(zakai.InputError, match="no option"):
-        zakai.online(zakai.Model(**WALK), "kalman-bucy", points=3)
+        zakai.online(zakai.Model(**WALK, observation_kind="increments"), "kalman-bucy", points=3)
     with pytest.raises(zakai.InputError, match="Model"):
         zakai.online("gallery:benes")
 

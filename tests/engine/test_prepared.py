@@ -13,7 +13,14 @@ from zakai.records.checkpoint import read_checkpoint, write_checkpoint
 
 TIMES = np.concatenate([np.arange(1, 9) / 20, [0.5, 0.53, 0.6]])
 GAUSSIAN = {"kind": "gaussian", "mean": [0.3], "cov": [[2.0]]}
-LINEAR = dict(state=["x"], drift=["-a*x + sin(t)"], observation=["2*x"], parameters={"a": 0.5}, prior=GAUSSIAN)
+LINEAR = dict(
+    state=["x"],
+    drift=["-a*x + sin(t)"],
+    observation=["2*x"],
+    observation_kind="increments",
+    parameters={"a": 0.5},
+    prior=GAUSSIAN,
+)
 SPIRAL = dict(state=["x"], drift=["t*x/3"], observation=["x*sin(x)", "x*cos(x)"], prior=GAUSSIAN)
 CUBIC = dict(state=["x"], drift=["cos(x)"], observation=["x**3"], prior=GAUSSIAN)
 BENES = dict(state=["x"], drift=["tanh(x)"], observation=["x"], prior=GAUSSIAN)

@@ -12,7 +12,8 @@ import pytest
 import zakai
 from zakai._progress import bar
 
-MODEL = zakai.Model(state=["x"], drift=["-x"], observation=["x"], prior={"kind": "gaussian", "mean": [0], "cov": [[1]]})
+PRIOR = {"kind": "gaussian", "mean": [0], "cov": [[1]]}
+MODEL = zakai.Model(state=["x"], drift=["-x"], observation=["x"], observation_kind="increments", prior=PRIOR)
 RECORD = zakai.Record(0.01 * np.arange(1, 1001), np.zeros(1000))
 
 

@@ -16,7 +16,10 @@ PRIOR = {"kind": "gaussian", "mean": [0.0], "cov": [[1.0]]}
 
 @pytest.mark.parametrize(("noise", "reported"), [("1 + 9/10*sin(50*t)", True), ("1 + t/100", False), ("2", False)])
 def test_noise_that_varies_within_an_interval_is_reported_with_its_first_time(noise, reported):
-    model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], observation_noise=[[noise]], prior=PRIOR)
+    kind = "increments"
+    model = zakai.Model(
+        state=["x"], drift=["-x"], observation=["x"], observation_kind=kind, observation_noise=[[noise]], prior=PRIOR
+    )
     record = zakai.Record([0.1, 0.4, 0.9], [np.nan, 0.2, 0.1], "increments")
     warnings = [line for line in zakai.filter(model, record).warnings if "observation_noise varies" in line]
     assert len(warnings) == reported

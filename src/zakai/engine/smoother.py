@@ -129,7 +129,7 @@ def smooth(
     filtered.record = record
     smooth_all(runs)
     result = plan.result(runs)
-    result.record = record
+    result.record, result.increment_law_error = record, filtered.increment_law_error
     for one in (filtered, result):
         one.warnings[:0] = [record._note] if record._note else []
     result.attributes["kind"] = "smoothed"
@@ -280,6 +280,7 @@ class SmoothingRun(Run):
             figures[0] = self.start.health[name]
         result.bounds = {**result.bounds, "evidence_error": (self.backward.accuracy(self.empty), _EVIDENCE)}
         result.warnings = [*self.notes, *warnings_of_run(result)]
+        result.increment_law_error = None  # `smooth` gives that of the filter
         return result
 
 

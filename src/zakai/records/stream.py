@@ -178,8 +178,8 @@ def _csv(
     observed, placed = columns
     if not placed and observed == list(range(1, 1 + len(observed))):
         return numbers[0], numbers[1:], None
-    if len(cells) <= max(*observed, *placed):
-        raise ValueError(f"{len(cells)} columns; the header has more")
+    if len(cells) != 1 + len(observed) + len(placed):
+        raise ValueError(f"{len(cells)} columns; the header has {1 + len(observed) + len(placed)}")
     given = {name: numbers[place] for name, place in zip(inputs, placed, strict=True) if cells[place]}
     return numbers[0], [numbers[place] for place in observed], given or None
 
