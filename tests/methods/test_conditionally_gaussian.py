@@ -82,6 +82,7 @@ def test_it_is_the_filter_of_liptser_and_shiryaev(keys, coefficients):
     assert np.all(np.abs(result.mean[-1] - mean) < 0.01 * deviations)
     assert np.allclose(result.cov[-1], cov, rtol=0, atol=0.01 * cov.max())
     assert abs(result.log_likelihood - total) < 0.05
+    assert not result.error_estimate.any()
     # The error falls with the length of the intervals.
     rough = zakai.filter(model, coarse(model, fine, increments, 2000))
     assert np.abs(rough.mean[-1] - mean).max() > np.abs(result.mean[-1] - mean).max()

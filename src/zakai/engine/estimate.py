@@ -141,4 +141,5 @@ def _deviations(probability: float) -> float:
 def _is_gaussian(feed: Feed) -> bool:
     """Return whether the density is a Gaussian at all times."""
     name, prior = feed.setting.method.name, feed.setting.prior
-    return name == "extended-kalman-bucy" or (name == "kalman-bucy" and isinstance(prior, GaussianPrior))
+    gaussian = name in ("kalman-bucy", "conditionally-gaussian") and isinstance(prior, GaussianPrior)
+    return name == "extended-kalman-bucy" or gaussian

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 # Health figures that estimate the error of a mean, in standard deviations.
 _ERRORS_OF_MEANS = ("mean_error", "error_estimate", "time_error")
-_EXACT = ("kalman-bucy", "benes", "hu-yau")
+_EXACT = ("kalman-bucy", "conditionally-gaussian", "benes", "hu-yau")
 _MOST_ASSEMBLED = 4 * 2**30  # bytes of the covariances of independent blocks, when they are put together
 
 
