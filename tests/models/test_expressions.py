@@ -110,7 +110,7 @@ def test_a_formula_that_cannot_be_read_is_refused_at_its_position(text, position
         ("x[0]", "indexing"),
         ("x < y", "comparisons"),
         ("'x'", "unexpected character"),
-        ("x if y else t", "operator"),
+        ("x if y else t", "there is no if"),
         ("\uff13*x", "unexpected character"),
         ("\u0445 + 1", "unexpected character"),
         ("x\x00", "unexpected character"),

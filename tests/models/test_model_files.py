@@ -172,7 +172,7 @@ def test_a_pipe_and_a_device_are_refused_and_not_waited_for(tmp_path):
 def test_an_integer_of_a_million_digits_is_one_short_line(tmp_path, key):
     keys = {"state": "['x']", "drift": "['x']", "observation": "['x']"} | {key: "0x" + "f" * 900_000}
     (tmp_path / "m.toml").write_text("\n".join(f"{name} = {value}" for name, value in keys.items()))
-    with pytest.raises(InputError, match=f"m.toml: {key}: ") as error:
+    with pytest.raises(InputError, match=rf"m.toml: {key}(\[0\])?: ") as error:
         load_model(tmp_path / "m.toml")
     assert len(str(error.value)) < 300
 
@@ -269,3 +269,42 @@ def test_models_do_not_import_jax():
 
 def test_a_matrix_is_a_covariance_whatever_its_units():
     Model(state=["x"], drift=["0"], observation=["x", "x"], observation_noise=[["1e-200", "0"], ["0", "1e200"]])
+
+
+@pytest.mark.parametrize(
+    ("formula", "words"),
+    [
+        ("ln(x)", r"unknown function 'ln'; write log\(x\)"),
+        ("pow(x, 2)", r"write x\*\*y"),
+        ("arcsin(x)", r"write asin\(x\)"),
+        ("log10(x)", r"write log\(x\)/log\(10\)"),
+        ("x > 0", r"write heaviside\(a - b\) for a > b, or max"),
+        ("1 if x > 0 else 2", r"there is no if: write heaviside"),
+        ("if(x, 1, 2)", r"there is no if: write heaviside"),
+        ("where(x, 1, 2)", r"write heaviside"),
+        ("x % 2", r"write a - b\*floor\(a/b\)"),
+        ("relu(x)", r"write max\(x, 0\)"),
+    ],
+)
+def test_what_other_languages_have_is_named_with_what_to_write(formula, words):
+    with pytest.raises(InputError, match=words):
+        Model(state=["x"], drift=[formula], observation=["x"])
+
+
+def test_one_formula_or_number_is_taken_where_there_is_one_state_or_sensor():
+    one = Model(
+        state=["x"], drift="-x", diffusion=0.5, process_noise=2, observation="2*x", observation_kind="samples",
+        observation_noise=0.04, prior={"kind": "gaussian", "mean": 0.5, "cov": 1.0},
+    )  # fmt: skip
+    full = Model(
+        state=["x"], drift=["-x"], diffusion=[[0.5]], process_noise=[[2]], observation=["2*x"], observation_kind="samples",
+        observation_noise=[[0.04]], prior={"kind": "gaussian", "mean": [0.5], "cov": [[1.0]]},
+    )  # fmt: skip
+    assert one.to_toml() == full.to_toml()
+    two = {"state": ["x", "y"], "drift": ["-x", "-y"], "observation": ["x", "y"], "observation_kind": "samples"}
+    assert Model(**two, observation_noise=[0.1, 0.2]).to_toml() == Model(**two, observation_noise=[[0.1, 0], [0, 0.2]]).to_toml()
+    for wrong in (0.1, [0.1], [0.1, 0.2, 0.3]):
+        with pytest.raises(InputError, match="observation_noise: expected 2 rows of 2 formulas"):
+            Model(**two, observation_noise=wrong)
+    with pytest.raises(InputError, match="drift: expected a list of 2 formulas"):
+        Model(**{**two, "drift": "-x"})

@@ -107,8 +107,8 @@ def test_the_careful_road_gives_the_same_numbers_as_the_fast_one(read):
         ("1,2,3\n2,3,4\n", 1, "the header must begin with time (is the header missing?)"),
         ("t,a,b\n1,2,3\n", 1, "the first column is 't'; the header must begin with time"),
         ("time,a\n1,2\n", 1, "2 columns; the model needs 3: time, and one for each of its observations"),
-        ("time;a;b\n1;2;3\n", 1, "the first column is 'time;a;b'"),
-        ("\n1,2,3\n", 1, "the header must begin with time"),
+        ("time:a:b\n1:2:3\n", 1, "the first column is 'time:a:b'"),
+        ("\n1,2,3\n", 2, "the header must begin with time"),
     ],
 )
 def test_the_first_bad_row_is_named_by_its_line_number_in_one_line(read, content, row, says):

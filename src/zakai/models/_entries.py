@@ -145,8 +145,15 @@ def items(value: Any, length: int | None, expected: str) -> list[Any]:
     return list(value)
 
 
+def _is_formula(value: Any) -> bool:
+    """Return whether a value is one formula or number."""
+    return isinstance(value, str | int | float | Decimal | np.number | sympy.Expr) and not isinstance(value, bool)
+
+
 def vector_of_formulas(value: Any, length: int | None, expected: str) -> list[str]:
-    """A list of formulas; a SymPy column is one too."""
+    """A list of formulas; a SymPy column is one too, and one formula is a list of one where that is allowed."""
+    if _is_formula(value) and length in (1, None):
+        value = [value]
     if isinstance(value, sympy.MatrixBase) and 1 in value.shape:
         value = list(value)
     texts = items(value, length, expected)
@@ -158,7 +165,9 @@ def vector_of_formulas(value: Any, length: int | None, expected: str) -> list[st
 
 
 def matrix_of_formulas(value: Any, rows: int, columns: int | None, expected: str) -> list[list[str]]:
-    """Rows of formulas, all of one length."""
+    """Rows of formulas, all of one length; one formula is a matrix of size one where that is allowed."""
+    if _is_formula(value) and rows == 1 and columns in (1, None):
+        value = [[value]]
     table = items(value, rows, expected)
     for index, row in enumerate(table):
         with named(f"[{index}]"):
@@ -168,6 +177,18 @@ def matrix_of_formulas(value: Any, rows: int, columns: int | None, expected: str
                 raise InputError(f"expected {expected}: {columns} in each row, got {len(row)}")
             table[index] = vector_of_formulas(row, columns, expected)
     return table
+
+
+def square_of_formulas(value: Any, size: int, expected: str) -> list[list[str]]:
+    """Rows of formulas of a square matrix; a list of variances is its diagonal, and one formula the matrix of size one."""
+    if isinstance(value, sympy.MatrixBase | np.ndarray):
+        value = value.tolist()
+    if size == 1 and not isinstance(value, list | tuple | Mapping) and value is not None:
+        value = [[value]]
+    if isinstance(value, list | tuple) and value and not any(isinstance(row, list | tuple | np.ndarray) for row in value):
+        variances = vector_of_formulas(value, size, f"{expected}, or {size} variances")
+        return [[variances[i] if i == j else "0" for j in range(size)] for i in range(size)]
+    return matrix_of_formulas(value, size, size, expected)
 
 
 def names(value: Any, expected: str) -> tuple[str, ...]:

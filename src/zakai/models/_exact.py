@@ -11,6 +11,7 @@ import sympy
 
 from zakai.models._cost import MAX_EXPONENT, MAX_ROOT, Cost, cost_of_call, cost_of_product, cost_of_sum
 from zakai.models._errors import did_you_mean, echo, listing
+from zakai.models._other_names import instead_of
 from zakai.models.expressions import (
     ARGUMENTS,
     FUNCTIONS,
@@ -123,7 +124,8 @@ class _Converter:
         if node.name in (*FUNCTIONS, *self._functions, *self._tables):
             raise ExpressionError(f"the function {node.name} needs an argument in parentheses", node.position)
         known = [*self._symbols, "pi", *FUNCTIONS, *self._functions, *self._tables]
-        hint = did_you_mean(node.name, known) or f"; the names are {listing([*self._symbols, 'pi'])[:200]}"
+        hint = instead_of(node.name) or did_you_mean(node.name, known)
+        hint = hint or f"; the names are {listing([*self._symbols, 'pi'])[:200]}"
         raise ExpressionError(f"unknown name {echo(node.name)}{hint}", node.position)
 
     def _sum(self, node: Sum) -> _Part:
@@ -185,7 +187,7 @@ class _Converter:
             if node.name in self._symbols or node.name == "pi":
                 raise ExpressionError(f"{node.name!r} is not a function; write * to multiply", node.position)
             known = [*FUNCTIONS, *self._functions, *self._tables]
-            hint = did_you_mean(node.name, known) or f"; the functions are {listing(known[::-1])[:200]}"
+            hint = instead_of(node.name) or did_you_mean(node.name, known) or f"; the functions are {listing(known[::-1])[:200]}"
             raise ExpressionError(f"unknown function {echo(node.name)}{hint}", node.position)
         least, largest = ARGUMENTS.get(node.name, (1, 1)) if table is None else (len(table.axes),) * 2
         if not undetermined and not least <= len(node.arguments) <= largest:

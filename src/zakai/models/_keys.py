@@ -128,7 +128,7 @@ def read_formulas(model: Model, keys: Mapping[str, Any]) -> None:
             continue
         with named(key):
             rows = f"{size} rows of {size} formulas (one a {what})"
-            canonical[key] = _entries.matrix_of_formulas(given[key], size, size, rows)
+            canonical[key] = _entries.square_of_formulas(given[key], size, rows)
     _refuse_long(canonical)
     if not custom:
         read_path(model, keys)

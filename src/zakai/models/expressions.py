@@ -134,14 +134,16 @@ _TOKEN = re.compile(
     r"(?P<space>[ \t\r\n]+)|(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
     r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*)|(?:\*\*|[-+*/(),])"
 )
+_CONDITION = re.compile(r"(?<![\w.])(if|else|elif)(?!\w)")
+_NO_COMPARISON = "there are no comparisons: write heaviside(a - b) for a > b, or max(a, b) and min(a, b)"
 _HINTS = {
     "^": "; write ** for a power",
-    "%": "; there is no modulo",
+    "%": "; there is no modulo: write a - b*floor(a/b)",
     "[": "; there is no indexing",
     ".": "; there are no attributes",
     "=": "; write one formula, not an equation",
-    "<": "; there are no comparisons",
-    ">": "; there are no comparisons",
+    "<": f"; {_NO_COMPARISON}",
+    ">": f"; {_NO_COMPARISON}",
 }
 
 
@@ -178,6 +180,9 @@ def parse(text: str) -> Node:
     """
     if len(text) > MAX_LENGTH:
         raise ExpressionError(f"the formula has {len(text)} characters; at most {MAX_LENGTH} are read", MAX_LENGTH + 1)
+    if (word := _CONDITION.search(text)) is not None:
+        what = "write heaviside(a - b), which is 1 where a > b and else 0, or max and min"
+        raise ExpressionError(f"there is no {word.group()}: {what}", word.start() + 1)
     parser = _Parser(text)
     if parser.token.kind == "end":
         raise ExpressionError("the formula is empty", 1)

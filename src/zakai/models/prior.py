@@ -187,7 +187,7 @@ def read_prior(
 
 def _read_gaussian(keys: Mapping[str, Any], n: int) -> GaussianPrior:
     with named("mean"):
-        mean = _numbers(keys["mean"], (n,), f"a list of {n} numbers (one a state)")
+        mean = _numbers(_listed(keys["mean"], n), (n,), f"a list of {n} numbers (one a state)")
     with named("cov"):
         return GaussianPrior(mean, _read_covariance(keys["cov"], n))
 
@@ -220,9 +220,14 @@ def _numbers(value: Any, shape: tuple[int, ...], expected: str) -> np.ndarray:
     return numbers
 
 
+def _listed(value: Any, n: int) -> Any:
+    """Return one number of one state as a list."""
+    return [value] if n == 1 and isinstance(value, int | float | np.number) and not isinstance(value, bool) else value
+
+
 def _read_covariance(value: Any, n: int) -> np.ndarray:
     expected = f"a {n} x {n} list of rows, or a list of {n} variances"
-    rows = items(value, n, expected)
+    rows = items(_listed(value, n), n, expected)
     if all(not isinstance(row, list | tuple | np.ndarray) for row in rows):
         cov = np.diag(_numbers(rows, (n,), expected))
     else:

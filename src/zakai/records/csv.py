@@ -16,6 +16,7 @@ from zakai.errors import InputError
 from zakai.models._errors import named
 from zakai.records.columns import observed_columns
 from zakai.records.dates import Clock, date_of, unit_name
+from zakai.records.dialect import Dialect, dialect_of, other_separator
 from zakai.records.header import LONGEST_LINE, cells_of, columns_fault, header_names, header_of, quoted
 from zakai.records.inputs import Inputs
 from zakai.records.numbers import NUMBER
@@ -41,6 +42,9 @@ def read_record(
     be others. Every other line is one time and its m observations, in what the model's `observation_kind` says. Times increase
     strictly, need not be regular, and begin after the model's `start` (samples: at or after). An empty cell or `nan` is "not
     observed". The text is UTF-8; a byte-order mark, Windows line ends and blank lines are accepted.
+
+    Cells may be separated by semicolons or tabs, with decimal commas. Lines that begin with `#` are comments, `NA`, `null` and
+    the like are "not observed", `Time` is `time`, and a column of row numbers before it, named `index` or not, is left out.
 
     Columns with the names of the model's inputs, in addition to the m observations, are the inputs at these times; the first
     row with inputs holds from the model's start, and a row with empty inputs changes nothing.
@@ -189,10 +193,14 @@ def table_of(
     first = next(parts, None)
     if first is None:
         raise InputError(f"{source}: is empty; expected a header of {columns + 1} names, the first of them time, then rows")
-    header = _header(source, first.lines[0], columns, what, names, used is not None)
+    dialect = dialect_of(first.lines)
+    if dialect is None:
+        raise InputError(f"{source}: has no header; the first line that is no comment must have names, the first of them time")
+    header = _header(source, dialect, columns, what, names, used is not None)
     used = range(len(header)) if used is None else used
     numbers, row, before = array("d"), 0, np.empty((0, len(used)))
-    for part in chain([first._replace(number=2, lines=first.lines[1:])], parts):
+    for part in chain([first._replace(number=dialect.line + 1, lines=first.lines[dialect.line :])], parts):
+        part = part._replace(lines=dialect.translated(part.lines))
         part, wrong = (part, None) if dates is None else dates.numbered(part)
         rows = _fast(part.lines, len(header), used)
         if rows is None:
@@ -238,16 +246,18 @@ def _parts(file: TextIO, source: str) -> Iterator[_Part]:
         yield _Part(number, [rest], False)
 
 
-def _header(source: str, line: str, m: int, what: str, expected: Sequence[str] | None, known: bool = False) -> list[str]:
-    if (fault := _not_text(line)) is not None:
-        raise InputError(f"{source}: row 1: {fault}")
-    names = header_names(line)
+def _header(
+    source: str, dialect: Dialect, m: int, what: str, expected: Sequence[str] | None, known: bool = False
+) -> list[str]:
+    where = f"{source}: row {dialect.line}"
+    if (fault := _not_text(dialect.header)) is not None:
+        raise InputError(f"{where}: {fault}")
+    names = header_names(dialect.header)
     if names[0] != "time":
-        hint = " (is the header missing?)" if NUMBER.fullmatch(names[0]) else ""
-        fault = f"the first column is {quoted(names[0])}; the header must begin with time{hint}"
-        raise InputError(f"{source}: row 1: {fault}")
+        hint = " (is the header missing?)" if NUMBER.fullmatch(names[0]) else other_separator(names[0])
+        raise InputError(f"{where}: the first column is {quoted(names[0])}; the header must begin with time{hint}")
     if not known and (fault := columns_fault(names, m, what, expected)) is not None:
-        raise InputError(f"{source}: row 1: {fault}")
+        raise InputError(f"{where}: {fault}")
     return names
 
 

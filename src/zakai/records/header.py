@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
+from zakai.records.dialect import dialect_of
+
 LONGEST_LINE = 1 << 20  # characters: a thousand numbers with a thousand blanks each
 
 
@@ -14,7 +16,9 @@ def header_of(path: Path) -> list[str]:
     """The names of the columns of a CSV file, or nothing where it cannot be read, which `read_table` reports."""
     try:
         with path.open(encoding="utf-8-sig", errors="surrogateescape") if path.is_file() else nullcontext() as file:
-            return [] if file is None else header_names(file.readline(LONGEST_LINE).rstrip("\r\n"))
+            lines = [] if file is None else file.read(LONGEST_LINE).split("\n")
+        dialect = dialect_of(lines)
+        return [] if dialect is None else header_names(dialect.header)
     except (OSError, ValueError):
         return []
 
