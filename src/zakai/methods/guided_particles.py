@@ -98,6 +98,7 @@ METHOD: Method[Prepared, State] = Method(
     state=State,
     bounds=BOUNDS,
     differentiable=False,
+    random=True,
     valid=valid,
     backward=BACKWARD,
     reduced=reduced,
