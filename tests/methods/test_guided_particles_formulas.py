@@ -33,7 +33,7 @@ def test_every_function_of_the_grammar_is_computed():
         "sin(x)*cos(y) + tan(x/5) - a*t", "asin(x/9) + acos(y/9) + atan(x)", "sinh(x) + cosh(y) + tanh(x)",
         "exp(-x**2) + log(1 + y**2)", "sqrt(1 + x**2) + erf(y) + abs(x)", "atan2(y, x) + sign(x) + floor(3*y)",
         "min(x, y) + max(x, 2*y) + heaviside(x - y)", "log1p(x**2) + expm1(y/3) + sinc(5*x)", "x**3 - y**-2 + (1 + x**2)**0.3",
-        "one(x) + two(y)", "both(x, y)", "again(3*x)", "log(cosh(x))",
+        "one(x) + two(y)", "both(x, y)", "again(3*x)", "log(cosh(x))", "lgamma(1 + x**2)", "erfc(y)",
     ]  # fmt: skip
     for pair in itertools.batched(formulas, 2) if hasattr(itertools, "batched") else zip(formulas[::2], formulas[1::2]):
         drift = [*pair, "0"][:2]
@@ -54,6 +54,22 @@ LAWS = {
          "degrees_of_freedom": ["3", "4 + y**2"]}, [2.4, -1.3],
     ),
     "counts": ({"observation": ["exp(x)", "1/(1 + exp(-y))"], "observation_family": ["poisson", "bernoulli"]}, [3.0, 1.0]),
+    "trials": (
+        {"observation": ["1/(1 + exp(-x))", "exp(y)"], "observation_family": ["binomial", "negative-binomial"], "trials": "7",
+         "dispersion": "0.3"}, [3.0, 2.0],
+    ),
+    "dispersion with the state": (
+        {"observation": ["exp(x)", "exp(y)"], "observation_family": "negative-binomial", "dispersion": ["1 + x**2", "0.5"]},
+        [3.0, 0.0],
+    ),
+    "positive": (
+        {"observation": ["x", "exp(y)"], "observation_family": ["log-normal", "exponential"],
+         "observation_noise": [["0.2", "0"], ["0", "1"]]}, [3.0, 0.4],
+    ),
+    "angles": (
+        {"observation": ["atan2(y, x)", "atan2(x, y)"], "observation_family": ["gaussian", "student-t"],
+         "observation_noise": [["3", "0"], ["0", "0.01"]], "degrees_of_freedom": "6"}, [3.0, 0.4],
+    ),
     "directions": (
         {"observation": ["x", "y"], "observation_family": "von-mises", "concentration": ["2", "1 + exp(4*x)"]}, [1.0, -2.0],
     ),
