@@ -135,7 +135,9 @@ def _plan_of_whole(
 
 
 def _fault_at_prior(setting: Setting) -> str:
-    """Return how a method's density at the start differs from the prior, or nothing."""
+    """Return how a method's density at the start differs from the prior, or nothing; draws differ by chance."""
+    if setting.method.random:
+        return ""
     prior, model = setting.prior, setting.model
     try:
         with np.errstate(all="ignore"):

@@ -188,6 +188,8 @@ class Method(Generic[P, S]):
     `handles` names the features of a model (`models/features.py`) that the method handles; a model with another one is refused
     before `theorem` is asked.
 
+    `random` says that the numbers have random errors, which the standard errors of an Info report.
+
     `absolute` says that what is prepared for an interval depends on where it begins, although the model does not depend on t.
 
     Optional: `variant(model, options)` returns the method with the functions for this model and these options, where those above
@@ -225,6 +227,7 @@ class Method(Generic[P, S]):
     handles: frozenset[str] = frozenset()
     shorter: str = "give fewer observations"
     absolute: bool = False
+    random: bool = False
     variant: Callable[[Model, Mapping[str, Any]], Method[Any, Any]] | None = None
     valid: Callable[[P, S], bool] | None = None
     segment: Callable[[P, slice, S, np.ndarray], tuple[Sequence[S], Infos] | None] | None = None

@@ -98,15 +98,10 @@ METHOD: Method[Prepared, State] = Method(
     state=State,
     bounds=BOUNDS,
     differentiable=False,
+    random=True,
     valid=valid,
     backward=BACKWARD,
     reduced=reduced,
     shorter="raise the tolerance",
-    handles=frozenset(
-        {
-            features.STATE_DEPENDENT_DIFFUSION, features.INPUTS, features.CROSS_NOISE, features.STATE_DEPENDENT_OBSERVATION_NOISE,
-            features.OBSERVATION_FAMILY, features.OBSERVATION_LOG_DENSITY, features.DOMAIN, features.TABLES, features.KINKS,
-            features.JUMPS, features.SINC,
-        }
-    ),
-)  # fmt: skip
+    handles=frozenset(features.ASSUMPTIONS) - {features.OBSERVED_PATH},
+)

@@ -24,7 +24,7 @@ from zakai.numerics.particles.population import backward_draws, systematic
 from zakai.numerics.particles.random import uniform_number
 
 DRAWS = 1000  # that a message holds
-CANDIDATES = 2000  # particles that a draw chooses from
+CANDIDATES = 8000  # particles that a draw chooses from
 ADDED = 0.02  # deviations of all particles that are added to those of a transition
 _STEP = 1e-4
 _USE = 100  # of random numbers, beside those of the filter

@@ -14,7 +14,7 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -47,7 +47,7 @@ FEW_FAMILIES = 20  # of the oldest generation that is looked back to, below whic
 # add up to this share of the intervals of the last move.  What a move leaves is counted as the unit where it is more, for moves
 # cannot lower it: the figure must exceed it by `MOVE_GAIN`, and it is forgotten at a rate.
 MOVE_ABOVE, MOVE_SHARE, MOVE_GAIN, FORGOTTEN = 2.5, 0.4, 3.0, 0.98
-MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4)  # power, change, most sweeps, rho
+MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
 SURE, TRUSTED = 0.5, 8  # share of the allowed time error below which its measurement is trusted in so many more intervals
@@ -366,12 +366,25 @@ def _advanced(prepared: Prepared, cloud: Cloud, events: Events, observed: Observ
     prior = (cloud.window.mean, cloud.window.root) if moving else None
     single = (np.array([observed.time]), observed.given[None], observed.counted[None])
     target = Target(motion, events, *single, prior, cloud.particles)
-    guided = _guided(prepared, target, cloud, plain, number)
-    best = plain if guided is None else guided
-    size = effective(np.exp(best.cloud.logs)) if np.isfinite(best.gained) else 0.0
-    if size >= min(TEMPER_BELOW * count, TEMPER_FLOOR) or not np.isfinite(logs).any():
-        return best
-    return _tempered(prepared, target, cloud, plain, logs, number)
+    first = np.concatenate([cloud.window.first, noise]) if moving else noise
+    best = _guided(prepared, target, cloud, plain, number) or Drawn(plain, first, logs, None)
+    size = effective(np.exp(best.after.cloud.logs)) if np.isfinite(best.after.gained) else 0.0
+    if size >= min(TEMPER_BELOW * count, TEMPER_FLOOR) or not np.isfinite(best.logs).any():
+        return best.after
+    return _tempered(prepared, target, cloud, best, number)
+
+
+class Drawn(NamedTuple):
+    """A draw of the noise of an interval, and the particles after it.
+
+    `path` (D, N) is the noise, with that of the prior where that is moved, `logs` (N,) the log weights, and `gaussian` that of
+    which it is drawn, none for plain noise.
+    """
+
+    after: Advanced
+    path: Array
+    logs: Array
+    gaussian: Any
 
 
 def _spread(particles: Array, logs: Array, angles: Array) -> Array:
@@ -388,7 +401,7 @@ def _log_likelihood(motion: Motion, particles: Array, observed: Observed) -> Arr
     return np.asarray(terms[observed.counted > 0].sum(axis=0))
 
 
-def _guided(prepared: Prepared, target: Target, cloud: Cloud, plain: Advanced, number: int) -> Advanced | None:
+def _guided(prepared: Prepared, target: Target, cloud: Cloud, plain: Advanced, number: int) -> Drawn | None:
     """Return the particles whose noise is drawn from the linearised posterior, None where that is no better."""
     count, moving = len(cloud.logs), target.prior is not None
     d0 = len(cloud.window.first) if moving else 0
@@ -412,36 +425,36 @@ def _guided(prepared: Prepared, target: Target, cloud: Cloud, plain: Advanced, n
     window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
     after = Cloud(particles, cloud.logs + logs - top, window, cloud.genealogy)
     assert len(logs) == count
-    return Advanced(after, top, np.ascontiguousarray(path[d0:]), plain.predicted, guided=True)
+    done = Advanced(after, top, np.ascontiguousarray(path[d0:]), plain.predicted, guided=True)
+    return Drawn(done, path, logs, gaussian)
 
 
-def _tempered(
-    prepared: Prepared, target: Target, cloud: Cloud, plain: Advanced, logs: Array, number: int
-) -> Advanced:
-    """Return plain particles carried to the posterior by powers of the likelihood, with moves of the interval's noise between."""
-    count, moving = len(cloud.logs), target.prior is not None
+def _tempered(prepared: Prepared, target: Target, cloud: Cloud, drawn: Drawn, number: int) -> Advanced:
+    """Return particles carried from what they were drawn from to the posterior, by powers of their weights with moves between."""
+    count, moving, fixed = len(cloud.logs), target.prior is not None, drawn.gaussian
     d0 = len(cloud.window.first) if moving else 0
-    path = np.concatenate([cloud.window.first, plain.noise]) if moving else plain.noise
+    path, logs, particles = drawn.path, drawn.logs, drawn.after.cloud.particles
     gained, low, levels, rates = 0.0, 0.0, 0, list[float]()
-    particles = plain.cloud.particles
+    share = 1.0 if fixed is None else FIRST_SHARE if moving else GUIDE_SHARE
     control = (2.0, 20.0) if moving else (1.5, 12.0)
     while low < 1.0 and levels < MOST_LEVELS:
         high = next_power(cloud.logs, logs, 0.5 * count, low)
         weights, top = normalised(cloud.logs + (high - low) * np.maximum(logs, -1e300))
         gained, levels, low = gained + top, levels + 1, high
         cloud, ancestors = cloud.resampled(weights, count, prepared.key(number, RESAMPLING, levels))
-        path, particles, logs = taken(path, ancestors), taken(particles, ancestors), logs[ancestors]
-        target = Target(target.motion, target.events, target.times, target.given, target.counted, target.prior, cloud.particles)
-        gaussian = target.gaussian(path, None, power=high)
+        path = taken(path, ancestors)
+        target = replace(target, start=cloud.particles)
+        gaussian = target.gaussian(path, None, power=high) if fixed is None else fixed
         if gaussian is None:
             n, D = cloud.particles.shape[0], len(path)
             gaussian = (np.zeros(D), np.zeros((D, n)), np.zeros(n), np.zeros((0, D)), np.zeros(0))
-        path, particles, logs, rate, _ = target.sweep(gaussian, path, (high, *control, 0.4), prepared.key(number, LEVELS, levels))
+        own = prepared.key(number, LEVELS, levels)
+        path, particles, logs, rate, _ = target.sweep(gaussian, path, (high, *control, 0.4, share), own)
         rates.append(rate)
     window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
     after = Cloud(particles, cloud.logs, window, cloud.genealogy)
-    noise = np.ascontiguousarray(path[d0:])
-    return Advanced(after, gained, noise, plain.predicted, levels, acceptance=float(np.mean(rates)))
+    noise, guided = np.ascontiguousarray(path[d0:]), fixed is not None
+    return Advanced(after, gained, noise, drawn.after.predicted, levels, guided, float(np.mean(rates)))
 
 
 def _excess(variance: Array, cov: Array, count: int) -> float:

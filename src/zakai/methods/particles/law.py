@@ -7,12 +7,14 @@ the marks e (m,) of what is observed.  P and c are computed once for an observat
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import sympy as sp
 
 from zakai.methods.particles.programs import Array, Expressions, LogBessel, LogGamma
+from zakai.models.angles import observed_angles
 from zakai.models.functions import Floor, Maximum
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
@@ -21,17 +23,8 @@ from zakai.numerics.particles.formulas import Program
 # Deviation of an angle above which the law sums over its images; the next image of a deviation of pi / 2 is at 3 pi / 2, where
 # the Gaussian is e^-27 of that at pi / 2.
 _WRAPPED_ONLY = 0.6
-_IMAGES = 3
-FAMILIES = ("gaussian", "student-t", "poisson", "bernoulli", "von-mises")
-
-
-def observed_angles(model: Model) -> tuple[bool, ...]:
-    """Return which samples are angles: those whose observation is atan2(...), or whose name is in `observed_angles`."""
-    if model.observation_kind != "samples" or model.log_density is not None:
-        return (False,) * model.m
-    named, names = getattr(model, "observed_angles", ()), getattr(model, "observation_names", ())
-    marked = [j < len(names) and names[j] in named for j in range(model.m)]
-    return tuple(mark or isinstance(h, sp.atan2) for mark, h in zip(marked, model.observation, strict=True))
+_REACH = 8.6  # deviations beyond which a Gaussian is negligible
+_IMAGES = 6  # on each side, of Student's law and where the noise is not known
 
 
 class Numbers(NamedTuple):
@@ -122,12 +115,16 @@ class Law:
                 P[which, which] = 1.0 / S[which, which]
             for j in which:
                 if not (self.joint and j in self._gaussian):
-                    c[j] = _constant(self.model.observation_family[j], values[j], S[j, j], shape[j])
+                    known = shape[j] if self.fixed_shapes[j] else math.nan
+                    spread = S[j, j] if self.fixed else math.nan
+                    c[j] = _constant(self.model.observation_family[j], values[j], spread, known)
             own = [j for j in which if j in self._gaussian]
             if self.joint and own:
                 block = 2 * np.pi * S[np.ix_(own, own)]
                 c[self._gaussian[0]] = -0.5 * np.linalg.slogdet(block)[1]
         pairs = [P[pair] for pair in numbers.pairs]
+        positive = np.array([name == "log-normal" for name in self.model.observation_family]) & seen
+        values = np.where(positive, np.log(np.where(positive, values, 1.0)), values)
         row = np.concatenate([[] if u is None else u, values, pairs, c, seen.astype(float)])
         return row, np.array([float(seen[places].any()) for places in self._terms])
 
@@ -166,9 +163,8 @@ class Law:
                 return -precision * v**2 / 2 if family == "gaussian" else -power * sp.log(1 + precision * v**2 / shape)
 
             result = law(d)
-            if self.angles[j] and self._wide(S):
-                shifts = [2 * sp.pi * k for k in range(-_IMAGES, _IMAGES + 1) if k]
-                result = result + sp.log(1 + sum(sp.exp(law(d + shift) - result) for shift in shifts))
+            if self.angles[j]:
+                result += self._images(family, d, S, law)
             if family == "gaussian":
                 return result + (c if self.fixed else -sp.log(2 * sp.pi * S) / 2)
             if self.fixed and self.fixed_shapes[j]:
@@ -179,14 +175,30 @@ class Law:
         if family == "bernoulli":
             outside = Maximum(-h, 0) + Maximum(h - 1, 0)
             return sp.log(z * h + (1 - z) * (1 - h)) - sp.Float(1e300) * outside
+        if family == "binomial":
+            outside = Maximum(-h, 0) + Maximum(h - 1, 0)
+            chance, other = (Maximum(part, sp.Float(1e-300)) for part in (h, 1 - h))
+            return z * sp.log(chance) + (shape - z) * sp.log(other) - sp.Float(1e300) * outside + c
+        if family == "negative-binomial":
+            ratio = z * sp.log(Maximum(h, sp.Float(1e-300))) - (z + 1 / shape) * sp.log(1 + shape * h)
+            return ratio - sp.Float(1e300) * Maximum(-h, 0) + (c if self.fixed_shapes[j] else c + _of_dispersion(z, shape))
+        if family == "log-normal":
+            # The given number is log z.
+            return -precision * d**2 / 2 + (c if self.fixed else c - sp.log(2 * sp.pi * S) / 2)
+        if family == "exponential":
+            return -z / h - sp.log(h)
         angle = shape * sp.cos(z - h)
         return angle + c if self.fixed_shapes[j] else angle - LogBessel(shape) - sp.log(2 * sp.pi)
 
-    def _wide(self, S: sp.Expr) -> bool:
-        """Return whether the images of an angle count, by the noise at the start."""
+    def _images(self, family: str, d: sp.Expr, S: sp.Expr, law: Callable[[sp.Expr], sp.Expr]) -> sp.Expr:
+        """Return the logarithm of the sum over the images of an angle, relative to the nearest."""
         values = dict(zip(self.model.parameter_symbols, self.model.parameters.values(), strict=True))
-        number = S.subs(values).subs(self.model.t, sp.Float(self.model.start))
-        return not (number.is_number and float(number) < _WRAPPED_ONLY**2)
+        number, count = S.subs(values).subs(self.model.t, sp.Float(self.model.start)), _IMAGES
+        if family == "gaussian" and number.is_number:
+            spread = math.sqrt(float(number))
+            count = math.ceil(_REACH * spread / (2 * math.pi) + 0.5) if spread >= _WRAPPED_ONLY else 0
+        shifts = [2 * sp.pi * k for k in range(-count, count + 1) if k]
+        return sp.log(1 + sum((sp.exp(law(d + shift) - law(d)) for shift in shifts), sp.S.Zero))
 
 
 def _sequential(model: Model, numbers: Numbers, d: list[sp.Expr], own: list[int]) -> list[sp.Expr]:
@@ -209,18 +221,29 @@ def _sequential(model: Model, numbers: Numbers, d: list[sp.Expr], own: list[int]
     return terms
 
 
+def _of_dispersion(z: sp.Expr, shape: sp.Expr) -> sp.Expr:
+    return LogGamma(z + 1 / shape) - LogGamma(1 / shape) + z * sp.log(shape)
+
+
 def _wrapped(d: sp.Expr) -> sp.Expr:
     return d - 2 * sp.pi * Floor(d / (2 * sp.pi) + sp.Rational(1, 2))
 
 
 def _constant(family: str, z: float, S: float, shape: float) -> float:
     """Return what normalises the law of a coordinate, without what depends on the state."""
-    if family == "gaussian":
+    if family == "gaussian" and S > 0:
         return -0.5 * math.log(2 * math.pi * S)
-    if family == "student-t" and shape > 0:
+    if family == "student-t" and shape > 0 and S > 0:
         return math.lgamma((shape + 1) / 2) - math.lgamma(shape / 2) - 0.5 * math.log(shape * math.pi * S)
     if family == "poisson":
         return -math.lgamma(z + 1)
+    if family == "binomial":
+        return math.lgamma(shape + 1) - math.lgamma(z + 1) - math.lgamma(shape - z + 1) if 0 <= z <= shape else -math.inf
+    if family == "negative-binomial":
+        known = math.lgamma(z + 1 / shape) - math.lgamma(1 / shape) + z * math.log(shape) if shape > 0 else 0.0
+        return known - math.lgamma(z + 1)
+    if family == "log-normal":
+        return (-0.5 * math.log(2 * math.pi * S) if math.isfinite(S) else 0.0) - math.log(z)
     if family == "von-mises" and shape > 0:
         from scipy.special import ive
 

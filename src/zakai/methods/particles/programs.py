@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from zakai.errors import InputError
 from zakai.models._program import Program as Instructions
 from zakai.models.functions import _Real
 from zakai.models.model import Model
@@ -74,6 +75,10 @@ class Expressions:
             elif operation == "table":
                 number = tables.setdefault((constant.func, constant.keywords["orders"]), len(tables))
                 lines.append((TABLE, slot, operands[0], operands[-1], number))
+            elif operation == "lgamma":
+                if constant:
+                    raise InputError(f"{model.source}: the derivative of lgamma in the diffusion is not supported by particles")
+                lines.append((LOGGAMMA, slot, operands[0], operands[0], 0))
             elif operation == "sinc":
                 lines.append((SINC, slot, operands[0], operands[0], constant))
             elif operation == "power" and not (isinstance(constant, int) and 2 <= constant <= 64):

@@ -177,19 +177,23 @@ def sweep(motion: Any, events: Any, observed: Any, prior: Any, gaussian: Any, co
         observed: what is observed in it.
         prior: that of the first state, where its noise moves.
         gaussian: the Gaussian in which moves are reversible.
-        control: the power of the likelihood, the sum of acceptance (1 - rho^2) after which it is enough, the most sweeps, and the
-            first rho.
+        control: the power, the sum of acceptance (1 - rho^2) after which it is enough, the most sweeps, the first rho, and the
+            share of N(0, I) in q = share N(0, I) + (1 - share) Gaussian; the target is q (N(0, I) L / q)^power, with share one
+            N(0, I) L^power.
         key: of the random numbers.
         low: the first particle, a multiple of `CHUNK`.
         high: the particle after the last one.
         start: the states (n, N) at the start of the window.
         path: the noise (D, N), which is replaced.
         out: receives the states (n, N) at the end.
-        total: receives the log-likelihoods (N,).
+        total: receives log N(0, I) L / q (N,).
         moved: receives the mean acceptance and the change of each chunk (chunks, 2).
     """
     n, D = start.shape[0], path.shape[0]
-    power, enough, most = control[0], control[1], int(control[2])
+    power, enough, most, part = control[0], control[1], int(control[2]), control[4]
+    log_det = 0.0
+    for factor in gaussian[4]:
+        log_det += math.log(factor)
     blocks, buffers = _blocks(motion, observed), buffers_of(motion, events)
     along = np.empty(BLOCK)
     x, found = np.empty((motion[0][3].size, BLOCK)), np.empty(BLOCK)
@@ -223,9 +227,14 @@ def sweep(motion: Any, events: Any, observed: Any, prior: Any, gaussian: Any, co
                             new[r, i] += m[r, i]
                 _follow(motion, events, observed, prior, blocks, begin, new, x, found, buffers, size)
                 for i in range(size):
-                    value = power * found[i]
+                    g, phi = log_det, 0.0
                     for r in range(D):
-                        value += 0.5 * (fresh[r, i] ** 2 - new[r, i] ** 2)
+                        g -= 0.5 * fresh[r, i] ** 2
+                        phi -= 0.5 * new[r, i] ** 2
+                    top = max(g, phi)
+                    q = phi if part == 1.0 else top + math.log((1.0 - part) * math.exp(g - top) + part * math.exp(phi - top))
+                    found[i] += phi - q
+                    value = power * found[i] + q - g
                     if not value < np.inf:
                         value = -np.inf
                     if turn >= 0:

@@ -1,0 +1,241 @@
+"""`guided-particles` against exact filters, closed forms, and the spread over seeds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zakai
+from zakai.algebra.theorems import in_order
+from zakai.errors import InputError
+
+PARTICLES = "guided-particles"
+PRIOR = {"kind": "gaussian", "mean": [1.0, 0.0], "cov": [1.0, 1.0]}
+OSCILLATOR = {"state": ["x", "v"], "drift": ["v", "-x - 0.3*v"], "diffusion": [["0"], ["1"]], "prior": PRIOR}
+SAMPLED = {"observation_kind": "samples", "observation_noise": [["0.25", "0.1"], ["0.1", "0.3"]]}
+GATHERED = {"observation_noise": [["0.3", "0"], ["0", "1"]]}
+LINEAR = {
+    "samples": {**OSCILLATOR, **SAMPLED, "observation": ["x + v", "2*v"]},
+    "increments": {**OSCILLATOR, **GATHERED, "observation": ["2*x", "v"], "observation_kind": "increments"},
+    "path": {**OSCILLATOR, **GATHERED, "observation": ["2*x", "v"], "observation_kind": "path"},
+    "cross noise": {
+        **OSCILLATOR, **GATHERED, "observation": ["2*x", "v"], "observation_kind": "increments", "cross_noise": [["0.1", "0.6"]],
+    },
+    "inputs": {
+        **OSCILLATOR, **SAMPLED, "drift": ["v", "-x - 0.3*v + u"], "observation": ["x + v", "2*v + u"], "inputs": ["u"],
+    },
+}  # fmt: skip
+
+
+def record_of(model, count=16, step=0.3, seed=3, gaps=True):
+    inputs = zakai.Inputs(np.arange(0.0, 20.0, 0.37), np.sin(np.arange(0.0, 20.0, 0.37))) if model.inputs else None
+    _, record = zakai.simulate(model, np.arange(1, count + 1) * step, seed=seed, inputs=inputs)
+    values = record.values.copy()
+    if gaps:
+        values[4] = np.nan
+        values[7, 0] = np.nan
+    return zakai.Record(record.times, values, record.kind, inputs=inputs)
+
+
+def deviations(result, exact):
+    """Errors of the means in reported standard errors (K, n)."""
+    return (result.mean - exact.mean)[1:] / result.mean_standard_error[1:]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", LINEAR)
+def test_means_and_evidence_agree_with_the_kalman_filter_within_their_standard_errors(name):
+    model = zakai.Model(**LINEAR[name])
+    record = record_of(model, step=0.3 if name in ("samples", "inputs") else 0.1, gaps=name != "cross noise")
+    result, exact = zakai.filter(model, record, PARTICLES), zakai.filter(model, record, "kalman-bucy")
+    errors = deviations(result, exact)
+    assert np.sqrt(np.mean(errors**2)) < 1.8 and np.abs(errors).max() < 4.5
+    assert np.nanmax(result.error_estimate) < 0.1
+    assert np.allclose(result.variance[1:] / exact.variance[1:], 1.0, atol=0.15)
+    assert abs(result.log_likelihood - exact.log_likelihood) < 4 * result.log_likelihood_standard_error + 0.05
+
+
+def test_the_reported_errors_are_the_spread_over_seeds():
+    model = zakai.Model(**LINEAR["samples"])
+    record = record_of(model)
+    exact = zakai.filter(model, record, "kalman-bucy")
+    runs = [zakai.filter(model, record, PARTICLES, particles=400, seed=seed, keep="moments") for seed in range(24)]
+    errors = np.array([run.mean - exact.mean for run in runs])[:, 1:]
+    reported = np.array([run.mean_standard_error for run in runs])[:, 1:]
+    assert 0.75 < np.sqrt(np.mean(reported**2) / np.mean(errors**2)) < 1.4
+    evidence = np.array([run.log_likelihood - exact.log_likelihood for run in runs])
+    assert 0.5 < np.mean([run.log_likelihood_standard_error for run in runs]) / np.sqrt(np.mean(evidence**2)) < 2.0
+    # The estimate of the likelihood itself has no bias.
+    assert abs(np.exp(evidence).mean() - 1.0) < 4 * np.exp(evidence).std() / np.sqrt(len(runs))
+
+
+def test_moves_of_the_past_keep_a_parameter_without_noise_known():
+    names = ["x", "b"]
+    prior = {"kind": "gaussian", "mean": [0.0, 0.0], "cov": [1.0, 1.0]}
+    model = zakai.Model(
+        state=names, drift=["b - 0.5*x", "0"], diffusion=[["0.2"], ["0"]], observation=["x"], observation_kind="samples",
+        observation_noise=[["0.04"]], prior=prior,
+    )  # fmt: skip
+    record = record_of(model, 30, 0.4, gaps=False)
+    result, exact = zakai.filter(model, record, PARTICLES, particles=1000), zakai.filter(model, record, "kalman-bucy")
+    assert np.nansum(result.health["moved"]) >= 2
+    assert np.sqrt(np.mean(deviations(result, exact) ** 2)) < 1.8
+    # 1,000 independent draws have 0.03; without moves the families of the first ancestors leave 0.2.
+    assert np.abs((result.mean - exact.mean) / np.sqrt(exact.variance))[1:].max() < 0.2
+
+
+def test_an_observation_far_from_the_prediction_is_reached():
+    model = zakai.Model(**{**LINEAR["samples"], "observation_noise": [["1e-4", "0"], ["0", "1e-4"]]})
+    record = zakai.Record([0.3, 0.6, 0.9], [[3.5, 5.0], [2.0, 1.0], [1.2, -1.0]], "samples")
+    result, exact = zakai.filter(model, record, PARTICLES), zakai.filter(model, record, "kalman-bucy")
+    assert np.nanmax(result.health["guided"]) == 1 or np.nanmax(result.health["tempering_levels"]) > 0
+    assert np.abs((result.mean - exact.mean) / np.sqrt(exact.variance))[1:].max() < 0.2
+    assert abs(result.log_likelihood - exact.log_likelihood) < 0.5
+
+
+def test_an_angle_is_observed_across_the_cut():
+    keys = {
+        "state": ["x", "y"], "drift": ["0", "0"], "diffusion": [["0.05", "0"], ["0", "0.05"]], "observation_kind": "samples",
+        "prior": {"kind": "gaussian", "mean": [-5.0, 0.0], "cov": [0.2, 0.2]},
+    }  # fmt: skip
+    angle = zakai.Model(**keys, observation=["atan2(y, x)"], observation_noise=[["1e-3"]])
+    # The same observation, of an angle that is counted from the other side.
+    turned = zakai.Model(**keys, observation=["-atan2(y, -x)"], observation_noise=[["1e-3"]])
+    values = np.array([np.pi - 0.02, -np.pi + 0.03, np.pi - 0.01])
+    times = [0.1, 0.2, 0.3]
+    other_values = np.mod(values, 2 * np.pi) - np.pi
+    result = zakai.filter(angle, zakai.Record(times, values[:, None], "samples"), PARTICLES, particles=4000)
+    other = zakai.filter(turned, zakai.Record(times, other_values[:, None], "samples"), PARTICLES, particles=4000)
+    assert np.allclose(result.mean, other.mean, atol=0.05) and np.allclose(result.log_likelihood, other.log_likelihood, atol=0.15)
+
+
+def test_equal_seeds_give_equal_bits_on_any_number_of_threads(monkeypatch):
+    from zakai.numerics.particles import chunks
+
+    model = zakai.Model(**{**LINEAR["samples"], "drift": ["v", "-sin(x) - 0.3*v"]})
+    record = record_of(model, 5, gaps=False)
+    found = []
+    for cores in (1, 3):
+        monkeypatch.setattr(chunks, "_cores", lambda cores=cores: cores)
+        found.append(zakai.filter(model, record, PARTICLES, particles=9000, keep="moments"))
+    assert found[0].mean.tobytes() == found[1].mean.tobytes()
+    assert found[0].log_likelihood_increments.tobytes() == found[1].log_likelihood_increments.tobytes()
+    other = zakai.filter(model, record, PARTICLES, particles=9000, seed=1, keep="moments")
+    assert not np.array_equal(other.mean, found[0].mean)
+
+
+def moments_after(model, time, particles=40_000, seed=0):
+    record = zakai.Record([time], [[np.nan] * model.m], "samples")
+    result = zakai.filter(model, record, PARTICLES, particles=particles, seed=seed, keep="moments")
+    return result.mean[1], result.cov[1], result
+
+
+def test_noise_that_depends_on_the_state_is_of_the_ito_kind():
+    growth, volatility, time = 0.3, 0.5, 1.0
+    model = zakai.Model(
+        state=["s"], drift=["0.3*s"], diffusion=[["0.5*s"]], observation=["s"], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [1.0], "cov": [1e-12]},
+    )  # fmt: skip
+    mean, cov, _ = moments_after(model, time)
+    assert mean[0] == pytest.approx(np.exp(growth * time), abs=4 * np.sqrt(cov[0, 0] / 40_000))
+    expected = np.exp(2 * growth * time) * np.expm1(volatility**2 * time)
+    assert cov[0, 0] == pytest.approx(expected, rel=0.06)
+
+
+def test_fields_of_noise_that_do_not_commute_have_the_moments_of_the_equation():
+    # dx = dv1, dy = x dv2 - x dv1 / 2: E y = 0, E y^2 = 5/4 int E x^2 = 5/8 + 5/4 var0 at t = 1.
+    model = zakai.Model(
+        state=["x", "y"], drift=["0", "0"], diffusion=[["1", "0"], ["-x/2", "x"]], observation=["x"], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [0.0, 0.0], "cov": [0.25, 1e-12]},
+    )  # fmt: skip
+    mean, cov, _ = moments_after(model, 1.0)
+    assert abs(mean[1]) < 0.03
+    assert cov[1, 1] == pytest.approx(5 / 8 + 5 / 4 * 0.25, rel=0.05)
+    assert cov[0, 1] == pytest.approx(0.0, abs=0.03)
+
+
+def test_states_stay_in_their_domain():
+    model = zakai.Model(
+        state=["x", "y"], drift=["1 - x", "x - y"], diffusion=[["0.8*sqrt(x)", "0"], ["0", "0.1"]], observation=["y"],
+        observation_kind="samples", observation_noise=[["0.01"]], domain={"x": {"lower": 0.0}},
+        prior={"kind": "gaussian", "mean": [1.0, 1.0], "cov": [0.01, 0.1]},
+    )  # fmt: skip
+    record = record_of(model, 12, 0.4, gaps=False)
+    result = zakai.filter(model, record, PARTICLES)
+    assert min(result.density(k).points[:, 0].min() for k in range(1, 13)) >= 0.0
+    assert np.isfinite(result.log_likelihood)
+
+
+def test_a_hundred_states_are_filtered():
+    n = 100
+    names = [f"x{i}" for i in range(n)]
+    drift = [f"-x{i} + 0.2*x{(i + 1) % n}" for i in range(n)]
+    model = zakai.Model(
+        state=names, drift=drift, observation=[f"sin({name})" for name in names[::25]], observation_kind="samples",
+        prior={"kind": "gaussian", "mean": [0.0] * n, "cov": [0.5] * n},
+    )  # fmt: skip
+    record = zakai.Record([0.2, 0.4], np.zeros((2, 4)), "samples")
+    result = zakai.filter(model, record, "auto", particles=500)
+    assert result.method == PARTICLES and np.isfinite(result.mean).all() and result.mean_standard_error.shape == (3, n)
+
+
+def test_auto_takes_particles_where_four_states_are_seen_nonlinearly_and_as_the_last_resort():
+    keys = {"drift": ["v", "-sin(x)", "w", "x - y**3"], "state": ["x", "v", "y", "w"], "observation_kind": "samples"}
+    prior = {"kind": "gaussian", "mean": [0.0] * 4, "cov": [1.0] * 4}
+    nonlinear = zakai.Model(**keys, observation=["x*y"], prior=prior)
+    assert in_order(nonlinear).index(PARTICLES) < in_order(nonlinear).index("general-direct")
+    result = zakai.filter(nonlinear, zakai.Record([0.1], [[0.3]], "samples"))
+    assert result.method == PARTICLES and "least work" in result.why
+    assert in_order(zakai.Model(**keys, observation=["x"], prior=prior))[-1] == PARTICLES
+
+
+def test_smoothing_and_paths_agree_with_the_kalman_smoother():
+    model = zakai.Model(**{**LINEAR["samples"], "observation": ["2*x", "v"]})
+    record = record_of(model, 10)
+    ours, exact = zakai.smooth(model, record, PARTICLES), zakai.smooth(model, record, "kalman-bucy")
+    assert np.sqrt(np.mean((ours.mean - exact.mean) ** 2 / exact.variance)) < 0.12
+    assert np.allclose((ours.variance / exact.variance)[1:], 1.0, atol=0.3)
+    paths, expected = ours.sample_paths(400), exact.sample_paths(400)
+    steps, known = (np.diff(drawn[:, :, 0], axis=1).var(axis=0) for drawn in (paths, expected))
+    assert np.allclose(steps / known, 1.0, atol=0.5) and paths.shape == (400, 11, 2)
+
+
+def test_residuals_forecasts_and_a_later_prior_come_from_the_particles(tmp_path):
+    model = zakai.Model(**LINEAR["samples"])
+    record = record_of(model, 8)
+    ours, exact = zakai.filter(model, record, PARTICLES), zakai.filter(model, record, "kalman-bucy")
+    assert np.nanmax(np.abs(ours.residuals() - exact.residuals())) < 0.06
+    ahead, known = ours.forecast([3.0, 4.0]), exact.forecast([3.0, 4.0])
+    assert np.allclose(ahead.mean, known.mean, atol=0.1)
+    density = ours.density(-1)
+    assert isinstance(density, zakai.densities.ParticleDensity)
+    density.save(tmp_path / "end")
+    later = model.with_prior(zakai.load_density(tmp_path / "end"), start=float(record.times[-1]))
+    assert np.allclose(later.prior.mean, density.mean(), atol=0.05)
+    assert np.allclose(density.marginal("x").quantile([0.5]), density.quantile([0.5])[:, :1])
+    ours.save(tmp_path / "result.nc")
+    read = zakai.load_result(tmp_path / "result.nc")
+    assert np.array_equal(read.mean_standard_error[1:], ours.mean_standard_error[1:])
+    assert read.log_likelihood_standard_error == ours.log_likelihood_standard_error
+
+
+def test_an_exact_method_has_no_standard_errors():
+    model = zakai.Model(**LINEAR["samples"])
+    exact = zakai.filter(model, record_of(model, 3, gaps=False), "kalman-bucy")
+    assert exact.mean_standard_error is None and exact.log_likelihood_standard_error is None
+    assert not exact.error_estimate.any()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"tolerance": 0.0}, "option tolerance: 0.0 is not a number from 0.001 to 0.5"),
+        ({"particles": 1}, "option particles: 1 is not a whole number"),
+        ({"particles": 100, "most_particles": 50}, "option particles: 100 is more than most_particles, 50"),
+        ({"seed": -1}, "option seed: -1 is not a whole number"),
+    ],
+)
+def test_wrong_options_are_refused(options, words):
+    model = zakai.Model(**LINEAR["samples"])
+    with pytest.raises(InputError, match=words):
+        zakai.filter(model, record_of(model, 2, gaps=False), PARTICLES, **options)
