@@ -18,6 +18,7 @@ T = sp.Symbol("t", real=True)
 X = sp.symbols("x1:4", real=True)
 STEP = mpmath.mpf(10) ** -12
 PHI = {
+    "powers": lambda u, v: u**4 / 7 + u * v,
     "log cosh": lambda u, v: sp.log(sp.cosh(u)),
     "sine": lambda u, v: sp.sin(u) + sp.cos(v) / 3,
     "cubic": lambda u, v: u**2 * v / 5 + v**3,
@@ -67,6 +68,18 @@ def test_the_drift_is_affine_plus_g_times_the_slope_of_phi(name, n):
                 assert max(abs(a - b) for a, b in zip(slopes, exact)) < 1e-15
             found = L * sp.Matrix(at) + l + G * sp.Matrix(slopes)
             assert max(abs(e) for e in found - f) < 1e-15
+
+
+@pytest.mark.parametrize(
+    ("drift", "phi"),
+    [("1/x", "log(x)"), ("2/x - x", "2*log(x)"), ("tan(x)", "-log(cos(x))"), ("1/(1 + exp(-x))", "x + log(1 + exp(-x))")],
+)
+def test_a_singular_drift_has_a_potential_in_closed_form(drift, phi):
+    form = yau_form(zakai.Model(state=["x"], drift=[drift], observation=["x"]))
+    x, expected = sp.Symbol("x", positive=True), sp.sympify(phi)
+    own = form.potential.subs(next(iter(form.potential.free_symbols)), x)
+    rest = sp.diff(own - expected.subs(sp.Symbol("x"), x), x, 2)
+    assert all(abs(rest.subs(x, at).evalf(30)) < 1e-20 for at in (0.3, 0.7, 1.2))
 
 
 @pytest.mark.parametrize("name", PHI)

@@ -41,8 +41,10 @@ class FactoredTower(Tower):
         return found
 
     def is_exponential(self, p: Any) -> bool:
-        """Return whether a polynomial of one term is a power of an exponential."""
-        return all(("exponent", self.generated(k).key) in self._made for k in self.used(p))
+        """Return whether a polynomial of one term is a product of exponentials."""
+        return not any(p.degrees()[self.count :]) and all(
+            ("exponent", self.generated(k).key) in self._made for k in self.used(p)
+        )
 
     def note_sign(self, e: Element) -> None:
         """Note that an argument is not negative, which fixes the sign of its factors of odd power together."""
