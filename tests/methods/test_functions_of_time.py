@@ -65,7 +65,7 @@ def test_an_input_beside_the_potential_moves_the_mean_alone():
 def test_a_table_of_time_that_ends_before_the_record_warns():
     table = {"level": ([0.0, 1.0], [0.0, 2.0])}
     model = zakai.Model(state=["x"], drift=["-x + level(t)"], observation=["x"], tables=table, prior=PRIOR)
-    result = zakai.filter(model, zakai.Record([0.5, 1.5], [[0.1], [0.2]]))
+    result = zakai.filter(model, zakai.Record([0.5, 1.5], [[0.1], [0.2]], "increments"))
     assert result.method == "kalman-bucy"
     assert result.warnings == [
         "level(t) is beyond the range of the table, where that is constant, at 1 of 3 times, first at t = 1.5; extend the table"

@@ -81,4 +81,4 @@ def test_few_states_keep_the_grid_and_increments_are_refused():
     assert zakai.filter(model, zakai.Record(TIMES, np.array(values, float)[:, None], "samples")).method == "yau-yau"
     kinked = zakai.Model(state=["x"], drift=["-x"], observation=["sinc(x)"], prior={"kind": "gaussian", "mean": [0], "cov": [1]})
     with pytest.raises(zakai.ConditionError, match="what a sample depends on"):
-        zakai.filter(kinked, zakai.Record([0.1], [[0.1]]), "general-direct")
+        zakai.filter(kinked, zakai.Record([0.1], [[0.1]], "increments"), "general-direct")

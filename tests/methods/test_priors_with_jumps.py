@@ -71,7 +71,8 @@ def test_auto_leaves_the_sums_of_gaussians_at_a_jump_and_a_named_one_names_anoth
 
 def test_a_function_that_does_not_decay_is_still_no_density():
     model = zakai.Model(
-        state=["x"], drift=["-x**3"], observation=["x"], prior={"kind": "density", "log_density": "log(heaviside(x)) - atan(x)"}
-    )
+        state=["x"], drift=["-x**3"], observation=["x"], observation_kind="increments",
+        prior={"kind": "density", "log_density": "log(heaviside(x)) - atan(x)"},
+    )  # fmt: skip
     with pytest.raises(zakai.InputError, match="does not decay"):
         zakai.online(model)

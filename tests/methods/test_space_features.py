@@ -170,6 +170,7 @@ def test_a_drift_that_jumps_is_refused():
 
 def test_a_drift_of_one_state_that_jumps_is_refused_where_no_noise_spreads_the_point_that_it_makes():
     keys = {**LINEAR, "state": ["x"], "drift": ["-sign(x)"], "observation": ["x"], "observation_noise": [["0.1"]]}
+    keys["observation_kind"] = "increments"
     keys |= {"diffusion": [["0"]], "process_noise": [["1"]], "prior": {"kind": "gaussian", "mean": [1.0], "cov": [[0.2]]}}
     with pytest.raises(ConditionError, match=r"write tanh\(x/w\) for sign\(x\)"):
         zakai.online(zakai.Model(**keys))

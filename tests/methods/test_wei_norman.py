@@ -31,7 +31,8 @@ PASSIVE = [
 
 
 def line(drift="tanh(x)", prior=None, **others) -> zakai.Model:
-    return zakai.Model(state=["x"], drift=[drift], observation=["x"], prior=prior or MIXTURE, **others)
+    keys = {"observation_kind": "increments", "prior": prior or MIXTURE, **others}
+    return zakai.Model(state=["x"], drift=[drift], observation=["x"], **keys)
 
 
 def record_of(model, times, seed=1, missing=()):
