@@ -34,6 +34,17 @@ STIFF = {
     "prior": {"kind": "gaussian", "mean": [0, 1], "cov": [0.3, 0.1]},
 }  # fmt: skip
 
+TABLES = {
+    "state": ["x", "y"], "drift": ["-slope(x) + sinc(3*y)", "ring(x + y)/3 - y"], "observation": ["depth(x) + y", "sinc(x - 9)"],
+    "observation_kind": "samples", "observation_noise": [[0.2, 0], [0, 0.1]],
+    "tables": {
+        "slope": {"x": [-1.0, 0, 1.5, 2], "values": [-3.0, 0, 1, 6], "kind": "linear"},
+        "depth": {"x": [-1.0, 0, 0.7, 1.5, 2], "values": [-3.0, 0, 1, 6, 5], "kind": "cubic"},
+        "ring": {"x": [0.0, 1, 2.5, 3, 4], "values": [1.0, 0, 2, -1, 1], "kind": "cubic", "periodic": True},
+    },
+    "prior": {"kind": "gaussian", "mean": [0.4, 0.3], "cov": [[0.6, 0.1], [0.1, 0.3]]},
+}  # fmt: skip
+
 
 def record_of(model, count, scale):
     times = np.cumsum(RNG.exponential(scale, count))
@@ -44,7 +55,7 @@ def record_of(model, count, scale):
 
 
 @pytest.mark.parametrize("substeps", [1, 2])
-@pytest.mark.parametrize("keys", [TURN, SWING, KINKS, STIFF, {**SWING, "observation_kind": "path"}])
+@pytest.mark.parametrize("keys", [TURN, SWING, KINKS, STIFF, TABLES, {**SWING, "observation_kind": "path"}])
 def test_the_compiled_loop_is_the_step_in_numpy(keys, substeps):
     model = zakai.Model(**keys)
     schedule, values = schedule_of(model, record_of(model, 20, 0.2))
@@ -64,7 +75,7 @@ def test_the_compiled_loop_is_the_step_in_numpy(keys, substeps):
         state = found
 
 
-@pytest.mark.parametrize("keys", [TURN, SWING, KINKS])
+@pytest.mark.parametrize("keys", [TURN, SWING, TABLES])
 def test_record_online_batch_and_restart_agree_to_the_bit(keys):
     model = zakai.Model(**keys)
     record = record_of(model, 40, 0.2)
@@ -127,7 +138,7 @@ def test_a_coordinated_turn_is_that_of_a_plain_filter_with_short_steps():
     assert np.allclose(found.cov[-1], cov, rtol=0, atol=0.02 * cov.max())
 
 
-def test_tables_and_sinc_are_taken_without_the_loop():
+def test_tables_and_sinc_are_those_of_the_formulas_that_they_stand_for():
     model = zakai.Model(
         state=["x"], drift=["-depth(x) + sinc(x)"], observation=["depth(x)"], observation_kind="samples",
         tables={"depth": {"x": [-3.0, 0, 3], "values": [-3.0, 0, 6], "kind": "linear"}},

@@ -74,7 +74,7 @@ class Prepared:
     The formulas; the parts of the intervals, of which those of interval k begin at `first`[k]; the coordinates that act inside an
     interval and those at its end (K, m) with their `spans` (K, m) and the inputs there; the covariance of the rates in each half
     of a part (J, 2, m, m) and that at the end (K, m, m).  `loop` is what the compiled loop receives, None where there is none:
-    for tables and sinc, correlated noise, derivatives and riccati="euler".
+    for tables of two arguments, correlated noise, derivatives and riccati="euler".
     """
 
     model: Model

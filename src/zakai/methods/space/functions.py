@@ -95,4 +95,6 @@ class PointFunction:
     def _translated(self) -> Formulas | None:
         """Return the program as arrays, without parameters; None where it has tables, sinc or inputs."""
         found = translated(self._program)
-        return None if found is None or (found[0].coordinates <= FIRST_INPUT).any() else found[0]
+        if found is None or len(found.data) or (found.formulas.coordinates <= FIRST_INPUT).any():
+            return None
+        return found.formulas
