@@ -227,13 +227,14 @@ class Online:
         if time > now:
             return float(time)
         begins = self.feeds[0].now.info is None
-        if time == now and begins and self.model.observation_kind == "samples":
+        if time == now and self.model.observation_kind == "samples":
             return float(time)
         if begins:
             raise InputError(f"update: the time {time!r} must be after the model's start {now!r}")
         if time == now:
-            raise InputError(f"update: the time {time!r} repeats that of the last observation")
-        raise InputError(f"update: the time {time!r} is late by {now - time:.12g}: the last observation was at {now!r}")
+            raise InputError(f"update: the time {time!r} repeats that of the last observation; merge them into one")
+        late = f"the time {time!r} is late by {now - time:.12g}: the last observation was at {now!r}"
+        raise InputError(f"update: {late}, which is kept; to use late ones, go on from a checkpoint before {time!r}")
 
     def _values(self, value: Any) -> list[float]:
         m = self.model.m
