@@ -336,3 +336,16 @@ def test_an_end_of_an_interval_is_a_bound_or_infinite_where_the_likelihood_does_
     record = zakai.simulate(model, [0.2, 0.4, 0.8], seed=4)[1]
     low, high = zakai.fit(model, record, bounds={"b": (-0.5, 0.7)}).intervals()["b"]
     assert (low, high) == (-0.5, 0.7)
+
+
+@pytest.mark.parametrize("start", [{"tau": 50.0, "sigma": 0.01}, {"tau": 100.0, "sigma": 5.0}, {"tau": 0.02, "sigma": 30.0}])
+def test_a_far_start_leads_to_the_maximum_and_keeps_the_signs(start):
+    model = zakai.Model(
+        state=["x"], drift=["-x/tau"], diffusion=[["sigma"]], observation=["x"], observation_kind="samples",
+        observation_noise=[["0.01"]], parameters={"tau": 1, "sigma": 1}, prior={"kind": "gaussian", "mean": [0], "cov": [[0.5]]},
+    )  # fmt: skip
+    record = zakai.simulate(model, np.arange(0.1, 20.05, 0.1), seed=2)[1]
+    near, far = zakai.fit(model, record), zakai.fit(model, record, start=start)
+    assert far.converged and far.warnings == []
+    assert far.log_likelihood == pytest.approx(near.log_likelihood, abs=1e-3)
+    assert far.estimates["tau"] == pytest.approx(near.estimates["tau"], rel=1e-3)

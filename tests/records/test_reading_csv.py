@@ -76,7 +76,6 @@ def test_the_careful_road_gives_the_same_numbers_as_the_fast_one(read):
 @pytest.mark.parametrize(
     ("content", "row", "says"),
     [
-        ("time,a,b\n1,2,3\n1,2,3\n", 3, "repeats the time before it"),
         (
             "time,a,b\n1,2,3\n\n2,2,3\n1.5,2,3\n",
             5,

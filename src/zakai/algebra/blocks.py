@@ -11,6 +11,7 @@ import sympy as sp
 from zakai.algebra._readable import tidy
 from zakai.models.features import (
     DOMAIN,
+    INPUTS,
     JUMPS,
     KINKS,
     OBSERVATION_FAMILY,
@@ -26,7 +27,7 @@ from zakai.models.model import Model
 # The features with which a model is divided.
 DIVIDED = frozenset(
     {
-        STATE_DEPENDENT_DIFFUSION, STATE_DEPENDENT_OBSERVATION_NOISE, OBSERVATION_FAMILY, OBSERVED_ANGLES, DOMAIN, TABLES, KINKS,
+        INPUTS, STATE_DEPENDENT_DIFFUSION, STATE_DEPENDENT_OBSERVATION_NOISE, OBSERVATION_FAMILY, OBSERVED_ANGLES, DOMAIN, TABLES, KINKS,
         JUMPS, SINC,
     }
 )  # fmt: skip
@@ -137,6 +138,16 @@ def _families(model: Model, rows: tuple[int, ...]) -> dict[str, Any]:
     return keys
 
 
+def _inputs(model: Model, states: tuple[int, ...], rows: tuple[int, ...]) -> dict[str, Any]:
+    """Return the known inputs, all of them, for a part whose formulas contain one; a part without takes none."""
+    formulas = [*(model.drift[i] for i in states), *(model.observation[j] for j in rows)]
+    formulas += [*model.covariance.extract(states, states), *model.observation_noise.extract(rows, rows)]
+    formulas += [formula for (_, row), formula in model.family_parameters.items() if row in rows]
+    if not any(formula.free_symbols & set(model.u) for formula in formulas):
+        return {}
+    return {"inputs": model.inputs, "input_hold": model.input_hold}
+
+
 def part_of(model: Model, states: tuple[int, ...], rows: tuple[int, ...], prior: Any = None) -> Model:
     """The part of a model with these states and observations, and a prior for them."""
     if len(states) == model.n and prior is None:
@@ -158,6 +169,7 @@ def part_of(model: Model, states: tuple[int, ...], rows: tuple[int, ...], prior:
         "parameters": model.parameters,
         "functions": model.functions,
         "prior": prior,
+        **_inputs(model, states, rows),
         "domain": {name: interval.keys() for name, interval in model.domain.items() if name in names},
         "tables": {name: table.keys() for name, table in model.tables.items()},
         **_families(model, rows),

@@ -26,7 +26,7 @@ _NUMBER = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 def record_of_block(record: Record, block: IndependentBlock) -> Record:
     """Return the observations of one block; a block without sensors has one coordinate that is never observed."""
     values = record.values[:, list(block.observations)] if block.observations else np.full((len(record), 1), np.nan)
-    return Record(record.times, values, record.kind, record.inputs)
+    return Record(record.times, values, record.kind, record.inputs if block.model.inputs else None)
 
 
 def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> FilterResult:

@@ -72,6 +72,7 @@ class Feed:
         Raises:
             InputError: the observation leaves nothing of the density.
         """
+        inputs = inputs if self.setting.model.inputs else None  # a block may take none
         start, _, state, _, last_values, last_times, *_ = self.now
         span, length, late = time - start, length_of(start, time), False
         seen = tuple([value == value for value in values])

@@ -20,6 +20,8 @@ GAIN = 1e-6  # nats, by which an iteration of L-BFGS-B must raise the log-likeli
 NEAR = 1e-3  # the distance to the maximum, in standard errors, that counts as none
 LIMIT = 0.1  # nats: the most that can be gained before values without a log-likelihood, at which the search ends
 ROUNDS = 4  # of a search in all parameters and one along a limit
+FAR = 10.0  # factor by which a parameter may change before a search in logarithms is tried, too
+MOST_FACTORS = 6  # of this size, one after another
 HALVINGS = 20  # of a step that leads to such values
 EVEN = 1e-9  # relative difference of log-likelihoods that are the same
 SINGULAR = 1e-6  # the smallest eigenvalue of the information scaled to a unit diagonal; differences leave 1e-8
@@ -43,6 +45,7 @@ class Found:
     problem: str
     iterations: int
     beyond: np.ndarray | None
+    upwards: np.ndarray | None = None  # a direction in which the log-likelihood curves upwards at the values (p,)
 
 
 class _LimitReached(Exception):  # noqa: N818  # ends the search
@@ -165,7 +168,75 @@ def _searched(objective: _Objective, exists: Exists, limits: np.ndarray) -> _Sea
 def maximum(
     function: Function, values: np.ndarray, box: np.ndarray, names: tuple[str, ...], model: Model, exists: Exists
 ) -> Found:
-    """Return the maximum of the likelihood from `values`: L-BFGS-B, and then Newton's steps in the free parameters."""
+    """Return the maximum of the likelihood from `values`.
+
+    Where a parameter has changed its sign or its size by far, which may lead across a pole, a second search keeps the signs, in
+    the logarithms of the sizes, and the higher end counts.  Where the search ends at values from which the log-likelihood curves
+    upwards, it goes on from the best ones in that direction.
+    """
+    found = _maximum(function, values, box, names, model, exists)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moved = np.where(values == 0, 1.0, found.values / values)
+    if ((moved < 1.0 / FAR) | (moved > FAR)).any():
+        later = _maximum(function, _by_size(function, values, box), box, names, model, exists)
+        if later.log_likelihood > found.log_likelihood + GAIN:
+            found = replace(later, iterations=found.iterations + later.iterations)
+    for _ in range(ROUNDS):
+        start = _uphill(function, found, box)
+        if start is None:
+            break
+        later = _maximum(function, start, box, names, model, exists)
+        if not later.log_likelihood > found.log_likelihood:
+            break
+        found = replace(later, iterations=found.iterations + later.iterations)
+    return found
+
+
+def _by_size(function: Function, values: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Return the parameters where a search in the logarithms of their sizes ends, with the signs of `values`.
+
+    It goes by factors of at most `FAR`, and on from there.
+    """
+    log, centre = values != 0, values
+
+    def at(v: np.ndarray) -> np.ndarray:
+        return np.clip(np.where(log, centre * np.exp(np.where(log, v, 0.0)), centre + v), box[:, 0], box[:, 1])
+
+    def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
+        theta = at(v)
+        value, gradient = function(theta)
+        if not (np.isfinite(value) and np.isfinite(gradient).all()):
+            return 1e300, np.zeros(len(v))
+        return -float(value), -gradient * np.where(log, theta, 1.0)
+
+    reach = float(np.log(FAR))
+    bounds = [(-reach, reach) if one else (None, None) for one in log]
+    options = {"maxiter": ITERATIONS, "ftol": 1e-9}
+    for _ in range(MOST_FACTORS):
+        v = minimize(objective, np.zeros(len(values)), jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+        centre = at(v)
+        if not np.any(log & (np.abs(v) >= reach)):
+            break
+    return centre
+
+
+def _uphill(function: Function, found: Found, box: np.ndarray) -> np.ndarray | None:
+    """Return the best values in a direction in which the log-likelihood curves upwards, None where there are no better ones."""
+    if found.converged or found.upwards is None:
+        return None
+    best, start = found.log_likelihood + LIMIT, None
+    for length in np.concatenate([side * 2.0 ** np.arange(-6, 8) for side in (-1.0, 1.0)]):
+        trial = np.clip(found.values + length * found.upwards, box[:, 0], box[:, 1])
+        value = function(trial)[0]
+        if np.isfinite(value) and value > best:
+            best, start = value, trial
+    return start
+
+
+def _maximum(
+    function: Function, values: np.ndarray, box: np.ndarray, names: tuple[str, ...], model: Model, exists: Exists
+) -> Found:
+    """Return the maximum by L-BFGS-B, and then Newton's steps in the free parameters."""
     scale = FIRST * np.where(values != 0, np.abs(values), 1.0)
     objective, u = _Objective(function, values, scale), np.zeros(len(values))
     value, gradient = objective.exact(u)
@@ -216,7 +287,22 @@ def maximum(
     if not converged:
         message += f" ({search.message.strip().lower() if beyond is None else 'at a limit of the parameters'})"
     values = np.clip(objective.values(u), box[:, 0], box[:, 1])
-    return Found(values, -value, covariance, converged, message, problem, iterations, beyond)
+    return Found(values, -value, covariance, converged, message, problem, iterations, beyond, _upwards(information, free, scale))
+
+
+def _upwards(information: np.ndarray, free: np.ndarray, scale: np.ndarray) -> np.ndarray | None:
+    """Return the direction (p,) of the smallest negative curvature in the free parameters, about as long as they are, or None."""
+    block = information[np.ix_(free, free)]
+    if not block.size or not np.isfinite(block).all():
+        return None
+    size = np.sqrt(np.abs(np.diag(block)))
+    size = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(block / np.outer(size, size))
+    if values[0] >= -SINGULAR:
+        return None
+    found = np.zeros(len(free))
+    found[free] = vectors[:, 0] / size
+    return np.asarray(found / np.max(np.abs(found)) * scale)
 
 
 def with_signs_of(start: np.ndarray, found: Found, function: Function, box: np.ndarray) -> Found:

@@ -86,7 +86,8 @@ class Online:
             given = expected_inputs(inputs, "online: inputs").on(clock)
             given.check(model, max(self.time, float(given.times[0])), self.time, name="online: inputs")
             for feed in self.feeds:
-                feed.now = feed.now._replace(inputs=given.since(self.time))
+                if feed.setting.model.inputs:
+                    feed.now = feed.now._replace(inputs=given.since(self.time))
 
     def __repr__(self) -> str:
         return f"Online({self.method} of {self.model.source}, at t = {self.time:.12g})"
@@ -204,7 +205,7 @@ class Online:
 
     def _known(self, call: str, time: float, inputs: Any) -> Inputs | None:
         """Return the known inputs from the time of the filter on, None for a model without inputs."""
-        now = self.feeds[0].now
+        now = next((feed.now for feed in self.feeds if feed.setting.model.inputs), self.feeds[0].now)
         if isinstance(inputs, Inputs):
             inputs = inputs.on(self.clock)
         with named(call):
@@ -227,13 +228,14 @@ class Online:
         if time > now:
             return float(time)
         begins = self.feeds[0].now.info is None
-        if time == now and begins and self.model.observation_kind == "samples":
+        if time == now and self.model.observation_kind == "samples":
             return float(time)
         if begins:
             raise InputError(f"update: the time {time!r} must be after the model's start {now!r}")
         if time == now:
-            raise InputError(f"update: the time {time!r} repeats that of the last observation")
-        raise InputError(f"update: the time {time!r} is late by {now - time:.12g}: the last observation was at {now!r}")
+            raise InputError(f"update: the time {time!r} repeats that of the last observation; merge them into one")
+        late = f"the time {time!r} is late by {now - time:.12g}: the last observation was at {now!r}"
+        raise InputError(f"update: {late}, which is kept; to use late ones, go on from a checkpoint before {time!r}")
 
     def _values(self, value: Any) -> list[float]:
         m = self.model.m

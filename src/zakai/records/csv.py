@@ -76,7 +76,8 @@ def read_record(
         places, note = observed_columns(names[1:], observed, model.inputs, columns)
         known = _input_columns(names, model)
     used = [0, *(place + 1 for place in places), *known]
-    table, row = read_table(path, len(names) - 1, "observations", dates=dates, used=used)
+    equal = model.observation_kind == "samples" or not getattr(model, "kind_given", True)
+    table, row = read_table(path, len(names) - 1, "observations", dates=dates, used=used, equal=equal)
     values, rest = table[:, 1 : 1 + model.m], table[:, 1 + model.m :]
     inputs = _inputs_of(path, model, row, table[:, 0], rest) if known else None
     kind = model.observation_kind if getattr(model, "kind_given", True) else None
@@ -160,11 +161,13 @@ def read_table(
     names: Sequence[str] | None = None,
     dates: Dates | None = None,
     used: Sequence[int] | None = None,
+    equal: bool = False,
 ) -> tuple[np.ndarray, int]:
     """The times and the `columns` numbers of every row of a CSV file, (K, 1 + columns), and the line of the first row.
 
     `what` is what a column holds, in the plural; with `names` the columns must have just these; `used` are the places of the
-    columns that are read, the first of which is 0, in the order of the table. Raises InputError as `read_record` does.
+    columns that are read, the first of which is 0, in the order of the table; times may be `equal`. Raises InputError as
+    `read_record` does.
     """
     try:
         # A pipe or a device could be endless.
@@ -173,7 +176,7 @@ def read_table(
             raise InputError(f"{shown(path)}: is {kind}; give a CSV file")
         # Bytes that are not UTF-8 become lone surrogates, which no number has; so their row is found.
         with path.open(encoding="utf-8-sig", errors="surrogateescape", newline=None) as file:
-            return table_of(file, shown(path), columns, what, names, dates, used)
+            return table_of(file, shown(path), columns, what, names, dates, used, equal)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{shown(path)}: cannot be read: {reason}; give a CSV file") from None
@@ -187,6 +190,7 @@ def table_of(
     names: Sequence[str] | None = None,
     dates: Dates | None = None,
     used: Sequence[int] | None = None,
+    equal: bool = False,
 ) -> tuple[np.ndarray, int]:
     """`read_table` of an open file, which is read once, a part at a time; `source` is what errors call it."""
     parts = _parts(file, source)
@@ -208,7 +212,7 @@ def table_of(
             wrong = other or wrong
         # The first bad row is the one to name: an earlier one may break a rule about its numbers.
         both = np.vstack([before, rows])
-        fault = first_fault(both[:, 0], both[:, 1:])
+        fault = first_fault(both[:, 0], both[:, 1:], equal)
         if fault is not None:
             wrong = _line(part, fault[0] - len(before)), fault[1]
         if wrong is not None:

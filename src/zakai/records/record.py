@@ -25,14 +25,17 @@ KINDS = ("increments", "path", "rates", "samples")
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """Observations at strictly increasing times.
+    """Observations at increasing times.
+
+    Samples of several sensors at one time may be rows with equal times: each is a factor of its own, in their order.  Of the
+    other kinds times increase strictly.
 
     What row k holds depends on `kind`: the increment y(t_k) - y(t_{k-1}) of dy = h dt + dw (`increments`),
     y(t_k) itself (`path`), the increment over the length of its interval (`rates`), or a sample
     z_k = h(x(t_k), t_k) + r_k (`samples`).
 
     Args:
-        times: (K,), in the model's unit of time, strictly increasing, at least one; or dates (pandas, NumPy, `datetime` or ISO
+        times: (K,), in the model's unit of time, increasing, at least one; or dates (pandas, NumPy, `datetime` or ISO
             texts), with a `unit`.
         values: (K, m), in the model's units; nan, or a masked cell, is "this coordinate was not observed here". (K,) is taken
             as (K, 1).
@@ -73,7 +76,7 @@ class Record:
             raise InputError(f"record: kind is {self.kind!r}; it must be one of {', '.join(KINDS)}")
         given, clock, dates = read_times(self.times, self.unit, self.origin)
         times, values = numbers_in_time(given, self.values, "record", "(K,)", "m")
-        fault = first_fault(times, values)
+        fault = first_fault(times, values, self.kind in (None, "samples"))
         if fault is not None:
             raise InputError(f"record: row {fault[0]}, counted from 0: {fault[1]}")
         times.flags.writeable = values.flags.writeable = False
@@ -166,6 +169,10 @@ class Record:
         if too_early is not None:
             hint = "" if self.unit is None else "; give the date at which t = 0 as origin"
             raise InputError(f"record: row 0, counted from 0: {too_early}{hint}")
+        if model.observation_kind != "samples" and (np.diff(self.times) == 0).any():
+            fault = first_fault(self.times, self.values)
+            if fault is not None:
+                raise InputError(f"record: row {fault[0]}, counted from 0: {fault[1]}")
         if self.inputs is not None or model.inputs:
             check_inputs(model, self.inputs, float(self.times[0]), float(self.times[-1]))
         fault = self.fault_of_law(model)
@@ -304,10 +311,13 @@ def _date_text(date: np.datetime64) -> str:
     return str(date.astype("datetime64[s]")).removesuffix("T00:00:00")
 
 
-def first_fault(times: np.ndarray, values: np.ndarray) -> tuple[int, str] | None:
-    """The first row (from 0) that no record may hold, and what is wrong with it; None if all are good."""
+def first_fault(times: np.ndarray, values: np.ndarray, equal: bool = False) -> tuple[int, str] | None:
+    """The first row (from 0) that no record may hold, and what is wrong with it; None if all are good.
+
+    Times may be `equal` in records of samples, of which each row is a factor of its own.
+    """
     rising = np.ones(len(times), dtype=bool)
-    rising[1:] = times[1:] > times[:-1]
+    rising[1:] = times[1:] >= times[:-1] if equal else times[1:] > times[:-1]
     good = rising & (np.abs(times) <= LARGEST) & ~(np.abs(values) > LARGEST).any(axis=1)
     if good.all():
         return None
@@ -320,7 +330,8 @@ def first_fault(times: np.ndarray, values: np.ndarray) -> tuple[int, str] | None
     if not rising[row]:
         before = float(times[row - 1])
         if time == before:
-            return row, f"the time {time!r} repeats the time before it; times must be strictly increasing: leave one row out"
+            what = f"the time {time!r} repeats the time before it"
+            return row, f"{what}; times must be strictly increasing: merge them into one row"
         return row, f"the time {time!r} comes after the time {before!r}; times must be strictly increasing: sort the rows"
     column = int(np.argmax(np.abs(values[row]) > LARGEST))
     return row, (

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import sympy as sp
 
+from zakai.algebra.yau import YauForm
 from zakai.errors import InputError
 from zakai.methods.sums.gauge import SumGauge, directions_of, span
 from zakai.methods.sums.system import System, system_of
@@ -56,7 +57,9 @@ class Sum:
         """The same for sums that need no gauge, and whose angles are any real numbers."""
         other = copy(self)
         other.angles = ()
-        other.gauge = SumGauge(sp.Integer(0), self.model, self.system.origin)
+        flat = sp.ImmutableMatrix.zeros(self.model.n, 1)
+        none = YauForm(sp.ImmutableMatrix.zeros(self.model.n, self.model.n), flat, sp.Integer(0), flat, flat)
+        other.gauge = SumGauge(none, self.model, self.system.origin)
         return other
 
     def limits(self, count: int) -> tuple[int, int]:
