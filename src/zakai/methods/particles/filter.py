@@ -23,7 +23,18 @@ import numpy as np
 from zakai.densities._density import wrap
 from zakai.methods._protocol import Info
 from zakai.methods.particles.errors import DEPTH, Genealogy, of_log_likelihood, variances
-from zakai.methods.particles.interval import PILOTS, TIME_ERROR, Events, Interval, Motion, Pilots, Scheme, Steps, steps_of
+from zakai.methods.particles.interval import (
+    MOST_SUBSTEPS,
+    PILOTS,
+    TIME_ERROR,
+    Events,
+    Interval,
+    Motion,
+    Pilots,
+    Scheme,
+    Steps,
+    steps_of,
+)
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import System, drawn, gaussian_prior
 from zakai.methods.particles.window import Observed, Target, Window, taken
@@ -33,7 +44,7 @@ from zakai.numerics.particles.population import effective, next_power, normalise
 from zakai.numerics.particles.random import key_of, normals, uniform_number
 from zakai.records.schedule import Schedule
 
-NOISE, RESAMPLING, PILOT, GUIDE, MOVE, PRIOR, RESIZE, LEVELS = range(8)  # uses of random numbers
+NOISE, RESAMPLING, PILOT, GUIDE, MOVE, PRIOR, LEVELS = range(7)  # uses of random numbers
 RESAMPLE_BELOW = 0.5  # effective share of the particles
 GUIDE_BELOW = 0.3  # effective share below which the noise is drawn again from the linearised posterior
 TEMPER_BELOW, TEMPER_FLOOR = 0.1, 400  # effective share and number below which powers of the likelihood are taken
@@ -57,9 +68,9 @@ class Control(NamedTuple):
     """What decides the next step beside the particles.
 
     `interval` counts intervals; `substeps` per unit time with `stages`, whose `error` was measured in an interval of this
-    `length` and is trusted in so many more; `variance` of a mean times N, `last` intervals of the window at
-    the last move, `urgency` what has added up since then, `floor` what it has left, and `doubtful_until` the
-    number of resamplings until which standard errors are lower bounds.
+    `length` and is trusted in so many more; `variance` of a mean times N, `last` intervals of the window at the last move,
+    `urgency` what has added up since then, `floor` what it has left, and `doubtful_until` the number of resamplings until which
+    standard errors are lower bounds.
     """
 
     interval: int
@@ -150,7 +161,7 @@ def init(prepared: Prepared, prior: Any) -> State:
     terms = len(prepared.motion.law[3])
     window = Window.begin(particles, first, gaussian, (width, terms))
     logs = np.full(count, -np.log(count))
-    control = Control(0, 0.0, 4, np.inf, 0.0, 0, VARIANCE, 0, 0.0, 0.0, 0)
+    control = Control(0, 0.0, 4, 0.0, 0.0, 0, VARIANCE, 0, 0.0, 0.0, 0)
     return State(particles, logs, window, Genealogy.begin(count), control, np.zeros(n), np.zeros(n))
 
 
@@ -257,6 +268,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         mean, deviations, cov = moments(cloud.particles, weights, angles)
         found = variances(cloud.genealogy, weights, deviations)
         floor = _excess(found.largest, cov, len(weights))
+        # A move that gained little is repeated when there is more to gain.
+        floor *= max(1.0, MOVE_GAIN * floor / factor)
         last, urgency, moved = cloud.window.length, 0.0, 1.0
         doubtful = doubtful or doubtful_move
     spread = np.sqrt(np.maximum(np.diag(cov), 0.0))
@@ -296,7 +309,7 @@ def _steps(
     """Return the substeps of an interval, measured where the last measurement does not hold any more, and the controls."""
     control, (mean, scale) = state.control, about
     length = interval.stop - interval.start
-    guess = max(1, round(control.substeps * length))
+    guess = min(max(1, round(control.substeps * length)), MOST_SUBSTEPS)
     if length <= 0:
         return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0), control
     # The error of an interval is of the third order of its length.
@@ -484,4 +497,4 @@ def _wanted(rule: Rule, count: int, variance: float) -> int:
     need = variance / rule.tolerance**2
     if count / 1.3 < need < 1.2 * count:
         return count
-    return int(np.clip(min(max(need, 0.7 * count, 500.0), 1.5 * count), min(500, rule.most), rule.most))
+    return int(np.clip(min(max(need, 0.7 * count), 1.5 * count), rule.particles, rule.most))

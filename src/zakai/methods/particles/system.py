@@ -78,6 +78,7 @@ class System:
             self.box[0][place], self.box[1][place] = interval.lower, interval.upper
         self.angles = np.array([name in model.periodic for name in model.state])
         self.affine = not state_dependent and _is_affine(model)
+        self.driven = bool(model.drift.free_symbols & {model.t, *model.u})  # whether f depends on time
         self.timed = bool(model.inputs) or any(
             part.has(model.t) for part in (model.diffusion, model.process_noise, model.observation_noise, model.cross_noise)
         )
