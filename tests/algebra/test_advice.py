@@ -83,7 +83,7 @@ def test_the_command_prints_both_lines(tmp_path, capsys):
     from zakai.cli import main
 
     (tmp_path / "m.toml").write_text(
-        'state = ["x"]\ndrift = ["x"]\ndiffusion = [["x"]]\nobservation = ["log(x)"]\n'
+        'state = ["x"]\ndrift = ["x"]\ndiffusion = [["x"]]\nobservation = ["log(x)"]\nobservation_kind = "increments"\n'
         '[prior]\nkind = "gaussian"\nmean = [1]\ncov = [[0.1]]\n'
     )
     (tmp_path / "r.csv").write_text("time,y\n0.1,0.2\n")

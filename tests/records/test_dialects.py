@@ -58,6 +58,6 @@ def test_dates_and_inputs_may_be_written_so_too(tmp_path):
     (tmp_path / "record.csv").write_text("Time;range;bearing\n2024-01-31;0,5;NA\n2024-02-01;1,5;2\n")
     record = read_record(tmp_path / "record.csv", MODEL, unit="d")
     np.testing.assert_array_equal(np.column_stack([record.times, record.values]), [[0, 0.5, np.nan], [1, 1.5, 2]])
-    room = zakai.load_model("gallery:heated-room")
+    heated = zakai.load_model("gallery:heated-room")
     (tmp_path / "inputs.csv").write_text("# heater in kW\ntime;outdoor;heater\n0;5;1,5\n")
-    np.testing.assert_array_equal(read_inputs(tmp_path / "inputs.csv", room).values, [[1.5, 5]])
+    np.testing.assert_array_equal(read_inputs(tmp_path / "inputs.csv", heated).values, [[1.5, 5]])

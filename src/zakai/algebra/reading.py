@@ -385,7 +385,7 @@ def _raised(orders: tuple[int, ...], i: int) -> tuple[int, ...]:
 
 
 def _inverse_parts(u: sp.Expr, kinds: tuple[type, ...]) -> tuple[list[tuple[sp.Expr, int]], sp.Expr]:
-    """Return the integer multiples of inverse functions in a sum, and what is left."""
+    """Return the integer multiples of inverse functions in a sum, and the rest."""
     if not u.has(*kinds):
         return [], u
     parts, rest = [], []

@@ -142,7 +142,7 @@ class Tower:
     # Bounded arithmetic.
 
     def begin(self, share: int = 1) -> None:
-        """Count the work from here on anew, with the bounds divided by `share`."""
+        """Count the work from zero, with the bounds divided by `share`."""
         self._work, self._operations, self._share = 0, 0, share
 
     def spend(self, products: int) -> None:

@@ -66,6 +66,7 @@ class Fit:
             Venzon and Moolgavkar 1988, A method for computing profile-likelihood-based confidence intervals.
 
         Example:
+            fitted = zakai.fit(model, record, parameters=["a"])
             fitted.intervals(0.9)["a"]
         """
         if isinstance(level, bool) or not isinstance(level, int | float | np.number) or not 0.0 < level < 1.0:
