@@ -63,7 +63,11 @@ def other_image(apart: Array, variance: Array) -> float:
     return float(np.max(weights, initial=0.0))
 
 
-ONE_IMAGE = 1e-6, "weight of another image of an observed angle (z + 2 pi) relative to the nearest, the only one that is taken"
+ONE_IMAGE = (
+    1e-6,
+    "weight of another image of an observed angle (z + 2 pi) relative to the nearest, the only one that is taken; take yau-yau or "
+    "guided-particles, which add up all images",
+)
 
 
 class Wrapped:
