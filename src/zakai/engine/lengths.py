@@ -38,12 +38,12 @@ DIFFERS = 0.2  # standard deviations, or nats of an interval, that a result repo
 class Distances(NamedTuple):
     """How much the means (K,), in standard deviations, and the log-likelihoods (K,) of intervals differ.
 
-    `nats` is for the state at the mean, `lost` for its density.
+    `nats` is for the state at the mean, `shortfall` for its density.
     """
 
     means: Array
     nats: Array
-    lost: Array
+    shortfall: Array
 
 
 def notes_on_lengths(schedule: Schedule, distances: Distances) -> list[str]:
