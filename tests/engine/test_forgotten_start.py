@@ -60,8 +60,8 @@ def test_a_late_first_observation_is_no_forgotten_start(record):
 
 def test_messages_print_times_so_that_they_differ():
     model = model_of(start=UNIX, inputs=["u"])
-    record = zakai.Record([UNIX + 0.5], [[0.0]], "samples", zakai.Inputs([UNIX + 0.25], [[1.0]]))
-    with pytest.raises(zakai.InputError, match=r"the first time 1634800000.25 is after the start 1634800000 "):
+    record = zakai.Record([UNIX + 0.5], [[0.0]], "samples", zakai.Inputs([UNIX + 0.75], [[1.0]]))
+    with pytest.raises(zakai.InputError, match=r"the first time 1634800000.75 is after the first observation at 1634800000.5"):
         zakai.filter(model, record)
     result = zakai.filter(model_of(start=UNIX), record_of(UNIX + 1))
     with pytest.raises(zakai.InputError, match=r"the time 1634800019.5 is not after the end of the record, 1634800020;"):

@@ -78,6 +78,14 @@ def test_a_pole_in_the_density_is_refused_with_the_domain_that_serves(drift, key
         filtered(model_of([drift], **keys), 1.0)
 
 
+def test_particles_are_refused_as_grids_are():
+    model, record = model_of(["x**3 + y", "-y"]), zakai.Record([1.0], [[0.3]], "samples")
+    with pytest.raises(zakai.InputError, match=r"drift\[0\] = x\*\*3 \+ y takes x to infinity between t = 0 and 1"):
+        zakai.filter(model, record, "guided-particles")
+    near = model_of(["x**3 + y", "-y"], variance=0.01)
+    assert np.isfinite(zakai.filter(near, zakai.Record([0.05], [[0.3]], "samples"), "guided-particles").mean).all()
+
+
 def test_a_pole_in_the_density_of_two_states_is_refused():
     with pytest.raises(zakai.InputError, match=r"drift\[0\] = y/x is infinite within the density at t = 0, as at x = "):
         filtered(model_of(["y/x", "-y"]), 1.0)

@@ -18,6 +18,8 @@ The losses of the log-likelihood have one sign, and add up over a record.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,19 +30,30 @@ from zakai.models.numeric import numpy_function
 from zakai.records.schedule import Schedule
 
 Array = NDArray[np.float64]
-MATTERS = 1.0  # nats of a record that a result reports: a likelihood that is wrong by a factor of e
+MATTERS = 2.0  # nats of a record that a result reports: as evidence between two models they count as positive
 STEP = 1e-3  # of the standard deviations, for the slopes of h
 DIFFERS = 0.2  # standard deviations, or nats of an interval, that a result reports
 
 
-def notes_on_lengths(schedule: Schedule, distances: tuple[Array, Array]) -> list[str]:
+class Distances(NamedTuple):
+    """How much the means (K,), in standard deviations, and the log-likelihoods (K,) of intervals differ.
+
+    `nats` is for the state at the mean, `shortfall` for its density.
+    """
+
+    means: Array
+    nats: Array
+    shortfall: Array
+
+
+def notes_on_lengths(schedule: Schedule, distances: Distances) -> list[str]:
     """Return a sentence on the intervals for which one of the formulas above exceeds 0.2, if there are any.
 
     Args:
         schedule: The K intervals.
         distances: What `distances_of_lengths` returns.
     """
-    means, nats = distances
+    means, nats, _ = distances
     over = np.maximum(means, nats) > DIFFERS
     if not over.any():
         return []
@@ -53,7 +66,7 @@ def notes_on_lengths(schedule: Schedule, distances: tuple[Array, Array]) -> list
 
 
 def notes_on_increments(times: Array, lost: Array | None) -> list[str]:
-    """Return a sentence where the intervals of a record together lose more than a nat.
+    """Return a sentence where the intervals of a record together lose more than two nats.
 
     Args:
         times: The times (K + 1,) of a result.
@@ -73,8 +86,8 @@ def _size(distances: Array) -> str:
     return f"{distances.max():.1g}" if distances.max() < 1 else "1 or more"
 
 
-def distances_of_lengths(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> tuple[Array, Array]:
-    """Return by how much means (K,), in standard deviations, and log-likelihoods (K,) of the intervals differ.
+def distances_of_lengths(model: Model, theta: Array, schedule: Schedule, infos: Infos) -> Distances:
+    """Return by how much the intervals differ.
 
     Args:
         model: The model.
@@ -84,7 +97,7 @@ def distances_of_lengths(model: Model, theta: Array, schedule: Schedule, infos: 
     """
     n, m = model.n, model.m
     if model.observation_kind == "samples" or not len(schedule):
-        return np.zeros(len(schedule)), np.zeros(len(schedule))
+        return Distances(*np.zeros((3, len(schedule))))
     f, h, G, S = kept(
         model,
         distances_of_lengths,
@@ -129,9 +142,9 @@ def distances_of_lengths(model: Model, theta: Array, schedule: Schedule, infos: 
             return np.asarray(noise / (12.0 + 4.0 * rate * length) + by_motion)
 
         # -log E exp(-loss) over the density, by three Gauss-Hermite points along each axis.
-        centre = nats = loss(mean)
+        centre = lost = loss(mean)
         for axis in np.eye(n):
             above, below = (loss(mean + side * np.sqrt(3.0) * reach * axis) - centre for side in (1.0, -1.0))
-            nats = nats - np.log((4.0 + np.exp(-above) + np.exp(-below)) / 6.0)
-        return np.nan_to_num(means, posinf=0.0), np.nan_to_num(nats, posinf=0.0)
+            lost = lost - np.log((4.0 + np.exp(-above) + np.exp(-below)) / 6.0)
+        return Distances(*(np.nan_to_num(part, posinf=0.0) for part in (means, noise + motion[0], lost)))
 

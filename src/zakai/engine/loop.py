@@ -236,7 +236,7 @@ class Run:
             conditions=considered,
             bounds={name: bound for name, bound in method.bounds.items() if name in infos.health},
             state=model.state,
-            increment_law_error=None if model.observation_kind == "samples" else np.cumsum(np.append(0.0, distances[1])),
+            increment_law_error=None if model.observation_kind == "samples" else np.cumsum(np.append(0.0, distances.shortfall)),
             attributes={"source": method.source, "exactness": method.exactness, **versions()},
             mean_standard_error=_with_start(infos.mean_standard_error),
             log_likelihood_standard_error=_last(infos.log_likelihood_standard_error),

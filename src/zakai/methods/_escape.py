@@ -233,8 +233,8 @@ def _zeros(function: Callable[[Array], Array], points: Array) -> list[float]:
 def infinite_text(model: Model, row: int, names: str, share: float) -> str:
     """Return the message about states that reach infinity; `row` is that of the drift which takes them there."""
     return (
-        f"{formula_text('drift', row, model)} takes {names} to infinity {UNTIL} with probability {share:.2g}, and no grid holds "
-        "such a density; give shorter intervals, a narrower prior, or a drift that grows no faster than the state"
+        f"{formula_text('drift', row, model)} takes {names} to infinity {UNTIL} with probability {share:.2g}, so that there is "
+        "no density to filter; give shorter intervals, a narrower prior, or a drift that grows no faster than the state"
     )
 
 

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities._density import wrap
+from zakai.methods._escape_of_states import check_escape
 from zakai.methods._protocol import Info
 from zakai.methods.particles.errors import DEPTH, Genealogy, of_log_likelihood, variances
 from zakai.methods.particles.interval import (
@@ -238,6 +239,12 @@ FIGURES = (
 
 
 def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
+    def at_start() -> tuple[Array, Array]:
+        weights = np.exp(state.log_weights)
+        mean = state.particles @ weights
+        return mean, (state.particles - mean[:, None]) * weights @ (state.particles - mean[:, None]).T
+
+    check_escape(prepared, k, at_start)
     motion, interval, control = prepared.motion, prepared.interval(k), state.control
     angles, number, rule = prepared.system.angles, control.interval + 1, prepared.rule
     cloud = Cloud(state.particles, state.log_weights, state.window, state.genealogy)

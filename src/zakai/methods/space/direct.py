@@ -19,7 +19,6 @@ from zakai.methods._yau_system import YauSystem, power_series_of, yau_of
 from zakai.methods.gaussian.affine_system import precision_of
 from zakai.methods.series.kernel import PowerSeries
 from zakai.methods.space import kolmogorov as base
-from zakai.methods.space.escape import check_escape
 from zakai.methods.space.filter import State
 from zakai.methods.space.flow import Stepper, regridded
 from zakai.methods.space.observed import Observations
@@ -81,7 +80,7 @@ class Prepared(base.Prepared):
 
     def step(self, k: int, state: State, values: np.ndarray) -> tuple[State, Info]:
         """Return the state after interval k and its observation, and what the step reports."""
-        check_escape(self, k, state)
+        self.check_escape(k, state)
         schedule, yau, bounds = self.schedule, self.yau, self.bounds
         begin, observations = Field(state.values, grid_of(state, bounds.periodic), 0.0), self.observations
         start, length = float(schedule.starts[k]), float(observations.lengths[k])

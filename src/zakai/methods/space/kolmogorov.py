@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from zakai.errors import InputError
+from zakai.methods._escape_of_states import check_escape
 from zakai.methods._options import tolerance_of
 from zakai.methods._protocol import Info
 from zakai.methods.line.cross import OMITTED
 from zakai.methods.space.cross import CrossSystem, potential_of
-from zakai.methods.space.escape import check_escape
 from zakai.methods.space.filter import State
 from zakai.methods.space.observed import MOST_PANELS, Observations
 from zakai.methods.space.short import predicted_on
@@ -96,13 +96,18 @@ class Prepared:
         """Return the posterior on a grid."""
         return Field(state.values, grid_of(state, self.bounds.periodic), 0.0)
 
+    def check_escape(self, k: int, state: State) -> None:
+        """Raise InputError where paths escape from a density in interval k."""
+        values, grid = np.maximum(np.asarray(state.values).real, 0.0), grid_of(state, self.bounds.periodic)
+        check_escape(self, k, lambda: moments_of(values, grid, self.angles))
+
     def allowed(self, state: State) -> float:
         """Return the error in time that one interval may make: errors of earlier intervals add to it."""
         return SHARE * self.tolerance * float(np.sqrt(1 - min(state.kept, KEPT) ** 2))
 
     def step(self, k: int, state: State, values: np.ndarray) -> tuple[State, Info]:
         """Return the state after interval k and its observation, and what the step reports."""
-        check_escape(self, k, state)
+        self.check_escape(k, state)
         observations = self.observations
         begin = Field(state.values, grid_of(state, self.bounds.periodic), 0.0)
         length, inside = float(observations.lengths[k]), observations.inside[k]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from zakai.methods._escape import FAR, FASTER, STEEP, EscapeError, divisors_of, formula_text, infinite_text
-from zakai.methods.space.filter import State
-from zakai.methods.space.system import grid_of, moments_of
-from zakai.models.kept import kept
+from zakai.models.kept import kept, once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import NumericFunction, numpy_function
 from zakai.numerics.escape import share_that_escapes
@@ -36,8 +35,14 @@ class Interval(NamedTuple):
         return EscapeError(f"{self.model.source}: {words}", self.row, self.start, self.length)
 
 
-def check_escape(prepared: Any, k: int, state: State) -> None:
-    """Raise InputError where paths escape from the density of a state in interval k of a `Prepared` of this package."""
+def check_escape(prepared: Any, k: int, moments: Callable[[], tuple[Array, Array]]) -> None:
+    """Raise InputError where paths escape in interval k.
+
+    Args:
+        prepared: what a method prepares, with a model, a schedule and parameters.
+        k: the number of the interval.
+        moments: returns the mean (n,) and the covariance (n, n) of the density at its start.
+    """
     model, schedule, theta = prepared.model, prepared.schedule, prepared.theta.real
     start, length = float(schedule.starts[k]), float(schedule.lengths[k])
     if length <= 0:
@@ -52,11 +57,10 @@ def check_escape(prepared: Any, k: int, state: State) -> None:
         return _grows(at(_far_points(model.n), start + 0.5 * length)[..., : model.n])
 
     with np.errstate(all="ignore"):
-        grows = growing() if prepared.system.drift_varies else kept(model, check_escape, growing, theta.tobytes(), 8)
+        grows = growing() if _varies(model) else kept(model, check_escape, growing, theta.tobytes(), 8)
         if not grows and divisors is None:
             return
-        grid = grid_of(state, prepared.bounds.periodic)
-        mean, cov = moments_of(np.maximum(np.asarray(state.values).real, 0.0), grid, prepared.angles)
+        mean, cov = moments()
         if not (np.isfinite(mean).all() and np.isfinite(cov).all() and (np.diagonal(cov) > 0).all()):
             return
         if grows:
@@ -64,6 +68,12 @@ def check_escape(prepared: Any, k: int, state: State) -> None:
         if divisors is not None:
             points = mean + _directions(model.n, SAMPLES) @ _root(cov).T
             _check_poles(Interval(model, at, k, start, length), points, at(points, start + 0.5 * length, divisors))
+
+
+@once_for_a_model
+def _varies(model: Model) -> bool:
+    """Return whether the drift depends on t or on inputs."""
+    return bool(model.drift.free_symbols & {model.t, *model.u})
 
 
 def _motion(model: Model) -> NumericFunction:
@@ -138,6 +148,6 @@ def _check_poles(interval: Interval, points: Array, divisors: Array) -> None:
             key, row = ("drift", index) if index < model.n else ("diffusion", (index - model.n) // model.n)
             place = ", ".join(f"{name} = {value:.3g}" for name, value in zip(model.state, low[0], strict=True))
             raise interval.error(
-                f"{formula_text(key, row, model)} is infinite within the density at t = START, as at {place}, and no grid holds "
-                "it; give a prior on one side and far from it, or another formula"
+                f"{formula_text(key, row, model)} is infinite within the density at t = START, as at {place}, and there is "
+                "no density to filter; give a prior on one side and far from it, or another formula"
             )
