@@ -25,7 +25,7 @@ _MOST_STATES = 6
 
 
 def posterior(result: Any, truth: np.ndarray | None) -> str:
-    """The heat maps, one per state, with a closer look at the end where the record is long."""
+    """The heat maps, one per state, with the end once more where the record is long."""
     total = len(result.times)
     names = state_names(result)
     shown = min(len(names), _MOST_STATES)
