@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import sympy
 
+import zakai
 from report.fakes import fake_result
 from zakai.algebra.conditions import Condition
 from zakai.errors import InputError
@@ -77,9 +78,22 @@ def test_a_run_without_densities_says_so_and_draws_the_band():
     assert "The densities of this run were not kept" in text and 'id="posterior-0"' in text
 
 
-def test_a_band_that_is_thin_is_drawn_again_about_its_mean():
+def test_a_state_with_a_thin_band_is_drawn_once():
     result, _ = fake_result(observations=100, step=5.0)
-    assert "about-mean-0" in without_library(page(result))
+    assert without_library(page(result)).count('id="posterior-0"') == 1
+
+
+def test_a_report_says_whether_it_is_of_a_filter_or_a_smoother_and_draws_the_inputs():
+    model = zakai.load_model("gallery:heated-room")
+    inputs = zakai.Inputs([0.0, 1.0], [[1.0, 5.0], [0.0, 4.0]])
+    record = zakai.simulate(model, np.arange(0.5, 6, 0.5), seed=0, inputs=inputs)[1]
+    results = [call(model, record) for call in (zakai.filter, zakai.smooth)]
+    assert [special_moments(result)[0] for result in results] == [(0, "prior"), (0, "start")]
+    filtered, smoothed = (without_library(page(result)) for result in results)
+    assert "Filtering report" in filtered and "given all observations up to that time" in filtered
+    assert "Smoothing report" in smoothed and "all observations, earlier and later" in smoothed
+    assert "Filtering report" not in smoothed and "smoothed 11 observations" in smoothed
+    assert 'id="inputs"' in filtered and "At the end, t = 5.5, the estimate is " in filtered
 
 
 def test_a_run_without_observations_or_health_or_conditions_is_a_page_too():

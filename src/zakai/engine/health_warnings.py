@@ -15,6 +15,7 @@ _MORE_OBSERVATIONS = "give more frequent observations"
 _OTHER_METHOD = "take another method that holds"
 _MORE_COMPONENTS = f"{_OTHER_METHOD}, or raise the option components"
 _WIDER_PRIOR = "give a wider prior, if it is not meant so narrow"
+NOTICEABLE = 1e-3  # deviations: an error of the mean within three digits of the deviation
 # What to change, for the figures whose words do not say it.
 ADVICE = {
     "negative_variance": "give variances of the noise and of the prior that are nearer in size",
@@ -71,7 +72,9 @@ def warnings_of_run(result: FilterResult) -> list[str]:
             )
     for name, (bound, what) in result.bounds.items():
         over = result.health[name] > bound if name in result.health else np.zeros(0, bool)
-        if over.any():
+        if over.any() and name == "tolerance_ratio" and "error_estimate" in result.health:
+            said += _of_tolerance(result, over)
+        elif over.any():
             times = len(over) - int(np.isnan(result.health[name][0]))  # a filter has no figure of the start
             worst = int(np.nanargmax(np.where(over, result.health[name], -np.inf)))
             said.append(
@@ -79,6 +82,24 @@ def warnings_of_run(result: FilterResult) -> list[str]:
                 f"{result.times[worst]:.12g} ({result.health[name][worst]:.2g}): {advised(name, what)}"
             )
     return said
+
+
+def _of_tolerance(result: FilterResult, over: np.ndarray) -> list[str]:
+    """Return by how much the means may be off, and from when on, where steps missed the tolerance; nothing if by little.
+
+    The estimate is a bound, which may be far above the error: beyond one deviation it says only that it knows nothing.
+    """
+    errors = np.nan_to_num(np.asarray(result.health["error_estimate"], float), nan=0.0)
+    off = errors > NOTICEABLE
+    if not off.any():
+        return []
+    first, worst = float(result.times[np.argmax(off)]), float(errors.max())
+    ratio = float(np.nanmax(np.where(over, result.health["tolerance_ratio"], -np.inf)))
+    size = f"by about {worst:.1g} deviations" if worst < 1.0 else "by an unknown amount"
+    return [
+        f"the means may be off {size}, from t = {first:.12g} on (tolerance_ratio exceeds 1 at {int(over.sum())} times, up to "
+        f"{ratio:.2g}); compare with a result of tolerance=1e-2: digits that agree are right; {_MORE_OBSERVATIONS}"
+    ]
 
 
 def advised(name: str, what: str) -> str:

@@ -179,7 +179,8 @@ def maximum(
         moved = np.where(values == 0, 1.0, found.values / values)
     if ((moved < 1.0 / FAR) | (moved > FAR)).any():
         later = _maximum(function, _by_size(function, values, box), box, names, model, exists)
-        if later.log_likelihood > found.log_likelihood + GAIN:
+        known = later.converged or not found.converged  # a plateau far away does not replace a maximum
+        if known and later.log_likelihood > found.log_likelihood + LIMIT:
             found = replace(later, iterations=found.iterations + later.iterations)
     for _ in range(ROUNDS):
         start = _uphill(function, found, box)

@@ -103,23 +103,20 @@ def density_over_time(
     stop: int | None = None,
     columns: int = 600,
     extra: tuple[int, ...] = (),
-    about_mean: bool = False,
-    profiles: tuple[Profile, ...] = (),
 ) -> DensityOverTime:
     """Evaluate the marginal posterior of one state over the times `start <= k < stop`.
 
     At most about `columns` times are taken, evenly spaced over the record, and the times `extra` with them.
-    `truth` has shape (K+1, n), nan where it is not known. With `about_mean` everything is the deviation from
-    the posterior mean. `profiles` are those of an earlier picture of the same times: no density is evaluated
-    twice.
+    `truth` has shape (K+1, n), nan where it is not known.
     """
     index = chosen_times(len(result.times), start, stop, columns, extra)
     periodic = is_periodic(result, state)
     mean = np.asarray(result.mean, dtype=float)[index, state]
     truth_here = None if truth is None else np.array(truth[index, state], dtype=float)
     kept = bool(result.has_densities)
+    profiles: tuple[Profile, ...] = ()
     if kept:
-        profiles = profiles or tuple(profile(result, int(k), state) for k in index)
+        profiles = tuple(profile(result, int(k), state) for k in index)
         low = np.array([p.quantile((1 - BAND) / 2) for p in profiles])
         high = np.array([p.quantile((1 + BAND) / 2) for p in profiles])
     else:
@@ -127,10 +124,8 @@ def density_over_time(
         high = np.minimum(high, np.pi) if periodic else high
         low = -high
 
-    centre = np.zeros_like(mean) if about_mean else mean
-    if about_mean and truth_here is not None:
-        truth_here = wrap(truth_here - mean) if periodic else truth_here - mean
-    if periodic and not about_mean:
+    centre = mean
+    if periodic:
         edges = np.linspace(-np.pi, np.pi, _ROWS + 1)
     else:
         edges = _edges(centre, centre + low, centre + high, truth_here, index)
@@ -149,11 +144,10 @@ def density_over_time(
                 density[:, column] += (low[column] <= middle) & (middle <= high[column])
 
     lower, upper = centre + low, centre + high
-    if periodic and not about_mean:
+    if periodic:
         lower, upper = wrap(lower), wrap(upper)
         truth_here = None if truth_here is None else wrap(truth_here)
     times = np.asarray(result.times, dtype=float)[index]
-    shown_on_circle = periodic and not about_mean
     return DensityOverTime(
         state_names(result)[state],
         index,
@@ -164,7 +158,7 @@ def density_over_time(
         lower,
         upper,
         truth_here,
-        shown_on_circle,
+        periodic,
         kept,
         profiles,
     )

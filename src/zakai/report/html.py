@@ -56,10 +56,10 @@ def page(result: Any, truth: Any = None) -> str:
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{name}: filtering report</title><style>{_style.css()}</style>"
+        f"<title>{name}: {words.title(result).lower()}</title><style>{_style.css()}</style>"
         "<script>window.PlotlyConfig = {MathJaxConfig: 'local'};</script>"
         f"<script>{plots.library()}</script></head>\n"
-        f'<body><main><header><p class="eyebrow">Filtering report</p><h1>{name}</h1>'
+        f'<body><main><header><p class="eyebrow">{words.title(result)}</p><h1>{name}</h1>'
         f'<p class="verdict">{escape(words.verdict(result))}</p>{_warnings(result)}{_facts(result, states)}'
         "<noscript><p>The pictures on this page need JavaScript; the text and the tables do "
         "not.</p></noscript>"

@@ -74,7 +74,23 @@ def observations(result: Any) -> str:
     text = f"<p>The dots are {what}" + ("." if expected is None else "; the line is h at the posterior mean after each of them.")
     if len(series) < record.values.shape[1]:
         text += f" The first {len(series)} of {record.values.shape[1]} coordinates are drawn."
-    return text + "</p>" + plots.framed(observations_figure(series, getattr(result, "clock", None)), "observations-figure", "")
+    figure = observations_figure(series, getattr(result, "clock", None))
+    return text + "</p>" + plots.framed(figure, "observations-figure", "") + known_inputs(result)
+
+
+def known_inputs(result: Any) -> str:
+    """The known inputs over the times of the record, or nothing where there are none."""
+    model, record = result.model, result.record
+    if model is None or record is None or record.inputs is None:
+        return ""
+    times = np.unique(np.concatenate([result.times, record.inputs.times]))
+    times = times[(times >= result.times[0]) & (times <= result.times[-1])]
+    values = record.inputs.at(times, model.input_hold)
+    nothing = np.zeros(0)
+    shown = model.inputs[:_MOST_COORDINATES]
+    series = [(f"input {name}", nothing, nothing, (times, values[:, j])) for j, name in enumerate(shown)]
+    figure = observations_figure(series, getattr(result, "clock", None), "known input")
+    return "<h3>Known inputs</h3>" + plots.framed(figure, "inputs", "")
 
 
 def _expected(result: Any) -> np.ndarray:
@@ -93,7 +109,9 @@ def _short(formula: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def observations_figure(series: list[tuple[str, np.ndarray, np.ndarray, Any]], clock: Any = None) -> Any:
+def observations_figure(
+    series: list[tuple[str, np.ndarray, np.ndarray, Any]], clock: Any = None, said: str = "h at the posterior mean"
+) -> Any:
     """One panel for each observed coordinate: (title, times, values, times and values of a line, or None)."""
     go, make_subplots = plotting("plotly.graph_objects"), plotting("plotly.subplots").make_subplots
     rows = len(series)
@@ -101,14 +119,15 @@ def observations_figure(series: list[tuple[str, np.ndarray, np.ndarray, Any]], c
     figure = make_subplots(rows=rows, cols=1, shared_xaxes=True, vertical_spacing=0.22 / rows, subplot_titles=titles)
     for row, (_, times, values, line) in enumerate(series, start=1):
         keep = plots.thinned(values)
-        plots.dots(figure, plots.moments(times[keep], clock), values[keep], row=row, col=1, showlegend=row == 1)
+        if len(values):
+            plots.dots(figure, plots.moments(times[keep], clock), values[keep], row=row, col=1, showlegend=row == 1)
         if line is not None:
             few = plots.thinned(line[1])
             figure.add_trace(
                 go.Scatter(
                     x=plots.moments(line[0][few], clock), y=line[1][few].astype(np.float32), mode="lines",
                     line={"color": style.INK, "width": 1.4}, showlegend=row == 1, legendgroup="expected",
-                    name="h at the posterior mean",
+                    name=said,
                 ), row=row, col=1,
             )  # fmt: skip
     plots.layout(figure, 190 * rows + 80)

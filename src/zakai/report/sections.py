@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from zakai.densities._density import wrap
 from zakai.report import plots, words
 from zakai.report.equations import equations
 from zakai.report.heatmap import (
@@ -26,7 +25,7 @@ _MOST_STATES = 6
 
 
 def posterior(result: Any, truth: np.ndarray | None) -> str:
-    """The heat maps, one per state, with a closer look where the record is long or the band thin."""
+    """The heat maps, one per state, with the end once more where the record is long."""
     total = len(result.times)
     names = state_names(result)
     shown = min(len(names), _MOST_STATES)
@@ -54,14 +53,6 @@ def posterior(result: Any, truth: np.ndarray | None) -> str:
             note = f"The last {_DETAIL} times, every one drawn."
             drawn = plots.posterior(last, 330, observed=_seen(result, i, last), clock=clock)
             parts.append(plots.framed(drawn, f"detail-{i}", note))
-        spread = np.median(np.abs(wrap(picture.upper - picture.lower) if picture.periodic else picture.upper - picture.lower))
-        if not picture.periodic and spread < 0.05 * (picture.edges[-1] - picture.edges[0]):
-            close = density_over_time(
-                result, i, truth, columns=_COLUMNS, extra=moments, about_mean=True, profiles=picture.profiles
-            )
-            note = "The same about its mean, since the band is thin against the range above."
-            label = f"{names[i]} − mean"
-            parts.append(plots.framed(plots.posterior(close, 330, label, clock=clock), f"about-mean-{i}", note))
     return "".join(parts)
 
 
@@ -77,8 +68,7 @@ def _seen(result: Any, state: int, picture: DensityOverTime) -> tuple[np.ndarray
 def _how_to_read(result: Any, truth: np.ndarray | None) -> str:
     if result.has_densities:
         text = (
-            "Each column of the picture is the conditional density of the state, given all observations "
-            "up to that time: the "
+            f"Each column of the picture is the conditional density of the state, given {words.given(result)}: the "
             "darker, the more probable, each column relative to its own peak. The black line is the mean; "
             "between the thin "
             "blue lines lies the state with probability 95%."
@@ -101,7 +91,7 @@ def _how_to_read(result: Any, truth: np.ndarray | None) -> str:
 def special_moments(result: Any) -> list[tuple[int, str]]:
     """At most six times of note, in their order, each with a name."""
     last = len(result.times) - 1
-    named: dict[int, str] = {0: "prior"}
+    named: dict[int, str] = {0: words.first_moment(result)}
     if last:
         after = np.arange(1, last + 1)
         with np.errstate(divide="ignore"):

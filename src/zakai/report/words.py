@@ -106,16 +106,47 @@ def exactness(result: Any) -> str:
     return str(result.attributes.get("exactness", ""))
 
 
+def kind_of(result: Any) -> str:
+    """Return what a result is: "filtered", "smoothed" or "forecast"."""
+    return str(getattr(result, "attributes", {}).get("kind", "filtered"))
+
+
+def title(result: Any) -> str:
+    """Return the heading of the report."""
+    return {"smoothed": "Smoothing report", "forecast": "Forecast report"}.get(kind_of(result), "Filtering report")
+
+
+def given(result: Any) -> str:
+    """Return what a density of a result is conditioned on."""
+    whole = {"smoothed": "all observations, earlier and later", "forecast": "all observations of the record"}
+    return whole.get(kind_of(result), "all observations up to that time")
+
+
+def first_moment(result: Any) -> str:
+    """Return the name of the first time of a result."""
+    return {"smoothed": "start", "forecast": "end of the record"}.get(kind_of(result), "prior")
+
+
+def estimate(result: Any) -> str:
+    """Return a sentence with the first states at the end, each with its deviation."""
+    names, deviation = state_names(result), np.sqrt(np.maximum(np.asarray(result.variance)[-1], 0.0))
+    few = [f"{name} = {signed(f'{mean:.4g}')} ± {width:.2g}" for name, mean, width in zip(names, result.mean[-1], deviation)][:3]
+    more = f" (the first 3 of {len(names)} states)" if len(names) > 3 else ""
+    last = len(result.times) - 1
+    return f"At the end, {moment(result, last)}, the estimate is {', '.join(few)}{more}: mean and standard deviation. "
+
+
 def verdict(result: Any) -> str:
-    """Return one or two sentences: method, amount of data, likelihood, warnings, exactness."""
+    """Return a few sentences: the estimate, the method, amount of data, likelihood, warnings, exactness."""
     observations = len(result.times) - 1
     by_blocks = getattr(result, "blocks", ())
-    text = f"The method {result.method}"
+    text = f"{estimate(result)}The method {result.method}"
     if by_blocks:
         methods = result.method.removeprefix("blocks: ")
-        text = f"A method for each of {count(len(by_blocks), 'independent block')} ({methods})"
+        text = f"{estimate(result)}A method for each of {count(len(by_blocks), 'independent block')} ({methods})"
     total = signed(f"{result.log_likelihood:,.2f}")
-    text += f" filtered {count(observations, 'observation')} with a log-likelihood of {total}"
+    done = "smoothed" if kind_of(result) == "smoothed" else "filtered"
+    text += f" {done} {count(observations, 'observation')} with a log-likelihood of {total}"
     if observations:
         text += f" ({signed(f'{result.log_likelihood / observations:.3f}')} per observation)"
     warned = len(result.warnings)
