@@ -42,12 +42,12 @@ def measure(name: str, seeds: int) -> dict[str, float]:
     steps = SYSTEMS[name][2]
     big = [zakai.filter(model, record, "guided-particles", particles=REFERENCE, seed=1000 + i, keep="moments") for i in range(2)]
     clock = time.process_time()
-    plain = [bootstrap(model, record, PEER, i, steps) for i in range(2)]
-    peer_time = (time.process_time() - clock) / len(plain)
+    filters = [bootstrap(model, record, PEER, i, steps) for i in range(2)]
+    other_time = (time.process_time() - clock) / len(filters)
     sd = np.sqrt(np.mean([one.variance[1:] for one in big], axis=0))
     angles = apart(model, big[1].mean[1:], big[0].mean[1:])
     reference = big[0].mean[1:] + 0.5 * angles
-    theirs = plain[0][0] + 0.5 * apart(model, plain[1][0], plain[0][0])
+    theirs = filters[0][0] + 0.5 * apart(model, filters[1][0], filters[0][0])
     likelihood = float(np.mean([one.log_likelihood for one in big]))
     runs, spent = [], []
     for seed in range(seeds):
@@ -58,7 +58,7 @@ def measure(name: str, seeds: int) -> dict[str, float]:
     reported = np.array([run.mean_standard_error[1:] / sd for run in runs])
     log_errors = np.array([run.log_likelihood - likelihood for run in runs])
     log_reported = np.array([run.log_likelihood_standard_error for run in runs])
-    peer_error = rms(np.array([apart(model, one[0], reference) / sd for one in plain]))
+    peer_error = rms(np.array([apart(model, one[0], reference) / sd for one in filters]))
     ours_time = float(np.median(spent))
     return {
         "states": model.n,
@@ -73,9 +73,9 @@ def measure(name: str, seeds: int) -> dict[str, float]:
         "ms": ours_time / len(record) * 1e3,
         "moves": float(np.mean([np.nansum(run.health["moved"]) for run in runs])),
         "peer error": peer_error,
-        "peer ms": peer_time / len(record) * 1e3,
+        "peer ms": other_time / len(record) * 1e3,
         "apart": rms(apart(model, reference, theirs) / sd),
-        "gain": (peer_error / rms(errors)) ** 2 * peer_time / ours_time,
+        "gain": (peer_error / rms(errors)) ** 2 * other_time / ours_time,
     }
 
 

@@ -70,8 +70,8 @@ class Control(NamedTuple):
 
     `interval` counts intervals; `substeps` per unit time with `stages`, whose `error` was measured in an interval of this
     `length` and is trusted in so many more; `variance` of a mean times N, `last` intervals of the window at the last move,
-    `urgency` what has added up since then, `floor` what it has left, and `doubtful_until` the number of resamplings until which
-    standard errors are lower bounds.
+    `urgency` what has added up since then, `floor` what it has left, `doubtful_until` the number of resamplings until which
+    standard errors are lower bounds, and `shifted` the variance of the log-likelihood by the time step.
     """
 
     interval: int
@@ -85,6 +85,7 @@ class Control(NamedTuple):
     urgency: float
     floor: float
     doubtful_until: int
+    shifted: float
 
 
 class State(NamedTuple):
@@ -162,7 +163,7 @@ def init(prepared: Prepared, prior: Any) -> State:
     terms = len(prepared.motion.law[3])
     window = Window.begin(particles, first, gaussian, (width, terms))
     logs = np.full(count, -np.log(count))
-    control = Control(0, 0.0, 4, 0.0, 0.0, 0, VARIANCE, 0, 0.0, 0.0, 0)
+    control = Control(0, 0.0, 4, 0.0, 0.0, 0, VARIANCE, 0, 0.0, 0.0, 0, 0.0)
     return State(particles, logs, window, Genealogy.begin(count), control, np.zeros(n), np.zeros(n))
 
 
@@ -281,10 +282,14 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         doubtful = doubtful or doubtful_move
     spread = np.sqrt(np.maximum(np.diag(cov), 0.0))
     # What the data says of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
-    contraction = np.minimum(1.0, spread / np.maximum(done.predicted, 1e-300)) ** 2
-    shift = (_carried(motion, events, before, state.shift) + steps.shift) * contraction
+    known = np.maximum(done.predicted, 1e-300)
+    contraction = np.minimum(1.0, spread / known) ** 2
+    shift = _carried(motion, events, before, state.shift) + steps.shift
+    # A shifted prediction changes the log density of an observation by the shift times an innovation.
+    shifted = control.shifted + float(((shift / known) ** 2 * (1.0 - contraction)).max())
+    shift = shift * contraction
     genealogy, evidence = of_log_likelihood(cloud.genealogy, found)
-    cloud = cloud._replace(genealogy=genealogy)
+    cloud, evidence = cloud._replace(genealogy=genealogy), evidence + shifted
     positive = np.where(spread > 0, spread, np.inf)
     share = found.largest / positive**2
     until = cloud.genealogy.age + DEPTH if doubtful else control.doubtful_until
@@ -305,7 +310,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     info = Info(done.gained, mean, cov, health, np.sqrt(found.largest + shift**2), float(np.sqrt(evidence)))
     variance = 0.8 * control.variance + 0.2 * len(weights) * float(share.mean())
     control = control._replace(
-        interval=number, variance=variance, last=last, urgency=urgency, floor=floor, doubtful_until=until
+        interval=number, variance=variance, last=last, urgency=urgency, floor=floor, doubtful_until=until, shifted=shifted
     )
     return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, steps.shift), info
 
