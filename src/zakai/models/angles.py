@@ -65,8 +65,8 @@ def other_image(apart: Array, variance: Array) -> float:
 
 ONE_IMAGE = (
     1e-6,
-    "weight of another image of an observed angle (z + 2 pi) relative to the nearest, the only one that is taken; take yau-yau or "
-    "guided-particles, which add up all images",
+    "weight of another image of an observed angle (z + 2 pi) relative to the nearest, the only one that is taken; take "
+    "yau-yau or guided-particles, which add up all images",
 )
 
 
