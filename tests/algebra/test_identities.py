@@ -30,6 +30,7 @@ PROVED = [
     sp.cos(sp.atan2(Y, X)) * sp.sqrt(X**2 + Y**2) - X,
     X**A * X - X ** (A + 1),
     Minimum(X, Y) * Maximum(X, Y) - X * Y,
+    sp.erf(X) + sp.erfc(X) - 1,
     Sinc(X, 0) * X - sp.sin(X),
     sp.tanh(X + Y) * (1 + sp.tanh(X) * sp.tanh(Y)) - sp.tanh(X) - sp.tanh(Y),
 ]

@@ -115,6 +115,8 @@ class Line:
             return self._power(self(e.base), rational(e.exp))
         if e.is_Pow:
             return self(sp.exp(e.exp * sp.log(e.base), evaluate=False))
+        if isinstance(e, sp.erfc):
+            return self(1 - sp.erf(e.args[0]))
         if e.func in QUOTIENTS:
             above, below = QUOTIENTS[e.func]
             return self((above(e.args[0]) if above else 1) / below(e.args[0]))

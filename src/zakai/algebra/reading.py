@@ -274,6 +274,8 @@ class Reader(FactoredTower):
         if f in QUOTIENTS or not e.args:
             raise OutOfBounds(f"{e} is not in the tower")
         u = self._read(e.args[0])
+        if f is sp.erfc:
+            return self.one - self._read(sp.erf(e.args[0]))
         if f is sp.Abs:
             return self._abs(u)
         if f is sp.sign:
@@ -406,7 +408,7 @@ def _gather(e: sp.Expr, functions: dict[sp.Expr, int]) -> int:
     further: list[sp.Expr] = []
     if isinstance(e, sp.asin | sp.acos):
         further = [_root_of(u)]
-    elif isinstance(e, sp.erf):
+    elif isinstance(e, sp.erf | sp.erfc):
         further = [sp.exp(-(u**2)), sp.sqrt(sp.pi)]
     elif isinstance(e, Sinc):
         further = [sp.sin(u)]
