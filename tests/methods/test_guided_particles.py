@@ -239,3 +239,30 @@ def test_wrong_options_are_refused(options, words):
     model = zakai.Model(**LINEAR["samples"])
     with pytest.raises(InputError, match=words):
         zakai.filter(model, record_of(model, 2, gaps=False), PARTICLES, **options)
+
+
+def test_a_fit_says_how_far_its_maximum_is_known():
+    keys = {**LINEAR["samples"], "observation": ["x", "v"], "drift": ["v", "-w*x - 0.3*v"], "parameters": {"w": 2.0}}
+    record = record_of(zakai.Model(**keys), 12, 0.4)
+    start = zakai.Model(**{**keys, "parameters": {"w": 1.5}})
+    exact = zakai.fit(start, record, method="kalman-bucy")
+    found = zakai.fit(start, record, method=PARTICLES, particles=400)
+    assert found.converged and found.method == PARTICLES
+    assert found.estimates["w"] == pytest.approx(exact.estimates["w"], abs=0.3 * exact.standard_errors["w"])
+    assert found.standard_errors["w"] == pytest.approx(exact.standard_errors["w"], rel=0.3)
+    assert any("its maximum is known to w +- " in warning for warning in found.warnings)
+
+
+def test_the_maximum_of_a_function_with_jumps_is_found():
+    from zakai.engine.random_maximum import random_maximum
+
+    H = np.array([[4.0, 1.0], [1.0, 2.0]])
+
+    def value(theta, seed):
+        d = theta - np.array([1.0, -2.0])
+        jumps = 0.02 * np.sin(1e6 * theta).sum() + 0.1 * np.random.default_rng(seed).normal(size=2) @ d
+        return float(-0.5 * d @ H @ d - 0.02 * d[0] ** 3 + jumps)
+
+    found = random_maximum(value, np.array([0.3, -1.0]), np.array([[-np.inf, np.inf], [-3.0, 3.0]]))
+    assert found.converged and np.allclose(found.values, [1.0, -2.0], atol=0.1)
+    assert np.allclose(found.covariance, np.linalg.inv(H), atol=0.1) and (found.errors > 0).all()

@@ -246,8 +246,8 @@ def in_order(model: Model) -> tuple[str, ...]:
     the work of "yau-yau" with three states, and for increments of an h with a kink in several; in two its grid does not hold the
     narrow peaks and rings that precise samples of a nonlinear h leave.
 
-    Particles are the last resort.  With four or more states and a nonlinear h, or a law of its own, they are taken before a grid
-    and a Gaussian sum, whose work grows with a power of the number of states: see `WORK`.
+    Particles are the last resort.  With four or more states and a nonlinear h, or a law of its own, of two or more of them, they
+    are taken before a grid and a Gaussian sum, whose work grows with a power of these numbers: see `WORK`.
     """
     last: tuple[str, ...] = ()
     nonlinear, samples = affine_observation(model) is None, model.observation_kind == "samples"
@@ -259,8 +259,10 @@ def in_order(model: Model) -> tuple[str, ...]:
         last = ("limited-direct", "general-direct")
     if features.OBSERVED_ANGLES in model.features:
         last = (*last, "kalman-bucy")  # it takes the nearest image alone
-    if model.n >= PARTICLES_FROM and (nonlinear or laws):
-        last = ("guided-particles", "general-direct", "yau-yau")
+    law = [*model.observation, *model.observation_noise.diagonal(), *model.family_parameters.values()]
+    read = set().union(*(part.free_symbols for part in [*law, *([] if model.log_density is None else [model.log_density])]))
+    if model.n >= PARTICLES_FROM and (nonlinear or laws) and len(read & set(model.x)) > 1:
+        last = ("guided-particles", "general-direct", "yau-yau", *last[len(last) - last.count("kalman-bucy") :])
     else:
         last = (*last, "guided-particles")
     return (*(name for name in _registry.AUTO if name not in last), *last)

@@ -12,10 +12,11 @@ from zakai import _display
 from zakai._progress import bar
 from zakai.densities import GaussianMixture
 from zakai.engine.driver import filter as run_filter
-from zakai.engine.driver import with_inputs
+from zakai.engine.driver import planned, with_inputs
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
 from zakai.engine.maximum import maximum, with_signs_of
 from zakai.engine.profile import Profile
+from zakai.engine.random_maximum import random_maximum, sentence
 from zakai.errors import InputError
 from zakai.models._errors import listing
 from zakai.models.model import Model
@@ -166,6 +167,8 @@ def fit(
     values = _start(model, names, start)
     box = _box(model, names, values, bounds)
     now = model.with_parameters(**dict(zip(names, values.tolist(), strict=True)))
+    if any(setting.method.random for setting in planned(now, None, method, options, by_value=False).settings):
+        return _fit_of_draws(now, record, names, values, box, method, options)
     function, known = LogLikelihood(now, record, method, names, options), dict[bytes, tuple[float, np.ndarray]]()
     with bar("fitting: log-likelihood and gradient") as advance:
 
@@ -203,6 +206,58 @@ def fit(
         observations=len(record.times),
         warnings=warnings,
         _profile=Profile(function.unwarned, values, found.covariance, box, names),
+    )
+
+
+def _fit_of_draws(
+    model: Model,
+    record: Record,
+    names: tuple[str, ...],
+    values: np.ndarray,
+    box: np.ndarray,
+    method: str,
+    options: dict[str, Any],
+) -> Fit:
+    """Return the fit by a log-likelihood with random errors, with common random numbers."""
+    known: dict[tuple[bytes, int], float] = {}
+    first = int(options.get("seed", 0))
+
+    def result_at(theta: np.ndarray, seed: int) -> Any:
+        at = model.with_parameters(**dict(zip(names, theta.tolist(), strict=True)))
+        return run_filter(at, record, method, keep="moments", **{**options, "seed": first + seed})
+
+    with bar("fitting: log-likelihood") as advance:
+
+        def value(theta: np.ndarray, seed: int) -> float:
+            key = theta.tobytes(), seed
+            if key not in known:
+                if advance is not None:
+                    advance(len(known) + 1, None)
+                try:
+                    known[key] = result_at(theta, seed).log_likelihood
+                except InputError:
+                    known[key] = -np.inf
+            return known[key]
+
+        found = random_maximum(value, values, box)
+    result = result_at(found.values, 0)
+    errors = np.sqrt(np.diag(found.covariance))
+    warnings = [sentence(names, found), *result.warnings]
+    if not found.converged:
+        warnings.insert(0, "the fit did not converge; these are the best values that were found")
+    estimates = dict(zip(names, found.values.tolist(), strict=True))
+    return Fit(
+        estimates=estimates,
+        standard_errors=dict(zip(names, errors.tolist(), strict=True)),
+        log_likelihood=result.log_likelihood,
+        model=model.with_parameters(**estimates),
+        converged=found.converged,
+        message=f"{'converged' if found.converged else 'not converged'}: quadratics through values with common random numbers",
+        iterations=found.iterations,
+        covariance=found.covariance,
+        method=result.method,
+        observations=len(record.times),
+        warnings=warnings,
     )
 
 

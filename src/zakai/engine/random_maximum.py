@@ -1,0 +1,101 @@
+"""The maximum of a function with random errors: quadratics through values with common random numbers.
+
+    l(theta) ~ l0 + g.(theta - c) + (theta - c)'H (theta - c) / 2,  by least squares over points around c,  c <- c - H^-1 g
+
+The distance of the points is that over which l falls by about one half, which is a standard error of the parameters: nearer
+points would see the jumps of the function, and not its curvature.  The spread of the maxima for several seeds says how far the
+maximum is known.
+
+References:
+    Myers, Montgomery and Anderson-Cook 2009, Response surface methodology.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Array = Any
+ROUNDS, SEEDS = 12, 4
+FIRST = 0.1  # distance of the first points, relative to a parameter
+CLOSE = 0.2  # of a step, in distances of the points, that ends the search
+DISTANCE = 1.5  # of the points, in standard errors
+_FACTOR = 3.0  # by which the distances change in a round, at most
+
+
+class RandomMaximum(NamedTuple):
+    """The maximum (p,), the inverse of the negative Hessian (p, p), the random error of the maximum (p,), and how it ended."""
+
+    values: Array
+    covariance: Array
+    errors: Array
+    converged: bool
+    iterations: int
+
+
+def random_maximum(function: Callable[[Array, int], float], start: Array, box: Array) -> RandomMaximum:
+    """Return the maximum of a function of p parameters and a seed, within bounds (p, 2)."""
+    centre = np.array(start, float)
+    apart = np.maximum(FIRST * np.abs(centre), 0.5 * FIRST)
+    converged, rounds = False, 0
+    while rounds < ROUNDS and not converged:
+        rounds += 1
+        slope, H = _quadratic(lambda theta: 0.5 * (function(theta, 0) + function(theta, 1)), centre, apart, box)
+        step = _step(slope, H, apart)
+        moved = np.clip(centre + step, box[:, 0], box[:, 1]) - centre
+        centre = centre + moved
+        curvature = -np.diag(H)
+        wanted = np.where(curvature > 0, DISTANCE / np.sqrt(np.maximum(curvature, 1e-300)), _FACTOR * apart)
+        changed = np.clip(wanted, apart / _FACTOR, apart * _FACTOR)
+        settled = bool(np.all(np.abs(np.log(changed / apart)) < np.log(1.5)))
+        apart = changed
+        converged = settled and bool(np.all(np.abs(moved) <= CLOSE * apart) and np.all(curvature > 0))
+    maxima, hessians = [], []
+    for seed in range(SEEDS):
+        slope, H = _quadratic(lambda theta, seed=seed: function(theta, seed), centre, apart, box)  # type: ignore[misc]
+        maxima.append(centre + _step(slope, H, apart))
+        hessians.append(H)
+    H = np.mean(hessians, axis=0)
+    errors = np.std(maxima, axis=0, ddof=1) / np.sqrt(SEEDS)
+    values = np.clip(np.mean(maxima, axis=0), box[:, 0], box[:, 1])
+    definite = bool(np.all(np.isfinite(H)) and np.linalg.eigvalsh(-H).min() > 0)
+    covariance = np.linalg.inv(-H) if definite else np.full_like(H, np.nan)
+    return RandomMaximum(values, covariance, errors, converged and definite, rounds)
+
+
+def _quadratic(function: Callable[[Array], float], centre: Array, apart: Array, box: Array) -> tuple[Array, Array]:
+    """Return the slope (p,) and the Hessian (p, p) of the quadratic through the values at a design around the centre."""
+    p = len(centre)
+    offsets = [np.zeros(p), *np.eye(p), *-np.eye(p)]
+    offsets += [a * np.eye(p)[i] + b * np.eye(p)[j] for i in range(p) for j in range(i) for a, b in ((1, 1), (-1, -1))]
+    points = np.clip(centre + np.array(offsets) * apart, box[:, 0], box[:, 1])
+    values = np.array([function(point) for point in points])
+    z = (points - centre) / apart
+    pairs = [(i, j) for i in range(p) for j in range(i + 1)]
+    columns = [np.ones(len(z)), *z.T, *(z[:, i] * z[:, j] * (0.5 if i == j else 1.0) for i, j in pairs)]
+    exists = np.isfinite(values)
+    if not exists.any():
+        return np.zeros(p), np.zeros((p, p))
+    # Where the function does not exist it is taken as far below the smallest value.
+    values = np.where(exists, values, values[exists].min() - 10.0)
+    found, *_ = np.linalg.lstsq(np.column_stack(columns), values, rcond=None)
+    H = np.zeros((p, p))
+    for (i, j), entry in zip(pairs, found[1 + p :], strict=True):
+        H[i, j] = H[j, i] = entry
+    return found[1 : 1 + p] / apart, H / np.outer(apart, apart)
+
+
+def _step(slope: Array, H: Array, apart: Array) -> Array:
+    """Return the step to the maximum of a quadratic, or uphill where it has none, of at most two distances of the points."""
+    scaled, gradient = H * np.outer(apart, apart), slope * apart
+    values, vectors = np.linalg.eigh(scaled)
+    step = vectors @ ((vectors.T @ gradient) / np.maximum(-values, 0.1 * max(np.abs(values).max(), 1e-12)))
+    return np.clip(step, -2.0, 2.0) * apart
+
+
+def sentence(names: Sequence[str], found: RandomMaximum) -> str:
+    """Return how far the maximum is known."""
+    known = ", ".join(f"{name} +- {error:.2g}" for name, error in zip(names, found.errors, strict=True))
+    return f"the log-likelihood has random errors: by {SEEDS} seeds its maximum is known to {known}, beside the standard errors"
