@@ -19,6 +19,7 @@ TURN = {
 }  # fmt: skip
 SWING = {
     "state": ["a", "b"], "drift": ["b", "-sin(a) - b/5 + u*t"], "diffusion": [[0], [0.5]], "observation": ["sin(a)*u", "b"],
+    "observation_kind": "increments",
     "observation_noise": [[0.1, 0.01], [0.01, "0.1*(2 + sin(9*t))"]], "inputs": ["u"], "input_hold": "linear",
     "prior": {"kind": "gaussian", "mean": [0, 1], "cov": [0.3, 0.0]},
 }  # fmt: skip

@@ -247,7 +247,8 @@ def in_order(model: Model) -> tuple[str, ...]:
     narrow peaks and rings that precise samples of a nonlinear h leave.
 
     Particles are the last resort.  With four or more states and a nonlinear h, or a law of its own, of two or more of them, they
-    are taken before a grid and a Gaussian sum, whose work grows with a power of these numbers: see `WORK`.
+    are taken before a grid and a Gaussian sum, whose work grows with a power of these numbers: see `WORK`.  With four or more states
+    they are always taken before a grid.
     """
     last: tuple[str, ...] = ()
     nonlinear, samples = affine_observation(model) is None, model.observation_kind == "samples"
@@ -264,7 +265,7 @@ def in_order(model: Model) -> tuple[str, ...]:
     if model.n >= PARTICLES_FROM and (nonlinear or laws) and len(read & set(model.x)) > 1:
         last = ("guided-particles", "general-direct", "yau-yau", *last[len(last) - last.count("kalman-bucy") :])
     else:
-        last = (*last, "guided-particles")
+        last = (*last, "guided-particles", *(["yau-yau"] if model.n >= PARTICLES_FROM else []))
     return (*(name for name in _registry.AUTO if name not in last), *last)
 
 

@@ -66,13 +66,14 @@ def notes_on_start(schedule: Schedule) -> list[str]:
     Times in seconds since 1970 with a start of zero begin with an interval of fifty years.
     """
     lengths = schedule.lengths
-    if len(lengths) < 2 or not schedule.seen.any() or not lengths[0] > FORGOTTEN * lengths[1:].max():
+    later = lengths[1:].max(initial=0.0)
+    if not schedule.seen.any() or not later > 0.0 or not lengths[0] > FORGOTTEN * later:
         return []
     first, last = float(schedule.starts[0]), float(schedule.stops[0])
     return [
         f"the first interval, from the model's start {first:.12g} to the first time {last:.12g}, is "
-        f"{lengths[0] / lengths[1:].max():.2g} times as long as the longest other; unless it is meant, give a start next to the "
-        f"first time, as start = {last - float(lengths[1:].max()):.12g}"
+        f"{lengths[0] / later:.2g} times as long as the longest other; unless it is meant, give a start next to the "
+        f"first time, as start = {last - float(later):.12g}"
     ]
 
 

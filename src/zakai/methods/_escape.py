@@ -143,7 +143,9 @@ def check_one_state(motion: Motion, density: Density) -> None:
                 f"give {_domain(motion, poles, mean, REFLECTING)} if {name} is reflected there, or another formula"
             )
         divides = min(share, 1.0 - share) > RARE
-        if divides or (probability > RARELY_NEAR and not any(sides)):
+        # A grid that holds the tails of the density holds the pole, and no number of steps is enough beside it.
+        held = low <= pole.place <= high
+        if divides or ((held or probability > RARELY_NEAR) and not any(sides)):
             what = f"has {share:.2g} of its mass below" if divides else f"comes close to it {UNTIL}"
             raise motion.error(
                 f"{infinite}; no path crosses it, and the density {what}; give {_domain(motion, poles, mean)} and a prior "

@@ -14,7 +14,7 @@ from zakai.models.functions import NEAR, NODES, WEIGHTS
 from zakai.models.model import Model
 from zakai.models.numeric import program_of
 from zakai.numerics.formula_kernel import BINARY, CLOCK, FIRST_INPUT, NEITHER, UNARY, Formulas
-from zakai.numerics.linearised import SINC, TABLE
+from zakai.numerics.formula_points import SINC, TABLE
 
 Array = NDArray[Any]
 
@@ -66,7 +66,7 @@ def translated(program: Program) -> Translation | None:
 
 
 def _table(evaluated: Any) -> list[float]:
-    """Return the data of a table of one argument, or of its derivative, for `numerics/linearised.py`."""
+    """Return the data of a table of one argument, or of its derivative, for `numerics/formula_points.py`."""
     table, (order,) = evaluated.func, evaluated.keywords["orders"]
     (found,), weights = table.pieces()
     (knots, splines), degree = found, table.degree
