@@ -247,8 +247,8 @@ def in_order(model: Model) -> tuple[str, ...]:
     narrow peaks and rings that precise samples of a nonlinear h leave.
 
     Particles are the last resort.  With four or more states and a nonlinear h, or a law of its own, of two or more of them, they
-    are taken before a grid and a Gaussian sum, whose work grows with a power of these numbers: see `WORK`.  With four or more states
-    they are always taken before a grid.
+    are taken before a grid and a Gaussian sum, whose work grows with a power of these numbers: see `WORK`.  With four or more
+    states they are always taken before a grid.
     """
     last: tuple[str, ...] = ()
     nonlinear, samples = affine_observation(model) is None, model.observation_kind == "samples"
