@@ -27,7 +27,6 @@ BAD = {
     "before the start": (b"time,y\n-1,1\n", "row 2"),
     "no time": (b"time,y\n,1\n", "row 2"),
     "not UTF-8": (b"time,y\n0.1,\xff\n", "row 2"),
-    "semicolons": (b"time;y\n0.1;1\n", "row 1"),
 }
 
 

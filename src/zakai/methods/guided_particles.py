@@ -14,7 +14,8 @@ from zakai.errors import InputError
 from zakai.methods._options import real_number, whole_number
 from zakai.methods._protocol import Method
 from zakai.methods.particles.backward import BACKWARD
-from zakai.methods.particles.filter import MOST_GROWTH, VARIANCE, Prepared, Rule, State, init, reduced, step
+from zakai.methods.particles.filter import MOST_GROWTH, VARIANCE, init, reduced, step
+from zakai.methods.particles.state import Prepared, Rule, State
 from zakai.methods.particles.system import system_of
 from zakai.methods.particles.validity import valid
 from zakai.models import features

@@ -147,7 +147,9 @@ def items(value: Any, length: int | None, expected: str) -> list[Any]:
 
 def _is_formula(value: Any) -> bool:
     """Return whether a value is one formula or number."""
-    return isinstance(value, str | int | float | Decimal | np.number | sympy.Expr) and not isinstance(value, bool)
+    return isinstance(value, str | int | float | Decimal | np.number | sympy.Expr) and not isinstance(
+        value, bool | sympy.MatrixBase
+    )
 
 
 def vector_of_formulas(value: Any, length: int | None, expected: str) -> list[str]:

@@ -17,9 +17,10 @@ import numpy as np
 
 from zakai.densities import ParticleDensity
 from zakai.methods._protocol import Backward, Info
-from zakai.methods.particles.filter import Prepared, State, moments
+from zakai.methods.particles.filter import moments
 from zakai.methods.particles.interval import Scheme
 from zakai.methods.particles.programs import Array
+from zakai.methods.particles.state import Prepared, State
 from zakai.numerics.particles.population import backward_draws, systematic
 from zakai.numerics.particles.random import uniform_number
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from zakai.methods.particles.errors import DEPTH
-from zakai.methods.particles.filter import Prepared, State
 from zakai.methods.particles.programs import Array
+from zakai.methods.particles.state import Prepared, State
 from zakai.methods.particles.window import INTERVALS, Window
 
 

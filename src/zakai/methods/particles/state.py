@@ -1,0 +1,97 @@
+"""What the particle filter is prepared with, and what a step hands to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+from zakai.methods.particles.errors import Genealogy
+from zakai.methods.particles.interval import Interval, Motion
+from zakai.methods.particles.programs import Array
+from zakai.methods.particles.system import System
+from zakai.methods.particles.window import Window
+from zakai.models.model import Model
+from zakai.numerics.particles.random import key_of
+from zakai.records.schedule import Schedule
+
+
+class Control(NamedTuple):
+    """What decides the next step beside the particles.
+
+    `interval` counts intervals; `substeps` per unit time with `stages`, whose `error` was measured in an interval of this
+    `length` and is trusted in so many more; `variance` of a mean times N, `last` intervals of the window at the last move,
+    `urgency` what has added up since then, `floor` what it has left, `doubtful_until` the number of resamplings until which
+    standard errors are lower bounds, and `shifted` the variance of the log-likelihood by the time step.
+    """
+
+    interval: int
+    substeps: float
+    stages: int
+    error: float
+    length: float
+    trusted: int
+    variance: float
+    last: int
+    urgency: float
+    floor: float
+    doubtful_until: int
+    shifted: float
+
+
+class State(NamedTuple):
+    """The weighted particles and what continues them.
+
+    `particles` (n, N), `log_weights` (N,) that sum to one, the past, the ancestors, the controls, `shift` (n,), the error of the
+    mean by the time step, and `last_shift` (n,), that of the last interval in which it was measured.
+    """
+
+    particles: Array
+    log_weights: Array
+    window: Window
+    genealogy: Genealogy
+    control: Control
+    shift: Array
+    last_shift: Array
+
+
+@dataclass(frozen=True)
+class Rule:
+    """The options: the particles at the start, their largest number, the wanted standard error or none, and the seed."""
+
+    particles: int
+    most: int
+    tolerance: float | None
+    seed: int
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A system with its parameters, a schedule and the options."""
+
+    system: System
+    theta: Array
+    schedule: Schedule
+    rule: Rule
+    notes: tuple[str, ...] = ()
+
+    @property
+    def model(self) -> Model:
+        """The model."""
+        return self.system.model
+
+    @cached_property
+    def motion(self) -> Motion:
+        """The programs for these parameters."""
+        return Motion(self.system, self.theta)
+
+    def interval(self, k: int) -> Interval:
+        """Return an interval of the schedule."""
+        schedule = self.schedule
+        start, stop = float(schedule.starts[k]), float(schedule.stops[k])
+        inputs = None if schedule.inputs is None else schedule.inputs.part(start, stop)
+        return Interval(start, stop, schedule.seen[k], schedule.inside[k], schedule.elapsed[k], inputs)
+
+    def key(self, interval: int, use: int, more: int = 0) -> Array:
+        """Return the key of the random numbers of one use in one interval."""
+        return key_of(self.rule.seed, interval, use, more)
