@@ -6,7 +6,7 @@ density of log d is ~ d^(kappa + 1 - k).  A grid that ends where that density is
 
     p = (kappa - 1) / (kappa + 1 - k).
 
-At the limit of Feller, kappa = 1, that is no small number for any e.  Finite volumes without flux through their ends lose nothing.
+At the limit of Feller, kappa = 1, that is no small number for any e.  Finite volumes without flux at their ends lose nothing.
 """
 
 from __future__ import annotations
