@@ -14,6 +14,7 @@ from zakai.methods.line.coarse import EDGE, coarsened
 from zakai.methods.line.coefficients import resolved_parts
 from zakai.methods.line.drift_grid import showing_drift
 from zakai.methods.line.figures import refitted
+from zakai.methods.line.leak import ALLOWED, lost
 from zakai.methods.line.moving import speed_of
 from zakai.methods.line.system import NOISE, Prepared
 from zakai.numerics.line import window as lw
@@ -77,7 +78,7 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
     known, begin = lw.figures(values, window.closed, negligible).aliasing, window
     while window.size <= lw.LARGEST:
         found = by_modes(prepared, values, window, length)
-        if found is None or not abs(float(np.sum(found[0].real)) - 1.0) < 1e-3:
+        if found is None or not lost(float(np.sum(found[0].real))) < 1e-3:
             return None
         look = lw.figures(found[0], window.closed, negligible)
         if look.aliasing > 30.0 * negligible and (look.aliasing > rough or not look.rough):
@@ -85,6 +86,10 @@ def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, lengt
         bound = max(EDGE, 4.0 * look.aliasing)
         left, right = look.left > bound, look.right > bound
         if not (left or right):
+            missing = lost(float(np.sum(found[0].real)))
+            if missing > ALLOWED * prepared.tolerance:
+                return None
+            report.time += missing
             if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
                 report.aliasing = max(report.aliasing, lw.figures(values, window.closed, negligible).aliasing - known)
             return _normalised(found[0], window, found[1], report, negligible, Passage(values, window, length, 0.0, window))
@@ -154,8 +159,9 @@ def _by_substeps(
             attempt = attempted(prepared, values, window, Substep(start + first, last - first, inside, rates, speed))
             report.decomposed = attempt.substep is None
             total = float(np.sum(attempt.values.real))
-            lost = not 1e-100 < total < 1e6 or (not inside.any() and abs(total - 1.0) > 1e-3)
-            split = (attempt.split or lost) and last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
+            missing = 0.0 if inside.any() else lost(total)
+            failed = not 1e-100 < total < 1e6 or missing > 1e-3
+            split = (attempt.split or failed) and last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
             if split:
                 break
             look = lw.figures(attempt.values, window.closed, negligible)
@@ -199,7 +205,7 @@ def _by_substeps(
         if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
             brought = lw.figures(values, window.closed, negligible).aliasing
             report.aliasing = max(report.aliasing, brought - known)
-        report.time += attempt.error
+        report.time += attempt.error + missing
         begin, after = window, lw.moved(window, speed * (last - first))
         before, values = values, np.where(attempt.values.real > 0, attempt.values, 0.0)
         mass = np.sum(values)

@@ -14,6 +14,7 @@ import numpy as np
 
 from zakai.methods.line.coefficients import coefficients
 from zakai.methods.line.course import FAST, LEVELS, Course, course_of, drift_along, ends_of
+from zakai.methods.line.leak import ends_of_leak
 from zakai.methods.line.model import within
 from zakai.methods.line.moves import Moved, Report
 from zakai.methods.line.system import Prepared
@@ -67,7 +68,8 @@ def contracted(
     noise = float(np.max(covariance_at(prepared.system, window.points, start, prepared.theta.real)))
     rounding = ROUNDING * 0.5 * (np.pi / window.spacing) ** 2 * noise * length
     general = rough(prepared, inside) or fine
-    stiff_noise = not general and rounding > SHARE * prepared.tolerance
+    leak = ends_of_leak(prepared, window, ends, start, length)
+    stiff_noise = leak is not None or (not general and rounding > SHARE * prepared.tolerance)
     if not (general or stiff_noise or speed * length > FAST * width):
         return None
     # Cells do not bring back what the grid does not resolve.
@@ -82,6 +84,8 @@ def contracted(
         course = course_of(prepared, values, window, ends, start, length, inside, widening=widening * width)
         if course is None:
             return None
+        if leak is not None:
+            course = course._replace(cells=course.cells.reaching(*leak))
         stiff = stiff_noise or speed * length > STIFF * width
         far = (course.way.travel > MOST_TRAVEL and not moving) or course.way.deviations > MOST_DEVIATIONS
         if not (general or stiff or far) or width < NARROWEST * course.finest:  # sharper than the cells where it begins

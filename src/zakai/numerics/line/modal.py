@@ -148,6 +148,7 @@ def advance(
                 from_, to = min(from_, j), j
         if not (abs(mass - 1.0) < 1e-3):
             return i, FAILED
+        missing = abs(mass - 1.0)
         for j in range(size):
             moved[j] /= mass
         predicted, before = moments(moved)[2] * coarse**2, moments(now)[2] * spacing**2
@@ -192,7 +193,8 @@ def advance(
         if not closed:
             edge = max(edge, on_left, on_right)
         row[1], row[2] = moments(now)[1:]
-        made = 2.0 * aliasing + 10.0 * (edge + negative) + rounding + unsure + min(floor * growth, 1.0)
+        # What the ends of the grid absorb is missing.
+        made = 2.0 * aliasing + 10.0 * (edge + negative) + rounding + unsure + missing + min(floor * growth, 1.0)
         if not ((closed or not seen or max(on_left, on_right) < 1e-10) and made <= allowed):
             return i, FAILED
         ratio = min(max(np.sqrt(before * row[2]) * spacing / predicted, 0.3), 1.0)

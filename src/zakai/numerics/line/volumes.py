@@ -61,6 +61,11 @@ class Volumes(NamedTuple):
         """Between which s (P + 1,) the cells are uniform, and how many lie before each (P + 1,)."""
         return _geometry(self)[:2]
 
+    def reaching(self, low: float, high: float) -> Volumes:
+        """Return as many cells that also cover two offsets from the origin."""
+        first, last = np.arcsinh((np.array([low, high]) - self.centre) / self.scale)
+        return self._replace(first=min(self.first, float(first)), last=max(self.last, float(last)))
+
     def place(self, offsets: Array) -> Array:
         """Return how many cells lie before offsets (J,) from the origin, NaN beyond the cells."""
         s, before = self.ends

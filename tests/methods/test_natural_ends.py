@@ -1,0 +1,64 @@
+"""One state that nearly reaches a natural end, near the limit of Feller: exact transition densities, by quadrature."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import ive
+from scipy.stats import ncx2
+
+import zakai
+
+NOISE = 0.3
+
+
+def bessel(c):
+    """Return the transition density of dx = c / x dt + dB, a Bessel process of index c - 1/2."""
+    index = c - 0.5
+    return lambda t, x, y: y / t * (y / x) ** index * np.exp(-((x - y) ** 2) / (2 * t)) * ive(index, x * y / t)
+
+
+def cox_ingersoll_ross(a):
+    """Return the transition density of dx = a (1 - x) dt + sqrt(x) dB."""
+
+    def transition(t, x, y):
+        c = 2 * a / (1 - np.exp(-a * t))
+        return 2 * c * ncx2.pdf(2 * c * y, 4 * a, 2 * c * x * np.exp(-a * t))
+
+    return transition
+
+
+CASES = {
+    "bessel at the limit": ("0.5/x", "1", bessel(0.5)),
+    "bessel near it": ("0.75/x", "1", bessel(0.75)),
+    "bessel in three dimensions": ("1/x", "1", bessel(1.0)),
+    "square root at the limit": ("0.5*(1 - x)", "sqrt(x)", cox_ingersoll_ross(0.5)),
+    "square root near it": ("0.6*(1 - x)", "sqrt(x)", cox_ingersoll_ross(0.6)),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_process_near_the_limit_of_feller_has_the_exact_law(name):
+    drift, diffusion, transition = CASES[name]
+    model = zakai.Model(
+        state=["x"], drift=[drift], diffusion=[[diffusion]], observation=["x"], observation_kind="samples",
+        observation_noise=[[str(NOISE)]], domain={"x": {"lower": 0}},
+        prior={"kind": "density", "log_density": "-5*(x - 1.5)**2 - 0.02/x"},
+    )  # fmt: skip
+    times, values = np.array([0.8, 1.0]), np.array([0.6, 0.2])
+    result = zakai.filter(model, zakai.Record(times, values[:, None], "samples"), "yau-yau")
+    nodes, weights = np.polynomial.legendre.leggauss(260)
+    root = 1.6 * (nodes + 1)  # powers of x at zero are smooth in the root
+    x, weights = root**2, 3.2 * root * weights
+    p, log_likelihood = np.exp(-5 * (x - 1.5) ** 2 - 0.02 / x), 0.0
+    p /= weights @ p
+    for k, length in enumerate([0.8, 0.2]):
+        p = (weights * p) @ transition(length, x[:, None], x)
+        p *= np.exp(-((values[k] - x) ** 2) / (2 * NOISE)) / np.sqrt(2 * np.pi * NOISE)
+        log_likelihood += np.log(weights @ p)
+        p /= weights @ p
+        mean = weights @ (x * p)
+        assert result.mean[k - 2, 0] == pytest.approx(mean, abs=4e-6)
+        assert result.variance[k - 2, 0] == pytest.approx(weights @ ((x - mean) ** 2 * p), abs=4e-6)
+    assert result.log_likelihood == pytest.approx(log_likelihood, abs=4e-6)
+    assert not result.warnings
