@@ -10,6 +10,7 @@ import sympy as sp
 
 import zakai
 from zakai.algebra.conditions import all_hold
+from zakai.algebra.quadratics import decided_q
 from zakai.algebra.systems import yau_system
 from zakai.algebra.yau import YauForm, yau_form
 from zakai.methods._potential import potential_of
@@ -107,6 +108,7 @@ def test_q_of_a_moving_log_cosh_is_the_quadratic_that_differences_give():
     )
     found = yau_system(model)
     assert found is not None and found.unobserved is not None and found.full is not None
+    assert all("no proof" not in decided_q(model, energy).evidence for energy in (False, True))
     phi = sp.log(sp.cosh(q * x + d))
     exact = 2 * sp.diff(phi, T) + G * (sp.diff(phi, x, 2) + sp.diff(phi, x) ** 2) + 2 * a * x * sp.diff(phi, x) + 2 * a
     for energy, quadratic in ((0, found.unobserved), (x**2 * (1 + T) ** 2, found.full)):
