@@ -9,7 +9,22 @@ from pathlib import Path
 
 import zakai
 
-PACKAGES = ["densities", "models", "algebra", "numerics", "records", "methods", "engine", "peers", "studies", "report", "cli"]
+PACKAGES = [
+    "densities",
+    "models",
+    "algebra",
+    "numerics",
+    "records",
+    "methods",
+    "notes",
+    "engine",
+    "diagnostics",
+    "inference",
+    "peers",
+    "studies",
+    "report",
+    "cli",
+]
 EVERYWHERE = {"errors", "_display", "_progress", "_registry"}
 SOURCE = Path(zakai.__file__).parent
 # Simulating makes a record, which belongs to a later package; imported inside functions, so that there is no circle.
@@ -17,17 +32,18 @@ SOURCE = Path(zakai.__file__).parent
 LAZILY = {
     ("models/simulate.py", "records"),
     ("engine/results.py", "report"),
+    ("engine/results.py", "diagnostics"),
     ("densities/_density.py", "report"),
     ("densities/_density.py", "records"),
-    ("engine/fit.py", "report"),
+    ("inference/fit.py", "report"),
     ("algebra/analysis.py", "report"),
 }
 # The registry at the root imports every package by name; no import of a package stands in it.
 FILES = sorted(path.relative_to(SOURCE).as_posix() for path in SOURCE.rglob("*.py") if path.parent != SOURCE)
 JAX = {"jax", "jaxlib", "cuthbert", "cuthbertlib", "dynamax", "tensorflow_probability"}
 # Inside functions, for what a caller who uses JAX passes: a key, or the parameters under `jax.grad`.
-WHERE_JAX_IS_LOADED = {"densities/_density.py", "engine/likelihood.py", "engine/likelihood_in_jax.py", "engine/bayes.py"}
-KNOWS_NO_MODEL = {"models", "algebra", "densities", "records", "methods", "engine"}  # what numerics/ may not import
+WHERE_JAX_IS_LOADED = {"densities/_density.py", "engine/likelihood.py", "engine/likelihood_in_jax.py", "inference/bayes.py"}
+KNOWS_NO_MODEL = {"models", "algebra", "densities", "records", "methods", "notes", "engine"}  # what numerics/ may not import
 
 
 @cache
@@ -82,8 +98,8 @@ CALLED = {
         "zakai.report",
         "zakai.report.axes",
         "zakai.engine.forecast",
-        "zakai.engine.observed_ahead",
-        "zakai.engine.residuals",
+        "zakai.diagnostics.observed_ahead",
+        "zakai.diagnostics.residuals",
         "zakai.engine.stored",
     },
     # The parts of one method.

@@ -9,7 +9,7 @@ import pytest
 
 import zakai
 from zakai._registry import METHODS, load
-from zakai.engine.health_warnings import warnings_of_step
+from zakai.notes.health import warnings_of_step
 
 
 @pytest.mark.parametrize("name", METHODS)

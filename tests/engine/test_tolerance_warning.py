@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import zakai
-from zakai.engine.health_warnings import warnings_of_run
+from zakai.notes.health import warnings_of_run
 
 
 @pytest.mark.parametrize(

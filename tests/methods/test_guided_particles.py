@@ -256,7 +256,7 @@ def test_a_fit_says_how_far_its_maximum_is_known():
 
 
 def test_the_maximum_of_a_function_with_jumps_is_found():
-    from zakai.engine.random_maximum import random_maximum
+    from zakai.inference.random_maximum import random_maximum
 
     H = np.array([[4.0, 1.0], [1.0, 2.0]])
 

@@ -119,7 +119,7 @@ def fit(
     columns: str = "",
 ) -> None:
     """Print the parameters of largest likelihood, and write the model with them."""
-    from zakai.engine.fit import fit as run
+    from zakai.inference.fit import fit as run
     from zakai.records.writing import atomic_write
 
     check_outputs([output], [source, record_path, inputs_path])

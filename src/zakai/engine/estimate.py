@@ -13,9 +13,9 @@ from zakai.densities import Density, ProductDensity
 from zakai.densities.product import renamed
 from zakai.engine.blocks import SMALLEST_IS_WORST
 from zakai.engine.feed import Feed, Moment
-from zakai.engine.health_warnings import warnings_of_step
 from zakai.errors import InputError
 from zakai.models.prior import GaussianPrior
+from zakai.notes.health import warnings_of_step
 
 if TYPE_CHECKING:
     from zakai.engine.online import Online

@@ -11,17 +11,6 @@ import numpy as np
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.along_path import along_path, record_along
-from zakai.engine.health_warnings import warnings_of_run
-from zakai.engine.lengths import distances_of_lengths, notes_on_lengths
-from zakai.engine.misfit import notes_on_law
-from zakai.engine.notes import (
-    notes_on_angles,
-    notes_on_domain,
-    notes_on_formulas,
-    notes_on_start,
-    notes_on_tables,
-    why_not_finite,
-)
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import KEPT, Setting
 from zakai.engine.versions import versions
@@ -29,6 +18,17 @@ from zakai.errors import InputError
 from zakai.methods._escape import EscapeError
 from zakai.methods._protocol import Infos, stacked
 from zakai.methods._states import Joined
+from zakai.notes.health import warnings_of_run
+from zakai.notes.lengths import distances_of_lengths, notes_on_lengths
+from zakai.notes.misfit import notes_on_law
+from zakai.notes.model import (
+    notes_on_angles,
+    notes_on_domain,
+    notes_on_formulas,
+    notes_on_start,
+    notes_on_tables,
+    why_not_finite,
+)
 from zakai.numerics.one_thread import one_thread
 from zakai.records import Record
 from zakai.records.noise import notes_on_noise

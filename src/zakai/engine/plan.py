@@ -14,7 +14,6 @@ from zakai.algebra.conditions import all_hold
 from zakai.algebra.independent import IndependentBlock
 from zakai.algebra.theorems import conditions_of, in_order
 from zakai.engine.blocks import joined_blocks, record_of_block
-from zakai.engine.lengths import notes_on_increments
 from zakai.engine.loop import KEPT_BYTES, Run
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import Setting
@@ -23,6 +22,7 @@ from zakai.methods._moments import prior_moments
 from zakai.methods._protocol import Method
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior, GaussianPrior
+from zakai.notes.lengths import notes_on_increments
 from zakai.numerics.sums.mixture import wrapped
 from zakai.records import Record
 

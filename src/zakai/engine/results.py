@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-    from zakai.engine.observed_ahead import PredictedObservations
+    from zakai.diagnostics.observed_ahead import PredictedObservations
     from zakai.engine.plan import Plan
     from zakai.records import Inputs
 
@@ -274,7 +274,7 @@ class FilterResult:
             low, high = predicted.quantile([0.05, 0.95])
             outside = (record.values < low) | (record.values > high)
         """
-        from zakai.engine.observed_ahead import predict_observations
+        from zakai.diagnostics.observed_ahead import predict_observations
 
         return predict_observations(self, times, inputs)
 
@@ -300,7 +300,7 @@ class FilterResult:
             u = result.residuals()
             scipy.stats.kstest(u[~np.isnan(u)], "uniform").pvalue
         """
-        from zakai.engine.residuals import residuals
+        from zakai.diagnostics.residuals import residuals
 
         return residuals(self, seed)
 

@@ -19,7 +19,6 @@ from zakai.algebra.theorems import conditions_of
 from zakai.densities import Density
 from zakai.engine.batch import Progress, announced, filter_all, smooth_all
 from zakai.engine.driver import check_noise, check_records, with_inputs
-from zakai.engine.health_warnings import warnings_of_run
 from zakai.engine.loop import CHUNK, KEPT_BYTES, Run, advance, joined, size_of
 from zakai.engine.plan import plan_of
 from zakai.engine.results import FilterResult
@@ -28,6 +27,7 @@ from zakai.errors import InputError
 from zakai.methods._protocol import Info, Infos, stacked
 from zakai.methods._states import Joined
 from zakai.models.model import Model
+from zakai.notes.health import warnings_of_run
 from zakai.numerics.one_thread import one_thread
 from zakai.records import Inputs, Record
 

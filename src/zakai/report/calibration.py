@@ -107,7 +107,7 @@ def _uniformity(u: np.ndarray) -> float:
 
 def section(result: Any) -> str:
     """Return the section: PIT histogram, normal scores over time, and autocorrelation of each observed coordinate."""
-    from zakai.engine.residuals import residuals
+    from zakai.diagnostics.residuals import residuals
 
     count = len(result.times) - 1
     if getattr(result, "origin", None) is None or result.record is None or count == 0:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import zakai
-from zakai.engine import maximum
+from zakai.inference import maximum
 
 LINE = dict(
     state=["x"],
@@ -296,7 +296,7 @@ def test_signs_that_only_change_together_are_those_of_the_start():
         prior={"kind": "gaussian", "mean": [0.0], "cov": [[0.5]]},
     )
     _, record = zakai.simulate(model, 0.05 * np.arange(1, 401), seed=4)
-    from zakai.engine.maximum import Found, with_signs_of
+    from zakai.inference.maximum import Found, with_signs_of
 
     function, values = zakai.log_likelihood(model, record, "kalman-bucy").value_and_gradient, np.array([0.8, 0.6])
     mirrored = Found(-values, function(values)[0], np.eye(2), True, "", "", 1, None)

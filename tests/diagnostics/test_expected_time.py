@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import zakai
-from zakai.engine import expected_time
-from zakai.engine.expected_time import Expected, expected_seconds
+from zakai.diagnostics import expected_time
+from zakai.diagnostics.expected_time import Expected, expected_seconds
 
 PENDULUM = zakai.load_model("gallery:pendulum")
 

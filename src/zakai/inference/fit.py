@@ -14,10 +14,10 @@ from zakai.densities import GaussianMixture
 from zakai.engine.driver import filter as run_filter
 from zakai.engine.driver import planned, with_inputs
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
-from zakai.engine.maximum import maximum, with_signs_of
-from zakai.engine.profile import Profile
-from zakai.engine.random_maximum import random_maximum, sentence
 from zakai.errors import InputError
+from zakai.inference.maximum import maximum, with_signs_of
+from zakai.inference.profile import Profile
+from zakai.inference.random_maximum import random_maximum, sentence
 from zakai.models._errors import listing
 from zakai.models.model import Model
 from zakai.records import Inputs, Record

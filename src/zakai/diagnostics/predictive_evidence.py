@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.engine.predictive import Pair, PredictiveSums
+from zakai.diagnostics.predictive import Pair, PredictiveSums
 from zakai.engine.setting import Setting
 from zakai.models.families import COUNTS
 from zakai.numerics.tangent_quadrature import distribution

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai import _display
+from zakai.diagnostics.predictive import Mixture, PredictiveSums
 from zakai.engine.forecast import future_of, origin_of
 from zakai.engine.loop import CHUNK, Run, segments
-from zakai.engine.predictive import Mixture, PredictiveSums
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
 from zakai.models.families import COUNTS

@@ -20,9 +20,9 @@ from zakai._progress import bar
 from zakai.engine.batch import LONG, Progress
 from zakai.engine.driver import with_inputs
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
-from zakai.engine.maximum import hessian
-from zakai.engine.priors import Prior
 from zakai.errors import InputError
+from zakai.inference.maximum import hessian
+from zakai.inference.priors import Prior
 from zakai.models.model import Model
 from zakai.records import Inputs, Record
 

@@ -1,9 +1,9 @@
 """Residuals: where each observation lies in its one-step-ahead predictive law.
 
-The law is a sum over the predicted density where that is a grid or a mixture of Gaussians (`zakai.engine.predictive`).  Elsewhere
-the density of a coordinate z given the past is the evidence of the filter's own step as a function of z; for an increment, times
-the density of the noise alone.  Its distribution function is a quadrature over z, so that every method and every kind of
-observation is served, with the accuracy of the method.
+The law is a sum over the predicted density where that is a grid or a mixture of Gaussians (`zakai.diagnostics.predictive`).
+Elsewhere the density of a coordinate z given the past is the evidence of the filter's own step as a function of z; for an
+increment, times the density of the noise alone.  Its distribution function is a quadrature over z, so that every method and every
+kind of observation is served, with the accuracy of the method.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zakai.diagnostics.predictive import Pair, PredictiveSums
+from zakai.diagnostics.predictive_evidence import PredictiveEvidence
 from zakai.engine.forecast import origin_of
 from zakai.engine.loop import CHUNK, Run, segments
-from zakai.engine.predictive import Pair, PredictiveSums
-from zakai.engine.predictive_evidence import PredictiveEvidence
 from zakai.errors import InputError
 from zakai.models.features import OBSERVED_PATH
 from zakai.numerics.tangent_quadrature import MASS_ERROR

@@ -9,7 +9,7 @@ from scipy import stats
 
 import zakai
 from zakai._progress import bar
-from zakai.engine.priors import Prior
+from zakai.inference.priors import Prior
 
 
 class Terminal(io.StringIO):

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 
-from zakai.engine.limit import Exists, Limit
 from zakai.errors import InputError
+from zakai.inference.limit import Exists, Limit
 from zakai.models._errors import listing
 from zakai.models.model import Model
 
