@@ -16,7 +16,7 @@ from zakai.engine.driver import planned, with_inputs
 from zakai.engine.likelihood import LogLikelihood, chosen_parameters
 from zakai.errors import InputError
 from zakai.inference.maximum import maximum, with_signs_of
-from zakai.inference.profile import Profile
+from zakai.inference.profile import Profile, Quadratic
 from zakai.inference.random_maximum import random_maximum, sentence
 from zakai.models._errors import listing
 from zakai.models.model import Model
@@ -44,7 +44,7 @@ class Fit:
     method: str
     observations: int
     warnings: list[str] = field(default_factory=list)
-    _profile: Profile | None = None
+    _profile: Profile | Quadratic | None = None
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Return confidence intervals of the parameters by their profile likelihood.
@@ -52,7 +52,9 @@ class Fit:
             {x : 2 (l(estimates) - max l(theta | theta_i = x)) <= chi^2_1(level)}
 
         Where the likelihood does not fall enough, an end is the bound of the parameter, or infinite.  They need not be symmetric,
-        and need no standard errors.
+        and need no standard errors.  By a method with random errors, such as particles, the likelihood is the quadratic that was
+        fitted: the interval is the estimate and a multiple of its standard error, to which the random error of the maximum is
+        added.
 
         Args:
             level: the probability with which an interval covers the true value, for long records.
@@ -258,6 +260,7 @@ def _fit_of_draws(
         method=result.method,
         observations=len(record.times),
         warnings=warnings,
+        _profile=Quadratic(found.values, found.covariance, found.errors, box, names),
     )
 
 

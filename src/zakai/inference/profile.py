@@ -26,6 +26,31 @@ ACCURACY = 1e-4  # of an end, in steps of one standard error
 HIGHER = 1e-2  # nats by which a profile may exceed the fit's log-likelihood
 
 
+class Quadratic(NamedTuple):
+    """A log-likelihood with random errors as the quadratic that was fitted to it.
+
+    The estimates (p,), their covariance (p, p), the random errors (p,) of the estimates, the bounds (p, 2) and the names.
+    """
+
+    estimates: Array
+    covariance: Array
+    errors: Array
+    box: Array
+    names: tuple[str, ...]
+
+    def intervals(self, level: float) -> dict[str, tuple[float, float]]:
+        """Return the interval of each parameter, estimate -+ a multiple of (variance + random error^2)^1/2, within the bounds."""
+        deviations = np.sqrt(np.diag(self.covariance) + self.errors**2)
+        if not np.isfinite(deviations).all():
+            raise InputError(
+                "intervals: the log-likelihood has random errors and no maximum that they leave visible; name more particles and "
+                "fit again"
+            )
+        reach = float(norm.ppf(0.5 + 0.5 * level)) * deviations
+        ends = np.clip(self.estimates[:, None] + np.outer(reach, [-1.0, 1.0]), self.box[:, :1], self.box[:, 1:])
+        return {name: (float(low), float(high)) for name, (low, high) in zip(self.names, ends, strict=True)}
+
+
 class Profile(NamedTuple):
     """The log-likelihood with its gradient, the estimates (p,), their covariance (p, p), the bounds (p, 2) and the names."""
 

@@ -13,7 +13,7 @@ from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import System, root
 from zakai.numerics.particles.chunks import over_chunks
 from zakai.numerics.particles.formulas import evaluate
-from zakai.numerics.particles.motion import ADDITIVE, ORDERED, advance
+from zakai.numerics.particles.motion import ADDITIVE, ORDERED, Arrival, advance
 from zakai.numerics.particles.random import key_of, normals
 from zakai.records.inputs import Inputs
 
@@ -87,7 +87,7 @@ class Motion:
         out, gained = np.empty_like(start), np.empty(start.shape[1])
         ends = np.empty((0, *start.shape)) if ends is None else ends
         arrays = self.arrays, tuple(events), start, noise
-        over_chunks(lambda low, high: advance(*arrays, low, high, out, gained, ends), len(gained))
+        over_chunks(lambda low, high: advance(*arrays, low, high, Arrival(out, gained, ends)), len(gained))
         return out, gained
 
     def values(self, program: tuple[Any, ...], x: Array, t: float, given: Array) -> Array:

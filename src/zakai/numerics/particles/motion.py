@@ -14,7 +14,7 @@ References:
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -33,11 +33,51 @@ MOTION = types.Tuple((PROGRAM, PROGRAM, BOX, types.int64))
 EVENTS = types.Tuple((F2, I2, F3, F3, I2))
 
 
+class Buffers(NamedTuple):
+    """What is overwritten: rows of a block (rows, BLOCK), given numbers (L,), and the times (2,) of a kick."""
+
+    work: Array
+    row: Array
+    time: Array
+
+
+class Stretch(NamedTuple):
+    """One flow: its length, the times (2,) and the given numbers (2, L) at both ends, and its evaluations, 2 or 4."""
+
+    length: float
+    times: Array
+    given: Array
+    stages: int
+
+
+class Kick(NamedTuple):
+    """The noise of one substep: its root (n or r, d), the normal numbers (d, size), and the given numbers (2, L)."""
+
+    root: Array
+    noise: Array
+    given: Array
+
+
+class Arrival(NamedTuple):
+    """What `advance` writes.
+
+    The states (n, N) after the events, the integrals (N,) of the drift's output after the first n, zero where there is none, and
+    the states (I, n, N) at the observations, or (0, n, N) where they are not wanted.
+    """
+
+    states: Array
+    gained: Array
+    ends: Array
+
+
+ARRIVAL = types.NamedTuple((F2, F1, F3), Arrival)
+
+
 @helper
-def _flow(program: Any, values: Array, x: Array, work: Array, box: Any, length: float, times: Array, given: Array, row: Array,
-          stages: int, size: int) -> None:  # fmt: skip
-    """Advance the first rows of x (rows, size) by one Runge-Kutta step; `times` and `given` at both ends."""
-    outputs = program[3]
+def _flow(program: Any, values: Array, x: Array, box: Any, stretch: Any, buffers: Any, size: int) -> None:
+    """Advance the first rows of x (rows, size) by one Runge-Kutta step."""
+    outputs, work, row = program[3], buffers.work, buffers.row
+    length, times, given, stages = stretch
     count, rows = outputs.size, x.shape[0]
     point, slopes, total = work[:rows], work[rows : rows + count], work[rows + count : rows + 2 * count]
     for stage in range(stages):
@@ -68,10 +108,10 @@ def _flow(program: Any, values: Array, x: Array, work: Array, box: Any, length: 
 
 
 @helper
-def _kick(motion: Any, values: Array, x: Array, work: Array, root: Array, noise: Array, given: Array, row: Array, time: Array,
-          size: int) -> None:  # fmt: skip
+def _kick(motion: Any, values: Array, x: Array, kick: Any, buffers: Any, size: int) -> None:
     """Add the noise of one kick to x; rows of x after those of the drift hold the coefficients of the fields."""
-    fields, kind = motion[1], motion[3]
+    fields, kind, work = motion[1], motion[3], buffers.work
+    root, noise, given = kick
     n, width = motion[2][0].size, root.shape[1]
     if kind == ADDITIVE:
         for d in range(n):
@@ -83,7 +123,7 @@ def _kick(motion: Any, values: Array, x: Array, work: Array, root: Array, noise:
         return
     # The point of the fields: the state, then a coefficient for each field.
     r = root.shape[0]
-    point, rest = work[: n + r], work[n + r :]
+    point, rest = work[: n + r], Buffers(work[n + r :], buffers.row, buffers.time)
     for d in range(n):
         for i in range(size):
             point[d, i] = x[d, i]
@@ -98,7 +138,7 @@ def _kick(motion: Any, values: Array, x: Array, work: Array, root: Array, noise:
                     j = turn if noise[width, i] > 0.0 else width - 1 - turn
                     value = root[a, j] * noise[j, i]
                 point[n + a, i] = value
-        _flow(fields, values, point, rest, motion[2], 1.0, time, given, row, 4, size)
+        _flow(fields, values, point, motion[2], Stretch(1.0, buffers.time, given, 4), rest, size)
     for d in range(n):
         for i in range(size):
             x[d, i] = point[d, i]
@@ -108,17 +148,15 @@ def _kick(motion: Any, values: Array, x: Array, work: Array, root: Array, noise:
 def run_event(motion: Any, events: Any, e: int, blocks: Any, x: Array, noise: Array, buffers: Any, size: int) -> None:
     """Advance x (rows, size) by one event; `noise` (D, size) is that of all events."""
     times, places, given, roots, rows = events
-    work, row, time = buffers
     n, box = motion[2][0].size, motion[2]
     if times[e, 1] != times[e, 0]:
-        _flow(motion[0], blocks[0], x, work, box, times[e, 1] - times[e, 0], times[e], given[e], row, places[e, 2], size)
+        stretch = Stretch(times[e, 1] - times[e, 0], times[e], given[e], places[e, 2])
+        _flow(motion[0], blocks[0], x, box, stretch, buffers, size)
     r = places[e, 0]
     if r >= 0:
-        width = rows[r, 1]
-        time[0], time[1] = times[e, 1], times[e, 1]
-        constant = given[e, 1:, :]
-        first = rows[r, 0]
-        _kick(motion, blocks[1], x, work, roots[r, :, :width], noise[first:], _twice(constant), row, time, size)
+        buffers.time[0], buffers.time[1] = times[e, 1], times[e, 1]
+        kick = Kick(roots[r, :, : rows[r, 1]], noise[rows[r, 0] :], _twice(given[e, 1:, :]))
+        _kick(motion, blocks[1], x, kick, buffers, size)
     for d in range(n):
         if box[0][d] > -np.inf or box[1][d] < np.inf:
             for i in range(size):
@@ -138,12 +176,11 @@ def _twice(row: Array) -> Any:
 def buffers_of(motion: Any, events: Any) -> Any:
     """Return what `run_event` overwrites."""
     n, r = motion[2][0].size, events[3].shape[1]
-    return np.empty((6 * (n + r + 2), BLOCK)), np.empty(events[2].shape[2]), np.empty(2)
+    return Buffers(np.empty((6 * (n + r + 2), BLOCK)), np.empty(events[2].shape[2]), np.empty(2))
 
 
-@kernel(types.void(MOTION, EVENTS, F2, F2, types.int64, types.int64, F2, F1, F3))
-def advance(motion: Any, events: Any, start: Array, noise: Array, low: int, high: int, out: Array, gained: Array,
-            ends: Array) -> None:  # fmt: skip
+@kernel(types.void(MOTION, EVENTS, F2, F2, types.int64, types.int64, ARRIVAL))
+def advance(motion: Any, events: Any, start: Array, noise: Array, low: int, high: int, arrival: Any) -> None:
     """Advance the particles from `low` to `high` by all events.
 
     Args:
@@ -153,10 +190,9 @@ def advance(motion: Any, events: Any, start: Array, noise: Array, low: int, high
         noise: standard normal numbers (D, N).
         low: the first particle.
         high: the particle after the last one.
-        out: the states (n, N) after the events.
-        gained: the integrals (N,) of the drift's output after the first n, zero where there is none.
-        ends: the states (I, n, N) at the observations, or (0, n, N) where they are not wanted.
+        arrival: receives the results.
     """
+    out, gained, ends = arrival
     blocks = (block_of(motion[0]), block_of(motion[1]))
     buffers = buffers_of(motion, events)
     n, rows, places = start.shape[0], motion[0][3].size, events[1]
