@@ -2,6 +2,7 @@
 
 import threading
 import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -13,21 +14,26 @@ from zakai.diagnostics.expected_time import Expected, expected_seconds
 PENDULUM = zakai.load_model("gallery:pendulum")
 
 
-def test_the_expected_time_is_that_of_the_filter_within_a_factor():
-    _, record = zakai.simulate(PENDULUM, 0.02 * np.arange(1, 101), seed=0)
+@pytest.mark.parametrize("count", [100, 1000])
+def test_the_expected_time_is_that_of_the_observations_together(monkeypatch, count):
+    """An observation takes .03 s on a clock of the test's own."""
+    clock = [0.0]
+
+    def advance(setting, prepared, rows, state, values, stepped):
+        def after_one():
+            clock[0] += 0.03
+            stepped()
+
+        return filtered(setting, prepared, rows, state, values, after_one)
+
+    filtered = expected_time.advance
+    monkeypatch.setattr(expected_time, "advance", advance)
+    monkeypatch.setattr(expected_time, "working_time", lambda: clock[0])
+    monkeypatch.setattr(expected_time, "_at_most", lambda _: nullcontext())
+    _, record = zakai.simulate(PENDULUM, 0.02 * np.arange(1, count + 1), seed=0)
     expected = expected_seconds(PENDULUM, record, "yau-yau")
-    began = time.process_time()
-    zakai.filter(PENDULUM, record, "yau-yau", keep="moments")
-    taken = time.process_time() - began
     assert not expected.at_least
-    assert taken / 10 < expected.seconds < 10 * taken  # the machine may be loaded
-
-
-def test_ten_times_the_record_takes_about_ten_times_as_long():
-    _, record = zakai.simulate(PENDULUM, 0.02 * np.arange(1, 1001), seed=0)
-    short = zakai.Record(record.times[:100], record.values[:100], record.kind)
-    first, second = (expected_seconds(PENDULUM, one, "yau-yau").seconds for one in (short, record))
-    assert 2 * first < second < 50 * first
+    assert expected.seconds == pytest.approx(0.03 * count, rel=1e-9)
 
 
 @pytest.mark.parametrize("interrupted", [True, False])
