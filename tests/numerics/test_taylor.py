@@ -7,7 +7,7 @@ import pytest
 import sympy
 
 from zakai.errors import ConditionError
-from zakai.methods.series.jets import Expansion
+from zakai.methods.system.jets import Expansion
 from zakai.numerics.series import cholesky, derivative, inverse, product, value
 
 t, a = sympy.symbols("t a")

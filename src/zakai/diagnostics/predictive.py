@@ -20,7 +20,7 @@ from zakai.algebra.systems import affine_observation
 from zakai.densities import Density, GaussianMixture, GridDensity, IntervalDensity, PointMasses
 from zakai.densities.mapped import MappedDensity
 from zakai.engine.setting import Setting
-from zakai.methods._residuals import Sensors
+from zakai.methods.system.residuals import Sensors
 from zakai.models.checks import depends_on_state
 from zakai.models.numeric import numpy_function
 from zakai.numerics.complex_step import STEP

@@ -15,9 +15,9 @@ from zakai.engine.results import FilterResult
 from zakai.engine.setting import KEPT, Setting
 from zakai.engine.versions import versions
 from zakai.errors import InputError
-from zakai.methods._escape import EscapeError
 from zakai.methods._protocol import Infos, stacked
 from zakai.methods._states import Joined
+from zakai.methods.system.escape import EscapeError
 from zakai.notes.health import warnings_of_run
 from zakai.notes.lengths import distances_of_lengths, notes_on_lengths
 from zakai.notes.misfit import notes_on_law

@@ -18,8 +18,8 @@ from zakai.engine.loop import KEPT_BYTES, Run
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
-from zakai.methods._moments import prior_moments
 from zakai.methods._protocol import Method
+from zakai.methods.system.prior_moments import prior_moments
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior, GaussianPrior
 from zakai.notes.lengths import notes_on_increments

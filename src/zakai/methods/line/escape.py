@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from zakai.methods._escape import Density, Motion, check_one_state, divisors_of
 from zakai.methods.line.domain import on_the_line, variable_of
 from zakai.methods.line.system import Prepared
+from zakai.methods.system.escape import Density, Motion, check_one_state, divisors_of
 from zakai.models.domain import Interval
 
 Array = Any

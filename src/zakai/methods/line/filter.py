@@ -21,7 +21,6 @@ from zakai.densities import Density, GridDensity, MappedDensity
 from zakai.methods._protocol import Info, Infos
 from zakai.methods._states import Joined
 from zakai.methods.line import loop
-from zakai.methods.line.cross import OMITTED
 from zakai.methods.line.domain import on_the_line, variable_of
 from zakai.methods.line.drift_grid import showing_drift
 from zakai.methods.line.ends import check_ends
@@ -47,6 +46,7 @@ from zakai.methods.line.prior import state_of
 from zakai.methods.line.system import NOISE, Parts, Prepared, State
 from zakai.methods.line.update import acting_inside, factor_of, sampled_weakly
 from zakai.methods.line.volumes import contracted
+from zakai.methods.system.cross_noise import OMITTED
 from zakai.models.model import Model
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.channel import Channel, around, chosen

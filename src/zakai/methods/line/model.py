@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
-from zakai.methods._outside_tables import OutsideTables
+from zakai.methods.system.outside_tables import OutsideTables
 from zakai.models.angles import without_branch
 from zakai.models.features import CROSS_NOISE, OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
 from zakai.models.functions import Floor, Maximum, Minimum, TableFunction

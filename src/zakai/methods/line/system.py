@@ -11,7 +11,7 @@ import numpy as np
 
 from zakai.methods.line.model import System
 from zakai.methods.line.yau import Kernels, YauLine
-from zakai.methods.series.kernel import PowerSeries
+from zakai.methods.yau.kernel import PowerSeries
 from zakai.models.model import Model
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.segment import Limits, Mechanisms, Steps

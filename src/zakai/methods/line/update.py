@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from zakai.methods._observation import log_likelihood
 from zakai.methods.line.figures import figures
 from zakai.methods.line.model import System
 from zakai.methods.line.system import Prepared
 from zakai.methods.line.tables import tables
+from zakai.methods.system.observation import log_likelihood
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.panels import GAUSS_NODES, GAUSS_WEIGHTS, panels

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods._yau_system import YauSystem
-from zakai.methods.series.kernel import PowerSeries
+from zakai.methods.yau.kernel import PowerSeries
+from zakai.methods.yau.system import YauSystem
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.numerics.flow import FlowResult, Transition, integrate

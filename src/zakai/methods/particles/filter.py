@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities._density import wrap
-from zakai.methods._escape_of_states import check_escape
 from zakai.methods._protocol import Info
 from zakai.methods.particles.errors import DEPTH, Genealogy, of_log_likelihood, variances
 from zakai.methods.particles.interval import (
@@ -39,6 +38,7 @@ from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Control, Prepared, Rule, State
 from zakai.methods.particles.system import drawn, gaussian_prior
 from zakai.methods.particles.window import Observed, Target, Window, taken
+from zakai.methods.system.escape_of_states import check_escape
 from zakai.numerics.particles.chunks import over_chunks
 from zakai.numerics.particles.population import effective, next_power, normalised, systematic
 from zakai.numerics.particles.random import normals, uniform_number

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from zakai.methods._moments import density_grid, prior_moments
 from zakai.methods.particles.law import Law, Numbers
 from zakai.methods.particles.programs import Array, Expressions
+from zakai.methods.system.prior_moments import density_grid, prior_moments
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from zakai.algebra.yau import observation_energy
-from zakai.methods.series.jets import jets
+from zakai.methods.system.jets import jets
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.series import cauchy, derivative, integral, value

@@ -20,12 +20,12 @@ import numpy as np
 
 from zakai.algebra.exponentials import wei_norman_filter as theorem
 from zakai.densities import GridDensity
-from zakai.methods._borrowed_backward import OF_MESSAGE, borrowed
 from zakai.methods._options import whole_number
 from zakai.methods._protocol import Info, Method
-from zakai.methods._residuals import Factor
-from zakai.methods._wei_norman_system import Array, System
+from zakai.methods.series.borrowed_backward import OF_MESSAGE, borrowed
+from zakai.methods.series.wei_norman_system import Array, System
 from zakai.methods.space.system import prior_on_grid
+from zakai.methods.system.residuals import Factor
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function

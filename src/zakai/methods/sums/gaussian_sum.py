@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from zakai.algebra.theorems import gaussian_sum as theorem
-from zakai.methods import general_direct
+from zakai.methods.sums import general_direct
 
 METHOD = replace(
     general_direct.METHOD,

@@ -14,9 +14,9 @@ import numpy as np
 
 from zakai.densities import GaussianMixture
 from zakai.errors import InputError
-from zakai.methods._moments import wrapped
 from zakai.methods._protocol import Info
-from zakai.methods.extended import filter as ahead
+from zakai.methods.gaussian.extended import filter as ahead
+from zakai.methods.system.prior_moments import wrapped
 from zakai.numerics.transition import Array
 
 

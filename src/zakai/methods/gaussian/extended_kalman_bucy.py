@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from zakai.algebra.theorems import smooth_system as theorem
 from zakai.methods._protocol import Backward, Method
-from zakai.methods.extended.backward import density as smoothed_density
-from zakai.methods.extended.backward import message, smoothed
-from zakai.methods.extended.backward import step as step_back
-from zakai.methods.extended.filter import Prepared, State, density, init, prepare, segment, step, valid
+from zakai.methods.gaussian.extended.backward import density as smoothed_density
+from zakai.methods.gaussian.extended.backward import message, smoothed
+from zakai.methods.gaussian.extended.backward import step as step_back
+from zakai.methods.gaussian.extended.filter import Prepared, State, density, init, prepare, segment, step, valid
 from zakai.models.angles import ONE_IMAGE
 from zakai.models.features import CROSS_NOISE, INPUTS, LINEARISED
 

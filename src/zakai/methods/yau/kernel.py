@@ -16,8 +16,8 @@ import numpy as np
 import sympy as sp
 
 from zakai.errors import ConditionError
-from zakai.methods.series.jets import Expansion
-from zakai.methods.series.power import Schroedinger, Series, power_series, schroedinger, taylor_data
+from zakai.methods.system.jets import Expansion
+from zakai.methods.yau.power import Schroedinger, Series, power_series, schroedinger, taylor_data
 from zakai.models.model import Model
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.flow import FlowResult

@@ -28,14 +28,14 @@ import numpy as np
 from zakai.densities import GaussianMixture
 from zakai.densities._density import wrap
 from zakai.errors import InputError
-from zakai.methods._input_pieces import Pieces, pieces_of
-from zakai.methods._moments import prior_moments, wrapped
 from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info, Infos
-from zakai.methods.extended.compiled import Loop, advance, loop_of
-from zakai.methods.extended.linearisation import linearisation
-from zakai.methods.extended.linearised_system import Formulas, Part, formulas_of, part_of, rate_noise_of, subdivided
-from zakai.methods.line.cross import OMITTED
+from zakai.methods.gaussian.extended.compiled import Loop, advance, loop_of
+from zakai.methods.gaussian.extended.linearisation import linearisation
+from zakai.methods.gaussian.extended.linearised_system import Formulas, Part, formulas_of, part_of, rate_noise_of, subdivided
+from zakai.methods.system.cross_noise import OMITTED
+from zakai.methods.system.input_pieces import Pieces, pieces_of
+from zakai.methods.system.prior_moments import prior_moments, wrapped
 from zakai.models.angles import other_image
 from zakai.models.model import Model
 from zakai.numerics.complex_step import cholesky, is_complex

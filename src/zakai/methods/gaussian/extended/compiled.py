@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods._formula_arrays import arrays_of
-from zakai.methods._input_pieces import Pieces
-from zakai.methods.extended.linearised_system import jacobian
+from zakai.methods.gaussian.extended.linearised_system import jacobian
+from zakai.methods.system.formula_arrays import arrays_of
+from zakai.methods.system.input_pieces import Pieces
 from zakai.models.angles import observed_angles
 from zakai.models.kept import kept
 from zakai.models.model import Model

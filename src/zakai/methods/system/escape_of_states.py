@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods._escape import FAR, FASTER, STEEP, EscapeError, divisors_of, formula_text, infinite_text
+from zakai.methods.system.escape import FAR, FASTER, STEEP, EscapeError, divisors_of, formula_text, infinite_text
 from zakai.models.kept import kept, once_for_a_model
 from zakai.models.model import Model
 from zakai.models.numeric import NumericFunction, numpy_function

@@ -13,11 +13,11 @@ import numpy as np
 from scipy.linalg import expm
 
 from zakai.densities._density import wrap
-from zakai.methods.extended.linearised_system import Formulas, Part, part_of
+from zakai.methods.gaussian.extended.linearised_system import Formulas, Part, part_of
 from zakai.numerics.transition import Array
 
 if TYPE_CHECKING:
-    from zakai.methods.extended.filter import Prepared, State
+    from zakai.methods.gaussian.extended.filter import Prepared, State
 
 
 def linearisation(prepared: Prepared, k: int, before: State, predicted: State, end_noise: Array) -> float:

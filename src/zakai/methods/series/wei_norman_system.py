@@ -11,7 +11,7 @@ import sympy as sp
 from zakai.algebra.estimation_algebra import estimation_algebra
 from zakai.algebra.exponentials import exponentials
 from zakai.errors import ConditionError
-from zakai.methods._residuals import Sensors
+from zakai.methods.system.residuals import Sensors
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.numerics.complex_step import is_complex

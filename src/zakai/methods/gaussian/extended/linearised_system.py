@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import sympy as sp
 
-from zakai.methods._input_pieces import Pieces
 from zakai.methods.gaussian.affine_system import RESOLVED, precision_of
+from zakai.methods.system.input_pieces import Pieces
 from zakai.models.functions import without_jumps
 from zakai.models.kept import kept
 from zakai.models.model import Model

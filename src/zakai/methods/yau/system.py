@@ -8,9 +8,9 @@ import numpy as np
 import sympy as sp
 
 from zakai.algebra.systems import yau_system
-from zakai.methods._potential import potential_of
 from zakai.methods.gaussian.affine_system import Matrices, precision_of
-from zakai.methods.series.kernel import PowerSeries
+from zakai.methods.system.potential import potential_of
+from zakai.methods.yau.kernel import PowerSeries
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.numerics.flow import Coefficients

@@ -22,10 +22,9 @@ from zakai.algebra.theorems import kolmogorov_series as theorem
 from zakai.densities import GridDensity
 from zakai.errors import InputError
 from zakai.methods import yau_yau
-from zakai.methods._borrowed_backward import OF_MESSAGE, borrowed
 from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info, Method
-from zakai.methods._residuals import Factor
+from zakai.methods.series.borrowed_backward import OF_MESSAGE, borrowed
 from zakai.methods.series.heat import FORMS
 from zakai.methods.series.transition import (
     FEW,
@@ -43,6 +42,7 @@ from zakai.methods.series.transition import (
     without_law,
 )
 from zakai.methods.space.system import prior_on_grid
+from zakai.methods.system.residuals import Factor
 from zakai.models import features
 from zakai.models.kept import kept
 from zakai.models.model import Model

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from zakai.algebra.exact_theorems import benes as theorem
-from zakai.methods import kalman_bucy
+from zakai.methods.gaussian import kalman_bucy
 from zakai.models.features import INPUTS
 
 METHOD = replace(
