@@ -15,6 +15,7 @@ PACKAGES = [
     "algebra",
     "numerics",
     "records",
+    "simulation",
     "methods",
     "notes",
     "engine",
@@ -27,10 +28,8 @@ PACKAGES = [
 ]
 EVERYWHERE = {"errors", "_display", "_progress", "_registry"}
 SOURCE = Path(zakai.__file__).parent
-# Simulating makes a record, which belongs to a later package; imported inside functions, so that there is no circle.
 # What a user plots or reports is drawn by a later package.
 LAZILY = {
-    ("models/simulate.py", "records"),
     ("engine/results.py", "report"),
     ("engine/results.py", "diagnostics"),
     ("densities/_density.py", "report"),
@@ -103,7 +102,6 @@ CALLED = {
         "zakai.engine.stored",
     },
     # The parts of one method.
-    "methods/space/filter.py": {"zakai.methods.space.direct", "zakai.methods.space.kolmogorov"},
     "methods/line/system.py": {"zakai.methods.line.parts", "zakai.methods.line.steps"},
 }
 
@@ -169,5 +167,5 @@ def test_numerics_imports_neither_sympy_nor_a_model():
 
 def test_the_order_of_packages_can_fail():
     assert faults("engine/driver.py", [("zakai.report", True)]) == ["engine/driver.py imports zakai.report"]
-    assert faults("models/simulate.py", [("zakai.records", True)]) != []
-    assert faults("models/simulate.py", [("zakai.records", False)]) == []
+    assert faults("engine/results.py", [("zakai.diagnostics", True)]) != []
+    assert faults("engine/results.py", [("zakai.diagnostics", False)]) == []

@@ -18,7 +18,7 @@ _PUBLIC = {
     "Model": "zakai.models.model",
     "load_model": "zakai.models.files",
     "gallery": "zakai.models.gallery",
-    "simulate": "zakai.models.simulate",
+    "simulate": "zakai.simulation.simulate",
     "Analysis": "zakai.algebra.analysis",
     "analyze": "zakai.algebra.analysis",
     "Truth": "zakai.records",

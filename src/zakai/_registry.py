@@ -37,7 +37,7 @@ METHODS = {
         "exact for affine h and a drift L x + l + G grad F whose eta is quadratic, whatever the prior",
     ),
     "limited-direct": Entry(
-        "zakai.methods.limited_direct",
+        "zakai.methods.grid.limited_direct",
         "exact between observations for time-varying Yau systems whose q is quadratic, in one to three states",
     ),
     "general-direct": Entry(
@@ -53,7 +53,7 @@ METHODS = {
         "for finite estimation algebras in one to three states, exp(t L0) on a grid; only when it is named",
     ),
     "yau-yau": Entry(
-        "zakai.methods.yau_yau",
+        "zakai.methods.grid.yau_yau",
         "convergent for any smooth system in one to four states: the Kolmogorov equation on a grid that follows the density",
     ),
     "kolmogorov-series": Entry(

@@ -17,7 +17,7 @@ from references.flow import flow_kernel
 from references.power_series import data, single
 from references.systems import planar
 from zakai.methods.yau import power as power_series
-from zakai.numerics.series import apply, cauchy
+from zakai.numerics.series.power_series import apply, cauchy
 
 t = Symbol("t", real=True)
 x1, x2 = symbols("x1 x2", real=True)

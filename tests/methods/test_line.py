@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from scipy.special import erf
 
 import zakai
-from zakai.methods import limited_direct, yau_yau
+from zakai.methods.grid import limited_direct, yau_yau
 from zakai.records import Record
 from zakai.records.schedule import schedule_of
 

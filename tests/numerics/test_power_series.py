@@ -14,7 +14,7 @@ from references.systems import planar, scalar
 from zakai.errors import ConditionError
 from zakai.methods.yau.kernel import PowerSeries
 from zakai.methods.yau.power import TaylorData, schroedinger, whitening
-from zakai.numerics.series import derivative, product
+from zakai.numerics.series.power_series import derivative, product
 from zakai.numerics.transition import compose
 
 t = sympy.Symbol("t")

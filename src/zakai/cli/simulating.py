@@ -22,9 +22,9 @@ def simulate(
 ) -> None:
     """Simulate a record, and write it and the truth."""
     from zakai.models.files import load_model
-    from zakai.models.simulate import simulate
     from zakai.records import read_inputs, write_record, write_truth
     from zakai.records.writing import shown
+    from zakai.simulation.simulate import simulate
 
     check_outputs([output, truth_path], [source, inputs_path])
     model = load_model(source)

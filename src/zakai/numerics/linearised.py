@@ -207,8 +207,8 @@ def segment(
         means: The means (R, n) after each interval.
         covs: The covariances (R, n, n).
         gains: The increments (R,) of the log-likelihood.
-        figures: How far from linear the system is (`methods/gaussian/extended/linearisation.py`), and the largest weight of another
-            image of an angle, as in `models/angles.py` (2, R).
+        figures: How far from linear the system is (`methods/gaussian/extended/linearisation.py`), and the largest weight of
+            another image of an angle, as in `models/angles.py` (2, R).
     """
     motion, sensor, drift, observation, noise = programs
     first, starts, lengths, inputs, rates, rate_noise = parts

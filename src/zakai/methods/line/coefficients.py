@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from zakai.methods.line.cross import with_cross_noise
 from zakai.methods.line.model import within
 from zakai.methods.line.system import Prepared
 from zakai.methods.line.tables import covariance_at, drift_at, finite, tables
-from zakai.methods.system.cross_noise import with_cross_noise
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.panels import Panels, panels
 

@@ -46,7 +46,7 @@ from zakai.methods.line.prior import state_of
 from zakai.methods.line.system import NOISE, Parts, Prepared, State
 from zakai.methods.line.update import acting_inside, factor_of, sampled_weakly
 from zakai.methods.line.volumes import contracted
-from zakai.methods.system.cross_noise import OMITTED
+from zakai.methods.system.notes import OMITTED
 from zakai.models.model import Model
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.channel import Channel, around, chosen

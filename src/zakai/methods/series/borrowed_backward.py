@@ -11,8 +11,8 @@ from functools import lru_cache
 from typing import Any
 
 from zakai.densities import GridDensity
-from zakai.methods import yau_yau
 from zakai.methods._protocol import Backward, through
+from zakai.methods.grid import yau_yau
 from zakai.methods.line.system import State as LineState
 from zakai.numerics.line import window as lw
 from zakai.numerics.space.field import Field

@@ -21,9 +21,9 @@ import numpy as np
 from zakai.algebra.theorems import kolmogorov_series as theorem
 from zakai.densities import GridDensity
 from zakai.errors import InputError
-from zakai.methods import yau_yau
 from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info, Method
+from zakai.methods.grid import yau_yau
 from zakai.methods.series.borrowed_backward import OF_MESSAGE, borrowed
 from zakai.methods.series.heat import FORMS
 from zakai.methods.series.transition import (
@@ -46,7 +46,7 @@ from zakai.methods.system.residuals import Factor
 from zakai.models import features
 from zakai.models.kept import kept
 from zakai.models.model import Model
-from zakai.numerics.dyadic_grid import Field, Grid, edge_masses, quadrature_error
+from zakai.numerics.series.dyadic_grid import Field, Grid, edge_masses, quadrature_error
 from zakai.records.schedule import Schedule
 
 MOST_SUBSTEPS = 1024

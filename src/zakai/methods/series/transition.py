@@ -16,8 +16,8 @@ from zakai.methods.system.residuals import Factor, Sensors
 from zakai.models import features
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-from zakai.numerics.composed_kernels import SHORTEST, Kernels
-from zakai.numerics.dyadic_grid import SUPPORT, Field, Grid
+from zakai.numerics.series.composed_kernels import SHORTEST, Kernels
+from zakai.numerics.series.dyadic_grid import SUPPORT, Field, Grid
 from zakai.records.schedule import Schedule
 
 Array = np.ndarray

@@ -30,8 +30,8 @@ from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior
-from zakai.numerics import sinc_grid
-from zakai.numerics.sinc_grid import Field, Generator, moments, resolution_of
+from zakai.numerics.series import sinc_grid
+from zakai.numerics.series.sinc_grid import Field, Generator, moments, resolution_of
 from zakai.records.schedule import Schedule
 
 KEPT = 8  # values of the parameters for which a model's system is kept

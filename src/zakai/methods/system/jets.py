@@ -21,7 +21,7 @@ from zakai.errors import ConditionError, InputError
 from zakai.models._program import Program
 from zakai.models.model import Model
 from zakai.models.numeric import COMPLEX, REAL, program_of
-from zakai.numerics.series import cauchy, derivative, integral
+from zakai.numerics.series.power_series import cauchy, derivative, integral
 
 Array = np.ndarray
 

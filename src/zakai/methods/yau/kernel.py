@@ -21,7 +21,7 @@ from zakai.methods.yau.power import Schroedinger, Series, power_series, schroedi
 from zakai.models.model import Model
 from zakai.numerics.complex_step import log_determinant
 from zakai.numerics.flow import FlowResult
-from zakai.numerics.series import apply, dot, value
+from zakai.numerics.series.power_series import apply, dot, value
 from zakai.numerics.transition import Array, Transition, at, compose, identity, symmetric, transposed
 
 TOLERANCE = 1e-13  # remainder above which an interval is divided

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.errors import ConditionError
-from zakai.numerics.series import apply, cauchy, cholesky, derivative, dot, integral, inverse, product, value
+from zakai.numerics.series.power_series import apply, cauchy, cholesky, derivative, dot, integral, inverse, product, value
 from zakai.numerics.transition import symmetric, transposed
 
 Array = NDArray[Any]

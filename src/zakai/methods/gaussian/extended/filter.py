@@ -33,8 +33,8 @@ from zakai.methods._protocol import Info, Infos
 from zakai.methods.gaussian.extended.compiled import Loop, advance, loop_of
 from zakai.methods.gaussian.extended.linearisation import linearisation
 from zakai.methods.gaussian.extended.linearised_system import Formulas, Part, formulas_of, part_of, rate_noise_of, subdivided
-from zakai.methods.system.cross_noise import OMITTED
 from zakai.methods.system.input_pieces import Pieces, pieces_of
+from zakai.methods.system.notes import OMITTED
 from zakai.methods.system.prior_moments import prior_moments, wrapped
 from zakai.models.angles import other_image
 from zakai.models.model import Model

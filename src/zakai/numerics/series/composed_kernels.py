@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import dia_array
 
-from zakai.numerics.dyadic_grid import Grid
+from zakai.numerics.series.dyadic_grid import Grid
 
 SHORTEST = 1.34  # grid spacings in the standard deviation of the shortest kernel
 KEPT = 12  # short kernels of other lengths

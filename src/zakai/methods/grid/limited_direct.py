@@ -15,6 +15,7 @@ from zakai.algebra.theorems import limited_direct
 from zakai.errors import InputError
 from zakai.methods._options import one_of, tolerance_of
 from zakai.methods._protocol import Method
+from zakai.methods.grid.yau_yau import BOUNDS, in_space, on_line
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line import tangents as line_tangents
 from zakai.methods.line.backward import BACKWARD as LINE
@@ -22,7 +23,6 @@ from zakai.methods.line.model import in_pieces
 from zakai.methods.line.system import State
 from zakai.methods.line.yau import yau_line_of
 from zakai.methods.yau.system import power_series_of
-from zakai.methods.yau_yau import BOUNDS, in_space, on_line
 from zakai.models import features
 from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior, MixturePrior

@@ -19,8 +19,6 @@ from zakai.methods.line.tables import finite
 
 Array = Any
 
-OMITTED = "an increment gathered over more than its interval counts as if dv and dw were independent: cross_noise is omitted"
-
 
 def with_cross_noise(
     prepared: Prepared,

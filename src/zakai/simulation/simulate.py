@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from zakai.errors import InputError
 from zakai.models import checks
 from zakai.models._definite import square_root
-from zakai.models._density_draw import draw_from_density
 from zakai.models._entries import kind_of
+from zakai.models.model import Model
 from zakai.models.numeric import explain_nonfinite, numpy_function, program_of
 from zakai.models.observed_path import observed_in_formulas, with_path_as_states
 from zakai.models.prior import DensityPrior
-from zakai.models.stepper import Stepper, outside_domain
-
-if TYPE_CHECKING:
-    from zakai.models.model import Model
-    from zakai.records import Inputs, Record, Truth
+from zakai.records import Inputs, Record, Truth
+from zakai.records.inputs import check_inputs
+from zakai.simulation.density_draw import draw_from_density
+from zakai.simulation.stepper import Stepper, outside_domain
 
 SUBSTEPS = 10
 SUBSTEPS_OF_STATE_DEPENDENT_NOISE = 50
@@ -67,9 +66,6 @@ def simulate(
         >>> truth.values.shape, record.values.shape
         ((4, 1), (3, 1))
     """
-    from zakai.records import Record, Truth
-    from zakai.records.inputs import check_inputs
-
     if observed_in_formulas(model).any():
         return _with_path(model, times, seed, initial, substeps, inputs)
     grid = _checked_times(model, times)
@@ -100,8 +96,6 @@ def _with_path(
     model: Model, times: Any, seed: Any, initial: Any, substeps: int | None, inputs: Inputs | None
 ) -> tuple[Truth, Record]:
     """Simulate the state and the path together, where formulas contain what is observed."""
-    from zakai.records import Record, Truth
-
     grid, both = _checked_times(model, times), with_path_as_states(model)
     rng = np.random.default_rng(seed)
     start = np.append(_initial_state(model, initial, rng), np.zeros(model.m))
