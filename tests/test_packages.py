@@ -104,7 +104,6 @@ CALLED = {
     },
     # The parts of one method.
     "methods/space/filter.py": {"zakai.methods.space.direct", "zakai.methods.space.kolmogorov"},
-    "methods/line/system.py": {"zakai.methods.line.parts", "zakai.methods.line.steps"},
 }
 
 

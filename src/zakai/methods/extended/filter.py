@@ -35,7 +35,7 @@ from zakai.methods._protocol import Info, Infos
 from zakai.methods.extended.compiled import Loop, advance, loop_of
 from zakai.methods.extended.linearisation import linearisation
 from zakai.methods.extended.linearised_system import Formulas, Part, formulas_of, part_of, rate_noise_of, subdivided
-from zakai.methods.line.cross import OMITTED
+from zakai.methods.line.coefficients import OMITTED
 from zakai.models.angles import other_image
 from zakai.models.model import Model
 from zakai.numerics.complex_step import cholesky, is_complex

@@ -17,7 +17,7 @@ from zakai.errors import InputError
 from zakai.methods._escape_of_states import check_escape
 from zakai.methods._options import tolerance_of
 from zakai.methods._protocol import Info
-from zakai.methods.line.cross import OMITTED
+from zakai.methods.line.coefficients import OMITTED
 from zakai.methods.space.cross import CrossSystem, potential_of
 from zakai.methods.space.filter import State
 from zakai.methods.space.observed import MOST_PANELS, Observations
