@@ -101,8 +101,6 @@ CALLED = {
         "zakai.diagnostics.residuals",
         "zakai.engine.stored",
     },
-    # The parts of one method.
-    "methods/line/system.py": {"zakai.methods.line.parts", "zakai.methods.line.steps"},
 }
 
 

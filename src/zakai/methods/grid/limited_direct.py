@@ -20,7 +20,7 @@ from zakai.methods.line import filter as line_filter
 from zakai.methods.line import tangents as line_tangents
 from zakai.methods.line.backward import BACKWARD as LINE
 from zakai.methods.line.model import in_pieces
-from zakai.methods.line.system import State
+from zakai.methods.line.prepared import State
 from zakai.methods.line.yau import yau_line_of
 from zakai.methods.yau.system import power_series_of
 from zakai.models import features

@@ -19,7 +19,7 @@ from zakai.methods.line import filter as line_filter
 from zakai.methods.line import tangents as line_tangents
 from zakai.methods.line.backward import BACKWARD as LINE
 from zakai.methods.line.model import in_pieces
-from zakai.methods.line.system import Prepared, State
+from zakai.methods.line.prepared import Prepared, State
 from zakai.methods.reflecting import filter as reflecting_filter
 from zakai.methods.reflecting.backward import BACKWARD as REFLECTING
 from zakai.models import features

@@ -18,16 +18,13 @@ from zakai.densities import Density
 from zakai.methods._protocol import Backward, Info, Infos
 from zakai.methods._states import Joined
 from zakai.methods.line import filter as line_filter
-from zakai.methods.line.adjoint import back
-from zakai.methods.line.figures import state_moments
+from zakai.methods.line.backward_interval import negligible, pulled, smoothing_tolerance
+from zakai.methods.line.backward_loop import back
 from zakai.methods.line.loop import joined
 from zakai.methods.line.message import Message, points_of, reliable
-from zakai.methods.line.parts import cut
 from zakai.methods.line.paths import draw
-from zakai.methods.line.prior import state_of
-from zakai.methods.line.system import Parts, Prepared, State
-from zakai.methods.line.update import acting_inside, factor_of
-from zakai.methods.line.way import negligible, pulled, smoothing_tolerance
+from zakai.methods.line.prepared import Parts, Prepared, State, cut
+from zakai.methods.line.update import acting_inside, factor_of, state_moments, state_of
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import support
 

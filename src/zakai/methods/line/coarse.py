@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.line.figures import figures
-from zakai.methods.line.system import Prepared
-from zakai.methods.line.tables import covariance_at, gauge_at, spectral
+from zakai.methods.line.coefficients import EDGE, covariance_at, gauge_at, spectral
+from zakai.methods.line.prepared import Prepared
+from zakai.methods.line.update import figures
 from zakai.numerics.line import window as lw
 
 Array = Any
@@ -27,7 +27,6 @@ SHARP = 2.0  # how much finer a grid is at least
 REACH = 7.2  # standard deviations of the noise by which the support grows
 MARGIN = 7.2  # of them beyond: the waves that R' leaves everywhere end there, and spread from the ends
 ATTEMPTS = 6
-EDGE = 1e-11  # density at the outermost points, relative to the maximum
 
 
 class Coarsened(NamedTuple):

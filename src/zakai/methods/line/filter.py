@@ -21,39 +21,36 @@ from zakai.densities import Density, GridDensity, MappedDensity
 from zakai.methods._protocol import Info, Infos
 from zakai.methods._states import Joined
 from zakai.methods.line import loop
-from zakai.methods.line.domain import on_the_line, variable_of
-from zakai.methods.line.drift_grid import showing_drift
-from zakai.methods.line.ends import check_ends
-from zakai.methods.line.escape import check_escape
-from zakai.methods.line.figures import (
+from zakai.methods.line.coefficients import showing_drift
+from zakai.methods.line.domain import check_ends, check_escape, on_the_line, variable_of
+from zakai.methods.line.kernel import by_kernel
+from zakai.methods.line.model import system_of
+from zakai.methods.line.prepared import NOISE, SHARED, Parts, Prepared, State, parts_of_step, segment_of_parts
+from zakai.methods.line.transition import SOME, Passage, Report, by_decomposition, by_substeps, travel
+from zakai.methods.line.update import (
+    acting_inside,
     edge_of_moments,
+    factor_of,
     figures,
     forgetting,
     on_fitting_grid,
     outside_tables,
     refitted,
+    sampled_weakly,
     spread,
     state_moments,
+    state_of,
 )
-from zakai.methods.line.grids import SHARED
-from zakai.methods.line.kernel import by_kernel
-from zakai.methods.line.model import system_of
-from zakai.methods.line.moves import Passage, Report, by_decomposition, by_substeps
-from zakai.methods.line.moving import SOME, travel
-from zakai.methods.line.parts import parts_of_step, segment_of_parts
-from zakai.methods.line.prior import init as init
-from zakai.methods.line.prior import state_of
-from zakai.methods.line.system import NOISE, Parts, Prepared, State
-from zakai.methods.line.update import acting_inside, factor_of, sampled_weakly
+from zakai.methods.line.update import init as init
 from zakai.methods.line.volumes import contracted
 from zakai.methods.system.notes import OMITTED
 from zakai.models.model import Model
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.channel import Channel, around, chosen
 from zakai.numerics.line.density import separated
-from zakai.numerics.line.outlook import FAR
-from zakai.numerics.line.posterior import General, multiplied
-from zakai.numerics.line.segment import RELIABLE
+from zakai.numerics.line.gaussian_kernels import Channel, around, chosen
+from zakai.numerics.line.grid_choice import FAR
+from zakai.numerics.line.product import General, multiplied
+from zakai.numerics.line.steps import RELIABLE
 from zakai.records.schedule import Schedule
 
 Array = Any

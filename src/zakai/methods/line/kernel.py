@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from zakai.methods.line.moves import Moved, Report
-from zakai.methods.line.system import Prepared
+from zakai.methods.line.prepared import Prepared
+from zakai.methods.line.transition import Moved, Report
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.channel import Channel
-from zakai.numerics.line.filters import WIDE, applied, wrapped
+from zakai.numerics.line.gaussian_kernels import WIDE, Channel, applied, wrapped
 
 Array = Any
 

@@ -1,4 +1,4 @@
-"""Steps by the modes of the operator (`numerics/line/modal.py`), for `line/loop.py`."""
+"""Steps by the modes of the operator (`numerics/line/modes.py`), for `line/loop.py`."""
 
 from __future__ import annotations
 
@@ -7,17 +7,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.line.grids import SHARED
-from zakai.methods.line.system import Prepared, State
-from zakai.methods.line.tables import covariance_at, gauge_at, profile_of, spectral
+from zakai.methods.line.coefficients import covariance_at, gauge_at, profile_of, spectral
+from zakai.methods.line.prepared import SHARED, Prepared, State
 from zakai.methods.line.update import factor_at_end
-from zakai.numerics.line import modal as lm
+from zakai.numerics.line import modes as lm
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import circular_rows, waves
-from zakai.numerics.line.place import PER
-from zakai.numerics.line.posterior import General
-from zakai.numerics.line.segment import COLUMNS, FAILED
-from zakai.numerics.line.weak import at_nodes, nodes, weaken
+from zakai.numerics.line.grid_choice import PER
+from zakai.numerics.line.product import General, at_nodes, nodes, weaken
+from zakai.numerics.line.steps import COLUMNS, FAILED
 
 Array = Any
 
@@ -73,7 +71,7 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
         k, stop: the intervals.
         state: the state before them.
         observed: what is observed (K, m).
-        way: whether the steps stay on the grid of the state, see `numerics/line/modal.py`.
+        way: whether the steps stay on the grid of the state, see `numerics/line/modes.py`.
     """
     system, window, steps, stays = prepared.system, state.window, prepared.steps, way == lm.STAY
     general, special = system.general or prepared.weak, system.general or not system.steady_observation or prepared.weak

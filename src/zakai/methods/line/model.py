@@ -242,3 +242,8 @@ def system_of(model: Model) -> System:
 def within(times: Array, start: float, stop: float) -> Array:
     """Return times of a piece, in which the end counts as the limit from inside."""
     return np.clip(times, start, np.nextafter(stop, start))
+
+
+def finite(values: Array) -> Array:
+    """Return the values with zero where a formula has no value."""
+    return np.where(np.isfinite(values.real), values, 0.0)

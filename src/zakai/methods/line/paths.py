@@ -22,10 +22,10 @@ import numpy as np
 from zakai.densities._density import wrap
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line.domain import variable_of
-from zakai.methods.line.system import Prepared, State
+from zakai.methods.line.prepared import Prepared, State
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.polynomial import local_polynomial
+from zakai.numerics.line.window import local_polynomial
 from zakai.numerics.transition import Array
 
 RELIABLE = 1e-10  # of the maximum: a density whose derivative is not rounding

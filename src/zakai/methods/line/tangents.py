@@ -17,21 +17,17 @@ from sympy import sympify
 
 from zakai.methods._protocol import Infos, Tangents
 from zakai.methods.line import filter as line_filter
-from zakai.methods.line.adjoint import log_likelihoods
-from zakai.methods.line.attempt import Substep, exponents_of
-from zakai.methods.line.grids import grid_of
-from zakai.methods.line.loop import DIVIDED, START, Piece, infos_of
-from zakai.methods.line.moves import Passage
-from zakai.methods.line.parts import segment_of_parts
-from zakai.methods.line.system import Parts, Prepared, State
-from zakai.methods.line.tables import spectral
+from zakai.methods.line.backward_loop import log_likelihoods
+from zakai.methods.line.coefficients import spectral
+from zakai.methods.line.loop import DIVIDED, START, Piece, grid_of, infos_of
+from zakai.methods.line.prepared import Parts, Prepared, State, segment_of_parts
+from zakai.methods.line.transition import Passage, Substep, exponents_of
 from zakai.methods.line.update import factor_of
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.exponential_tangents import exponential_tangents
-from zakai.numerics.line.segment import SPLIT
-from zakai.numerics.line.split_tangents import Coefficients, Interval, through
-from zakai.numerics.line.tangents import Varied, extended, resampled_tangents
+from zakai.numerics.line.splitting import Coefficients, Interval, through
+from zakai.numerics.line.steps import SPLIT
+from zakai.numerics.line.tangents import Varied, exponential_tangents, extended, resampled_tangents
 
 Array = Any
 

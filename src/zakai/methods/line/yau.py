@@ -1,7 +1,7 @@
 """The transition of a time-varying Yau system with one state: f = L x + l + G phi', q quadratic.
 
 In the gauge u = e^phi v the equation of an interval is linear-quadratic, so that its kernel is Gaussian for any interval
-(`numerics/line/channel.py`), positive, and exact:
+(`numerics/line/gaussian_kernels.py`), positive, and exact:
 
     u(x) = e^phi(x, stop) int N(x; a y + b, V) exp(k0 + k1 y + k2 y^2) e^-phi(y, start) u(y) dy.
 """

@@ -15,11 +15,10 @@ import numpy as np
 from zakai.densities import IntervalDensity
 from zakai.errors import InputError
 from zakai.methods._protocol import Info
-from zakai.methods.line.escape import check_escape
-from zakai.methods.line.figures import forgetting, outside_tables, spread
-from zakai.methods.line.moves import Report
-from zakai.methods.line.system import NOISE, Prepared
-from zakai.methods.line.update import factor_at_end
+from zakai.methods.line.domain import check_escape
+from zakai.methods.line.prepared import NOISE, Prepared
+from zakai.methods.line.transition import Report
+from zakai.methods.line.update import factor_at_end, forgetting, outside_tables, spread
 from zakai.methods.reflecting.elements import (
     CUT,
     SAMPLES,
@@ -31,16 +30,16 @@ from zakai.methods.reflecting.elements import (
     moments,
     negligible_of,
     placed,
+    propagated,
     sampled,
     support,
     with_margin,
     without_nan,
 )
-from zakai.methods.reflecting.moves import propagated
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior
-from zakai.numerics.line.posterior import General, Likelihood, place
-from zakai.numerics.line.segment import RELIABLE
+from zakai.numerics.line.product import General, Likelihood, place
+from zakai.numerics.line.steps import RELIABLE
 from zakai.numerics.lobatto import Element
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 

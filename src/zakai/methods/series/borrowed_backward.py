@@ -13,7 +13,7 @@ from typing import Any
 from zakai.densities import GridDensity
 from zakai.methods._protocol import Backward, through
 from zakai.methods.grid import yau_yau
-from zakai.methods.line.system import State as LineState
+from zakai.methods.line.prepared import State as LineState
 from zakai.numerics.line import window as lw
 from zakai.numerics.space.field import Field
 from zakai.numerics.space.grid import Grid

@@ -13,7 +13,7 @@ import numpy as np
 from zakai.models.model import Model
 from zakai.models.numeric import NumericFunction, numpy_function
 from zakai.numerics.complex_step import cholesky, log_determinant
-from zakai.numerics.line.panels import GAUSS_NODES, GAUSS_WEIGHTS, panels
+from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS, panels
 from zakai.records.schedule import Schedule
 
 Array = np.ndarray

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.polynomial import interpolated_logs
+from zakai.numerics.line.window import interpolated_logs
 
 Array = NDArray[Any]
 Bands = tuple[Array, Array, Array]

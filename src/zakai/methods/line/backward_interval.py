@@ -1,9 +1,9 @@
-"""A message of one state over one interval, backward in time, where the compiled loop does not take it.
+"""A message of one state over one interval, backward in time, where the compiled loop refuses it.
 
-A Gaussian kernel is a sum over a grid.  On the circle the transposed exponentials of the filter act (`line/transposed.py`), on
-the line a grid that moves (`line/gauged.py`) where the drift carries the density.  Else, where no coefficient depends on t and no
-increments act within, a grid covers the support of the message at the end of the interval, that of the density at its start, and
-the paths between them; psi is moved by its decomposition.  Else grids stand (`line/gauged.py`).  Other intervals are for finite
+A Gaussian kernel is a sum over a grid.  On the circle the transposed exponentials of the filter act, on the line a grid that
+moves (`line/gauged.py`) where the drift carries the density.  Else, where no coefficient depends on t and no increments act
+within, a grid covers the support of the message at the end of the interval, that of the density at its start, and the paths
+between them; psi is moved by its decomposition.  Else grids are fixed (`line/gauged.py`).  Other intervals are for finite
 volumes (`line/volumes.py`).
 """
 
@@ -14,22 +14,72 @@ from typing import Any
 import numpy as np
 
 from zakai.methods.line import filter as line_filter
-from zakai.methods.line.course import course_of, ends_of
-from zakai.methods.line.gauge import gauged
+from zakai.methods.line.coefficients import covariance_at, resolved_parts
 from zakai.methods.line.gauged import by_moving_grid, by_standing_grids
-from zakai.methods.line.message import FEWEST, Message, covering, points_of, reliable, taper
-from zakai.methods.line.moves import Report
-from zakai.methods.line.moving import travel
-from zakai.methods.line.system import Prepared, State
-from zakai.methods.line.tables import covariance_at
-from zakai.methods.line.transposed import by_exponentials
-from zakai.methods.line.volumes import pulled_back
+from zakai.methods.line.message import FEWEST, Message, covering, gauged, points_of, reliable, taper
+from zakai.methods.line.prepared import Prepared, State
+from zakai.methods.line.transition import MOST_SUBSTEPS, Report, Substep, attempted, parts_of_split, travel
+from zakai.methods.line.volumes import course_of, ends_of, pulled_back
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.adjoint import EXCURSION
+from zakai.numerics.line.backward import EXCURSION
 from zakai.numerics.line.density import support
-from zakai.numerics.line.polynomial import local_polynomial
+from zakai.numerics.line.window import local_polynomial
 
 Array = Any
+
+def by_exponentials(
+    prepared: Prepared, k: int, inside: np.ndarray, rates: np.ndarray, state: State, later: Message, accepted: float
+) -> tuple[Message, float] | None:
+    """Return the message at the start of interval k, and the error that the interval adds; None where this does not serve.
+
+    Args:
+        prepared: the system.
+        k: the interval.
+        inside, rates: which increments act within it, and their rates.
+        state: the filter's state at its start.
+        later: the message at its end.
+        accepted: the values relative to the maximum that do not count.
+    """
+    start, length, spacing = float(prepared.schedule.starts[k]), float(prepared.lengths[k]), later.needed
+    for _ in range(MOST_GRIDS):
+        window = covering(later.window, 0.0, 0.0, min(spacing, state.spacing))
+        values = np.exp(later.at(window.offsets) - np.max(later.logs))
+        values, top, error = _transposed(prepared, values, window, start, length, inside, rates)
+        look = lw.figures(values, True, accepted)
+        if look.aliasing <= accepted or window.size >= lw.LARGEST:
+            break
+        spacing = window.spacing / 1.5
+    else:
+        return None
+    density, least = reliable(state, window), ROUNDING * float(np.max(values))
+    error += 2.0 * look.aliasing + least * float(np.sum(density) / (density @ values))
+    needed = window.spacing * float(np.clip(look.resolving, 1.0, 2.0))
+    logs = np.log(np.maximum(values, least)) + top + float(np.max(later.logs))
+    return Message.of(logs, window, needed, later.error), error
+
+
+def _transposed(
+    prepared: Prepared, values: Array, window: lw.Window, start: float, length: float, inside: np.ndarray, rates: np.ndarray
+) -> tuple[Array, float, float]:
+    """Return a message at the start of an interval, of the sum one, the logarithm of the sum before, and the error."""
+    total = float(np.sum(values))
+    values, top, error = values / total, float(np.log(total)), 0.0
+    stack, count = [(0.0, 0.5 * length), (0.5 * length, length)], 0
+    if prepared.system.varying:
+        stack, error = resolved_parts(prepared, values, window, start, length, inside)
+    while stack:
+        first, last = stack.pop()
+        attempt = attempted(prepared, values, window, Substep(start + first, last - first, inside, rates), True)
+        count += 1
+        if attempt.split and count + len(stack) < MOST_SUBSTEPS:
+            stack += parts_of_split(prepared, first, last, attempt.error)
+            continue
+        total = float(np.sum(attempt.values))
+        error += np.inf if attempt.split else attempt.error
+        top += attempt.offset + float(np.log(total))
+        values = attempt.values / total
+    return values, top, error
+
 
 ROUNDING = 1e-15  # of the maximum: smaller values of psi are not kept
 RESOLVED = 0.25  # spacing in standard deviations of the noise

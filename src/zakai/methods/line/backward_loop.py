@@ -1,6 +1,6 @@
 """Many intervals backward in time in one compiled loop (`numerics/line/backward.py`), for `line/backward.py`.
 
-The message is moved on the grids of the filter.  An interval that the loop does not take is taken by `line/way.py`.
+The message is moved on the grids of the filter.  An interval that the loop refuses is filtered by `line/backward_interval.py`.
 """
 
 from __future__ import annotations
@@ -11,21 +11,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.methods._protocol import Infos
-from zakai.methods.line.figures import state_moments
-from zakai.methods.line.gauge import gauged
-from zakai.methods.line.grids import grid_of
-from zakai.methods.line.loop import TOGETHER
-from zakai.methods.line.message import LOWEST, PAD, SURE, Message, taper
-from zakai.methods.line.moving import displaced
-from zakai.methods.line.system import SHARE, Prepared, State
-from zakai.methods.line.tables import covariance_at
-from zakai.methods.line.update import factor_at_end
-from zakai.methods.line.way import negligible, smoothing_tolerance
+from zakai.methods.line.backward_interval import negligible, smoothing_tolerance
+from zakai.methods.line.coefficients import covariance_at
+from zakai.methods.line.loop import TOGETHER, grid_of
+from zakai.methods.line.message import LOWEST, PAD, SURE, Message, gauged, taper
+from zakai.methods.line.prepared import SHARE, Prepared, State
+from zakai.methods.line.transition import displaced
+from zakai.methods.line.update import factor_at_end, state_moments
 from zakai.numerics.line import backward as lb
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.adjoint import EXCURSION, by_adjoints
+from zakai.numerics.line.backward import EXCURSION, by_adjoints
 from zakai.numerics.line.density import support
-from zakai.numerics.line.segment import SPLIT, SPLIT_FACTOR
+from zakai.numerics.line.steps import SPLIT, SPLIT_FACTOR
 
 Array = Any
 

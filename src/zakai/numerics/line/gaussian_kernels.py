@@ -1,15 +1,20 @@
-"""Gaussian kernels as filters on a uniform grid.
+"""Gaussian kernels of linear-quadratic equations of one state, as filters on a uniform grid.
 
-A kernel exp(k0 + k1 y + k2 y^2) N(x; a y + b, V) is, because x y = (x^2 + y^2 - (x - y)^2) / 2, the convolution with a Gaussian
-of the variance V / a between two exponentials of quadratic polynomials.  Where V / a is large enough in squares of the spacing,
-its samples are a filter of positive numbers, which is accurate relative to every value, far into the tails.  Else it is a filter
-that is exact for band-limited densities, which is accurate relative to the maximum.
+A transition (`numerics/transition.py`) takes the unit mass at y to
+
+    exp(k0 + k1 y + k2 y^2) N(x; a y + b, V),
+
+where b and k1 are linear in the inputs e = (1, e_1, ...) of the equation, and k0 is a quadratic form.  Rates of observation
+enter in this way after the transitions have been computed.  Because x y = (x^2 + y^2 - (x - y)^2) / 2, the kernel is the
+convolution with a Gaussian of the variance V / a between two exponentials of quadratic polynomials.  Where V / a is large
+enough in squares of the spacing, its samples are a filter of positive numbers, which is accurate relative to every value, far
+into the tails.  Else it is a filter that is exact for band-limited densities, which is accurate relative to the maximum.
 """
 
 from __future__ import annotations
 
 from math import erfc
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import complex128, float64, int64
@@ -18,9 +23,44 @@ from numpy.typing import NDArray
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.density import highest_of
-from zakai.numerics.line.terms import Transition, failed
+from zakai.numerics.line.steps import Transition, failed
+from zakai.numerics.transition import Transition as LinearTransition
 
 Array = NDArray[Any]
+
+class Channel(NamedTuple):
+    """The kernel for given inputs: a, b, V, k0, k1, k2."""
+
+    scale: Any
+    shift: Any
+    variance: Any
+    constant: Any
+    slope: Any
+    curvature: Any
+
+
+def chosen(transitions: LinearTransition, k: int, inputs: Array) -> Channel:
+    """Return the kernel of interval k for the inputs (k,)."""
+    scale, shift, variance, information, slope, constant = (part[k] for part in transitions)
+    return Channel(
+        scale[0, 0], shift[0] @ inputs, variance[0, 0], inputs @ constant @ inputs, slope[0] @ inputs, -0.5 * information[0, 0]
+    )
+
+
+def packed(transitions: LinearTransition, rows: Array) -> Array:
+    """Return the parameters (R, .) of the kernels of some intervals for all inputs, as `filters.kernel_of` reads them."""
+    scale, shift, variance, information, slope, constant = (part[rows].reshape(len(rows), -1) for part in transitions)
+    return np.concatenate([scale, shift, variance, constant, slope, -0.5 * information], axis=1)
+
+
+def around(channel: Channel, origin: float) -> Channel:
+    """Return the kernel for x and y relative to `origin`."""
+    return channel._replace(
+        shift=channel.shift + (channel.scale - 1.0) * origin,
+        constant=channel.constant + (channel.slope + channel.curvature * origin) * origin,
+        slope=channel.slope + 2.0 * channel.curvature * origin,
+    )
+
 
 WIDE = 1.96  # variance of a kernel, in squares of the spacing, from which its samples are a filter
 BAND = 0.625  # part of the frequencies of a grid for which the filters of narrow kernels are exact
@@ -157,7 +197,7 @@ def kernel_size(inputs: int) -> int:
 def kernel_of(parameters: Array, observed: Array, length: float, to: Array) -> None:
     """Write a, b, V, k0, k1, k2 of a kernel for increments (m,) over an interval of a length, infinite where none acts inside.
 
-    With the inputs e = (1, increments / length) the parameters are those of `line/channel.packed`.
+    With the inputs e = (1, increments / length) the parameters are those of `gaussian_kernels.packed`.
     """
     count = 1 + observed.size
     shift, variance, constant = parameters[1 : 1 + count], parameters[1 + count], parameters[2 + count : -1 - count]
