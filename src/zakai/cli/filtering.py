@@ -44,9 +44,6 @@ def filter(
     check_outputs([output, report], [source, record_path, truth_path, inputs_path])
     if report is not None:
         from zakai.report import write_report
-        from zakai.report._extra import plotting
-
-        plotting("plotly")
     from zakai.engine.kept_record import MOST_QUANTILES
 
     model, record, options = _given(source, record_path, settings, inputs_path, unit, origin, columns)

@@ -1,0 +1,154 @@
+"""Densities of one state as averages over cells of equal size: what a picture draws of them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import kernel
+
+Array = NDArray[Any]
+
+_SEEN = 1e-6  # of the largest value of a density: what is below everywhere is outside of its window
+_SUMMED = 1e-10  # of the largest value on the grid: smaller terms change nothing that is drawn
+_REACH = 7.0  # standard deviations at which a Gaussian is below 1e-10 of its peak
+
+
+def grid_cells(log_values: Array, closed: bool, count: int) -> tuple[float, float, Array]:
+    """Return the density that is band-limited on the grid 0, 1, ..., size - 1 as averages over `count` cells.
+
+    Args:
+        log_values: (size,) logarithms of the density, up to a constant.
+        closed: whether the grid goes once around a circle.
+        count: number of cells.
+
+    Returns:
+        The ends of the window that holds the mass, as indices of the grid, and the averages (count,), up to a factor.  On a
+        circle the window may go beyond the last index.
+    """
+    values = np.exp(log_values - np.max(log_values))
+    size = len(values)
+    if closed:
+        first, length = _arc(values > _SEEN)
+        start, terms = _arc(values > _SUMMED)
+        low, high = first - 1.0, first + length + 0.0
+        if 2 * (high - low) > size:  # the whole circle, from the point opposite to the mean
+            mean = np.angle(values @ np.exp(2j * np.pi / size * np.arange(size))) * size / (2 * np.pi)
+            low, high = mean - 0.5 * size, mean + 0.5 * size
+            start, terms = 0, size
+    else:
+        seen, summed = np.flatnonzero(values > _SEEN), np.flatnonzero(values > _SUMMED)
+        low, high = max(seen[0] - 1.0, -0.5), min(seen[-1] + 1.0, size - 0.5)
+        start, terms = int(summed[0]), int(summed[-1] - summed[0] + 1)
+    within = max(1, math.ceil(2.0 * (high - low) / count))  # two points for each of the grid
+    out, cell = np.empty(count), (high - low) / count
+    signed = np.take(values, np.arange(start, start + terms), mode="wrap")
+    signed[1::2] *= -1.0
+    if closed:
+        _interpolate_on_circle(signed, size, start, low, cell, within, out)
+    else:
+        _interpolate(signed, start, low, cell, within, out)
+    return low, high, out
+
+
+def _arc(inside: Array) -> tuple[int, int]:
+    """Return the first index and the length of the shortest arc of a circle that holds all places that are `inside`."""
+    places = np.flatnonzero(inside)
+    gaps = np.diff(np.append(places, places[0] + len(inside)))
+    widest = int(np.argmax(gaps))
+    return int(places[(widest + 1) % len(places)]), len(inside) - int(gaps[widest]) + 1
+
+
+@kernel(
+    types.void(types.float64[::1], types.int64, types.float64, types.float64, types.int64, types.float64[::1]), reordered=True
+)
+def _interpolate(signed: Array, start: int, low: float, cell: float, within: int, out: Array) -> None:
+    """Write the averages over cells of the sinc interpolant of the values (-1)^i `signed`[i] at the points `start` + i."""
+    for r in range(len(out)):
+        total = 0.0
+        for s in range(within):
+            x = low + cell * (r + (s + 0.5) / within) - start
+            nearest = math.floor(x + 0.5)
+            rest = x - nearest
+            sign = 1.0 if int(nearest) % 2 == 0 else -1.0
+            if abs(rest) < 1e-12:
+                total += sign * signed[int(nearest)] if 0 <= nearest < len(signed) else 0.0
+                continue
+            found = 0.0
+            for i in range(len(signed)):
+                found += signed[i] / (x - i)
+            total += sign * math.sin(math.pi * rest) / math.pi * found  # sin(pi (x - i)) = sin(pi rest) (-1)^(nearest - i)
+        out[r] = max(total / within, 0.0)
+
+
+@kernel(
+    types.void(types.float64[::1], types.int64, types.int64, types.float64, types.float64, types.int64, types.float64[::1]),
+    reordered=True,
+)
+def _interpolate_on_circle(signed: Array, size: int, start: int, low: float, cell: float, within: int, out: Array) -> None:
+    """Write the averages over cells of the trigonometric interpolant of `size` values, of which those not given are zero."""
+    for r in range(len(out)):
+        total = 0.0
+        for s in range(within):
+            x = low + cell * (r + (s + 0.5) / within) - start
+            nearest = math.floor(x + 0.5)
+            rest = x - nearest
+            sign = 1.0 if int(nearest) % 2 == 0 else -1.0
+            if abs(rest) < 1e-12:
+                at = int(nearest) % size
+                total += signed[at] * (1.0 if at % 2 == 0 else -1.0) if at < len(signed) else 0.0
+                continue
+            found = 0.0
+            for i in range(len(signed)):
+                angle = math.pi * (x - i) / size
+                found += signed[i] / (math.sin(angle) if size % 2 else math.tan(angle))
+            total += sign * math.sin(math.pi * rest) / size * found
+        out[r] = max(total / within, 0.0)
+
+
+@kernel(
+    types.void(
+        types.float64[::1], types.float64[::1], types.float64[::1], types.float64, types.float64, types.int64, types.float64[::1]
+    )
+)
+def mixture_cells(weights: Array, means: Array, deviations: Array, low: float, cell: float, within: int, out: Array) -> None:
+    """Write the averages over cells of a sum of Gaussians, each by the recurrence of its values at equal distances.
+
+    Args:
+        weights: (k,).
+        means: (k,).
+        deviations: (k,) standard deviations.
+        low: the start of the first cell.
+        cell: the size of a cell.
+        within: number of points in a cell of which the average is that of the cell.
+        out: (count,), overwritten.
+    """
+    step = cell / within
+    last = len(out) * within - 1
+    out[:] = 0.0
+    for k in range(len(weights)):
+        scale, begin = step / deviations[k], low + 0.5 * step
+        middle = int(min(max(math.floor((means[k] - begin) / step + 0.5), 0.0), float(last)))
+        z = (begin + middle * step - means[k]) / deviations[k]
+        if abs(z) > _REACH:
+            continue
+        height = weights[k] / (deviations[k] * within * math.sqrt(2.0 * math.pi)) * math.exp(-0.5 * z * z)
+        reach = int(_REACH / scale) + 1
+        shrink = math.exp(-scale * scale)
+        for direction in (1, -1):
+            value = height
+            ratio = math.exp(-scale * (direction * z + 0.5 * scale))
+            at = middle
+            if direction < 0:
+                value, ratio, at = value * ratio, ratio * shrink, middle - 1
+            for _ in range(reach):
+                if at < 0 or at > last:
+                    break
+                out[at // within] += value
+                value *= ratio
+                ratio *= shrink
+                at += direction
