@@ -60,7 +60,9 @@ MOVE_ABOVE, MOVE_SHARE, MOVE_GAIN, FORGOTTEN = 2.5, 0.4, 3.0, 0.98
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
-SURE, TRUSTED = 0.5, 8  # share of the allowed time error below which its measurement is trusted in so many more intervals
+# Share of the allowed time error below which its measurement is trusted in so many more intervals, if it is certain or not, and
+# the ratio of the errors of two lengths up to which that holds.
+SURE, TRUSTED, TRUSTED_LESS, LONGER = 0.5, 8, 2, 4.0
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -240,18 +242,18 @@ def _steps(
     length = interval.stop - interval.start
     guess = min(max(1, round(control.substeps * length)), MOST_SUBSTEPS)
     if length <= 0:
-        return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0), control
+        return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0, 0.0), control
     # The error of an interval is of the third order of its length.
     ratio = (length / control.length) ** 3 if control.trusted else np.inf
-    if control.error * ratio <= SURE * TIME_ERROR:
-        known = Steps(Scheme(guess, control.stages), state.last_shift, control.error)
+    if ratio <= LONGER and control.error * ratio <= SURE * TIME_ERROR:
+        known = Steps(Scheme(guess, control.stages), state.last_shift, control.error, control.error)
         return known, control._replace(trusted=control.trusted - 1)
     key = prepared.key(control.interval + 1, PILOT)
     chosen = np.empty(PILOTS, np.int32)
     systematic(np.exp(state.log_weights), uniform_number(key), chosen)
     pilots = Pilots(taken(state.particles, chosen), mean, scale, int(key[0] >> np.uint64(2)))
     found = steps_of(prepared.motion, interval, values, pilots, guess)
-    trusted = TRUSTED if found.error <= SURE * TIME_ERROR else 0
+    trusted = TRUSTED if found.surely <= SURE * TIME_ERROR else TRUSTED_LESS if found.error <= SURE * TIME_ERROR else 0
     scheme = found.scheme
     changed = control._replace(
         substeps=scheme.substeps / length, stages=scheme.stages, error=found.error, length=length, trusted=trusted
