@@ -35,13 +35,14 @@ class Interval(NamedTuple):
         return EscapeError(f"{self.model.source}: {words}", self.row, self.start, self.length)
 
 
-def check_escape(prepared: Any, k: int, moments: Callable[[], tuple[Array, Array]]) -> None:
+def check_escape(prepared: Any, k: int, moments: Callable[[], tuple[Array, Array]], infinity: bool = True) -> None:
     """Raise InputError where paths escape in interval k.
 
     Args:
         prepared: what a method prepares, with a model, a schedule and parameters.
         k: the number of the interval.
         moments: returns the mean (n,) and the covariance (n, n) of the density at its start.
+        infinity: whether paths to infinity are sought, and not only poles.
     """
     model, schedule, theta = prepared.model, prepared.schedule, prepared.theta.real
     start, length = float(schedule.starts[k]), float(schedule.lengths[k])
@@ -57,7 +58,7 @@ def check_escape(prepared: Any, k: int, moments: Callable[[], tuple[Array, Array
         return _grows(at(_far_points(model.n), start + 0.5 * length)[..., : model.n])
 
     with np.errstate(all="ignore"):
-        grows = growing() if _varies(model) else kept(model, check_escape, growing, theta.tobytes(), 8)
+        grows = infinity and (growing() if _varies(model) else kept(model, check_escape, growing, theta.tobytes(), 8))
         if not grows and divisors is None:
             return
         mean, cov = moments()
