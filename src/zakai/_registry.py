@@ -65,7 +65,7 @@ METHODS = {
         "convergent for any model in any number of states: particles, with standard errors of what they give",
     ),
     "extended-kalman-bucy": Entry(
-        "zakai.methods.gaussian.extended_kalman_bucy",
+        "zakai.methods.gaussian.extended.extended_kalman_bucy",
         "approximate for formulas with a derivative almost everywhere: linearised at the mean; only when it is named",
     ),
 }

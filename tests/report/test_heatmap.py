@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from report.fakes import fake_result
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.errors import InputError
 from zakai.report.heatmap import chosen_times, circle_line, density_over_time, true_states
 

@@ -13,6 +13,7 @@ import numpy as np
 from zakai import _display
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
+from zakai.engine.forecast import forecast, origin_of
 from zakai.engine.kept_record import Variables, quantiles_of, record_of
 from zakai.engine.table import save_table
 from zakai.engine.variables import attributes_of, variables_of
@@ -250,8 +251,6 @@ class FilterResult:
             ahead = result.forecast([11.0, 12.0])
             ahead.mean, ahead.density(-1).quantile([0.05, 0.95])
         """
-        from zakai.engine.forecast import forecast
-
         return forecast(self, times, inputs)
 
     def predict_observations(self, times: Any = None, inputs: Inputs | None = None) -> PredictedObservations:
@@ -373,8 +372,6 @@ class FilterResult:
         record: Variables = {}
         request: dict[str, str] = {}
         if densities:
-            from zakai.engine.forecast import origin_of
-
             plan, _, given = origin_of(self, "save")
             record, request = record_of(self, plan, given)
         save_variables({**variables_of(self), **quantiles, **record}, {**attributes_of(self), **request}, path)

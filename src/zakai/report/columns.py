@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from zakai.densities import Density
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
 from zakai.densities.points import PointMasses

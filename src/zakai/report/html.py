@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.report import _style, calibration, observed, sections, words
 from zakai.report.heatmap import is_periodic, state_names, true_states
 from zakai.report.scripts import policy, script

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.errors import InputError
 from zakai.models.numeric import numpy_function
 from zakai.records.schedule import schedule_of

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.errors import InputError
 from zakai.report import words
 from zakai.report.charts import clock_header

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from zakai.densities import Density
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.densities.points import PointMasses
 from zakai.errors import InputError
 from zakai.report.charts import clock_header

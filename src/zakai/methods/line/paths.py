@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line.domain import variable_of
 from zakai.methods.line.prepared import Prepared, State

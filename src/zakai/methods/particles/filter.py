@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.methods._protocol import Info
 from zakai.methods.particles.errors import DEPTH, Genealogy, of_log_likelihood, variances
 from zakai.methods.particles.interval import (

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from zakai.densities import GaussianMixture
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.errors import InputError
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function

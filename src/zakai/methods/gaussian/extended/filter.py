@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities import GaussianMixture
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.errors import InputError
 from zakai.methods._options import one_of, whole_number
 from zakai.methods._protocol import Info, Infos

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import expm
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.methods.gaussian.extended.linearised_system import Formulas, Part, part_of
 from zakai.numerics.transition import Array
 
