@@ -21,23 +21,19 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES
 from zakai.numerics.line.gaussian_kernels import BAND
 from zakai.numerics.line.loop import advance
-from zakai.numerics.line.modes import BROAD, NARROW, OWN, PLACE, STAY
+from zakai.numerics.line.modes import OWN, PLACE, STAY
 from zakai.numerics.line.product import at_nodes, nodes
 from zakai.numerics.line.steps import (
-    AFTER,
     CELL,
     COLUMNS,
     DRIFT,
-    FAILED,
     MARGIN,
     OBSERVED,
-    OK,
     PHI,
-    RANGE,
     SLOPE,
-    UNRESOLVED,
     Grid,
     Segment,
+    Status,
 )
 
 Array = Any
@@ -221,43 +217,43 @@ def compiled_steps(prepared: Prepared, rows: slice, state: State, observed: np.n
                 break
         now = observed[first - rows.start : stop - rows.start]
         if prepared.gaussian:
-            piece, why, answer = _on_one_table(prepared, slice(first, stop), state, now)
+            piece, status, answer = _on_one_table(prepared, slice(first, stop), state, now)
         else:
             result = modal.advanced(prepared, first, stop, state, now, placement)
-            why, answer = result.why, result.answer
+            status, answer = result.status, result.answer
             piece = Piece.of(first, state, *result[:4])._replace(coarse=result.coarse) if len(result.reports) else None
         if piece is not None:
-            last = regridded(prepared, piece.last) if why == AFTER or prepared.cut_up else piece.last
+            last = regridded(prepared, piece.last) if status == Status.AFTER or prepared.cut_up else piece.last
             pieces.append(piece._replace(last=last))
             trials, state, first = 1, last, first + len(piece.reports)
-        if why == FAILED or (why == OK and piece is None):
+        if status == Status.FAILED or (status == Status.OK and piece is None):
             break
-        if why == RANGE:
+        if status == Status.RANGE:
             larger = _covering(prepared, state, *answer.tolist())
             if larger is None:
                 break
             state = larger
-        if placement == STAY and why in (NARROW, UNRESOLVED):
+        if placement == STAY and status in (Status.NARROW, Status.UNRESOLVED):
             if prepared.kinked:
                 break
-            placement = PLACE if why == NARROW else OWN
-        elif why == BROAD or placement == OWN:
+            placement = PLACE if status == Status.NARROW else OWN
+        elif status == Status.BROAD or placement == OWN:
             placement = STAY
     return pieces
 
 
-def _on_one_table(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Piece | None, int, Array]:
+def _on_one_table(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Piece | None, Status, Array]:
     """Return the first steps of `rows` by kernels or splitting, why they end, and the grid that is needed."""
     together = 1 if prepared.cut_up else TOGETHER if prepared.mixed else len(observed)
     here = slice(rows.start, min(rows.stop, rows.start + together))
     grid = grid_of(prepared, state.window, here)
     if grid is None:
-        return None, FAILED, np.zeros(3)
+        return None, Status.FAILED, np.zeros(3)
     segment = advance(
         prepared.mechanisms, np.ascontiguousarray(state.values), grid, prepared.steps, rows.start, observed[:together],
         float(state.error), float(state.log_floor), prepared.limits,
     )  # fmt: skip
-    return (_piece(rows.start, state, grid.start, segment) if len(segment.reports) else None), segment.why, segment.answer
+    return (_piece(rows.start, state, grid.start, segment) if len(segment.reports) else None), segment.status, segment.answer
 
 
 def _piece(first: int, before: State, start: int, segment: Segment) -> Piece:

@@ -15,7 +15,7 @@ from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import circular_rows, waves
 from zakai.numerics.line.grid_choice import PER
 from zakai.numerics.line.product import General, at_nodes, nodes, weaken
-from zakai.numerics.line.steps import COLUMNS, FAILED
+from zakai.numerics.line.steps import COLUMNS, STATUSES, Status
 
 Array = Any
 
@@ -29,7 +29,7 @@ class Advanced(NamedTuple):
     """Steps on grids of their own: densities (K, n), centres and spacings (K,), and reports (K, .).
 
     The transitions were those of `coarse` grids, with centres, spacings, sizes and the numbers of points at either end at which
-    there is no density (K, 4), or of the grid on which all steps have stayed.  `why` is why the loop ended, and `answer` the
+    there is no density (K, 4), or of the grid on which all steps have stayed.  `status` is why the loop ended, and `answer` the
     range of the grid that it needs and its spacing.
     """
 
@@ -38,7 +38,7 @@ class Advanced(NamedTuple):
     spacings: Array
     reports: Array
     coarse: Array | None
-    why: int
+    status: Status
     answer: Array
 
 
@@ -82,7 +82,7 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
         n = window.size if stays else SIZES[at]
         cosines, sines = waves(n)
         densities, places, out = np.empty((count, n)), np.empty((count + 1, 4)), np.zeros((count, len(COLUMNS)))
-        done, why = lm.advance(
+        done, number = lm.advance(
             np.ascontiguousarray(state.values), float(state.centre), float(state.spacing), window.unit, window.closed, profile,
             coarse.numbers, coarse.index, rows, owner, general, placement, k, observed[:count], steps.lengths,
             steps.precisions[:, 0], steps.constants, float(state.error), prepared.limits, cosines, sines, densities, places, out,
@@ -91,10 +91,11 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
             circular_rows(densities[:done], cosines, sines, out)
         grids = coarse.index[places[:done, 2].astype(int), :3]
         completed = None if stays else np.column_stack([grids, places[:done, 3]])
-        result = Advanced(densities[:done], places[:done, 0], places[:done, 1], out[:done], completed, why, places[-1, :3])
-        if done or why not in (lm.SIZE, lm.GRID):
+        centres, spacings, status = places[:done, 0], places[:done, 1], STATUSES[number]
+        result = Advanced(densities[:done], centres, spacings, out[:done], completed, status, places[-1, :3])
+        if done or result.status not in (Status.SIZE, Status.GRID):
             return result
-        if why == lm.SIZE:
+        if result.status == Status.SIZE:
             at, count = at + 1, 1
             if at < len(SIZES):
                 continue
@@ -118,7 +119,7 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
                 if parts is not None:
                     continue
         break
-    return result._replace(why=FAILED)
+    return result._replace(status=Status.FAILED)
 
 
 def _parts(prepared: Prepared, grid: lw.Window) -> list[Array] | None:

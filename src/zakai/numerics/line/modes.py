@@ -38,7 +38,19 @@ from zakai.numerics.line.grid_choice import (
     weighed,
 )
 from zakai.numerics.line.product import WEAK_SHARE, weak_error
-from zakai.numerics.line.steps import AFTER, FAILED, OK, RANGE, RELIABLE, UNRESOLVED, product
+from zakai.numerics.line.steps import (
+    AFTER,
+    BROAD,
+    FAILED,
+    GRID,
+    NARROW,
+    OK,
+    RANGE,
+    RELIABLE,
+    SIZE,
+    UNRESOLVED,
+    product,
+)
 from zakai.numerics.line.window import CUT, LARGEST
 
 Array = NDArray[Any]
@@ -188,7 +200,6 @@ def carried(
 
 
 STAY, OWN, PLACE = range(3)  # steps on the grid of the density; on its own grid the first transition, or none
-NARROW, BROAD, GRID, SIZE = range(10, 14)  # why the loop ends, beside those of `line/steps.py`
 _EDGE = 1e-11  # density at the outermost points, relative to the maximum
 _TRIALS = 6  # coarse grids on which a step is tried
 
