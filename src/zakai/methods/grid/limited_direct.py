@@ -7,6 +7,7 @@ gauge u = e^phi v makes the Kolmogorov equation linear-quadratic, so that its ke
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -71,16 +72,16 @@ def prepare(
         options: dict[str, Any] = {"splitting": splitting, "tolerance": tolerance, "kernel": kernel, "order": order}
         return space_direct.prepare(model, schedule, theta, **options)
     prepared = line_filter.prepare(model, schedule, theta, tolerance_of(tolerance, 1e-9), in_pieces(model))
-    prepared.promised = 1e-7 if tolerance is None else prepared.tolerance
     yau, lie = yau_line_of(model), splitting == "lie"
     prior = model.prior
     origin = float(prior.mean[0]) if isinstance(prior, GaussianPrior | MixturePrior) else 0.0
     inside = prepared.inside & (prepared.inside.all(axis=1, keepdims=True) if lie else True)
     power_series = power_series_of(model, order) if series else None
-    prepared.kernels = yau.kernels(schedule.starts, prepared.lengths, inside, theta, lie, origin, power_series)
-    prepared.yau, prepared.lie, prepared.generous = yau, lie, 256 if model.periodic else 128
-    prepared.origin, prepared.series = origin, power_series
-    return prepared
+    return replace(
+        prepared, promised=1e-7 if tolerance is None else prepared.tolerance, generous=256 if model.periodic else 128,
+        yau=yau, kernels=yau.kernels(schedule.starts, prepared.lengths, inside, theta, lie, origin, power_series),
+        lie=lie, origin=origin, series=power_series,
+    )  # fmt: skip
 
 
 def variant(model: Model, options: Mapping[str, Any]) -> Method[Any, Any]:

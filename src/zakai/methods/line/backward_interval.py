@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from zakai.methods.line import filter as line_filter
 from zakai.methods.line.coefficients import covariance_at, resolved_parts
-from zakai.methods.line.gauged import by_moving_grid, by_standing_grids
+from zakai.methods.line.gauged import by_fixed_grids, by_moving_grid
+from zakai.methods.line.kernel import kernel_of
 from zakai.methods.line.message import FEWEST, Message, covering, gauged, points_of, reliable, taper
-from zakai.methods.line.prepared import Prepared, State
-from zakai.methods.line.transition import MOST_SUBSTEPS, Report, Substep, attempted, parts_of_split, travel
-from zakai.methods.line.volumes import course_of, ends_of, pulled_back
+from zakai.methods.line.prepared import Prepared, State, TimeInterval
+from zakai.methods.line.transition import MOST_SUBSTEPS, Report, Substep, parts_of_split, travel, trial_substep
+from zakai.methods.line.volumes import cell_plan_of, ends_of, pulled_back
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import EXCURSION
 from zakai.numerics.line.density import support
@@ -28,56 +28,56 @@ from zakai.numerics.line.window import local_polynomial
 Array = Any
 
 def by_exponentials(
-    prepared: Prepared, k: int, inside: np.ndarray, rates: np.ndarray, state: State, later: Message, accepted: float
+    prepared: Prepared, interval: TimeInterval, state: State, later: Message, accepted: float
 ) -> tuple[Message, float] | None:
-    """Return the message at the start of interval k, and the error that the interval adds; None where this does not serve.
+    """Return the message at the start of an interval, and the error that the interval adds; None where this does not serve.
 
     Args:
         prepared: the system.
-        k: the interval.
-        inside, rates: which increments act within it, and their rates.
+        interval: the interval.
         state: the filter's state at its start.
         later: the message at its end.
         accepted: the values relative to the maximum that do not count.
     """
-    start, length, spacing = float(prepared.schedule.starts[k]), float(prepared.lengths[k]), later.needed
+    spacing = later.needed
     for _ in range(MOST_GRIDS):
         window = covering(later.window, 0.0, 0.0, min(spacing, state.spacing))
         values = np.exp(later.at(window.offsets) - np.max(later.logs))
-        values, top, error = _transposed(prepared, values, window, start, length, inside, rates)
-        look = lw.figures(values, True, accepted)
-        if look.aliasing <= accepted or window.size >= lw.LARGEST:
+        values, top, error = _transposed(prepared, values, window, interval)
+        check = lw.grid_check(values, True, accepted)
+        if check.aliasing <= accepted or window.size >= lw.LARGEST:
             break
         spacing = window.spacing / 1.5
     else:
         return None
     density, least = reliable(state, window), ROUNDING * float(np.max(values))
-    error += 2.0 * look.aliasing + least * float(np.sum(density) / (density @ values))
-    needed = window.spacing * float(np.clip(look.resolving, 1.0, 2.0))
+    error += 2.0 * check.aliasing + least * float(np.sum(density) / (density @ values))
+    needed = window.spacing * float(np.clip(check.resolving, 1.0, 2.0))
     logs = np.log(np.maximum(values, least)) + top + float(np.max(later.logs))
     return Message.of(logs, window, needed, later.error), error
 
 
 def _transposed(
-    prepared: Prepared, values: Array, window: lw.Window, start: float, length: float, inside: np.ndarray, rates: np.ndarray
+    prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval
 ) -> tuple[Array, float, float]:
     """Return a message at the start of an interval, of the sum one, the logarithm of the sum before, and the error."""
+    _, start, length, inside, rates = interval
     total = float(np.sum(values))
     values, top, error = values / total, float(np.log(total)), 0.0
     stack, count = [(0.0, 0.5 * length), (0.5 * length, length)], 0
     if prepared.system.varying:
-        stack, error = resolved_parts(prepared, values, window, start, length, inside)
+        stack, error = resolved_parts(prepared, values, window, interval)
     while stack:
         first, last = stack.pop()
-        attempt = attempted(prepared, values, window, Substep(start + first, last - first, inside, rates), True)
+        trial = trial_substep(prepared, values, window, Substep(start + first, last - first, inside, rates), True)
         count += 1
-        if attempt.split and count + len(stack) < MOST_SUBSTEPS:
-            stack += parts_of_split(prepared, first, last, attempt.error)
+        if trial.split and count + len(stack) < MOST_SUBSTEPS:
+            stack += parts_of_split(prepared, first, last, trial.error)
             continue
-        total = float(np.sum(attempt.values))
-        error += np.inf if attempt.split else attempt.error
-        top += attempt.offset + float(np.log(total))
-        values = attempt.values / total
+        total = float(np.sum(trial.values))
+        error += np.inf if trial.split else trial.error
+        top += trial.offset + float(np.log(total))
+        values = trial.values / total
     return values, top, error
 
 
@@ -100,48 +100,46 @@ def smoothing_tolerance(prepared: Prepared) -> float:
 
 
 def pulled(
-    prepared: Prepared, k: int, inside: np.ndarray, rates: np.ndarray, state: State, later: Message
+    prepared: Prepared, interval: TimeInterval, state: State, later: Message
 ) -> tuple[Message, float]:
-    """Return the message at the start of interval k, and the error that the interval adds.
+    """Return the message at the start of an interval, and the error that the interval adds.
 
     Args:
         prepared: the system.
-        k: the interval.
-        inside, rates: which increments act within it, and their rates.
+        interval: the interval.
         state: the filter's state at its start.
         later: the message at its end.
     """
     own, accepted = state.window, negligible(prepared)
     low, high = support(np.ascontiguousarray(state.values.real), 1e-13)
     ends = float(own.offsets[low]), float(own.offsets[high])
-    found = _by_kernel(prepared, k, rates, ends, later)
-    if found is not None:
-        return found
+    result = _by_kernel(prepared, interval, ends, later)
+    if result is not None:
+        return result
     if later.closed:
-        dense = by_exponentials(prepared, k, inside, rates, state, later, accepted)
+        dense = by_exponentials(prepared, interval, state, later, accepted)
         if dense is not None:
             return dense
-    interval = float(prepared.schedule.starts[k]), float(prepared.lengths[k])
-    arguments, dense = (prepared, k, inside, rates, state, later, accepted), None
-    if travel(prepared, np.asarray(state.values), own, *interval) > 0.0:
+    arguments, dense = (prepared, interval, state, later, accepted), None
+    if travel(prepared, np.asarray(state.values), own, interval.start, interval.length) > 0.0:
         dense = by_moving_grid(*arguments)
         if dense is not None and dense[1] <= smoothing_tolerance(prepared):
             return dense
-    found = _by_modes(prepared, k, inside, state, ends, later) or by_standing_grids(*arguments)
-    if found is not None:
-        return found
-    found = _by_volumes(prepared, k, inside, rates, state, ends, later)
-    return dense if dense is not None and dense[1] < found[1] else found
+    result = _by_modes(prepared, interval, state, ends, later) or by_fixed_grids(*arguments)
+    if result is not None:
+        return result
+    result = _by_volumes(prepared, interval, state, ends, later)
+    return dense if dense is not None and dense[1] < result[1] else result
 
 
 def _by_kernel(
-    prepared: Prepared, k: int, rates: np.ndarray, ends: tuple[float, float], later: Message
+    prepared: Prepared, interval: TimeInterval, ends: tuple[float, float], later: Message
 ) -> tuple[Message, float] | None:
     """Return the same of an interval whose kernel is Gaussian, None where it is not or needs many points."""
     if prepared.yau is None or later.closed:
         return None
-    report = Report()
-    kernel = line_filter.kernel_of(prepared, k, later.window, rates, report)
+    report, k = Report(), interval.k
+    kernel = kernel_of(prepared, interval, later.window, report)
     if kernel is None or not kernel.variance > 0:
         return None
     deviation, (low, high) = float(np.sqrt(kernel.variance)), later.ends
@@ -154,24 +152,24 @@ def _by_kernel(
     after = later.at(x) + prepared.yau.potential(fine.points, float(prepared.schedule.stops[k]), theta)
     logs = after - 0.5 * ((x - kernel.scale * y[:, None] - kernel.shift) / deviation) ** 2
     top = np.max(logs, axis=1)
-    found = np.log(np.sum(np.exp(logs - top[:, None]), axis=1) * fine.spacing / (deviation * np.sqrt(2 * np.pi))) + top
-    found += kernel.constant + y * (kernel.slope + kernel.curvature * y)
-    found -= prepared.yau.potential(new.points, float(prepared.schedule.starts[k]), theta)
-    return Message.of(found, new, new.spacing, later.error), report.time
+    result = np.log(np.sum(np.exp(logs - top[:, None]), axis=1) * fine.spacing / (deviation * np.sqrt(2 * np.pi))) + top
+    result += kernel.constant + y * (kernel.slope + kernel.curvature * y)
+    result -= prepared.yau.potential(new.points, float(prepared.schedule.starts[k]), theta)
+    return Message.of(result, new, new.spacing, later.error), report.time
 
 
 def _by_modes(
-    prepared: Prepared, k: int, inside: np.ndarray, state: State, ends: tuple[float, float], later: Message
+    prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], later: Message
 ) -> tuple[Message, float] | None:
     """Return the same by a decomposition, None where there is none or rounding in psi counts."""
-    if prepared.system.varying or prepared.system.rough or inside.any():
+    if prepared.system.varying or prepared.system.rough or interval.inside.any():
         return None
-    length, accepted = float(prepared.lengths[k]), max(negligible(prepared), 30.0 * prepared.negligible)
+    length, accepted = interval.length, max(negligible(prepared), 30.0 * prepared.negligible)
     low, high = min(later.ends[0], ends[0]), max(later.ends[1], ends[1])
-    least, most = _noise(prepared, k, state.origin + low, state.origin + high)
+    least, most = _noise(prepared, interval.k, state.origin + low, state.origin + high)
     low, high = low - EXCURSION * most, high + EXCURSION * most  # paths from one support to the other leave both
     spacing = max(later.needed, RESOLVED * least)
-    for attempt in range(MOST_GRIDS):
+    for trial in range(MOST_GRIDS):
         window = covering(later.window, low, high, spacing)
         if window.size > lw.LARGE:
             return None
@@ -179,24 +177,24 @@ def _by_modes(
         if operator is None:
             return None
         psi, top = _psi(later, window, operator.logs)
-        moved, growth = operator.decayed(psi, length), max(1.0, float(np.exp(-length * operator.rates[0])))
-        highest = float(np.max(moved))
+        propagated, growth = operator.decayed(psi, length), max(1.0, float(np.exp(-length * operator.rates[0])))
+        highest = float(np.max(propagated))
         if not 0.0 < highest < np.inf:
             return None
         error = 4e-16 * float(np.sqrt(np.sum(psi * psi))) * growth / highest
-        if not _exact(prepared, state, moved, operator.logs, window, error):
+        if not _exact(prepared, state, propagated, operator.logs, window, error):
             return None
-        look = lw.figures(moved, False, accepted)
-        coarse = look.aliasing > accepted and not (look.rough and look.aliasing < 1e-3 * prepared.tolerance)
-        if not coarse or window.size >= lw.LARGEST or (look.rough and attempt > 1):
+        check = lw.grid_check(propagated, False, accepted)
+        coarse = check.aliasing > accepted and not (check.rough and check.aliasing < 1e-3 * prepared.tolerance)
+        if not coarse or window.size >= lw.LARGEST or (check.rough and trial > 1):
             break
         spacing = window.spacing / 1.5
-    made = error + 2.0 * look.aliasing + 10.0 * max(look.left, look.right)
+    made = error + 2.0 * check.aliasing + 10.0 * max(check.left, check.right)
     if made > smoothing_tolerance(prepared):
         return None
     assert operator is not None
-    logs = np.log(np.maximum(moved, ROUNDING * highest) / window.spacing) - operator.logs + top
-    needed = window.spacing * float(np.clip(look.resolving, 1.0, 2.0))
+    logs = np.log(np.maximum(propagated, ROUNDING * highest) / window.spacing) - operator.logs + top
+    needed = window.spacing * float(np.clip(check.resolving, 1.0, 2.0))
     return Message.of(logs, window, needed, later.error).between(*ends), made
 
 
@@ -230,32 +228,25 @@ def _exact(prepared: Prepared, state: State, psi: Array, gauge: Array, window: l
 
 
 def _by_volumes(
-    prepared: Prepared,
-    k: int,
-    inside: np.ndarray,
-    rates: np.ndarray,
-    state: State,
-    ends: tuple[float, float],
-    later: Message,
+    prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], later: Message
 ) -> tuple[Message, float]:
     """Return the same by finite volumes, of infinite error where they do not serve."""
-    values, window, start = np.asarray(state.values).real, state.window, float(prepared.schedule.starts[k])
+    values, window = np.asarray(state.values).real, state.window
     mean, variance = later.moments
-    interval = start, float(prepared.lengths[k]), inside, (mean, variance**0.5)
-    course = course_of(prepared, values, window, ends_of(values, window), *interval)
+    plan = cell_plan_of(prepared, values, window, ends_of(values, window), interval, (mean, variance**0.5))
 
     def density(offsets: Array) -> Array:
         return lw.density_at(values, window, offsets)
 
-    found = pulled_back(prepared, later.falling, density, course, start, inside, rates)
-    if found is None:
+    result = pulled_back(prepared, later.falling, density, plan, interval)
+    if result is None:
         return later._replace(logs=np.full(len(later.logs), np.nan)), np.inf
-    least, _ = _noise(prepared, k, *(state.origin + np.array(later.ends)))
+    least, _ = _noise(prepared, interval.k, *(state.origin + np.array(later.ends)))
     needed = min(max(later.needed, 0.5 * RESOLVED * least), window.spacing)
     new = points_of(window, *ends, needed)
-    values = found.at(new.offsets)
-    logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + found.log_scale
-    return Message.of(logs, new, needed, later.error), found.error
+    values = result.at(new.offsets)
+    logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + result.log_scale
+    return Message.of(logs, new, needed, later.error), result.error
 
 
 def _noise(prepared: Prepared, k: int, low: float, high: float) -> tuple[float, float]:

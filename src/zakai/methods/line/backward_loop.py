@@ -31,7 +31,7 @@ MOST = 64  # intervals that are taken together
 APART = 32  # the ends of a grid for a decomposition are multiples of so many spacings
 
 
-class Taken(NamedTuple):
+class BackwardSegment(NamedTuple):
     """The message before the last `number` intervals, and what is reported at the times between them."""
 
     message: Message
@@ -41,7 +41,7 @@ class Taken(NamedTuple):
 
 def back(
     prepared: Prepared, rows: slice, states: Sequence[State], later: Message, product: Array, grid: lw.Window, observed: Array
-) -> Taken | None:
+) -> BackwardSegment | None:
     """Take a message back over the last of some intervals, None where the loop takes none of them.
 
     Args:
@@ -73,9 +73,10 @@ def back(
         here = slice(begin, k + 1)
         before = states[begin - first : k + 1 - first]
         for stride in (0,) if split else STRIDES:
-            taken = _taken(prepared, here, before, later, product, grid, window, stride, observed[begin - first : k + 1 - first])
-            if taken is not None:
-                return taken
+            values = observed[begin - first : k + 1 - first]
+            completed = _on_one_grid(prepared, here, before, later, product, grid, window, stride, values)
+            if completed is not None:
+                return completed
     return None
 
 
@@ -102,10 +103,10 @@ def _exact(prepared: Prepared, k: int, state: State) -> bool:
     return bool(np.all(lost < np.log(lb.ROUGH * smoothing_tolerance(prepared) / lb.NOISE)))
 
 
-def _taken(
+def _on_one_grid(
     prepared: Prepared, here: slice, before: Sequence[State], later: Message, product: Array, grid: lw.Window, window: lw.Window,
     stride: int, observed: Array,
-) -> Taken | None:  # fmt: skip
+) -> BackwardSegment | None:  # fmt: skip
     """Return the message before intervals, moved on one grid, None where none is taken."""
     limits = lb.Limits(smoothing_tolerance(prepared), SHARE * prepared.tolerance, negligible(prepared), prepared.cut)
     now, start, longer, gauge = lw.resampled(product, grid, window), 0, window, np.zeros(1)
@@ -118,7 +119,8 @@ def _taken(
         filtered, ends = filtered._replace(starts=filtered.starts + start), np.append(centres[1:], window.centre)
         logs = log_likelihoods(prepared, here, observed, window.origin + ends[:, None] + window.spacing * lw.index(window.size))
         message, steps = _on(later, window, start, now), prepared.steps.part(here)
-        taken = by_adjoints(message, filtered, table, logs, steps, np.ascontiguousarray(observed, float), window.closed, limits)
+        observed = np.ascontiguousarray(observed, float)
+        completed = by_adjoints(message, filtered, table, logs, steps, observed, window.closed, limits)
     else:
         lengths = np.ascontiguousarray(prepared.lengths[here])
         longer = _longer(prepared, window, stride, float(np.max(lengths)))
@@ -127,18 +129,19 @@ def _taken(
             return None
         logs, gauge = log_likelihoods(prepared, here, observed, longer.points[None]), operator.logs
         known = lb.Gauged(np.ascontiguousarray(operator.modes.T), operator.rates, gauge, _place(window, longer, stride), stride)
-        taken = lb.by_modes(_psi(later, longer, gauge, now), filtered, known, logs, lengths, window.closed, limits)
-    if not taken.number:
+        completed = lb.by_modes(_psi(later, longer, gauge, now), filtered, known, logs, lengths, window.closed, limits)
+    if not completed.number:
         return None
-    reports, found = taken.reports, taken.message
-    first, last = found.first, found.last
-    logs = (np.log(np.maximum(found.values, 1e-300)) - gauge)[first : last + 1] + found.scale + reports[0, lb.LOG_MASS]
-    middle = found.start - start + first + len(logs) // 2 - longer.size // 2
+    reports, result = completed.reports, completed.message
+    first, last = result.first, result.last
+    logs = (np.log(np.maximum(result.values, 1e-300)) - gauge)[first : last + 1] + result.scale + reports[0, lb.LOG_MASS]
+    middle = result.start - start + first + len(logs) // 2 - longer.size // 2
     own = longer._replace(centre=longer.centre + longer.spacing * middle)
-    kept = Message.of(logs, own, longer.spacing, found.error)
-    errors = np.array([float(state.error) for state in before[len(before) - taken.number + 1 :]])
-    centres = centres[len(centres) - taken.number + 1 :]
-    return Taken(kept, taken.number, _infos(prepared, window, centres, errors, taken.products[1:], reports[1:]))
+    retained = Message.of(logs, own, longer.spacing, result.error)
+    errors = np.array([float(state.error) for state in before[len(before) - completed.number + 1 :]])
+    centres = centres[len(centres) - completed.number + 1 :]
+    infos = _infos(prepared, window, centres, errors, completed.products[1:], reports[1:])
+    return BackwardSegment(retained, completed.number, infos)
 
 
 def _before(states: Sequence[State], window: lw.Window) -> tuple[lb.Filtered, Array]:
@@ -171,13 +174,13 @@ def _shared(state: State, after: lw.Window, later: Message, product: Array, grid
     own = state.window
     first, last = support(np.ascontiguousarray(state.values.real), lb.SMALLEST)
     low, high = min(own.offsets[first], later.ends[0]), max(own.offsets[last], later.ends[1])
-    found = []
+    result = []
     for window in sorted({own, after}, key=lambda window: window.spacing, reverse=True):
         if _holds(window, low, high):
             on_it = lw.resampled(product, grid, window)
             whole = abs(float(np.sum(on_it)) - 1.0) <= lb.UNRESOLVED  # or it stands between the points
-            found += [window] if whole and lw.figures(on_it, window.closed).aliasing <= lb.UNRESOLVED else []
-    return found
+            result += [window] if whole and lw.grid_check(on_it, window.closed).aliasing <= lb.UNRESOLVED else []
+    return result
 
 
 def _holds(window: lw.Window, low: float, high: float) -> bool:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.methods.line.model import System, finite, within
-from zakai.methods.line.prepared import Prepared
+from zakai.methods.line.prepared import Derived, Prepared, TimeInterval
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS, Panels, panels
 from zakai.numerics.line.grid_choice import PER, PROFILE
@@ -49,14 +49,14 @@ def tables(prepared: Prepared, window: lw.Window) -> Tables:
         observation = system.observation(points, start, theta).T
         return Tables(drift, observation, covariance_at(system, window.points, start, theta))
 
-    found: Tables = prepared.once(window, make)
-    return found
+    result: Tables = prepared.once(Derived.TABLES, window, make)
+    return result
 
 
 def spectral(prepared: Prepared, window: lw.Window) -> Spectral | None:
     """Return the decomposition of the operator on a grid, if it has one."""
-    found: tuple[Spectral | None] = prepared.once(("spectral", window), lambda: (decomposed(prepared, window, lw.LARGEST),))
-    return found[0]
+    result: tuple[Spectral | None] = prepared.once(Derived.MODES, window, lambda: (decomposed(prepared, window, lw.LARGEST),))
+    return result[0]
 
 
 def profile_of(prepared: Prepared, window: lw.Window) -> Array:
@@ -70,8 +70,8 @@ def profile_of(prepared: Prepared, window: lw.Window) -> Array:
         f = finite(system.drift(x[:, None], start, theta)[:, 0])
         return np.stack([f, np.gradient(f, x), covariance_at(system, x, start, theta) * np.ones(len(x))])
 
-    found: Array = prepared.once(("profile", window.origin, window.unit), make)
-    return found
+    result: Array = prepared.once(Derived.PROFILE, (window.origin, window.unit), make)
+    return result
 
 
 def drift_at(system: System, window: lw.Window, t: Array, theta: Array) -> Array:
@@ -91,8 +91,8 @@ def drift_at(system: System, window: lw.Window, t: Array, theta: Array) -> Array
 def covariance_at(system: System, points: Array, t: Array, theta: Array) -> Array:
     """Return G at points (..., N) and times (...): (..., N), or (...) if it is constant; zero where g has no value."""
     if system.state_dependent:
-        found = finite(system.covariance(points[..., None], np.asarray(t)[..., None], theta)[..., 0, 0])
-        return np.where(found.real > 0.0, found, 0.0)
+        result = finite(system.covariance(points[..., None], np.asarray(t)[..., None], theta)[..., 0, 0])
+        return np.where(result.real > 0.0, result, 0.0)
     return system.covariance(np.zeros((*np.shape(t), 1)), t, theta)[..., 0, 0]
 
 
@@ -186,8 +186,8 @@ def coefficients(
         h = np.moveaxis(system.observation(points, times[:, None], theta), -1, 1)
     precision = np.broadcast_to(precision_of(prepared, times, inside), (len(times), system.m, system.m))
     potentials, constants = zip(*[potential_of(*pair, rates, values) for pair in zip(h, precision, strict=True)], strict=True)
-    found = drift, covariance, np.stack(potentials), np.array(constants)
-    return found if system.cross is None else with_cross_noise(prepared, points, times, rates, h, precision, found)
+    result = drift, covariance, np.stack(potentials), np.array(constants)
+    return result if system.cross is None else with_cross_noise(prepared, points, times, rates, h, precision, result)
 
 
 def precision_of(prepared: Prepared, times: Any, inside: np.ndarray) -> Array:
@@ -200,7 +200,7 @@ def precision_of(prepared: Prepared, times: Any, inside: np.ndarray) -> Array:
         return np.where(both, np.linalg.inv(np.where(both, noise, 0.0) + np.diag(1.0 * ~inside)), 0.0)
 
     if system.steady_noise:
-        return prepared.once(("inside", inside.tobytes()), lambda: make(prepared.model.start))
+        return prepared.once(Derived.PRECISION, inside.tobytes(), lambda: make(prepared.model.start))
     return make(times)
 
 
@@ -227,12 +227,12 @@ def offset_of(potential: Array, values: Array) -> tuple[float, float]:
 
 
 def resolved_parts(
-    prepared: Prepared, values: Array, window: lw.Window, start: float, length: float, inside: np.ndarray
+    prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval
 ) -> Panels:
     """Return parts of the interval in each of which the coefficients are polynomials of time, nearly."""
-    system, theta = prepared.system, prepared.theta.real
-    look = lw.figures(values, window.closed)
-    first, last = look.first, look.last
+    system, theta, (_, start, length, inside, _) = prepared.system, prepared.theta.real, interval
+    check = lw.grid_check(values, window.closed)
+    first, last = check.first, check.last
     x = window.points[np.unique(np.linspace(first, last, 7).astype(int))]
 
     bounds, error = [], 0.0
@@ -253,9 +253,9 @@ def resolved_parts(
                 columns.append(system.cross(x[:, None], t[:, None], theta).reshape(len(t), -1))
             return finite(np.concatenate(columns, axis=1)) if columns else np.zeros((len(t), 1))
 
-        found = panels(at, low - start, length if high == start + length else high - start)
-        error += found.error
-        bounds += found.bounds
+        result = panels(at, low - start, length if high == start + length else high - start)
+        error += result.error
+        bounds += result.bounds
     return Panels(bounds, error)
 
 
@@ -296,7 +296,7 @@ BETWEEN = 0.5 * (np.sqrt(5.0) - 1.0)  # place in a spacing: the golden ratio is 
 _CUBIC = np.array([np.prod([(BETWEEN - m) / (j - m) for m in range(-1, 3) if m != j]) for j in range(-1, 3)])
 
 
-def showing_drift(
+def on_grid_for_drift(
     prepared: Prepared, values: Array, window: lw.Window, start: float, length: float
 ) -> tuple[Array, lw.Window]:
     """Return a density at the start of an interval on a grid that shows the drift, and this grid.
@@ -318,7 +318,7 @@ def showing_drift(
     return values, window
 
 
-def hides_drift(prepared: Prepared, window: lw.Window) -> bool:
+def misses_drift(prepared: Prepared, window: lw.Window) -> bool:
     """Return whether a density may be on this grid that does not show a drift without time."""
     steady = not (prepared.kinked or prepared.system.rough or prepared.system.varying)
     return steady and bool(_hidden(prepared, window, prepared.model.start)[0].any())
@@ -334,11 +334,11 @@ def _hidden(prepared: Prepared, window: lw.Window, start: float) -> tuple[Array,
             finite(prepared.system.drift(x[:, None], start, theta)[:, 0])
             for x in (around, around[1:-2] + BETWEEN * window.spacing)
         )
-        found = np.array(sum(c * known[j : j + window.size] for j, c in enumerate(_CUBIC)))
-        error, whole = np.abs(between - found), np.maximum(np.abs(between), np.abs(found))
+        result = np.array(sum(c * known[j : j + window.size] for j, c in enumerate(_CUBIC)))
+        error, whole = np.abs(between - result), np.maximum(np.abs(between), np.abs(result))
         return np.where(error > np.maximum(HIDDEN * whole, SLIGHT * np.max(whole)), error, 0.0), whole
 
     if prepared.system.varying:
         return make()
-    pair: tuple[Array, Array] = prepared.once(("hidden", window), make)
+    pair: tuple[Array, Array] = prepared.once(Derived.HIDDEN_DRIFT, window, make)
     return pair

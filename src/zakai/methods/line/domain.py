@@ -79,11 +79,11 @@ def on_the_line(model: Model) -> Model:
 
     arranged = sp.expand if np.isinf(variable.upper - variable.lower) else sp.together
 
-    def moved(formula: sp.Expr, factor: Any = 1, more: Any = 0) -> sp.Expr:
+    def transformed(formula: sp.Expr, factor: Any = 1, more: Any = 0) -> sp.Expr:
         return sp.powsimp(arranged(formula.subs(w, x) * factor + more))
 
     def matrix(formulas: sp.MatrixBase, factor: Any = 1) -> sp.ImmutableMatrix:
-        return sp.ImmutableMatrix(formulas.applyfunc(lambda entry: moved(entry, factor)))
+        return sp.ImmutableMatrix(formulas.applyfunc(lambda entry: transformed(entry, factor)))
 
     ito = -model.covariance[0, 0].subs(w, x) * second / (2 * first**3)
     other = object.__new__(Model)
@@ -91,12 +91,12 @@ def on_the_line(model: Model) -> Model:
     vars(other).update(
         domain={},
         prior=None,
-        drift=sp.ImmutableMatrix([[moved(model.drift[0], 1 / first, ito)]]),
+        drift=sp.ImmutableMatrix([[transformed(model.drift[0], 1 / first, ito)]]),
         diffusion=matrix(model.diffusion, 1 / first),
         observation=matrix(model.observation),
         observation_noise=matrix(model.observation_noise),
-        family_parameters={key: moved(value) for key, value in model.family_parameters.items()},
-        log_density=None if model.log_density is None else moved(model.log_density),
+        family_parameters={key: transformed(value) for key, value in model.family_parameters.items()},
+        log_density=None if model.log_density is None else transformed(model.log_density),
     )
     return other
 
@@ -177,7 +177,7 @@ def ends_of_leak(prepared: Prepared, window: lw.Window, ends: Array, start: floa
     if variable is None:
         return None
     system, theta = prepared.system, prepared.theta.real
-    found, leaking = np.array(ends, float), False
+    result, leaking = np.array(ends, float), False
     for i, (own, end, side) in enumerate(zip((variable.lower, variable.upper), ends, (-1.0, 1.0), strict=True)):
         points = window.origin + float(end) + side * np.concatenate([[0.0], FAR_DISTANCES])
         drift = system.drift(points[:, None], start, theta)[:, 0].real
@@ -189,8 +189,8 @@ def ends_of_leak(prepared: Prepared, window: lw.Window, ends: Array, start: floa
         inward = max(float(-2.0 * side * drift[1] / noise[1]), 0.0)  # kappa - 1
         if grows > NOISE_GROWS and EDGE ** (inward / (inward + grows)) > ALLOWED * prepared.tolerance:
             leaking = True
-            found[i] += side * -np.log(EDGE) / (inward + grows)
-    return found if leaking else None
+            result[i] += side * -np.log(EDGE) / (inward + grows)
+    return result if leaking else None
 
 
 def check_escape(prepared: Prepared, k: int, points: Array, values: Array) -> None:

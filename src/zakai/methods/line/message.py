@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.methods.line.coefficients import decomposed
-from zakai.methods.line.prepared import Prepared, State
+from zakai.methods.line.prepared import Derived, Prepared, State
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.operator import Spectral
 from zakai.numerics.line.window import local_polynomial
@@ -71,9 +71,9 @@ class Message(NamedTuple):
 
     def falling(self, offsets: Array) -> Array:
         """Return log b at offsets from the origin (J,), beyond the grid with the slope at its ends where b falls outward."""
-        found = self.at(offsets)
+        result = self.at(offsets)
         (low, high), (left, right) = self.ends, np.maximum(self.logs[[3, -4]] - self.logs[[0, -1]], 0.0) / (3.0 * self.spacing)
-        return found - left * np.maximum(low - offsets, 0.0) - right * np.maximum(offsets - high, 0.0)
+        return result - left * np.maximum(low - offsets, 0.0) - right * np.maximum(offsets - high, 0.0)
 
     def between(self, low: float, high: float) -> Message:
         """Return the message on its points between two offsets, and on those that hold them."""
@@ -86,8 +86,8 @@ class Message(NamedTuple):
 
     def on(self, window: lw.Window) -> Message:
         """Return the message on another grid."""
-        found = Message.of(self.at(window.offsets), window, self.needed, self.error)
-        return found._replace(mean=self.mean, deviation=self.deviation)
+        result = Message.of(self.at(window.offsets), window, self.needed, self.error)
+        return result._replace(mean=self.mean, deviation=self.deviation)
 
     @property
     def moments(self) -> tuple[float, float]:
@@ -161,10 +161,10 @@ def gauged(prepared: Prepared, window: lw.Window) -> Spectral | None:
         ends = slope / window.spacing, curvature / window.spacing**2
 
     def make() -> tuple[Spectral | None]:
-        found = decomposed(prepared, window, lw.LARGE, ends)
-        if found is not None:
-            found.modes = np.asfortranarray(found.modes)  # the loop reads rows of U'
-        return (found,)
+        result = decomposed(prepared, window, lw.LARGE, ends)
+        if result is not None:
+            result.modes = np.asfortranarray(result.modes)  # the loop reads rows of U'
+        return (result,)
 
-    known: tuple[Spectral | None] = prepared.once(("gauged", window), make)
+    known: tuple[Spectral | None] = prepared.once(Derived.MESSAGE_MODES, window, make)
     return known[0]

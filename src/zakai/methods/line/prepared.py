@@ -7,8 +7,9 @@ was gathered over more than the interval, belongs to the last part.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -35,26 +36,52 @@ NOISE = 3e-15  # error of a density relative to its maximum, which matters in it
 KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
 SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
 SHARED = 128  # points of the largest grid on which many steps share a decomposition
-KEPT_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are kept for a model
+CACHE_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are kept for a model
 
 
 @lru_cache(maxsize=8)
-def _kept(model: Model, theta: bytes, kind: str, setting: Any) -> Kept:
-    return Kept()
+def _grid_cache_of(model: Model, theta: bytes, kind: str, setting: Any) -> GridCache:
+    return GridCache()
 
 
-class Kept(dict[Any, tuple[Any, int]]):
+class Derived(Enum):
+    """What is derived of a model on a grid, and held in the cache."""
+
+    TABLES = "f, h and G at the points of a grid"
+    MODES = "the decomposition of the operator on a grid"
+    MESSAGE_MODES = "the decomposition of the operator of messages on a grid"
+    LOBATTO_MODES = "the decomposition of the operator on an element"
+    EXPONENTIAL = "the exponential of the operator on a grid, for one length"
+    COARSE_GRIDS = "grids and their modes as the compiled loop reads them"
+    PROFILE = "f, f' and G around an origin"
+    TERMS = "the terms of f and h in a table that is longer than a grid"
+    FINE = "an h with kinks at nodes between the points"
+    FINE_OF_GRID = "the same of one grid, and h at its centre"
+    HIDDEN_DRIFT = "the error of f between the points of a grid"
+    PRECISION = "the inverse of S for some coordinates"
+    SAMPLE_NOISE = "the inverse of S of a sample, and the constant of its density"
+    KINKS = "the states between two at which coefficients have kinks"
+
+
+class CacheKey(NamedTuple):
+    """The key of a derived quantity: which, and of what."""
+
+    quantity: Derived
+    at: Hashable
+
+
+class GridCache(dict[CacheKey, tuple[Any, int]]):
     """Values and their bytes, in the order of their last use; `bytes` is about their sum, which threads may miscount."""
 
     bytes = 0
 
-    def insert(self, key: Any, value: Any) -> None:
+    def insert(self, key: CacheKey, value: Any) -> None:
         """Store a value, and drop those that were used long ago where all are large."""
         self[key] = value, (size := _bytes_of(value))
         self.bytes += size
-        if self.bytes > KEPT_BYTES:
+        if self.bytes > CACHE_BYTES:
             self.bytes = sum(size for _, size in list(self.values()))
-            while self.bytes > 0.75 * KEPT_BYTES and len(self) > 1:
+            while self.bytes > 0.75 * CACHE_BYTES and len(self) > 1:
                 try:
                     self.bytes -= self.pop(next(iter(self)), (None, 0))[1]
                 except (StopIteration, RuntimeError):  # another thread was faster
@@ -98,6 +125,20 @@ class Coefficients(NamedTuple):
     parts: Array
 
 
+class TimeInterval(NamedTuple):
+    """Interval k: when it begins, its length, and which increments (m,) act inside at which rates (m,)."""
+
+    k: int
+    start: float
+    length: float
+    inside: np.ndarray
+    rates: np.ndarray
+
+    def part(self, first: float, last: float) -> TimeInterval:
+        """Return the part between two times after the start."""
+        return self._replace(start=self.start + first, length=last - first)
+
+
 class Parts(NamedTuple):
     """The parts of all intervals: those of interval k are first[k] to first[k + 1] of `prepared`."""
 
@@ -105,14 +146,14 @@ class Parts(NamedTuple):
     first: Array
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Prepared:
     """What is known without data.
 
     `tolerance` is what substeps are chosen for, `promised` the error of a step above which a result warns; `negligible` the
-    spectrum that need not be resolved; `generous` the size of a grid that is kept though fewer points would do; `pieces` whether
-    densities are polynomials between ends and kinks; `kept` holds what was computed for single grids; `shares` (K,) are those of
-    parts in the time of their intervals, and `cut_up` whether these are parts of one interval.
+    spectrum that need not be resolved; `generous` the size of a grid that is retained though fewer points would do; `pieces`
+    whether densities are polynomials between ends and kinks; `grid_cache` holds what was computed for single grids; `shares` (K,)
+    are those of parts in the time of their intervals, and `cut_up` whether these are parts of one interval.
     """
 
     model: Model
@@ -136,10 +177,16 @@ class Prepared:
     cut_up: bool = False
 
     @cached_property
-    def kept(self) -> Kept:
+    def grid_cache(self) -> GridCache:
         """What was computed for single grids, shared by all schedules of a model with these parameters and this method."""
         setting = self.pieces, self.tolerance, self.yau is None, self.kernels is None, self.series is None, self.lie, self.origin
-        return _kept(self.model, self.theta.tobytes(), self.theta.dtype.str, setting)
+        return _grid_cache_of(self.model, self.theta.tobytes(), self.theta.dtype.str, setting)
+
+    def interval(self, k: int, inside: np.ndarray, observed: np.ndarray) -> TimeInterval:
+        """Return interval k, of a length above zero, in which increments act `inside` (m,)."""
+        length = float(self.lengths[k])
+        rates = np.where(inside & (not self.lie), observed, 0.0) / length
+        return TimeInterval(k, float(self.schedule.starts[k]), length, inside, rates)
 
     @cached_property
     def real(self) -> Prepared:
@@ -215,15 +262,15 @@ class Prepared:
         """The points of the largest grid of the compiled loop, and of any grid where a larger one does not help."""
         return lw.LARGE if self.gaussian else lw.LARGEST
 
-    def largest_for(self, look: lw.Figures | None = None, size: int = 0) -> int:
+    def largest_for(self, check: lw.GridCheck | None = None, size: int = 0) -> int:
         """Return the points of the largest grid for a density with some figures on a grid of some size.
 
         The spectrum of kinks and that of noise fall slowly on every grid, what the largest grid of all does not resolve none
         does, and noise that grows with the state, and potentials within intervals, are too fast for a large one.
         """
         noisy, system = False, self.system
-        if look is not None and look.aliasing > self.negligible:
-            noisy = look.rough if look.aliasing < lw.GROSS else size >= lw.SIZES[-1]
+        if check is not None and check.aliasing > self.negligible:
+            noisy = check.rough if check.aliasing < lw.GROSS else size >= lw.SIZES[-1]
         slow = noisy or system.kinked_drift or not system.smooth_observation or system.state_dependent or not system.samples
         return self.largest if slow else lw.SIZES[-1]
 
@@ -256,22 +303,26 @@ class Prepared:
     @cached_property
     def fast(self) -> list[bool]:
         """Which intervals (K,) the compiled loop may take."""
-        found: list[bool] = (self.kinds >= 0).tolist()
-        return found
+        result: list[bool] = (self.kinds >= 0).tolist()
+        return result
 
     def deepest(self, floor: float) -> float:
         """Return the depth of the tails, as a logarithm below the maximum, to which a density with this floor is accurate."""
         return max(float(np.log(self.promised) - np.log(max(floor, 1e-300))), 2.3)
 
-    def once(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return what `make` returns for a key, from the last ones that were kept; a value depends on its key alone."""
-        found = self.kept.pop(key, None)
-        if found is None:
+    def once(self, quantity: Derived, at: Hashable, make: Callable[[], Any]) -> Any:
+        """Return the derived quantity of a grid, or of what else it is `at`, by `make` where the cache does not hold it.
+
+        A value depends on its key alone.
+        """
+        key = CacheKey(quantity, at)
+        result = self.grid_cache.pop(key, None)
+        if result is None:
             value = make()
-            self.kept.insert(key, value)
+            self.grid_cache.insert(key, value)
             return value
-        self.kept[key] = found  # the last one that was used is the last one to go
-        return found[0]
+        self.grid_cache[key] = result  # the last one that was used is the last one to go
+        return result[0]
 
 
 def _bytes_of(value: Any) -> int:
@@ -306,8 +357,8 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
 
     def everywhere(function: Callable[..., np.ndarray], steady: bool) -> np.ndarray:
         """Return a function of time alone at all times."""
-        found = function(_X, t[:1, :1] if steady else t, theta)
-        return np.broadcast_to(found, (*t.shape, *found.shape[2:]))
+        result = function(_X, t[:1, :1] if steady else t, theta)
+        return np.broadcast_to(result, (*t.shape, *result.shape[2:]))
 
     def precision(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if system.general:  # the loop takes only intervals without observations
@@ -449,13 +500,13 @@ def parts_of(prepared: Prepared) -> Parts | None:
     """Return the parts of the intervals of a schedule, None where no interval needs any."""
     if not prepared.timed or prepared.kernels is not None or np.iscomplexobj(prepared.theta):
         return None
-    found, owner = prepared, np.arange(len(prepared.schedule))
+    result, owner = prepared, np.arange(len(prepared.schedule))
     for _ in range(ROUNDS):
-        schedule = found.schedule
-        needed = np.where(found.lengths > 0, found.coefficients.parts, 1)
+        schedule = result.schedule
+        needed = np.where(result.lengths > 0, result.coefficients.parts, 1)
         if not (needed > 1).any():
             break
-        bounds = [_bounds(found, k, n) if n > 1 else [schedule.starts[k]] for k, n in enumerate(needed)]
+        bounds = [_bounds(result, k, n) if n > 1 else [schedule.starts[k]] for k, n in enumerate(needed)]
         counts = np.array([len(bound) for bound in bounds])
         starts = np.concatenate(bounds)
         stops = np.append(starts[1:], schedule.stops[-1])
@@ -464,18 +515,17 @@ def parts_of(prepared: Prepared) -> Parts | None:
         parent = np.repeat(np.arange(len(schedule)), counts)
         last = np.zeros(len(starts), bool)
         last[ends] = True
-        whole, inside = lengths_of(starts, stops)[:, None], found.inside[parent]
+        whole, inside = lengths_of(starts, stops)[:, None], result.inside[parent]
         seen = schedule.seen[parent] & (inside | last[:, None])
         elapsed = np.where(inside, whole, np.where(seen, schedule.elapsed[parent], 0.0))
         schedule = Schedule(starts, stops, seen, elapsed, schedule.inputs)
-        found = replace(found, schedule=schedule, lengths=schedule.lengths, inside=schedule.inside)
+        result = replace(result, schedule=schedule, lengths=schedule.lengths, inside=schedule.inside)
         owner = owner[parent]
-    if found is prepared:
+    if result is prepared:
         return None
     first = np.searchsorted(owner, np.arange(len(prepared.schedule) + 1))
-    shares = np.where(found.lengths < prepared.lengths[owner], found.lengths / prepared.lengths[owner], 1.0)
-    found.shares = shares
-    return Parts(found, first)
+    shares = np.where(result.lengths < prepared.lengths[owner], result.lengths / prepared.lengths[owner], 1.0)
+    return Parts(replace(result, shares=shares), first)
 
 
 def parts_of_step(prepared: Prepared, k: int, values: np.ndarray, window: Window) -> Parts | None:
@@ -505,9 +555,9 @@ def parts_of_step(prepared: Prepared, k: int, values: np.ndarray, window: Window
     seen = np.zeros((count, prepared.system.m), bool)
     seen[-1] = schedule.seen[k]
     starts, stops = np.array([*bounds, stop]), np.array([*bounds[1:], stop, stop])
-    found = Schedule(starts, stops, seen, np.where(seen, schedule.elapsed[k], 0.0), schedule.inputs)
-    shares = np.append(found.lengths[:-1] / length, 1.0)
-    own = replace(prepared, schedule=found, lengths=found.lengths, inside=found.inside, shares=shares, cut_up=True)
+    result = Schedule(starts, stops, seen, np.where(seen, schedule.elapsed[k], 0.0), schedule.inputs)
+    shares = np.append(result.lengths[:-1] / length, 1.0)
+    own = replace(prepared, schedule=result, lengths=result.lengths, inside=result.inside, shares=shares, cut_up=True)
     return Parts(own, np.array([0, count]))
 
 

@@ -23,16 +23,16 @@ from zakai.methods.line.coefficients import (
     coefficients,
     covariance_at,
     offset_of,
+    on_grid_for_drift,
     potential_of,
     precision_of,
     resolved_parts,
-    showing_drift,
     spectral,
     tables,
 )
 from zakai.methods.line.domain import ALLOWED, lost
 from zakai.methods.line.model import finite
-from zakai.methods.line.prepared import NOISE, Prepared
+from zakai.methods.line.prepared import NOISE, Derived, Prepared, TimeInterval
 from zakai.methods.line.update import refitted
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
@@ -43,7 +43,7 @@ from zakai.numerics.line.product import finer
 Array = Any
 
 CONTRACTED = -2.0  # f' times the length of an interval, below which other grids hold a density that becomes much sharper
-SOME = 0.3  # ranges of a density that it moves in an interval without modes, above which grids move with it
+MOVING = 0.3  # ranges of a density that it moves in an interval without modes, above which grids move with it
 
 
 def travel(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
@@ -54,12 +54,12 @@ def travel(prepared: Prepared, values: Array, window: lw.Window, start: float, l
     system = prepared.system
     if window.closed or prepared.kinked or system.kinks is not None or system.cross is not None or system.reflecting:
         return 0.0
-    look, (carried, growth) = lw.figures(values, False), displaced(prepared, values, window, start, length)
-    G = covariance_at(system, window.points[[look.first, look.last]], start, prepared.theta.real)
+    check, (carried, growth) = lw.grid_check(values, False), displaced(prepared, values, window, start, length)
+    G = covariance_at(system, window.points[[check.first, check.last]], start, prepared.theta.real)
     noise = float(np.sqrt(np.max(G.real) * length))
     if growth < CONTRACTED or abs(carried) < noise:
         return 0.0
-    return abs(carried) / (window.spacing * (look.last - look.first + 1) + 2.0 * REACH * noise)
+    return abs(carried) / (window.spacing * (check.last - check.first + 1) + 2.0 * REACH * noise)
 
 
 def speed_of(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
@@ -74,8 +74,8 @@ def displaced(prepared: Prepared, values: Array, window: lw.Window, start: float
     x = window.origin + float(mean.real) + float(np.sqrt(variance.real)) * np.array([0.0, -0.1, 0.1])
     here, below, above = finite(prepared.system.drift(x[:, None], start, prepared.theta.real)[:, 0]).tolist()
     growth = length * (above - below) / (x[2] - x[1])
-    found = length * here * (np.expm1(min(growth, 3.0)) / growth if abs(growth) > 1e-8 else 1.0)
-    return (float(found), float(growth)) if np.isfinite(found) else (0.0, 0.0)
+    result = length * here * (np.expm1(min(growth, 3.0)) / growth if abs(growth) > 1e-8 else 1.0)
+    return (float(result), float(growth)) if np.isfinite(result) else (0.0, 0.0)
 
 
 Coefficients = tuple[Array, Array, Array, Array]  # f (T, N), G (T,) or (T, N), V (T, N) and a constant (T,)
@@ -99,7 +99,7 @@ class Substep(NamedTuple):
     parts: int = 1
 
 
-class Attempt(NamedTuple):
+class Trial(NamedTuple):
     """The density after a substep, times exp(-offset); its error; whether a shorter substep is needed.
 
     `substep` tells how exponentials of the operator gave it, None where its decomposition did; the potential multiplies what is
@@ -123,14 +123,14 @@ class Exponents(NamedTuple):
     lift: float  # nats by which V is larger where there is no mass, infinite where G is negative
 
 
-def attempted(prepared: Prepared, values: Array, window: lw.Window, substep: Substep, adjoint: bool = False) -> Attempt:
+def trial_substep(prepared: Prepared, values: Array, window: lw.Window, substep: Substep, adjoint: bool = False) -> Trial:
     """Return the density after a substep; the `adjoint` of the transition takes a message from its end to its start."""
     inside, moving = substep.inside, bool(substep.speed)
     if prepared.system.varying or moving:
         return magnus(prepared, values, window, substep, _at_points(prepared, values, window, substep), adjoint, moving)
     modes = None if adjoint or inside.any() else by_modes(prepared, values, window, substep.length)
     if modes is not None:
-        return Attempt(modes[0], 0.0, modes[1], False)
+        return Trial(modes[0], 0.0, modes[1], False)
     exponents = exponents_of(prepared, values, window, substep)
     return _acted(prepared, values, window, substep, exponents, adjoint, not inside.any())
 
@@ -160,13 +160,13 @@ def exponents_of(prepared: Prepared, values: Array, window: lw.Window, substep: 
 
 def _acted(
     prepared: Prepared, values: Array, window: lw.Window, substep: Substep, exponents: Exponents, adjoint: bool, keeps: bool
-) -> Attempt:
+) -> Trial:
     """Return a density after the exponentials, or a message after their transposes in reverse order; `keeps` the exponential."""
     if exponents.lift > GROWTH:
-        return Attempt(values, 0.0, 0.0, True)
-    matrices, found, error = [window.generator(*one) for one in exponents.generators], values, 0.0
+        return Trial(values, 0.0, 0.0, True)
+    matrices, result, error = [window.generator(*one) for one in exponents.generators], values, 0.0
     if any(isinstance(one, FourierOperator) and one.decay > SMOOTHED for one in matrices):
-        return Attempt(values, 0.0, 0.0, True)
+        return Trial(values, 0.0, 0.0, True)
     if adjoint:
         matrices = [one.T for one in matrices[::-1]]
     if len(matrices) == 2:
@@ -176,13 +176,13 @@ def _acted(
         commutator = 0.5 * (first @ (difference @ now) - difference @ (first @ now)).real
         error = 5.0 * float(np.sum(np.abs(commutator))) ** (5.0 / 3.0)
         if error > MAGNUS * prepared.tolerance:
-            return Attempt(values, 0.0, error, True)
+            return Trial(values, 0.0, error, True)
     for matrix in matrices:
-        key = ("exponential", window, substep.length, adjoint)
-        transition = prepared.once(key, partial(exponential_of, matrix)) if keeps else exponential_of(matrix)
-        found, rounding = transition(found)
+        key = window, substep.length, adjoint
+        transition = prepared.once(Derived.EXPONENTIAL, key, partial(exponential_of, matrix)) if keeps else exponential_of(matrix)
+        result, rounding = transition(result)
         error += rounding
-    return Attempt(found, exponents.offset + exponents.constant, error, False, substep, exponents.lift)
+    return Trial(result, exponents.offset + exponents.constant, error, False, substep, exponents.lift)
 
 
 class _Averages(NamedTuple):
@@ -234,7 +234,7 @@ def _of_magnus(prepared: Prepared, values: Array, averages: _Averages, moving: b
 def magnus(
     prepared: Prepared, values: Array, window: lw.Window, substep: Substep, at: Callable[[Array], Coefficients], adjoint: bool,
     moving: bool,
-) -> Attempt:  # fmt: skip
+) -> Trial:  # fmt: skip
     """Advance a substep by the exponentials of `_of_magnus`, with as many nodes as they need.
 
     Args:
@@ -252,7 +252,7 @@ def magnus(
             error = _unresolved(window, values, length * averages.drift, length * averages.potential)
         if error <= MAGNUS * prepared.tolerance:
             return _acted(prepared, values, window, substep, _of_magnus(prepared, values, averages, moving), adjoint, False)
-    return Attempt(values, 0.0, error, True)
+    return Trial(values, 0.0, error, True)
 
 
 def _unresolved(window: lw.Window, values: Array, drift: Array, potential: Array) -> float:
@@ -274,14 +274,14 @@ def by_modes(prepared: Prepared, values: Array, window: lw.Window, length: float
     decomposed = spectral(prepared, window)
     if decomposed is None:
         return None
-    found, error = decomposed(values, length)
+    result, error = decomposed(values, length)
     # Tails that were cut off are jumps in the gauge of the decomposition, which show at the highest frequencies, as does a
     # density that reaches the ends of the grid: that one needs another grid, not another transition.
     allowed = 1e-5 * prepared.tolerance
-    look = lw.figures(found, window.closed, prepared.negligible)
-    aliased = look.aliasing > max(allowed, 30.0 * prepared.negligible)
-    ended = max(look.left, look.right) > max(EDGE, 4.0 * look.aliasing)
-    return (found, error) if error < max(1e-11, allowed) and (ended or not aliased) else None
+    check = lw.grid_check(result, window.closed, prepared.negligible)
+    aliased = check.aliasing > max(allowed, 30.0 * prepared.negligible)
+    ended = max(check.left, check.right) > max(EDGE, 4.0 * check.aliasing)
+    return (result, error) if error < max(1e-11, allowed) and (ended or not aliased) else None
 
 
 MOST_SUBSTEPS = 4000
@@ -296,14 +296,14 @@ class Report:
         self.positive = True  # small values are accurate
         self.decomposed = True  # the operator has a decomposition on the grid that serves every interval
 
-    def density(self, look: lw.Figures) -> None:
+    def density(self, check: lw.GridCheck) -> None:
         """Note the figures of a density."""
-        self.aliasing = max(self.aliasing, look.aliasing)
-        self.negative = max(self.negative, look.negative)
-        self.edge = max(self.edge, look.left, look.right)
+        self.aliasing = max(self.aliasing, check.aliasing)
+        self.negative = max(self.negative, check.negative)
+        self.edge = max(self.edge, check.left, check.right)
 
 
-class Passage(NamedTuple):
+class RecordedTransition(NamedTuple):
     """A transition: the density and the grid before it, its length, the logarithm of its mass, and the grid after it.
 
     It is by the modes of that grid, of which at the `margins`, in points, there is no density; or by the exponentials of a
@@ -320,41 +320,42 @@ class Passage(NamedTuple):
     margins: tuple[int, int] = 0, 0
 
 
-class Moved(NamedTuple):
+class Prediction(NamedTuple):
     """The density after an interval, its grid, the logarithm of its mass, its figures, and how it was moved, where known."""
 
     values: Array
     window: lw.Window
     gained: Any
-    look: lw.Figures | None
-    passages: tuple[Passage, ...] = ()
+    check: lw.GridCheck | None
+    transitions: tuple[RecordedTransition, ...] = ()
 
 
-def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, length: float, report: Report) -> Moved | None:
+def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, length: float, report: Report) -> Prediction | None:
     """Return the density after an interval without observations inside by modes of its operator, None where they do not serve."""
     negligible, rough = prepared.negligible, max(1e-10, 1e-3 * prepared.tolerance)
     carried = coarsened(prepared, values, window, length)
     if carried is not None:
-        passage = Passage(values, window, length, 0.0, carried.window, margins=carried.margins)
-        return _normalised(carried.values, carried.window, carried.error, report, negligible, passage)
-    known, begin = lw.figures(values, window.closed, negligible).aliasing, window
+        transition = RecordedTransition(values, window, length, 0.0, carried.window, margins=carried.margins)
+        return _normalised(carried.values, carried.window, carried.error, report, negligible, transition)
+    known, begin = lw.grid_check(values, window.closed, negligible).aliasing, window
     while window.size <= lw.LARGEST:
-        found = by_modes(prepared, values, window, length)
-        if found is None or not lost(float(np.sum(found[0].real))) < 1e-3:
+        result = by_modes(prepared, values, window, length)
+        if result is None or not lost(float(np.sum(result[0].real))) < 1e-3:
             return None
-        look = lw.figures(found[0], window.closed, negligible)
-        if look.aliasing > 30.0 * negligible and (look.aliasing > rough or not look.rough):
+        check = lw.grid_check(result[0], window.closed, negligible)
+        if check.aliasing > 30.0 * negligible and (check.aliasing > rough or not check.rough):
             return None
-        bound = max(EDGE, 4.0 * look.aliasing)
-        left, right = look.left > bound, look.right > bound
+        bound = max(EDGE, 4.0 * check.aliasing)
+        left, right = check.left > bound, check.right > bound
         if not (left or right):
-            missing = lost(float(np.sum(found[0].real)))
+            missing = lost(float(np.sum(result[0].real)))
             if missing > ALLOWED * prepared.tolerance:
                 return None
             report.time += missing
             if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
-                report.aliasing = max(report.aliasing, lw.figures(values, window.closed, negligible).aliasing - known)
-            return _normalised(found[0], window, found[1], report, negligible, Passage(values, window, length, 0.0, window))
+                report.aliasing = max(report.aliasing, lw.grid_check(values, window.closed, negligible).aliasing - known)
+            transition = RecordedTransition(values, window, length, 0.0, window)
+            return _normalised(result[0], window, result[1], report, negligible, transition)
         new = lw.enlarged(window, left, right)
         if new == window:
             return None
@@ -366,129 +367,123 @@ def by_substeps(
     prepared: Prepared,
     values: Array,
     window: lw.Window,
-    start: float,
-    length: float,
-    inside: np.ndarray,
-    rates: np.ndarray,
+    interval: TimeInterval,
     report: Report,
     moving: bool = False,
-) -> Moved:
+) -> Prediction:
     """Return the density after an interval, by exponentials of its operator, on grids that move with it or stand."""
-    interval = start, length, inside, rates
-    found, tails = _by_substeps(prepared, values, window, *interval, report, moving)
+    result, tails = _by_substeps(prepared, values, window, interval, report, moving)
     if NOISE * np.exp(min(tails, 690.0)) > 0.1 * prepared.tolerance:
         # Increments far from the density may multiply rounding errors in its tails: compare with a density that has more of them.
-        noisy, _ = _by_substeps(prepared, values + NOISE * np.max(values.real), window, *interval, Report(), moving)
-        (mean, variance), (other, another) = (lw.moments(one.values.real, one.window) for one in (found, noisy))
+        noisy, _ = _by_substeps(prepared, values + NOISE * np.max(values.real), window, interval, Report(), moving)
+        (mean, variance), (other, another) = (lw.moments(one.values.real, one.window) for one in (result, noisy))
         report.time += float(np.nan_to_num(abs(mean - other) / np.sqrt(variance) + abs(another / variance - 1.0), nan=1.0))
-    return found
+    return result
 
 
 def _by_substeps(
     prepared: Prepared,
     values: Array,
     window: lw.Window,
-    start: float,
-    length: float,
-    inside: np.ndarray,
-    rates: np.ndarray,
+    interval: TimeInterval,
     report: Report,
     moving: bool,
-) -> tuple[Moved, float]:
+) -> tuple[Prediction, float]:
     """Return the same, and the logarithm of a bound on the growth of small values relative to the density."""
-    system, negligible, look = prepared.system, prepared.negligible, None
+    system, negligible, check = prepared.system, prepared.negligible, None
+    _, start, length, inside, rates = interval
     gained: Any = 0.0
     rough, resolved = max(1e-10, 1e-3 * prepared.tolerance), 30.0 * negligible
     report.positive = False
     bounds = [(0.0, length)]
     if system.varying:
-        parts = resolved_parts(prepared, values, window, start, length, inside)
+        parts = resolved_parts(prepared, values, window, interval)
         bounds, report.time = parts.bounds, report.time + parts.error
     stack = bounds[::-1]
-    substeps, passages, speed, tails = 0, [], 0.0, 0.0
+    substeps, transitions, speed, tails = 0, [], 0.0, 0.0
     while stack:
         first, last = stack.pop()
         substeps += 1
         large = window.size > lw.LARGEST and substeps < FEW
         most = lw.SIZES[-1] if large else lw.LARGEST
         if not np.isfinite(values.real).all():
-            return Moved(values, window, np.float64(np.nan), look), tails
+            return Prediction(values, window, np.float64(np.nan), check), tails
         begin, grown = window, False
-        known = lw.figures(values, window.closed, negligible).aliasing
+        known = lw.grid_check(values, window.closed, negligible).aliasing
         while True:
             if moving:
                 speed = speed_of(prepared, values, window, start + first, last - first)
-            attempt = attempted(prepared, values, window, Substep(start + first, last - first, inside, rates, speed))
-            report.decomposed = attempt.substep is None
-            total = float(np.sum(attempt.values.real))
+            trial = trial_substep(prepared, values, window, Substep(start + first, last - first, inside, rates, speed))
+            report.decomposed = trial.substep is None
+            total = float(np.sum(trial.values.real))
             missing = 0.0 if inside.any() else lost(total)
             failed = not 1e-100 < total < 1e6 or missing > 1e-3
-            split = (attempt.split or failed) and last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
+            split = (trial.split or failed) and last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
             if split:
                 break
-            look = lw.figures(attempt.values, window.closed, negligible)
-            coarse = look.aliasing > resolved and (look.aliasing > rough or not look.rough)
+            check = lw.grid_check(trial.values, window.closed, negligible)
+            coarse = check.aliasing > resolved and (check.aliasing > rough or not check.rough)
             coarse = coarse and (not prepared.weak or known <= resolved)  # a finer grid has no more of the spectrum of a kink
-            bound = max(EDGE, 4.0 * look.aliasing)
-            left, right = look.left > bound, look.right > bound
+            bound = max(EDGE, 4.0 * check.aliasing)
+            left, right = check.left > bound, check.right > bound
             if not (left or right or coarse):
                 break
             new = window
-            smooth = lw.figures(values, window.closed, negligible).aliasing < 0.1 * rough
-            if look.aliasing > lw.GROSS and smooth:
+            smooth = lw.grid_check(values, window.closed, negligible).aliasing < 0.1 * rough
+            if check.aliasing > lw.GROSS and smooth:
                 new = window  # what such an attempt shows of the edges is not the density
             elif left or right:
                 new, grown = lw.enlarged(new, left, right), True
-            if coarse and window.size < most and not (look.aliasing > lw.GROSS and smooth):
-                new = lw.refined(new) if grown else finer(values, window, look)
+            if coarse and window.size < most and not (check.aliasing > lw.GROSS and smooth):
+                new = lw.refined(new) if grown else finer(values, window, check)
             if new.size <= most and new != window and not window.size == new.size == lw.SIZES[-1]:
                 values = lw.resampled(values, window, new)
                 window = new
                 continue
             # The grid is as large as it may be: take a shorter substep, unless that does not help.
-            helps = smooth and look.aliasing > rough and (not look.rough or look.aliasing > lw.GROSS)
+            helps = smooth and check.aliasing > rough and (not check.rough or check.aliasing > lw.GROSS)
             split = (left or right or helps) and last - first > 1e-12 * length
             split = split and substeps + len(stack) < MOST_SUBSTEPS
             break
         if split:
-            if attempt.split and attempt.error > 0:
-                stack += parts_of_split(prepared, first, last, attempt.error)[::-1]
+            if trial.split and trial.error > 0:
+                stack += parts_of_split(prepared, first, last, trial.error)[::-1]
             else:
                 middle = first + (last - first) * (0.25 if last - first > 1e-3 * length else 0.0625)
                 stack += [(middle, last), (first, middle)]
-            look = lw.figures(values, window.closed, negligible)
-            values, window = refitted(prepared, values, window, look, large=substeps < FEW)
-            values, window = showing_drift(prepared, values, window, start + first, length - first)
+            check = lw.grid_check(values, window.closed, negligible)
+            values, window = refitted(prepared, values, window, check, large=substeps < FEW)
+            values, window = on_grid_for_drift(prepared, values, window, start + first, length - first)
             continue
-        assert look is not None
+        assert check is not None
         if prepared.smoothing and stack:  # what a kink leaves everywhere
-            look = look._replace(aliasing=0.0, left=0.0, right=0.0)
-        report.density(look)
+            check = check._replace(aliasing=0.0, left=0.0, right=0.0)
+        report.density(check)
         if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
-            brought = lw.figures(values, window.closed, negligible).aliasing
+            brought = lw.grid_check(values, window.closed, negligible).aliasing
             report.aliasing = max(report.aliasing, brought - known)
-        report.time += attempt.error + missing
-        begin, after = window, lw.moved(window, speed * (last - first))
-        before, values = values, np.where(attempt.values.real > 0, attempt.values, 0.0)
+        report.time += trial.error + missing
+        begin, after = window, lw.translated(window, speed * (last - first))
+        before, values = values, np.where(trial.values.real > 0, trial.values, 0.0)
         mass = np.sum(values)
-        passages.append(Passage(before, begin, last - first, np.log(mass), after, attempt.substep, attempt.offset))
-        tails = max(tails + attempt.lift - float(np.log(mass.real)), 0.0)
+        transitions.append(RecordedTransition(before, begin, last - first, np.log(mass), after, trial.substep, trial.offset))
+        tails = max(tails + trial.lift - float(np.log(mass.real)), 0.0)
         values, window = values / mass, after
-        gained = gained + np.log(mass) + attempt.offset
+        gained = gained + np.log(mass) + trial.offset
         if stack:
-            values, window = refitted(prepared, values, window, look, large=substeps < FEW)
-            values, window = showing_drift(prepared, values, window, start + last, length - last)
+            values, window = refitted(prepared, values, window, check, large=substeps < FEW)
+            values, window = on_grid_for_drift(prepared, values, window, start + last, length - last)
     if substeps >= MOST_SUBSTEPS:
         report.time = np.inf
-    return Moved(values, window, gained, look, tuple(passages)), tails
+    return Prediction(values, window, gained, check, tuple(transitions)), tails
 
 
 def _normalised(
-    found: Array, window: lw.Window, error: float, report: Report, negligible: float, passage: Passage
-) -> Moved:
-    look = lw.figures(found, window.closed, negligible)
-    report.density(look)
+    result: Array, window: lw.Window, error: float, report: Report, negligible: float, transition: RecordedTransition
+) -> Prediction:
+    check = lw.grid_check(result, window.closed, negligible)
+    report.density(check)
     report.time, report.decomposed = report.time + error, True
-    found = np.where(found.real > 0, found, 0.0)
-    mass = np.sum(found)
-    return Moved(found / mass, window, np.log(mass), look, (passage._replace(log_mass=np.log(mass)),))
+    result = np.where(result.real > 0, result, 0.0)
+    mass = np.sum(result)
+    return Prediction(result / mass, window, np.log(mass), check, (transition._replace(log_mass=np.log(mass)),))

@@ -11,7 +11,7 @@ from zakai.errors import InputError
 from zakai.methods.line.coefficients import covariance_at, tables
 from zakai.methods.line.domain import variable_of
 from zakai.methods.line.model import System
-from zakai.methods.line.prepared import Prepared, State
+from zakai.methods.line.prepared import Derived, Prepared, State
 from zakai.methods.system.observation import log_likelihood
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior
@@ -45,26 +45,26 @@ def resampled(prepared: Prepared, values: Array, window: lw.Window, new: lw.Wind
     if not prepared.weak or new.spacing <= window.spacing:
         return lw.resampled(values, window, new)
     density = at_nodes(lw.density_at(values, window, nodes(new.offsets, new.spacing)))
-    found = weak(density, new.spacing)[0] * (new.spacing / window.spacing)
-    return np.where(found > 0, found, 0.0)
+    result = weak(density, new.spacing)[0] * (new.spacing / window.spacing)
+    return np.where(result > 0, result, 0.0)
 
 
-def figures(prepared: Prepared, values: Array, window: lw.Window) -> lw.Figures:
+def grid_check(prepared: Prepared, values: Array, window: lw.Window) -> lw.GridCheck:
     """Return the figures of a density.
 
     A spectrum that falls slowly, of kinks and of what the largest grid does not resolve, does not tell where a density ends.  Of
     kinks of likelihoods a coarser grid would fold it, and a finer one has no more of it.
     """
-    look = lw.figures(values, window.closed, prepared.negligible, prepared.cut)
-    if prepared.kinked or look.aliasing > UNRESOLVED:
-        noise = 0.0 if prepared.weak else 1e-2 * look.aliasing  # of waves that the transition leaves everywhere
+    check = lw.grid_check(values, window.closed, prepared.negligible, prepared.cut)
+    if prepared.kinked or check.aliasing > UNRESOLVED:
+        noise = 0.0 if prepared.weak else 1e-2 * check.aliasing  # of waves that the transition leaves everywhere
         first, last = support(np.ascontiguousarray(values.real), max(prepared.cut, noise))
-        look = look._replace(first=first, last=last)
-    return look._replace(resolving=1.0) if prepared.weak else look
+        check = check._replace(first=first, last=last)
+    return check._replace(resolving=1.0) if prepared.weak else check
 
 
 def refitted(
-    prepared: Prepared, values: Array, window: lw.Window, look: lw.Figures, generous: int = 64, large: bool = True
+    prepared: Prepared, values: Array, window: lw.Window, check: lw.GridCheck, generous: int = 64, large: bool = True
 ) -> tuple[Array, lw.Window]:
     """Return a density on the grid for its next substep, and this grid.
 
@@ -76,31 +76,33 @@ def refitted(
         generous: a grid of up to so many points is kept though fewer would do.
         large: whether it may have more points than a matrix of the operator.
     """
-    large = large and prepared.largest_for(look, window.size) > prepared.largest
-    look = look._replace(resolving=1.0) if prepared.smoothing else look
-    new = lw.fitted(look, window, lw.SIZES[-1] if large else lw.LARGEST, generous)
-    moved = resampled(prepared, values, window, new)
-    return moved / np.sum(moved) if prepared.smoothing else moved, new  # an imaginary part need not have the sum zero
+    large = large and prepared.largest_for(check, window.size) > prepared.largest
+    check = check._replace(resolving=1.0) if prepared.smoothing else check
+    new = lw.fitted(check, window, lw.SIZES[-1] if large else lw.LARGEST, generous)
+    new_values = resampled(prepared, values, window, new)
+    if prepared.smoothing:  # elsewhere an imaginary part need not have the sum zero
+        new_values = new_values / np.sum(new_values)
+    return new_values, new
 
 
 def on_fitting_grid(
-    prepared: Prepared, values: Array, window: lw.Window, look: lw.Figures, generous: int, margin: float = 0.12
+    prepared: Prepared, values: Array, window: lw.Window, check: lw.GridCheck, generous: int, margin: float = 0.12
 ) -> tuple[Array, lw.Window, float]:
     """Return a density on the grid for the next interval, this grid, and the spectrum that it does not resolve.
 
     The grid is large only where one on which matrices act does not resolve the density.  For the arguments see `fitted` of
     `numerics/line/window.py`.
     """
-    most, large = prepared.largest, prepared.largest_for(look, window.size)
+    most, large = prepared.largest, prepared.largest_for(check, window.size)
     while True:
-        new = lw.fitted(look, window, most, generous, margin)
+        new = lw.fitted(check, window, most, generous, margin)
         if new == window:
-            return values, window, look.aliasing
-        moved = resampled(prepared, values, window, new)
-        moved = moved / np.sum(moved)
-        coarse = 0.0 if prepared.weak else lw.figures(moved, new.closed, prepared.negligible, prepared.cut).aliasing
+            return values, window, check.aliasing
+        new_values = resampled(prepared, values, window, new)
+        new_values = new_values / np.sum(new_values)
+        coarse = 0.0 if prepared.weak else lw.grid_check(new_values, new.closed, prepared.negligible, prepared.cut).aliasing
         if coarse <= RESOLVED or most >= large:
-            return moved, new, coarse
+            return new_values, new, coarse
         most = large
 
 
@@ -130,7 +132,7 @@ def edge_of_moments(prepared: Prepared, values: Array, window: lw.Window) -> flo
     return float(max(parts[0], parts[-1]) / np.sum(parts))
 
 
-def forgetting(before: Any, predicted: Any, after: Any, spread: float) -> float:
+def error_remainder(before: Any, predicted: Any, after: Any, spread: float) -> float:
     """Return the remainder of an old relative error after a step, from the variances: that of an error of the mean in deviations.
 
     `spread` is the integral of G over the interval, which counts where the observation acts inside.
@@ -196,7 +198,7 @@ def factor_at_end(prepared: Prepared, k: int, at_end: np.ndarray, observed: np.n
 
 def sampled_weakly(
     prepared: Prepared, k: int, values: Array, window: lw.Window, observed: np.ndarray
-) -> tuple[Product, lw.Figures]:
+) -> tuple[Product, lw.GridCheck]:
     """Return the product of a density and the likelihood of a sample of an h with kinks, on a grid that resolves it weakly.
 
     The figures of the product report the error in the weak sense in place of the spectrum at the highest frequencies.
@@ -226,14 +228,14 @@ def sampled_weakly(
     reference = float(np.log(values.max()))
     growth = float(np.sum(np.exp(np.minimum(logs + reference - best - np.log(total), 200.0))))
     depth = float(product @ np.where(product > 0, reference - known, 0.0))
-    look = figures(prepared, product, window)._replace(aliasing=error)
-    return Product(product, gained, depth, growth, window), look
+    check = grid_check(prepared, product, window)._replace(aliasing=error)
+    return Product(product, gained, depth, growth, window), check
 
 
 def _finer(prepared: Prepared, values: Array, window: lw.Window) -> tuple[lw.Window, bool]:
     """Return a finer grid for a density, and whether that holds it with the margins that a grid is kept with."""
-    look = figures(prepared, values, window)
-    low, high = window.offsets[look.first], window.offsets[look.last]
+    check = grid_check(prepared, values, window)
+    low, high = window.offsets[check.first], window.offsets[check.last]
     new = lw.quantized(window, low, high, window.spacing / 2**0.5 * 1.001, margin=0.16, most=lw.SIZES[-1])
     least = new.size // 16
     return new, bool(new.offsets[least] <= low and high < new.offsets[-least])
@@ -247,8 +249,8 @@ def _sample_noise(prepared: Prepared, stop: float, at_end: np.ndarray) -> tuple[
         noise = system.noise(np.zeros(1), stop, prepared.theta)[np.ix_(rows, rows)]
         return np.linalg.inv(noise), -0.5 * (log_determinant(noise) + np.log(2 * np.pi) * len(rows))
 
-    found: tuple[Array, Any] = prepared.once(("noise", at_end.tobytes()), make) if system.steady_noise else make()
-    return found
+    result: tuple[Array, Any] = prepared.once(Derived.SAMPLE_NOISE, at_end.tobytes(), make) if system.steady_noise else make()
+    return result
 
 
 def exponential_factor(prepared: Prepared, k: int, observed: np.ndarray) -> Gaussian:
@@ -348,7 +350,7 @@ def init(prepared: Prepared, prior: Any) -> State:
         origin = 0.5 * (low + high)
         window = Window(origin, 0.0, spacing, 0, False, spacing)
         window = lw.quantized(window, low - origin, high - origin, spacing, margin=0.0, most=lw.LARGE)
-    for attempt in range(8):
+    for trial in range(8):
         if log_density is None:
             points = window.points[:, None]
             logs = evaluate(np.pi - np.mod(np.pi - points, 2 * np.pi) if closed else points)
@@ -357,11 +359,11 @@ def init(prepared: Prepared, prior: Any) -> State:
             logs = log_density(np.array([window.origin]), window.offsets[:, None])
         values = np.exp(logs - np.max(logs.real))
         values = values / np.sum(values)
-        look = lw.figures(values, closed, cut=cut)
-        new = lw.fitted(look, window, lw.LARGE)
-        if new == window or attempt == 7:  # the values belong to this window
+        check = lw.grid_check(values, closed, cut=cut)
+        new = lw.fitted(check, window, lw.LARGE)
+        if new == window or trial == 7:  # the values belong to this window
             break
         window = new
-    if log_density is None and not closed and look.aliasing > SMOOTH:
+    if log_density is None and not closed and check.aliasing > SMOOTH:
         values = averaged(evaluate, window)
-    return state_of(values, window, max(0.0, look.aliasing - 1e-12), -700.0)
+    return state_of(values, window, max(0.0, check.aliasing - 1e-12), -700.0)

@@ -22,9 +22,9 @@ from zakai.methods.line.backward import accuracy
 from zakai.methods.line.backward_interval import negligible, smoothing_tolerance
 from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
 from zakai.methods.line.message import SURE, Message, points_of
-from zakai.methods.line.prepared import NOISE, Prepared
+from zakai.methods.line.prepared import NOISE, Prepared, TimeInterval
 from zakai.methods.line.update import factor_at_end
-from zakai.methods.line.volumes import course_of, pulled_back
+from zakai.methods.line.volumes import cell_plan_of, pulled_back
 from zakai.methods.reflecting import filter as reflecting_filter
 from zakai.methods.reflecting.elements import (
     SIZES,
@@ -73,7 +73,7 @@ def draw(
     deviation = float(np.sqrt(np.min(G) * min(length, 0.5 / max(slope, 1e-300))))
     wide = REACH * float(np.sqrt(np.max(G) * length))
     low, high = min(element.lower, float(z.min())), max(element.upper, float(z.max()))
-    found, order = np.empty(len(z)), np.argsort(z)
+    result, order = np.empty(len(z)), np.argsort(z)
     pieces = np.floor((z[order] - low) / (PIECE * deviation)).astype(int)
     for places in np.split(order, np.flatnonzero(np.diff(pieces)) + 1):
         first, last = float(z[places].min()), float(z[places].max())
@@ -82,8 +82,8 @@ def draw(
         lower, upper = max(first - reach, low), min(last + reach, high)
         needed = RESOLVING * 2.0 * float(np.max(element_of(prepared, lower, upper, SIZES[0]).halves)) / deviation
         piece = element_of(prepared, lower, upper, next((size for size in SIZES if size >= needed), SIZES[-1]))
-        found[places] = _drawn(prepared, k, piece, z[places], observed, state, uniform[places])
-    return np.clip(found, domain_of(prepared).lower, domain_of(prepared).upper)[:, None], 0.0
+        result[places] = _drawn(prepared, k, piece, z[places], observed, state, uniform[places])
+    return np.clip(result, domain_of(prepared).lower, domain_of(prepared).upper)[:, None], 0.0
 
 
 def _drawn(prepared: Prepared, k: int, piece: Element, z: Array, observed: np.ndarray, state: State, uniform: Array) -> Array:
@@ -104,22 +104,23 @@ def _drawn(prepared: Prepared, k: int, piece: Element, z: Array, observed: np.nd
 
 def _transition(prepared: Prepared, k: int, piece: Element, before: Array, observed: np.ndarray) -> Array:
     """Return T (N, N) from the points of an element to the densities at them, weighted by what is observed inside."""
-    start, length, inside = float(prepared.schedule.starts[k]), float(prepared.lengths[k]), prepared.inside[k]
-    rates, bounds, found = np.where(inside, observed, 0.0) / length, [(0.0, length)], np.eye(len(piece.points))
+    interval = prepared.interval(k, prepared.inside[k], observed)
+    _, start, length, inside, rates = interval
+    bounds, result = [(0.0, length)], np.eye(len(piece.points))
     if prepared.system.varying:
-        parts = resolved_parts(prepared, before, piece, start, length, inside).bounds  # type: ignore[arg-type]  # by its points
+        parts = resolved_parts(prepared, before, piece, interval).bounds  # type: ignore[arg-type]  # by its points
         cuts = [np.linspace(*part, SUBSTEPS + 1) for part in parts]
         bounds = [(float(a), float(b)) for cut in cuts for a, b in zip(cut[:-1], cut[1:], strict=True)]
     for first, last in bounds:
         middle = np.array([start + 0.5 * (first + last)])
         known = operator_at(prepared, piece, float(middle[0]))
         if known is None:
-            return np.full_like(found, np.nan)
+            return np.full_like(result, np.nan)
         _, _, potential, _ = coefficients(prepared, piece, middle, inside, rates, before)  # type: ignore[arg-type]
         modes = known.weighted(potential[0]) if inside.any() else known.modes
         s = modes.scale[:, None]
-        found = s * (modes.modes @ (np.exp((first - last) * modes.rates)[:, None] * (modes.modes.T @ (found / s))))
-    return np.asarray(found / piece.weights[:, None])
+        result = s * (modes.modes @ (np.exp((first - last) * modes.rates)[:, None] * (modes.modes.T @ (result / s))))
+    return np.asarray(result / piece.weights[:, None])
 
 
 POINTS = 256  # of a message, on the whole element of the density
@@ -162,9 +163,9 @@ def _product(prepared: Prepared, state: State, later: Message) -> _Product:
     lower, upper = max(lower, element.lower), min(upper, element.upper)
     top = float(np.max(logs(np.linspace(lower, upper, 4 * element.size))))
     allowed = negligible_of(prepared, float(state.error) + later.error)
-    new, found = sampled(prepared, lambda x: np.exp(logs(x) - top), lower, upper, allowed)
-    total = float(np.sum(found))
-    return _Product(found / total, new, float(np.log(total)) + top)
+    new, result = sampled(prepared, lambda x: np.exp(logs(x) - top), lower, upper, allowed)
+    total = float(np.sum(result))
+    return _Product(result / total, new, float(np.log(total)) + top)
 
 
 @np.errstate(all="ignore")
@@ -182,30 +183,30 @@ def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message,
     }
     density = values / element.weights
     first, last = element.points[list(support(density, negligible(prepared)))] - later.origin
-    kept = later._replace(logs=later.logs - log_mass).between(float(first), float(last))
-    return kept, Info(log_mass, np.array([mean]), np.array([[variance]]), health)
+    retained = later._replace(logs=later.logs - log_mass).between(float(first), float(last))
+    return retained, Info(log_mass, np.array([mean]), np.array([[variance]]), health)
 
 
 @np.errstate(all="ignore")
 def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state: State) -> Message:
     """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
-    start, length, inside = float(prepared.schedule.starts[k]), float(prepared.lengths[k]), prepared.inside[k]
+    inside = prepared.inside[k]
     later, before = later.on(_window(prepared, *(later.origin + end for end in later.ends))), later.variance
     at_end = prepared.schedule.seen[k] & ~inside
     if at_end.any():
         likelihood = factor_at_end(prepared, k, at_end, observed, None)
         later = later._replace(logs=later.logs + likelihood.logs(later.window.points).real)
-    if length == 0:
+    if prepared.lengths[k] == 0:
         return later
-    rates = np.where(inside, observed, 0.0) / length
-    found = None if prepared.system.varying else _by_modes(prepared, later, start, length, inside, rates, state)
-    found = _by_volumes(prepared, later, start, length, inside, rates, state) if found is None else found
-    kept = float(np.clip(later.variance / np.sqrt(max(before * found.variance, 1e-300)), 0.3, 1.0))
-    return found._replace(error=found.error + kept * later.error)
+    interval = prepared.interval(k, inside, observed)
+    result = None if prepared.system.varying else _by_modes(prepared, later, interval, state)
+    result = _by_volumes(prepared, later, interval, state) if result is None else result
+    retained = float(np.clip(later.variance / np.sqrt(max(before * result.variance, 1e-300)), 0.3, 1.0))
+    return result._replace(error=result.error + retained * later.error)
 
 
 def _by_modes(
-    prepared: Prepared, later: Message, start: float, length: float, inside: Array, rates: Array, state: State
+    prepared: Prepared, later: Message, interval: TimeInterval, state: State
 ) -> Message | None:
     """Return the message at the start of an interval by the modes of the operator, None where they do not serve.
 
@@ -214,6 +215,7 @@ def _by_modes(
     s b is projected onto the modes by the quadrature of its own points.  The error of rounding, and of what is not resolved after
     the interval, counts where the density is.
     """
+    _, start, length, inside, _ = interval
     own, values = state.element, np.asarray(state.values).real
     G = covariance_at(prepared.system, own.points, np.asarray(start), prepared.theta.real)
     reach = MODES_REACH * float(np.sqrt(np.max(G) * length))
@@ -231,13 +233,13 @@ def _by_modes(
             return None
         density, modes, root = own.at(values, element.points) * element.weights, known.modes, np.sqrt(element.weights)
         if inside.any():
-            modes, _, constant = weighted(prepared, known, element, start, length, inside, rates, density)
+            modes, _, constant = weighted(prepared, known, element, interval, density)
         between = element.interpolation(after.points)
         psi = (between.T @ (weights * np.exp(between @ known.logs - modes.top))) / root
-        moved = modes.decayed(psi, length)
-        at, log_s, scaled = element.interpolation(own.points), modes.top - known.logs, moved / root
+        propagated = modes.decayed(psi, length)
+        at, log_s, scaled = element.interpolation(own.points), modes.top - known.logs, propagated / root
         own_weights = np.abs(values) * np.exp(at @ log_s)
-        wrong = max(4e-16 * float(np.exp(-length * modes.rates[0])), element.unresolved(moved * root))
+        wrong = max(4e-16 * float(np.exp(-length * modes.rates[0])), element.unresolved(propagated * root))
         wrong = wrong * max(float(np.sqrt(psi @ psi)), float(np.max(np.abs(scaled))))
         error = wrong * float(np.sum(own_weights)) / float(own_weights @ (at @ scaled))
         if 0.0 <= error < SHARE * smoothing_tolerance(prepared):
@@ -245,35 +247,35 @@ def _by_modes(
     else:
         return None
 
-    def worth(x: Array) -> Array:
+    def expectation(x: Array) -> Array:
         at = element.interpolation(x)
         return (at @ scaled) * np.exp(at @ log_s)
 
-    return _on(prepared, state, worth, top + constant, error)
+    return _on(prepared, state, expectation, top + constant, error)
 
 
 def _by_volumes(
-    prepared: Prepared, later: Message, start: float, length: float, inside: Array, rates: Array, state: State
+    prepared: Prepared, later: Message, interval: TimeInterval, state: State
 ) -> Message:
     """Return the message at the start of an interval by finite volumes."""
     element, values = state.element, np.asarray(state.values).real
     ends, (mean, variance) = np.array([0.0, element.upper - element.lower]), later.moments
     shift = element.lower - later.origin
     aim = mean - shift, variance**0.5
-    course = course_of(prepared, values, element, ends, start, length, inside, aim)  # type: ignore[arg-type]  # by its points
-    found = pulled_back(
-        prepared, lambda x: later.at(x + shift), lambda x: element.at(values, element.lower + x), course, start, inside, rates
+    plan = cell_plan_of(prepared, values, element, ends, interval, aim)  # type: ignore[arg-type]  # by its points
+    result = pulled_back(
+        prepared, lambda x: later.at(x + shift), lambda x: element.at(values, element.lower + x), plan, interval
     )
-    if found is None:
+    if result is None:
         return message(prepared, state)._replace(error=np.inf)
-    worth = found
-    return _on(prepared, state, lambda x: worth.at(x - element.lower), worth.log_scale, worth.error)
+    expectation = result
+    return _on(prepared, state, lambda x: expectation.at(x - element.lower), expectation.log_scale, expectation.error)
 
 
-def _on(prepared: Prepared, state: State, worth: Callable[[Array], Array], log_scale: float, error: float) -> Message:
+def _on(prepared: Prepared, state: State, expectation: Callable[[Array], Array], log_scale: float, error: float) -> Message:
     """Return a message by its values, of some scale, where the density is."""
     window = _window(prepared, float(state.lower), float(state.upper))
-    values = worth(np.clip(window.points, state.lower, state.upper))
+    values = expectation(np.clip(window.points, state.lower, state.upper))
     logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + log_scale
     return Message.of(logs, window, window.spacing, error)
 

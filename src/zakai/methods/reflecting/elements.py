@@ -17,9 +17,9 @@ import numpy as np
 
 from zakai.errors import InputError
 from zakai.methods.line.coefficients import covariance_at, offset_of, potential_of, precision_of, tables
-from zakai.methods.line.prepared import Prepared
+from zakai.methods.line.prepared import Derived, Prepared, TimeInterval
 from zakai.methods.line.transition import Report
-from zakai.methods.line.volumes import SHARE, advanced_by, course_of, kinks_between
+from zakai.methods.line.volumes import SHARE, advanced_by, cell_plan_of, kinks_between
 from zakai.models.domain import Interval
 from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line.operator import Spectral
@@ -46,7 +46,7 @@ def element_of(prepared: Prepared, lower: float, upper: float, size: int) -> Ele
         return Element(lower, upper, size)
     unit, width, domain = 2.0 ** np.ceil(np.log2(upper - lower)), upper - lower, domain_of(prepared)
     low, high = float(unit * np.floor(lower / unit)), float(unit * np.ceil(upper / unit))
-    known = prepared.once(("kinks", low, high), lambda: kinks_between(prepared, low, high, prepared.model.start).tolist())
+    known = prepared.once(Derived.KINKS, (low, high), lambda: kinks_between(prepared, low, high, prepared.model.start).tolist())
     first = lower + width * (BESIDE if lower <= domain.lower else MARGIN)
     last = upper - width * (BESIDE if upper >= domain.upper else MARGIN)
     return Element(lower, upper, size, tuple(kink for kink in known if first < kink < last))
@@ -147,10 +147,10 @@ class Operator(NamedTuple):
 
 def decomposed(prepared: Prepared, element: Element) -> Operator | None:
     """Return the operator on an element where no coefficient depends on t, None where it has no decomposition."""
-    found: tuple[Operator | None] = prepared.once(
-        ("modes", element), lambda: (operator_at(prepared, element, prepared.model.start),)
+    result: tuple[Operator | None] = prepared.once(
+        Derived.LOBATTO_MODES, element, lambda: (operator_at(prepared, element, prepared.model.start),)
     )
-    return found[0]
+    return result[0]
 
 
 def operator_at(prepared: Prepared, element: Element, t: float) -> Operator | None:
@@ -172,9 +172,10 @@ def operator_at(prepared: Prepared, element: Element, t: float) -> Operator | No
 
 
 def weighted(
-    prepared: Prepared, known: Operator, element: Element, start: float, length: float, inside: Array, rates: Array, values: Array
+    prepared: Prepared, known: Operator, element: Element, interval: TimeInterval, values: Array
 ) -> tuple[Spectral, Array, Any]:
     """Return the modes with the potential of increments less a number, its integral over time, and that of the number."""
+    _, start, length, inside, rates = interval
     h, precision = tables(prepared, element).observation, precision_of(prepared, start, inside)  # type: ignore[arg-type]
     potential, constant = potential_of(h, precision, rates, values)
     offset, _ = offset_of(length * potential, values)
@@ -194,19 +195,18 @@ def moments(values: Array, element: Element) -> tuple[Any, Any]:
 COUNTS = 1e-14  # density relative to the maximum beyond which it is rounding
 EDGE = 1e-12  # density at an end that is not one of the domain, relative to the maximum
 REACH = 7.2  # standard deviations of the noise by which a density widens
-ATTEMPTS = 24  # elements that are tried
+TRIALS = 24  # elements that are tried
 MOST_PARTS = 64  # of an interval that the volumes do not take as a whole
 PEAK = 1.5  # points in a standard deviation of the noise with which the first element begins
 
 
 def propagated(
-    prepared: Prepared, values: Array, element: Element, k: int, inside: Array, rates: Array, report: Report,
-    negligible: float,
-) -> tuple[Array, Element, Any]:  # fmt: skip
-    """Return the density after interval k, its points, and the logarithm of its mass."""
-    interval = float(prepared.schedule.starts[k]), float(prepared.lengths[k]), inside, rates, report, negligible
-    found = None if prepared.system.varying else _by_modes(prepared, values, element, *interval)
-    values, element, gained = _by_volumes(prepared, values, element, *interval) if found is None else found
+    prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
+) -> tuple[Array, Element, Any]:
+    """Return the density after an interval, its points, and the logarithm of its mass."""
+    arguments = prepared, values, element, interval, report, negligible
+    result = None if prepared.system.varying else _by_modes(*arguments)
+    values, element, gained = _by_volumes(*arguments) if result is None else result
     report.aliasing = max(report.aliasing, element.unresolved(values))
     report.edge = max(report.edge, *reached(values, element, domain_of(prepared)))
     real = values.real
@@ -216,11 +216,11 @@ def propagated(
 
 
 def _by_modes(
-    prepared: Prepared, values: Array, element: Element, start: float, length: float, inside: Array, rates: Array, report: Report,
-    negligible: float,
-) -> tuple[Array, Element, Any] | None:  # fmt: skip
+    prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
+) -> tuple[Array, Element, Any] | None:
     """Return the density after an interval, its points, and the logarithm of its mass; None where modes do not serve."""
     domain, allowed = domain_of(prepared), max(1e-11, 1e-5 * prepared.tolerance)
+    _, start, length, inside, _ = interval
     G = covariance_at(prepared.system, element.points, start, prepared.theta).real
     noise = np.sqrt(np.maximum([np.min(G), np.max(G)], 0.0) * length)
     counts = np.flatnonzero((values / element.weights).real > COUNTS * np.max((values / element.weights).real))
@@ -229,26 +229,26 @@ def _by_modes(
     longest = float(np.max(element_of(prepared, lower, upper, SIZES[0]).halves))
     needed = min(2.0 * PEAK * longest / max(noise[0], 1e-300), element.size * longest / float(np.max(element.halves)))
     size = next((size for size in SIZES if size >= min(needed, SIZES[4])), SIZES[-1])
-    for _ in range(ATTEMPTS):
+    for _ in range(TRIALS):
         new, offset = element_of(prepared, lower, upper, size), 0.0
         known = decomposed(prepared, new)
         if known is None:
             return None
         modes, inner = known.modes, _projected(values, element, new, known, negligible)
         if inside.any():
-            modes, weight, offset = weighted(prepared, known, new, start, length, inside, rates, modes.scale * inner)
-        found, error = modes.carried(inner, length)
-        if not np.isfinite(found.real).all():
+            modes, weight, offset = weighted(prepared, known, new, interval, modes.scale * inner)
+        result, error = modes.carried(inner, length)
+        if not np.isfinite(result.real).all():
             return None
-        unresolved, growth = new.unresolved(found), 0.0
+        unresolved, growth = new.unresolved(result), 0.0
         if inside.any():  # increments mix all waves of the density before, and may raise errors in its tails
             before = modes.scale * inner
             unresolved = max(unresolved, new.unresolved(before))
             raised = new.weights * np.exp((weight - offset).real) * float(np.max((before / new.weights).real))
-            growth = float(np.sum(raised) / np.sum(found.real))
+            growth = float(np.sum(raised) / np.sum(result.real))
         coarse = unresolved > negligible
         # Oscillations of what is not resolved reach the ends as well.
-        left, right = (float(end) > (unresolved if coarse else EDGE) for end in reached(found, new, domain))
+        left, right = (float(end) > (unresolved if coarse else EDGE) for end in reached(result, new, domain))
         if coarse and size < SIZES[-1]:
             size = SIZES[SIZES.index(size) + 1]
         elif coarse:
@@ -256,10 +256,10 @@ def _by_modes(
         elif left or right:
             width = upper - lower
             lower, upper = apart(lower - 0.4 * width * left, upper + 0.4 * width * right, domain)
-        elif error < allowed and (inside.any() or abs(np.sum(found.real) - 1.0) < 1e-3):
+        elif error < allowed and (inside.any() or abs(np.sum(result.real) - 1.0) < 1e-3):
             report.time, report.growth = report.time + error, growth
             report.aliasing = max(report.aliasing, unresolved)
-            return found, new, offset
+            return result, new, offset
         else:
             return None
     return None
@@ -272,26 +272,25 @@ def _projected(values: Array, element: Element, new: Element, known: Operator, n
     """
     if element == new:
         return np.asarray(values / known.modes.scale)
-    found = element.at(values, new.points) * new.weights
-    if new.unresolved(found) < negligible:
-        return np.asarray(found / known.modes.scale)
+    result = element.at(values, new.points) * new.weights
+    if new.unresolved(result) < negligible:
+        return np.asarray(result / known.modes.scale)
     between = new.interpolation(element.points)
     s = np.exp(between @ known.logs - known.modes.top)
     return np.asarray((between.T @ (values / s)) / np.sqrt(new.weights))
 
 
 def _by_volumes(
-    prepared: Prepared, values: Array, element: Element, start: float, length: float, inside: Array, rates: Array, report: Report,
-    negligible: float,
-) -> tuple[Array, Element, Any]:  # fmt: skip
+    prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
+) -> tuple[Array, Element, Any]:
     """Return the density after an interval, its points, and the logarithm of its mass, in parts where volumes do not settle."""
-    stack, gained, count = [(0.0, length)], 0.0 * values[0], 0
+    stack, gained, count = [(0.0, interval.length)], 0.0 * values[0], 0
     while stack:
         first, last = stack.pop()
         count += 1
-        found = _part(prepared, values, element, start + first, last - first, inside, rates, report, negligible)
-        if found is not None:
-            values, element, more = found
+        result = _part(prepared, values, element, interval.part(first, last), report, negligible)
+        if result is not None:
+            values, element, more = result
             gained = gained + more
         elif count + len(stack) < MOST_PARTS:
             middle = first + 0.25 * (last - first)
@@ -303,9 +302,8 @@ def _by_volumes(
 
 
 def _part(
-    prepared: Prepared, values: Array, element: Element, start: float, length: float, inside: Array, rates: Array, report: Report,
-    negligible: float,
-) -> tuple[Array, Element, Any] | None:  # fmt: skip
+    prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
+) -> tuple[Array, Element, Any] | None:
     """Return the density after a part of an interval from finite volumes, None where these do not settle."""
     domain, at = domain_of(prepared), element
 
@@ -313,15 +311,15 @@ def _part(
         return at.at(values, at.lower + offsets)
 
     ends = np.array([0.0, at.upper - at.lower])
-    course = course_of(prepared, values, at, ends, start, length, inside)  # type: ignore[arg-type]  # by its points
-    if course is None:
+    plan = cell_plan_of(prepared, values, at, ends, interval)  # type: ignore[arg-type]  # by its points
+    if plan is None:
         return None
-    found = advanced_by(prepared, before, course, start, inside, rates, SHARE * prepared.tolerance)
-    if found is None:
+    result = advanced_by(prepared, before, plan, interval, SHARE * prepared.tolerance)
+    if result is None:
         return None
-    report.time += found.error + course.unresolved
-    cells = found.cells
-    density = np.log(np.maximum((found.values / cells.widths).real, 1e-300))
+    report.time += result.error + plan.unresolved
+    cells = result.cells
+    density = np.log(np.maximum((result.values / cells.widths).real, 1e-300))
     here = np.flatnonzero(density > np.max(density) - CUT)
     faces, tiny = cells.origin + cells.faces, 1e-9 * (cells.faces[-1] - cells.faces[0])
     if faces[0] - domain.lower < tiny:
@@ -330,10 +328,10 @@ def _part(
         faces[-1] = domain.upper
     lower, upper = with_margin(float(faces[here[0]]), float(faces[here[-1] + 1]), domain)
     lower, upper = max(lower, float(faces[0])), min(upper, float(faces[-1]))
-    interpolated = cells.density(found.values)
+    interpolated = cells.density(result.values)
 
     def after(x: Array) -> Array:
         return interpolated(np.clip(x - cells.origin, *cells.faces[[0, -1]]))
 
-    element, values = sampled(prepared, after, lower, upper, max(negligible, 1e-2 * found.error))
-    return values / np.sum(values), element, found.log_scale
+    element, values = sampled(prepared, after, lower, upper, max(negligible, 1e-2 * result.error))
+    return values / np.sum(values), element, result.log_scale

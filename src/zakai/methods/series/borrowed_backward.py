@@ -35,11 +35,11 @@ def _of_grid(prepared: Any) -> tuple[Backward[Any, Any, Any], Any]:
 def _on_line(density: GridDensity) -> LineState:
     """Return a density of one state on a grid of `yau-yau`; all of them have the same origin and unit."""
     own = lw.Window(0.0, float(density.centre[0]), float(density.basis[0, 0]), len(density.weights), False, 1.0)
-    look = lw.figures(density.weights, False)
-    low, high = own.offsets[look.first], own.offsets[look.last]
-    window = lw.quantized(own, float(low), float(high), own.spacing * max(look.resolving, 1.0), most=lw.SIZES[-1])
+    check = lw.grid_check(density.weights, False)
+    low, high = own.offsets[check.first], own.offsets[check.last]
+    window = lw.quantized(own, float(low), float(high), own.spacing * max(check.resolving, 1.0), most=lw.SIZES[-1])
     values = lw.resampled(density.weights, own, window)
-    return LineState(values / values.sum(), 0.0, window.centre, window.spacing, 1.0, False, max(look.aliasing, 0.0), ROUNDING)
+    return LineState(values / values.sum(), 0.0, window.centre, window.spacing, 1.0, False, max(check.aliasing, 0.0), ROUNDING)
 
 
 def _state(prepared: Any, density: GridDensity) -> Any:

@@ -220,15 +220,15 @@ def averaging(values: Array, parts: Array, spreads: Array, spacing: float, close
     [B, D] / 4 + [B, [B, E]] / 10, and of fifth order 5 |[B, D] / 4|^(5/3) + [B, [B, E]] / 10.
     """
     size = values.size
-    found = np.zeros((8, size))
-    add(found[0], 1.0, values)
+    result = np.zeros((8, size))
+    add(result[0], 1.0, values)
     for operator, of, weight, to in _PRODUCTS:
-        _generated(found[of], parts[operator], spreads[operator], spacing, float(weight), closed, found[to])
+        _generated(result[of], parts[operator], spreads[operator], spacing, float(weight), closed, result[to])
     one, two, mass, limit = 0.0, 0.0, 0.0, 1e-12 * values[highest_of(values)]
     for j in range(size):
         mass += values[j]
         if values[j] > limit:
-            one += abs(found[4, j])
-            two += abs(found[5, j])
+            one += abs(result[4, j])
+            two += abs(result[5, j])
     one, two = 0.25 * one / mass, 0.1 * two / mass
     return one + two, 5.0 * one ** (5.0 / 3.0) + two

@@ -87,7 +87,7 @@ class Gauged(NamedTuple):
     stride: int
 
 
-class Taken(NamedTuple):
+class BackwardSteps(NamedTuple):
     """The message before the last `number` intervals, which were taken, and the smoothed densities (K, N) with their reports."""
 
     message: Message
@@ -144,7 +144,7 @@ def spread(b: Array, first: int, last: int) -> float:
 
 
 @helper
-def kept(before: float, between: float, after: float) -> float:
+def error_share(before: float, between: float, after: float) -> float:
     """Return the share of the error of b that an interval leaves, from variances."""
     return min(max(between / np.sqrt(max(before * after, 1e-300)), 0.3), 1.0)
 
@@ -167,7 +167,7 @@ def _decomposed(
     for j in range(size):
         b[j] = psi[place + stride * j] * np.exp(gauge[at] - gauge[place + stride * j])
     for i in range(lengths.size - 1, -1, -1):
-        tau, row, taken, likelihood = lengths[i], out[i], lengths.size - 1 - i, logs[i]
+        tau, row, completed, likelihood = lengths[i], out[i], lengths.size - 1 - i, logs[i]
         before, top, norm = spread(b, first, last), -np.inf, 0.0
         for j in range(longer):
             top = max(top, likelihood[j])
@@ -190,7 +190,7 @@ def _decomposed(
                 inner = max(now[place + stride * j], ROUNDING * highest)
                 reference = max(reference, np.log(inner * density[j]) - gauge[place + stride * j])
         if not (-np.inf < reference < np.inf):
-            return taken, error, scale, reliable
+            return completed, error, scale, reliable
         for j in range(size):
             b[j] = 0.0
             if density[j] > least:
@@ -200,13 +200,13 @@ def _decomposed(
                 total += density[j] * b[j]
         made = level * weight / total + (0.0 if closed else 10.0 * max(left, right))
         if not (made < ROUGH * most):
-            return taken, error, scale, reliable
+            return completed, error, scale, reliable
         row[LOG_MASS] = scale + top + reference
         first, last = multiplied(b, density, floors[i], negligible, closed, cosines, sines, products[i], row)
         if last < 0:
-            return taken, error, scale, reliable
+            return completed, error, scale, reliable
         at = place + stride * highest_of(products[i])
-        error = made + error * kept(before, between, spread(b, first, last))
+        error = made + error * error_share(before, between, spread(b, first, last))
         row[ERROR] = error
         scale, reliable = np.log(highest / total) - reference, max(SURE * level / highest, LEAST)
         for j in range(longer):
@@ -216,7 +216,7 @@ def _decomposed(
 
 def by_modes(
     message: Message, before: Filtered, gauged: Gauged, logs: Array, lengths: Array, closed: bool, limits: Limits
-) -> Taken:
+) -> BackwardSteps:
     """Return the message before the last intervals, as many as the decomposition takes.
 
     Args:
@@ -230,18 +230,18 @@ def by_modes(
     """
     count, size = len(lengths), len(message.product)
     psi, products, out = message.values.copy(), np.empty((count, size)), np.zeros((count, 6))
-    taken, error, scale, least = _decomposed(
+    completed, error, scale, least = _decomposed(
         psi, message.scale, message.error, message.product, before.densities, before.floors, gauged.modes.ravel(), *gauged[1:],
         logs, lengths, closed, limits.error, limits.negligible, *waves(size), *waves(len(gauged.rates)), products, out,
     )  # fmt: skip
     first, last = 0, len(psi) - 1
-    if taken and not closed:
-        small, peak = np.flatnonzero(psi <= least), gauged.place + gauged.stride * int(np.argmax(products[count - taken]))
+    if completed and not closed:
+        small, peak = np.flatnonzero(psi <= least), gauged.place + gauged.stride * int(np.argmax(products[count - completed]))
         first = int(np.max(small, where=small < peak, initial=-1)) + 1
         last = int(np.min(small, where=small > peak, initial=len(psi))) - 1
     psi = np.maximum(psi, ROUNDING)
-    found = Message(psi, scale, first, last, 0, error, message.product)
-    return Taken(found, taken, products[count - taken :], out[count - taken :])
+    result = Message(psi, scale, first, last, 0, error, message.product)
+    return BackwardSteps(result, completed, products[count - completed :], out[count - completed :])
 
 
 MOST_SUBSTEPS = 512
@@ -327,53 +327,53 @@ def _adjoint(
     """How many intervals were taken, and the support, the start and the error of the message b, which is replaced."""
     size, timed, depth = b.size, table.shape[0] > 1, 8.0 - np.log(cut)
     for i in range(lengths.size - 1, -1, -1):
-        row, taken, low, high = out[i], lengths.size - 1 - i, 0, size - 1
+        row, completed, low, high = out[i], lengths.size - 1 - i, 0, size - 1
         if start < 0 or start + size > table.shape[3]:
-            return taken, first, last, start, error
+            return completed, first, last, start, error
         if not closed:  # the paths from one support to the other
             begins, ends = support(densities[i], SMALLEST)
             noise = np.sqrt(max(covariances[i].max(), 0.0) * lengths[i]) / spacing
             if not held(densities[i], starts[i] - start, product, noise):
-                return taken, first, last, start, error
+                return completed, first, last, start, error
             margin = int(EXCURSION * noise) + 1
             low = max(min(first, begins + starts[i] - start) - margin, low)
             high = min(max(last, ends + starts[i] - start) + margin, high)
         points = high - low + 1
-        local, now, found = np.empty((table.shape[1], table.shape[2], points)), np.empty(points), np.zeros(size)
+        local, now, result = np.empty((table.shape[1], table.shape[2], points)), np.empty(points), np.zeros(size)
         copied(table[i if timed else 0], start + low, local)
         at, before = highest_of(product), spread(b, first, last)
         row[LOG_MASS] = logs[i, at]
         for j in range(first, last + 1):
-            found[j] = b[j] * np.exp(logs[i, j] - logs[i, at])
-        between = spread(found, first, last)
+            result[j] = b[j] * np.exp(logs[i, j] - logs[i, at])
+        between = spread(result, first, last)
         for j in range(points):
-            now[j] = found[low + j]
+            now[j] = result[low + j]
         made, constant = _split(
             now, product[low : high + 1], local, drifts[i], outputs[i], precisions[i], covariances[i], averages, observed[i],
             inside[i], lengths[i], at - low, first - low, last - low, spacing, closed, depth, most,
         )  # fmt: skip
         for j in range(size):
-            found[j] = now[j - low] if low <= j <= high else 0.0
+            result[j] = now[j - low] if low <= j <= high else 0.0
         row[LOG_MASS] += constant
         if not (made < np.inf):
-            return taken, first, last, start, error
+            return completed, first, last, start, error
         if starts[i] != start:
-            found = shifted(found, starts[i] - start)
-        begins, ends = multiplied(found, densities[i], floors[i], negligible, closed, cosines, sines, products[i], row)
+            result = shifted(result, starts[i] - start)
+        begins, ends = multiplied(result, densities[i], floors[i], negligible, closed, cosines, sines, products[i], row)
         if ends < 0:
-            return taken, first, last, start, error
+            return completed, first, last, start, error
         first, last, start = begins, ends, starts[i]
-        error = made + error * kept(before, between, spread(found, first, last))
+        error = made + error * error_share(before, between, spread(result, first, last))
         row[ERROR] = error
         for j in range(size):
-            b[j] = found[j] if first <= j <= last else 0.0
+            b[j] = result[j] if first <= j <= last else 0.0
             product[j] = products[i, j]
     return lengths.size, first, last, start, error
 
 
 def by_adjoints(
     message: Message, before: Filtered, grid: Grid, logs: Array, steps: Steps, observed: Array, closed: bool, limits: Limits
-) -> Taken:
+) -> BackwardSteps:
     """Return the message before the last intervals, as many as the adjoints of splittings take.
 
     Args:
@@ -390,11 +390,12 @@ def by_adjoints(
     b, product, products, out = message.values.copy(), message.product.copy(), np.empty((count, size)), np.zeros((count, 6))
     kinds, lengths, _, precisions, _, _, *rest = steps
     averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
-    taken, first, last, start, error = _adjoint(
+    completed, first, last, start, error = _adjoint(
         b, message.first, message.last, message.start, message.error, product, *before, grid.table, grid.spacing, closed,
         logs, kinds == SPLIT, lengths, observed, precisions, *rest, averages, limits.splitting, limits.negligible, limits.cut,
         *waves(size), products, out,
     )  # fmt: skip
-    if taken:
+    if completed:
         out[-1, LOG_MASS] += message.scale
-    return Taken(Message(b, 0.0, first, last, start, error, product), taken, products[count - taken :], out[count - taken :])
+    here = slice(count - completed, None)
+    return BackwardSteps(Message(b, 0.0, first, last, start, error, product), completed, products[here], out[here])

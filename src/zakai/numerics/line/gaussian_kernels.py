@@ -281,7 +281,7 @@ def applied(
     sources: Array, first: float, spacing: float, size: int, weights: Array, scale: Any, shift: Any, variance: Any
 ) -> Array:
     """Return sum_j N(x_i; scale y_j + shift, variance) weights_j at x_i = first + spacing i, i = 0 .. size - 1, by recurrence."""
-    found = np.zeros(size, weights.dtype)
+    result = np.zeros(size, weights.dtype)
     half = 0.5 / variance
     top = 1.0 / np.sqrt(2.0 * np.pi * variance)
     falloff = np.exp(-2.0 * half * spacing * spacing)
@@ -297,7 +297,7 @@ def applied(
         value = peak
         ratio = np.exp(-half * (2.0 * rest * spacing + spacing * spacing))
         for i in range(near, size):
-            found[i] += value
+            result[i] += value
             value *= ratio
             ratio *= falloff
             if abs(value.real) < 1e-300:
@@ -309,5 +309,5 @@ def applied(
             ratio *= falloff
             if abs(value.real) < 1e-300:
                 break
-            found[i] += value
-    return found
+            result[i] += value
+    return result

@@ -81,10 +81,10 @@ def _surveyed(
         first = weigh(x * PER, rows.shape[1], 1, weights)
         for i in range(rows.shape[0]):
             h[i] = weighed(rows[i], first, 1, weights)
-        found = log_likelihood(h, general, precision, observed)
+        result = log_likelihood(h, general, precision, observed)
         j = min(int(x), logs.size - 2)
-        highest = max(highest, logs[j] + (x - j) * (logs[j + 1] - logs[j]) + found)
-        top, bottom = max(top, found), min(bottom, found)
+        highest = max(highest, logs[j] + (x - j) * (logs[j + 1] - logs[j]) + result)
+        top, bottom = max(top, result), min(bottom, result)
     return highest, top, bottom
 
 
@@ -112,7 +112,7 @@ def placed(
             highest, top, bottom = _surveyed(left[c], width[c], logs, rows, general, precision, observed, weights, h)
             level[c, 0], level[c, 1], level[c, 2], best = highest, top, bottom, max(best, highest)
         # What is not left out is kept at the front, what is to be divided at the back.
-        kept, more = done, _MOST_CELLS
+        retained, more = done, _MOST_CELLS
         for c in range(done, count):
             highest, spread = level[c, 0], level[c, 1] - level[c, 2]
             if highest + 0.5 * spread + 1.0 >= best - _DEPTH:
@@ -124,9 +124,9 @@ def placed(
                     more -= 1
                     left[more], width[more] = left[c], width[c]
                 else:
-                    left[kept], width[kept], level[kept, 0] = left[c], width[c], highest
-                    kept += 1
-        done = count = kept
+                    left[retained], width[retained], level[retained, 0] = left[c], width[c], highest
+                    retained += 1
+        done = count = retained
         for c in range(more, _MOST_CELLS):
             for part in range(2):
                 left[count], width[count] = left[c] + 0.5 * part * width[c], 0.5 * width[c]
@@ -141,29 +141,29 @@ def placed(
 
 
 @helper
-def interpolated(values: Array, top: float, at: Array, found: Array, weights: Array) -> None:
+def interpolated(values: Array, top: float, at: Array, result: Array, weights: Array) -> None:
     """Write the interpolant of a positive density at indices of its grid; small values by their logarithms."""
     signed = np.empty(values.size)
     for j in range(values.size):
         signed[j] = values[j] if j % 2 == 0 else -values[j]
     for i in range(at.size):
-        found[i] = 0.0
+        result[i] = 0.0
     for j in range(values.size):
         if signed[j] != 0.0:
             for i in range(at.size):
-                found[i] += signed[j] / (at[i] - j)
+                result[i] += signed[j] / (at[i] - j)
     for i in range(at.size):
         near = np.floor(at[i] + 0.5)
         if abs(at[i] - near) < 1e-12:
-            found[i] = values[int(near)] if 0 <= near < values.size else 0.0
+            result[i] = values[int(near)] if 0 <= near < values.size else 0.0
         else:
             sine = np.sin(np.pi * (at[i] - near)) / np.pi
-            found[i] *= sine if near % 2 == 0 else -sine
-        if not (found[i] >= _SMALL * top):
+            result[i] *= sine if near % 2 == 0 else -sine
+        if not (result[i] >= _SMALL * top):
             first, logs = weigh(at[i], values.size, 1, weights), 0.0
             for k in range(weights.size):
                 logs += weights[k] * np.log(values[first + k]) if weights[k] != 0.0 else 0.0
-            found[i] = np.exp(logs) if logs < np.log(2.0 * _SMALL * top) and 0 <= at[i] <= values.size - 1 else 0.0
+            result[i] = np.exp(logs) if logs < np.log(2.0 * _SMALL * top) and 0 <= at[i] <= values.size - 1 else 0.0
 
 
 @helper

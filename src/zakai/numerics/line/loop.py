@@ -35,6 +35,7 @@ from zakai.numerics.line.steps import (
     RANGE,
     RELIABLE,
     SPLIT,
+    STATUSES,
     TABLE,
     UNRESOLVED,
     Grid,
@@ -244,4 +245,4 @@ def advance(
     )  # fmt: skip
     if mechanisms.closed:
         circular_rows(densities[:done], cosines, sines, out)
-    return Segment(densities[:done], out[:done], why, out[-1, :3])
+    return Segment(densities[:done], out[:done], STATUSES[why], out[-1, :3])

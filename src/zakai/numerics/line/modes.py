@@ -38,7 +38,19 @@ from zakai.numerics.line.grid_choice import (
     weighed,
 )
 from zakai.numerics.line.product import WEAK_SHARE, weak_error
-from zakai.numerics.line.steps import AFTER, FAILED, OK, RANGE, RELIABLE, UNRESOLVED, product
+from zakai.numerics.line.steps import (
+    AFTER,
+    BROAD,
+    FAILED,
+    GRID,
+    NARROW,
+    OK,
+    RANGE,
+    RELIABLE,
+    SIZE,
+    UNRESOLVED,
+    product,
+)
 from zakai.numerics.line.window import CUT, LARGEST
 
 Array = NDArray[Any]
@@ -68,22 +80,22 @@ def decayed(rates: Array, time: float) -> Array:
 def propagate(modes: Array, decay: Array, values: Array) -> None:
     """Replace values (N,) by U decay U' of them, with the rows of U' one after the other (N^2,) and the decay of the first M."""
     size = values.size
-    found = np.zeros(size)
+    result = np.zeros(size)
     for n in range(decay.size):
         row, coefficient = modes[n * size : (n + 1) * size], 0.0
         for j in range(size):
             coefficient += row[j] * values[j]
         coefficient *= decay[n]
         for j in range(size):
-            found[j] += coefficient * row[j]
+            result[j] += coefficient * row[j]
     for j in range(size):
-        values[j] = found[j]
+        values[j] = result[j]
 
 
 @helper
 def unresolved(values: Array, cosines: Array, sines: Array) -> float:
     """Return the largest spectrum of values in the highest eighth of the frequencies, relative to the mass."""
-    size, mass, found = values.size, 0.0, 0.0
+    size, mass, result = values.size, 0.0, 0.0
     for j in range(size):
         mass += values[j]
     for k in range(size // 2, 7 * (size // 2) // 8 - 1, -max(1, size // 64)):
@@ -92,33 +104,33 @@ def unresolved(values: Array, cosines: Array, sines: Array) -> float:
             real, imag = real + cosines[at] * values[j], imag + sines[at] * values[j]
             at += k
             at -= size if at >= size else 0
-        found = max(found, real * real + imag * imag)
-    return np.sqrt(found) / abs(mass)
+        result = max(result, real * real + imag * imag)
+    return np.sqrt(result) / abs(mass)
 
 
 @helper
-def gathered(values: Array, at: Array, found: Array) -> None:
+def gathered(values: Array, at: Array, result: Array) -> None:
     """Write the values at indices of a grid times the matrix of interpolation from its points (N,)."""
-    for j in range(found.size):
-        found[j] = 0.0
+    for j in range(result.size):
+        result[j] = 0.0
     for i in range(values.size):
         near = np.floor(at[i] + 0.5)
         part = np.sin(np.pi * (at[i] - near)) / np.pi * values[i]
         if abs(at[i] - near) < 1e-12:
-            if 0 <= near < found.size:
-                found[int(near)] += values[i] * (1.0 if near % 2 == 0 else -1.0)
+            if 0 <= near < result.size:
+                result[int(near)] += values[i] * (1.0 if near % 2 == 0 else -1.0)
             continue
         part = part if near % 2 == 0 else -part
-        for j in range(found.size):
-            found[j] += part / (at[i] - j)
-    for j in range(1, found.size, 2):
-        found[j] = -found[j]
+        for j in range(result.size):
+            result[j] += part / (at[i] - j)
+    for j in range(1, result.size, 2):
+        result[j] = -result[j]
 
 
 @helper
 def carried(
     now: Array, at: Array, same: bool, closed: bool, scale: Array, modes: Array, rates: Array, tau: float, first: int, last: int,
-    most: float, moved: Array,
+    most: float, propagated: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """Write the density (N,) of the grid of the modes after an interval; return its rounding error and that of the scale.
 
@@ -136,7 +148,7 @@ def carried(
         most: the largest error.
         moved: receives the density.
     """
-    size, top, weights = moved.size, highest_of(now), np.empty(8)
+    size, top, weights = propagated.size, highest_of(now), np.empty(8)
     inner, logs, after, unsure, total, end = np.zeros(now.size), np.zeros(now.size), np.empty(size), 0.0, 0.0, 0.0
     limit, reference = CUT * now[top], scale[PER * top] if same else 0.0
     if not same:
@@ -179,18 +191,17 @@ def carried(
     while last > first and not coefficients[last] > noise:
         last -= 1
     for j in range(size):
-        moved[j] = after[j] * coefficients[j] if first <= j <= last else 0.0
+        propagated[j] = after[j] * coefficients[j] if first <= j <= last else 0.0
         if first <= j <= last:
-            highest, largest = max(highest, after[j]), max(largest, moved[j])
+            highest, largest = max(highest, after[j]), max(largest, propagated[j])
     if not (largest > 0.0 and noise * outside < most * largest):
         return np.inf, unsure
     return (noise + _SPREAD * end) * highest / largest, unsure
 
 
 STAY, OWN, PLACE = range(3)  # steps on the grid of the density; on its own grid the first transition, or none
-NARROW, BROAD, GRID, SIZE = range(10, 14)  # why the loop ends, beside those of `line/steps.py`
 _EDGE = 1e-11  # density at the outermost points, relative to the maximum
-_ATTEMPTS = 6  # coarse grids on which a step is tried
+_TRIALS = 6  # coarse grids on which a step is tried
 
 
 @kernel(
@@ -201,7 +212,7 @@ _ATTEMPTS = 6  # coarse grids on which a step is tried
 )  # fmt: skip
 def advance(
     values: Array, centre: float, spacing: float, unit: float, closed: bool, profile: Array, known: Array, index: Array,
-    special: Array, owner: int, general: bool, way: int, begin: int, observed: Array, lengths: Array, precisions: Array,
+    special: Array, owner: int, general: bool, placement: int, begin: int, observed: Array, lengths: Array, precisions: Array,
     constants: Array, error: float, limits: Array, cosines: Array, sines: Array, densities: Array, places: Array, out: Array,
 ) -> tuple[int, int]:  # fmt: skip
     """Return the number of steps, and why the loop ended.
@@ -231,11 +242,11 @@ def advance(
             points at either end at which there is no density (K + 1, 4); and the reports.
     """
     negligible, allowed, generous = limits[0], limits[1], limits[4]
-    now, n, answer, place, stays = values.copy(), densities.shape[1], places[-1], -1, way == STAY
+    now, n, answer, place, stays = values.copy(), densities.shape[1], places[-1], -1, placement == STAY
     weak = general and special.shape[1] == 2
     for i in range(observed.shape[0]):
         k, row, half = begin + i, out[i], now.size // 2
-        tau, alone = lengths[k], stays or (way == OWN and i == 0)
+        tau, alone = lengths[k], stays or (placement == OWN and i == 0)
         begins, ends = support(now, CUT)
         needed = Outlook(0.0, 0.0, 0.0, 0.0)
         if not closed:
@@ -252,7 +263,7 @@ def advance(
         if not stays or i == 0:
             answer[0], answer[1], answer[2] = centre, spacing, now.size
         # The transition.
-        for attempt in range(_ATTEMPTS):
+        for trial in range(_TRIALS):
             if not alone:
                 wanted(left, right, coarse, margin, answer)
             if not stays or i == 0:
@@ -265,13 +276,14 @@ def advance(
             modes, offset = known[offset : offset + size * size], offset + size * size
             cosine, sine, offset = known[offset : offset + size], known[offset + size : offset + 2 * size], offset + 2 * size
             scale, offset = known[offset : offset + length], offset + length
-            at, moved, inset = np.empty(now.size), np.empty(size), int(np.ceil(margin / coarse))
+            at, propagated, inset = np.empty(now.size), np.empty(size), int(np.ceil(margin / coarse))
             for j in range(now.size):
                 at[j] = (centre + spacing * (j - half) - begin_at) / coarse
             first, last = inset, size - 1 - inset
-            rounding, unsure = carried(now, at, alone, closed, scale, modes, rates, tau, first, last, 0.1 * allowed, moved)
-            aliasing, top = unresolved(moved, cosine, sine), moved[highest_of(moved)]
-            on_left, on_right = max(abs(moved[first]), abs(moved[first + 1])), max(abs(moved[last]), abs(moved[last - 1]))
+            rounding, unsure = carried(now, at, alone, closed, scale, modes, rates, tau, first, last, 0.1 * allowed, propagated)
+            aliasing, top = unresolved(propagated, cosine, sine), propagated[highest_of(propagated)]
+            on_left = max(abs(propagated[first]), abs(propagated[first + 1]))
+            on_right = max(abs(propagated[last]), abs(propagated[last - 1]))
             edge, bound = 0.0 if closed else max(on_left, on_right) / top, max(_EDGE, 4.0 * aliasing)
             resolved = aliasing <= max(30.0 * negligible, 1e-5 * allowed)
             if not (aliasing < np.inf and rounding <= max(1e-11, 1e-3 * allowed) and (resolved or not stays)):
@@ -284,7 +296,7 @@ def advance(
                 answer[1] = spacing * ((size + on if on_right > bound * top else ends) - half)
                 answer[2] = spacing
                 return i, RANGE
-            if attempt == _ATTEMPTS - 1:
+            if trial == _TRIALS - 1:
                 return i, FAILED
             alone, margin = False, beyond
             left -= (last - first) * coarse / 3.0 if on_left > bound * top else 0.0
@@ -294,17 +306,17 @@ def advance(
                 coarse *= 2.0 ** (-0.5 * min(max(np.ceil(np.log2(short)), 1.0), 4.0))
         mass, negative, from_, to = 0.0, 0.0, last, first
         for j in range(first, last + 1):
-            negative -= min(moved[j], 0.0)
-            moved[j] = max(moved[j], 0.0)
-            mass += moved[j]
-            if moved[j] > CUT * top:
+            negative -= min(propagated[j], 0.0)
+            propagated[j] = max(propagated[j], 0.0)
+            mass += propagated[j]
+            if propagated[j] > CUT * top:
                 from_, to = min(from_, j), j
         if not (abs(mass - 1.0) < 1e-3):
             return i, FAILED
         missing = abs(mass - 1.0)
         for j in range(size):
-            moved[j] /= mass
-        predicted, before = moments(moved)[2] * coarse**2, moments(now)[2] * spacing**2
+            propagated[j] /= mass
+        predicted, before = moments(propagated)[2] * coarse**2, moments(now)[2] * spacing**2
         floor = np.exp(LOG_NOISE) + aliasing + edge + rounding
         # The sample.
         if owner >= -1:
@@ -317,18 +329,18 @@ def advance(
         if stays:
             constant, seen = on_grid(rows, highest_of(now), general, precisions[k], observed[i], b)
             for j in range(n):
-                now[j] = moved[j]
+                now[j] = propagated[j]
         else:
             now = np.empty(n)
             centre, spacing, constant, more, enough = sampled(
-                moved, max(from_ - 1, first), min(to + 1, last), rows, general, precisions[k], observed[i], begin_at, coarse,
+                propagated, max(from_ - 1, first), min(to + 1, last), rows, general, precisions[k], observed[i], begin_at, coarse,
                 unit, now, b,
             )  # fmt: skip
             if not enough:
                 return i, SIZE
             for j in range(n):
                 now[j] *= spacing / coarse
-            deeper = np.log(moved[highest_of(moved)] * spacing / coarse) - np.log(now[highest_of(now)])
+            deeper = np.log(propagated[highest_of(propagated)] * spacing / coarse) - np.log(now[highest_of(now)])
         added, growth, below = product(now, b) if seen else (0.0, 0.0, 0.0)
         on_left, on_right, from_at, to_at, _, unsampled, _, highest, _ = spectrum(now, CUT, negligible, cosines, sines, stays)
         limit = 30.0 * negligible if seen else np.inf

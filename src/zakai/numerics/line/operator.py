@@ -217,18 +217,18 @@ class Spectral:
         reach = float(np.sqrt(np.sum(inner.real**2)))
         if not np.isfinite(reach):
             return inner, np.inf
-        found = self.scale * self.decayed(inner, length)
-        top, growth = float(np.max(found.real)), max(1.0, float(np.exp(-length * self.rates[0])))
-        return found, 4e-16 * reach * growth / top if top > 0 else np.inf
+        result = self.scale * self.decayed(inner, length)
+        top, growth = float(np.max(result.real)), max(1.0, float(np.exp(-length * self.rates[0])))
+        return result, 4e-16 * reach * growth / top if top > 0 else np.inf
 
     def decayed(self, inner: Array, length: float) -> Array:
         """Return U exp(-length lambda) U' inner."""
         decay = np.exp(-length * self.rates)
         coefficients = real_product(self.modes.T, inner)
-        moved = decay * coefficients
+        propagated = decay * coefficients
         if self.change is not None:
-            moved = moved + 1j * ((quotients(self.rates, decay, length) * self.change) @ coefficients.real)
-        return real_product(self.modes, moved)
+            propagated = propagated + 1j * ((quotients(self.rates, decay, length) * self.change) @ coefficients.real)
+        return real_product(self.modes, propagated)
 
 
 FOURIER_PART = 6.0  # norm up to which one Taylor series is summed
@@ -317,5 +317,5 @@ def _waves(values: Array) -> Array:
 
 
 def _values(waves: Array, size: int) -> Array:
-    found = np.fft.irfft(waves, size)
-    return found if found.ndim == 1 else found[0] + 1j * found[1]
+    result = np.fft.irfft(waves, size)
+    return result if result.ndim == 1 else result[0] + 1j * result[1]

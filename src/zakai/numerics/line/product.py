@@ -71,8 +71,8 @@ class General:
 
     def logs(self, points: Array) -> Array:
         """Return log l (J,), minus infinity where it has no value."""
-        found = self.log_density(points)
-        return np.where(np.isnan(found.real), -np.inf, found)
+        result = self.log_density(points)
+        return np.where(np.isnan(result.real), -np.inf, result)
 
 
 Likelihood = Gaussian | General
@@ -101,32 +101,32 @@ def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: 
         rough: the largest spectrum at the highest frequencies, relative to the mass, with which the grid is kept.
     """
     product = _product(values, window, values, window, likelihood)
-    look = lw.figures(product.values, window.closed)
-    resolved = look.aliasing <= 1e-11 or (look.aliasing <= rough and look.rough)
-    if resolved and max(look.left, look.right) < 1e-10:
+    check = lw.grid_check(product.values, window.closed)
+    resolved = check.aliasing <= 1e-11 or (check.aliasing <= rough and check.rough)
+    if resolved and max(check.left, check.right) < 1e-10:
         return product
-    new = lw.fitted(look, window) if likelihood.linear else _placed(values, window, likelihood)
+    new = lw.fitted(check, window) if likelihood.linear else _placed(values, window, likelihood)
     for _ in range(12):
-        moved = lw.resampled(values, window, new)
-        if not moved.any():  # the observation contradicts all that is known, which the depth reports
-            moved = np.full_like(moved, _NOTHING)
-        product = _product(values, window, moved, new, likelihood)
+        new_values = lw.resampled(values, window, new)
+        if not new_values.any():  # the observation contradicts all that is known, which the depth reports
+            new_values = np.full_like(new_values, _NOTHING)
+        product = _product(values, window, new_values, new, likelihood)
         if not np.isfinite(product.log_mass.real):
             return product
-        look = lw.figures(product.values, new.closed)
-        noisy = look.rough and look.aliasing < lw.GROSS
-        if look.aliasing <= 1e-11 or new.size >= (lw.LARGE if noisy else lw.SIZES[-1]):
+        check = lw.grid_check(product.values, new.closed)
+        noisy = check.rough and check.aliasing < lw.GROSS
+        if check.aliasing <= 1e-11 or new.size >= (lw.LARGE if noisy else lw.SIZES[-1]):
             break
-        before, new = new, finer(product.values, new, look)
+        before, new = new, finer(product.values, new, check)
         if new == before:
             break
     return product
 
 
-def finer(values: Array, window: lw.Window, look: lw.Figures) -> lw.Window:
+def finer(values: Array, window: lw.Window, check: lw.GridCheck) -> lw.Window:
     """Return a finer grid that holds a density, of which modes may be far apart; the same grid where there is none."""
     low, high = window.offsets[list(support(np.ascontiguousarray(values.real), lw.CUT))]
-    factor = max(1.0 / look.resolving, 2**0.5)
+    factor = max(1.0 / check.resolving, 2**0.5)
     while factor > 1.1:
         if window.closed:
             new, holds = lw.refined(window, factor), True
@@ -139,15 +139,15 @@ def finer(values: Array, window: lw.Window, look: lw.Figures) -> lw.Window:
     return window
 
 
-def _product(values: Array, window: lw.Window, moved: Array, new: lw.Window, likelihood: Likelihood) -> Product:
+def _product(values: Array, window: lw.Window, new_values: Array, new: lw.Window, likelihood: Likelihood) -> Product:
     if isinstance(likelihood, Gaussian) and likelihood.known is not None and likelihood.known[0] == new:
         logs = likelihood.of(likelihood.known[1])
     else:
         logs = likelihood.logs(new.points)
-    if np.iscomplexobj(logs) or np.iscomplexobj(moved):
-        logs, moved = logs.astype(complex), moved.astype(complex)
+    if np.iscomplexobj(logs) or np.iscomplexobj(new_values):
+        logs, new_values = logs.astype(complex), new_values.astype(complex)
     top_of_density = float(values.real.max()) * new.spacing / window.spacing
-    return Product(*_normalized(np.ascontiguousarray(moved), np.ascontiguousarray(logs), top_of_density), new)
+    return Product(*_normalized(np.ascontiguousarray(new_values), np.ascontiguousarray(logs), top_of_density), new)
 
 
 _R, _C = types.float64, types.complex128
@@ -160,7 +160,7 @@ _R, _C = types.float64, types.complex128
 def _normalized(values: Array, logs: Array, largest: float) -> tuple[Array, Any, float, float]:
     """values exp(logs) normalised, the logarithm of its sum, how deep below `largest` its mass is, and the growth of errors."""
     size = values.size
-    found = np.zeros(size, values.dtype)
+    result = np.zeros(size, values.dtype)
     own = np.empty(size)
     top = -np.inf
     for i in range(size):
@@ -172,24 +172,24 @@ def _normalized(values: Array, logs: Array, largest: float) -> tuple[Array, Any,
     for i in range(size):
         if own[i] > -np.inf and logs[i].real > -np.inf:
             # Relative to the largest product: neither factor needs to be a number there.
-            found[i] = values[i] / np.exp(own[i]) * np.exp(own[i] + logs[i] - top)
-            mass += found[i]
+            result[i] = values[i] / np.exp(own[i]) * np.exp(own[i] + logs[i] - top)
+            mass += result[i]
     depth, growth, reference = 0.0, 0.0, np.log(largest)
     for i in range(size):
-        found[i] /= mass
+        result[i] /= mass
         growth += np.exp(min(logs[i].real + reference - top - np.log(mass.real), 80.0))
-        if found[i].real > 0:
-            depth += found[i].real * (reference - own[i])
-    return found, np.log(mass) + top, depth, growth
+        if result[i].real > 0:
+            depth += result[i].real * (reference - own[i])
+    return result, np.log(mass) + top, depth, growth
 
 
 def _placed(values: Array, window: lw.Window, likelihood: Likelihood) -> lw.Window:
     """Return a grid for the product; the same where no number compares parts of it, which the depth reports."""
     top = values.real.max()
-    found = place(window.offsets, np.log(np.maximum(values.real, 1e-30 * top)), likelihood, window.origin)
-    if found is None:
+    result = place(window.offsets, np.log(np.maximum(values.real, 1e-30 * top)), likelihood, window.origin)
+    if result is None:
         return window
-    low, high, finest = found
+    low, high, finest = result
     spacing = min(window.spacing, max(finest, (high - low) / 370.0))
     if window.closed:
         size = lw.size_for(min(2 * np.pi / spacing, lw.SIZES[-1]))

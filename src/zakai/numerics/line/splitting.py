@@ -371,15 +371,15 @@ def _split(interval: Interval, average: _Average, v: Array, dv: Array) -> tuple[
 def _slope(b: Array, spacing: float, closed: bool) -> Array:
     """Return the differences of `splitting.differences`."""
     size = b.shape[1]
-    found = np.empty_like(b)
+    result = np.empty_like(b)
     far, near = b[:, 5:-1] - b[:, 1:-5], b[:, 4:-2] - b[:, 2:-4]
-    found[:, 3:-3] = (0.75 * near - 0.15 * far + (b[:, 6:] - b[:, :-6]) / 60.0) / spacing
+    result[:, 3:-3] = (0.75 * near - 0.15 * far + (b[:, 6:] - b[:, :-6]) / 60.0) / spacing
     ends = np.array([0, 1, 2, size - 3, size - 2, size - 1])
     below, above = (ends - 1) % size, (ends + 1) % size
     if not closed:
         below, above = np.maximum(ends - 1, 0), np.minimum(ends + 1, size - 1)
-    found[:, ends] = (b[:, above] - b[:, below]) / (spacing * np.where(closed | (above - below == 2), 2.0, 1.0))
-    return found
+    result[:, ends] = (b[:, above] - b[:, below]) / (spacing * np.where(closed | (above - below == 2), 2.0, 1.0))
+    return result
 
 
 def _around(
@@ -426,18 +426,18 @@ def _along(
         order: which factor stands before, between and after the convolutions.
     """
     size, padded = v.size, np.zeros(v.size + 2 * taps.size)
-    moved, changed, row = np.empty(size), np.empty(size), np.empty(size)
+    propagated, changed, row = np.empty(size), np.empty(size), np.empty(size)
     for i in range(order.size):
         if i > 0:
-            moved[:], changed[:] = 0.0, 0.0
-            _convolve(v, taps, padded, moved)
+            propagated[:], changed[:] = 0.0, 0.0
+            _convolve(v, taps, padded, propagated)
             _convolve(v, changes, padded, changed)
             for l in range(turned.size):
                 for j in range(size):
                     row[j] = turned[l] * changed[j]
                 _convolve(dv[l], taps, padded, row)
                 dv[l, :] = row
-            v[:] = moved
+            v[:] = propagated
         which = order[i]
         for l in range(turned.size):
             for j in range(size):

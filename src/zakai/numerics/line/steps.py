@@ -8,6 +8,7 @@ f, f' and h.  The functions of an interval are sums of terms with factors that d
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,9 +27,32 @@ COLUMNS = (
 )  # fmt: skip
 # The transition: whole with a sample after it, split with increments inside, whole with increments inside, split with a sample.
 FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = 0, 1, 2, 3
-OK, FAILED, RANGE, AFTER, TABLE, UNRESOLVED = range(6)  # why a loop ends; the last where a product needs a finer grid
 RELIABLE = 1e-3  # of the promised error: smaller estimates are not reported
 MARGIN = 96  # points of a table of coefficients in time beyond the grid, of which a third may be used before it is made again
+
+
+class Status(Enum):
+    """Why a compiled loop ends, in words; the kernels return the numbers of these."""
+
+    OK = "all steps are done"
+    FAILED = "a step misses the tolerance, or a number is not finite"
+    RANGE = "the step needs a grid with another range or spacing, which the answer tells"
+    AFTER = "the next step needs another grid"
+    TABLE = "the next step needs another table of the coefficients in time"
+    UNRESOLVED = "the product with a sample needs a much finer grid"
+    NARROW = "the density is so narrow that a coarser grid for its transition and one of its own serve it better"
+    BROAD = "the density is so broad that one grid serves it better"
+    GRID = "the modes of the grid in the answer are not known"
+    SIZE = "the product with a sample needs a grid of more points"
+
+    @property
+    def number(self) -> int:
+        """The number that kernels return."""
+        return STATUSES.index(self)
+
+
+STATUSES = list(Status)
+OK, FAILED, RANGE, AFTER, TABLE, UNRESOLVED, NARROW, BROAD, GRID, SIZE = range(len(STATUSES))  # for kernels
 
 
 class Mechanisms(NamedTuple):
@@ -105,13 +129,13 @@ class Limits(NamedTuple):
 class Segment(NamedTuple):
     """The densities (K, N) after the first steps and their reports (K, len(COLUMNS)).
 
-    The column `start` of a report is the first point of the grid in the table.  `why` is why the loop ended, and `answer` the
+    The column `start` of a report is the first point of the grid in the table.  `status` is why the loop ended, and `answer` the
     range of the grid that it needs, relative to the centre of the present one, and its spacing.
     """
 
     densities: Array
     reports: Array
-    why: int
+    status: Status
     answer: Array
 
 

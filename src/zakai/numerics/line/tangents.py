@@ -62,9 +62,9 @@ def exponential_tangents(
         row[0] = 0.0 if parts[0] is None else scale * parts[0]
         row[1:] = [np.zeros(size) if one is None else scale * np.imag(one) / STEP * np.ones(size) for one in parts[1:]]
     rows[2, 0] -= shift
-    found = np.concatenate([values[None], tangents])
-    _taylor(np.concatenate(derivatives(size, window.closed)), *rows, found, shift, norm)
-    return found[0], found[1:]
+    result = np.concatenate([values[None], tangents])
+    _taylor(np.concatenate(derivatives(size, window.closed)), *rows, result, shift, norm)
+    return result[0], result[1:]
 
 
 def _by_complex_steps(window: Window, changed: Sequence[Coefficients], values: Array, tangents: Array) -> tuple[Array, Array]:
@@ -100,20 +100,20 @@ def _taylor(matrices: Array, covariance: Array, drift: Array, potential: Array, 
                     if i > 0:
                         products[i, j] += drift[i, j] * term[0, j]
                         products[i, size + j] += covariance[i, j] * term[0, j]
-            moved = np.dot(products, matrices)
+            propagated = np.dot(products, matrices)
             scale, settled = 1.0 / (parts * k), True
             for i in range(count):
                 change = 0.0
                 for j in range(size):
-                    found = moved[i, j] + potential[0, j] * term[i, j]
+                    result = propagated[i, j] + potential[0, j] * term[i, j]
                     if i > 0:
-                        found += potential[i, j] * term[0, j]
-                    found *= scale
-                    rows[i, j] += found
-                    moved[i, j] = found
-                    change = max(change, abs(found))
+                        result += potential[i, j] * term[0, j]
+                    result *= scale
+                    rows[i, j] += result
+                    propagated[i, j] = result
+                    change = max(change, abs(result))
                 settled = settled and change <= 1e-17 * largest[i]
-            term = moved
+            term = propagated
             if settled:
                 break
         rows *= factor
@@ -162,9 +162,9 @@ class Varied(NamedTuple):
             known, shifts = local_polynomial(logs, own, points), local_polynomial(self.scales, own, points)
             scale, at = np.exp(logs - known[top]), np.exp(known - known[top])
             scales, shifts = self.scales - shifts[:, top : top + 1], shifts - shifts[:, top : top + 1]
-            found = np.where(used, np.concatenate([values[None], tangents - values * shifts]) / at, 0.0)
+            result = np.where(used, np.concatenate([values[None], tangents - values * shifts]) / at, 0.0)
             # Interpolation leaves waves everywhere; where they end abruptly, the derivatives spread that.
-            inner, *rest = np.array([gathered(one, points, own) for one in found]) * _faded(own.size, margins)
+            inner, *rest = np.array([gathered(one, points, own) for one in result]) * _faded(own.size, margins)
             changes = np.array(rest)
         decay, coefficients = np.exp(-length * rates), inner @ U
         turned = (self.operators * quotients(rates, decay, length)) @ coefficients
@@ -186,10 +186,10 @@ def extended(values: Array, tangents: Array) -> Array:
     used = np.flatnonzero(values > CUT * np.max(values))
     if len(used) in (0, len(values)):
         return tangents
-    found, small = tangents.copy(), np.flatnonzero(~(values > CUT * np.max(values)))
-    for one in found:
+    result, small = tangents.copy(), np.flatnonzero(~(values > CUT * np.max(values)))
+    for one in result:
         one[small] = values[small] * np.interp(small, used, one[used] / values[used])
-    return found
+    return result
 
 
 def resampled_tangents(values: Array, tangents: Array, window: Window, new: Window) -> Array:
@@ -197,19 +197,19 @@ def resampled_tangents(values: Array, tangents: Array, window: Window, new: Wind
     if new == window:
         return tangents
     tangents = extended(values, tangents)
-    found, density = interpolated(tangents, window, new.offsets), density_at(values, window, new.offsets)
+    result, density = interpolated(tangents, window, new.offsets), density_at(values, window, new.offsets)
     small = np.flatnonzero(density < SMALL * np.max(values))
     scores = tangents / np.where(values > 0, values, np.inf)
-    found[:, small] = density[small] * local_polynomial(scores, window, new.offsets[small])
-    return np.ascontiguousarray(found * (new.spacing / window.spacing))
+    result[:, small] = density[small] * local_polynomial(scores, window, new.offsets[small])
+    return np.ascontiguousarray(result * (new.spacing / window.spacing))
 
 
 def _faded(size: int, margins: tuple[int, int]) -> Array:
     """Return factors (N,) that fall to zero at the two ends of a grid."""
-    found = np.ones(size)
-    for margin, end in zip(margins, (found, found[::-1]), strict=True):
+    result = np.ones(size)
+    for margin, end in zip(margins, (result, result[::-1]), strict=True):
         end[:margin] = ndtr(_FALL * np.linspace(-1.0, 1.0, margin, endpoint=False))
-    return found
+    return result
 
 
 _FALL = 6.0  # standard deviations from the middle to the ends of a factor that falls
