@@ -60,6 +60,10 @@ METHODS = {
         "zakai.methods.series.kolmogorov_series",
         "convergent for one state and any smooth f without time: the explicit series of the kernel; only when it is named",
     ),
+    "tensor-train": Entry(
+        "zakai.methods.tensor_train",
+        "convergent for smooth systems in two to eight states: a tensor train in a frame that follows the density",
+    ),
     "guided-particles": Entry(
         "zakai.methods.particles.guided_particles",
         "convergent for any model in any number of states: particles, with standard errors of what they give",

@@ -109,11 +109,11 @@ class Motion:
             if len(self._kept_roots) >= KEPT_LENGTHS:
                 self._kept_roots.clear()
             nothing = np.zeros((self.system.m, self.system.m))
-            G = self._covariance(float(self.system.model.start), nothing, None)
+            G = self.covariance(float(self.system.model.start), nothing, None)
             self._kept_roots[step] = root(noise_about_middle(self.constant_matrix, G, step))
         return self._kept_roots[step]
 
-    def _covariance(self, t: float, P: Array, u: Array | None) -> Array:
+    def covariance(self, t: float, P: Array, u: Array | None) -> Array:
         """Return g (Q - C P C') g' (n, n) for noise that does not depend on the state."""
         system = self.system
         if system.cross is None and not system.timed:
@@ -132,9 +132,9 @@ class Motion:
         """The matrix of an affine drift."""
         model = self.system.model
         given = np.zeros(self.system.drift.width)
-        return self._matrix(np.zeros(model.n), np.ones(model.n), float(model.start), given)
+        return self.matrix(np.zeros(model.n), np.ones(model.n), float(model.start), given)
 
-    def _matrix(self, x: Array, scale: Array, t: float, given: Array) -> Array:
+    def matrix(self, x: Array, scale: Array, t: float, given: Array) -> Array:
         """Return df/dx (n, n) at a point, by forward differences."""
         n = len(x)
         step = 1e-5 * scale
@@ -168,7 +168,7 @@ class Motion:
         kicked = np.searchsorted(kicks, ends)
         kicked = np.where((kicked < count) & (kicks[np.minimum(kicked, count - 1)] == ends), kicked, -1)
         places = np.column_stack([kicked, np.where(ends == stop, 0, -1), np.full(len(ends), scheme.stages)]).astype(np.int64)
-        given = self._given(interval, times, values)
+        given = self.given_numbers(interval, times, values)
         roots = self._roots(interval, times, places, given, step, mean, scale)
         coin = int(system.kind == ORDERED)
         width = roots.shape[2]
@@ -179,7 +179,7 @@ class Motion:
         known = interval.inputs
         return None if known is None else known.at(t, self.system.model.input_hold, before=before)
 
-    def _given(self, interval: Interval, times: Array, values: Array) -> Array:
+    def given_numbers(self, interval: Interval, times: Array, values: Array) -> Array:
         """Return the given numbers of the drift (E, 2, L) at both ends of each flow."""
         system, length = self.system, interval.stop - interval.start
         given = np.zeros((len(times), 2, system.drift.width))
@@ -221,7 +221,7 @@ class Motion:
                 if system.cross is not None:
                     P = system.precision(times[e, 1], interval.inside, self.theta, u)
                 if system.kind == ADDITIVE:
-                    G = self._covariance(times[e, 1], P, u)
+                    G = self.covariance(times[e, 1], P, u)
                     assert A is not None
                     slope = A[len(found)]
                     size = float(np.abs(slope).sum(axis=1).max()) * step
@@ -249,7 +249,7 @@ class Motion:
         none = Events(times, marked, given, np.zeros((0, system.n, 0)), np.zeros((0, 3), np.int64))
         ends = np.zeros((len(kicks), system.n, 1))
         self.advanced(none, np.ascontiguousarray(mean[:, None]), np.zeros((0, 1)), ends)
-        return [self._matrix(ends[j, :, 0], scale, times[e, 1], given[e, 1]) for j, e in enumerate(kicks)]
+        return [self.matrix(ends[j, :, 0], scale, times[e, 1], given[e, 1]) for j, e in enumerate(kicks)]
 
 
 def noise_about_middle(A: Array, G: Array, length: float) -> Array:

@@ -62,6 +62,7 @@ class System:
                 drift[i] -= sum(terms, sp.S.Zero)
             given += Q_given.values()
             fields = [sum((g[i, a] * coefficients[a] for a in range(r)), sp.S.Zero) for i in range(n)]
+        self.formulas, self.given = tuple(drift), tuple(given)
         self.drift = Expressions(drift, model, given)
         self.fields = Expressions(fields, model, given, coefficients)
         self.observe = Expressions(list(model.observation) if model.log_density is None else [sp.S.Zero], model)
