@@ -11,6 +11,7 @@ import numpy as np
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.along_path import along_path, record_along
+from zakai.engine.coarser import distances
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import KEPT, Setting
 from zakai.engine.versions import versions
@@ -249,8 +250,21 @@ class Run:
         undefined += notes_on_domain(noted, theta, record, result.mean, result.variance)
         lengths = notes_on_lengths(schedule, distances)
         misfit = notes_on_law(noted, theta, schedule, self.values, infos)
-        result.warnings.extend([*undefined, *self.notes, *lengths, *misfit, *warnings_of_run(result)])
+        result.warnings.extend([*undefined, *self.notes, *lengths, *misfit, *self.health_warnings(result)])
         return result
+
+    def health_warnings(self, result: FilterResult) -> list[str]:
+        """Return what the health figures of the result say."""
+
+        def apart() -> np.ndarray | None:
+            found = distances(self.setting, result.mean[1:], result.cov[1:], self.again)
+            return None if found is None else np.append(found[:1], found)
+
+        return warnings_of_run(result, self.setting.method.losses, apart)
+
+    def again(self, setting: Setting) -> Infos:
+        """Return what another setting of the method reports after each interval."""
+        return joined([one.infos for one in segments(setting, self.schedule, None, self.values)])
 
     def _no_density(self) -> str:
         if self.bytes and not self.keep:
