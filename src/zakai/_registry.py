@@ -61,7 +61,7 @@ METHODS = {
         "convergent for one state and any smooth f without time: the explicit series of the kernel; only when it is named",
     ),
     "tensor-train": Entry(
-        "zakai.methods.tensor_train",
+        "zakai.methods.frame.tensor_train",
         "convergent for smooth systems in two to eight states: a tensor train in a frame that follows the density",
     ),
     "guided-particles": Entry(

@@ -37,7 +37,7 @@ def simulate(
     truth, record = simulate(model, times, seed=seed, initial=start, inputs=inputs)
     if truth_path is not None:
         write_truth(truth_path, truth, model.state)
-    write_record(output, record)
+    write_record(output, record, list(model.observation_names))
     print(f"{len(record):,} observation{'s' if len(record) > 1 else ''} written to {output}")
 
 

@@ -9,7 +9,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from zakai.densities._density import DensityMethods, as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
+from zakai.densities._density import DensityMethods
+from zakai.densities._values import as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 from zakai.densities.grid import GridDensity
 from zakai.errors import InputError
 

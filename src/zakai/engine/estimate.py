@@ -98,7 +98,8 @@ class Estimate:
         for feed, moment in zip(self._online.feeds, self._moments, strict=True):
             said.update(dict.fromkeys(feed.notes(moment)))
             if moment.info is not None:
-                said.update(dict.fromkeys(warnings_of_step(moment.info.health, feed.setting.method.bounds)))
+                method = feed.setting.method
+                said.update(dict.fromkeys(warnings_of_step(moment.info.health, method.bounds, method.losses)))
         return tuple(said)
 
     @property

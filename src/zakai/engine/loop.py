@@ -10,11 +10,13 @@ import numpy as np
 
 from zakai.densities import Density
 from zakai.engine.along_path import along_path, record_along
+from zakai.engine.coarser import distances
 from zakai.engine.setting import KEPT, Setting
 from zakai.errors import InputError
 from zakai.methods._protocol import Infos, stacked
 from zakai.methods._states import Joined
 from zakai.methods.system.escape import EscapeError
+from zakai.notes.health import warnings_of_run
 from zakai.notes.model import (
     notes_on_angles,
     notes_on_start,
@@ -211,6 +213,19 @@ class Run:
     def complete(self, result: FilterResult) -> FilterResult:
         """Return the result of this run with what only this kind of run adds."""
         return result
+
+    def health_warnings(self, result: FilterResult) -> list[str]:
+        """Return what the health figures of the result say."""
+
+        def apart() -> np.ndarray | None:
+            found = distances(self.setting, result.mean[1:], result.cov[1:], self.again)
+            return None if found is None else np.append(found[:1], found)
+
+        return warnings_of_run(result, self.setting.method.losses, apart)
+
+    def again(self, setting: Setting) -> Infos:
+        """Return what another setting of the method reports after each interval."""
+        return joined([one.infos for one in segments(setting, self.schedule, None, self.values)])
 
     def why_no_density(self) -> str:
         """Return why densities were not kept."""

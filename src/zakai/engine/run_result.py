@@ -11,7 +11,6 @@ from zakai.engine.along_path import record_along
 from zakai.engine.loop import Run, joined
 from zakai.engine.results import FilterResult
 from zakai.engine.versions import versions
-from zakai.notes.health import warnings_of_run
 from zakai.notes.lengths import distances_of_lengths, notes_on_lengths
 from zakai.notes.misfit import notes_on_law
 from zakai.notes.model import notes_on_domain, notes_on_formulas
@@ -59,7 +58,7 @@ def result_of_run(run: Run, why: str, considered: Mapping[str, tuple[Condition, 
     undefined += notes_on_domain(noted, theta, record, result.mean, result.variance)
     lengths = notes_on_lengths(schedule, distances)
     misfit = notes_on_law(noted, theta, schedule, run.values, infos)
-    result.warnings.extend([*undefined, *run.notes, *lengths, *misfit, *warnings_of_run(result)])
+    result.warnings.extend([*undefined, *run.notes, *lengths, *misfit, *run.health_warnings(result)])
     return run.complete(result)
 
 

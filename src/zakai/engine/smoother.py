@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai import _registry
+from zakai._progress import announced
 from zakai.algebra.conditions import all_hold
 from zakai.algebra.theorems import conditions_of
 from zakai.densities import Density
-from zakai.engine.batch import Progress, announced, filter_all, smooth_all
+from zakai.engine.batch import Progress, filter_all, smooth_all
 from zakai.engine.driver import check_noise, check_records, with_inputs
 from zakai.engine.loop import CHUNK, KEPT_BYTES, Run, advance, joined, size_of
 from zakai.engine.paths import sample_paths
@@ -28,7 +29,6 @@ from zakai.errors import InputError
 from zakai.methods._protocol import Info, Infos, stacked
 from zakai.methods._states import Joined
 from zakai.models.model import Model
-from zakai.notes.health import warnings_of_run
 from zakai.numerics.one_thread import one_thread
 from zakai.records import Inputs, Record
 
@@ -269,6 +269,19 @@ class SmoothingRun(Run):
         """Return the mean and the covariance at the start, smoothed once the record is."""
         return super().start_moments() if self.start is None else (self.start.mean, self.start.cov)
 
+    def health_warnings(self, result: FilterResult) -> list[str]:
+        """Return what the figures of the filter say, nothing while they stand beside those of the smoother."""
+        return [] if self.start is not None else super().health_warnings(result)
+
+    def again(self, setting: Setting) -> Infos:
+        """Return what another setting of the method reports after each interval, of the smoother once the record is smoothed."""
+        if self.start is None:
+            return super().again(setting)
+        other = SmoothingRun(setting, self.record)
+        other.all()
+        other.smooth(lambda run, count: None, lambda run: None)
+        return joined(other.parts)
+
     def complete(self, result: FilterResult) -> FilterResult:
         """Return the result, of the filter until the record is smoothed."""
         if self.start is None:
@@ -277,7 +290,7 @@ class SmoothingRun(Run):
         for name, figures in result.health.items():
             figures[0] = self.start.health[name]
         result.bounds = {**result.bounds, "evidence_error": (self.backward.accuracy(self.empty), _EVIDENCE)}
-        result.warnings = [*self.notes, *warnings_of_run(result)]
+        result.warnings = [*self.notes, *super().health_warnings(result)]
         result.increment_law_error = None  # `smooth` gives that of the filter
         return result
 

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from zakai.densities._density import wrap
-from zakai.methods._escape_of_states import check_escape
 from zakai.methods._protocol import Info
 from zakai.methods.frame.build import CONTROLS, Builder, Unresolved, difference
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
@@ -21,6 +20,7 @@ from zakai.methods.frame.placement import Mass
 from zakai.methods.frame.state import Control, Prepared, State
 from zakai.methods.frame.update import depth_of, update
 from zakai.methods.particles.programs import Array
+from zakai.methods.system.escape_of_states import check_escape
 from zakai.models.prior import DensityPrior
 from zakai.numerics.trains.train import Train, quasi_random
 
@@ -85,7 +85,7 @@ def _mixture(prepared: Prepared, prior: Any) -> tuple[Callable[[Array], Array], 
 
 def _density_prior(prepared: Prepared, prior: DensityPrior) -> tuple[Callable[[Array], Array], Mass]:
     """Return a density that is given by a formula or on a grid as a function, and points of it."""
-    from zakai.methods._moments import density_grid, prior_moments
+    from zakai.methods.system.prior_moments import density_grid, prior_moments
     from zakai.models.numeric import numpy_function
 
     model, theta = prepared.model, prepared.theta

@@ -16,7 +16,7 @@ from zakai.algebra.theorems import limited_direct
 from zakai.errors import InputError
 from zakai.methods._options import one_of, tolerance_of
 from zakai.methods._protocol import Method
-from zakai.methods.grid.yau_yau import BOUNDS, in_space, on_line
+from zakai.methods.grid.yau_yau import BOUNDS, LOST, in_space, on_line
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line import tangents as line_tangents
 from zakai.methods.line.backward import BACKWARD as LINE
@@ -102,6 +102,7 @@ METHOD: Method[Any, Any] = Method(
     density=line_filter.density,
     state=State,
     bounds=BOUNDS,
+    losses=LOST,
     shorter="raise the option tolerance (command: --option tolerance=...)",
     variant=variant,
     valid=line_filter.valid,

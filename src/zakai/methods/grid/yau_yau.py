@@ -32,9 +32,13 @@ BOUNDS = {
         "the error of a step exceeds the tolerance by this factor. Give more frequent observations, or a larger tolerance",
     ),
     "tail_depth": (1.0, "depth in the tails of the prediction to which an observation leads, divided by the accurate depth"),
+    "aliasing": (1e-2, "share of the density that is finer than the grid: the mean may be off by as many deviations"),
     "outside_tables": (1e-4, "share of the mass where a table is constant beyond its range"),
     "without_law": (1e-6, "share of the mass where the law of the observation has no value, as for counts with a negative mean"),
 }
+# A tenth of a density that is finer than its grid, a step in which half of the density is unknown, and a sample where the density
+# consists of rounding.
+LOST = {"tail_depth": 1.0, "aliasing": 0.1, "splitting_error": 0.5}
 HANDLES = features.OF_OBSERVATION | {
     features.CROSS_NOISE,
     features.DOMAIN,
@@ -106,6 +110,7 @@ METHOD: Method[Any, Any] = Method(
     density=line_filter.density,
     state=State,
     bounds=BOUNDS,
+    losses=LOST,
     shorter="raise the option tolerance (command: --option tolerance=...)",
     variant=variant,
     valid=line_filter.valid,
