@@ -1,0 +1,137 @@
+"""Densities of one state as averages over cells of equal size: what a picture draws of them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import kernel
+
+Array = NDArray[Any]
+
+_SEEN = 1e-6  # of the largest value of a density: what is below everywhere is outside of its window
+_SUMMED = 1e-13  # of the largest value on the grid: smaller terms change no digit of the interpolant that is drawn
+_REACH = 7.0  # standard deviations at which a Gaussian is below 1e-10 of its peak
+
+
+def grid_cells(log_values: Array, closed: bool, count: int) -> tuple[float, float, Array]:
+    """Return the density that is band-limited on the grid 0, 1, ..., size - 1 as averages over `count` cells.
+
+    Args:
+        log_values: (size,) logarithms of the density, up to a constant.
+        closed: whether the grid goes once around a circle.
+        count: number of cells.
+
+    Returns:
+        The ends of the window that holds the mass, as indices of the grid, and the averages (count,), up to a factor.  On a circle
+        the window may go beyond the last index.
+    """
+    values = np.exp(log_values - np.max(log_values))
+    size = len(values)
+    if closed:
+        first, length = _arc(values > _SEEN)
+        start, terms = (first, size) if length == size else _arc(values > _SUMMED)
+        low, high = first - 1.0, first + length + 0.0
+        if length + 1 >= size:
+            low, high = first - 0.5, first + size - 0.5
+    else:
+        seen, summed = np.flatnonzero(values > _SEEN), np.flatnonzero(values > _SUMMED)
+        low, high = max(seen[0] - 1.0, -0.5), min(seen[-1] + 1.0, size - 0.5)
+        start, terms = int(summed[0]), int(summed[-1] - summed[0] + 1)
+    within = max(1, math.ceil(2.0 * (high - low) / count))  # two points for each of the grid
+    out = np.empty(count)
+    _interpolate(np.ascontiguousarray(values), start, terms, closed, low, (high - low) / count, within, out)
+    return low, high, out
+
+
+def _arc(inside: Array) -> tuple[int, int]:
+    """Return the first index and the length of the shortest arc of a circle that holds all places that are `inside`."""
+    places = np.flatnonzero(inside)
+    gaps = np.diff(np.append(places, places[0] + len(inside)))
+    widest = int(np.argmax(gaps))
+    return int(places[(widest + 1) % len(places)]), len(inside) - int(gaps[widest]) + 1
+
+
+@kernel(
+    types.void(
+        types.float64[::1], types.int64, types.int64, types.boolean, types.float64, types.float64, types.int64, types.float64[::1]
+    )
+)
+def _interpolate(
+    values: Array, start: int, terms: int, closed: bool, low: float, cell: float, within: int, out: Array
+) -> None:
+    """Write the averages over cells of the sinc interpolant, on a circle of the trigonometric one, of `terms` values."""
+    size = len(values)
+    for r in range(len(out)):
+        total = 0.0
+        for s in range(within):
+            x = low + cell * (r + (s + 0.5) / within)
+            nearest = math.floor(x + 0.5)
+            rest = x - nearest
+            if abs(rest) < 1e-12:
+                at = int(nearest)
+                total += values[at % size] if closed or 0 <= at < size else 0.0
+                continue
+            found = 0.0
+            # sin(pi (x - j)) = sin(pi rest) (-1)^(nearest - j)
+            sign = 1.0 if (int(nearest) - start) % 2 == 0 else -1.0
+            if closed:
+                for j in range(start, start + terms):
+                    angle = math.pi * (x - j) / size
+                    found += sign * values[j % size] / (size * (math.sin(angle) if size % 2 else math.tan(angle)))
+                    sign = -sign
+                total += math.sin(math.pi * rest) * found
+            else:
+                for j in range(start, start + terms):
+                    found += sign * values[j] / (x - j)
+                    sign = -sign
+                total += math.sin(math.pi * rest) / math.pi * found
+        out[r] = max(total / within, 0.0)
+
+
+@kernel(
+    types.void(
+        types.float64[::1], types.float64[::1], types.float64[::1], types.float64, types.float64, types.int64, types.float64[::1]
+    )
+)
+def mixture_cells(weights: Array, means: Array, deviations: Array, low: float, cell: float, within: int, out: Array) -> None:
+    """Write the averages over cells of a sum of Gaussians, each by the recurrence of its values at equal distances.
+
+    Args:
+        weights: (k,).
+        means: (k,).
+        deviations: (k,) standard deviations.
+        low: the start of the first cell.
+        cell: the size of a cell.
+        within: number of points in a cell of which the average is that of the cell.
+        out: (count,), overwritten.
+    """
+    step = cell / within
+    last = len(out) * within - 1
+    out[:] = 0.0
+    for k in range(len(weights)):
+        scale, begin = step / deviations[k], low + 0.5 * step
+        middle = int(min(max(math.floor((means[k] - begin) / step + 0.5), 0.0), float(last)))
+        z = (begin + middle * step - means[k]) / deviations[k]
+        if abs(z) > _REACH:
+            continue
+        height = weights[k] / (deviations[k] * within * math.sqrt(2.0 * math.pi)) * math.exp(-0.5 * z * z)
+        reach = int(_REACH / scale) + 1
+        shrink = math.exp(-scale * scale)
+        for direction in (1, -1):
+            value = height
+            ratio = math.exp(-scale * (direction * z + 0.5 * scale))
+            at = middle
+            if direction < 0:
+                value, ratio, at = value * ratio, ratio * shrink, middle - 1
+            for _ in range(reach):
+                if at < 0 or at > last:
+                    break
+                out[at // within] += value
+                value *= ratio
+                ratio *= shrink
+                at += direction
