@@ -14,7 +14,7 @@ from zakai.numerics.compiled import kernel
 Array = NDArray[Any]
 
 _SEEN = 1e-6  # of the largest value of a density: what is below everywhere is outside of its window
-_SUMMED = 1e-13  # of the largest value on the grid: smaller terms change no digit of the interpolant that is drawn
+_SUMMED = 1e-10  # of the largest value on the grid: smaller terms change nothing that is drawn
 _REACH = 7.0  # standard deviations at which a Gaussian is below 1e-10 of its peak
 
 
@@ -27,8 +27,8 @@ def grid_cells(log_values: Array, closed: bool, count: int) -> tuple[float, floa
         count: number of cells.
 
     Returns:
-        The ends of the window that holds the mass, as indices of the grid, and the averages (count,), up to a factor.  On a circle
-        the window may go beyond the last index.
+        The ends of the window that holds the mass, as indices of the grid, and the averages (count,), up to a factor.  On a
+        circle the window may go beyond the last index.
     """
     values = np.exp(log_values - np.max(log_values))
     size = len(values)
@@ -43,8 +43,13 @@ def grid_cells(log_values: Array, closed: bool, count: int) -> tuple[float, floa
         low, high = max(seen[0] - 1.0, -0.5), min(seen[-1] + 1.0, size - 0.5)
         start, terms = int(summed[0]), int(summed[-1] - summed[0] + 1)
     within = max(1, math.ceil(2.0 * (high - low) / count))  # two points for each of the grid
-    out = np.empty(count)
-    _interpolate(np.ascontiguousarray(values), start, terms, closed, low, (high - low) / count, within, out)
+    out, cell = np.empty(count), (high - low) / count
+    signed = np.take(values, np.arange(start, start + terms), mode="wrap")
+    signed[1::2] *= -1.0
+    if closed:
+        _interpolate_on_circle(signed, size, start, low, cell, within, out)
+    else:
+        _interpolate(signed, start, low, cell, within, out)
     return low, high, out
 
 
@@ -57,39 +62,49 @@ def _arc(inside: Array) -> tuple[int, int]:
 
 
 @kernel(
-    types.void(
-        types.float64[::1], types.int64, types.int64, types.boolean, types.float64, types.float64, types.int64, types.float64[::1]
-    )
+    types.void(types.float64[::1], types.int64, types.float64, types.float64, types.int64, types.float64[::1]), reordered=True
 )
-def _interpolate(
-    values: Array, start: int, terms: int, closed: bool, low: float, cell: float, within: int, out: Array
-) -> None:
-    """Write the averages over cells of the sinc interpolant, on a circle of the trigonometric one, of `terms` values."""
-    size = len(values)
+def _interpolate(signed: Array, start: int, low: float, cell: float, within: int, out: Array) -> None:
+    """Write the averages over cells of the sinc interpolant of the values (-1)^i `signed`[i] at the points `start` + i."""
     for r in range(len(out)):
         total = 0.0
         for s in range(within):
-            x = low + cell * (r + (s + 0.5) / within)
+            x = low + cell * (r + (s + 0.5) / within) - start
             nearest = math.floor(x + 0.5)
             rest = x - nearest
+            sign = 1.0 if int(nearest) % 2 == 0 else -1.0
             if abs(rest) < 1e-12:
-                at = int(nearest)
-                total += values[at % size] if closed or 0 <= at < size else 0.0
+                total += sign * signed[int(nearest)] if 0 <= nearest < len(signed) else 0.0
                 continue
             found = 0.0
-            # sin(pi (x - j)) = sin(pi rest) (-1)^(nearest - j)
-            sign = 1.0 if (int(nearest) - start) % 2 == 0 else -1.0
-            if closed:
-                for j in range(start, start + terms):
-                    angle = math.pi * (x - j) / size
-                    found += sign * values[j % size] / (size * (math.sin(angle) if size % 2 else math.tan(angle)))
-                    sign = -sign
-                total += math.sin(math.pi * rest) * found
-            else:
-                for j in range(start, start + terms):
-                    found += sign * values[j] / (x - j)
-                    sign = -sign
-                total += math.sin(math.pi * rest) / math.pi * found
+            for i in range(len(signed)):
+                found += signed[i] / (x - i)
+            total += sign * math.sin(math.pi * rest) / math.pi * found  # sin(pi (x - i)) = sin(pi rest) (-1)^(nearest - i)
+        out[r] = max(total / within, 0.0)
+
+
+@kernel(
+    types.void(types.float64[::1], types.int64, types.int64, types.float64, types.float64, types.int64, types.float64[::1]),
+    reordered=True,
+)
+def _interpolate_on_circle(signed: Array, size: int, start: int, low: float, cell: float, within: int, out: Array) -> None:
+    """Write the averages over cells of the trigonometric interpolant of `size` values, of which those not given are zero."""
+    for r in range(len(out)):
+        total = 0.0
+        for s in range(within):
+            x = low + cell * (r + (s + 0.5) / within) - start
+            nearest = math.floor(x + 0.5)
+            rest = x - nearest
+            sign = 1.0 if int(nearest) % 2 == 0 else -1.0
+            if abs(rest) < 1e-12:
+                at = int(nearest) % size
+                total += signed[at] * (1.0 if at % 2 == 0 else -1.0) if at < len(signed) else 0.0
+                continue
+            found = 0.0
+            for i in range(len(signed)):
+                angle = math.pi * (x - i) / size
+                found += signed[i] / (math.sin(angle) if size % 2 else math.tan(angle))
+            total += sign * math.sin(math.pi * rest) / size * found
         out[r] = max(total / within, 0.0)
 
 

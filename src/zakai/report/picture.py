@@ -14,7 +14,7 @@ from zakai.densities._density import wrap
 from zakai.errors import InputError
 from zakai.records.dates import Clock
 from zakai.report import words
-from zakai.report.columns import ROWS, Column, column_of, point
+from zakai.report.columns import ROWS, columns_at
 from zakai.report.frames import pack
 from zakai.report.heatmap import circle_line, direct_observations, is_periodic, state_names, true_states
 from zakai.report.plots import thinned
@@ -55,15 +55,15 @@ def picture_bytes(
     variances = np.asarray(result.variance, dtype=float)[:, number]
     arrays: dict[str, np.ndarray] = {"times": times[index], "mean": means[index]}
     if kept:
-        drawn = [column_at(result, int(k), number, rows) for k in index]
-        peaks = np.array([column.density.max() for column in drawn])
-        finite = np.isfinite(peaks) & (peaks > 0)
-        arrays["low"] = np.where(finite, [column.low for column in drawn], means[index])
-        arrays["high"] = np.where(finite, [column.high for column in drawn], means[index])
-        arrays["peak"] = np.where(finite, peaks, 0.0)
-        shapes = np.stack([column.density for column in drawn]) / np.where(finite, peaks, 1.0)[:, None]
-        arrays["cells"] = np.round(_SCALE * np.nan_to_num(shapes)).astype(np.uint16)
-        quantiles = np.stack([column.quantile(LEVELS) for column in drawn], axis=1)
+        drawn = columns_at(result, index, number, rows)
+        peaks = drawn.density.max(axis=1)
+        finite = np.isfinite(peaks)
+        peaks = np.where(finite, peaks, 0.0)
+        arrays["low"], arrays["high"] = (np.where(finite, ends, means[index]) for ends in (drawn.low, drawn.high))
+        arrays["peak"] = peaks
+        shapes = drawn.density * (_SCALE / np.where(finite, peaks, 1.0))[:, None]
+        arrays["cells"] = np.rint(np.nan_to_num(shapes, copy=False)).astype(np.uint16)
+        quantiles = drawn.quantile(LEVELS)
     else:
         half = _NORMAL_QUANTILE * np.sqrt(np.maximum(variances[index], 0.0))
         half = np.minimum(half, np.pi) if periodic else half
@@ -122,14 +122,6 @@ class _Lines:
         names = [f"line{len(self.described)}.{part}" for part in ("times", "values")]
         self.arrays.update(zip(names, (times, values), strict=True))
         self.described.append({"role": role, "text": _TEXTS[role], "times": names[0], "values": names[1], "dots": dots})
-
-
-def column_at(result: Any, k: int, state: int, rows: int = ROWS) -> Column:
-    """Return the column of one state at time k of a result."""
-    mean, variance = float(np.asarray(result.mean)[k, state]), float(np.asarray(result.variance)[k, state])
-    if not variance > 0:  # a state that is known exactly, or a run that was lost, has no density to ask for
-        return point(mean if variance == 0 else np.nan, rows)
-    return column_of(result.density(k).marginal(state), rows)
 
 
 def chosen(times: np.ndarray, window: tuple[float, float] | None, columns: int) -> tuple[np.ndarray, np.ndarray]:
