@@ -14,16 +14,17 @@ from zakai.studio.server import Settings, Studio
 PORT = 8123
 HOST = f"127.0.0.1:{PORT}"
 ORIGIN = f"http://{HOST}"
-TYPES = {"f8": "<f8", "f4": "<f4", "u1": "u1", "i4": "<i4"}
 
 
 def unpacked(frame: bytes) -> dict[str, Any]:
     """The header of a frame, with its arrays in it."""
-    (length,) = struct.unpack_from("<I", frame)
-    header = json.loads(frame[4 : 4 + length])
-    for name, (kind, shape, offset) in header.pop("arrays").items():
-        count = int(np.prod(shape))
-        header[name] = np.frombuffer(frame, TYPES[kind], count, 4 + length + offset).reshape(shape)
+    assert frame[:4] == b"ZKF1"
+    (length,) = struct.unpack_from("<I", frame, 4)
+    header = json.loads(frame[8 : 8 + length])
+    for name, about in header.pop("arrays").items():
+        count = int(np.prod(about["shape"]))
+        found = np.frombuffer(frame, about["type"], count, 8 + length + about["offset"])
+        header[name] = found.reshape(about["shape"])
     return header
 
 

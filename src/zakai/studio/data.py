@@ -39,7 +39,8 @@ def given(model: Model, request: Mapping[str, Any], folder: Path) -> Given:
 
     Args:
         model: the system.
-        request: `{"kind": "simulate", "until", "step", "seed", "inputs"}` or `{"kind": "file", "file", "columns", "unit", "origin"}`.
+        request: `{"kind": "simulate", "until", "step", "seed", "inputs"}` or
+            `{"kind": "file", "file", "columns", "unit", "origin"}`.
         folder: where the files are that were given to the studio.
 
     Raises:
@@ -58,13 +59,13 @@ def given(model: Model, request: Mapping[str, Any], folder: Path) -> Given:
     if model.inputs:
         values = request.get("inputs") or {}
         row = [_number(values.get(name, 0), f"input {name}") for name in model.inputs]
-        inputs = Inputs([model.start], [row])
+        inputs = Inputs(np.array([model.start]), np.array([row]))
     truth, record = simulate(model, times, seed, inputs=inputs)
     return Given(record, truth, "simulated")
 
 
 def _of_file(model: Model, request: Mapping[str, Any], folder: Path) -> Given:
-    path, names = file_of(request, folder), None
+    path = file_of(request, folder)
     names = header_of(path)
     name = str(request.get("name") or "the record")[:80]
     wanted = request.get("columns") or _matched(model, names)

@@ -114,7 +114,8 @@ def _simulated(model: Any, wanted: Mapping[str, Any], record: Any) -> list[str]:
 
 
 def _embedded(model: Any, record: Any) -> list[str]:
-    rows = ["    [" + ", ".join(_number(value) for value in (time, *row)) + "]," for time, row in zip(record.times, record.values)]
+    table = np.column_stack([record.times, record.values]).tolist()
+    rows = ["    [" + ", ".join(map(repr, row)) + "]," for row in table]
     lines = ["nan = float('nan')", "rows = np.array([  # time, and what was observed", *rows, "])"]
     inputs = ""
     if record.inputs is not None:
@@ -127,10 +128,6 @@ def _from_file(wanted: Mapping[str, Any], name: str) -> list[str]:
     more = "".join(f", {key}={wanted[key]!r}" for key in ("unit", "origin") if wanted.get(key))
     columns = f", columns={list(wanted['columns'])!r}" if wanted.get("columns") else ""
     return [f"record = zakai.read_record({name!r}, model{more}{columns})  # the file that was given to the studio"]
-
-
-def _number(value: float) -> str:
-    return repr(float(value))
 
 
 def _literal(text: str) -> str:

@@ -130,7 +130,7 @@ def expected(session: Session, request: Mapping[str, Any], report: Report) -> An
 
 
 def algebra(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
-    """Return whether the estimation algebra is finite dimensional, with its basis and certificate, and the page of the analysis."""
+    """Return whether the estimation algebra is finite dimensional, with basis and certificate, and the page of the analysis."""
     from zakai.algebra.analysis import analyze
 
     analysis = analyze(session.model(request))

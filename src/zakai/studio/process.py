@@ -139,8 +139,8 @@ class Worker:
     def _why(self, code: int) -> str:
         if code in (-9, -11, -6):
             return (
-                f"the computation ended; it needed more memory than it may have ({self.memory:g} GiB): take a shorter record or a "
-                "larger tolerance, or start zakai studio with a larger --memory"
+                f"the computation ended; it needed more memory than it may have ({self.memory:g} GiB): take a shorter record or "
+                "a larger tolerance, or start zakai studio with a larger --memory"
             )
         return f"the computation ended unexpectedly (code {code}); press Run again, and if that does not help save the model file"
 

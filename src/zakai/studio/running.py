@@ -98,7 +98,7 @@ def picture(session: Session, request: Mapping[str, Any], report: Report) -> Ans
     """Return the density of one state over the times that are seen."""
     held = session.held(request)
     view = pictures.View.of(request)
-    return pictures.density_picture(held.result, state_of(held.result, request), held.truth, view)
+    return {}, pictures.density_picture(held.result, state_of(held.result, request), held.truth, view)
 
 
 def joint(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
@@ -120,9 +120,9 @@ def slide(session: Session, request: Mapping[str, Any], report: Report) -> Answe
     method, options = coarse(held.result, *method_of(request))
     part, record, whole = part_of(held, model, view)
     result = run_filter(part, record, method, **options)
-    header, arrays = pictures.density_picture(result, state_of(result, request), held.truth, view)
-    value = result.log_likelihood if whole else None
-    return {**header, "log_likelihood": value, "start": held.result.times[0], "end": held.result.times[-1]}, arrays
+    extent = float(held.result.times[0]), float(held.result.times[-1])
+    arrays = pictures.density_picture(result, state_of(result, request), held.truth, view, extent)
+    return {"log_likelihood": result.log_likelihood if whole else None}, arrays
 
 
 def coarse(result: Any, method: str, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
@@ -142,8 +142,9 @@ def part_of(held: Held, model: Model, view: pictures.View) -> tuple[Model, Recor
     Of a long record they begin a little before the view, with the density that the result has there.
     """
     record = held.given.record
-    stop = min(len(record), int(np.searchsorted(record.times, view.last)) + 1)
-    start = max(0, int(np.searchsorted(record.times, view.first)) - BEFORE)
+    first, last = view.window or (record.times[0], record.times[-1])
+    stop = min(len(record), int(np.searchsorted(record.times, last)) + 1)
+    start = max(0, int(np.searchsorted(record.times, first)) - BEFORE)
     result = held.result
     if stop <= WHOLE or start == 0 or record.kind == "path" or not result.has_densities:
         return model, rows_of(record, 0, stop), stop == len(record)

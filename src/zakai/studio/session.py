@@ -1,7 +1,7 @@
 """What the worker does for each request: one function for each word in `do`.
 
-A request names everything that it needs (the model's text, the record, the method), so that a new worker answers it as the old one
-would have; what was read or computed last is kept, by these texts.
+A request names everything that it needs (the model's text, the record, the method), so that a new worker answers it as the old
+one would have; what was read or computed last is kept, by these texts.
 """
 
 from __future__ import annotations

@@ -18,14 +18,14 @@ _TOKEN = re.compile(r'"""(?:.|\n)*?"""|\'\'\'(?:.|\n)*?\'\'\'|"(?:\\.|[^"\\\n])*
 
 
 class Place(NamedTuple):
-    """A part of a text: from one character to another, its line and column (from 1), and the key and the indices it belongs to."""
+    """A part of a text: its first character and the one after its last, line and column (from 1), and its key and indices."""
 
     start: int
     stop: int
     line: int
     column: int
     key: tuple[str, ...] = ()
-    index: tuple[int, ...] = ()
+    entry: tuple[int, ...] = ()
 
 
 def place_of_error(text: str, message: str) -> Place | None:
@@ -62,7 +62,7 @@ def _column_within(text: str, place: Place, rest: str) -> Place:
     if found is None or text[place.start : place.start + 1] not in ('"', "'"):
         return place
     start = min(place.start + int(found[1]), place.stop - 1)
-    return _place(text, start, max(start + 1, place.stop - 1))._replace(key=place.key, index=place.index)
+    return _place(text, start, max(start + 1, place.stop - 1))._replace(key=place.key, entry=place.entry)
 
 
 def place_of(text: str, key: tuple[str, ...], index: tuple[int, ...] = (), name: bool = False) -> Place | None:
@@ -79,9 +79,9 @@ def place_of(text: str, key: tuple[str, ...], index: tuple[int, ...] = (), name:
     entries = list(_entries(text, found.end()))
     for entry, start, stop in entries:
         if index and entry == index:
-            return _place(text, start, stop)._replace(key=key, index=index)
+            return _place(text, start, stop)._replace(key=key, entry=index)
     stop = entries[-1][2] if entries else _end_of_line(text, found.end())
-    return _place(text, found.end(), max(stop, found.end() + 1))._replace(key=key, index=index)
+    return _place(text, found.end(), max(stop, found.end() + 1))._replace(key=key, entry=index)
 
 
 def with_values(text: str, changes: Mapping[str, Any]) -> str:

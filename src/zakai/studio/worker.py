@@ -13,6 +13,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -56,7 +57,7 @@ def answer(session: Session, request: dict[str, Any], memory: float, report: Cal
         return packed({**head, "error": "the formulas are nested too deep; write them in a shorter form"})
     except Exception as error:
         what = " ".join(f"{type(error).__name__}: {error}".split())[:300]
-        return packed({**head, "error": f"this is a fault of zakai, not of the model ({what}); save the model file and report it"})
+        return packed({**head, "error": f"this is a fault of zakai, not of the model ({what}); save the model and report it"})
 
 
 def limit_memory(memory: float) -> None:
@@ -83,13 +84,14 @@ def main() -> None:
     for line in sys.stdin.buffer:
         request = json.loads(line)
         number = int(request["number"])
-
-        def report(done: int, total: int | None, number: int = number, given: Any = request.get("id")) -> None:
-            output.send(number, packed({"id": given, "do": "progress", "done": done, "total": total}), False)
-
+        report = partial(_report, output, number, request.get("id"))
         output.send(number, answer(session, request, memory, report), True)
         if request.get("do") in ("run", "smooth", "fit"):
             gc.collect()  # results hold one another
+
+
+def _report(output: Output, number: int, given: Any, done: int, total: int | None) -> None:
+    output.send(number, packed({"id": given, "do": "progress", "done": done, "total": total}), False)
 
 
 if __name__ == "__main__":
