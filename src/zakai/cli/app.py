@@ -214,6 +214,20 @@ def gallery(
 
 
 @app.command()
+def studio(
+    model: Annotated[str | None, typer.Argument(metavar="MODEL", help="A model file (TOML), or gallery:NAME.")] = None,
+    record: Annotated[str | None, typer.Argument(metavar="RECORD", help="The observations (CSV); - is standard input.")] = None,
+    port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="The port; by default a free one.")] = 0,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open no browser.")] = False,
+    memory: Annotated[float, typer.Option(metavar="GIB", min=1.0, help="The most memory that a computation may take.")] = 4.0,
+) -> None:
+    """Open a local page on which a model is written, a record is filtered, and the density is looked at."""
+    from zakai.cli import showing
+
+    showing.studio(model, record, port, not no_browser, memory)
+
+
+@app.command()
 def study(
     file: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="Which models, methods and seeds.")],
     folder: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="The results, or a study to continue.")],

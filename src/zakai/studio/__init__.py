@@ -1,0 +1,1 @@
+"""A local page on which a model is written, a record is filtered, and the density is looked at: `zakai studio`."""

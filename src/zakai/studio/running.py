@@ -1,0 +1,163 @@
+"""Tasks that filter, and that look at a result."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from zakai import _registry
+from zakai.engine.driver import filter as run_filter
+from zakai.errors import InputError
+from zakai.models.model import Model
+from zakai.records import Record
+from zakai.report import words
+from zakai.studio import pictures
+from zakai.studio.session import Answer, Held, Report, Session, state_of
+
+COARSE = 1e-2  # tolerance while a slider is dragged
+WHOLE = 3_000  # rows that are filtered from the start while a slider is dragged; of more, those that are seen
+BEFORE = 200  # rows before the first that is seen, in which the start of a part is forgotten
+MOST_PAIRS = 45
+
+
+def run(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
+    """Filter a record, keep the result under its name, and return what there is to say about it."""
+    model = session.model(request)
+    found = session.given(model, request)
+    method, options = method_of(request)
+    result = run_filter(model, found.record, method, progress=report, **options)
+    held = Held(result, found.truth, found)
+    session.keep(str(request.get("name") or "main"), held)
+    return summary(held), {}
+
+
+def method_of(request: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Return the method that a request names, and its options: numbers, true, false and texts."""
+    options: dict[str, Any] = {}
+    for key, value in (request.get("options") or {}).items():
+        if key in ("model", "record", "method", "keep", "progress", "inputs"):
+            raise InputError(f"{key}: is not an option of a method")
+        if value not in (None, ""):
+            options[str(key)] = _value(value)
+    return str(request.get("method") or "auto"), options
+
+
+def _value(value: Any) -> Any:
+    if not isinstance(value, str):
+        return value
+    for kind in (int, float):
+        try:
+            return kind(value)
+        except ValueError:
+            continue
+    return {"true": True, "false": False, "none": None}.get(value.lower(), value)
+
+
+def summary(held: Held) -> dict[str, Any]:
+    """Return a result in figures and words."""
+    result = held.result
+    health = []
+    for name, figures in result.health.items():
+        bound = words.health_bound(result, name)
+        health.append(
+            {
+                "name": words.spoken(name),
+                "about": words.health_words(result, name),
+                "span": words.health_span(figures),
+                "bound": bound,
+            }
+        )
+    count = len(result.times) - 1
+    names = list(result.state)
+    error = result.log_likelihood_standard_error
+    return {
+        "method": result.method,
+        "why": result.why,
+        "kind": words.kind_of(result),
+        "verdict": words.verdict(result),
+        "warnings": list(result.warnings),
+        "log_likelihood": result.log_likelihood,
+        "log_likelihood_error": error,
+        "observations": count,
+        "states": names,
+        "pairs": list(itertools.islice(itertools.combinations(names, 2), MOST_PAIRS)),
+        "first": float(result.times[0]),
+        "last": float(result.times[-1]),
+        "health": health,
+        "densities": result.has_densities,
+        "unit": None if result.clock is None else result.clock.unit,
+        "origin": None if result.clock is None else str(result.clock.origin)[:19],
+        "truth": held.truth is not None,
+    }
+
+
+def picture(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
+    """Return the density of one state over the times that are seen."""
+    held = session.held(request)
+    view = pictures.View.of(request)
+    return {}, pictures.density_picture(held.result, state_of(held.result, request), held.truth, view)
+
+
+def joint(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
+    """Return the density of two states at the time nearest to one that is given."""
+    held = session.held(request)
+    result = held.result
+    pair = state_of(result, request, "across"), state_of(result, request, "up")
+    if pair[0] == pair[1]:
+        raise InputError("two states: choose two different ones")
+    k = int(np.argmin(np.abs(result.times - float(request.get("time") or 0.0))))
+    return pictures.joint_picture(result, pair, k)
+
+
+def slide(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
+    """Filter what is seen with other values of the parameters, coarsely, and return its picture."""
+    held = session.held(request)
+    model = session.model(request)
+    view = pictures.View.of(request)
+    method, options = coarse(held.result, *method_of(request))
+    part, record, whole = part_of(held, model, view)
+    result = run_filter(part, record, method, **options)
+    extent = float(held.result.times[0]), float(held.result.times[-1])
+    arrays = pictures.density_picture(result, state_of(result, request), held.truth, view, extent)
+    return {"log_likelihood": result.log_likelihood if whole else None}, arrays
+
+
+def coarse(result: Any, method: str, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Return the method of a result, so that none is looked for, and a coarse tolerance where it has one."""
+    if method == "auto" and result.method in _registry.METHODS:
+        method = result.method
+    names = [method] if method in _registry.METHODS else [block.method for block in result.blocks]
+    if any("tolerance" in _registry.load(name).options for name in names if name in _registry.METHODS):
+        given = options.get("tolerance")
+        options = {**options, "tolerance": max(COARSE, given) if isinstance(given, float) else COARSE}
+    return method, options
+
+
+def part_of(held: Held, model: Model, view: pictures.View) -> tuple[Model, Record, bool]:
+    """Return the model and the rows up to the end of a view, and whether these are all.
+
+    Of a long record they begin a little before the view, with the density that the result has there.
+    """
+    record = held.given.record
+    first, last = view.window or (record.times[0], record.times[-1])
+    stop = min(len(record), int(np.searchsorted(record.times, last)) + 1)
+    start = max(0, int(np.searchsorted(record.times, first)) - BEFORE)
+    result = held.result
+    if stop <= WHOLE or start == 0 or record.kind == "path" or not result.has_densities:
+        return model, rows_of(record, 0, stop), stop == len(record)
+    later = model.with_prior(result.density(start), start=float(result.times[start]))
+    return later, rows_of(record, start, min(stop, start + BEFORE + WHOLE)), False
+
+
+def rows_of(record: Record, start: int, stop: int) -> Record:
+    """Return some rows of a record, with its inputs."""
+    if start == 0 and stop == len(record):
+        return record
+    clock = {} if record.clock is None else record.clock._asdict()
+    return Record(record.times[start:stop], record.values[start:stop], record.kind, record.inputs, **clock)
+
+
+TASKS: dict[str, Callable[..., Answer]] = {"run": run, "picture": picture, "joint": joint, "slide": slide}

@@ -1,0 +1,172 @@
+// The record: simulated, or a CSV whose columns are chosen; what it holds, its gaps and its unit of time.
+
+import { byId, counted, debounced, field, h, number, segments } from "./dom.js";
+import { upload } from "./link.js";
+import { LinePanel } from "./panels.js";
+
+const LARGEST = 64 << 20;
+const UNITS = ["", "ns", "us", "ms", "s", "min", "h", "d"];
+
+export class Data {
+  constructor(studio) {
+    this.studio = studio;
+    this.file = null; // what the file that was dropped holds
+    this.describe = debounced(() => this._describe(), 150);
+    this.body = byId("data-body");
+    this.facts = h("p", { class: "small", "data-testid": "data-facts" });
+    this.fault = h("p", { class: "fault", role: "alert", "data-testid": "data-error", hidden: true });
+    this.sketch = h("div", { class: "sketch" });
+    this.dropped();
+  }
+
+  /** Return how a record is simulated where nothing was said. */
+  simulated(text) {
+    const samples = /observation_kind\s*=\s*"samples"/.test(text);
+    return { kind: "simulate", until: samples ? 20 : 10, step: samples ? 0.1 : 0.02, seed: 1 };
+  }
+
+  dropped() {
+    const stop = (event) => { event.preventDefault(); document.body.classList.toggle("dropping", event.type === "dragover"); };
+    for (const name of ["dragover", "dragleave"]) document.addEventListener(name, stop);
+    document.addEventListener("drop", (event) => {
+      stop(event);
+      const file = event.dataTransfer?.files?.[0];
+      if (file) this.take(file);
+    });
+  }
+
+  draw() {
+    const { data } = this.studio.state, simulate = data.kind !== "file";
+    const kinds = h("div", { class: "segments", role: "group", "aria-label": "Where the record comes from" });
+    segments(kinds, [{ value: "simulate", text: "Simulate", testid: "data-simulate" }, { value: "file", text: "File", testid: "data-file" }], data.kind, (kind) => {
+      this.studio.state.data = kind === "simulate" ? this.simulated(this.studio.state.text) : this.file ? { kind, ...this.file } : { kind };
+      this.draw();
+      if (kind === "simulate" || this.file) this.changed();
+    });
+    this.columns = h("div", {});
+    this.body.replaceChildren(kinds, simulate ? this._simulation(data) : this._upload(data), this.fault, this.sketch, this.facts);
+    this.facts.textContent = "";
+    if (!simulate && data.file) this._columns();
+  }
+
+  _simulation(data) {
+    const box = (key, label, hint) => field(label, h("input", { type: "number", step: "any", value: String(data[key]), "data-testid": `simulate-${key}`, onchange: ({ target }) => {
+      this.studio.state.data = { ...this.studio.state.data, [key]: key === "seed" ? Math.max(0, Math.round(Number(target.value) || 0)) : Number(target.value) };
+      this.changed();
+    } }), hint);
+    const inputs = (this.studio.model?.inputs ?? []).map((name) => field(`input ${name}`, h("input", { type: "number", step: "any", value: String(data.inputs?.[name] ?? 0), onchange: ({ target }) => {
+      this.studio.state.data = { ...this.studio.state.data, inputs: { ...data.inputs, [name]: Number(target.value) } };
+      this.changed();
+    } })));
+    return h("div", { class: "fields" }, box("until", "Until"), box("step", "Step"), box("seed", "Seed"), inputs);
+  }
+
+  _upload(data) {
+    const input = h("input", { type: "file", accept: ".csv,.txt,.tsv,text/csv", "data-testid": "record-file", id: "record-file", class: "file", onchange: ({ target }) => target.files[0] && this.take(target.files[0]) });
+    return h("div", {}, h("label", { class: "drop", for: "record-file" }, data.name ? h("strong", {}, data.name) : "Drop a CSV file here, or choose one",
+      h("small", {}, "first column time, then what was observed; at most 64 MiB and a million rows")), input, this.columns);
+  }
+
+  async take(file) {
+    this.fault.hidden = true;
+    try {
+      const found = await upload(file, LARGEST);
+      this.file = { file: found.file, name: file.name };
+      this.studio.state.data = { kind: "file", ...this.file };
+      this.draw();
+      await this._columns(true);
+    } catch (error) {
+      if (this.studio.state.data.kind !== "file") { this.studio.state.data = { kind: "file" }; this.draw(); }
+      this.wrong(error.message);
+    }
+  }
+
+  wrong(message) {
+    this.fault.textContent = message;
+    this.fault.hidden = false;
+    this.facts.textContent = "";
+    byId("data-said").textContent = "has an error";
+    byId("data-said").classList.add("fault");
+  }
+
+  async _columns(fresh = false) {
+    const { data } = this.studio.state;
+    let found;
+    try {
+      found = await this.studio.ask("columns", data, { quiet: true });
+    } catch (error) { this.wrong(error.message); return; }
+    if (!found) return;
+    this.found = found;
+    if (found.dated && !data.unit) this.studio.state.data = { ...data, unit: "h" };
+    this._mapping();
+    this.changed(fresh);
+  }
+
+  _mapping() {
+    const { found } = this, { model, state: { data } } = this.studio;
+    if (!found || !model || data.kind !== "file") return;
+    const names = found.columns.slice(1), matched = model.observations.every((name) => names.includes(name));
+    const free = names.filter((name) => !model.inputs.includes(name));
+    const columns = data.columns?.length === model.observations.length ? data.columns : model.observations.map((name, j) => (matched ? name : free[j] ?? names[0]));
+    const inputs = data.inputs?.length === model.inputs.length ? data.inputs : model.inputs.map((name) => (names.includes(name) ? name : names[names.length - 1]));
+    this.studio.state.data = { ...data, columns, inputs };
+    const choose = (what, chosen, key, j) => field(what, h("select", { "data-testid": `column-${what.split(" ").pop()}`, onchange: ({ target }) => {
+      const list = [...this.studio.state.data[key]];
+      list[j] = target.value;
+      this.studio.state.data = { ...this.studio.state.data, [key]: list };
+      this.changed();
+    } }, names.map((name) => h("option", { value: name, selected: name === chosen }, name))));
+    const unit = field("Unit of time", h("select", { onchange: ({ target }) => { this.studio.state.data = { ...this.studio.state.data, unit: target.value || undefined }; this.changed(); } },
+      UNITS.map((name) => h("option", { value: name, selected: name === (data.unit ?? this.studio.state.data.unit ?? "") }, name || "numbers"))), found.dated ? "of the model; the file has dates" : "");
+    this.columns.replaceChildren(h("div", { class: "fields" },
+      columns.map((name, j) => choose(`observation ${model.observations[j]}`, name, "columns", j)),
+      inputs.map((name, j) => choose(`input ${model.inputs[j]}`, name, "inputs", j)), unit),
+      h("div", { class: "scroll" }, h("table", { class: "preview" }, h("thead", {}, h("tr", {}, found.columns.map((name) => h("th", {}, name)))),
+        h("tbody", {}, found.rows.slice(0, 3).map((row) => h("tr", {}, row.map((cell) => h("td", {}, cell || "–"))))))));
+  }
+
+  /** The model is another one: other observations and inputs. */
+  modelled() {
+    const { data } = this.studio.state;
+    if (data.kind === "file") this._mapping();
+    else if (!this.body.contains(document.activeElement)) this.draw();
+  }
+
+  /** Another record: describe it and filter it. */
+  async changed(run = true) {
+    this.studio.remember();
+    if (await this._describe() && run) this.studio.run();
+  }
+
+  async _describe() {
+    const { studio } = this, { text, data } = studio.state;
+    if (!studio.model || (data.kind === "file" && !data.file)) return false;
+    let found;
+    try {
+      found = await studio.ask("describe", { text, data }, { quiet: true });
+    } catch (error) { this.wrong(error.message); return false; }
+    if (!found) return false;
+    this.fault.hidden = true;
+    byId("data-said").classList.remove("fault");
+    byId("data-said").textContent = `${found.name}, ${counted(found.rows, "row")}`;
+    const missing = found.names.map((name, j) => [name, found.missing[j]]).filter(([, count]) => count);
+    const unit = found.unit ? ` ${found.unit}` : "";
+    this.facts.textContent = [
+      `${counted(found.rows, "row")}, times ${number(found.first, 6)} to ${number(found.last, 6)}${unit}`,
+      found.irregular ? `irregular: every ${number(found.step, 3)}${unit} at the median, longest gap ${number(found.longest, 3)}${unit}` : found.step ? `one every ${number(found.step, 3)}${unit}` : "",
+      missing.length ? `not observed: ${missing.map(([name, count]) => `${name} in ${counted(count, "row")}`).join(", ")}` : "no gaps",
+      found.origin ? `t = 0 at ${found.origin.replace("T", " ")}` : "",
+    ].filter(Boolean).join(" · ");
+    this._sketch(found);
+    return true;
+  }
+
+  _sketch({ arrays, names, kind }) {
+    const { times, values } = arrays, m = names.length;
+    if (!this.panel) this.panel = new LinePanel(this.sketch, { label: "The record", height: 130 });
+    if (!this.sketch.isConnected) return;
+    const colours = ["series", "truth", "band", "faint"];
+    const series = names.slice(0, 4).map((name, j) => ({ role: `y${j}`, text: name, x: times, y: Float32Array.from({ length: times.length }, (_, k) => values[k * m + j]), dots: true, colour: colours[j] }));
+    this.panel.show({ x: { title: "" }, y: { title: m === 1 ? names[0] : kind }, series });
+  }
+}

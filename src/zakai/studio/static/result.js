@@ -1,0 +1,107 @@
+// The density over time, with the words about it: the largest part of the page.
+
+import { DensityView } from "./density.js";
+import { byId, counted, h, number, segments } from "./dom.js";
+
+const NAMES = { main: "Filtered", smooth: "Smoothed", forecast: "Forecast", live: "Live" };
+
+export class Result {
+  constructor(studio) {
+    this.studio = studio;
+    this.name = "main";
+    this.available = new Map();
+    this.view = new DensityView(byId("picture"), { testid: "density", height: pictureHeight(), onViewChange: (seen) => this._seen(seen) });
+    byId("coordinate").addEventListener("change", ({ target }) => {
+      studio.state.coordinate = target.value;
+      studio.remember();
+      this.picture();
+    });
+  }
+
+  get states() { return this.available.get(this.name)?.states ?? []; }
+
+  get coordinate() {
+    const wanted = this.studio.state.coordinate;
+    return this.states.includes(wanted) ? wanted : this.states[0];
+  }
+
+  /** A run has ended. */
+  async filtered(summary) {
+    this.available = new Map([["main", summary]]);
+    this.name = "main";
+    await this.show();
+    this.studio.say(`Filtered ${counted(summary.observations, "observation")} with ${summary.method}.`);
+  }
+
+  /** Another result is there, or another one is to be seen. */
+  async show(name = this.name, summary = null) {
+    if (summary) this.available.set(name, summary);
+    this.name = name;
+    const found = this.available.get(name);
+    const select = byId("coordinate");
+    select.replaceChildren(...found.states.map((state) => h("option", { value: state, selected: state === this.coordinate }, state)));
+    byId("coordinate-label").hidden = found.states.length < 2;
+    this._buttons();
+    this.words(found);
+    await this.picture();
+  }
+
+  _buttons() {
+    const options = ["main", "smooth", "forecast", "live"].filter((name) => this.available.has(name) || name === "smooth" || name === "forecast")
+      .map((name) => ({ value: name, text: NAMES[name], testid: `show-${name}` }));
+    segments(byId("shown"), options, this.name, (name) => this._choose(name));
+  }
+
+  async _choose(name) {
+    if (this.available.has(name)) { await this.show(name); return; }
+    const { studio } = this;
+    if (studio.running) return;
+    if (name === "smooth") {
+      studio.busy(true, "Smoothing …");
+      const found = await studio.ask("smooth", { ...studio.request, name }, { progress: (done, total) => studio.progressed(done, total) });
+      studio.busy(false);
+      if (!found) return;
+      studio.say("Smoothed: each density is given all observations, earlier and later.");
+      await this.show(name, found);
+    } else {
+      const main = this.available.get("main"), length = (main.last - main.first) / 5;
+      const found = await studio.ask("forecast", { of: "main", until: main.last + length, step: length / 100, name });
+      if (!found) return;
+      studio.say(`Forecast: ${number(length)} beyond the end of the record, without observations.`);
+      await this.show(name, found);
+    }
+  }
+
+  /** Ask for what can be seen. */
+  async picture(window = {}) {
+    const { name, coordinate } = this, columns = Math.round(Math.min(1000, Math.max(200, byId("picture").clientWidth)));
+    const found = await this.studio.ask("picture", { name, state: coordinate, columns, ...window }, { channel: "picture" });
+    if (!found) return;
+    this.view.setFrame(found.arrays.frame);
+    byId("picture").dataset.shown = name;
+  }
+
+  _seen({ wanted }) {
+    if (wanted) this.picture(wanted);
+  }
+
+  /** The part that is seen, for a slider. */
+  seen() {
+    const view = this.view.view && this.view.state();
+    return view ? { from: view.from, to: view.to, width: view.width } : { width: 600 };
+  }
+
+  words(found) {
+    byId("verdict").textContent = found.verdict;
+    const facts = [
+      ["log-likelihood", number(found.log_likelihood, 7) + (found.log_likelihood_error ? ` ± ${number(found.log_likelihood_error, 2)}` : "")],
+      ["method", found.method], ["observations", found.observations.toLocaleString("en")], ["states", String(found.states.length)],
+    ];
+    byId("facts").replaceChildren(...facts.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", { "data-testid": `fact-${name}` }, value))));
+    const notes = [...found.warnings, ...(found.notes ?? [])], box = byId("warnings");
+    box.hidden = !notes.length;
+    box.replaceChildren(...(notes.length ? [h("h3", {}, notes.length === 1 ? "A warning" : "Warnings"), h("ul", {}, notes.map((note) => h("li", {}, note)))] : []));
+  }
+}
+
+const pictureHeight = () => Math.round(Math.min(520, Math.max(280, 0.46 * window.innerHeight)));
