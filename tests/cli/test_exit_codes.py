@@ -86,7 +86,7 @@ def test_a_report_needs_no_extra(zakai, tmp_path, monkeypatch):
 
 
 def test_warnings_go_to_stderr_and_the_code_is_0(zakai, monkeypatch):
-    monkeypatch.setattr("zakai.engine.run_result.warnings_of_run", lambda result: ["the sky is falling"])
+    monkeypatch.setattr("zakai.engine.loop.warnings_of_run", lambda *_: ["the sky is falling"])
     answer = zakai("filter", "model.toml", "record.csv", "-o", "result.nc")
     assert answer.code == 0 and answer.err == "warning: the sky is falling\n"
 
