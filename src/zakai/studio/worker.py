@@ -45,7 +45,9 @@ def answer(session: Session, request: dict[str, Any], memory: float, report: Cal
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("ignore")
             warnings.simplefilter("always", UserWarning)
-            header, arrays = session.answer(request, report)
+            from zakai.studio import tasks  # with the first request, so that a worker starts at once
+
+            header, arrays = tasks.answer(session, request, report)
         notes = list(dict.fromkeys(str(one.message) for one in caught if one.category is UserWarning))
         return packed({**head, "notes": notes, **header}, arrays)
     except ZakaiError as error:
