@@ -11,14 +11,14 @@ from typing import NamedTuple
 import zakai
 
 # A file imports files of its own folder, and of those before it in this list; imports inside functions count.
-FOLDERS = """
-    densities models algebra
-    numerics numerics/sums numerics/gaussian numerics/line numerics/series numerics/space numerics/particles numerics/trains
-    records simulation
-    methods methods/system methods/gaussian methods/gaussian/extended methods/sums methods/yau methods/line methods/reflecting
-    methods/space methods/grid methods/particles methods/frame methods/series
-    notes engine diagnostics inference peers studies report studio cli
-""".split()
+FOLDERS = [
+    *("densities", "models", "algebra"),
+    *("numerics", "numerics/sums", "numerics/gaussian", "numerics/line", "numerics/series", "numerics/space"),
+    *("numerics/particles", "numerics/trains", "records", "simulation"),
+    *("methods", "methods/system", "methods/gaussian", "methods/gaussian/extended", "methods/sums", "methods/yau"),
+    *("methods/line", "methods/reflecting", "methods/space", "methods/grid", "methods/particles", "methods/frame"),
+    *("methods/series", "notes", "engine", "diagnostics", "inference", "peers", "studies", "report", "studio", "cli"),
+]
 EVERYWHERE = {"errors", "_display", "_progress", "_registry"}
 SOURCE = Path(zakai.__file__).parent
 # What a public object offers and a later module makes from it: imported when it is asked for, by a method of this name.
