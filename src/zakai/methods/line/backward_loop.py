@@ -120,7 +120,7 @@ def _on_one_grid(
         logs = log_likelihoods(prepared, here, observed, window.origin + ends[:, None] + window.spacing * lw.index(window.size))
         message, steps = _on(later, window, start, now), prepared.steps.part(here)
         observed = np.ascontiguousarray(observed, float)
-        completed = by_adjoints(message, filtered, table, logs, steps, observed, window.closed, limits)
+        completed = by_adjoints(message, filtered, table, steps, lb.Observed(logs, observed, window.closed), limits)
     else:
         lengths = np.ascontiguousarray(prepared.lengths[here])
         longer = _longer(prepared, window, stride, float(np.max(lengths)))
