@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zakai.errors import InputError
 from zakai.report.axes import joint_map
 from zakai.report.frames import pack, unpack
 from zakai.report.picture import picture_bytes
@@ -25,11 +26,13 @@ class View(NamedTuple):
     @classmethod
     def of(cls, request: Mapping[str, Any]) -> View:
         """Return the view that a request names; what it leaves out is everything."""
-        ends = [request.get(key) for key in ("from", "to")]
-        window = None if None in ends else (float(ends[0]), float(ends[1]))  # type: ignore[arg-type]
-        columns = int(np.clip(int(request.get("columns") or cls._field_defaults["columns"]), 2, MOST_COLUMNS))
-        rows = int(np.clip(int(request.get("rows") or cls._field_defaults["rows"]), 8, MOST_ROWS))
-        return cls(window, columns, rows)
+        wanted = {key: request.get(key) for key in ("from", "to", "columns", "rows")}
+        if not all(value is None or isinstance(value, int | float) for value in wanted.values()):
+            raise InputError("the view of the picture is not in numbers; reload the page")
+        begin, end = wanted["from"], wanted["to"]
+        columns = int(np.clip(wanted["columns"] or cls._field_defaults["columns"], 2, MOST_COLUMNS))
+        rows = int(np.clip(wanted["rows"] or cls._field_defaults["rows"], 8, MOST_ROWS))
+        return cls(None if begin is None or end is None else (float(begin), float(end)), columns, rows)
 
 
 def density_picture(result: Any, state: int, truth: Any, view: View, extent: Any = None) -> Arrays:

@@ -108,7 +108,8 @@ def joint(session: Session, request: Mapping[str, Any], report: Report) -> Answe
     pair = state_of(result, request, "across"), state_of(result, request, "up")
     if pair[0] == pair[1]:
         raise InputError("two states: choose two different ones")
-    k = int(np.argmin(np.abs(result.times - float(request.get("time") or 0.0))))
+    time = request.get("time")
+    k = int(np.argmin(np.abs(result.times - time))) if isinstance(time, int | float) else len(result.times) - 1
     return pictures.joint_picture(result, pair, k)
 
 

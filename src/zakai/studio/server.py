@@ -143,7 +143,7 @@ class Studio:
                 await older.send_text(json.dumps({"do": "replaced"}))
                 await older.close(4001)
         await self.stop_following()
-        await asyncio.gather(self.quick.cancel(), self.runner.cancel())
+        await asyncio.gather(self.quick.abandon(), self.runner.abandon())
         await socket.send_text(json.dumps(self._hello()))
         try:
             while True:

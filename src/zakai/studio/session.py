@@ -79,9 +79,7 @@ class Session:
         # A simulated record stays that of the text while parameters are changed.
         base = self.model({"text": request["text"]})
         key = (str(request["text"]), json.dumps(wanted, sort_keys=True))
-        return _kept(
-            self.records, key, KEPT_RECORDS, lambda: data.given(base if simulated else model, wanted, self.folder)
-        )
+        return _kept(self.records, key, KEPT_RECORDS, lambda: data.given(base if simulated else model, wanted, self.folder))
 
     def held(self, request: Mapping[str, Any], key: str = "name") -> Held:
         """Return the result that a request names."""

@@ -81,6 +81,7 @@ def main() -> None:
     output = Output(os.fdopen(os.dup(1), "wb"))
     os.dup2(2, 1)  # what a library prints does not get between the frames
     session = Session(folder)
+    _load()
     for line in sys.stdin.buffer:
         request = json.loads(line)
         number = int(request["number"])
@@ -88,6 +89,12 @@ def main() -> None:
         output.send(number, answer(session, request, memory, report), True)
         if request.get("do") in ("run", "smooth", "fit"):
             gc.collect()  # results hold one another
+
+
+def _load() -> None:
+    """Import what every page needs, while it is still being opened."""
+    from zakai.report import equations  # noqa: F401
+    from zakai.studio import inspecting, running  # noqa: F401
 
 
 def _report(output: Output, number: int, given: Any, done: int, total: int | None) -> None:
