@@ -1,4 +1,4 @@
-"""A package of zakai imports only packages to its left, and only `peers` imports JAX."""
+"""A folder of zakai imports only folders before it, no file imports itself in a circle, and only `peers` imports JAX."""
 
 from __future__ import annotations
 
@@ -6,102 +6,107 @@ import ast
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import zakai
 
-PACKAGES = ["densities", "models", "algebra", "numerics", "records", "methods", "engine", "peers", "studies", "report", "cli"]
+# A file imports files of its own folder, and of those before it in this list; imports inside functions count.
+FOLDERS = """
+    densities models algebra
+    numerics numerics/sums numerics/gaussian numerics/line numerics/series numerics/space numerics/particles numerics/trains
+    records simulation
+    methods methods/system methods/gaussian methods/gaussian/extended methods/sums methods/yau methods/line methods/reflecting
+    methods/space methods/grid methods/particles methods/frame methods/series
+    notes engine diagnostics inference peers studies report cli
+""".split()
 EVERYWHERE = {"errors", "_display", "_progress", "_registry"}
 SOURCE = Path(zakai.__file__).parent
-# Simulating makes a record, which belongs to a later package; imported inside functions, so that there is no circle.
-# What a user plots or reports is drawn by a later package.
-LAZILY = {
-    ("models/simulate.py", "records"),
-    ("engine/results.py", "report"),
-    ("densities/_density.py", "report"),
-    ("densities/_density.py", "records"),
-    ("engine/fit.py", "report"),
-    ("algebra/analysis.py", "report"),
+# What a public object offers and a later module makes from it: imported when it is asked for, by a method of this name.
+ENTRIES = {
+    ("densities/_density.py", "plot"): "zakai.report.axes",
+    ("densities/_density.py", "save"): "zakai.records.density_files",
+    ("algebra/analysis.py", "plot"): "zakai.report.axes",
+    ("engine/results.py", "plot"): "zakai.report.axes",
+    ("engine/results.py", "report"): "zakai.report",
+    ("engine/results.py", "residuals"): "zakai.diagnostics.residuals",
+    ("engine/results.py", "predict_observations"): "zakai.diagnostics.observed_ahead",
+    ("inference/fit.py", "plot"): "zakai.report.axes",
 }
 # The registry at the root imports every package by name; no import of a package stands in it.
 FILES = sorted(path.relative_to(SOURCE).as_posix() for path in SOURCE.rglob("*.py") if path.parent != SOURCE)
 JAX = {"jax", "jaxlib", "cuthbert", "cuthbertlib", "dynamax", "tensorflow_probability"}
 # Inside functions, for what a caller who uses JAX passes: a key, or the parameters under `jax.grad`.
-WHERE_JAX_IS_LOADED = {"densities/_density.py", "engine/likelihood.py", "engine/likelihood_in_jax.py", "engine/bayes.py"}
-KNOWS_NO_MODEL = {"models", "algebra", "densities", "records", "methods", "engine"}  # what numerics/ may not import
+WHERE_JAX_IS_LOADED = {"densities/_values.py", "engine/likelihood.py", "engine/likelihood_in_jax.py", "inference/bayes.py"}
+KNOWS_NO_MODEL = {"models", "algebra", "densities", "records", "methods", "notes", "engine"}  # what numerics/ may not import
+
+
+class Import(NamedTuple):
+    """A dotted name; whether it is imported with the file; and the function that imports it, "" outside of functions."""
+
+    name: str
+    at_top: bool
+    function: str = ""
 
 
 @cache
-def imports(file: str) -> list[tuple[str, bool]]:
-    """(dotted name, whether it is imported with the file) for each import of a file."""
-    return list(_imports(file))
+def imports(file: str) -> list[Import]:
+    """Return each import of a file but those for the type checker."""
+    return list(_imports(ast.parse((SOURCE / file).read_text()), file))
 
 
-def _imports(file: str) -> Iterator[tuple[str, bool]]:
-    tree = ast.parse((SOURCE / file).read_text())
-    skipped: set[ast.AST] = set()
-    inside: set[ast.AST] = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            skipped |= {below for statement in node.body for below in ast.walk(statement)}
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            inside |= set(ast.walk(node))
-    for node in ast.walk(tree):
-        if node in skipped:
+def _imports(node: ast.AST, file: str, function: str = "") -> Iterator[Import]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
             continue
-        if isinstance(node, ast.Import):
-            yield from ((alias.name, node not in inside) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{file}: a relative import"
-            whole = node.module == "zakai"
-            names = [f"zakai.{alias.name}" for alias in node.names] if whole else [str(node.module)]
-            yield from ((name, node not in inside) for name in names)
+        if isinstance(child, ast.Import):
+            yield from (Import(alias.name, not function, function) for alias in child.names)
+        elif isinstance(child, ast.ImportFrom):
+            assert child.level == 0, f"{file}: a relative import"
+            for alias in child.names:
+                whole = f"{child.module}.{alias.name}"
+                yield Import(whole if child.module == "zakai" or is_module(whole) else str(child.module), not function, function)
+        inner = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef)
+        yield from _imports(child, file, child.name if inner and not function else function)
 
 
-def faults(file: str, found: Iterable[tuple[str, bool]]) -> list[str]:
-    """The imports of a file that the order of the packages does not allow."""
-    package = file.partition("/")[0]
-    allowed = set(PACKAGES[: PACKAGES.index(package) + 1]) | EVERYWHERE
-    if package == "cli":
-        allowed.add("__version__")
-    said = []
-    for name, at_the_top in found:
-        root, _, rest = name.partition(".")
-        target = rest.partition(".")[0]
-        if root != "zakai" or target in allowed or (not target and package == "cli"):
-            continue
-        if (file, target) in LAZILY and not at_the_top:
-            continue
-        said.append(f"{file} imports {name}")
-    return said
+@cache
+def is_module(name: str) -> bool:
+    """Return whether a dotted name is a file or a folder of zakai."""
+    root, *rest = name.split(".")
+    path = SOURCE.joinpath(*rest)
+    return root == "zakai" and (path.is_dir() or path.with_suffix(".py").is_file())
 
 
-# What a method of an object needs when it is called: it is written in a later module, which imports the object's.
-CALLED = {
-    "densities/_density.py": {"zakai.report.axes", "zakai.records.density_files", "zakai.densities.region"},
-    "engine/results.py": {
-        "zakai.report",
-        "zakai.report.axes",
-        "zakai.engine.forecast",
-        "zakai.engine.observed_ahead",
-        "zakai.engine.residuals",
-        "zakai.engine.stored",
-    },
-    # The parts of one method.
-    "methods/space/filter.py": {"zakai.methods.space.direct", "zakai.methods.space.kolmogorov"},
-    "methods/line/system.py": {"zakai.methods.line.parts", "zakai.methods.line.steps"},
-}
+def folder_of(name: str) -> str:
+    """Return the folder of a module, as in `FOLDERS`; the name of a file at the root."""
+    path = SOURCE.joinpath(*name.split(".")[1:])
+    folder = path.parent if path.with_suffix(".py").is_file() and path.parent != SOURCE else path
+    return folder.relative_to(SOURCE).as_posix()
 
 
-def modules_imported(file: str, known: dict[str, str]) -> set[str]:
-    """The modules of zakai that a file imports, at the top or inside of functions, but for those in `CALLED`."""
-    tree, found = ast.parse((SOURCE / file).read_text()), set()
-    typed = [node for node in ast.walk(tree) if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
-    skipped = {below for node in typed for statement in node.body for below in ast.walk(statement)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node not in skipped:
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
-            found |= {name if name in known else str(node.module) for name in names}
-    return {name for name in found if name in known} - CALLED.get(file, set())
+def faults(file: str, found: Iterable[Import]) -> list[str]:
+    """Return the imports of a file that the order of the folders does not allow."""
+    folder = Path(file).parent.as_posix()
+    allowed = {*FOLDERS[: FOLDERS.index(folder) + 1], *EVERYWHERE}
+    if folder == "cli":
+        allowed |= {"__version__", ".", "citations"}
+    return [
+        f"{file} imports {name}"
+        for name, at_top, function in found
+        if name.partition(".")[0] == "zakai"
+        and folder_of(name) not in allowed
+        and (at_top or ENTRIES.get((file, function)) != name)
+    ]
+
+
+# One state: its system is made by the files that it names; to be merged.
+MERGED = {"methods/line/system.py": {"zakai.methods.line.parts", "zakai.methods.line.steps"}}
+
+
+def modules_imported(file: str) -> set[str]:
+    """Return the modules of zakai that a file imports, but for its entries."""
+    names = {name for name, _, function in imports(file) if ENTRIES.get((file, function)) != name}
+    return {name for name in names if is_module(name)} - MERGED.get(file, set())
 
 
 def circle(graph: dict[str, set[str]]) -> list[str]:
@@ -114,22 +119,27 @@ def circle(graph: dict[str, set[str]]) -> list[str]:
 
 
 def test_no_modules_import_one_another_in_a_circle():
-    known = {f"zakai.{file.removesuffix('.py').replace('/', '.')}".removesuffix(".__init__"): file for file in FILES}
-    graph = {name: modules_imported(file, known) for name, file in known.items()}
+    names = {file: f"zakai.{file.removesuffix('.py').replace('/', '.')}".removesuffix(".__init__") for file in FILES}
+    graph = {name: modules_imported(file) for file, name in names.items()}
     assert circle(graph) == []
     assert circle({**graph, "zakai.models.tables": {"zakai.models.files"}}) != []  # the test can fail
 
 
-def test_a_package_imports_only_packages_to_its_left():
-    assert {file.partition("/")[0] for file in FILES} <= set(PACKAGES)
+def test_a_folder_imports_only_folders_before_it():
+    assert {Path(file).parent.as_posix() for file in FILES} == set(FOLDERS)
     assert [fault for file in FILES for fault in faults(file, imports(file))] == []
+
+
+def test_every_entry_is_there():
+    found = {(file, function): name for file in FILES for name, top, function in imports(file) if (file, function) in ENTRIES}
+    assert found == ENTRIES
 
 
 def test_only_peers_import_jax_or_a_library_of_filters():
     found = [
         f"{file} imports {name}"
         for file in FILES
-        for name, top in imports(file)
+        for name, top, _ in imports(file)
         if not file.startswith("peers/")
         and (name.partition(".")[0] in JAX or name.startswith("zakai.peers"))
         and (top or file not in WHERE_JAX_IS_LOADED)
@@ -138,20 +148,22 @@ def test_only_peers_import_jax_or_a_library_of_filters():
 
 
 def test_whoever_imports_jax_sets_double_precision():
-    names = {file: {name for name, top in imports(file) if top} for file in FILES if file.startswith("peers/")}
+    names = {file: {name for name, top, _ in imports(file) if top} for file in FILES if file.startswith("peers/")}
     importing = {file for file, own in names.items() if any(name.partition(".")[0] in JAX for name in own)}
     setting = {file for file, own in names.items() if any(name.startswith("zakai.peers") for name in own)}
     assert importing and importing <= setting | {"peers/_float64.py"}
 
 
 def test_numerics_imports_neither_sympy_nor_a_model():
-    names = [(file, name) for file in FILES if file.startswith("numerics/") for name, _ in imports(file)]
+    names = [(file, name) for file in FILES if file.startswith("numerics/") for name, *_ in imports(file)]
     forbidden = [f"zakai.{package}" for package in KNOWS_NO_MODEL]
     assert names
     assert [found for found in names if found[1].startswith("sympy") or ".".join(found[1].split(".")[:2]) in forbidden] == []
 
 
-def test_the_order_of_packages_can_fail():
-    assert faults("engine/driver.py", [("zakai.report", True)]) == ["engine/driver.py imports zakai.report"]
-    assert faults("models/simulate.py", [("zakai.records", True)]) != []
-    assert faults("models/simulate.py", [("zakai.records", False)]) == []
+def test_the_order_of_folders_can_fail():
+    assert faults("engine/driver.py", [Import("zakai.report", True)]) == ["engine/driver.py imports zakai.report"]
+    assert faults("methods/line/filter.py", [Import("zakai.methods.space.filter", False, "step")]) != []
+    assert faults("engine/results.py", [Import("zakai.diagnostics.residuals", True)]) != []
+    assert faults("engine/results.py", [Import("zakai.diagnostics.residuals", False, "save")]) != []
+    assert faults("engine/results.py", [Import("zakai.diagnostics.residuals", False, "residuals")]) == []

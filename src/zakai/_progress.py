@@ -1,7 +1,8 @@
-"""A progress bar for long work, on a terminal or in a notebook; nothing is printed elsewhere."""
+"""A progress bar for long work, on a terminal or in a notebook, and a line in the log elsewhere."""
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -11,8 +12,10 @@ from threading import Lock, Timer
 from typing import Any
 
 PATIENCE = 1.0  # seconds of work before a bar appears
+FIRST = 5.0  # seconds after which long work is announced
 
 Advance = Callable[[int, int | None], None]
+_LOG = logging.getLogger("zakai")
 _LOCK = Lock()  # one bar at a time: work inside of other work has none of its own
 
 
@@ -21,6 +24,18 @@ def shown() -> bool:
     if "ipykernel" in sys.modules:
         return find_spec("ipywidgets") is not None
     return sys.stderr is not None and sys.stderr.isatty()
+
+
+@contextmanager
+def announced(what: str) -> Iterator[None]:
+    """Log that work takes more than `FIRST` seconds, if it does; nothing is known of its end."""
+    timer = Timer(FIRST, lambda: _LOG.warning("%s takes more than %.0f s", what, FIRST))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 @contextmanager

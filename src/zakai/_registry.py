@@ -21,51 +21,55 @@ class Entry(NamedTuple):
 
 METHODS = {
     "kalman-bucy": Entry(
-        "zakai.methods.kalman_bucy",
+        "zakai.methods.gaussian.kalman_bucy",
         "exact for linear systems in any number of states, whatever the prior; singular noise is allowed",
     ),
     "conditionally-gaussian": Entry(
-        "zakai.methods.conditionally_gaussian",
+        "zakai.methods.gaussian.conditionally_gaussian",
         "exact for f and h that are affine in x, with coefficients that depend on what is observed",
     ),
     "benes": Entry(
-        "zakai.methods.benes",
+        "zakai.methods.gaussian.benes",
         "exact for affine h and a drift L x + l + G grad log cosh(q.x + delta), in any number of states",
     ),
     "hu-yau": Entry(
-        "zakai.methods.hu_yau",
+        "zakai.methods.gaussian.hu_yau",
         "exact for affine h and a drift L x + l + G grad F whose eta is quadratic, whatever the prior",
     ),
     "limited-direct": Entry(
-        "zakai.methods.limited_direct",
+        "zakai.methods.grid.limited_direct",
         "exact between observations for time-varying Yau systems whose q is quadratic, in one to three states",
     ),
     "general-direct": Entry(
-        "zakai.methods.general_direct",
+        "zakai.methods.sums.general_direct",
         "a Gaussian sum for time-varying Yau systems of any dimension; exact where h is affine and v0 a Gaussian sum",
     ),
     "gaussian-sum": Entry(
-        "zakai.methods.gaussian_sum",
+        "zakai.methods.sums.gaussian_sum",
         "the same for systems that do not depend on time (the survey's Algorithm 2); only when it is named",
     ),
     "wei-norman": Entry(
-        "zakai.methods.wei_norman",
+        "zakai.methods.series.wei_norman",
         "for finite estimation algebras in one to three states, exp(t L0) on a grid; only when it is named",
     ),
     "yau-yau": Entry(
-        "zakai.methods.yau_yau",
+        "zakai.methods.grid.yau_yau",
         "convergent for any smooth system in one to four states: the Kolmogorov equation on a grid that follows the density",
     ),
     "kolmogorov-series": Entry(
-        "zakai.methods.kolmogorov_series",
+        "zakai.methods.series.kolmogorov_series",
         "convergent for one state and any smooth f without time: the explicit series of the kernel; only when it is named",
     ),
+    "tensor-train": Entry(
+        "zakai.methods.frame.tensor_train",
+        "convergent for smooth systems in two to eight states: a tensor train in a frame that follows the density",
+    ),
     "guided-particles": Entry(
-        "zakai.methods.guided_particles",
+        "zakai.methods.particles.guided_particles",
         "convergent for any model in any number of states: particles, with standard errors of what they give",
     ),
     "extended-kalman-bucy": Entry(
-        "zakai.methods.extended_kalman_bucy",
+        "zakai.methods.gaussian.extended.extended_kalman_bucy",
         "approximate for formulas with a derivative almost everywhere: linearised at the mean; only when it is named",
     ),
 }

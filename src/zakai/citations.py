@@ -22,6 +22,7 @@ PAPERS = {
     "wei-norman": ("wei-norman-1964", "yau-1993", "dong-chen-yau-2021"),
     "yau-yau": ("yau-yau-2008",),
     "kolmogorov-series": ("yau-1993",),
+    "tensor-train": ("oseledets-tyrtyshnikov-2010",),
     "guided-particles": ("gordon-salmond-smith-1993", "gilks-berzuini-2001", "lee-whiteley-2018"),
     "extended-kalman-bucy": ("jazwinski-1970", "chen-luo-yau-2017"),
     "ekf": ("sarkka-2013",),

@@ -13,7 +13,7 @@ from zakai.algebra.conditions import all_hold
 from zakai.algebra.quadratics import decided_q
 from zakai.algebra.systems import yau_system
 from zakai.algebra.yau import YauForm, yau_form
-from zakai.methods._potential import potential_of
+from zakai.methods.system.potential import potential_of
 
 T = sp.Symbol("t", real=True)
 X = sp.symbols("x1:4", real=True)

@@ -157,3 +157,26 @@ def test_warm_up_compiles_the_kernels_that_are_declared_and_prints_the_folder(za
     assert answer.out == f"compiled  2 kernels in 0 s\nkept in   {tmp_path}\n"
     monkeypatch.setattr(kernel_cache, "folder", lambda: None)
     assert zakai("warm-up").code == 2
+
+
+@pytest.mark.parametrize(
+    ("names", "header"),
+    [(["range", "bearing"], "time,range,bearing"), (None, "time,y,x"), (None, "time,y1,y2")],
+)
+def test_a_simulated_file_has_the_names_of_the_observations_and_is_read_by_them(zakai, tmp_path, names, header):
+    plain = header == "time,y,x"
+    keys = "" if names is None else f"observation_names = {names}\n"
+    observation = '["y", "x"]' if plain else '["2*x", "x + y"]'
+    (tmp_path / "two.toml").write_text(
+        f'state = ["x", "y"]\ndrift = ["-x", "x - y"]\nobservation = {observation}\nobservation_kind = "samples"\n{keys}'
+        '[prior]\nkind = "gaussian"\nmean = [0, 0]\ncov = [1, 1]\n'
+    )
+    assert zakai("simulate", "two.toml", "--until", "0.5", "--step", "0.1", "-o", "made.csv").code == 0
+    lines = (tmp_path / "made.csv").read_text().split()
+    assert lines[0] == header
+    swapped = [",".join(cell for cell in (line.split(",")[i] for i in (0, 2, 1))) for line in lines]
+    (tmp_path / "swapped.csv").write_text("\n".join(swapped))
+    model = package.load_model(tmp_path / "two.toml")
+    made, other = (package.read_record(tmp_path / name, model) for name in ("made.csv", "swapped.csv"))
+    assert np.allclose(made.values, package.simulate(model, 0.1 * np.arange(1, 6), seed=0)[1].values, rtol=1e-12)
+    assert np.array_equal(made.values, other.values) and not made._note and not other._note

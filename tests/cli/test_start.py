@@ -119,6 +119,6 @@ def test_a_filter_imports_no_library_that_it_does_not_need(tmp_path):
     filtered = ["filter", "model.toml", "record.csv", "-o", "result.nc", "--method", "kalman-bucy"]
     code = (
         f"import sys; from zakai.cli import main; assert main({filtered!r}) == 0\n"
-        "print([name for name in ('jax', 'xarray', 'pandas', 'rich', 'plotly', 'matplotlib') if name in sys.modules])"
+        "print([name for name in ('jax', 'xarray', 'pandas', 'rich', 'anywidget', 'matplotlib') if name in sys.modules])"
     )
     assert answered(started(tmp_path, code))[0].splitlines()[-1] == "[]"

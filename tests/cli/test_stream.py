@@ -53,6 +53,21 @@ def test_every_line_is_answered_with_what_a_record_gives(stream, tmp_path):
     assert np.allclose([one["interval"] for one in answers], both, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("header", "separator", "comma"),
+    [
+        ("Time,y1", ",", "."), ("t,angle", ",", "."), ("TIME;y1", ";", ","), ("time\ty1", "\t", ","), ('"Time";"y1"', ";", "."),
+        ("\ufeffTime,y1\r", ",", "."), ("# from the sensor\n# Time;y1", ";", ","),
+    ],
+)  # fmt: skip
+def test_a_stream_is_read_in_the_dialects_of_records(stream, header, separator, comma):
+    given = [json.loads(line) for line in LINES]
+    rows = [f"{one['time']}{separator}{one['y'][0]}".replace(".", comma) for one in given]
+    assert stream([header, *rows[:5], "# a comment", *rows[5:]]).out == stream(LINES).out
+    missing = stream([header, f"0{comma}1{separator}NA"])
+    assert missing.err == "" and missing.out == stream(['{"time": 0.1, "y": [null]}']).out
+
+
 def test_csv_is_read_as_json_lines_are(stream):
     rows = ["time,angle", *(f"{one['time']},{one['y'][0]}" for one in map(json.loads, LINES))]
     assert stream(rows).out == stream(LINES).out
@@ -62,7 +77,7 @@ def test_csv_is_read_as_json_lines_are(stream):
 
 
 @pytest.mark.parametrize(
-    "first", ["Time,y1", "y1,time", "t,angle-1", "TIME;y1", "time\ty1", '"Time","y1"', "0.1,0.5", "\ufeffTime,y1\r"]
+    "first", ["hour,y1", "y1,time", "u,angle-1", "hour;y1", "y1\ttime", '"Hour","y1"', "0.1,0.5", "\ufeffhour,y1\r"]
 )
 def test_a_stream_that_begins_like_csv_without_its_header_is_refused_once(stream, first):
     answer = stream([first, "0.1,0.5", "0.2,0.6"])

@@ -60,7 +60,7 @@ def test_a_word_that_is_not_used_is_found(tmp_path):
 
 
 def test_the_first_shell_session_runs_and_prints_what_is_shown(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("plotly")
+    pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
     sessions = [block for block in blocks("README.md", "sh") if "zakai " in block.code]
     assert sessions

@@ -99,9 +99,10 @@ def test_what_takes_longer_than_was_announced_is_announced_again(monkeypatch, ca
 
 
 def test_a_decision_that_takes_long_is_announced(monkeypatch, caplog):
+    from zakai import _progress
     from zakai.engine import driver
 
-    monkeypatch.setattr(batch, "FIRST", 0.01)
+    monkeypatch.setattr(_progress, "FIRST", 0.01)
     own = driver.plan_of
     monkeypatch.setattr(driver, "plan_of", lambda *arguments: (sleep(0.2), own(*arguments))[1])
     model = zakai.Model(state=["x"], drift=["-x"], observation=["x"], prior=PRIOR)

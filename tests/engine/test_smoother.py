@@ -264,7 +264,7 @@ def test_a_result_is_stored_and_read(tmp_path):
 
 @pytest.mark.parametrize("kind", ["samples", "increments"])
 def test_the_compiled_backward_pass_is_that_of_single_steps(kind, monkeypatch):
-    from zakai.methods import kalman_bucy
+    from zakai.methods.gaussian import kalman_bucy
 
     rng = np.random.default_rng(5)
     times, values = np.cumsum(10.0 ** rng.uniform(-3, 0.5, 300)), rng.normal(size=(300, 2))

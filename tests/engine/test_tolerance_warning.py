@@ -1,10 +1,16 @@
-"""What is said where steps missed the tolerance: by how much the means may be off, and from when on."""
+"""Warnings say by how much the means may be off and from when on, or that the density was lost; right results are silent."""
 
 import numpy as np
 import pytest
+from scipy import special
 
 import zakai
-from zakai.engine.health_warnings import warnings_of_run
+from zakai.notes.health import warnings_of_run
+
+
+def linear(**more):
+    keys = {"observation": ["x"], "prior": {"kind": "gaussian", "mean": [0], "cov": [[1]]}, **more}
+    return zakai.Model(state=["x"], drift=["-x"], observation_kind="samples", **keys)
 
 
 @pytest.mark.parametrize(
@@ -12,17 +18,78 @@ from zakai.engine.health_warnings import warnings_of_run
     [
         ([0, 5e-4, 9e-4, 2e-4], None),
         ([0, 5e-4, 0.03, 0.2], "off by about 0.2 deviations, from t = 0.2 on"),
-        ([0, 4e3, 2.0, np.nan], "off by an unknown amount, from t = 0.1 on"),
+        ([0, 0.3, 2e-4, 2e-4], "off by about 0.3 deviations, at t = 0.1"),
+        ([0, 0.3, 0.03, 2e-4], "off by about 0.3 deviations, from t = 0.1 to t = 0.2"),
+        ([0, 4e3, 2.0, np.nan], "the density may be lost from t = 0.1 on"),
     ],
 )
 def test_an_estimate_says_how_far_and_since_when(errors, words):
-    model = zakai.Model(
-        state=["x"], drift=["-x"], observation=["x"], observation_kind="samples",
-        prior={"kind": "gaussian", "mean": [0], "cov": [[1]]},
-    )  # fmt: skip
-    result = zakai.filter(model, zakai.Record([0.1, 0.2, 0.3], [0.1, 0.3, 0.2], "samples"), "yau-yau")
+    result = zakai.filter(linear(), zakai.Record([0.1, 0.2, 0.3], [0.1, 0.3, 0.2], "samples"), "yau-yau")
     assert result.warnings == []
     result.health["error_estimate"] = np.array(errors)
     result.health["tolerance_ratio"] = np.array([np.nan, 7.0, 3.0, 2.0])
     found = warnings_of_run(result)
     assert found == [] if words is None else len(found) == 1 and words in found[0] and "up to 7" in found[0]
+    # A result of a coarser tolerance that agrees bounds the error too.
+    assert warnings_of_run(result, distances=lambda: np.array([0, 1e-4, 1e-4, 1e-4])) == []
+    if words is not None:
+        (closer,) = warnings_of_run(result, distances=lambda: np.array([0, 0.02, 0.01, 0.01]))
+        assert "off by about 0.02 deviations" in closer or errors[1] < 1e-3
+
+
+def test_a_right_result_that_a_coarser_tolerance_reproduces_is_silent():
+    # A sharp likelihood with a kink: the estimate of the method is 0.02 deviations.
+    model = linear(observation=["abs(x - 0.3)"], observation_noise=[["0.0001"]])
+    values = np.array([2.249, 2.040, 2.086, 1.415, 1.016, 0.797])
+    record = zakai.Record(0.1 * np.arange(1, 7), values, "samples")
+    result = zakai.filter(model, record, "yau-yau")
+    assert result.health["tolerance_ratio"][1:].max() > 10 and result.error_estimate[1:].max() > 5e-3
+    assert result.warnings == []
+    mean, deviation = dense(record.times, values, lambda x: np.abs(x - 0.3), 1e-4, np.arange(-4, 4, 4e-4))
+    assert (np.abs(result.mean[1:, 0] - mean) / deviation).max() < 5e-3
+
+
+def test_observations_in_the_tails_are_silent_until_the_density_is_lost_there():
+    # Nine and then twenty deviations from what is predicted; the exact filter knows the truth.
+    record = zakai.Record(0.1 * np.arange(1, 8), [0.1, 0.2, 12.0, 0.1, 0.2, 0.0, -20.0], "samples")
+    exact = zakai.filter(linear(), record, "kalman-bucy")
+    found = zakai.filter(linear(), record, "yau-yau")
+    off = np.abs(found.mean - exact.mean)[:, 0] / np.sqrt(exact.variance[:, 0])
+    assert off[:7].max() < 1e-4 and off[7] > 0.2
+    assert found.error_estimate[3] > 0.1  # a bound, far above the error
+    (said,) = found.warnings
+    assert said.startswith("the density was lost at t = 0.7: later rows mean nothing (tail_depth")
+    online = zakai.online(linear(), "yau-yau")
+    for time, value in zip(record.times, record.values, strict=True):
+        estimate = online.update(time, value)
+    assert len(estimate.warnings) == 1 and estimate.warnings[0].startswith("the density was lost (tail_depth")
+
+
+@pytest.mark.parametrize("method", ["limited-direct", "yau-yau"])
+def test_a_density_that_is_finer_than_every_grid_is_said_to_be_lost(method):
+    # Peaks of 3e-4 at every zero of sin(3 x) - z: a coarser tolerance has the same grid and the same result.
+    model = linear(observation=["sin(3*x)"], observation_noise=[["1e-6"]])
+    values = np.array([0.42, -0.3])
+    record = zakai.Record([0.1, 0.2], values, "samples")
+    result = zakai.filter(model, record, method)
+    mean, deviation = dense(record.times, values, lambda x: np.sin(3 * x), 1e-6, np.arange(-5, 5, 4e-5))
+    assert (np.abs(result.mean[1:, 0] - mean) / deviation).max() > 0.1
+    assert result.warnings[0].startswith("the density was lost at t = 0.2")
+
+
+def dense(times, values, h, noise, x):
+    """Means and deviations of dx = -x dt + dv from N(0, 1), by sums over all points with any likelihood."""
+    points, logs, before, moments = np.zeros(1), np.zeros(1), 0.0, []
+    for time, value in zip(times, values, strict=True):
+        decay, spread = np.exp(before - time), (1 - np.exp(2 * (before - time))) / 2
+        spread = spread + decay**2 if before == 0 else spread  # the prior's variance
+        likelihood = -0.5 * (value - h(x)) ** 2 / noise
+        here = x[likelihood > -60]
+        motion = -0.5 * (here[:, None] - decay * points) ** 2 / spread
+        new = special.logsumexp(motion + logs, axis=1) + likelihood[likelihood > -60]
+        kept = new > new.max() - 40
+        points, logs, before = here[kept], new[kept] - new.max(), time
+        weights = np.exp(logs) / np.exp(logs).sum()
+        mean = weights @ points
+        moments.append((mean, np.sqrt(weights @ (points - mean) ** 2)))
+    return np.array(moments).T

@@ -16,8 +16,8 @@ from sympy import Function, Matrix, Rational, Symbol, diff, exp, eye, symbols
 from references.flow import flow_kernel
 from references.power_series import data, single
 from references.systems import planar
-from zakai.methods.series import power as power_series
-from zakai.numerics.series import apply, cauchy
+from zakai.methods.yau import power as power_series
+from zakai.numerics.series.power_series import apply, cauchy
 
 t = Symbol("t", real=True)
 x1, x2 = symbols("x1 x2", real=True)

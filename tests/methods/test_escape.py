@@ -161,10 +161,10 @@ def test_what_does_not_escape_is_answered_without_a_warning(drift, keys):
 
 
 def test_growth_like_x_log_x_is_no_explosion():
-    from zakai.methods.line.escape import check_escape
+    from zakai.methods.line.domain import check_escape
 
     model = model_of(["x*log(x**2 + 1)"])
-    prepared = zakai.methods.yau_yau.prepare(model, _schedule(model, 1.0), model.theta())
+    prepared = zakai.methods.grid.yau_yau.prepare(model, _schedule(model, 1.0), model.theta())
     x = np.linspace(-8.0, 8.0, 801)
     check_escape(prepared, 0, x, np.exp(-0.5 * x**2))  # d log x / dt = 2 log x: finite at every time
 

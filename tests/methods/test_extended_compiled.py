@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import zakai
-from zakai.methods.extended import filter as extended
+from zakai.methods.gaussian.extended import filter as extended
 from zakai.records.schedule import schedule_of
 
 RNG = np.random.default_rng(0)

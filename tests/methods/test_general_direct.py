@@ -9,7 +9,7 @@ from scipy.linalg import expm
 import zakai
 from zakai.engine.likelihood import log_likelihood
 from zakai.errors import ConditionError, InputError
-from zakai.methods import general_direct
+from zakai.methods.sums import general_direct
 from zakai.records.schedule import Schedule, schedule_of
 
 LINE = np.linspace(-9.0, 9.0, 721)

@@ -253,10 +253,12 @@ def test_a_fit_says_how_far_its_maximum_is_known():
     assert found.estimates["w"] == pytest.approx(exact.estimates["w"], abs=0.3 * exact.standard_errors["w"])
     assert found.standard_errors["w"] == pytest.approx(exact.standard_errors["w"], rel=0.3)
     assert any("its maximum is known to w +- " in warning for warning in found.warnings)
+    (low, high), (exact_low, exact_high) = found.intervals()["w"], exact.intervals()["w"]
+    assert high - low == pytest.approx(exact_high - exact_low, rel=0.4) and low < exact.estimates["w"] < high
 
 
 def test_the_maximum_of_a_function_with_jumps_is_found():
-    from zakai.engine.random_maximum import random_maximum
+    from zakai.inference.random_maximum import random_maximum
 
     H = np.array([[4.0, 1.0], [1.0, 2.0]])
 
@@ -268,3 +270,16 @@ def test_the_maximum_of_a_function_with_jumps_is_found():
     found = random_maximum(value, np.array([0.3, -1.0]), np.array([[-np.inf, np.inf], [-3.0, 3.0]]))
     assert found.converged and np.allclose(found.values, [1.0, -2.0], atol=0.1)
     assert np.allclose(found.covariance, np.linalg.inv(H), atol=0.1) and (found.errors > 0).all()
+
+
+def test_particles_far_out_in_a_stiff_drift_are_not_thrown_to_infinity():
+    model = zakai.Model(
+        state=["x"], drift=["x - x**3"], diffusion=[["0.5"]], observation=["x"], observation_kind="samples",
+        observation_noise=[["0.1"]], prior={"kind": "gaussian", "mean": [0.0], "cov": [1.0]},
+    )  # fmt: skip
+    record = zakai.Record([1.0, 2.5, 3.0], [[np.nan], [0.4], [0.9]], "samples")
+    ours, exact = zakai.filter(model, record, PARTICLES), zakai.filter(model, record, "yau-yau")
+    assert np.allclose(ours.mean, exact.mean, atol=0.05) and np.allclose(ours.variance, exact.variance, atol=0.05)
+    predicted, known = ours.predict_observations(), exact.predict_observations()
+    assert np.allclose(predicted.mean, known.mean, atol=0.05)
+    assert np.allclose(predicted.quantile([0.1, 0.9]), known.quantile([0.1, 0.9]), atol=0.1)

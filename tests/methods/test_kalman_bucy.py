@@ -8,7 +8,7 @@ import pytest
 import zakai
 from references.convention import within_convention
 from references.kalman_bucy import assert_agrees, kalman_bucy
-from zakai.methods.kalman_bucy import METHOD
+from zakai.methods.gaussian.kalman_bucy import METHOD
 from zakai.records.schedule import schedule_of
 
 

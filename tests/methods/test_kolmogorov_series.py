@@ -212,7 +212,7 @@ def test_noise_that_varies_within_an_interval_is_integrated():
 
 @pytest.mark.parametrize("kind", ["samples", "increments"])
 def test_the_gradient_is_that_of_differences(kind):
-    from zakai.methods.kolmogorov_series import METHOD
+    from zakai.methods.series.kolmogorov_series import METHOD
     from zakai.records.schedule import Schedule, schedule_of
 
     model = zakai.Model(

@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from scipy.special import erf
 
 import zakai
-from zakai.methods import limited_direct, yau_yau
+from zakai.methods.grid import limited_direct, yau_yau
 from zakai.records import Record
 from zakai.records.schedule import schedule_of
 
@@ -482,7 +482,7 @@ def test_gaussian_kernels_in_the_loop_agree_with_single_steps(kind, monkeypatch)
     states, infos = DIRECT.segment(prepared, slice(0, len(times)), DIRECT.init(prepared, model.prior), numbers)
     together = np.stack([infos.mean[:, 0], infos.cov[:, 0, 0], infos.log_likelihood_increment], axis=1)
     assert np.array_equal(together, found)
-    monkeypatch.setattr("zakai.methods.line.loop.taken", lambda *arguments: [])
+    monkeypatch.setattr("zakai.methods.line.loop.compiled_steps", lambda *arguments: [])
     slow, _, _ = steps(model, times, values, DIRECT, tolerance=1e-9)
     assert distance(found, slow) < 2e-7
     assert not any(warned(DIRECT, health) for health in healths)

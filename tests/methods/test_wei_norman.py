@@ -91,7 +91,7 @@ def test_benes_with_two_peaks_and_gaps_is_the_exact_filter():
 
 def states_of(model, record, theta=None):
     """The states after each step, and the log-likelihood."""
-    from zakai.methods.wei_norman import METHOD
+    from zakai.methods.series.wei_norman import METHOD
     from zakai.records.schedule import Schedule, schedule_of
 
     theta = model.theta() if theta is None else theta

@@ -263,7 +263,7 @@ def test_models_do_not_import_jax():
     import subprocess
     import sys
 
-    code = "import sys, zakai.models.simulate, zakai.models.gallery as g; g.load('benes'); assert 'jax' not in sys.modules"
+    code = "import sys, zakai.simulation.simulate, zakai.models.gallery as g; g.load('benes'); assert 'jax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -6,7 +6,7 @@ from scipy import stats
 
 import zakai
 from zakai.errors import InputError
-from zakai.methods._observation import log_likelihood
+from zakai.methods.system.observation import log_likelihood
 
 KEYS = {"state": ["x"], "drift": ["0"], "observation_kind": "samples", "prior": {"kind": "gaussian", "mean": [0], "cov": [[1]]}}
 X = np.array([[-1.2], [0.1], [0.8], [2.0]])

@@ -6,7 +6,7 @@ import zakai
 from zakai.errors import InputError
 from zakai.models import Model, gallery, load_model
 from zakai.models.prior import GaussianPrior, MixturePrior
-from zakai.models.simulate import simulate
+from zakai.simulation.simulate import simulate
 
 
 def linear(kind, **keys):
@@ -80,7 +80,7 @@ def test_a_clock_that_is_regular_up_to_rounding_is_regular():
 
 def test_a_result_does_not_depend_on_how_the_time_is_cut_into_pieces(monkeypatch):
     model, times = linear("increments"), np.arange(1, 101) * 0.1
-    import zakai.models.simulate as module
+    import zakai.simulation.simulate as module
 
     truth, record = simulate(model, times, seed=2)
     monkeypatch.setattr(module, "CHUNK", 70)

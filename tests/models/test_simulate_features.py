@@ -6,7 +6,7 @@ from scipy import stats
 
 import zakai
 from zakai.errors import InputError
-from zakai.models.simulate import simulate
+from zakai.simulation.simulate import simulate
 
 SAMPLES = {"state": ["x"], "observation": ["x"], "observation_kind": "samples"}
 

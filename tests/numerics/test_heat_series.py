@@ -11,8 +11,8 @@ import sympy as sp
 import zakai
 from zakai.algebra.kolmogorov_series import kolmogorov_series
 from zakai.methods.series.heat import heat_series
-from zakai.methods.series.jets import jets
-from zakai.numerics.series import value
+from zakai.methods.system.jets import jets
+from zakai.numerics.series.power_series import value
 from zakai.studies._yau_kernels import parametrix, transition
 
 DRIFTS = {

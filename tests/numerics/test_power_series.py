@@ -12,9 +12,9 @@ from references.kolmogorov import Box, filter_system
 from references.power_series import data, entries, kernel_of, single, texts
 from references.systems import planar, scalar
 from zakai.errors import ConditionError
-from zakai.methods.series.kernel import PowerSeries
-from zakai.methods.series.power import TaylorData, schroedinger, whitening
-from zakai.numerics.series import derivative, product
+from zakai.methods.yau.kernel import PowerSeries
+from zakai.methods.yau.power import TaylorData, schroedinger, whitening
+from zakai.numerics.series.power_series import derivative, product
 from zakai.numerics.transition import compose
 
 t = sympy.Symbol("t")

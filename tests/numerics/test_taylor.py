@@ -7,8 +7,8 @@ import pytest
 import sympy
 
 from zakai.errors import ConditionError
-from zakai.methods.series.jets import Expansion
-from zakai.numerics.series import cholesky, derivative, inverse, product, value
+from zakai.methods.system.jets import Expansion
+from zakai.numerics.series.power_series import cholesky, derivative, inverse, product, value
 
 t, a = sympy.symbols("t a")
 INNER = sympy.Rational(1, 3) + t / 2 + t**2 / 7

@@ -104,7 +104,7 @@ def test_the_careful_road_gives_the_same_numbers_as_the_fast_one(read):
         (GOOD.encode("utf-16"), 1, "not UTF-8"),
         (b"\0" * 4096, 1, "NUL byte"),
         ("1,2,3\n2,3,4\n", 1, "the header must begin with time (is the header missing?)"),
-        ("t,a,b\n1,2,3\n", 1, "the first column is 't'; the header must begin with time"),
+        ("u,a,b\n1,2,3\n", 1, "the first column is 'u'; the header must begin with time"),
         ("time,a\n1,2\n", 1, "2 columns; the model needs 3: time, and one for each of its observations"),
         ("time:a:b\n1:2:3\n", 1, "the first column is 'time:a:b'"),
         ("\n1,2,3\n", 2, "the header must begin with time"),

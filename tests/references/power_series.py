@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import sympy
 
-from zakai.methods.series.jets import Expansion
-from zakai.methods.series.kernel import transition_of
-from zakai.methods.series.power import power_series, schroedinger, taylor_data
+from zakai.methods.system.jets import Expansion
+from zakai.methods.yau.kernel import transition_of
+from zakai.methods.yau.power import power_series, schroedinger, taylor_data
 
 KEYS = ("G", "L", "l", "Q", "p", "r")
 

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
+from report.frames import on_page, series, without_scripts
 from zakai.report.comparisons import error_curves, log_range, nees_curves, works
-from zakai.report.plots import library
 from zakai.report.study_page import page, write_study
 from zakai.report.study_pictures import error_figure, nees_figure, work_figure
 from zakai.studies.study import run_study
@@ -82,9 +82,11 @@ def test_static_pictures_have_units_and_a_line_for_every_method(outcome):
 
 def test_the_page_is_whole_escaped_and_fetches_nothing(outcome):
     text = page(outcome)
-    rest = text.replace(library(), "")
+    rest = without_scripts(text)
     assert "Two &lt;filters&gt; &amp; a $walk$" in rest and "<filters>" not in rest
     assert "Euler&#x27;s &lt;step&gt;" in rest
+    names = {one["text"] for one in series(on_page(text)["error-over-time-0"]) if "below" not in one["text"]}
+    assert names == {entry.label for entry in outcome.study.methods}
     assert "src=" not in rest and "href=" not in rest and "default-src 'none'" in rest
     written = write_study(outcome)
     assert [path.name for path in written] == ["error-over-time.png", "nees.png", "work-precision.png", "study.html"]

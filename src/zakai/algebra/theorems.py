@@ -176,6 +176,14 @@ def any_smooth_system(model: Model) -> tuple[Condition, ...]:
 
 
 @once_for_a_model
+def tensor_train(model: Model) -> tuple[Condition, ...]:
+    """Any smooth system of two to eight states without reflecting ends, whose f and g do not jump."""
+    source = "cross interpolation of a density in a moving frame"
+    conditions = [determined(model), Condition("there are two to eight states", 2 <= model.n <= 8, f"n = {model.n}", source)]
+    return (*conditions, *on_characteristics(model), *reflecting_ends(model))
+
+
+@once_for_a_model
 def kolmogorov_series(model: Model) -> tuple[Condition, ...]:
     """A smooth drift without time and a constant, definite G: its kernel has the series of Yau 1993, Theorems 10 and 11.
 
@@ -219,6 +227,7 @@ THEOREMS: Mapping[str, Callable[[Model], tuple[Condition, ...]]] = {
     "wei-norman": wei_norman_filter,
     "yau-yau": any_smooth_system,
     "kolmogorov-series": kolmogorov_series,
+    "tensor-train": tensor_train,
     "guided-particles": any_model,
     "extended-kalman-bucy": smooth_system,
 }

@@ -44,9 +44,6 @@ def filter(
     check_outputs([output, report], [source, record_path, truth_path, inputs_path])
     if report is not None:
         from zakai.report import write_report
-        from zakai.report._extra import plotting
-
-        plotting("plotly")
     from zakai.engine.kept_record import MOST_QUANTILES
 
     model, record, options = _given(source, record_path, settings, inputs_path, unit, origin, columns)
@@ -119,7 +116,7 @@ def fit(
     columns: str = "",
 ) -> None:
     """Print the parameters of largest likelihood, and write the model with them."""
-    from zakai.engine.fit import fit as run
+    from zakai.inference.fit import fit as run
     from zakai.records.writing import atomic_write
 
     check_outputs([output], [source, record_path, inputs_path])

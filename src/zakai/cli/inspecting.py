@@ -67,7 +67,7 @@ def _record(path: Path, model: Model, inputs_path: Path | None) -> Record:
 
 def _expected(model: Model, record: Record, name: str, ends: float) -> str:
     """Return the expected time of a method for a record, or why there is none; it is measured before `ends`."""
-    from zakai.engine.expected_time import expected_seconds
+    from zakai.diagnostics.expected_time import expected_seconds
 
     left = ends - time.monotonic()
     if left <= 0.0:

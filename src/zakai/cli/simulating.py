@@ -22,9 +22,9 @@ def simulate(
 ) -> None:
     """Simulate a record, and write it and the truth."""
     from zakai.models.files import load_model
-    from zakai.models.simulate import simulate
     from zakai.records import read_inputs, write_record, write_truth
     from zakai.records.writing import shown
+    from zakai.simulation.simulate import simulate
 
     check_outputs([output, truth_path], [source, inputs_path])
     model = load_model(source)
@@ -37,7 +37,7 @@ def simulate(
     truth, record = simulate(model, times, seed=seed, initial=start, inputs=inputs)
     if truth_path is not None:
         write_truth(truth_path, truth, model.state)
-    write_record(output, record)
+    write_record(output, record, list(model.observation_names))
     print(f"{len(record):,} observation{'s' if len(record) > 1 else ''} written to {output}")
 
 

@@ -8,8 +8,9 @@ from zakai.densities.mapped import MappedDensity
 from zakai.densities.particles import ParticleDensity
 from zakai.densities.points import PointMasses
 from zakai.densities.product import ProductDensity
+from zakai.densities.tensor_train import TensorTrainDensity
 
 __all__ = [
     "Density", "GaussianMixture", "GridDensity", "IntervalDensity", "MappedDensity", "ParticleDensity", "PointMasses",
-    "ProductDensity",
+    "ProductDensity", "TensorTrainDensity",
 ]  # fmt: skip

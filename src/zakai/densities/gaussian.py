@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from zakai.densities._density import DensityMethods, as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
+from zakai.densities._density import DensityMethods
+from zakai.densities._values import as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 
 _AT_ONCE = 2**21  # points times components in one array
 _PROPOSALS = 1000  # of a draw from a mixture with negative weights

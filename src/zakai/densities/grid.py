@@ -9,7 +9,8 @@ from functools import cached_property
 
 import numpy as np
 
-from zakai.densities._density import WeightedPoints, as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
+from zakai.densities._density import WeightedPoints
+from zakai.densities._values import as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 
 _FINER = 8  # points of a distribution function for each of a grid
 _BLOCK = 4_000_000  # numbers held at once while a density is interpolated

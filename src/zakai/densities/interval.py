@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from zakai.densities._density import WeightedPoints, as_states, coordinate_numbers, generator, probabilities, sample_size
+from zakai.densities._density import WeightedPoints
+from zakai.densities._values import as_states, coordinate_numbers, generator, probabilities, sample_size
 
 _SAME = 1e-9  # distance of two points, relative to the length of all, below which they are the end of two intervals
 _FINE = 4001  # points between which the distribution function is interpolated

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zakai.densities._density import WeightedPoints, as_states, coordinate_numbers
+from zakai.densities._density import WeightedPoints
+from zakai.densities._values import as_states, coordinate_numbers
 from zakai.densities.grid import GridDensity
 
 

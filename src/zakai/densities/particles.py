@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from zakai.densities._density import coordinate_numbers, generator, sample_size, wrap
+from zakai.densities._values import coordinate_numbers, generator, sample_size, wrap
 from zakai.densities.points import PointMasses
 
 

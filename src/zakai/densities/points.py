@@ -8,16 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from zakai.densities._density import (
-    WeightedPoints,
-    as_states,
-    coordinate_numbers,
-    deviations,
-    generator,
-    probabilities,
-    sample_size,
-    wrap,
-)
+from zakai.densities._density import WeightedPoints, deviations
+from zakai.densities._values import as_states, coordinate_numbers, generator, probabilities, sample_size, wrap
 from zakai.densities.gaussian import GaussianMixture
 from zakai.errors import InputError
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 
 import numpy as np
 
-from zakai.densities._density import Density, DensityMethods, as_states, coordinate_numbers, generator, probabilities, sample_size
+from zakai.densities._density import Density, DensityMethods
+from zakai.densities._values import as_states, coordinate_numbers, generator, probabilities, sample_size
 
 
 @dataclass(frozen=True, repr=False)

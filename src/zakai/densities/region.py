@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.errors import InputError
 
 if TYPE_CHECKING:

@@ -14,9 +14,7 @@ from zakai.records.path_inputs import PathInputs
 from zakai.records.schedule import Schedule
 
 
-def along_path(
-    model: Model, schedule: Schedule, values: np.ndarray, start: np.ndarray | None = None
-) -> tuple[Model, Schedule]:
+def along_path(model: Model, schedule: Schedule, values: np.ndarray, start: np.ndarray | None = None) -> tuple[Model, Schedule]:
     """Return a model and a schedule whose inputs contain the path; the same where no formula contains it.
 
     Args:

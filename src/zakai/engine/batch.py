@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
-from threading import Event, Lock, Thread, Timer
+from contextlib import nullcontext
+from threading import Event, Lock, Thread
 from typing import Any
 
-from zakai._progress import bar
+from zakai._progress import FIRST, bar
 from zakai.engine.loop import Run
 from zakai.numerics.compiled import working_time
 
 LONG = 10.0  # seconds of work that are announced
-FIRST = 5.0  # seconds after which long work is announced by what is known then
 EARLY, FEW = 1.5, 4  # seconds, and observations, after which work that takes twice as long is announced already
 OFF = 3.0  # times the announced seconds after which the rest is announced again
 SURE = 0.5  # seconds after which the rest can be estimated
@@ -39,18 +38,6 @@ def filter_all(runs: Sequence[Run], progress: Progress | None, blocks: float = 1
 def smooth_all(runs: Sequence[Any]) -> None:
     """Smooth every run that has filtered its record, one after the other."""
     _watched(runs, lambda run, watch: run.smooth(watch.report, watch.step), None, len(runs), 1)
-
-
-@contextmanager
-def announced(what: str) -> Iterator[None]:
-    """Log that work takes more than `FIRST` seconds, if it does; nothing is known of its end."""
-    timer = Timer(FIRST, lambda: _LOG.warning("%s takes more than %.0f s", what, FIRST))
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 def _watched(

@@ -14,6 +14,7 @@ from zakai.densities import Density, ProductDensity
 from zakai.densities.product import renamed
 from zakai.engine.loop import KEPT_BYTES, Run
 from zakai.engine.results import FilterResult
+from zakai.engine.run_result import result_of_run
 from zakai.engine.versions import versions
 from zakai.models.model import Model
 from zakai.records import Record
@@ -39,7 +40,7 @@ def joined_blocks(model: Model, division: Division, runs: Sequence[Run]) -> Filt
     health: dict[str, np.ndarray] = {}
     bounds: dict[str, tuple[float, str]] = {}
     for run, block in zip(runs, blocks, strict=True):
-        part = run.result(division.why, division.conditions[block.model])
+        part = result_of_run(run, division.why, division.conditions[block.model])
         _rename(part, block)
         parts.append(part)
         mean[:, block.states], variance[:, block.states] = part.mean, part.variance

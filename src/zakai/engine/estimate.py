@@ -13,9 +13,9 @@ from zakai.densities import Density, ProductDensity
 from zakai.densities.product import renamed
 from zakai.engine.blocks import SMALLEST_IS_WORST
 from zakai.engine.feed import Feed, Moment
-from zakai.engine.health_warnings import warnings_of_step
 from zakai.errors import InputError
 from zakai.models.prior import GaussianPrior
+from zakai.notes.health import warnings_of_step
 
 if TYPE_CHECKING:
     from zakai.engine.online import Online
@@ -98,7 +98,8 @@ class Estimate:
         for feed, moment in zip(self._online.feeds, self._moments, strict=True):
             said.update(dict.fromkeys(feed.notes(moment)))
             if moment.info is not None:
-                said.update(dict.fromkeys(warnings_of_step(moment.info.health, feed.setting.method.bounds)))
+                method = feed.setting.method
+                said.update(dict.fromkeys(warnings_of_step(moment.info.health, method.bounds, method.losses)))
         return tuple(said)
 
     @property

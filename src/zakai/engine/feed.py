@@ -11,12 +11,12 @@ import numpy as np
 
 from zakai.densities import Density
 from zakai.engine.along_path import along_path
-from zakai.engine.lengths import distances_of_lengths, notes_on_lengths
-from zakai.engine.misfit import notes_on_law
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
-from zakai.methods._escape import EscapeError
 from zakai.methods._protocol import Info, stacked
+from zakai.methods.system.escape import EscapeError
+from zakai.notes.lengths import distances_of_lengths, notes_on_lengths
+from zakai.notes.misfit import notes_on_law
 from zakai.numerics.one_thread import one_thread
 from zakai.records.inputs import Inputs
 from zakai.records.noise import noise_varies, notes_on_noise

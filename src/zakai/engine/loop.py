@@ -2,37 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zakai.algebra.conditions import Condition
 from zakai.densities import Density
 from zakai.engine.along_path import along_path, record_along
-from zakai.engine.health_warnings import warnings_of_run
-from zakai.engine.lengths import distances_of_lengths, notes_on_lengths
-from zakai.engine.misfit import notes_on_law
-from zakai.engine.notes import (
+from zakai.engine.coarser import distances
+from zakai.engine.setting import KEPT, Setting
+from zakai.errors import InputError
+from zakai.methods._protocol import Infos, stacked
+from zakai.methods._states import Joined
+from zakai.methods.system.escape import EscapeError
+from zakai.notes.health import warnings_of_run
+from zakai.notes.model import (
     notes_on_angles,
-    notes_on_domain,
-    notes_on_formulas,
     notes_on_start,
     notes_on_tables,
     why_not_finite,
 )
-from zakai.engine.results import FilterResult
-from zakai.engine.setting import KEPT, Setting
-from zakai.engine.versions import versions
-from zakai.errors import InputError
-from zakai.methods._escape import EscapeError
-from zakai.methods._protocol import Infos, stacked
-from zakai.methods._states import Joined
 from zakai.numerics.one_thread import one_thread
 from zakai.records import Record
 from zakai.records.noise import notes_on_noise
 from zakai.records.schedule import ROUNDING, Schedule, schedule_of
+
+if TYPE_CHECKING:
+    from zakai.engine.results import FilterResult
 
 CHUNK = 1024  # intervals that are prepared together, at most
 PIECE = 128  # intervals between two reports of progress, at most
@@ -213,61 +210,31 @@ class Run:
         """Return the density at an index of the result."""
         return self.setting.method.density(self.empty, self.states[index])
 
-    def result(self, why: str, considered: Mapping[str, tuple[Condition, ...]]) -> FilterResult:
-        """Return the result."""
-        model, method = self.setting.model, self.setting.method
-        first_mean, first_cov = self.start_moments()
-        infos = joined(self.parts)
-        cov = np.concatenate([first_cov[None], infos.cov])
-        kept = len(self.states) == len(self.schedule) + 1
-        theta, (noted, schedule) = self.setting.theta.real, self.noted
-        distances = distances_of_lengths(noted, theta, schedule, infos)
-        result = FilterResult(
-            times=np.concatenate([[model.start], self.record.times]),
-            mean=np.concatenate([first_mean[None], infos.mean]),
-            variance=np.diagonal(cov, axis1=1, axis2=2),
-            log_likelihood_increments=np.concatenate([[0.0], infos.log_likelihood_increment]),
-            health={name: np.concatenate([[np.nan], values]) for name, values in infos.health.items()},
-            warnings=[],
-            method=method.name,
-            why=why,
-            model=model,
-            record=self.record,
-            conditions=considered,
-            bounds={name: bound for name, bound in method.bounds.items() if name in infos.health},
-            state=model.state,
-            increment_law_error=None if model.observation_kind == "samples" else np.cumsum(np.append(0.0, distances.shortfall)),
-            attributes={"source": method.source, "exactness": method.exactness, **versions()},
-            mean_standard_error=_with_start(infos.mean_standard_error),
-            log_likelihood_standard_error=_last(infos.log_likelihood_standard_error),
-            _cov=cov,
-            _density=self.density if kept else None,
-            _no_density=self._no_density(),
-        )
-        record = record_along(self.record, schedule)
-        undefined = notes_on_formulas(noted, theta, record, result.mean, result.variance)
-        undefined += notes_on_domain(noted, theta, record, result.mean, result.variance)
-        lengths = notes_on_lengths(schedule, distances)
-        misfit = notes_on_law(noted, theta, schedule, self.values, infos)
-        result.warnings.extend([*undefined, *self.notes, *lengths, *misfit, *warnings_of_run(result)])
+    def complete(self, result: FilterResult) -> FilterResult:
+        """Return the result of this run with what only this kind of run adds."""
         return result
 
-    def _no_density(self) -> str:
+    def health_warnings(self, result: FilterResult) -> list[str]:
+        """Return what the health figures of the result say."""
+
+        def apart() -> np.ndarray | None:
+            found = distances(self.setting, result.mean[1:], result.cov[1:], self.again)
+            return None if found is None else np.append(found[:1], found)
+
+        return warnings_of_run(result, self.setting.method.losses, apart)
+
+    def again(self, setting: Setting) -> Infos:
+        """Return what another setting of the method reports after each interval."""
+        return joined([one.infos for one in segments(setting, self.schedule, None, self.values)])
+
+    def why_no_density(self) -> str:
+        """Return why densities were not kept."""
         if self.bytes and not self.keep:
             return (
                 f"the densities of {len(self.schedule)} steps were not kept: they need more than "
                 f'{self.most / 2**20:.3g} MiB; keep="densities" keeps them all'
             )
         return 'the densities were not kept; keep="densities" keeps them'
-
-
-def _with_start(errors: np.ndarray | None) -> np.ndarray | None:
-    """Return standard errors with those of the start, which are those of draws of the prior and not reported."""
-    return None if errors is None else np.concatenate([np.full((1, errors.shape[1]), np.nan), errors])
-
-
-def _last(errors: np.ndarray | None) -> float | None:
-    return None if errors is None else float(errors[-1])
 
 
 def _after_gaps(schedule: Schedule) -> list[str]:

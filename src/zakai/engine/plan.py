@@ -14,15 +14,16 @@ from zakai.algebra.conditions import all_hold
 from zakai.algebra.independent import IndependentBlock
 from zakai.algebra.theorems import conditions_of, in_order
 from zakai.engine.blocks import joined_blocks, record_of_block
-from zakai.engine.lengths import notes_on_increments
 from zakai.engine.loop import KEPT_BYTES, Run
 from zakai.engine.results import FilterResult
+from zakai.engine.run_result import result_of_run
 from zakai.engine.setting import Setting
 from zakai.errors import InputError
-from zakai.methods._moments import prior_moments
 from zakai.methods._protocol import Method
+from zakai.methods.system.prior_moments import prior_moments
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior, GaussianPrior
+from zakai.notes.lengths import notes_on_increments
 from zakai.numerics.sums.mixture import wrapped
 from zakai.records import Record
 
@@ -59,7 +60,7 @@ class Plan(NamedTuple):
     def result(self, runs: Sequence[Run]) -> FilterResult:
         """Return the result of the runs, with what continues it: the plan, and the last state of each run."""
         if self.division is None:
-            result = runs[0].result(self.why, self.considered)
+            result = result_of_run(runs[0], self.why, self.considered)
         else:
             result = joined_blocks(self.model, self.division, runs)
         result.warnings.extend(notes_on_increments(result.times, result.increment_law_error))

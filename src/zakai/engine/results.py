@@ -13,6 +13,7 @@ import numpy as np
 from zakai import _display
 from zakai.algebra.conditions import Condition
 from zakai.densities import Density
+from zakai.engine.forecast import forecast, origin_of
 from zakai.engine.kept_record import Variables, quantiles_of, record_of
 from zakai.engine.table import save_table
 from zakai.engine.variables import attributes_of, variables_of
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-    from zakai.engine.observed_ahead import PredictedObservations
+    from zakai.diagnostics.observed_ahead import PredictedObservations
     from zakai.engine.plan import Plan
     from zakai.records import Inputs
 
@@ -250,8 +251,6 @@ class FilterResult:
             ahead = result.forecast([11.0, 12.0])
             ahead.mean, ahead.density(-1).quantile([0.05, 0.95])
         """
-        from zakai.engine.forecast import forecast
-
         return forecast(self, times, inputs)
 
     def predict_observations(self, times: Any = None, inputs: Inputs | None = None) -> PredictedObservations:
@@ -274,7 +273,7 @@ class FilterResult:
             low, high = predicted.quantile([0.05, 0.95])
             outside = (record.values < low) | (record.values > high)
         """
-        from zakai.engine.observed_ahead import predict_observations
+        from zakai.diagnostics.observed_ahead import predict_observations
 
         return predict_observations(self, times, inputs)
 
@@ -300,7 +299,7 @@ class FilterResult:
             u = result.residuals()
             scipy.stats.kstest(u[~np.isnan(u)], "uniform").pvalue
         """
-        from zakai.engine.residuals import residuals
+        from zakai.diagnostics.residuals import residuals
 
         return residuals(self, seed)
 
@@ -373,8 +372,6 @@ class FilterResult:
         record: Variables = {}
         request: dict[str, str] = {}
         if densities:
-            from zakai.engine.forecast import origin_of
-
             plan, _, given = origin_of(self, "save")
             record, request = record_of(self, plan, given)
         save_variables({**variables_of(self), **quantiles, **record}, {**attributes_of(self), **request}, path)

@@ -6,7 +6,7 @@ the message p(later observations | x) through a segment, whose states it filters
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,13 +14,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai import _registry
-from zakai.algebra.conditions import Condition, all_hold
+from zakai._progress import announced
+from zakai.algebra.conditions import all_hold
 from zakai.algebra.theorems import conditions_of
 from zakai.densities import Density
-from zakai.engine.batch import Progress, announced, filter_all, smooth_all
+from zakai.engine.batch import Progress, filter_all, smooth_all
 from zakai.engine.driver import check_noise, check_records, with_inputs
-from zakai.engine.health_warnings import warnings_of_run
 from zakai.engine.loop import CHUNK, KEPT_BYTES, Run, advance, joined, size_of
+from zakai.engine.paths import sample_paths
 from zakai.engine.plan import plan_of
 from zakai.engine.results import FilterResult
 from zakai.engine.setting import Setting
@@ -80,8 +81,6 @@ class SmoothingResult(FilterResult):
                 "sample_paths: a result that was read from a file does not hold its filter; smooth the record again, or save it "
                 "with densities=True"
             )
-        from zakai.engine.paths import sample_paths
-
         place = {name: i for i, name in enumerate(self.state)}
         names = [block.state for block in self.blocks] or [self.state]
         return sample_paths(self._runs, [[place[name] for name in own] for own in names], len(self.state), count, seed)
@@ -270,16 +269,28 @@ class SmoothingRun(Run):
         """Return the mean and the covariance at the start, smoothed once the record is."""
         return super().start_moments() if self.start is None else (self.start.mean, self.start.cov)
 
-    def result(self, why: str, considered: Mapping[str, tuple[Condition, ...]]) -> FilterResult:
+    def health_warnings(self, result: FilterResult) -> list[str]:
+        """Return what the figures of the filter say, nothing while they stand beside those of the smoother."""
+        return [] if self.start is not None else super().health_warnings(result)
+
+    def again(self, setting: Setting) -> Infos:
+        """Return what another setting of the method reports after each interval, of the smoother once the record is smoothed."""
+        if self.start is None:
+            return super().again(setting)
+        other = SmoothingRun(setting, self.record)
+        other.all()
+        other.smooth(lambda run, count: None, lambda run: None)
+        return joined(other.parts)
+
+    def complete(self, result: FilterResult) -> FilterResult:
         """Return the result, of the filter until the record is smoothed."""
-        result = super().result(why, considered)
         if self.start is None:
             return result
         result._density = self.density
         for name, figures in result.health.items():
             figures[0] = self.start.health[name]
         result.bounds = {**result.bounds, "evidence_error": (self.backward.accuracy(self.empty), _EVIDENCE)}
-        result.warnings = [*self.notes, *warnings_of_run(result)]
+        result.warnings = [*self.notes, *super().health_warnings(result)]
         result.increment_law_error = None  # `smooth` gives that of the filter
         return result
 

@@ -1,1 +1,1 @@
-"""The filters: one file a method, all of the shape that `methods/_protocol.py` declares."""
+"""The filters, in folders by kind of state space; each method is one file of the shape that `methods/_protocol.py` declares."""

@@ -182,7 +182,8 @@ class Method(Generic[P, S]):
     """One filter: its functions, and what is said of it.
 
     `options` are the keyword arguments of `prepare` with their defaults.  `bounds` gives for a health figure the bound above
-    which a result warns, and the words of the warning.  `state` is the class of the states.  `shorter` says what shortens a long
+    which a result warns, and the words of the warning; `losses` gives for some the value above which the step has lost the
+    density, so that later rows mean nothing.  `state` is the class of the states.  `shorter` says what shortens a long
     run, as in "this takes about 40 s; to shorten it, raise the tolerance".
 
     `handles` names the features of a model (`models/features.py`) that the method handles; a model with another one is refused
@@ -223,6 +224,7 @@ class Method(Generic[P, S]):
     density: Callable[[P, S], Density]
     state: type[S]
     bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    losses: Mapping[str, float] = field(default_factory=dict)
     differentiable: bool = True
     handles: frozenset[str] = frozenset()
     shorter: str = "give fewer observations"

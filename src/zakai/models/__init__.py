@@ -1,4 +1,4 @@
-"""What the system is: formulas, models, model files, the gallery, simulation, compilation."""
+"""What the system is: formulas, models, model files, the gallery, compilation."""
 
 from zakai.models.files import load_model
 from zakai.models.model import Model

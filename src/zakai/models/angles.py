@@ -11,7 +11,7 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.models.families import Family, Gaussian, StudentT
 
 if TYPE_CHECKING:

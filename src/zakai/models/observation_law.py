@@ -10,7 +10,7 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.errors import InputError
 from zakai.models.angles import Wrapped, observed_angles
 from zakai.models.families import FAMILIES, Family

@@ -34,10 +34,12 @@ def grid_cells(log_values: Array, closed: bool, count: int) -> tuple[float, floa
     size = len(values)
     if closed:
         first, length = _arc(values > _SEEN)
-        start, terms = (first, size) if length == size else _arc(values > _SUMMED)
+        start, terms = _arc(values > _SUMMED)
         low, high = first - 1.0, first + length + 0.0
-        if length + 1 >= size:
-            low, high = first - 0.5, first + size - 0.5
+        if 2 * (high - low) > size:  # the whole circle, from the point opposite to the mean
+            mean = np.angle(values @ np.exp(2j * np.pi / size * np.arange(size))) * size / (2 * np.pi)
+            low, high = mean - 0.5 * size, mean + 0.5 * size
+            start, terms = 0, size
     else:
         seen, summed = np.flatnonzero(values > _SEEN), np.flatnonzero(values > _SUMMED)
         low, high = max(seen[0] - 1.0, -0.5), min(seen[-1] + 1.0, size - 0.5)

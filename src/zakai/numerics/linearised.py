@@ -1,4 +1,4 @@
-"""A Gaussian that follows a linearised system over many intervals, compiled: the step of `methods/extended/filter.py`.
+"""A Gaussian that follows a linearised system over many intervals, compiled: the step of `methods/gaussian/extended/filter.py`.
 
 Formulas are data (`numerics/formula_points.py`).  A part of an interval moves by the exact flow of
 
@@ -207,8 +207,8 @@ def segment(
         means: The means (R, n) after each interval.
         covs: The covariances (R, n, n).
         gains: The increments (R,) of the log-likelihood.
-        figures: How far from linear the system is, as in `methods/extended/linearisation.py`, and the largest weight of another
-            image of an angle, as in `models/angles.py` (2, R).
+        figures: How far from linear the system is (`methods/gaussian/extended/linearisation.py`), and the largest weight of
+            another image of an angle, as in `models/angles.py` (2, R).
     """
     motion, sensor, drift, observation, noise = programs
     first, starts, lengths, inputs, rates, rate_noise = parts

@@ -59,14 +59,14 @@ def interpolation(nodes: Array, weights: Array, points: Array) -> Array:
         points: (J,).
     """
     breaks, near = np.flatnonzero(np.diff(nodes) < _SAME * (nodes[-1] - nodes[0])) + 1, _NEAR * (nodes[-1] - nodes[0])
-    found, piece = np.zeros((len(points), len(nodes))), np.searchsorted(nodes[breaks], points, side="right")
+    result, piece = np.zeros((len(points), len(nodes))), np.searchsorted(nodes[breaks], points, side="right")
     for j, (first, last) in enumerate(zip([0, *breaks], [*breaks, len(nodes)], strict=True)):
         here = piece == j
         apart = points[here, None] - nodes[first:last]
         same = np.abs(apart) <= near
         terms = np.where(same.any(axis=1)[:, None], same, _barycentric(weights[first:last]) / np.where(same, 1.0, apart))
-        found[here, first:last] = terms / terms.sum(axis=1)[:, None]
-    return found
+        result[here, first:last] = terms / terms.sum(axis=1)[:, None]
+    return result
 
 
 _SAME = 1e-9  # distance of two points, relative to the length of all, below which they are the end of two intervals
@@ -112,10 +112,10 @@ class Element(NamedTuple):
         tiny = max(_BESIDE * (self.upper - self.lower), 4.0 * float(np.spacing(max(abs(self.lower), abs(self.upper)))))
         low, high = (np.array(ends) for ends in ([self.lower, *self.cuts], [*self.cuts, self.upper]))
         half = self.halves[:, None]
-        found = np.where(x < 0, low[:, None] + half * (1.0 + x), high[:, None] - half * (1.0 - x))
-        found[1:, 0] += tiny
-        found[:-1, -1] -= tiny
-        return np.asarray(found.reshape(-1))
+        result = np.where(x < 0, low[:, None] + half * (1.0 + x), high[:, None] - half * (1.0 - x))
+        result[1:, 0] += tiny
+        result[:-1, -1] -= tiny
+        return np.asarray(result.reshape(-1))
 
     @property
     def offsets(self) -> Array:
@@ -155,19 +155,19 @@ class Element(NamedTuple):
             logs: log s at the points (N,).
         """
         total = self.size * len(self.halves)
-        found = np.zeros((total, total - len(self.cuts)))
+        result = np.zeros((total, total - len(self.cuts)))
         columns = np.arange(total) - np.arange(total) // self.size
-        found[np.arange(total), columns] = 1.0
+        result[np.arange(total), columns] = 1.0
         for j in range(1, len(self.halves)):
             k = j * self.size
             both = np.sqrt(self.weights[k - 1 : k + 1]) * np.exp(logs[k - 1 : k + 1] - np.max(logs[k - 1 : k + 1]))
-            found[k - 1 : k + 1, columns[k]] = both / np.sqrt(np.sum(both**2))
-        return found
+            result[k - 1 : k + 1, columns[k]] = both / np.sqrt(np.sum(both**2))
+        return result
 
     def derivative(self, values: Array) -> Array:
         """Return the derivative of polynomials at the points from their values there (N,)."""
-        found = values.reshape(-1, self.size) @ rule(self.size).derivative.T / self.halves[:, None]
-        return np.asarray(found.reshape(-1))
+        result = values.reshape(-1, self.size) @ rule(self.size).derivative.T / self.halves[:, None]
+        return np.asarray(result.reshape(-1))
 
     def interpolation(self, points: Array) -> Array:
         """Return the matrix (J, N) from values to those of the polynomials at points (J,)."""

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.densities import GaussianMixture
-from zakai.methods._moments import prior_moments, wrapped
 from zakai.methods._protocol import Info
+from zakai.methods.system.prior_moments import prior_moments, wrapped
 from zakai.models.angles import ONE_IMAGE
 from zakai.models.model import Model
 from zakai.peers import _float64  # noqa: F401

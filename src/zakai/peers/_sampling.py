@@ -8,8 +8,8 @@ import numpy as np
 
 from zakai.densities import GridDensity
 from zakai.errors import InputError
-from zakai.methods._moments import density_grid, wrapped
 from zakai.methods._options import whole_number
+from zakai.methods.system.prior_moments import density_grid, wrapped
 from zakai.models._definite import square_root
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function

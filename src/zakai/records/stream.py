@@ -14,6 +14,7 @@ from zakai.errors import InputError
 from zakai.models._errors import named
 from zakai.records.columns import observed_columns
 from zakai.records.dates import Clock, date_of
+from zakai.records.dialect import Dialect, dialect_of
 from zakai.records.header import header_names, quoted
 from zakai.records.numbers import NUMBER
 from zakai.records.writing import default_names
@@ -43,8 +44,8 @@ def lines_of(
     r"""Yield the lines of a stream of observations, each as soon as it is there.
 
     JSON lines are {"time": 0.1, "y": [0.5, null], "inputs": {"u": 1.0}}; other keys are ignored, and no key may stand twice. A
-    stream whose first line begins with `time` is CSV, with m columns after that and, in any place, one for each input. Empty
-    lines are skipped. No line is held in memory beyond a mebibyte.
+    stream whose first line begins with `time` is CSV in the dialects that `read_record` reads, with m columns after that and, in
+    any place, one for each input. Empty lines are skipped. No line is held in memory beyond a mebibyte.
 
     Args:
         file: bytes, as `sys.stdin.buffer`.
@@ -63,6 +64,8 @@ def lines_of(
         [[0.5], [None]]
     """
     parse: Callable[[str], tuple[Any, list[Any], dict[str, Any] | None]] | None = None
+    dialect: Dialect | None = None
+    comment: list[str] = []  # the last one before the header
     number = 0
     while content := file.readline(LONGEST + 1):
         number += 1
@@ -71,17 +74,25 @@ def lines_of(
             yield Line(number, None, [], fault=f"is longer than {LONGEST} bytes")
             continue
         try:
-            text = content.decode("utf-8-sig" if number == 1 else "utf-8")
+            text = content.decode("utf-8-sig" if number == 1 else "utf-8").rstrip("\r\n")
         except UnicodeDecodeError:
             yield Line(number, None, [], fault="holds bytes that are not UTF-8 text")
             continue
+        if parse is None:
+            if text.lstrip().startswith("#"):
+                comment = [text]
+            if not text.strip() or text.lstrip().startswith("#"):
+                continue
+            found = dialect_of([*comment, text])
+            columns = None if found is None else _columns(text, found, number, names or default_names(m), inputs)
+            parse = partial(_json, clock) if columns is None else partial(_csv, clock, inputs, columns)
+            dialect = None if columns is None else found
+            if dialect is not None and dialect.line > len(comment):
+                continue
+        if dialect is not None:
+            text = dialect.translated([text])[0]
         if not text.strip():
             continue
-        if parse is None:
-            columns = _columns(text, number, names or default_names(m), inputs)
-            parse = partial(_json, clock) if columns is None else partial(_csv, clock, inputs, columns)
-            if columns is not None:
-                continue
         try:
             yield Line(number, *parse(text))
         except ValueError as error:
@@ -184,13 +195,15 @@ def _csv(
     return numbers[0], [numbers[place] for place in observed], given or None
 
 
-def _columns(text: str, number: int, observed: Sequence[str], inputs: Sequence[str]) -> tuple[list[int], list[int]] | None:
+def _columns(
+    text: str, dialect: Dialect, number: int, observed: Sequence[str], inputs: Sequence[str]
+) -> tuple[list[int], list[int]] | None:
     """Return the places of the observations and of the inputs if the first line is the header of a CSV, None if it is JSON.
 
     Raises:
         InputError: a header that does not fit, or a line that looks like CSV and is no header.
     """
-    names = header_names(text.strip())
+    names = header_names(dialect.header)
     with named(f"standard input: line {number}"):
         if names[0] == "time":
             given = inputs if set(inputs) & set(names[1:]) else ()
@@ -202,7 +215,7 @@ def _columns(text: str, number: int, observed: Sequence[str], inputs: Sequence[s
         if _looks_like_csv(text):
             header = (
                 f"whose first line must be a header: first the column time, then {len(observed)} for the observations, with "
-                "commas between"
+                "commas, semicolons or tabs between"
             )
             raise InputError(f"{quoted(text.strip())} looks like CSV, {header}")
     return None

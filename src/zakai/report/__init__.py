@@ -1,4 +1,4 @@
-"""Pictures and the HTML report of a result; plotly and matplotlib are imported when they are used."""
+"""Pictures and the HTML report of a result; matplotlib is imported when it is used."""
 
 from __future__ import annotations
 

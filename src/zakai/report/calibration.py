@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.errors import InputError
-from zakai.report import _style as style
-from zakai.report import plots
-from zakai.report._extra import plotting
+from zakai.report.charts import Chart, axis, time_axis
+from zakai.report.scripts import framed
 
 _ROWS = 200  # of the end of a record, of which the residuals are computed
 _BINS, _LAGS, _MOST_COORDINATES = 10, 20, 4
@@ -107,7 +106,7 @@ def _uniformity(u: np.ndarray) -> float:
 
 def section(result: Any) -> str:
     """Return the section: PIT histogram, normal scores over time, and autocorrelation of each observed coordinate."""
-    from zakai.engine.residuals import residuals
+    from zakai.diagnostics.residuals import residuals
 
     count = len(result.times) - 1
     if getattr(result, "origin", None) is None or result.record is None or count == 0:
@@ -136,59 +135,37 @@ def section(result: Any) -> str:
     for j in columns[:_MOST_COORDINATES]:
         found = calibration_of(times, u[:, j])
         title = f"<h3>Observation {j + 1}</h3>" if u.shape[1] > 1 else ""
-        figure = plots.framed(calibration_figure(found, getattr(result, "clock", None)), f"calibration-{j}", "")
+        figure = framed("chart", calibration_frame(found, getattr(result, "clock", None)), f"calibration-{j}")
         parts.append(f"{title}<p>{len(found.u):,} residuals{used}.</p>{found.table()}{figure}")
     return "".join(parts)
 
 
-def calibration_figure(found: Calibration, clock: Any = None) -> Any:
+def calibration_frame(found: Calibration, clock: Any = None) -> bytes:
     """Return the three panels for one observed coordinate."""
     from scipy.special import bdtr
 
-    go, make_subplots = plotting("plotly.graph_objects"), plotting("plotly.subplots").make_subplots
-    titles = ["residuals", "autocorrelation of the normal scores", "normal scores over time"]
-    figure = make_subplots(
-        rows=2, cols=2, specs=[[{}, {}], [{"colspan": 2}, None]], subplot_titles=titles, vertical_spacing=0.2,
-        horizontal_spacing=0.1,
-    )  # fmt: skip
     count = len(found.u)
     heights = np.histogram(found.u, _BINS, (0.0, 1.0))[0] * _BINS / count
-    bars = {"color": style.SERIES_COLOUR, "opacity": 0.75}
     middles = (np.arange(_BINS) + 0.5) / _BINS
-    figure.add_trace(
-        go.Bar(x=middles, y=heights, width=0.92 / _BINS, marker=bars, showlegend=False, name="density"), row=1, col=1
-    )
     low, high = np.searchsorted(bdtr(np.arange(count), count, 1.0 / _BINS), [0.025, 0.975]) * _BINS / count
-    middle, edge = {"color": style.INK, "width": 1}, {"color": style.BAND_COLOUR, "width": 1, "dash": "3px,3px"}
-    band = {"fillcolor": style.BAND_COLOUR, "opacity": 0.16, "line_width": 0, "layer": "below"}
-    figure.add_hrect(y0=float(low), y1=float(high), row=1, col=1, **band)
-    for level, line in ((float(low), edge), (1.0, middle), (float(high), edge)):  # the bars hide the band
-        figure.add_hline(y=level, line=line, row=1, col=1)
-    lags = np.arange(1, len(found.autocorrelation) + 1)
-    figure.add_trace(
-        go.Bar(x=lags, y=found.autocorrelation, width=0.3, marker=bars, showlegend=False, name="autocorrelation"), row=1, col=2
-    )
-    bound = 1.96 / np.sqrt(count)
-    figure.add_hrect(y0=-bound, y1=bound, row=1, col=2, **band)
-    figure.add_hline(y=0.0, line=middle, row=1, col=2)
-    dots = {"color": style.SERIES_COLOUR, "size": 4, "opacity": 0.75}
-    figure.add_trace(
-        go.Scatter(
-            x=plots.moments(found.times, clock), y=found.scores, mode="markers", marker=dots, showlegend=False,
-            name="normal score", hovertemplate="%{x}<br>%{y:.3g}<extra></extra>",
-        ), row=2, col=1,
-    )  # fmt: skip
-    figure.add_hrect(y0=-1.96, y1=1.96, row=2, col=1, **band)
-    plots.layout(figure, 560)
-    figure.update_annotations(font={"size": 13, "color": style.INK})
-    figure.update_layout(margin={"t": 62}, bargap=0.05)
-    figure.update_xaxes(title_standoff=8)
+    chart = Chart(across=2)
+    top = 1.1 * max(float(high), float(heights.max()))
+    panel = chart.panel("residuals", axis("probability", 0, 1), axis("density", 0, top), height=230)
+    panel.add("bars", middles, heights, width=0.92 / _BINS).add("rows", low=low, high=high, colour="band")
+    for level, line in (
+        (low, {"dash": [3, 3], "colour": "band"}),
+        (1.0, {"colour": "ink"}),
+        (high, {"dash": [3, 3], "colour": "band"}),
+    ):
+        panel.add("row", at=float(level), **line)
+    lags, bound = np.arange(1, len(found.autocorrelation) + 1), 1.96 / np.sqrt(count)
     size = max(0.3, 1.2 * bound, 1.1 * float(np.abs(found.autocorrelation).max(initial=0.0)))
-    figure.update_xaxes(title_text="probability", range=[0, 1], row=1, col=1)
-    figure.update_yaxes(title_text="density", range=[0, 1.1 * max(float(high), float(heights.max()))], row=1, col=1)
-    figure.update_xaxes(title_text="lag (observations)", range=[0, len(lags) + 1], row=1, col=2)
-    figure.update_yaxes(range=[-size, size], row=1, col=2)
-    plots.time_axis(figure, clock, row=2, col=1)
+    panel = chart.panel(
+        "autocorrelation of the normal scores", axis("lag (observations)", 0, len(lags) + 1), axis("", -size, size), height=230
+    )
+    panel.add("rows", low=-bound, high=bound, colour="band").add("bars", lags, found.autocorrelation, width=0.3)
+    panel.add("row", at=0.0, colour="ink")
     size = max(3.5, 1.1 * float(np.abs(found.scores).max()))
-    figure.update_yaxes(title_text="standard deviations", range=[-size, size], row=2, col=1)
-    return figure
+    panel = chart.panel("normal scores over time", time_axis(clock), axis("deviations", -size, size), wide=True, height=210)
+    panel.add("rows", low=-1.96, high=1.96, colour="band").add("dots", found.times, found.scores)
+    return chart.frame()

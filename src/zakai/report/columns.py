@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from zakai.densities import Density
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
 from zakai.densities.points import PointMasses
@@ -93,6 +93,12 @@ def columns_at(result: Any, index: Iterable[int], state: int, rows: int = ROWS) 
 
 
 def _column(density: Density, rows: int) -> _Column:
+    low, high, values = _window(density, rows)
+    turn = 2 * np.pi * np.rint((low + high) / (4 * np.pi)) if density.periodic[0] and np.isfinite(low) else 0.0
+    return low - turn, high - turn, values
+
+
+def _window(density: Density, rows: int) -> _Column:
     if isinstance(density, PointMasses):
         if not np.ptp(density.points) > 0:
             return _point(float(density.points[0, 0]), rows)

@@ -1,8 +1,6 @@
-"""The posterior density over time as an array: what both the HTML report and the static pictures draw.
+"""The posterior density over time on one grid: what Matplotlib draws.
 
-Each density is evaluated on its own window around its mean, fine enough for the mass that is there, and then
-binned: a cell of the common grid holds the *average* density over the cell. So a density that is narrower
-than a cell keeps its mass, where sampling it at the cell's centre would miss it.
+A cell of the grid that all times have in common holds the average density over the cell, from the columns of `columns.py`.
 """
 
 from __future__ import annotations
@@ -12,34 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.errors import InputError
+from zakai.report.columns import columns_at
 
 BAND = 0.95
 _NORMAL_QUANTILE = 1.959963984540054
-_WINDOW = 5.5  # standard deviations on each side of the mean
-_POINTS = 281  # evaluations of one density: 25 to a standard deviation
 _ROWS = 280
-
-
-@dataclass(frozen=True)
-class Profile:
-    """One marginal density on its own window: p(centre + deviation), normalised on the window."""
-
-    centre: float
-    deviation: np.ndarray  # (points,)
-    density: np.ndarray  # (points,)
-
-    @property
-    def cumulative(self) -> np.ndarray:
-        """The distribution function at the points of the window."""
-        steps = 0.5 * (self.density[1:] + self.density[:-1]) * np.diff(self.deviation)
-        total = np.concatenate([[0.0], np.cumsum(steps)])
-        return total / total[-1]
-
-    def quantile(self, q: float) -> float:
-        """The deviation from the centre below which the mass q lies."""
-        return float(np.interp(q, self.cumulative, self.deviation))
 
 
 @dataclass(frozen=True)
@@ -63,7 +40,6 @@ class DensityOverTime:
     truth: np.ndarray | None  # (columns,)
     periodic: bool
     kept: bool
-    profiles: tuple[Profile, ...]  # the marginal densities that were binned; none if they were not kept
 
     @property
     def joined(self) -> bool:
@@ -83,17 +59,6 @@ class DensityOverTime:
         peak = np.max(self.density, axis=0, initial=0.0)
         return np.nan_to_num(self.density / np.where(peak > 0, peak, 1.0))
 
-    @property
-    def coverage(self) -> float | None:
-        """The share of the times with a known truth at which the band holds it; None without any."""
-        if self.truth is None or not np.isfinite(self.truth).any():
-            return None
-        from_lower, width = self.truth - self.lower, self.upper - self.lower
-        if self.periodic:
-            from_lower, width = np.mod(from_lower, 2 * np.pi), 2 * np.pi - np.mod(-width, 2 * np.pi)
-        known = np.isfinite(self.truth)
-        return float(np.mean((0 <= from_lower[known]) & (from_lower[known] <= width[known])))
-
 
 def density_over_time(
     result: Any,
@@ -102,23 +67,19 @@ def density_over_time(
     start: int = 0,
     stop: int | None = None,
     columns: int = 600,
-    extra: tuple[int, ...] = (),
 ) -> DensityOverTime:
     """Evaluate the marginal posterior of one state over the times `start <= k < stop`.
 
-    At most about `columns` times are taken, evenly spaced over the record, and the times `extra` with them.
-    `truth` has shape (K+1, n), nan where it is not known.
+    At most `columns` times are taken, evenly spaced over the record.  `truth` has shape (K+1, n), nan where it is not known.
     """
-    index = chosen_times(len(result.times), start, stop, columns, extra)
+    index = chosen_times(len(result.times), start, stop, columns)
     periodic = is_periodic(result, state)
     mean = np.asarray(result.mean, dtype=float)[index, state]
     truth_here = None if truth is None else np.array(truth[index, state], dtype=float)
     kept = bool(result.has_densities)
-    profiles: tuple[Profile, ...] = ()
-    if kept:
-        profiles = tuple(profile(result, int(k), state) for k in index)
-        low = np.array([p.quantile((1 - BAND) / 2) for p in profiles])
-        high = np.array([p.quantile((1 + BAND) / 2) for p in profiles])
+    drawn = columns_at(result, index, state) if kept else None
+    if drawn is not None:
+        low, high = drawn.quantile([(1 - BAND) / 2, (1 + BAND) / 2]) - mean
     else:
         high = _NORMAL_QUANTILE * np.sqrt(np.asarray(result.variance, dtype=float)[index, state])
         high = np.minimum(high, np.pi) if periodic else high
@@ -131,15 +92,14 @@ def density_over_time(
         edges = _edges(centre, centre + low, centre + high, truth_here, index)
 
     density = np.zeros((_ROWS, len(index)))
+    own = None if drawn is None else (drawn.edges, drawn.cumulative)
     for column in range(len(index)):
-        turns = (-2 * np.pi, 0.0, 2 * np.pi) if periodic else (0.0,)
-        for turn in turns:
-            deviation = edges + turn - centre[column]
-            if kept:
-                here = profiles[column]
-                mass = np.diff(np.interp(deviation, here.deviation, here.cumulative))
+        for turn in (-2 * np.pi, 0.0, 2 * np.pi) if periodic else (0.0,):
+            if own is not None:
+                mass = np.diff(np.interp(edges + turn, own[0][column], own[1][column]))
                 density[:, column] += mass / np.diff(edges)
             else:
+                deviation = edges + turn - centre[column]
                 middle = 0.5 * (deviation[1:] + deviation[:-1])
                 density[:, column] += (low[column] <= middle) & (middle <= high[column])
 
@@ -160,42 +120,17 @@ def density_over_time(
         truth_here,
         periodic,
         kept,
-        profiles,
     )
 
 
-def profile(result: Any, k: int, state: int) -> Profile:
-    """The marginal density of one state at time k on a window that holds its mass, the circle at most."""
-    mean = float(np.asarray(result.mean)[k, state])
-    spread = float(np.sqrt(np.asarray(result.variance)[k, state]))
-    certain = not spread > 0  # a state that is known exactly, or a run that was lost, has no density to ask for
-    if certain:
-        spread = 1e-9 * max(1.0, abs(mean))
-    periodic = is_periodic(result, state)
-    width = min(_WINDOW * spread, np.pi) if periodic else _WINDOW * spread
-    deviation = np.linspace(-width, width, _POINTS)
-    if certain:
-        logarithm = -0.5 * (deviation / spread) ** 2
-    else:
-        points = wrap(mean + deviation) if periodic else mean + deviation
-        marginal = result.density(k).marginal(state)
-        logarithm = np.asarray(marginal.log_density(points[:, None]), dtype=float).reshape(-1)
-    logarithm = np.where(np.isfinite(logarithm), logarithm, -np.inf)
-    shape = np.exp(logarithm - max(float(np.max(logarithm)), -1e300))
-    mass = np.trapezoid(shape, deviation)
-    return Profile(mean, deviation, shape / mass if mass > 0 else np.full_like(shape, np.nan))
-
-
-def chosen_times(
-    count: int, start: int = 0, stop: int | None = None, columns: int = 600, extra: tuple[int, ...] = ()
-) -> np.ndarray:
-    """Return the positions of at most `columns` evenly spaced times in [start, stop), and of the `extra` times in it."""
+def chosen_times(count: int, start: int = 0, stop: int | None = None, columns: int = 600) -> np.ndarray:
+    """Return the positions of at most `columns` evenly spaced times in [start, stop)."""
     inside = np.arange(count)[start:stop]
     if inside.size == 0:
         raise InputError(f"start={start}, stop={stop}: no time of the result lies there (it has {count})")
     if inside.size > columns:
         inside = inside[np.unique(np.round(np.linspace(0, inside.size - 1, columns)).astype(int))]
-    return np.union1d(inside, [k for k in extra if inside[0] <= k <= inside[-1]]).astype(int)
+    return inside
 
 
 def is_periodic(result: Any, state: int) -> bool:

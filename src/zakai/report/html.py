@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from zakai.densities._density import wrap
-from zakai.report import _style, calibration, observed, plots, sections, words
+from zakai.densities._values import wrap
+from zakai.report import _style, calibration, observed, sections, words
 from zakai.report.heatmap import is_periodic, state_names, true_states
+from zakai.report.scripts import policy, script
 from zakai.report.words import signed
-
-# The page may not fetch anything, whatever a file that was put into it says.
-_POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
 
 
 def write_report(result: Any, path: str | Path, truth: Any = None) -> None:
@@ -24,7 +22,7 @@ def write_report(result: Any, path: str | Path, truth: Any = None) -> None:
 
     Arguments: `result`, a `FilterResult`; `path`, the file to write, replaced only when the whole report is
     ready; `truth`, the true states where they are known, (K+1, n) or an object with `times` and `values`.
-    Raises `InputError` for a truth of the wrong shape, or when the extra `plots` is not installed.
+    Raises `InputError` for a truth of the wrong shape.
 
     Example: `write_report(zakai.filter(model, record), "report.html")`.
     """
@@ -40,7 +38,7 @@ def page(result: Any, truth: Any = None) -> str:
     states = true_states(truth, result)
     parts = [
         ("posterior", "The posterior over time", sections.posterior(result, states)),
-        *([("joint", "The joint density of two states", observed.joint(result))] if len(state_names(result)) > 1 else []),
+        *([("joint", "The joint density of two states", observed.joint(result, states))] if len(state_names(result)) > 1 else []),
         ("snapshots", "The density at moments of note", sections.snapshots(result, states)),
         *([("observations", "The observations", observed.observations(result))] if result.record is not None else []),
         ("log-likelihood", "Log-likelihood", sections.likelihood(result)),
@@ -49,21 +47,19 @@ def page(result: Any, truth: Any = None) -> str:
         ("method", "Which method, and why", sections.method(result)),
         ("model", "The model", sections.model(result)),
     ]
-    links = "".join(f'<a href="#{key}">{key.capitalize()}</a>' for key, _, _ in parts)
+    links = " ".join(f'<a href="#{key}">{key.capitalize()}</a>' for key, _, _ in parts)
     body = "".join(f'<section id="{key}"><h2>{escape(title)}</h2>{text}</section>' for key, title, text in parts)
     name = escape(result.model.name if result.model is not None else "Filtering run")
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        f"{policy()}"
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{name}: {words.title(result).lower()}</title><style>{_style.css()}</style>"
-        "<script>window.PlotlyConfig = {MathJaxConfig: 'local'};</script>"
-        f"<script>{plots.library()}</script></head>\n"
+        f"<title>{name}: {words.title(result).lower()}</title><style>{_style.css()}</style></head>\n"
         f'<body><main><header><p class="eyebrow">{words.title(result)}</p><h1>{name}</h1>'
         f'<p class="verdict">{escape(words.verdict(result))}</p>{_warnings(result)}{_facts(result, states)}'
         "<noscript><p>The pictures on this page need JavaScript; the text and the tables do "
         "not.</p></noscript>"
-        f"<nav>{links}</nav></header>{body}<footer>{_versions(result)}</footer></main></body></html>\n"
+        f"<nav>{links}</nav></header>{body}<footer>{_versions(result)}</footer></main>{script()}</body></html>\n"
     )
 
 
@@ -109,7 +105,7 @@ def _versions(result: Any) -> str:
 
 def _installed() -> dict[str, str]:
     found = {}
-    for name in ("zakai", "numba", "numpy", "sympy", "plotly"):
+    for name in ("zakai", "numba", "numpy", "sympy"):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

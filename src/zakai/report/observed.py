@@ -8,39 +8,45 @@ from typing import Any
 
 import numpy as np
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
+from zakai.errors import InputError
 from zakai.models.numeric import numpy_function
 from zakai.records.schedule import schedule_of
-from zakai.report import _style as style
-from zakai.report import plots, words
-from zakai.report._extra import plotting
-from zakai.report.axes import joint_map
+from zakai.report import words
+from zakai.report.charts import Chart, axis, time_axis
 from zakai.report.heatmap import circle_line, state_names
+from zakai.report.plane import plane_bytes
+from zakai.report.scripts import framed
+from zakai.report.sections import special_moments
+from zakai.report.series import thinned
 
 _MOST_PAIRS = 3
 _MOST_COORDINATES = 4
 
 
-def joint(result: Any) -> str:
-    """The joint density of two states at the end, for the first pairs."""
-    names, clock_end = state_names(result), words.moment(result, len(result.times) - 1)
+def joint(result: Any, truth: np.ndarray | None) -> str:
+    """The joint density of two states at the moments of note, for the first pairs."""
+    names, moments = state_names(result), special_moments(result)
     if len(names) < 2:
         return "<p>There is one state.</p>"
     if not result.has_densities:
         return '<p>The densities of this run were not kept. Filter again with <code>keep="densities"</code> to see them.</p>'
     pairs = list(itertools.combinations(range(len(names)), 2))
     parts = [
-        f"<p>The density of two states at {escape(clock_end)}; the lines bound the smallest regions that hold 95% and 50%.</p>"
+        "<p>The density of two states at the moments of the next section; the slider chooses one of them. The lines bound the "
+        "smallest regions that hold 95% and 50%.</p>"
     ]
     if len(pairs) > _MOST_PAIRS:
         parts.append(f"<p>The first {_MOST_PAIRS} of {len(pairs)} pairs are drawn.</p>")
     for pair in pairs[:_MOST_PAIRS]:
-        drawn = joint_map(result.density(len(result.times) - 1).marginal(pair))
-        if not (np.isfinite(drawn[2]).all() and drawn[2].max() > 0):
+        last = len(result.times) - 1
+        try:
+            frame = plane_bytes(result, pair, [k for k, _ in moments], truth=truth)
+        except (InputError, np.linalg.LinAlgError):
             parts.append(f"<p>{escape(names[pair[0]])} and {escape(names[pair[1]])} have no joint density.</p>")
             continue
-        figure = joint_figure(*drawn, (names[pair[0]], names[pair[1]]))
-        parts.append(plots.framed(figure, f"joint-{pair[0]}-{pair[1]}", f"Correlation {_correlation(result, pair):.3f}."))
+        note = f"At the end, {words.moment(result, last)}, the correlation is {_correlation(result, pair):.3f}."
+        parts.append(framed("plane", frame, f"joint-{pair[0]}-{pair[1]}", note, 420))
     return "".join(parts)
 
 
@@ -75,7 +81,7 @@ def observations(result: Any) -> str:
     if len(series) < record.values.shape[1]:
         text += f" The first {len(series)} of {record.values.shape[1]} coordinates are drawn."
     figure = observations_figure(series, getattr(result, "clock", None))
-    return text + "</p>" + plots.framed(figure, "observations-figure", "") + known_inputs(result)
+    return text + "</p>" + framed("chart", figure, "observations-figure") + known_inputs(result)
 
 
 def known_inputs(result: Any) -> str:
@@ -90,7 +96,7 @@ def known_inputs(result: Any) -> str:
     shown = model.inputs[:_MOST_COORDINATES]
     series = [(f"input {name}", nothing, nothing, (times, values[:, j])) for j, name in enumerate(shown)]
     figure = observations_figure(series, getattr(result, "clock", None), "known input")
-    return "<h3>Known inputs</h3>" + plots.framed(figure, "inputs", "")
+    return "<h3>Known inputs</h3>" + framed("chart", figure, "inputs")
 
 
 def _expected(result: Any) -> np.ndarray:
@@ -111,58 +117,15 @@ def _short(formula: Any) -> str:
 
 def observations_figure(
     series: list[tuple[str, np.ndarray, np.ndarray, Any]], clock: Any = None, said: str = "h at the posterior mean"
-) -> Any:
-    """One panel for each observed coordinate: (title, times, values, times and values of a line, or None)."""
-    go, make_subplots = plotting("plotly.graph_objects"), plotting("plotly.subplots").make_subplots
-    rows = len(series)
-    titles = [escape(title) for title, _, _, _ in series]
-    figure = make_subplots(rows=rows, cols=1, shared_xaxes=True, vertical_spacing=0.22 / rows, subplot_titles=titles)
-    for row, (_, times, values, line) in enumerate(series, start=1):
-        keep = plots.thinned(values)
+) -> bytes:
+    """Return one panel for each observed coordinate: (title, times, values, times and values of a line, or None)."""
+    chart = Chart()
+    for title, times, values, line in series:
+        panel = chart.panel(title, time_axis(clock), axis(""), height=190, link="time")
+        keep = thinned(values)
         if len(values):
-            plots.dots(figure, plots.moments(times[keep], clock), values[keep], row=row, col=1, showlegend=row == 1)
+            panel.add("dots", times[keep], values[keep], colour="faint", text="observations")
         if line is not None:
-            few = plots.thinned(line[1])
-            figure.add_trace(
-                go.Scatter(
-                    x=plots.moments(line[0][few], clock), y=line[1][few].astype(np.float32), mode="lines",
-                    line={"color": style.INK, "width": 1.4}, showlegend=row == 1, legendgroup="expected",
-                    name=said,
-                ), row=row, col=1,
-            )  # fmt: skip
-    plots.layout(figure, 190 * rows + 80)
-    figure.update_annotations(font={"size": 13, "color": style.INK}, x=0, xanchor="left")
-    figure.update_layout(margin={"t": 62}, legend={"x": 1, "xanchor": "right"})
-    plots.time_axis(figure, clock, row=rows, col=1)
-    return figure
-
-
-def joint_figure(x: np.ndarray, y: np.ndarray, values: np.ndarray, levels: np.ndarray, names: tuple[str, str]) -> Any:
-    """The joint density of two states, with the regions that hold 50% and 95%."""
-    go = plotting("plotly.graph_objects")
-    figure = go.Figure()
-    colours = style.DENSITY_COLOURS
-    scale = [[i / (len(colours) - 1), colour] for i, colour in enumerate(colours)]
-    grid = {"x": x.astype(np.float32), "y": y.astype(np.float32)}
-    percent = np.round(100 * values / max(values.max(), np.finfo(float).tiny)).astype(np.uint8)
-    figure.add_trace(
-        go.Heatmap(
-            **grid, z=percent, colorscale=scale, showscale=False,
-            hovertemplate="%{x:.4g}, %{y:.4g}<br>%{z}% of the peak<extra></extra>",
-        )
-    )  # fmt: skip
-    for level, width in zip(levels, (0.9, 1.4), strict=True):
-        height = float(100 * level / values.max())
-        figure.add_trace(
-            go.Contour(
-                **grid, z=100 * values / values.max(), showscale=False, hoverinfo="skip",
-                contours={"start": height, "end": height, "size": 1, "coloring": "none"},
-                line={"color": style.BAND_COLOUR, "width": width},
-                showlegend=False,
-            )
-        )  # fmt: skip
-    plots.layout(figure, 430)
-    figure.update_layout(width=520)
-    figure.update_xaxes(title_text=escape(names[0]))
-    figure.update_yaxes(title_text=escape(names[1]))
-    return figure
+            few = thinned(line[1])
+            panel.add("line", line[0][few], line[1][few], colour="ink", width=1.4, text=said)
+    return chart.frame()

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.errors import InputError
-from zakai.records.dates import Clock
 from zakai.report import words
+from zakai.report.charts import clock_header
 from zakai.report.columns import ROWS, columns_at
 from zakai.report.frames import pack
 from zakai.report.heatmap import circle_line, direct_observations, is_periodic, state_names, true_states
-from zakai.report.plots import thinned
+from zakai.report.series import thinned
 
 LEVELS = (0.025, 0.975)
 _NORMAL_QUANTILE = 1.959963984540054
@@ -33,6 +33,8 @@ def picture_bytes(
     columns: int = COLUMNS,
     rows: int = ROWS,
     truth: Any = None,
+    *,
+    alone: bool = False,
 ) -> bytes:
     """Return the frame of one state over a window of times.
 
@@ -43,6 +45,7 @@ def picture_bytes(
         columns: the number of densities at most; of more times, as many are taken evenly.
         rows: the number of cells of a density.
         truth: the true states where they are known, as for `FilterResult.plot`.
+        alone: whether the window is all that a reader can see.
 
     Raises:
         InputError: an unknown state, a window without times, or a truth of the wrong shape.
@@ -97,9 +100,12 @@ def picture_bytes(
         "given": words.given(result),
         "levels": list(LEVELS),
         "window": [float(times[inside[0]]), float(times[inside[-1]])],
-        "extent": [float(times[0]), float(times[-1])],
-        "range": value_range(means, variances, known, periodic),
+        "extent": [float(times[k]) for k in ((inside[0], inside[-1]) if alone else (0, -1))],
+        "range": value_range(
+            *((one if one is None or not alone else one[inside]) for one in (means, variances, known)), periodic
+        ),
         "complete": len(index) == len(inside),
+        "coverage": None if known is None else coverage(arrays["quantiles"], arrays["truth"], periodic),
         "lines": lines.described,
     }
     return pack(header, {name: np.ascontiguousarray(array) for name, array in arrays.items()})
@@ -122,6 +128,17 @@ class _Lines:
         names = [f"line{len(self.described)}.{part}" for part in ("times", "values")]
         self.arrays.update(zip(names, (times, values), strict=True))
         self.described.append({"role": role, "text": _TEXTS[role], "times": names[0], "values": names[1], "dots": dots})
+
+
+def coverage(quantiles: np.ndarray, truth: np.ndarray, periodic: bool) -> float | None:
+    """Return the share of the times with a known truth (C,) at which it is between two quantiles (2, C); None without any."""
+    known = np.isfinite(truth)
+    if not known.any():
+        return None
+    offset, width = truth - quantiles[0], quantiles[1] - quantiles[0]
+    if periodic:
+        offset, width = np.mod(offset, 2 * np.pi), 2 * np.pi - np.mod(-width, 2 * np.pi)
+    return float(np.mean((0 <= offset[known]) & (offset[known] <= width[known])))
 
 
 def chosen(times: np.ndarray, window: tuple[float, float] | None, columns: int) -> tuple[np.ndarray, np.ndarray]:
@@ -151,14 +168,6 @@ def number_of(result: Any, coordinate: int | str) -> int:
     if isinstance(coordinate, int | np.integer) and 0 <= coordinate < len(names):
         return int(coordinate)
     raise InputError(f"picture: there is no state {coordinate!r}; the states are {', '.join(names)}")
-
-
-def clock_header(clock: Clock | None) -> dict[str, float] | None:
-    """Return the date of t = 0 in milliseconds since 1970 and the unit of t in milliseconds."""
-    if clock is None:
-        return None
-    origin, unit = clock.days(0.0), clock.days(1.0) - clock.days(0.0)
-    return {"origin": float(origin) * 86400e3, "unit": float(unit) * 86400e3}
 
 
 def value_range(means: np.ndarray, variances: np.ndarray, truth: np.ndarray | None, periodic: bool) -> list[float]:

@@ -12,7 +12,7 @@ from zakai.report import _style as style
 from zakai.report import words
 from zakai.report._extra import plotting
 from zakai.report.axes import plain, plot_result
-from zakai.report.plots import on_log_scale, thinned
+from zakai.report.series import on_log_scale, thinned
 
 _FORMATS = ("png", "pdf", "svg")
 

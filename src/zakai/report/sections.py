@@ -9,17 +9,15 @@ import numpy as np
 
 from zakai.report import plots, words
 from zakai.report.equations import equations
-from zakai.report.heatmap import (
-    DensityOverTime,
-    density_over_time,
-    direct_observations,
-    is_periodic,
-    profile,
-    state_names,
-)
+from zakai.report.frames import unpack
+from zakai.report.heatmap import is_periodic, state_names
+from zakai.report.picture import picture_bytes
+from zakai.report.scripts import framed
+from zakai.report.series import MOST_POINTS
 from zakai.report.words import signed
 
 _COLUMNS = 600
+_ROWS = 160  # of the columns of the report: 14 or more for a standard deviation of a Gaussian
 _DETAIL = 200
 _MOST_STATES = 6
 
@@ -32,46 +30,32 @@ def posterior(result: Any, truth: np.ndarray | None) -> str:
     parts = [f"<p>{_how_to_read(result, truth)}</p>"]
     if shown < len(names):
         parts.append(f"<p>The first {shown} of {len(names)} states are drawn.</p>")
-    moments, clock = tuple(k for k, _ in special_moments(result)), getattr(result, "clock", None)
     for i in range(shown):
-        picture = density_over_time(result, i, truth, columns=_COLUMNS, extra=moments)
-        note = "Every time is drawn." if total <= _COLUMNS else (
-            f"{len(picture.index):,} of {total:,} times are drawn, evenly spaced, and the moments of the "
-            f"next section."
+        frame = picture_bytes(result, i, None, _COLUMNS, _ROWS, truth)
+        header, arrays = unpack(frame)
+        note = "Every time is drawn." if header["complete"] else (
+            f"{len(arrays['times']):,} of {total:,} densities are drawn, evenly spaced; of the mean, the extremes."
         )  # fmt: skip
-        if not picture.joined:
+        if header["periodic"] and not header["complete"]:
             note += " Between them the angle may have gone either way round: the means are dots."
-        if picture.coverage is not None:
-            note += f" The band holds the true state at {picture.coverage:.1%} of them."
+        if header["coverage"] is not None:
+            note += f" The band holds the true state at {header['coverage']:.1%} of them."
         title = f"<h3>{escape(names[i])}</h3>" if len(names) > 1 else ""
-        parts.append(
-            title
-            + plots.framed(plots.posterior(picture, observed=_seen(result, i, picture), clock=clock), f"posterior-{i}", note)
-        )
+        parts.append(title + framed("density", frame, f"posterior-{i}", note, 400))
         if total > _COLUMNS:
-            last = density_over_time(result, i, truth, start=total - _DETAIL)
-            note = f"The last {_DETAIL} times, every one drawn."
-            drawn = plots.posterior(last, 330, observed=_seen(result, i, last), clock=clock)
-            parts.append(plots.framed(drawn, f"detail-{i}", note))
+            times = np.asarray(result.times, dtype=float)
+            last = picture_bytes(result, i, (times[-_DETAIL], times[-1]), _DETAIL + 1, _ROWS, truth, alone=True)
+            parts.append(framed("density", last, f"detail-{i}", f"The last {_DETAIL} times, every one drawn.", 320))
     return "".join(parts)
-
-
-def _seen(result: Any, state: int, picture: DensityOverTime) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the observations of a state itself at the times of a picture, of many the extremes."""
-    found = direct_observations(result, state, float(picture.times[0]), float(picture.times[-1]))
-    if found is None:
-        return None
-    keep = plots.thinned(found[1])
-    return found[0][keep], found[1][keep]
 
 
 def _how_to_read(result: Any, truth: np.ndarray | None) -> str:
     if result.has_densities:
         text = (
             f"Each column of the picture is the conditional density of the state, given {words.given(result)}: the "
-            "darker, the more probable, each column relative to its own peak. The black line is the mean; "
-            "between the thin "
-            "blue lines lies the state with probability 95%."
+            "stronger the blue, the more probable, each column relative to its own peak. The thick line is the mean; between the "
+            "thin lines lies the state with probability 95%. Point at a place for its numbers; drag, pinch or use Ctrl and the "
+            "wheel to look closer."
         )
     else:
         text = (
@@ -79,7 +63,7 @@ def _how_to_read(result: Any, truth: np.ndarray | None) -> str:
             "band is the 95% band of "
             "a Gaussian with that mean and variance. The true density may have another shape; to see it, "
             "filter again with "
-            '<code>keep="densities"</code>. The black line is the mean.'
+            '<code>keep="densities"</code>. The thick line is the mean.'
         )
     if truth is not None:
         text += " The dashed orange line is the true state."
@@ -128,19 +112,11 @@ def snapshots(result: Any, truth: np.ndarray | None) -> str:
     ]
     moments = special_moments(result)
     names = state_names(result)
+    shots = [(k, f"{name[0].upper()}{name[1:]}, {words.moment(result, k)}") for k, name in moments]
     for i in range(min(len(names), _MOST_STATES)):
-        shots = [
-            (
-                name[0].upper() + name[1:],
-                words.moment(result, k),
-                profile(result, k, i),
-                None if truth is None else float(truth[k, i]),
-            )
-            for k, name in moments
-        ]
-        drawn = plots.snapshots(shots, names[i], is_periodic(result, i))
+        frame = plots.snapshots(result, shots, i, None if truth is None else truth[:, i], names[i], is_periodic(result, i))
         title = f"<h3>{escape(names[i])}</h3>" if len(names) > 1 else ""
-        parts.append(title + plots.framed(drawn, f"snapshots-{i}", ""))
+        parts.append(title + framed("chart", frame, f"snapshots-{i}"))
     return "".join(parts)
 
 
@@ -165,12 +141,12 @@ def likelihood(result: Any) -> str:
     if surprise is not None:
         worst = signed(f"{increments[surprise]:.4g}")
         note += f" The largest surprise, {worst}, came at {words.moment(result, surprise)} (circled)."
-    if len(times) - 1 > plots.MOST_POINTS:
+    if len(times) - 1 > MOST_POINTS:
         note += " The record is long: of every stretch of observations, the best and the worst are drawn."
     drawn = plots.log_likelihood(
         times[1:], increments[1:], None if surprise is None else surprise - 1, getattr(result, "clock", None)
     )
-    return f"<p>{text}</p>" + plots.framed(drawn, "log-likelihood-figure", note)
+    return f"<p>{text}</p>" + framed("chart", drawn, "log-likelihood-figure", note)
 
 
 def health(result: Any) -> str:
@@ -184,7 +160,7 @@ def health(result: Any) -> str:
         bounds = {name: words.health_bound(result, name) for name in varying}
         note = "Dotted line: the bound beyond which to worry. On a logarithmic scale an exact zero lies a decade below the rest."
         drawn = plots.health(np.asarray(result.times, dtype=float), varying, bounds, getattr(result, "clock", None))
-        figure = plots.framed(drawn, "health-figures", note)
+        figure = framed("chart", drawn, "health-figures", note)
     meaning = "".join(
         f"<dt>{escape(words.spoken(name))}</dt><dd>{escape(words.health_span(v))} {escape(words.health_words(result, name))}</dd>"
         for name, v in series.items()

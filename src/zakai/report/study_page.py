@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from zakai.records.writing import atomic_write
-from zakai.report import _style, plots, study_pictures, study_plots
-from zakai.report.html import _POLICY
+from zakai.report import _style, study_pictures, study_plots
 from zakai.report.pictures import save_figure
+from zakai.report.scripts import framed, policy, script
 
 MOST_POINTS = 12  # of a grid of parameters that are drawn
 _PICTURES = (
@@ -58,14 +58,12 @@ def page(outcome: Any) -> str:
     said += f"; distances are from {escape(reference)}." if reference else "."
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        f"{policy()}"
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{name}: study</title><style>{_style.css()}</style>"
-        "<script>window.PlotlyConfig = {MathJaxConfig: 'local'};</script>"
-        f"<script>{plots.library()}</script></head>\n"
+        f"<title>{name}: study</title><style>{_style.css()}</style></head>\n"
         f'<body><main><header><p class="eyebrow">Study</p><h1>{name}</h1><p class="verdict">{said}</p>'
         "<noscript><p>The pictures on this page need JavaScript; the tables do not.</p></noscript></header>"
-        f"{body}</main></body></html>\n"
+        f"{body}</main>{script()}</body></html>\n"
     )
 
 
@@ -75,8 +73,7 @@ def _section(outcome: Any, point: int) -> str:
     parts = [f"<h2>{title}</h2>", _table(figures)]
     for name, metric, heading, _, draw, caption in _PICTURES:
         if metric in outcome.study.metrics:
-            fragment = plots.html(draw(outcome, point), f"{name}-{point}")
-            parts.append(f"<h3>{heading}</h3><figure>{fragment}<figcaption>{caption}</figcaption></figure>")
+            parts.append(f"<h3>{heading}</h3>{framed('chart', draw(outcome, point), f'{name}-{point}', caption)}")
     return f"<section>{''.join(parts)}</section>"
 
 

@@ -20,8 +20,8 @@ from zakai.engine.versions import versions
 from zakai.errors import InputError
 from zakai.models.files import read_model
 from zakai.models.model import Model
-from zakai.models.simulate import simulate
 from zakai.records import Record
+from zakai.simulation.simulate import simulate
 from zakai.studies import metrics
 from zakai.studies._cost import Cost
 from zakai.studies.innovations import Innovations

@@ -7,9 +7,9 @@ import numpy as np
 from zakai.algebra.yau import eta
 from zakai.errors import ConditionError
 from zakai.methods.series.heat import REACH, HeatSeries, covariance_of, series
-from zakai.methods.series.jets import jets
+from zakai.methods.system.jets import jets
 from zakai.models.model import Model
-from zakai.numerics.series import value
+from zakai.numerics.series.power_series import value
 
 Array = np.ndarray
 

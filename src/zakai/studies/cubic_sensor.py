@@ -18,8 +18,8 @@ from zakai.engine.driver import filter as filter_record
 from zakai.errors import InputError
 from zakai.methods._options import whole_number
 from zakai.models.files import load_model
-from zakai.models.simulate import simulate
 from zakai.records import Record
+from zakai.simulation.simulate import simulate
 from zakai.studies._drawing import INK, OURS, PALE, SERIES, TRUTH, new_figure, plain
 from zakai.studies._published import (
     Comparison,

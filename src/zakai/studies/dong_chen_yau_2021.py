@@ -21,8 +21,8 @@ from zakai.methods._options import whole_number
 from zakai.models.files import load_model
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-from zakai.models.simulate import simulate
 from zakai.records import Record
+from zakai.simulation.simulate import simulate
 from zakai.studies._drawing import OURS, PALE, new_figure, plain
 from zakai.studies._published import Comparison, Pictures, Progress, Reproduction, by_computation
 

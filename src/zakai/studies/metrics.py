@@ -18,7 +18,7 @@ from scipy import stats
 from scipy.special import logsumexp, ndtr
 
 from zakai.densities import Density
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 
 PROBABILITIES = (np.arange(400) + 0.5) / 400  # at which the quantiles of a density stand for it
 _TAILS = np.array([1e-9, 1e-7, 1e-5, 1e-4, 3e-4])

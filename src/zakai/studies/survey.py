@@ -21,7 +21,7 @@ from zakai.engine.driver import filter as filter_record
 from zakai.engine.results import FilterResult
 from zakai.methods._options import whole_number
 from zakai.models.model import Model
-from zakai.models.simulate import simulate
+from zakai.simulation.simulate import simulate
 from zakai.studies._drawing import INK, PALE, SERIES, new_figure, plain
 from zakai.studies._published import Comparison, Pictures, Progress, Reproduction, Table, by_computation
 from zakai.studies._reference_density import Solution, conditional_densities

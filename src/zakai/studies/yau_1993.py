@@ -22,7 +22,7 @@ from zakai.methods._options import whole_number
 from zakai.methods.series.heat import HeatSeries, heat_series
 from zakai.models.files import load_model
 from zakai.models.model import Model
-from zakai.models.simulate import simulate
+from zakai.simulation.simulate import simulate
 from zakai.studies._drawing import SERIES, new_figure, plain
 from zakai.studies._published import Comparison, Pictures, Progress, Reproduction, Table, by_computation
 from zakai.studies._reference_density import conditional_densities

@@ -29,7 +29,7 @@ import sympy as sp
 from zakai.algebra.gauges import affine_system
 from zakai.algebra.systems import affine_observation
 from zakai.errors import InputError
-from zakai.methods._input_pieces import Pieces, pieces_of
+from zakai.methods.system.input_pieces import Pieces, pieces_of
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function

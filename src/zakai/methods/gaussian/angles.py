@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from zakai.densities import Density
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.methods._protocol import Backward, Info
 from zakai.methods.gaussian import families
 from zakai.methods.gaussian.backward import BACKWARD as PLAIN

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.algebra.gauges import gauge
-from zakai.methods._potential import potential_of
 from zakai.methods.gaussian.affine_system import Matrices
+from zakai.methods.system.potential import potential_of
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.numerics.complex_step import cholesky

@@ -10,7 +10,8 @@ from functools import cached_property
 import numpy as np
 
 from zakai.densities import Density, GaussianMixture, GridDensity
-from zakai.densities._density import DensityMethods, as_states
+from zakai.densities._density import DensityMethods
+from zakai.densities._values import as_states
 from zakai.methods.gaussian.gauge import Gauge, Posterior, posterior
 from zakai.models.model import Model
 from zakai.numerics.families import Family, log_terms

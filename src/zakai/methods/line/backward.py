@@ -18,16 +18,13 @@ from zakai.densities import Density
 from zakai.methods._protocol import Backward, Info, Infos
 from zakai.methods._states import Joined
 from zakai.methods.line import filter as line_filter
-from zakai.methods.line.adjoint import back
-from zakai.methods.line.figures import state_moments
+from zakai.methods.line.backward_interval import negligible, pulled, smoothing_tolerance
+from zakai.methods.line.backward_loop import back
 from zakai.methods.line.loop import joined
 from zakai.methods.line.message import Message, points_of, reliable
-from zakai.methods.line.parts import cut
 from zakai.methods.line.paths import draw
-from zakai.methods.line.prior import state_of
-from zakai.methods.line.system import Parts, Prepared, State
-from zakai.methods.line.update import acting_inside, factor_of
-from zakai.methods.line.way import negligible, pulled, smoothing_tolerance
+from zakai.methods.line.prepared import Parts, Prepared, State, cut
+from zakai.methods.line.update import acting_inside, factor_of, state_moments, state_of
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import support
 
@@ -86,11 +83,11 @@ def _of_parts(parts: Parts, rows: slice, state: State, later: Message, observed:
     # What a report says of the step after it belongs to that interval's gain.
     inner, values, last = cut(parts, rows, observed)
     between, _ = line_filter.segment_of_whole(parts.prepared, inner, state, values)
-    found, infos = _of_whole(parts.prepared, inner, Joined([[state], between]), later, values)
+    result, infos = _of_whole(parts.prepared, inner, Joined([[state], between]), later, values)
     gained = infos.log_likelihood_increment
     health = {name: np.fmax.reduceat(figures, last) for name, figures in infos.health.items()}
     reports = Infos(np.add.reduceat(gained, last), infos.mean[last], infos.cov[last], health)
-    return found._replace(logs=found.logs + np.sum(gained[: last[0]])), reports
+    return result._replace(logs=result.logs + np.sum(gained[: last[0]])), reports
 
 
 @np.errstate(all="ignore")
@@ -102,43 +99,43 @@ def _of_whole(
     stop = rows.stop
     while stop > rows.start:
         place = stop - rows.start
-        found = _product(states[place], later)
-        later, info = _smoothed(prepared, states[place], later, found)
+        result = _product(states[place], later)
+        later, info = _smoothed(prepared, states[place], later, result)
         parts.append(line_filter.alone(info))
-        taken = back(prepared, slice(rows.start, stop), states, later, found.values, found.window, observed)
-        if taken is None:
+        completed = back(prepared, slice(rows.start, stop), states, later, result.values, result.window, observed)
+        if completed is None:
             stop -= 1
             later = step(prepared, stop, later, observed[place - 1], states[place - 1])
         else:
-            later, stop = taken.message, stop - taken.number
-            parts.append(taken.infos)
+            later, stop = completed.message, stop - completed.number
+            parts.append(completed.infos)
     return later, joined(parts[::-1])
 
 
-def _smoothed(prepared: Prepared, state: State, later: Message, found: _Product) -> tuple[Message, Info]:
-    window = found.window
-    look = lw.figures(found.values, window.closed, prepared.negligible)
-    mean, variance = lw.moments(found.values, window)
+def _smoothed(prepared: Prepared, state: State, later: Message, result: _Product) -> tuple[Message, Info]:
+    window = result.window
+    check = lw.grid_check(result.values, window.closed, prepared.negligible)
+    mean, variance = lw.moments(result.values, window)
     centre, deviation = float(mean), float(np.sqrt(max(variance, 0.0)))
     spacings = deviation / window.spacing
-    mean, variance = state_moments(prepared, found.values, window, mean, variance)
+    mean, variance = state_moments(prepared, result.values, window, mean, variance)
     if window.closed:
         mean = mean - 2 * np.pi * np.ceil((mean - np.pi) / (2 * np.pi))
     health = {
         "error_estimate": float(state.error) + later.error,
         "tolerance_ratio": later.error / smoothing_tolerance(prepared),
-        "edge_mass": max(look.left, look.right),
-        "negative_mass": look.negative,
-        "aliasing": look.aliasing,
+        "edge_mass": max(check.left, check.right),
+        "negative_mass": check.negative,
+        "aliasing": check.aliasing,
         "std_in_spacings": spacings,
     }
-    first, last = support(found.values, negligible(prepared))
-    needed = min(later.needed, window.spacing * max(look.resolving, 1.0), float(state.spacing))
+    first, last = support(result.values, negligible(prepared))
+    needed = min(later.needed, window.spacing * max(check.resolving, 1.0), float(state.spacing))
     low, high = float(window.offsets[first]), float(window.offsets[last])
     finer = later.spacing > 2.0 * needed  # few points hold more than the product
-    kept = later.on(points_of(later.window, low, high, needed)) if finer else later.between(low, high)
-    kept = kept._replace(logs=kept.logs - found.log_mass, needed=needed, mean=centre, deviation=deviation)
-    return kept, Info(found.log_mass, np.array([mean]), np.array([[variance]]), health)
+    retained = later.on(points_of(later.window, low, high, needed)) if finer else later.between(low, high)
+    retained = retained._replace(logs=retained.logs - result.log_mass, needed=needed, mean=centre, deviation=deviation)
+    return retained, Info(result.log_mass, np.array([mean]), np.array([[variance]]), health)
 
 
 @np.errstate(all="ignore")
@@ -154,17 +151,16 @@ def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state
     if length == 0:
         return later
     between = later.variance
-    rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
-    later, made = pulled(prepared, k, inside, rates, state, later)
-    kept = float(np.clip(later.scaled * between / np.sqrt(max(before * later.variance, 1e-300)), 0.3, 1.0))
-    return later._replace(error=made + kept * later.error, scaled=1.0)
+    later, made = pulled(prepared, prepared.interval(k, inside, observed), state, later)
+    retained = float(np.clip(later.scaled * between / np.sqrt(max(before * later.variance, 1e-300)), 0.3, 1.0))
+    return later._replace(error=made + retained * later.error, scaled=1.0)
 
 
 @np.errstate(all="ignore")
 def density(prepared: Prepared, state: State, later: Message) -> Density:
     """Return the smoothed density."""
-    found = _product(state, later)
-    return line_filter.density(prepared, state_of(found.values, found.window, state.error, state.log_floor))
+    result = _product(state, later)
+    return line_filter.density(prepared, state_of(result.values, result.window, state.error, state.log_floor))
 
 
 def accuracy(prepared: Prepared) -> float:

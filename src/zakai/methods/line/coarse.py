@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.line.figures import figures
-from zakai.methods.line.system import Prepared
-from zakai.methods.line.tables import covariance_at, gauge_at, spectral
+from zakai.methods.line.coefficients import EDGE, covariance_at, gauge_at, spectral
+from zakai.methods.line.prepared import Prepared
+from zakai.methods.line.update import grid_check
 from zakai.numerics.line import window as lw
 
 Array = Any
@@ -26,8 +26,7 @@ SPACING = 0.34  # spacing in standard deviations of the noise, at most: the shor
 SHARP = 2.0  # how much finer a grid is at least
 REACH = 7.2  # standard deviations of the noise by which the support grows
 MARGIN = 7.2  # of them beyond: the waves that R' leaves everywhere end there, and spread from the ends
-ATTEMPTS = 6
-EDGE = 1e-11  # density at the outermost points, relative to the maximum
+TRIALS = 6
 
 
 class Coarsened(NamedTuple):
@@ -48,18 +47,18 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
         window: the fine grid on the line.
         length: tau.
     """
-    look = figures(prepared, values, window) if prepared.kinked else lw.figures(values, window.closed, prepared.negligible)
-    inner = slice(look.first, look.last + 1)
-    points, kept = window.points[inner], values[inner]
+    check = grid_check(prepared, values, window) if prepared.kinked else lw.grid_check(values, window.closed, prepared.negligible)
+    inner = slice(check.first, check.last + 1)
+    points, retained = window.points[inner], values[inner]
     covariance = covariance_at(prepared.system, points, prepared.model.start, prepared.theta)
     deviation = float(np.sqrt(max(np.min(covariance.real), 0.0) * _remembered(prepared, points, length)))
     if window.closed or SPACING * deviation < SHARP * window.spacing:
         return None
     spacing = window.unit * 2.0 ** np.floor(np.log2(SPACING * deviation / window.unit) + 1e-9)
     wide = float(np.sqrt(np.max(covariance.real) * length))
-    low, high = window.offsets[look.first] - REACH * wide, window.offsets[look.last] + REACH * wide
+    low, high = window.offsets[check.first] - REACH * wide, window.offsets[check.last] + REACH * wide
     allowed = 1e-5 * prepared.tolerance
-    for _ in range(ATTEMPTS):
+    for _ in range(TRIALS):
         coarse = _grid(window, float(low - MARGIN * wide), float(high + MARGIN * wide), float(spacing))
         decomposed = spectral(prepared, coarse) if coarse.size <= lw.LARGEST else None
         if decomposed is None or spacing < SHARP * window.spacing:
@@ -68,13 +67,13 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
             scale = np.exp(_gauge(prepared, coarse, points) - decomposed.top)
             if np.ndim(covariance):
                 scale = scale / np.sqrt(covariance)
-            found, error = decomposed.carried(lw.gathered(kept / scale, window.offsets[inner], coarse), length)
+            result, error = decomposed.carried(lw.gathered(retained / scale, window.offsets[inner], coarse), length)
         trusted = (coarse.offsets >= low) & (coarse.offsets <= high)
         ends = np.flatnonzero(trusted)[[0, 1, -2, -1]]
-        found = np.where(trusted, found, 0.0)
-        after = lw.figures(found, False, prepared.negligible)
+        result = np.where(trusted, result, 0.0)
+        after = lw.grid_check(result, False, prepared.negligible)
         bound = max(EDGE, 4.0 * after.aliasing)
-        left, right = np.max(np.abs(found[ends]).reshape(2, 2), axis=1) > bound * np.max(found.real)
+        left, right = np.max(np.abs(result[ends]).reshape(2, 2), axis=1) > bound * np.max(result.real)
         if left or right:
             third = (high - low) / 3.0
             low, high = low - third * left, high + third * right
@@ -83,7 +82,7 @@ def coarsened(prepared: Prepared, values: Array, window: lw.Window, length: floa
         elif error > max(1e-11, allowed):
             return None
         else:
-            return Coarsened(found, coarse, error, (int(ends[0]), coarse.size - 1 - int(ends[-1])))
+            return Coarsened(result, coarse, error, (int(ends[0]), coarse.size - 1 - int(ends[-1])))
     return None
 
 

@@ -1,19 +1,155 @@
-"""The coefficients of the equation of one state at the points of a grid and times of an interval."""
+"""The coefficients of the equation of one state at the points of a grid, and the decomposition of its operator there.
+
+    u_t = (G u)'' / 2 - (f u)' + (h'S^-1 dy/dt - h'S^-1 h / 2) u
+
+Where the noises are correlated, E dv dw' = C dt, with a = g C, K = S^-1 and y linear between observations,
+
+    u_t = ((G - a K a') u)'' / 2 - ((f - a K h - a_x K a' / 2 + a K dy/dt) u)' + (h'K dy/dt - h'K h / 2 - h_x'K a' / 2) u,
+
+which is u_t = L u - sum K_ij M_i M_j u / 2 + sum K_ij (dy_j/dt) M_i u with M_i u = h_i u - (a_i u)', the Zakai equation in the
+sense of Stratonovich.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.line.cross import with_cross_noise
-from zakai.methods.line.model import within
-from zakai.methods.line.system import Prepared
-from zakai.methods.line.tables import covariance_at, drift_at, finite, tables
+from zakai.methods.line.model import System, finite, within
+from zakai.methods.line.prepared import Derived, Prepared, TimeInterval
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.panels import Panels, panels
+from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS, Panels, panels
+from zakai.numerics.line.grid_choice import PER, PROFILE
+from zakai.numerics.line.operator import Spectral, symmetric
+from zakai.numerics.line.product import PARTS, at_nodes, nodes, weak
 
 Array = Any
+
+EDGE = 1e-11  # density at the outermost points of a grid, relative to the maximum
+
+_MIDPOINTS = (np.arange(32) + 0.5) / 32.0 - 0.5
+
+
+class Tables(NamedTuple):
+    """f and h at the points of a grid where they do not depend on t: (N,), (m, N); and G, (N,) where it depends on x."""
+
+    drift: Array
+    observation: Array
+    covariance: Any
+
+
+def tables(prepared: Prepared, window: lw.Window) -> Tables:
+    """Return the tables of a grid."""
+    system, theta, start = prepared.system, prepared.theta, prepared.model.start
+
+    def make() -> Tables:
+        points = window.points[:, None]
+        drift = drift_at(system, window, start, theta)
+        observation = system.observation(points, start, theta).T
+        return Tables(drift, observation, covariance_at(system, window.points, start, theta))
+
+    result: Tables = prepared.once(Derived.TABLES, window, make)
+    return result
+
+
+def spectral(prepared: Prepared, window: lw.Window) -> Spectral | None:
+    """Return the decomposition of the operator on a grid, if it has one."""
+    result: tuple[Spectral | None] = prepared.once(Derived.MODES, window, lambda: (decomposed(prepared, window, lw.LARGEST),))
+    return result[0]
+
+
+def profile_of(prepared: Prepared, window: lw.Window) -> Array:
+    """Return f, f' and G (3, L) at offsets from the origin that are unit / PER apart, of kinked systems the largest G alone."""
+    if prepared.kinked:
+        return np.full((3, 1), np.max(tables(prepared, window).covariance))
+
+    def make() -> Array:
+        system, start, theta = prepared.system, prepared.model.start, prepared.theta
+        x = window.origin + window.unit / PER * (np.arange(PROFILE) - PROFILE // 2.0)
+        f = finite(system.drift(x[:, None], start, theta)[:, 0])
+        return np.stack([f, np.gradient(f, x), covariance_at(system, x, start, theta) * np.ones(len(x))])
+
+    result: Array = prepared.once(Derived.PROFILE, (window.origin, window.unit), make)
+    return result
+
+
+def drift_at(system: System, window: lw.Window, t: Array, theta: Array) -> Array:
+    """Return f at the points of a grid and times (...), (..., N).
+
+    Of an f with jumps it is the mean over the spacing around a point, less the second difference that a smooth f adds to it.
+    """
+    times = np.asarray(t)[..., None]
+    if system.slope is not None or not isinstance(window, lw.Window):
+        return finite(system.drift(window.points[:, None], times, theta)[..., 0])
+    around = window.origin + window.centre + window.spacing * (np.arange(-1, window.size + 1) - window.size // 2)
+    nodes = (around[:, None] + window.spacing * _MIDPOINTS).reshape(-1, 1)
+    means = finite(system.drift(nodes, times, theta)[..., 0]).reshape(*times.shape[:-1], window.size + 2, -1).mean(axis=-1)
+    return means[..., 1:-1] - (means[..., 2:] - 2.0 * means[..., 1:-1] + means[..., :-2]) / 24.0
+
+
+def covariance_at(system: System, points: Array, t: Array, theta: Array) -> Array:
+    """Return G at points (..., N) and times (...): (..., N), or (...) if it is constant; zero where g has no value."""
+    if system.state_dependent:
+        result = finite(system.covariance(points[..., None], np.asarray(t)[..., None], theta)[..., 0, 0])
+        return np.where(result.real > 0.0, result, 0.0)
+    return system.covariance(np.zeros((*np.shape(t), 1)), t, theta)[..., 0, 0]
+
+
+def covariance_between(system: System, window: lw.Window, t: Array, theta: Array) -> Array:
+    """Return G half a spacing below each point of a grid, on the line also above the last one."""
+    ends = np.concatenate([window.points - 0.5 * window.spacing, window.points[-1:] + 0.5 * window.spacing])
+    return covariance_at(system, ends[:-1] if window.closed else ends, t, theta)
+
+
+def gauge_at(prepared: Prepared, points: Array, parts: int = 1) -> Array:
+    """Return int f / G from the first of increasing points (J,) to each, by Gauss' rule in equal parts of the steps between."""
+    start, theta, steps = prepared.model.start, prepared.theta, np.diff(points) / parts
+    nodes = (points[:-1, None] + steps[:, None] * (np.arange(parts)[:, None] + GAUSS_NODES).reshape(-1)).reshape(-1)
+    slopes = prepared.system.drift(nodes[:, None], start, theta)[:, 0] / covariance_at(prepared.system, nodes, start, theta)
+    return np.append(0.0, np.cumsum(steps * (slopes.reshape(len(steps), parts, -1) @ GAUSS_WEIGHTS).sum(axis=1)))
+
+
+def decomposed(
+    prepared: Prepared, window: lw.Window, largest: int, ends: tuple[Array, Array] | None = None
+) -> Spectral | None:
+    """Return the decomposition of the operator on a grid of at most so many points, None where there is none.
+
+    With `ends`, F'/F and its derivative (N,) of a function F, the drift in the symmetric operator is f + G F'/F.
+    """
+    known = tables(prepared, window)
+    drift, covariance = known.drift, known.covariance
+    system, theta, start = prepared.system, prepared.theta, prepared.model.start
+    if system.moving or system.slope is None or system.spread is None or window.size > largest:
+        return None
+    if not (covariance.real > 0).all():
+        return None
+    points, parts, spread, curvature, scale = window.points[:, None], PARTS if system.rough else 1, 0.0, 0.0, 1.0
+    gauge = gauge_at(prepared, np.append(window.points, window.points[-1] + window.spacing), parts)
+    if system.rough and not window.closed:
+        x = nodes(window.points, window.spacing)
+        drift, covariance = system.drift(x[:, None], start, theta)[:, 0], covariance_at(system, x, start, theta)
+        drift = drift - (0.5 * system.spread(x[:, None], start, theta)[:, 0] if system.state_dependent else 0.0)
+        drift, covariance = at_nodes(drift), at_nodes(np.broadcast_to(covariance, x.shape))
+        potential = 0.5 * (weak(drift**2 / covariance, window.spacing)[0] + weak(drift, window.spacing)[1])
+    else:
+        slope = system.slope(points, start, theta)[:, 0]
+        if system.state_dependent:
+            spread, curvature = np.moveaxis(system.spread(points, start, theta), -1, 0)
+        if ends is not None:
+            drift, slope = drift + covariance * ends[0], slope + spread * ends[0] + covariance * ends[1]
+        potential = 0.5 * ((drift - 0.5 * spread) ** 2 / covariance + slope - 0.5 * curvature)
+    covariance = known.covariance
+    if system.state_dependent:
+        scale = 1.0 / np.sqrt(covariance)
+        covariance = covariance_between(system, window, start, theta)
+    if not np.isfinite(potential.real).all() or not np.isfinite(gauge.real).all():
+        return None
+    if window.closed and abs(gauge[-1].real) > 1e-12 * max(1.0, float(np.sum(np.abs(np.diff(gauge.real))))):
+        return None
+    modes = spectral(prepared.real, window) if np.iscomplexobj(theta) else None
+    return Spectral(symmetric(window.closed, window.spacing, covariance, potential), gauge[:-1], scale, modes)
+
 
 GROWTH = 12.0  # largest growth by the potential in one substep where there is no mass, as a logarithm
 
@@ -50,8 +186,8 @@ def coefficients(
         h = np.moveaxis(system.observation(points, times[:, None], theta), -1, 1)
     precision = np.broadcast_to(precision_of(prepared, times, inside), (len(times), system.m, system.m))
     potentials, constants = zip(*[potential_of(*pair, rates, values) for pair in zip(h, precision, strict=True)], strict=True)
-    found = drift, covariance, np.stack(potentials), np.array(constants)
-    return found if system.cross is None else with_cross_noise(prepared, points, times, rates, h, precision, found)
+    result = drift, covariance, np.stack(potentials), np.array(constants)
+    return result if system.cross is None else with_cross_noise(prepared, points, times, rates, h, precision, result)
 
 
 def precision_of(prepared: Prepared, times: Any, inside: np.ndarray) -> Array:
@@ -64,7 +200,7 @@ def precision_of(prepared: Prepared, times: Any, inside: np.ndarray) -> Array:
         return np.where(both, np.linalg.inv(np.where(both, noise, 0.0) + np.diag(1.0 * ~inside)), 0.0)
 
     if system.steady_noise:
-        return prepared.once(("inside", inside.tobytes()), lambda: make(prepared.model.start))
+        return prepared.once(Derived.PRECISION, inside.tobytes(), lambda: make(prepared.model.start))
     return make(times)
 
 
@@ -91,12 +227,12 @@ def offset_of(potential: Array, values: Array) -> tuple[float, float]:
 
 
 def resolved_parts(
-    prepared: Prepared, values: Array, window: lw.Window, start: float, length: float, inside: np.ndarray
+    prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval
 ) -> Panels:
     """Return parts of the interval in each of which the coefficients are polynomials of time, nearly."""
-    system, theta = prepared.system, prepared.theta.real
-    look = lw.figures(values, window.closed)
-    first, last = look.first, look.last
+    system, theta, (_, start, length, inside, _) = prepared.system, prepared.theta.real, interval
+    check = lw.grid_check(values, window.closed)
+    first, last = check.first, check.last
     x = window.points[np.unique(np.linspace(first, last, 7).astype(int))]
 
     bounds, error = [], 0.0
@@ -117,7 +253,92 @@ def resolved_parts(
                 columns.append(system.cross(x[:, None], t[:, None], theta).reshape(len(t), -1))
             return finite(np.concatenate(columns, axis=1)) if columns else np.zeros((len(t), 1))
 
-        found = panels(at, low - start, length if high == start + length else high - start)
-        error += found.error
-        bounds += found.bounds
+        result = panels(at, low - start, length if high == start + length else high - start)
+        error += result.error
+        bounds += result.bounds
     return Panels(bounds, error)
+
+
+def with_cross_noise(
+    prepared: Prepared,
+    points: Array,
+    times: Array,
+    rates: Array,
+    h: Array,
+    precision: Array,
+    coefficients: tuple[Array, Array, Array, Array],
+) -> tuple[Array, Array, Array, Array]:
+    """Return the coefficients of the equation with correlated noise from those with independent noise.
+
+    Args:
+        prepared: the system.
+        points: the points (N, 1) or (T, N, 1).
+        times: (T,).
+        rates: dy/dt (m,).
+        h: (T, m, N).
+        precision: K (T, m, m), zero for coordinates that do not act inside of the interval.
+        coefficients: f (T, N), G (T,) or (T, N), the potential (T, N) and its constant (T,).
+    """
+    drift, covariance, potential, constant = coefficients
+    parts = prepared.system.cross(points, times[:, None], prepared.theta)  # type: ignore[misc]
+    cross, slope, h_slope = np.moveaxis(finite(parts), (2, 3), (0, 2))
+    gain = precision @ cross
+    covariance = np.broadcast_to(covariance[..., None] if covariance.ndim == 1 else covariance, drift.shape)
+    rest = covariance - np.sum(gain * cross, axis=1)
+    rest = np.where(rest.real > 1e-13 * covariance.real, rest, 0.0)
+    drift = drift - np.sum(gain * (finite(h) - rates[:, None] + 0.5 * slope), axis=1)
+    return drift, rest, potential - 0.5 * np.sum(gain * h_slope, axis=1), constant
+
+
+HIDDEN = 0.05  # share of the drift that interpolation between the points may miss: a wave has at least five points
+SLIGHT = 1e-4  # of the largest drift: less is rounding
+BETWEEN = 0.5 * (np.sqrt(5.0) - 1.0)  # place in a spacing: the golden ratio is far from every fraction of a period
+_CUBIC = np.array([np.prod([(BETWEEN - m) / (j - m) for m in range(-1, 3) if m != j]) for j in range(-1, 3)])
+
+
+def on_grid_for_drift(
+    prepared: Prepared, values: Array, window: lw.Window, start: float, length: float
+) -> tuple[Array, lw.Window]:
+    """Return a density at the start of an interval on a grid that shows the drift, and this grid.
+
+    The density alone does not tell its grid: a broad prior is resolved by spacings of a period of f = sin(x), at which f is zero
+    everywhere.  Where f has kinks or jumps other bounds hold.
+    """
+    if prepared.kinked or prepared.system.rough or not length > 0.0:
+        return values, window
+    deviation = float(np.sqrt(lw.moments(values.real, window)[1]))
+    while window.size < lw.SIZES[-1]:
+        hidden, whole = _hidden(prepared, window, start)
+        share, size = (float(np.abs(values.real) @ one) for one in (hidden, whole))
+        if share <= HIDDEN * size or HIDDEN * length * size <= prepared.tolerance * deviation:
+            break
+        new = lw.refined(window, 2.0)
+        values = lw.resampled(values, window, new)
+        values, window = values / np.sum(values), new
+    return values, window
+
+
+def misses_drift(prepared: Prepared, window: lw.Window) -> bool:
+    """Return whether a density may be on this grid that does not show a drift without time."""
+    steady = not (prepared.kinked or prepared.system.rough or prepared.system.varying)
+    return steady and bool(_hidden(prepared, window, prepared.model.start)[0].any())
+
+
+def _hidden(prepared: Prepared, window: lw.Window, start: float) -> tuple[Array, Array]:
+    """Return the error of f after each point, by cubic interpolation, where it counts, and the size of f there, (N,) each."""
+
+    def make() -> tuple[Array, Array]:
+        around = window.origin + window.centre + window.spacing * (np.arange(-1, window.size + 2) - window.size // 2)
+        theta = prepared.theta.real
+        known, between = (
+            finite(prepared.system.drift(x[:, None], start, theta)[:, 0])
+            for x in (around, around[1:-2] + BETWEEN * window.spacing)
+        )
+        result = np.array(sum(c * known[j : j + window.size] for j, c in enumerate(_CUBIC)))
+        error, whole = np.abs(between - result), np.maximum(np.abs(between), np.abs(result))
+        return np.where(error > np.maximum(HIDDEN * whole, SLIGHT * np.max(whole)), error, 0.0), whole
+
+    if prepared.system.varying:
+        return make()
+    pair: tuple[Array, Array] = prepared.once(Derived.HIDDEN_DRIFT, window, make)
+    return pair

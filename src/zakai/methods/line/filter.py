@@ -13,6 +13,7 @@ Magnus' series of fourth order in adaptive substeps elsewhere.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,39 +22,31 @@ from zakai.densities import Density, GridDensity, MappedDensity
 from zakai.methods._protocol import Info, Infos
 from zakai.methods._states import Joined
 from zakai.methods.line import loop
-from zakai.methods.line.cross import OMITTED
-from zakai.methods.line.domain import on_the_line, variable_of
-from zakai.methods.line.drift_grid import showing_drift
-from zakai.methods.line.ends import check_ends
-from zakai.methods.line.escape import check_escape
-from zakai.methods.line.figures import (
+from zakai.methods.line.choice import predicted
+from zakai.methods.line.domain import check_ends, check_escape, on_the_line, variable_of
+from zakai.methods.line.model import system_of
+from zakai.methods.line.prepared import NOISE, SHARED, Parts, Prepared, State, parts_of_step, segment_of_parts
+from zakai.methods.line.transition import RecordedTransition, Report
+from zakai.methods.line.update import (
+    acting_inside,
     edge_of_moments,
-    figures,
-    forgetting,
+    error_remainder,
+    factor_of,
+    grid_check,
     on_fitting_grid,
     outside_tables,
-    refitted,
+    sampled_weakly,
     spread,
     state_moments,
+    state_of,
 )
-from zakai.methods.line.grids import SHARED
-from zakai.methods.line.kernel import by_kernel
-from zakai.methods.line.model import system_of
-from zakai.methods.line.moves import Passage, Report, by_decomposition, by_substeps
-from zakai.methods.line.moving import SOME, travel
-from zakai.methods.line.parts import parts_of_step, segment_of_parts
-from zakai.methods.line.prior import init as init
-from zakai.methods.line.prior import state_of
-from zakai.methods.line.system import NOISE, Parts, Prepared, State
-from zakai.methods.line.update import acting_inside, factor_of, sampled_weakly
-from zakai.methods.line.volumes import contracted
+from zakai.methods.line.update import init as init
+from zakai.methods.system.notes import OMITTED
 from zakai.models.model import Model
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.channel import Channel, around, chosen
 from zakai.numerics.line.density import separated
-from zakai.numerics.line.outlook import FAR
-from zakai.numerics.line.posterior import General, multiplied
-from zakai.numerics.line.segment import RELIABLE
+from zakai.numerics.line.product import General, multiplied
+from zakai.numerics.line.steps import RELIABLE
 from zakai.records.schedule import Schedule
 
 Array = Any
@@ -73,13 +66,12 @@ def prepare(model: Model, schedule: Schedule, theta: np.ndarray, tolerance: floa
     if system.kinked_drift and not pieces:  # the spectrum of a density falls slowly
         negligible = max(negligible, SLOW * tolerance)
     generous = SHARED if system.samples and not system.moving else GENEROUS
-    lengths, inside = schedule.lengths, schedule.inside
-    found = Prepared(model, schedule, theta, system, tolerance, lengths, inside, negligible, generous, tolerance)
-    found.pieces = pieces
-    if found.kinked:  # a grid is finer, and another one takes long to prepare
-        found.generous = SLOW_GENEROUS
-    found.notes = (OMITTED,) if system.cross is not None and (schedule.seen & ~inside).any() else ()
-    return found
+    result = Prepared(
+        model, schedule, theta, system, tolerance, schedule.lengths, schedule.inside, negligible, generous, tolerance,
+        notes=(OMITTED,) if system.cross is not None and (schedule.seen & ~schedule.inside).any() else (), pieces=pieces,
+    )  # fmt: skip
+    # With kinks a grid is finer, and another one takes long to prepare.
+    return replace(result, generous=SLOW_GENEROUS) if result.kinked else result
 
 
 def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info]:
@@ -87,9 +79,9 @@ def step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tupl
     if prepared.parts is not None:
         return _of_parts(prepared.parts, k, state, observed)
     if prepared.fast[k]:
-        found = loop.one(prepared, k, state, observed)
-        if found is not None:
-            return found
+        product = loop.one(prepared, k, state, observed)
+        if product is not None:
+            return product
     # Attempts that overflow are taken again in shorter substeps.
     with np.errstate(all="ignore"):
         stepped = single(prepared, k, state, observed)
@@ -109,7 +101,7 @@ def segment(prepared: Prepared, rows: slice, state: State, observed: np.ndarray)
     return segment_of_whole(prepared, rows, state, observed)
 
 
-class Stepped(NamedTuple):
+class SingleStep(NamedTuple):
     """The state after an interval that the compiled loop does not take, its report, and how the density came about.
 
     That is how its transition moved it, where that is known; the density after the observation on its own grid; and the parts of
@@ -118,13 +110,13 @@ class Stepped(NamedTuple):
 
     state: State
     info: Info
-    passages: tuple[Passage, ...]
+    transitions: tuple[RecordedTransition, ...]
     values: np.ndarray
     window: lw.Window
     parts: Parts | None = None
 
 
-Taken = list[loop.Piece] | Stepped
+FilteredSteps = list[loop.Piece] | SingleStep
 
 
 def segment_of_whole(
@@ -132,7 +124,7 @@ def segment_of_whole(
     rows: slice,
     state: State,
     observed: np.ndarray,
-    noted: Callable[[int, State, Taken], None] | None = None,
+    noted: Callable[[int, State, FilteredSteps], None] | None = None,
 ) -> tuple[Sequence[State], Infos]:
     """Return the same of intervals that are not cut into parts.
 
@@ -146,18 +138,19 @@ def segment_of_whole(
         last, before = k, state
         while last < rows.stop and prepared.fast[last]:
             last += 1
-        pieces = loop.taken(prepared, slice(k, last), state, observed[k - rows.start : last - rows.start]) if last > k else []
+        values = observed[k - rows.start : last - rows.start]
+        pieces = loop.compiled_steps(prepared, slice(k, last), state, values) if last > k else []
         if pieces:
-            found: Taken = pieces
+            filtered: FilteredSteps = pieces
             states.append(Joined([piece.states for piece in pieces]))
             parts.append(loop.infos_of(prepared, pieces))
         else:
             with np.errstate(all="ignore"):
-                found = single(prepared, k, state, observed[k - rows.start])
-            states.append([found.state])
-            parts.append(alone(found.info))
+                filtered = single(prepared, k, state, observed[k - rows.start])
+            states.append([filtered.state])
+            parts.append(alone(filtered.info))
         if noted is not None:
-            noted(k, before, found)
+            noted(k, before, filtered)
         k, state = rows.start + len(states), states[-1]
     return states, loop.joined(parts)
 
@@ -167,41 +160,24 @@ def alone(info: Info) -> Infos:
     return Infos(np.array([info.log_likelihood_increment]), info.mean[None], info.cov[None], health)
 
 
-def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> Stepped:
+def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> SingleStep:
     schedule, length = prepared.schedule, float(prepared.lengths[k])
-    values, window, report, look = np.asarray(state.values), state.window, Report(), None
+    values, window, report, check = np.asarray(state.values), state.window, Report(), None
     check_escape(prepared, k, window.points, values)
     inside = acting_inside(prepared, k)
     parts = parts_of_step(prepared, k, values, window)
     if parts is not None:
         state, info = _of_parts(parts, 0, state, observed)
-        return Stepped(state, info, (), np.asarray(state.values), state.window, parts)
-    passages: tuple[Passage, ...] = ()
+        return SingleStep(state, info, (), np.asarray(state.values), state.window, parts)
+    transitions: tuple[RecordedTransition, ...] = ()
     before, gained, contraction = lw.moments(values, window), 0.0, 1.0
     if length > 0:
-        rates = np.where(inside & (not prepared.lie), observed, 0.0) / length
-        start = float(schedule.starts[k])
-        kernel = kernel_of(prepared, k, window, rates, report)
-        contraction = 1.0 if kernel is None else float(kernel.scale.real)
-        found = None if kernel is None else by_kernel(prepared, values, window, start, length, kernel, report)
-        if found is None:
-            if prepared.gaussian:  # the grids of kernels are finer
-                look = lw.figures(values, window.closed, prepared.negligible)
-                values, window = refitted(prepared, values, window, look, prepared.generous)
-            report.positive = False
-            values, window = showing_drift(prepared, values, window, start, length)
-            interval = start, length, inside, rates, report
-            ranges = travel(prepared, values, window, start, length)
-            if not (ranges > FAR or prepared.system.varying or inside.any()):
-                found = by_decomposition(prepared, values, window, length, report)
-            if found is None:
-                whole = prepared, values, window, *interval, ranges > SOME
-                found = contracted(*whole) or by_substeps(*whole)
-        values, window, gained, look, passages = found
-    predicted, log_floor = lw.moments(values, window), float(state.log_floor)
+        prediction, contraction = predicted(prepared, values, window, prepared.interval(k, inside, observed), report)
+        values, window, gained, check, transitions = prediction
+    mean_and_variance, log_floor = lw.moments(values, window), float(state.log_floor)
     if report.positive:
         # A positive kernel fills the tails again.
-        wider = predicted[1].real / max(contraction**2 * before[1].real, 1e-300)
+        wider = mean_and_variance[1].real / max(contraction**2 * before[1].real, 1e-300)
         log_floor = max(log_floor * float(np.clip(wider, 1.0, 20.0)), float(np.log(prepared.cut)))
         floor = float(np.exp(log_floor)) + report.edge
     else:
@@ -212,30 +188,30 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> St
         if isinstance(likelihood, General):
             report.lawless = float(np.sum(values.real[np.isnan(likelihood.log_density(window.points).real)]))
         if prepared.weak and not np.iscomplexobj(values):
-            result, look = sampled_weakly(prepared, k, values, window, observed)
+            product, check = sampled_weakly(prepared, k, values, window, observed)
         else:
-            result = multiplied(values, window, likelihood, max(1e-10, 1e-3 * prepared.tolerance))
-            ends = lw.figures(result.values, result.window.closed)
-            if max(ends.left, ends.right) > PILED and result.depth > prepared.deepest(floor):
+            product = multiplied(values, window, likelihood, max(1e-10, 1e-3 * prepared.tolerance))
+            ends = lw.grid_check(product.values, product.window.closed)
+            if max(ends.left, ends.right) > PILED and product.depth > prepared.deepest(floor):
                 # No state within reach explains the observation: it counts in the evidence alone.
-                result = result._replace(values=values, window=window, depth=np.inf)
-            look = figures(prepared, result.values, result.window)
-        values, window, gained = result.values, result.window, gained + result.log_mass
-        report.depth, report.growth = result.depth, result.growth
-        report.density(look)
-    elif look is None or prepared.kinked:
-        look = figures(prepared, values, window)
+                product = product._replace(values=values, window=window, depth=np.inf)
+            check = grid_check(prepared, product.values, product.window)
+        values, window, gained = product.values, product.window, gained + product.log_mass
+        report.depth, report.growth = product.depth, product.growth
+        report.density(check)
+    elif check is None or prepared.kinked:
+        check = grid_check(prepared, values, window)
     # A large grid is kept only where its decomposition serves the next intervals too.
     generous = prepared.generous if report.decomposed else min(prepared.generous, GENEROUS)
-    moved, new, coarse = on_fitting_grid(prepared, values, window, look, generous)
+    new_values, new, coarse = on_fitting_grid(prepared, values, window, check, generous)
     if new != window and not prepared.weak:  # the largest grid may be too coarse for all that the density has
         report.aliasing = max(report.aliasing, coarse)
     mean, variance = lw.moments(values, window)
     report.edge = max(report.edge, edge_of_moments(prepared, values, window))
     made = 2.0 * report.aliasing + 10.0 * report.edge + report.time + 10.0 * report.negative
     made += min(floor * report.growth, 1.0)
-    kept = forgetting(before[1], predicted[1], variance, spread(prepared, k, length, window.origin + mean.real))
-    error = made + state.error * (1.0 if separated(np.ascontiguousarray(values.real)) else kept)
+    retained = error_remainder(before[1], mean_and_variance[1], variance, spread(prepared, k, length, window.origin + mean.real))
+    error = made + state.error * (1.0 if separated(np.ascontiguousarray(values.real)) else retained)
     error = max(error, RELIABLE * prepared.promised)
     spacings = float(np.sqrt(max(variance.real, 0.0))) / window.spacing
     health = {
@@ -257,17 +233,7 @@ def single(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> St
         mean = mean - 2 * np.pi * np.ceil((mean.real - np.pi) / (2 * np.pi))
     log_floor = min(log_floor + max(report.depth - 1.0, 0.0), 0.0)
     info = Info(gained, np.array([mean]), np.array([[variance]]), health)
-    return Stepped(state_of(moved, new, float(error), log_floor), info, passages, values, window)
-
-
-def kernel_of(prepared: Prepared, k: int, window: lw.Window, rates: np.ndarray, report: Report) -> Channel | None:
-    """Return the Gaussian kernel of interval k, for x relative to the origin of the window, if there is one."""
-    kernels = prepared.kernels
-    if kernels is None or kernels.place[k] < 0:
-        return None
-    place = int(kernels.place[k])
-    report.time += float(kernels.errors[place])
-    return around(chosen(kernels.transitions, place, np.concatenate([np.ones(1), rates])), window.origin - kernels.origin)
+    return SingleStep(state_of(new_values, new, float(error), log_floor), info, transitions, values, window)
 
 
 def valid(prepared: Prepared, state: State) -> bool:
@@ -287,5 +253,5 @@ def density(prepared: Prepared, state: State) -> Density:
         logs = np.log(np.maximum(np.asarray(state.values).real, 0.0))
     window = state.window
     names, variable = prepared.model.state, variable_of(prepared.model)
-    found = GridDensity(logs, np.array([window.origin + window.centre]), np.array([[window.spacing]]), names, (window.closed,))
-    return found if variable is None else MappedDensity(found, variable)
+    product = GridDensity(logs, np.array([window.origin + window.centre]), np.array([[window.spacing]]), names, (window.closed,))
+    return product if variable is None else MappedDensity(product, variable)

@@ -1,4 +1,4 @@
-"""A message of one state over one interval, backward in time, on grids that move and scale with it or stand.
+"""A message of one state over one interval, backward in time, on grids that move and scale with it or are fixed.
 
 What is moved is psi = e^l b.  On a grid that moves and scales with b, x = m(t) + s(t) z, with m' = f(m) and an s that grows as
 the width of b, l is a quadratic polynomial of z, so that psi at the end of the interval is about the smoothed density:
@@ -6,9 +6,9 @@ the width of b, l is a quadratic polynomial of z, so that psi at the end of the 
     -psi_t = (d - g l') psi_z + g psi_zz / 2 + (V - d l' + g (l'^2 - l'') / 2) psi,
     d = (f(x, t) - m' - (x - m) s' / s) / s,    g = G / s^2.
 
-On a grid that stands l follows the logarithm of the filter's density at the start, so that psi is the smoothed density there; an
+On a fixed grid l follows the logarithm of the filter's density at the start, so that psi is the smoothed density there; an
 interval in which the density changes much has several parts.  The same operators take back an estimate of the error of psi, by
-rounding and by what is not known of b beyond its ends: where it is large b is not kept.
+rounding and by what is not known of b beyond its ends: where it is large b is not retained.
 """
 
 from __future__ import annotations
@@ -16,18 +16,133 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import expit
 
-from zakai.methods.line.attempt import Attempt, Coefficients, Substep, magnus, parts_of_split
-from zakai.methods.line.coefficients import coefficients, resolved_parts
+from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
 from zakai.methods.line.message import FEWEST, Message, reliable
-from zakai.methods.line.moves import MOST_SUBSTEPS, Report, by_substeps
-from zakai.methods.line.prior import state_of
-from zakai.methods.line.psi import RELAXED, Psi, part_of, placed
-from zakai.methods.line.system import Prepared, State
-from zakai.methods.line.tables import covariance_at, finite
+from zakai.methods.line.model import finite
+from zakai.methods.line.prepared import Prepared, State, TimeInterval
+from zakai.methods.line.transition import (
+    MOST_SUBSTEPS,
+    Coefficients,
+    Report,
+    Substep,
+    Trial,
+    by_substeps,
+    magnus,
+    parts_of_split,
+)
+from zakai.methods.line.update import state_of
 from zakai.numerics.line import window as lw
+from zakai.numerics.line.density import support
 
 Array = Any
+
+ROUNDING = 1e-15  # of the maximum: the error of psi by rounding
+DEGREE = 8  # of the polynomial l that follows a density
+DEPTH = -20.0  # logarithm of the density, relative to its maximum, beyond which l is linear
+BLEND = 3.0  # spacings over which it becomes linear
+UNSURE = 10.0  # errors of psi from which its values count
+BULK = 1e-7  # of the maximum: there smaller values may be tails
+NEAR = 5  # points of a message that tell the curvature of its logarithm beyond an end
+STEEP = 3.0  # least fall beyond the ends of a message, in deviations
+RELAXED = 4.0  # spacings that a message may need: its product with the density shows whether it does
+
+
+class Psi(NamedTuple):
+    """psi (N,) at the points of a grid, of sum one, with the logarithm of the sum before.
+
+    The imaginary part of `values` is an estimate of the error of psi, which the same operators take back.  The rows of `gauges`
+    (3, N) are l and its two derivatives, in spacings; the drift has made psi wider by `scaled`.
+    """
+
+    values: Array
+    window: lw.Window
+    gauges: Array
+    scale: float
+    scaled: float = 1.0
+
+    def message(self, error: float, first: int, last: int) -> Message:
+        """Return b from one point to another."""
+        here, window = slice(first, last + 1), part_of(self.window, first, last)
+        logs = np.log(self.values.real[here]) - self.gauges[0][here] + self.scale
+        return Message.of(logs, window, RELAXED * self.window.spacing, error)
+
+    def reliable(self, weights: Array | float = 1.0) -> tuple[int, int]:
+        """Return the first and the last point of psi times weights that are no noise, as far outward as this falls."""
+        product = np.where(self.values.real > UNSURE * np.abs(self.values.imag), self.values.real, 0.0) * weights
+        first, last = support(product, BULK)
+        while first > 0 and 0.0 < product[first - 1] < product[first]:
+            first -= 1
+        while last < len(product) - 1 and 0.0 < product[last + 1] < product[last]:
+            last += 1
+        return first, last
+
+
+def part_of(window: lw.Window, first: int, last: int) -> lw.Window:
+    """Return the grid from one point to another."""
+    size = last - first + 1
+    return window._replace(size=size, centre=float(window.offsets[first + size // 2]))
+
+
+def placed(later: Message, centre: float, deviation: float, spacing: float, reach: float, state: State | None) -> Psi | None:
+    """Return psi of a message on a grid about a mean, None where that is too large or psi is not finite.
+
+    Beyond the ends of the message psi differs from a Gaussian by a factor.  With a state l follows its density.
+    """
+    count = 2.0 * reach / spacing
+    if not count <= lw.LARGEST:
+        return None
+    window = later.window._replace(centre=centre, spacing=spacing, size=lw.size_for(count))
+    deviation /= spacing
+    ends = np.array(later.ends)
+    z, inner = lw.index(window.size) / deviation, np.clip(window.offsets, *ends)
+    at, logs = (inner - centre) / (spacing * deviation), later.at(inner)
+    if not np.isfinite(logs).all():
+        return None
+    c2, c1, c0 = np.polyfit(at, logs, 2, w=np.exp(-0.25 * z * z))
+    curvature = min(-1.0 - 2.0 * c2, 0.0)
+    gauges = np.stack([z * (0.5 * curvature * z - c1), curvature * z - c1, np.full(len(z), curvature)])
+    density = np.zeros(0) if state is None else reliable(state, window)
+    if np.count_nonzero(density > np.exp(DEPTH) * np.max(density, initial=0.0)) > 2 * DEGREE:
+        gauges = _logarithms(density, z)
+    # Beyond its ends the message is continued with its slopes, and psi falls.
+    outer, unit = (ends - centre) / (spacing * deviation), later.spacing / (spacing * deviation)
+    slopes = (later.logs[[2, -1]] - later.logs[[0, -3]]) / (2.0 * unit) + np.interp(outer, z, gauges[1])
+    curvatures = np.abs(np.diff(later.logs, 2)) / unit**2
+    left, right = np.minimum(z - outer[0], 0.0), np.maximum(z - outer[1], 0.0)
+    exponents = logs + np.where(left + right == 0.0, gauges[0], np.interp(at, z, gauges[0]))
+    exponents += max(slopes[0], STEEP) * left + min(slopes[1], -STEEP) * right
+    top = float(np.max(exponents))
+    values = np.exp(exponents - top)
+    total = float(np.sum(values))
+    if not np.isfinite(total):
+        return None
+    unknown = np.max(curvatures[:NEAR]) * left**2 + np.max(curvatures[-NEAR:]) * right**2
+    values = values + 1j * (values * np.minimum(unknown, 1.0) + ROUNDING)
+    scales = deviation ** -np.arange(3.0)[:, None]
+    return Psi(values / total, window, gauges * scales, top + float(np.log(total)))
+
+
+def _logarithms(density: Array, z: Array) -> Array:
+    """Return a polynomial near the logarithm of a density (N,) at points (N,), linear in its tails, and its derivatives."""
+    logs = np.log(np.maximum(density, 1e-300) / np.max(density))
+    inside = np.flatnonzero(logs > DEPTH)
+    result = np.polynomial.Chebyshev.fit(z[inside], logs[inside], DEGREE, w=np.exp(0.125 * logs[inside]))
+    ends, width = z[inside[[0, -1]]], BLEND * (z[1] - z[0])
+    beyond = np.stack([ends[0] - z, z - ends[1]]) / width
+    share, beyond = expit(beyond), width * np.logaddexp(0.0, beyond)
+    inner, slopes = z + beyond[0] - beyond[1], result.deriv()(ends)
+    slopes = np.array([max(slopes[0], 0.0), min(slopes[1], 0.0)])
+    speed, change = 1.0 - share[0] - share[1], share * (1.0 - share) / width
+    value, slope, curvature = result(inner), result.deriv()(inner), result.deriv(2)(inner)
+    signs = np.array([-1.0, 1.0]) * slopes
+    return np.stack([
+        value + signs @ beyond,
+        slope * speed + slopes @ share,
+        curvature * speed**2 + slope * (change[0] - change[1]) + signs @ change,
+    ])
+
 
 WIDTH = 8.8  # standard deviations of psi from its mean to the ends of a grid
 MARGIN = 1.2  # of a wider grid
@@ -39,67 +154,57 @@ MOST_PARTS = 16  # of an interval
 NOISE = -32.0  # logarithm of the error of small values of a density within an interval, relative to the largest
 
 
-class _Interval(NamedTuple):
-    """An interval: when it begins, and which increments act within it, at which rates."""
-
-    start: float
-    inside: np.ndarray
-    rates: np.ndarray
-
-
 def by_moving_grid(
-    prepared: Prepared, k: int, inside: np.ndarray, rates: np.ndarray, state: State, later: Message, accepted: float
+    prepared: Prepared, interval: TimeInterval, state: State, later: Message, accepted: float
 ) -> tuple[Message, float] | None:
     """Return the message at the start of interval k, and the error that the interval adds; None where this does not serve.
 
     Args:
         prepared: the system.
-        k: the interval.
-        inside, rates: which increments act within it, and their rates.
+        interval: the interval.
         state: the filter's state at its start.
         later: the message at its end.
         accepted: the values relative to the maximum that do not count.
     """
-    interval = _Interval(float(prepared.schedule.starts[k]), inside, rates)
-    return _taken_back(prepared, interval, (0.0, float(prepared.lengths[k])), state, later, accepted, False)
+    return _over_part(prepared, interval, (0.0, interval.length), state, later, accepted, False)
 
 
-def by_standing_grids(
-    prepared: Prepared, k: int, inside: np.ndarray, rates: np.ndarray, state: State, later: Message, accepted: float
+def by_fixed_grids(
+    prepared: Prepared, interval: TimeInterval, state: State, later: Message, accepted: float
 ) -> tuple[Message, float] | None:
     """Return the same by grids that stand, each for a part of the interval in which the density changes by little."""
-    interval, length = _Interval(float(prepared.schedule.starts[k]), inside, rates), float(prepared.lengths[k])
+    length = interval.length
     count = _parts(prepared, later, interval.start + length, length)
     while count <= MOST_PARTS:
-        cuts, found, error = np.linspace(0.0, length, count + 1).tolist(), later, 0.0
+        cuts, result, error = np.linspace(0.0, length, count + 1).tolist(), later, 0.0
         parts = list(zip(cuts[:-1], cuts[1:], _states(prepared, interval, cuts, state), strict=True))
         for first, last, before in parts[::-1]:
-            back = _taken_back(prepared, interval, (first, last), before, found, accepted, True)
+            back = _over_part(prepared, interval, (first, last), before, result, accepted, True)
             if back is None:
                 break
-            found, error = back[0]._replace(needed=back[0].spacing), error + back[1]
+            result, error = back[0]._replace(needed=back[0].spacing), error + back[1]
         else:
             if error <= prepared.tolerance:
-                return found._replace(needed=RELAXED * found.spacing), error
+                return result._replace(needed=RELAXED * result.spacing), error
         count *= 3
     return None
 
 
-def _states(prepared: Prepared, interval: _Interval, cuts: list[float], state: State) -> list[State]:
+def _states(prepared: Prepared, interval: TimeInterval, cuts: list[float], state: State) -> list[State]:
     """Return the filter's states at the cuts of an interval but the last."""
-    found, (start, inside, rates) = [state], interval
+    result = [state]
     for first, last in zip(cuts[:-2], cuts[1:-1], strict=True):
-        moved = by_substeps(prepared, found[-1].values, found[-1].window, start + first, last - first, inside, rates, Report())
-        found.append(state_of(moved.values, moved.window, state.error, max(float(state.log_floor), NOISE)))
-    return found
+        before = result[-1]
+        propagated = by_substeps(prepared, before.values, before.window, interval.part(first, last), Report())
+        result.append(state_of(propagated.values, propagated.window, state.error, max(float(state.log_floor), NOISE)))
+    return result
 
 
-def _taken_back(
-    prepared: Prepared, interval: _Interval, part: tuple[float, float], state: State, later: Message, accepted: float,
+def _over_part(
+    prepared: Prepared, interval: TimeInterval, part: tuple[float, float], state: State, later: Message, accepted: float,
     stands: bool,
 ) -> tuple[Message, float] | None:  # fmt: skip
     """Return the message at the start of a part of an interval, and the error that it adds; None where this does not serve."""
-    start, inside, rates = interval
     spacing, error, noise, scaled = later.needed, 0.0, 0.0, later.scaled
     now, begin, centre, deviation, reach = None, later, later.mean, later.deviation, WIDTH * later.deviation
     if stands:  # the ends of the product
@@ -115,20 +220,20 @@ def _taken_back(
                 return None
             now = now._replace(scaled=scaled)
             if prepared.system.varying and last == part[1] and not tried:
-                stack, error = resolved_parts(prepared, now.values, now.window, start + part[0], part[1] - part[0], inside)
+                stack, error = resolved_parts(prepared, now.values, now.window, interval.part(*part))
                 stack = [(part[0] + low, part[0] + high) for low, high in stack]
                 first, last = stack.pop()
-        attempt, moved = _substep(prepared, now, start, first, last, inside, rates, stands)
+        trial, propagated = _substep(prepared, now, interval.part(first, last), stands)
         count += 1
-        if attempt.split:
-            if count + len(stack) >= MOST_SUBSTEPS or not np.isfinite(attempt.error):
+        if trial.split:
+            if count + len(stack) >= MOST_SUBSTEPS or not np.isfinite(trial.error):
                 return None
-            stack += parts_of_split(prepared, first, last, attempt.error)
+            stack += parts_of_split(prepared, first, last, trial.error)
             continue
-        look = lw.figures(moved.values.real, False, accepted)
-        made = max(look.aliasing, 0.1 * look.left, 0.1 * look.right)
-        if made <= min(accepted * 10.0**tried if not look.rough else 1.0, ROUGH * prepared.tolerance):
-            error, noise, now, tried = error + attempt.error, max(noise, made), moved, 0
+        check = lw.grid_check(propagated.values.real, False, accepted)
+        made = max(check.aliasing, 0.1 * check.left, 0.1 * check.right)
+        if made <= min(accepted * 10.0**tried if not check.rough else 1.0, ROUGH * prepared.tolerance):
+            error, noise, now, tried = error + trial.error, max(noise, made), propagated, 0
             continue
         # Another grid about psi as it is, then wider and finer ones.
         stack.append((first, last))
@@ -139,14 +244,14 @@ def _taken_back(
             mean, variance = lw.moments(now.values.real, now.window)
             centre, deviation = centre if stands else float(mean), float(np.sqrt(variance))
         tried, scaled = tried + 1, now.scaled
-        if tried % 2 and look.aliasing > accepted:
+        if tried % 2 and check.aliasing > accepted:
             spacing /= 1.4
         now = None
     assert now is not None
-    return _kept(now, state, later.error, noise, error)
+    return _reliable_message(now, state, later.error, noise, error)
 
 
-def _kept(now: Psi, state: State, before: float, noise: float, error: float) -> tuple[Message, float] | None:
+def _reliable_message(now: Psi, state: State, before: float, noise: float, error: float) -> tuple[Message, float] | None:
     """Return the message where its product with the density is reliable, and the error with that of this product."""
     density, highest = reliable(state, now.window), float(np.max(now.values.real))
     logs = np.where(density > 0.0, np.log(density) - now.gauges[0], -np.inf)
@@ -165,8 +270,8 @@ def _kept(now: Psi, state: State, before: float, noise: float, error: float) -> 
     padded = np.concatenate([[0.0], density, [0.0]])
     wrong[[0, -1]] += product[[0, -1]] * (padded[[first, last + 2]] > 0.0)  # beyond the ends
     error += float(wrong @ moment) / total
-    found = now.message(before, first, last)._replace(scaled=now.scaled, mean=float(mean), deviation=float(np.sqrt(variance)))
-    return (found, error) if np.isfinite(error) else None
+    result = now.message(before, first, last)._replace(scaled=now.scaled, mean=float(mean), deviation=float(np.sqrt(variance)))
+    return (result, error) if np.isfinite(error) else None
 
 
 def _parts(prepared: Prepared, later: Message, time: float, length: float) -> int:
@@ -187,14 +292,13 @@ def _flow(prepared: Prepared, x: float, apart: float, variance: float, time: flo
 
 
 def _substep(
-    prepared: Prepared, later: Psi, start: float, first: float, last: float, inside: np.ndarray, rates: np.ndarray,
-    stands: bool,
-) -> tuple[Attempt, Psi]:  # fmt: skip
-    """Return psi before the part from start + first to start + last of an interval."""
+    prepared: Prepared, later: Psi, interval: TimeInterval, stands: bool
+) -> tuple[Trial, Psi]:
+    """Return psi before an interval."""
     window, points = later.window, lw.index(later.window.size)
-    length, spacing, (_, derivative, curvature) = last - first, window.spacing, later.gauges
+    (_, start, length, inside, rates), spacing, (_, derivative, curvature) = interval, window.spacing, later.gauges
     variance = float(lw.moments(later.values.real, window)[1])
-    speed, slope, growth = _flow(prepared, window.origin + window.centre, spacing, variance, start + last, length)
+    speed, slope, growth = _flow(prepared, window.origin + window.centre, spacing, variance, start + length, length)
     scaled = later.scaled * float(np.exp(-slope * length))
     if stands:
         speed, slope, growth = 0.0, 0.0, 0.0
@@ -208,7 +312,7 @@ def _substep(
     def at(nodes: Array) -> Coefficients:
         by, velocity, s = (one[:, None] for one in place(length * (nodes - 1.0)))
         shifts = by + (s - 1.0) * spacing * points
-        times = start + first + length * nodes
+        times = start + length * nodes
         f, G, V, constant = coefficients(prepared, window, times, inside, rates, later.values, shifts)
         d = (f - velocity) / (s * spacing) - growth * points
         g = G.reshape(len(times), -1) / (s * spacing) ** 2
@@ -217,8 +321,8 @@ def _substep(
 
     by, _, s = place(np.array([-length]))
     unit = lw.Window(0.0, 0.0, 1.0, window.size, False, 1.0)
-    attempt = magnus(prepared, later.values, unit, Substep(start + first, length, inside, rates), at, True, not stands)
-    total = float(np.sum(attempt.values.real))
+    trial = magnus(prepared, later.values, unit, Substep(start, length, inside, rates), at, True, not stands)
+    total = float(np.sum(trial.values.real))
     before = window._replace(centre=window.centre + float(by[0]), spacing=spacing * float(s[0]))
-    scale = later.scale + float(attempt.offset) + float(np.log(total))
-    return attempt, later._replace(values=attempt.values / total, window=before, scale=scale, scaled=scaled)
+    scale = later.scale + float(trial.offset) + float(np.log(total))
+    return trial, later._replace(values=trial.values / total, window=before, scale=scale, scaled=scaled)

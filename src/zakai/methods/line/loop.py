@@ -1,7 +1,7 @@
-"""Many steps in one compiled loop (`numerics/line/loop.py`), for `line/filter.py`.
+"""Many steps of one-state filters in one compiled loop (`numerics/line/loop.py`, `numerics/line/modes.py`).
 
-A step that the loop does not take (an error above the tolerance, a gap in a path) is taken by `_line.step`, which asks this loop
-for its one interval first: whether steps are taken one by one or together makes no difference.
+An interval that the loop refuses (an error above the tolerance, a gap in a path) is filtered by `single` of `line/filter.py`.
+`step` of that file asks this loop for its one interval first: whether steps are taken one by one or together makes no difference.
 """
 
 from __future__ import annotations
@@ -14,21 +14,129 @@ import numpy as np
 from zakai.methods._protocol import Info, Infos
 from zakai.methods._states import Joined, StackedStates
 from zakai.methods.line import modal
-from zakai.methods.line.drift_grid import hides_drift, showing_drift
-from zakai.methods.line.figures import edge_of_moments, figures, on_fitting_grid, outside_tables, resampled, state_moments
-from zakai.methods.line.grids import grid_of
-from zakai.methods.line.system import Prepared, State
+from zakai.methods.line.coefficients import misses_drift, on_grid_for_drift
+from zakai.methods.line.prepared import Derived, Prepared, State, parts_needed, probed
+from zakai.methods.line.update import edge_of_moments, grid_check, on_fitting_grid, outside_tables, resampled, state_moments
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.filters import BAND
+from zakai.numerics.line.averages import GAUSS_NODES
+from zakai.numerics.line.gaussian_kernels import BAND
 from zakai.numerics.line.loop import advance
-from zakai.numerics.line.modal import BROAD, NARROW, OWN, PLACE, STAY
-from zakai.numerics.line.segment import AFTER, COLUMNS, FAILED, OK, RANGE, UNRESOLVED, Segment
+from zakai.numerics.line.modes import OWN, PLACE, STAY
+from zakai.numerics.line.product import at_nodes, nodes
+from zakai.numerics.line.steps import (
+    CELL,
+    COLUMNS,
+    DRIFT,
+    MARGIN,
+    OBSERVED,
+    PHI,
+    SLOPE,
+    Grid,
+    Segment,
+    Status,
+)
 
 Array = Any
 
+BLOCK = 2048  # points by which the tables of a spacing are apart; a table has twice as many
+LOBATTO = np.array([0.0, 0.5 - 0.5 / np.sqrt(5.0), 0.5 + 0.5 / np.sqrt(5.0)])  # nodes within a spacing
+_NONE = np.zeros(0)
+
+
+def grid_of(prepared: Prepared, window: lw.Window, rows: slice) -> Grid | None:
+    """Return what the loop knows of a grid, None where a formula has no value."""
+    index, size = round(window.centre / window.spacing), window.size
+    if window.closed:
+        begin, length = 0, size
+    elif prepared.mixed:
+        begin, length = index - size // 2 - MARGIN, size + 2 * MARGIN
+    else:
+        begin, length = BLOCK * round(index / BLOCK) - BLOCK, 2 * BLOCK
+    start = 0 if window.closed else index - size // 2 - begin
+
+    def make() -> tuple[Grid, np.ndarray]:
+        offsets = window.offsets if window.closed else window.spacing * (begin + np.arange(float(length)))
+        x = window.origin + offsets
+        table = _mixed(prepared, window, x, rows) if prepared.mixed else _separated(prepared, window, x)
+        offset, fine = window.origin - prepared.origin + float(offsets[0]), _fine(prepared, window, x)
+        missing = ~np.isfinite(table[:, :, OBSERVED:]).all(axis=(0, 1, 2))
+        grid = Grid(table, 0, offset, window.spacing, fine)
+        return grid, np.append(0, np.cumsum(missing))
+
+    key = window.origin, window.spacing, begin, length
+    grid, missing = make() if prepared.mixed else prepared.once(Derived.TERMS, key, make)
+    return None if missing[start + size] > missing[start] else grid._replace(start=start)
+
+
+def _separated(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:
+    """Return the terms (1, R, 4 + m, T) of f and h at points (T,)."""
+    system, start, theta = prepared.system, prepared.model.start, prepared.theta
+    assert system.separated is not None
+    parts = np.moveaxis(system.separated[1](_nodes(window, x), start, theta), 0, -1)
+    table = np.zeros((1, len(parts), OBSERVED + system.m, len(x)), theta.dtype)
+    table[0, :, CELL] = _cells(window, parts[:, 0])
+    table[0, :, DRIFT:] = parts[..., :-1:3]
+    if prepared.yau is not None:
+        table[0, 0, PHI] = prepared.yau.potential(x, start, theta)
+    return table
+
+
+def _fine(prepared: Prepared, window: lw.Window, x: np.ndarray) -> np.ndarray:
+    """Return an h with kinks, of samples, at the nodes of points (m, F), else nothing."""
+    system = prepared.system
+    if not prepared.weak:
+        return _NONE[None]
+
+    def make() -> np.ndarray:
+        points = nodes(x, window.spacing)[:, None]
+        return at_nodes(system.observation(points, prepared.model.start, prepared.theta).T)
+
+    result: np.ndarray = prepared.once(Derived.FINE, (window.origin, window.spacing, float(x[0]), len(x)), make)
+    return result
+
+
+def _nodes(window: lw.Window, x: np.ndarray) -> np.ndarray:
+    """Return Lobatto's nodes (3 T + 1, 1) of the spacings above points (T,)."""
+    return np.append((x[:, None] + window.spacing * LOBATTO).reshape(-1), x[-1] + window.spacing)[:, None]
+
+
+def _cells(window: lw.Window, f: np.ndarray) -> np.ndarray:
+    """Return the integrals (..., T) of f over spacings from values at Lobatto's nodes (..., 3 T + 1)."""
+    ends, inner = f[..., ::3], f[..., 1::3] + f[..., 2::3]
+    return np.asarray(window.spacing / 12.0 * (ends[..., :-1] + 5.0 * inner + ends[..., 1:]))
+
+
+def _mixed(prepared: Prepared, window: lw.Window, x: np.ndarray, rows: slice) -> np.ndarray:
+    """Return terms (K, 7, 4 + m, T) at points (T,): f and h at the Gauss nodes of intervals and, for samples, at their ends.
+
+    Those of intervals in which the nodes do not resolve the coefficients are NaN.
+    """
+    system, theta, count = prepared.system, prepared.theta, len(GAUSS_NODES)
+    starts, stops = prepared.schedule.starts[rows, None], prepared.schedule.stops[rows, None]
+    inner = np.clip(starts + prepared.lengths[rows, None] * GAUSS_NODES, starts, np.nextafter(stops, starts))
+    times = np.concatenate([inner, stops], axis=1)
+    table = np.zeros((*times.shape, OBSERVED + system.m, len(x)), theta.dtype)
+    f = system.drift(_nodes(window, x), times[..., None], theta)[..., 0]
+    table[..., CELL, :], table[..., DRIFT, :] = _cells(window, f), f[..., :-1:3]
+    assert system.slope is not None
+    table[..., SLOPE, :] = system.slope(x[:, None], times[..., None], theta)[..., 0]
+    table[..., OBSERVED:, :] = np.moveaxis(system.observation(x[:, None], times[..., None], theta), -1, 2)
+    at = window.points[:: max(1, window.size // 8), None]
+
+    def coefficients(t: np.ndarray) -> np.ndarray:
+        f: np.ndarray = system.drift(at, t[..., None], theta)[..., 0]
+        if system.samples:
+            return f
+        return np.concatenate([f, system.observation(at, t[..., None], theta).reshape(*t.shape, -1)], axis=-1)
+
+    known = coefficients(times[:, :count])
+    table[parts_needed(coefficients(probed(starts, stops)), known) != 1, :, :OBSERVED] = np.nan
+    return table
+
+
 LARGER = 0.2  # margin of a new grid, relative to the range of the density
 TOGETHER = 32  # intervals whose tables of coefficients in time are computed together
-ATTEMPTS = 8  # grids on which a step is tried
+TRIALS = 8  # grids on which a step is tried
 HEALTH = {
     "edge_mass": "edge",
     "negative_mass": "negative",
@@ -89,63 +197,63 @@ def infos_of(prepared: Prepared, pieces: Sequence[Piece]) -> Infos:
 
 def one(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tuple[State, Info] | None:
     """Return the state after interval k, and its report; None where the loop does not take it."""
-    pieces = taken(prepared, slice(k, k + 1), state, observed[None])
+    pieces = compiled_steps(prepared, slice(k, k + 1), state, observed[None])
     return (pieces[0].last, _info(prepared, pieces[0])) if pieces else None
 
 
-def taken(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> list[Piece]:
+def compiled_steps(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> list[Piece]:
     """Return the first steps of `rows`, as many as the loop takes."""
     pieces: list[Piece] = []
-    attempts, first, way, observed = 0, rows.start, STAY, np.ascontiguousarray(observed, float)
+    trials, first, placement, observed = 0, rows.start, STAY, np.ascontiguousarray(observed, float)
     most = prepared.largest
-    while first < rows.stop and attempts < ATTEMPTS and state.window.size <= most:
-        attempts += 1
+    while first < rows.stop and trials < TRIALS and state.window.size <= most:
+        trials += 1
         stop = rows.stop
-        if hides_drift(prepared, state.window):
+        if misses_drift(prepared, state.window):
             interval = float(prepared.schedule.starts[first]), float(prepared.lengths[first])
-            values, window = showing_drift(prepared, np.asarray(state.values), state.window, *interval)
+            values, window = on_grid_for_drift(prepared, np.asarray(state.values), state.window, *interval)
             state, stop = state._replace(values=values, centre=window.centre, spacing=window.spacing), first + 1
             if window.size > most:
                 break
         now = observed[first - rows.start : stop - rows.start]
         if prepared.gaussian:
-            piece, why, answer = _on_one_table(prepared, slice(first, stop), state, now)
+            piece, status, answer = _on_one_table(prepared, slice(first, stop), state, now)
         else:
-            found = modal.advanced(prepared, first, stop, state, now, way)
-            why, answer = found.why, found.answer
-            piece = Piece.of(first, state, *found[:4])._replace(coarse=found.coarse) if len(found.reports) else None
+            result = modal.advanced(prepared, first, stop, state, now, placement)
+            status, answer = result.status, result.answer
+            piece = Piece.of(first, state, *result[:4])._replace(coarse=result.coarse) if len(result.reports) else None
         if piece is not None:
-            last = regridded(prepared, piece.last) if why == AFTER or prepared.cut_up else piece.last
+            last = regridded(prepared, piece.last) if status == Status.AFTER or prepared.cut_up else piece.last
             pieces.append(piece._replace(last=last))
-            attempts, state, first = 1, last, first + len(piece.reports)
-        if why == FAILED or (why == OK and piece is None):
+            trials, state, first = 1, last, first + len(piece.reports)
+        if status == Status.FAILED or (status == Status.OK and piece is None):
             break
-        if why == RANGE:
+        if status == Status.RANGE:
             larger = _covering(prepared, state, *answer.tolist())
             if larger is None:
                 break
             state = larger
-        if way == STAY and why in (NARROW, UNRESOLVED):
+        if placement == STAY and status in (Status.NARROW, Status.UNRESOLVED):
             if prepared.kinked:
                 break
-            way = PLACE if why == NARROW else OWN
-        elif why == BROAD or way == OWN:
-            way = STAY
+            placement = PLACE if status == Status.NARROW else OWN
+        elif status == Status.BROAD or placement == OWN:
+            placement = STAY
     return pieces
 
 
-def _on_one_table(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Piece | None, int, Array]:
+def _on_one_table(prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Piece | None, Status, Array]:
     """Return the first steps of `rows` by kernels or splitting, why they end, and the grid that is needed."""
     together = 1 if prepared.cut_up else TOGETHER if prepared.mixed else len(observed)
     here = slice(rows.start, min(rows.stop, rows.start + together))
     grid = grid_of(prepared, state.window, here)
     if grid is None:
-        return None, FAILED, np.zeros(3)
+        return None, Status.FAILED, np.zeros(3)
     segment = advance(
         prepared.mechanisms, np.ascontiguousarray(state.values), grid, prepared.steps, rows.start, observed[:together],
         float(state.error), float(state.log_floor), prepared.limits,
     )  # fmt: skip
-    return (_piece(rows.start, state, grid.start, segment) if len(segment.reports) else None), segment.why, segment.answer
+    return (_piece(rows.start, state, grid.start, segment) if len(segment.reports) else None), segment.status, segment.answer
 
 
 def _piece(first: int, before: State, start: int, segment: Segment) -> Piece:
@@ -174,18 +282,18 @@ def _covering(prepared: Prepared, state: State, low: float, high: float, spacing
             return None
     if new == window:
         return None
-    moved = resampled(prepared, np.asarray(state.values), window, new)
-    return state._replace(values=moved / np.sum(moved), centre=new.centre, spacing=new.spacing)
+    new_values = resampled(prepared, np.asarray(state.values), window, new)
+    return state._replace(values=new_values / np.sum(new_values), centre=new.centre, spacing=new.spacing)
 
 
 def regridded(prepared: Prepared, state: State) -> State:
     """Return a state on a grid that fits it, with a margin for the next steps."""
     window, values = state.window, state.values
-    look = figures(prepared, values, window)
+    check = grid_check(prepared, values, window)
     if prepared.gaussian:
-        look = look._replace(resolving=look.resolving * BAND / 0.92)
-    moved, new, _ = on_fitting_grid(prepared, np.asarray(values), window, look, prepared.generous, LARGER)
-    return state if new == window else state._replace(values=moved, centre=new.centre, spacing=new.spacing)
+        check = check._replace(resolving=check.resolving * BAND / 0.92)
+    new_values, new, _ = on_fitting_grid(prepared, np.asarray(values), window, check, prepared.generous, LARGER)
+    return state if new == window else state._replace(values=new_values, centre=new.centre, spacing=new.spacing)
 
 
 def _infos(prepared: Prepared, piece: Piece) -> Infos:

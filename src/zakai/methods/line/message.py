@@ -1,14 +1,21 @@
-"""What the observations after t say of the state at t, for one state: the logarithm of a function on a grid."""
+"""The message of one state: the logarithm of b(x) = p(later observations | x) on a grid, and the operator that moves it.
+
+A message b obeys -b_t = G b'' / 2 + f b'.  What is moved is psi = F e^s b with s' = (f - G'/2) / G and an F that falls to zero
+towards the ends of the grid: its operator is that of a density, with the drift f + G F'/F of a process that keeps to the grid.
+"""
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.line.system import State
+from zakai.methods.line.coefficients import decomposed
+from zakai.methods.line.prepared import Derived, Prepared, State
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.polynomial import local_polynomial
+from zakai.numerics.line.operator import Spectral
+from zakai.numerics.line.window import local_polynomial
 
 Array = Any
 
@@ -64,9 +71,9 @@ class Message(NamedTuple):
 
     def falling(self, offsets: Array) -> Array:
         """Return log b at offsets from the origin (J,), beyond the grid with the slope at its ends where b falls outward."""
-        found = self.at(offsets)
+        result = self.at(offsets)
         (low, high), (left, right) = self.ends, np.maximum(self.logs[[3, -4]] - self.logs[[0, -1]], 0.0) / (3.0 * self.spacing)
-        return found - left * np.maximum(low - offsets, 0.0) - right * np.maximum(offsets - high, 0.0)
+        return result - left * np.maximum(low - offsets, 0.0) - right * np.maximum(offsets - high, 0.0)
 
     def between(self, low: float, high: float) -> Message:
         """Return the message on its points between two offsets, and on those that hold them."""
@@ -79,8 +86,8 @@ class Message(NamedTuple):
 
     def on(self, window: lw.Window) -> Message:
         """Return the message on another grid."""
-        found = Message.of(self.at(window.offsets), window, self.needed, self.error)
-        return found._replace(mean=self.mean, deviation=self.deviation)
+        result = Message.of(self.at(window.offsets), window, self.needed, self.error)
+        return result._replace(mean=self.mean, deviation=self.deviation)
 
     @property
     def moments(self) -> tuple[float, float]:
@@ -133,3 +140,31 @@ def reliable(state: State, window: lw.Window) -> Array:
     floor = SURE * float(np.exp(min(state.log_floor, LOWEST))) * float(np.max(values))
     return lw.resampled(np.where(values > floor, values, 0.0), state.window, window)
 
+
+@lru_cache(maxsize=64)
+def _fall(size: int) -> tuple[Array, Array]:
+    """Return F'/F and its derivative at the points of a grid on the line (size,) with the spacing one."""
+    from scipy.special import erfcx
+
+    i = np.arange(size)
+    y = (np.maximum(PAD - i, PAD - i[::-1]) - HALF) / FALL
+    with np.errstate(over="ignore"):
+        slope = -2.0 / (np.sqrt(np.pi) * erfcx(y)) / FALL  # of log(erfc(y) / 2)
+    return slope * np.where(i < size / 2, -1.0, 1.0), -slope * (2.0 * y / FALL + slope)
+
+
+def gauged(prepared: Prepared, window: lw.Window) -> Spectral | None:
+    """Return the decomposition for psi on a grid of a system without time, None where there is none; s are its logarithms."""
+    ends = None
+    if not window.closed:
+        slope, curvature = _fall(window.size)
+        ends = slope / window.spacing, curvature / window.spacing**2
+
+    def make() -> tuple[Spectral | None]:
+        result = decomposed(prepared, window, lw.LARGE, ends)
+        if result is not None:
+            result.modes = np.asfortranarray(result.modes)  # the loop reads rows of U'
+        return (result,)
+
+    known: tuple[Spectral | None] = prepared.once(Derived.MESSAGE_MODES, window, make)
+    return known[0]

@@ -1,4 +1,4 @@
-"""Steps by the modes of the operator (`numerics/line/modal.py`), for `line/loop.py`."""
+"""Steps by the modes of the operator (`numerics/line/modes.py`), for `line/loop.py`."""
 
 from __future__ import annotations
 
@@ -7,17 +7,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.line.grids import SHARED
-from zakai.methods.line.system import Prepared, State
-from zakai.methods.line.tables import covariance_at, gauge_at, profile_of, spectral
+from zakai.methods.line.coefficients import covariance_at, gauge_at, profile_of, spectral
+from zakai.methods.line.prepared import SHARED, CacheKey, Derived, Prepared, State
 from zakai.methods.line.update import factor_at_end
-from zakai.numerics.line import modal as lm
+from zakai.numerics.line import modes as lm
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import circular_rows, waves
-from zakai.numerics.line.place import PER
-from zakai.numerics.line.posterior import General
-from zakai.numerics.line.segment import COLUMNS, FAILED
-from zakai.numerics.line.weak import at_nodes, nodes, weaken
+from zakai.numerics.line.grid_choice import PER
+from zakai.numerics.line.product import General, at_nodes, nodes, weaken
+from zakai.numerics.line.steps import COLUMNS, STATUSES, Status
 
 Array = Any
 
@@ -31,7 +29,7 @@ class Advanced(NamedTuple):
     """Steps on grids of their own: densities (K, n), centres and spacings (K,), and reports (K, .).
 
     The transitions were those of `coarse` grids, with centres, spacings, sizes and the numbers of points at either end at which
-    there is no density (K, 4), or of the grid on which all steps have stayed.  `why` is why the loop ended, and `answer` the
+    there is no density (K, 4), or of the grid on which all steps have stayed.  `status` is why the loop ended, and `answer` the
     range of the grid that it needs and its spacing.
     """
 
@@ -40,7 +38,7 @@ class Advanced(NamedTuple):
     spacings: Array
     reports: Array
     coarse: Array | None
-    why: int
+    status: Status
     answer: Array
 
 
@@ -65,7 +63,7 @@ class Coarse:
             return bool(stop <= len(self.numbers))
 
 
-def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.ndarray, way: int) -> Advanced:
+def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.ndarray, placement: int) -> Advanced:
     """Return the first steps of some intervals.
 
     Args:
@@ -73,37 +71,38 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
         k, stop: the intervals.
         state: the state before them.
         observed: what is observed (K, m).
-        way: whether the steps stay on the grid of the state, see `numerics/line/modal.py`.
+        way: whether the steps stay on the grid of the state, see `numerics/line/modes.py`.
     """
-    system, window, steps, stays = prepared.system, state.window, prepared.steps, way == lm.STAY
+    system, window, steps, stays = prepared.system, state.window, prepared.steps, placement == lm.STAY
     general, special = system.general or prepared.weak, system.general or not system.steady_observation or prepared.weak
-    key, profile = ("coarse grids", window.origin, window.unit, window.closed), profile_of(prepared, window)
-    coarse, rows, at = prepared.once(key, Coarse), np.empty((0, 0, 0)), 0
+    key, profile = (window.origin, window.unit, window.closed), profile_of(prepared, window)
+    coarse, rows, at = prepared.once(Derived.COARSE_GRIDS, key, Coarse), np.empty((0, 0, 0)), 0
     owner, count = (-2, stop - k) if not special else (-1, min(TOGETHER, stop - k) if stays else 1)
     for _ in range(NEW):
         n = window.size if stays else SIZES[at]
         cosines, sines = waves(n)
         densities, places, out = np.empty((count, n)), np.empty((count + 1, 4)), np.zeros((count, len(COLUMNS)))
-        done, why = lm.advance(
+        done, number = lm.advance(
             np.ascontiguousarray(state.values), float(state.centre), float(state.spacing), window.unit, window.closed, profile,
-            coarse.numbers, coarse.index, rows, owner, general, way, k, observed[:count], steps.lengths, steps.precisions[:, 0],
-            steps.constants, float(state.error), prepared.limits, cosines, sines, densities, places, out,
+            coarse.numbers, coarse.index, rows, owner, general, placement, k, observed[:count], steps.lengths,
+            steps.precisions[:, 0], steps.constants, float(state.error), prepared.limits, cosines, sines, densities, places, out,
         )  # fmt: skip
         if window.closed:
             circular_rows(densities[:done], cosines, sines, out)
         grids = coarse.index[places[:done, 2].astype(int), :3]
-        taken = None if stays else np.column_stack([grids, places[:done, 3]])
-        found = Advanced(densities[:done], places[:done, 0], places[:done, 1], out[:done], taken, why, places[-1, :3])
-        if done or why not in (lm.SIZE, lm.GRID):
-            return found
-        if why == lm.SIZE:
+        completed = None if stays else np.column_stack([grids, places[:done, 3]])
+        centres, spacings, status = places[:done, 0], places[:done, 1], STATUSES[number]
+        result = Advanced(densities[:done], centres, spacings, out[:done], completed, status, places[-1, :3])
+        if done or result.status not in (Status.SIZE, Status.GRID):
+            return result
+        if result.status == Status.SIZE:
             at, count = at + 1, 1
             if at < len(SIZES):
                 continue
         else:
-            centre, spacing, size = found.answer.tolist()
+            centre, spacing, size = result.answer.tolist()
             grid = window._replace(centre=centre, spacing=spacing, size=int(size))
-            places_of = np.flatnonzero((coarse.index[:, :3] == found.answer).all(axis=1))
+            places_of = np.flatnonzero((coarse.index[:, :3] == result.answer).all(axis=1))
             if len(places_of):  # what is missing is what is observed
                 here = range(k, k + count)
                 owner, rows = int(places_of[0]), np.stack([_rows(prepared, i, grid, observed[i - k], stays) for i in here])
@@ -114,13 +113,13 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
             elif not stays or grid.size <= SHARED or grid.closed or prepared.kinked:
                 parts = _parts(prepared, grid)
                 if parts is not None and not coarse.add(grid, parts):  # the others are left to threads that read them
-                    prepared.kept.pop(key, None)
-                    coarse = prepared.once(key, Coarse)
+                    prepared.grid_cache.pop(CacheKey(Derived.COARSE_GRIDS, key), None)
+                    coarse = prepared.once(Derived.COARSE_GRIDS, key, Coarse)
                     coarse.add(grid, parts)
                 if parts is not None:
                     continue
         break
-    return found._replace(why=FAILED)
+    return result._replace(status=Status.FAILED)
 
 
 def _parts(prepared: Prepared, grid: lw.Window) -> list[Array] | None:
@@ -136,8 +135,8 @@ def _parts(prepared: Prepared, grid: lw.Window) -> list[Array] | None:
     if not system.general and system.steady_observation:
         rows = system.observation(x[:, None], start, theta).T
     angle = 2.0 * np.pi / grid.size * np.arange(grid.size)
-    found = [decomposed.rates, np.ascontiguousarray(decomposed.modes.T), np.cos(angle), np.sin(angle), scale, rows]
-    return found if all(np.isfinite(part).all() for part in found) else None
+    result = [decomposed.rates, np.ascontiguousarray(decomposed.modes.T), np.cos(angle), np.sin(angle), scale, rows]
+    return result if all(np.isfinite(part).all() for part in result) else None
 
 
 def _rows(prepared: Prepared, k: int, grid: lw.Window, observed: np.ndarray, stays: bool) -> Array:
@@ -149,14 +148,14 @@ def _rows(prepared: Prepared, k: int, grid: lw.Window, observed: np.ndarray, sta
     if prepared.weak:
         return _weak_rows(prepared, k, grid, observed)
     if not prepared.system.general:
-        found = prepared.system.observation(x[:, None], float(prepared.schedule.stops[k]), prepared.theta).T
+        result = prepared.system.observation(x[:, None], float(prepared.schedule.stops[k]), prepared.theta).T
     elif seen.any():
         likelihood = factor_at_end(prepared, k, seen, observed, None)
         assert isinstance(likelihood, General)
-        found = likelihood.log_density(x)[None]
+        result = likelihood.log_density(x)[None]
     else:
-        found = np.zeros((1, len(x)))
-    return np.array(found, float, order="C")
+        result = np.zeros((1, len(x)))
+    return np.array(result, float, order="C")
 
 
 def _weak_rows(prepared: Prepared, k: int, grid: lw.Window, observed: np.ndarray) -> Array:
@@ -167,11 +166,11 @@ def _weak_rows(prepared: Prepared, k: int, grid: lw.Window, observed: np.ndarray
         fine = at_nodes(system.observation(points, start, theta).T)
         return fine, np.ascontiguousarray(system.observation(grid.points[grid.size // 2, None][None], start, theta)[0])
 
-    fine, centre = prepared.once(("fine", grid), make)
-    found, precision = np.full((2, grid.size), [[-1e150], [1.0]]), np.ascontiguousarray(prepared.steps.precisions[k, 0])
-    weaken(fine, 0, precision, observed, centre, found[0], found[1])
-    found[0] -= 0.5 * (observed - centre) @ precision @ (observed - centre)
-    return found if prepared.schedule.seen[k].any() else np.zeros_like(found)
+    fine, centre = prepared.once(Derived.FINE_OF_GRID, grid, make)
+    result, precision = np.full((2, grid.size), [[-1e150], [1.0]]), np.ascontiguousarray(prepared.steps.precisions[k, 0])
+    weaken(fine, 0, precision, observed, centre, result[0], result[1])
+    result[0] -= 0.5 * (observed - centre) @ precision @ (observed - centre)
+    return result if prepared.schedule.seen[k].any() else np.zeros_like(result)
 
 
 def _points(grid: lw.Window) -> Array:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
-from zakai.methods._outside_tables import OutsideTables
+from zakai.methods.system.outside_tables import OutsideTables
 from zakai.models.angles import without_branch
 from zakai.models.features import CROSS_NOISE, OF_OBSERVATION, STATE_DEPENDENT_DIFFUSION
 from zakai.models.functions import Floor, Maximum, Minimum, TableFunction
@@ -72,27 +72,27 @@ def _roots(model: Model) -> list[sp.Expr]:
     Where there are such, those of the h of samples follow.
     """
     dynamics = [model.drift[0], model.covariance[0]]
-    found = _zeros(model, [*dynamics, *([] if model.observation_kind == "samples" else model.observation)])
-    return sorted(found | _zeros(model, [*dynamics, *without_branch(model)]), key=str) if found else []
+    result = _zeros(model, [*dynamics, *([] if model.observation_kind == "samples" else model.observation)])
+    return sorted(result | _zeros(model, [*dynamics, *without_branch(model)]), key=str) if result else []
 
 
 def _zeros(model: Model, formulas: list[sp.Expr]) -> set[sp.Expr]:
     """Return functions of x alone that are zero where formulas have a kink or a jump."""
     x, given = model.x[0], {model.t, *model.u}
-    found: set[sp.Expr] = set()
+    result: set[sp.Expr] = set()
     for part in formulas:
         for call in part.atoms(*_JUMPS, *_KINKS, TableFunction):
             first = call.args[0]
             if isinstance(call, (Minimum, Maximum)):
-                found.add(first - call.args[1])
+                result.add(first - call.args[1])
             elif isinstance(call, Floor):
-                found.add(sp.sin(sp.pi * first))
+                result.add(sp.sin(sp.pi * first))
             elif isinstance(call, TableFunction):
                 if call.table.degree == 1 and len(call.args) == 1 and not call.table.periodic:
-                    found.update(first - sp.Float(node, 17) for node in call.table.axes[0])
+                    result.update(first - sp.Float(node, 17) for node in call.table.axes[0])
             else:
-                found.add(first)
-    return {root for root in found if root.has(x) and not root.free_symbols & given}
+                result.add(first)
+    return {root for root in result if root.has(x) and not root.free_symbols & given}
 
 
 def _separated(model: Model) -> tuple[Function, Function] | None:
@@ -190,9 +190,9 @@ class System:
         """Return the same with the inputs of a record."""
         if inputs is None:
             return self
-        found = copy(self)
-        found._bind(inputs)
-        return found
+        result = copy(self)
+        result._bind(inputs)
+        return result
 
     def _bind(self, inputs: Inputs | None) -> None:
         self.inputs, formulas = inputs, _formulas(self.model)
@@ -242,3 +242,8 @@ def system_of(model: Model) -> System:
 def within(times: Array, start: float, stop: float) -> Array:
     """Return times of a piece, in which the end counts as the limit from inside."""
     return np.clip(times, start, np.nextafter(stop, start))
+
+
+def finite(values: Array) -> Array:
+    """Return the values with zero where a formula has no value."""
+    return np.where(np.isfinite(values.real), values, 0.0)

@@ -19,13 +19,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.methods.line import filter as line_filter
 from zakai.methods.line.domain import variable_of
-from zakai.methods.line.system import Prepared, State
+from zakai.methods.line.prepared import Prepared, State
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.polynomial import local_polynomial
+from zakai.numerics.line.window import local_polynomial
 from zakai.numerics.transition import Array
 
 RELIABLE = 1e-10  # of the maximum: a density whose derivative is not rounding
@@ -75,11 +75,11 @@ def _law(prepared: Prepared, k: int, values: Array, state: State) -> tuple[Law, 
     t = own.points if own.closed else (own.offsets - mean) / scale
     functions = [np.cos(t), np.sin(t), np.cos(2 * t), np.sin(2 * t)] if own.closed else [t, t**2, t**3, t**4]
     for function in functions:
-        found = line_filter.single(prepared, k, state._replace(values=density * (1.0 + 1j * STEP * function)), values)
-        moved, info = found.state, found.info
-        ratio = moved.values.imag / moved.values.real
+        result = line_filter.single(prepared, k, state._replace(values=density * (1.0 + 1j * STEP * function)), values)
+        propagated, info = result.state, result.info
+        ratio = propagated.values.imag / propagated.values.real
         means.append((ratio + np.imag(info.log_likelihood_increment)) / STEP)
-    window, q = moved.window, moved.values.real
+    window, q = propagated.window, propagated.values.real
     reliable = np.flatnonzero(q > RELIABLE * np.max(q))
     ends = float(window.offsets[reliable[0]]), float(window.offsets[reliable[-1]])
     if own.closed:

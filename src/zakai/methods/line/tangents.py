@@ -17,21 +17,17 @@ from sympy import sympify
 
 from zakai.methods._protocol import Infos, Tangents
 from zakai.methods.line import filter as line_filter
-from zakai.methods.line.adjoint import log_likelihoods
-from zakai.methods.line.attempt import Substep, exponents_of
-from zakai.methods.line.grids import grid_of
-from zakai.methods.line.loop import DIVIDED, START, Piece, infos_of
-from zakai.methods.line.moves import Passage
-from zakai.methods.line.parts import segment_of_parts
-from zakai.methods.line.system import Parts, Prepared, State
-from zakai.methods.line.tables import spectral
+from zakai.methods.line.backward_loop import log_likelihoods
+from zakai.methods.line.coefficients import spectral
+from zakai.methods.line.loop import DIVIDED, START, Piece, grid_of, infos_of
+from zakai.methods.line.prepared import Parts, Prepared, State, segment_of_parts
+from zakai.methods.line.transition import RecordedTransition, Substep, exponents_of
 from zakai.methods.line.update import factor_of
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.exponential_tangents import exponential_tangents
-from zakai.numerics.line.segment import SPLIT
-from zakai.numerics.line.split_tangents import Coefficients, Interval, through
-from zakai.numerics.line.tangents import Varied, extended, resampled_tangents
+from zakai.numerics.line.splitting import Coefficients, Interval, through
+from zakai.numerics.line.steps import SPLIT
+from zakai.numerics.line.tangents import Varied, exponential_tangents, extended, resampled_tangents
 
 Array = Any
 
@@ -77,17 +73,17 @@ class _Walk:
     def over(self, prepared: Prepared, rows: slice, state: State, observed: np.ndarray) -> tuple[Sequence[State], Infos]:
         """Take the intervals of a slice; return the states and the reports."""
 
-        def noted(k: int, before: State, found: line_filter.Taken) -> None:
+        def noted(k: int, before: State, result: line_filter.FilteredSteps) -> None:
             values = observed[k - rows.start :]
-            if isinstance(found, line_filter.Stepped):
-                if found.parts is not None:
-                    self.in_parts(found.parts, slice(0, 1), before, values[:1])
-                elif found.passages:
-                    self._passed(prepared, k, before, found, values[0])
+            if isinstance(result, line_filter.SingleStep):
+                if result.parts is not None:
+                    self.in_parts(result.parts, slice(0, 1), before, values[:1])
+                elif result.transitions:
+                    self._passed(prepared, k, before, result, values[0])
                 else:
-                    self._singly(k, before, found.state, values[0])
+                    self._singly(k, before, result.state, values[0])
                 return
-            for piece in found:
+            for piece in result:
                 place = piece.first - k
                 self._regrid(before.values, before.window, piece.before.window)
                 own = values[place : place + piece.number]
@@ -104,9 +100,9 @@ class _Walk:
         """Take the intervals of a slice that are cut into parts; return the states and the reports."""
         whole = self.shifted
         self.shifted = [replace(parts.prepared, theta=one.theta) for one in whole]
-        found = segment_of_parts(parts, rows, state, observed, self.over)
+        result = segment_of_parts(parts, rows, state, observed, self.over)
         self.shifted = whole
-        return found
+        return result
 
     def _singly(self, k: int, before: State, after: State, observed: np.ndarray) -> None:
         """Take one interval, for one parameter after the other."""
@@ -182,28 +178,28 @@ class _Walk:
         length, inside, closed = float(prepared.lengths[k]), bool(prepared.kinds[k] == SPLIT), piece.before.closed
         return Interval(length, piece.before.spacing, closed, observed, inside, int(pairs), int(substeps), bool(needed > 0.0))
 
-    def _passed(self, prepared: Prepared, k: int, before: State, step: line_filter.Stepped, observed: np.ndarray) -> None:
+    def _passed(self, prepared: Prepared, k: int, before: State, step: line_filter.SingleStep, observed: np.ndarray) -> None:
         """Take a single step whose transitions are known."""
         density, own, gained = before.values, before.window, 0.0
-        for passage in step.passages:
-            self._regrid(density, own, passage.window)
-            own = passage.after
-            if passage.substep is None:
+        for transition in step.transitions:
+            self._regrid(density, own, transition.window)
+            own = transition.after
+            if transition.substep is None:
                 varied = self._varied(prepared, own)
-                density, moved = varied.through(
-                    passage.values, self.tangents, passage.length, passage.window, own, passage.margins
+                density, propagated = varied.through(
+                    transition.values, self.tangents, transition.length, transition.window, own, transition.margins
                 )
             else:
-                density, moved = self._by_exponentials(prepared, passage, passage.substep)
-            self.tangents, gained = moved / np.exp(passage.log_mass), gained + passage.log_mass + passage.offset
+                density, propagated = self._by_exponentials(prepared, transition, transition.substep)
+            self.tangents, gained = propagated / np.exp(transition.log_mass), gained + transition.log_mass + transition.offset
         self._regrid(density, own, step.window)
         logs = self._logs(partial(_logs_of, k=k, observed=observed, points=step.window.points), prepared)
         self._multiply(step.values, logs, step.info.log_likelihood_increment - gained)
         self._regrid(step.values, step.window, step.state.window)
 
-    def _by_exponentials(self, prepared: Prepared, passage: Passage, substep: Substep) -> tuple[Array, Array]:
+    def _by_exponentials(self, prepared: Prepared, transition: RecordedTransition, substep: Substep) -> tuple[Array, Array]:
         """Return the density after a substep, but for its mass, and the derivatives, which are to be divided by its mass."""
-        values, window = passage.values, passage.window
+        values, window = transition.values, transition.window
         exponents = exponents_of(prepared, values, window, substep)
         shifted = [exponents_of(one, values, window, substep) for one in self.shifted]
         tangents = extended(values, self.tangents)
@@ -215,9 +211,9 @@ class _Walk:
 
     def _logs(self, function: Callable[[Prepared], Array], prepared: Prepared) -> Array:
         """Return the logarithms (p, ...) of likelihoods, with imaginary parts where a likelihood depends on the parameter."""
-        found = {i: function(self.shifted[i]) for i in self.observing}
-        real = next(iter(found.values())).real if found else function(prepared)
-        return np.array([found.get(i, real) for i in range(len(self.shifted))], complex)
+        result = {i: function(self.shifted[i]) for i in self.observing}
+        real = next(iter(result.values())).real if result else function(prepared)
+        return np.array([result.get(i, real) for i in range(len(self.shifted))], complex)
 
     def _varied(self, prepared: Prepared, window: lw.Window) -> Varied:
         """Return the decomposition on a grid with its derivatives."""
@@ -249,11 +245,11 @@ class _Walk:
 def _logs_of(prepared: Prepared, k: int, observed: Array, points: Array) -> Array:
     """Return the log-likelihood of an observation at points (N,)."""
     likelihood = factor_of(prepared, k, observed, None)
-    found: Array = np.zeros(len(points)) if likelihood is None else likelihood.logs(points)
-    return found
+    result: Array = np.zeros(len(points)) if likelihood is None else likelihood.logs(points)
+    return result
 
 
 def _derivatives(states: Sequence[State], new: lw.Window) -> Array:
     """Return the derivatives (p, N) on a grid of states at parameters with infinitesimal imaginary parts."""
-    found = [resampled_tangents(one.values.real, one.values.imag[None] / STEP, one.window, new)[0] for one in states]
-    return np.array(found)
+    result = [resampled_tangents(one.values.real, one.values.imag[None] / STEP, one.window, new)[0] for one in states]
+    return np.array(result)

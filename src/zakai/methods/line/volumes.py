@@ -1,8 +1,8 @@
 """One interval of one state on finite volumes (`numerics/line/volumes.py`), where a uniform grid does not serve.
 
 That is where the density contracts so much that no uniform grid holds it, as by -x^3 from a broad prior, and where coefficients
-have kinks or jumps.  The cells are small where the drift leads and grow with the distance; kinks and jumps are faces.  There are
-more and more cells and steps until the result settles.
+have kinks or jumps.  The cells are small where the drift leads and grow with the distance; kinks and jumps are faces.  Cells and
+steps are refined until the result settles.
 """
 
 from __future__ import annotations
@@ -12,19 +12,202 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from zakai.methods.line.coefficients import coefficients
-from zakai.methods.line.course import FAST, LEVELS, Course, course_of, drift_along, ends_of
-from zakai.methods.line.leak import ends_of_leak
-from zakai.methods.line.model import within
-from zakai.methods.line.moves import Moved, Report
-from zakai.methods.line.system import Prepared
-from zakai.methods.line.tables import covariance_at
+from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
+from zakai.methods.line.domain import ends_of_leak
+from zakai.methods.line.model import finite, within
+from zakai.methods.line.prepared import Prepared, TimeInterval
+from zakai.methods.line.transition import Prediction, Report
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.panels import GAUSS_NODES, interpolation
-from zakai.numerics.line.polynomial import local_polynomial
-from zakai.numerics.line.volumes import Bands, Volumes, advanced
+from zakai.numerics.line.averages import GAUSS_NODES, Panels, interpolation
+from zakai.numerics.line.volumes import Bands, Volumes, advanced, ends_of_steps, volumes
+from zakai.numerics.line.window import local_polynomial
 
 Array = Any
+
+FAST = 5.0  # ranges of a density that the drift crosses in an interval, below which it is not followed
+LEVELS = ((256, 24), (512, 34), (1024, 48), (2048, 68), (4096, 96), (8192, 136), (16384, 192))  # cells and steps
+FIRST = 0.1  # of the time in which the drift would cross the range of the density: the first step
+FASTEST = 100.0  # ranges of the density in the interval, divided by the tolerance: a faster drift counts as this
+REACH = 8.0  # standard deviations to the end of a density
+KINK_PROBES = 1025  # points between which kinks are sought
+MOST_KINKS = 16
+PROBES = 65  # points between which a formula ceases to have values
+DIFFUSED = 0.5  # of the time in which noise would double the variance: the first step
+GENTLE = 0.25  # of the steps where the density does not contract much
+_FLOW_POINTS = 17
+_FLOW_STEPS = 32
+
+
+class CellPlan(NamedTuple):
+    """How an interval moves a density, the cells that hold it all the way, the first step, and the fastest drift that counts.
+
+    `last` is the step with which a message that is sharp at the end begins.  Between two `bounds` (B + 1,) the coefficients are
+    polynomials of time, up to the relative error `unresolved`; `share` is that of the steps of `LEVELS` that are taken.
+    """
+
+    flow: FlowSummary
+    cells: Volumes
+    finest: float
+    quick: float
+    fastest: float
+    bounds: Array
+    unresolved: float
+    share: float
+    last: float = np.inf
+
+    def steps(self, count: int) -> Array:
+        """Return the ends of about `count` steps, none of which crosses a bound, graded towards the start and what is sharp."""
+        length, number = float(self.bounds[-1]), int(np.ceil(self.share * count))
+        ends = np.union1d(self.bounds, ends_of_steps(length, self.quick, number)[:-1])
+        if self.last < FIRST * length:
+            ends = np.union1d(ends, length - ends_of_steps(length, self.last, number)[:-1])
+        return ends
+
+
+def cell_plan_of(
+    prepared: Prepared, values: Array, window: lw.Window, ends: Array, interval: TimeInterval,
+    aim: tuple[float, float] = (0.0, np.inf), widening: float = np.inf,
+) -> CellPlan | None:  # fmt: skip
+    """Return the plan of cells for a density between two offsets, None where the drift leads beyond all numbers.
+
+    Args:
+        prepared: the system.
+        values, window: the density before the interval, and its grid.
+        ends: its ends as offsets from the origin.
+        interval: the interval.
+        aim: the mean and the standard deviation of a function of the state at the end that is taken back to the start.
+        widening: the most by which the range of the density grows on each side.
+    """
+    start, length = interval.start, interval.length
+    width, speed = float(ends[1] - ends[0]), float(np.max(np.abs(drift_along(prepared, window, ends, start))))
+    fastest = FASTEST * width / (length * prepared.tolerance)
+    points = window.origin + np.linspace(ends[0], ends[1], 5)
+    noise = float(np.max(covariance_at(prepared.system, points, start, prepared.theta.real)))
+    diffused, last = DIFFUSED * np.array([width / (2.0 * REACH), aim[1]]) ** 2 / max(noise, 1e-300)
+    quick = min(FIRST * width / max(min(speed, fastest), 1e-300), FIRST * length, float(diffused))
+    parts = Panels([(0.0, length)], 0.0)
+    if prepared.system.varying:
+        parts = resolved_parts(prepared, values, window, interval)
+    bounds = np.array([0.0, *(stop for _, stop in parts.bounds)])
+    ratio = float(np.log2(length / min(quick, float(last)))) / LEVELS[0][1]  # steps grow at most by a factor of two
+    share = 1.0 if speed * length > FAST * width else max(GENTLE, min(ratio, 1.0))
+    steps = np.union1d(bounds, ends_of_steps(length, quick, int(share * _FLOW_STEPS)))
+    flow = _flow_summary(prepared, window, ends, start, steps)
+    flow = flow._replace(low=max(flow.low, float(ends[0]) - widening), high=min(flow.high, float(ends[1]) + widening))
+    if not np.isfinite([flow.low, flow.high]).all() or not flow.high > flow.low:
+        return None
+    centre, scale, walls = 0.5 * (flow.low + flow.high), 0.5 * (flow.high - flow.low), walls_of(prepared, window.origin)
+    low, high = np.clip([min(ends[0], centre - scale), max(ends[1], centre + scale)], *walls)
+    low, high = (_defined(prepared, window.origin, centre, float(end), start) for end in (low, high))
+    if REACH * aim[1] < scale:
+        centre, scale = aim[0], REACH * aim[1]
+    cells = volumes(window.origin, centre, scale, float(low), float(high), LEVELS[0][0])
+    finest = (cells.last - cells.first) / LEVELS[-1][0] * np.hypot(scale, max(abs(ends[0] - centre), abs(ends[1] - centre)))
+    cells = cells._replace(cuts=_cuts(prepared, cells, start))
+    return CellPlan(flow, cells, float(finest), quick, fastest, bounds, parts.error, share, float(last))
+
+
+def _defined(prepared: Prepared, origin: float, inner: float, outer: float, t: float) -> float:
+    """Return how far between two offsets from the origin the drift and the noise have values."""
+    system, theta = prepared.system, prepared.theta.real
+
+    def has_values(offsets: Array) -> Array:
+        x = origin + offsets[:, None]
+        return np.isfinite(system.drift(x, t, theta)[:, 0]) & (system.covariance(x, t, theta)[:, 0, 0] >= 0.0)
+
+    for _ in range(4):
+        offsets = np.linspace(inner, outer, PROBES)
+        missing = ~has_values(offsets)
+        if not missing.any():
+            return outer
+        first = max(int(np.argmax(missing)), 1)
+        inner, outer = float(offsets[first - 1]), float(offsets[first])
+    return inner
+
+
+def walls_of(prepared: Prepared, origin: float) -> tuple[float, float]:
+    """Return the reflecting ends of the domain as offsets from the origin."""
+    if not prepared.system.reflecting:
+        return -np.inf, np.inf
+    domain = prepared.model.domain[prepared.model.state[0]]
+    return domain.lower - origin, domain.upper - origin
+
+
+def ends_of(values: Array, window: lw.Window) -> Array:
+    """Return the ends of the support of a density as offsets from the origin (2,)."""
+    check = lw.grid_check(values, False)
+    return window.offsets[[max(check.first - 1, 0), min(check.last + 1, window.size - 1)]]
+
+
+def drift_along(prepared: Prepared, window: lw.Window, offsets: Array, t: float) -> Array:
+    """Return f at offsets from the origin (J,)."""
+    return finite(prepared.system.drift(window.origin + offsets[:, None], t, prepared.theta.real)[:, 0])
+
+
+def _cuts(prepared: Prepared, cells: Volumes, start: float) -> tuple[float, ...]:
+    """Return where in the range of cells coefficients have kinks or jumps, in s; nothing where these are many."""
+    lower, upper = cells.origin + cells.centre + cells.scale * np.sinh([cells.first, cells.last])
+    result, apart = [cells.first], 1e-6 * (cells.last - cells.first)
+    for s in np.arcsinh((kinks_between(prepared, lower, upper, start) - cells.origin - cells.centre) / cells.scale):
+        if s - result[-1] > apart and cells.last - s > apart:
+            result.append(float(s))
+    return tuple(result[1:])
+
+
+def kinks_between(prepared: Prepared, lower: float, upper: float, t: float) -> Array:
+    """Return the states between two, in increasing order, where coefficients have kinks or jumps; none where these are many."""
+    kinks, theta = prepared.system.kinks, prepared.theta.real
+    if kinks is None:
+        return np.zeros(0)
+    x = np.linspace(lower, upper, KINK_PROBES)
+    negative = kinks(x[:, None], t, theta) < 0
+    at, which = np.nonzero(negative[1:] != negative[:-1])
+    if len(at) > MOST_KINKS:
+        return np.zeros(0)
+    low, high, left = x[at], x[at + 1], negative[at, which]
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        same = (kinks(middle[:, None], t, theta)[np.arange(len(at)), which] < 0) == left
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return np.sort(0.5 * (low + high))
+
+
+class FlowSummary(NamedTuple):
+    """How the drift moves a density: by how many of its ranges, their most in the smallest deviations of parts, and to where."""
+
+    travel: float
+    deviations: float
+    low: float
+    high: float
+
+
+def _flow_summary(prepared: Prepared, window: lw.Window, ends: Array, start: float, steps: Array) -> FlowSummary:
+    """Follow Gaussian parts of a density between two offsets by exponential Euler steps."""
+    count, width = _FLOW_POINTS, float(ends[1] - ends[0])
+    x, t, travel, most = np.linspace(float(ends[0]), float(ends[1]), count), start, 0.0, 0.0
+    own, noise, walls = np.full(count, (width / (2.0 * REACH)) ** 2), np.zeros(count), walls_of(prepared, window.origin)
+    for step in np.diff(steps):
+        near = 1e-6 * np.maximum(np.abs(window.origin + x), 1e-3 * width)
+        f = drift_along(prepared, window, np.concatenate([x, x + near, x - near]), t)
+        slope = 0.5 * step * (f[count : 2 * count] - f[2 * count :]) / near
+        G = covariance_at(prepared.system, window.origin + x, t, prepared.theta.real)
+        by = step * f[:count] * _relative(np.minimum(slope, 3.0))
+        x, t = np.clip(x + by, *walls), t + step
+        slope = np.minimum(2.0 * slope, 0.0)  # what drifts apart, the points show
+        own, noise = own * np.exp(slope), noise * np.exp(slope) + step * G * _relative(slope)
+        reach = REACH * np.sqrt(noise)
+        low, high = float(np.min(x - reach)), float(np.max(x + reach))
+        wide = float(np.max(x) - np.min(x)) + 2.0 * float(np.min(reach))
+        most = max(most, wide / float(np.sqrt(np.min(own + noise))))
+        travel += float(np.max(np.abs(by))) / wide
+    return FlowSummary(travel, most, low, high)
+
+
+def _relative(x: Array) -> Array:
+    """Return (exp(x) - 1) / x."""
+    small = np.abs(x) < 1e-8
+    return np.where(small, 1.0, np.expm1(x) / np.where(small, 1.0, x))
+
 
 FINE = 300.0  # phase by which the drift turns the shortest wave of a large grid, above which that is not tried
 STIFF = 100.0  # the same, above which no uniform grid is tried
@@ -50,30 +233,27 @@ def contracted(
     prepared: Prepared,
     values: Array,
     window: lw.Window,
-    start: float,
-    length: float,
-    inside: np.ndarray,
-    rates: np.ndarray,
+    interval: TimeInterval,
     report: Report,
     moving: bool,
-) -> Moved | None:
+) -> Prediction | None:
     """Return the density after an interval, None where volumes do not serve or a uniform grid, which may move, is better."""
     if window.closed:
         return None
-    ends = ends_of(values, window)
+    ends, start, length = ends_of(values, window), interval.start, interval.length
     drift = drift_along(prepared, window, ends, start)
     width, speed = float(ends[1] - ends[0]), 0.5 * float(np.ptp(drift)) if moving else float(np.max(np.abs(drift)))
     fine = window.size > lw.LARGEST and np.pi * speed * length > FINE * window.spacing
     # The noise of the logarithm of a state grows without limit towards a natural end.
     noise = float(np.max(covariance_at(prepared.system, window.points, start, prepared.theta.real)))
     rounding = ROUNDING * 0.5 * (np.pi / window.spacing) ** 2 * noise * length
-    general = rough(prepared, inside) or fine
+    general = rough(prepared, interval.inside) or fine
     leak = ends_of_leak(prepared, window, ends, start, length)
     stiff_noise = leak is not None or (not general and rounding > SHARE * prepared.tolerance)
     if not (general or stiff_noise or speed * length > FAST * width):
         return None
     # Cells do not bring back what the grid does not resolve.
-    unresolved = lw.figures(values, False, prepared.negligible).aliasing  # where the density is smaller, it may not end
+    unresolved = lw.grid_check(values, False, prepared.negligible).aliasing  # where the density is smaller, it may not end
     allowed = SHARE * max(prepared.tolerance, unresolved)
 
     def density(offsets: Array) -> Array:
@@ -81,28 +261,28 @@ def contracted(
 
     # Where noise falls that fast, a Gaussian widens less than its own noise says.
     for widening in WIDENINGS if stiff_noise else (np.inf,):
-        course = course_of(prepared, values, window, ends, start, length, inside, widening=widening * width)
-        if course is None:
+        plan = cell_plan_of(prepared, values, window, ends, interval, widening=widening * width)
+        if plan is None:
             return None
         if leak is not None:
-            course = course._replace(cells=course.cells.reaching(*leak))
+            plan = plan._replace(cells=plan.cells.reaching(*leak))
         stiff = stiff_noise or speed * length > STIFF * width
-        far = (course.way.travel > MOST_TRAVEL and not moving) or course.way.deviations > MOST_DEVIATIONS
-        if not (general or stiff or far) or width < NARROWEST * course.finest:  # sharper than the cells where it begins
+        far = (plan.flow.travel > MOST_TRAVEL and not moving) or plan.flow.deviations > MOST_DEVIATIONS
+        if not (general or stiff or far) or width < NARROWEST * plan.finest:  # sharper than the cells where it begins
             return None
-        found = advanced_by(prepared, density, course, start, inside, rates, allowed)
-        if found is None:
+        result = advanced_by(prepared, density, plan, interval, allowed)
+        if result is None:
             return None
-        masses, cells, gained, error = found
+        masses, cells, gained, error = result
         after = np.abs((masses / cells.widths).real)
         if max(after[0], after[-1]) <= max(EDGE, unresolved) * np.max(after):
             break
     else:  # the cells do not hold it
         return None
-    report.time, report.noise = report.time + error + course.unresolved, max(report.noise, min(error, 1.0))
+    report.time, report.noise = report.time + error + plan.unresolved, max(report.noise, min(error, 1.0))
     resampled = _resampled(prepared, cells, masses, window, error)
-    assert resampled.look is not None
-    report.density(resampled.look)
+    assert resampled.check is not None
+    report.density(resampled.check)
     return resampled._replace(gained=gained)
 
 
@@ -118,10 +298,8 @@ class Settled(NamedTuple):
 def advanced_by(
     prepared: Prepared,
     density: Callable[[Array], Array],
-    course: Course,
-    start: float,
-    inside: np.ndarray,
-    rates: np.ndarray,
+    plan: CellPlan,
+    interval: TimeInterval,
     allowed: float,
 ) -> Settled | None:
     """Return the masses of cells after an interval, None where they do not settle.
@@ -129,24 +307,23 @@ def advanced_by(
     Args:
         prepared: the system.
         density: the density before, as a function of offsets (J,).
-        course: the course of the density.
-        start: the time before.
-        inside, rates: which increments act within the interval, and their rates.
+        plan: the plan of the cells.
+        interval: the interval.
         allowed: the error at which more cells are not taken.
     """
 
     def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
         before = density(cells.offsets)
         masses = before * cells.widths
-        return _advanced(masses / np.sum(masses), prepared, before, cells, start, inside, rates, steps, course)
+        return _advanced(masses / np.sum(masses), prepared, before, cells, interval, steps, plan)
 
     def summed(masses: Array) -> Array:
         return masses.reshape(-1, 2).sum(axis=1)
 
-    return _settled(allowed, course, at_level, summed, lambda cells: np.ones(cells.size))
+    return _settled(allowed, plan, at_level, summed, lambda cells: np.ones(cells.size))
 
 
-class Worth(NamedTuple):
+class BackwardExpectation(NamedTuple):
     """A function of the state at the start of an interval: values (N,) at the middles of cells, the logarithm of their scale."""
 
     cells: Volumes
@@ -163,44 +340,41 @@ class Worth(NamedTuple):
 
 def pulled_back(
     prepared: Prepared,
-    log_worth: Callable[[Array], Array],
+    log_values: Callable[[Array], Array],
     density: Callable[[Array], Array],
-    course: Course | None,
-    start: float,
-    inside: np.ndarray,
-    rates: np.ndarray,
-) -> Worth | None:
+    plan: CellPlan | None,
+    interval: TimeInterval,
+) -> BackwardExpectation | None:
     """Return the expectation of a function of the state after an interval, given the state before; None where it does not settle.
 
     Args:
         prepared: the system.
         log_worth: the logarithm of the function at offsets (J,).
         density: the density before the interval, as a function of offsets (J,).
-        course: the course of the density, None where there is none.
-        start: the time before.
-        inside, rates: which increments act within the interval, and their rates.
+        plan: the plan of the cells, None where there is none.
+        interval: the interval.
     """
-    if course is None:
+    if plan is None:
         return None
 
     def at_level(cells: Volumes, steps: Array) -> tuple[Array, Any]:
-        logs = log_worth(cells.offsets)
+        logs = log_values(cells.offsets)
         top = float(np.max(logs))
-        interval = prepared, density(cells.offsets), cells, start, inside, rates, steps, course
-        found, gained = _advanced(np.exp(logs - top), *interval, backward=True)
-        return found, gained + top
+        before = density(cells.offsets)
+        result, gained = _advanced(np.exp(logs - top), prepared, before, cells, interval, steps, plan, backward=True)
+        return result, gained + top
 
-    def between(found: Array) -> Array:
-        padded = np.concatenate([found[:1], found, found[-1:]])
-        return (9.0 * (found[::2] + found[1::2]) - padded[:-2:2] - padded[3::2]) / 16.0
+    def between(result: Array) -> Array:
+        padded = np.concatenate([result[:1], result, result[-1:]])
+        return (9.0 * (result[::2] + result[1::2]) - padded[:-2:2] - padded[3::2]) / 16.0
 
-    found = _settled(SMOOTH, course, at_level, between, lambda cells: density(cells.offsets) * cells.widths)
-    return None if found is None else Worth(found.cells, found.values, float(found.log_scale), found.error)
+    result = _settled(SMOOTH, plan, at_level, between, lambda cells: density(cells.offsets) * cells.widths)
+    return None if result is None else BackwardExpectation(result.cells, result.values, float(result.log_scale), result.error)
 
 
 def _settled(
     allowed: float,
-    course: Course,
+    plan: CellPlan,
     at_level: Callable[[Volumes, Array], tuple[Array, Any]],
     paired: Callable[[Array], Array],
     weights: Callable[[Volumes], Array],
@@ -216,8 +390,8 @@ def _settled(
     before = best = None
     error = np.inf
     for size, count in LEVELS:
-        cells = course.cells._replace(size=size)
-        values, gained = at_level(cells, course.steps(count))
+        cells = plan.cells._replace(size=size)
+        values, gained = at_level(cells, plan.steps(count))
         if before is not None:
             coarse = paired(values)
             # The error of second order falls to a quarter where the size of the cells is halved.
@@ -242,20 +416,18 @@ def _advanced(
     prepared: Prepared,
     density: Array,
     cells: Volumes,
-    start: float,
-    inside: np.ndarray,
-    rates: np.ndarray,
+    interval: TimeInterval,
     ends: Array,
-    course: Course,
+    plan: CellPlan,
     backward: bool = False,
 ) -> tuple[Array, Any]:
     """Return the masses of cells after steps, and the logarithm of their sum; `density` is the one before the interval."""
-    at, bounds = cast(lw.Window, cells), course.bounds  # by its points
+    at, bounds, (_, start, _, inside, rates) = cast(lw.Window, cells), plan.bounds, interval  # by its points
     known: dict[int, Bands] = {}
 
     def operators(times: Array) -> Bands:
         drift, covariance, potential, constant = coefficients(prepared, at, times, inside, rates, density)
-        drift = np.where(np.abs(drift) < course.fastest, drift, course.fastest * np.sign(drift.real))
+        drift = np.where(np.abs(drift) < plan.fastest, drift, plan.fastest * np.sign(drift.real))
         covariance = covariance if covariance.ndim == 2 else covariance[:, None]
         return cells.bands(covariance, drift, potential + constant[:, None] - offset)
 
@@ -280,7 +452,7 @@ def _advanced(
     return masses, gained + offset * ends[-1]
 
 
-def _resampled(prepared: Prepared, cells: Volumes, masses: Array, window: lw.Window, error: float) -> Moved:
+def _resampled(prepared: Prepared, cells: Volumes, masses: Array, window: lw.Window, error: float) -> Prediction:
     """Return the masses of cells as a density on a uniform grid."""
     density, real = cells.density(masses), (masses / cells.widths).real
     used = cells.offsets[np.flatnonzero(real > lw.CUT * real.max())]
@@ -289,8 +461,8 @@ def _resampled(prepared: Prepared, cells: Volumes, masses: Array, window: lw.Win
         new = lw.quantized(window, used[0], used[-1], spacing, most=lw.SIZES[-1])
         values = density(new.offsets)
         values = values / np.sum(values)
-        look = lw.figures(values, False, prepared.negligible)
-        if look.aliasing <= max(1e-11, 1e-2 * error) or new.size >= lw.SIZES[-1]:
+        check = lw.grid_check(values, False, prepared.negligible)
+        if check.aliasing <= max(1e-11, 1e-2 * error) or new.size >= lw.SIZES[-1]:
             break
         spacing = 1.001 * new.spacing / 2**0.5
-    return Moved(values, new, 0.0, look)
+    return Prediction(values, new, 0.0, check)

@@ -1,7 +1,7 @@
 """The transition of a time-varying Yau system with one state: f = L x + l + G phi', q quadratic.
 
 In the gauge u = e^phi v the equation of an interval is linear-quadratic, so that its kernel is Gaussian for any interval
-(`numerics/line/channel.py`), positive, and exact:
+(`numerics/line/gaussian_kernels.py`), positive, and exact:
 
     u(x) = e^phi(x, stop) int N(x; a y + b, V) exp(k0 + k1 y + k2 y^2) e^-phi(y, start) u(y) dy.
 """
@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods._yau_system import YauSystem
-from zakai.methods.series.kernel import PowerSeries
+from zakai.methods.yau.kernel import PowerSeries
+from zakai.methods.yau.system import YauSystem
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.numerics.flow import FlowResult, Transition, integrate
@@ -72,18 +72,18 @@ class YauLine(YauSystem):
                 return series.integrate(begins, times, theta, at, full)
             acting = none if lie else acting
             begins = begins if self.varies(acting) else np.zeros(len(own))
-            found = integrate(
+            result = integrate(
                 lambda t, _: self.coefficients(t, theta, at, acting, full), begins, begins + times, not self.varies(acting)
             )
-            return found._replace(error=np.where(found.error > UNRESOLVED, found.error, 0.0))
+            return result._replace(error=np.where(result.error > UNRESOLVED, result.error, 0.0))
 
         which = np.unique(inside[rows], axis=0, return_inverse=True)[1].reshape(-1)
         groups = [rows[which == i] for i in range(which.max() + 1)]
-        found = [integrated(own) for own in groups]
+        result = [integrated(own) for own in groups]
         place = np.full(len(starts), -1)
         place[np.concatenate(groups)] = np.arange(len(rows))
-        fields = zip(*(_padded(one.transition, 1 + self.m) for one in found), strict=True)
-        return Kernels(Transition(*map(np.concatenate, fields)), np.concatenate([one.error for one in found]), place, origin)
+        fields = zip(*(_padded(one.transition, 1 + self.m) for one in result), strict=True)
+        return Kernels(Transition(*map(np.concatenate, fields)), np.concatenate([one.error for one in result]), place, origin)
 
 
 class Kernels(NamedTuple):
@@ -95,11 +95,11 @@ class Kernels(NamedTuple):
     origin: float
 
 
-def _padded(found: Transition, inputs: int) -> Transition:
+def _padded(result: Transition, inputs: int) -> Transition:
     """Return transitions for more inputs, which have no effect."""
-    more = (0, 0), (0, 0), (0, inputs - found.offset.shape[2])
-    offset, vector = np.pad(found.offset, more), np.pad(found.vector, more)
-    return found._replace(offset=offset, vector=vector, constant=np.pad(found.constant, (more[0], more[2], more[2])))
+    more = (0, 0), (0, 0), (0, inputs - result.offset.shape[2])
+    offset, vector = np.pad(result.offset, more), np.pad(result.vector, more)
+    return result._replace(offset=offset, vector=vector, constant=np.pad(result.constant, (more[0], more[2], more[2])))
 
 
 @once_for_a_model

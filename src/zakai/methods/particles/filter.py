@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.densities._density import wrap
-from zakai.methods._escape_of_states import check_escape
+from zakai.densities._values import wrap
 from zakai.methods._protocol import Info
 from zakai.methods.particles.errors import DEPTH, Genealogy, of_log_likelihood, variances
 from zakai.methods.particles.interval import (
@@ -39,6 +38,7 @@ from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Control, Prepared, Rule, State
 from zakai.methods.particles.system import drawn, gaussian_prior
 from zakai.methods.particles.window import Observed, Target, Window, taken
+from zakai.methods.system.escape_of_states import RARE, check_escape
 from zakai.numerics.particles.chunks import over_chunks
 from zakai.numerics.particles.population import effective, next_power, normalised, systematic
 from zakai.numerics.particles.random import normals, uniform_number
@@ -51,6 +51,7 @@ GUIDE_SHARE, FIRST_SHARE = 0.1, 0.2  # of plain noise in draws from the linearis
 FIRST_WIDER, FIRST_ROUNDS = 1.5, 6
 INFORMED = 0.25  # log det of the linearised posterior of the noise, below which the observation says nothing about the noise
 MOST_LEVELS = 60
+FAR = 1e100  # a state that has left every bounded set
 FEW_FAMILIES = 20  # of the oldest generation that is looked back to, below which they are too few to show their spread
 # Standard error of a mean times sqrt(N) in standard deviations (1 for independent draws) from which the past is moved.  A move
 # costs as much as the intervals of its window: it waits until the squares of these figures, in units of that of `MOVE_ABOVE`,
@@ -60,7 +61,9 @@ MOVE_ABOVE, MOVE_SHARE, MOVE_GAIN, FORGOTTEN = 2.5, 0.4, 3.0, 0.98
 MOVE_CONTROL = (1.0, 1.2, 4.0, 0.4, 1.0)  # power, change, most sweeps, rho, share
 VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the number of particles is chosen for
 MOST_GROWTH = 4
-SURE, TRUSTED = 0.5, 8  # share of the allowed time error below which its measurement is trusted in so many more intervals
+# Share of the allowed time error below which its measurement is trusted in so many more intervals, if it is certain or not, and
+# the ratio of the errors of two lengths up to which that holds.
+SURE, TRUSTED, TRUSTED_LESS, LONGER = 0.5, 8, 2, 4.0
 
 
 def init(prepared: Prepared, prior: Any) -> State:
@@ -128,7 +131,8 @@ class Advanced(NamedTuple):
     """Particles after an interval, with what was needed.
 
     `gained` is the increment of the log-likelihood, `noise` (D, N) that of the interval, `predicted` (n,) the standard deviations
-    before the observation, `acceptance` that of moves between powers of the likelihood.
+    before the observation, `acceptance` that of moves between powers of the likelihood, `lost` the share of the particles that
+    left every bounded set.
     """
 
     cloud: Cloud
@@ -138,6 +142,7 @@ class Advanced(NamedTuple):
     levels: int = 0
     guided: bool = False
     acceptance: float = np.nan
+    lost: float = 0.0
 
 
 def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
@@ -162,7 +167,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         mean = state.particles @ weights
         return mean, (state.particles - mean[:, None]) * weights @ (state.particles - mean[:, None]).T
 
-    check_escape(prepared, k, at_start)
+    check_escape(prepared, k, at_start, infinity=False)
     motion, interval, control = prepared.motion, prepared.interval(k), state.control
     angles, number, rule = prepared.system.angles, control.interval + 1, prepared.rule
     cloud = Cloud(state.particles, state.log_weights, state.window, state.genealogy)
@@ -176,6 +181,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     if effective(weights) < RESAMPLE_BELOW * len(weights) or wanted != len(weights):
         cloud, _ = cloud.resampled(weights, wanted, prepared.key(number, RESAMPLING))
     done = _advanced(prepared, cloud, events, observed, number)
+    if done.lost > 0.5 * RARE:
+        check_escape(prepared, k, at_start)
     cloud = done.cloud
     cloud = cloud._replace(window=cloud.window.appended(motion, events, observed, done.noise, cloud.particles))
     weights = np.exp(cloud.logs)
@@ -240,18 +247,18 @@ def _steps(
     length = interval.stop - interval.start
     guess = min(max(1, round(control.substeps * length)), MOST_SUBSTEPS)
     if length <= 0:
-        return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0), control
+        return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0, 0.0), control
     # The error of an interval is of the third order of its length.
     ratio = (length / control.length) ** 3 if control.trusted else np.inf
-    if control.error * ratio <= SURE * TIME_ERROR:
-        known = Steps(Scheme(guess, control.stages), state.last_shift, control.error)
+    if ratio <= LONGER and control.error * ratio <= SURE * TIME_ERROR:
+        known = Steps(Scheme(guess, control.stages), state.last_shift, control.error, control.error)
         return known, control._replace(trusted=control.trusted - 1)
     key = prepared.key(control.interval + 1, PILOT)
     chosen = np.empty(PILOTS, np.int32)
     systematic(np.exp(state.log_weights), uniform_number(key), chosen)
     pilots = Pilots(taken(state.particles, chosen), mean, scale, int(key[0] >> np.uint64(2)))
     found = steps_of(prepared.motion, interval, values, pilots, guess)
-    trusted = TRUSTED if found.error <= SURE * TIME_ERROR else 0
+    trusted = TRUSTED if found.surely <= SURE * TIME_ERROR else TRUSTED_LESS if found.error <= SURE * TIME_ERROR else 0
     scheme = found.scheme
     changed = control._replace(
         substeps=scheme.substeps / length, stages=scheme.stages, error=found.error, length=length, trusted=trusted
@@ -292,16 +299,17 @@ def _advanced(prepared: Prepared, cloud: Cloud, events: Events, observed: Observ
     key = prepared.key(number, NOISE)
     over_chunks(lambda low, high: normals(key, low, high, noise), count)
     particles, gained = motion.advanced(events, cloud.particles, noise)
-    lost = ~np.isfinite(particles).all(axis=0)
+    lost = ~(np.abs(particles) < FAR).all(axis=0)  # NaN, too
     if lost.any():
         particles[:, lost] = cloud.particles[:, lost]
     predicted = _spread(particles, cloud.logs, prepared.system.angles)
     if not (observed.counted.any() or len(motion.arrays[0][3]) > prepared.system.n) and not lost.any():
         return Advanced(cloud._replace(particles=particles), 0.0, noise, predicted)
+    share = float(lost.mean())
     logs = gained + _log_likelihood(motion, particles, observed)
     logs[lost | np.isnan(logs)] = -np.inf
     weights, top = normalised(cloud.logs + logs)
-    plain = Advanced(cloud._replace(particles=particles, logs=cloud.logs + logs - top), top, noise, predicted)
+    plain = Advanced(cloud._replace(particles=particles, logs=cloud.logs + logs - top), top, noise, predicted, lost=share)
     if effective(weights) >= GUIDE_BELOW * count and np.isfinite(top):
         return plain
     moving = cloud.window.length == 0 and len(cloud.window.first) > 0
@@ -367,7 +375,7 @@ def _guided(prepared: Prepared, target: Target, cloud: Cloud, plain: Advanced, n
     window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
     after = Cloud(particles, cloud.logs + logs - top, window, cloud.genealogy)
     assert len(logs) == count
-    done = Advanced(after, top, np.ascontiguousarray(path[d0:]), plain.predicted, guided=True)
+    done = plain._replace(cloud=after, gained=top, noise=np.ascontiguousarray(path[d0:]), guided=True)
     return Drawn(done, path, logs, gaussian)
 
 
@@ -396,7 +404,7 @@ def _tempered(prepared: Prepared, target: Target, cloud: Cloud, drawn: Drawn, nu
     window = cloud.window._replace(first=np.ascontiguousarray(path[:d0])) if moving else cloud.window
     after = Cloud(particles, cloud.logs, window, cloud.genealogy)
     noise, guided = np.ascontiguousarray(path[d0:]), fixed is not None
-    return Advanced(after, gained, noise, drawn.after.predicted, levels, guided, float(np.mean(rates)))
+    return Advanced(after, gained, noise, drawn.after.predicted, levels, guided, float(np.mean(rates)), drawn.after.lost)
 
 
 def _excess(variance: Array, cov: Array, count: int) -> float:

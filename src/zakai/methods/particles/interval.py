@@ -13,7 +13,7 @@ from zakai.methods.particles.programs import Array
 from zakai.methods.particles.system import System, root
 from zakai.numerics.particles.chunks import over_chunks
 from zakai.numerics.particles.formulas import evaluate
-from zakai.numerics.particles.motion import ADDITIVE, ORDERED, advance
+from zakai.numerics.particles.motion import ADDITIVE, ORDERED, Arrival, advance
 from zakai.numerics.particles.random import key_of, normals
 from zakai.records.inputs import Inputs
 
@@ -22,6 +22,9 @@ TIME_ERROR = 0.01  # of a mean or a standard deviation by one interval, in stand
 MOST_SUBSTEPS = 64
 EXACT = 1e-3  # relative error of the flow of an affine system without time that is not measured
 KEPT_LENGTHS = 64  # of substeps whose noise is kept
+# Norm of df/dx times a substep above which it is reduced where f is not linear: noise that is carried far to the middle of a
+# substep is amplified there, and a nonlinear flow does not take that back.
+_CARRIED = 2.0
 _SERIES = 4.0  # norm of A times the substep up to which the covariance of its noise is a series
 
 
@@ -87,7 +90,7 @@ class Motion:
         out, gained = np.empty_like(start), np.empty(start.shape[1])
         ends = np.empty((0, *start.shape)) if ends is None else ends
         arrays = self.arrays, tuple(events), start, noise
-        over_chunks(lambda low, high: advance(*arrays, low, high, out, gained, ends), len(gained))
+        over_chunks(lambda low, high: advance(*arrays, low, high, Arrival(out, gained, ends)), len(gained))
         return out, gained
 
     def values(self, program: tuple[Any, ...], x: Array, t: float, given: Array) -> Array:
@@ -106,11 +109,11 @@ class Motion:
             if len(self._kept_roots) >= KEPT_LENGTHS:
                 self._kept_roots.clear()
             nothing = np.zeros((self.system.m, self.system.m))
-            G = self._covariance(float(self.system.model.start), nothing, None)
+            G = self.covariance(float(self.system.model.start), nothing, None)
             self._kept_roots[step] = root(noise_about_middle(self.constant_matrix, G, step))
         return self._kept_roots[step]
 
-    def _covariance(self, t: float, P: Array, u: Array | None) -> Array:
+    def covariance(self, t: float, P: Array, u: Array | None) -> Array:
         """Return g (Q - C P C') g' (n, n) for noise that does not depend on the state."""
         system = self.system
         if system.cross is None and not system.timed:
@@ -129,9 +132,9 @@ class Motion:
         """The matrix of an affine drift."""
         model = self.system.model
         given = np.zeros(self.system.drift.width)
-        return self._matrix(np.zeros(model.n), np.ones(model.n), float(model.start), given)
+        return self.matrix(np.zeros(model.n), np.ones(model.n), float(model.start), given)
 
-    def _matrix(self, x: Array, scale: Array, t: float, given: Array) -> Array:
+    def matrix(self, x: Array, scale: Array, t: float, given: Array) -> Array:
         """Return df/dx (n, n) at a point, by forward differences."""
         n = len(x)
         step = 1e-5 * scale
@@ -165,7 +168,7 @@ class Motion:
         kicked = np.searchsorted(kicks, ends)
         kicked = np.where((kicked < count) & (kicks[np.minimum(kicked, count - 1)] == ends), kicked, -1)
         places = np.column_stack([kicked, np.where(ends == stop, 0, -1), np.full(len(ends), scheme.stages)]).astype(np.int64)
-        given = self._given(interval, times, values)
+        given = self.given_numbers(interval, times, values)
         roots = self._roots(interval, times, places, given, step, mean, scale)
         coin = int(system.kind == ORDERED)
         width = roots.shape[2]
@@ -176,7 +179,7 @@ class Motion:
         known = interval.inputs
         return None if known is None else known.at(t, self.system.model.input_hold, before=before)
 
-    def _given(self, interval: Interval, times: Array, values: Array) -> Array:
+    def given_numbers(self, interval: Interval, times: Array, values: Array) -> Array:
         """Return the given numbers of the drift (E, 2, L) at both ends of each flow."""
         system, length = self.system, interval.stop - interval.start
         given = np.zeros((len(times), 2, system.drift.width))
@@ -218,9 +221,13 @@ class Motion:
                 if system.cross is not None:
                     P = system.precision(times[e, 1], interval.inside, self.theta, u)
                 if system.kind == ADDITIVE:
-                    G = self._covariance(times[e, 1], P, u)
+                    G = self.covariance(times[e, 1], P, u)
                     assert A is not None
-                    known = root(noise_about_middle(A[len(found)], G, step))
+                    slope = A[len(found)]
+                    size = float(np.abs(slope).sum(axis=1).max()) * step
+                    if size > _CARRIED and not system.affine:
+                        slope = slope * (_CARRIED / size)
+                    known = root(noise_about_middle(slope, G, step))
                 else:
                     known = root(system.own_noise(times[e, 1], P, self.theta, u)) * np.sqrt(step)
             found.append(known)
@@ -242,7 +249,7 @@ class Motion:
         none = Events(times, marked, given, np.zeros((0, system.n, 0)), np.zeros((0, 3), np.int64))
         ends = np.zeros((len(kicks), system.n, 1))
         self.advanced(none, np.ascontiguousarray(mean[:, None]), np.zeros((0, 1)), ends)
-        return [self._matrix(ends[j, :, 0], scale, times[e, 1], given[e, 1]) for j, e in enumerate(kicks)]
+        return [self.matrix(ends[j, :, 0], scale, times[e, 1], given[e, 1]) for j, e in enumerate(kicks)]
 
 
 def noise_about_middle(A: Array, G: Array, length: float) -> Array:
@@ -269,11 +276,15 @@ def noise_about_middle(A: Array, G: Array, length: float) -> Array:
 
 
 class Steps(NamedTuple):
-    """The scheme of an interval, the shift (n,) of the mean that it leaves, and its error in standard deviations."""
+    """The scheme of an interval, the shift (n,) of the mean that it leaves, and its error in standard deviations.
+
+    `surely` is the error with what a finite number of pilots leaves open.
+    """
 
     scheme: Scheme
     shift: Array
     error: float
+    surely: float
 
 
 class Pilots(NamedTuple):
@@ -300,12 +311,12 @@ def steps_of(motion: Motion, interval: Interval, values: Array, pilots: Pilots, 
         # One substep is exact but for the flow, whose error is bounded by that of the exponential series.
         size = 0.5 * float(np.abs(motion.constant_matrix).sum(axis=1).max()) * (interval.stop - interval.start)
         if size**5 / 60 <= EXACT:
-            return Steps(Scheme(1, 4), np.zeros(system.n), size**5 / 60)
+            return Steps(Scheme(1, 4), np.zeros(system.n), size**5 / 60, size**5 / 60)
     n, count = system.n, max(1, guess)
-    shift, error = np.full(n, np.nan), np.inf
+    shift, error, surely = np.full(n, np.nan), np.inf, np.inf
     for turn in range(4):
         found = _time_errors(motion, interval, values, pilots._replace(key=pilots.key + turn), count)
-        (other, fewer), (error, shift) = found
+        (other, fewer, other_surely), (error, shift, surely) = found
         if not np.isfinite(error):
             if count >= MOST_SUBSTEPS:
                 break
@@ -316,19 +327,20 @@ def steps_of(motion: Motion, interval: Interval, values: Array, pilots: Pilots, 
             wanted = max(wanted, (count + 1) // 2)
         reduced = (count / wanted) ** 2
         if other * reduced <= TIME_ERROR:
-            return Steps(Scheme(wanted, 2), fewer * reduced, other * reduced)
+            return Steps(Scheme(wanted, 2), fewer * reduced, other * reduced, other_surely * reduced)
         if wanted <= 2 * count:
-            return Steps(Scheme(wanted, 4), shift * reduced, error * reduced)
-        count, shift, error = wanted, shift * reduced, error * reduced
-    return Steps(Scheme(count, 4), shift, error)
+            return Steps(Scheme(wanted, 4), shift * reduced, error * reduced, surely * reduced)
+        count, shift, error, surely = wanted, shift * reduced, error * reduced, surely * reduced
+    return Steps(Scheme(count, 4), shift, error, surely)
 
 
 def _time_errors(
     motion: Motion, interval: Interval, values: Array, pilots: Pilots, count: int
-) -> tuple[tuple[float, Array], tuple[float, Array]]:
+) -> tuple[tuple[float, Array, float], tuple[float, Array, float]]:
     """Return the errors of `count` substeps of 2 and of 4 stages, by the difference from twice as many, times 4/3.
 
-    The largest error of a mean or a deviation, in standard deviations, and the shift of the mean (n,).
+    The largest error of a mean or a deviation, in standard deviations, the shift of the mean (n,), and the error with that of the
+    pilots.
     """
     system, mean, scale = motion.system, pilots.mean, pilots.scale
     coarse, fine = (motion.events(interval, Scheme(k, 4), values, mean, scale) for k in (count, 2 * count))
@@ -339,7 +351,7 @@ def _time_errors(
     centred = y - y.mean(axis=1, keepdims=True)
     spread = np.maximum(centred.std(axis=1), 1e-300)
 
-    def change(stages: int) -> tuple[float, Array]:
+    def change(stages: int) -> tuple[float, Array, float]:
         places = coarse.places.copy()
         places[:, 2] = stages
         x, gained = motion.advanced(coarse._replace(places=places), pilots.states, shared)
@@ -348,12 +360,21 @@ def _time_errors(
             d[system.angles] = np.remainder(d[system.angles] + np.pi, 2 * np.pi) - np.pi
         weighted = (weight - weight.mean()) * centred
         parts = (d, d * centred / spread[:, None], weighted)
+        squares, noise = (np.array([f(part) for part in parts]) for f in (_squared_mean, _variance_of_mean))
         # What the finite number of pilots adds to a mean of zero is subtracted.
-        found = [np.maximum(part.mean(axis=1) ** 2 - part.var(axis=1) / part.shape[1], 0.0) for part in parts]
-        largest = np.sqrt(np.max(found, axis=0)) / scale
-        return 4 / 3 * float(largest.max()), 4 / 3 * (d + weighted).mean(axis=1)
+        largest = np.sqrt(np.maximum(squares - noise, 0.0).max(axis=0)) / scale
+        surely = np.sqrt((squares + noise).max(axis=0)) / scale
+        return 4 / 3 * float(largest.max()), 4 / 3 * (d + weighted).mean(axis=1), 4 / 3 * float(surely.max())
 
     return change(2), change(4)
+
+
+def _squared_mean(part: Array) -> Array:
+    return np.asarray(part.mean(axis=1) ** 2)
+
+
+def _variance_of_mean(part: Array) -> Array:
+    return np.asarray(part.var(axis=1) / part.shape[1])
 
 
 def _coarse_noise(motion: Motion, coarse: Events, fine: Events, noise: Array) -> Array:

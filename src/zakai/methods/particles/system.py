@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from zakai.methods._moments import density_grid, prior_moments
 from zakai.methods.particles.law import Law, Numbers
 from zakai.methods.particles.programs import Array, Expressions
+from zakai.methods.system.prior_moments import density_grid, prior_moments
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
@@ -62,6 +62,7 @@ class System:
                 drift[i] -= sum(terms, sp.S.Zero)
             given += Q_given.values()
             fields = [sum((g[i, a] * coefficients[a] for a in range(r)), sp.S.Zero) for i in range(n)]
+        self.formulas, self.given = tuple(drift), tuple(given)
         self.drift = Expressions(drift, model, given)
         self.fields = Expressions(fields, model, given, coefficients)
         self.observe = Expressions(list(model.observation) if model.log_density is None else [sp.S.Zero], model)

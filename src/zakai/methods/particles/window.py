@@ -186,17 +186,18 @@ class Target:
     start: Array
 
     @property
-    def arrays(self) -> tuple[Any, ...]:
-        """The first four arguments of the kernels."""
+    def arrays(self) -> moves.WindowLaw:
+        """The law as the kernels take it."""
         observed = (self.motion.law, self.times, self.given, self.counted)
         n = len(self.start)
-        return self.motion.arrays, tuple(self.events), observed, self.prior or (np.zeros(n), np.zeros((n, 0)))
+        prior = self.prior or (np.zeros(n), np.zeros((n, 0)))
+        return moves.WindowLaw(self.motion.arrays, tuple(self.events), observed, prior)
 
     def follow(self, path: Array) -> tuple[Array, Array]:
         """Return the states (n, N) at the end and the log-likelihoods (N,) for noise (D, N)."""
         out, total = np.empty_like(self.start), np.empty(path.shape[1])
         arrays = self.arrays
-        over_chunks(lambda low, high: moves.follow(*arrays, self.start, path, low, high, out, total), len(total))
+        over_chunks(lambda low, high: moves.follow(arrays, self.start, path, low, high, out, total), len(total))
         return out, total
 
     def draw(self, gaussian: Any, share: float, key: Array) -> tuple[Array, Array]:
@@ -213,8 +214,8 @@ class Target:
         path = path.copy()
         out, total, arrays = np.empty_like(self.start), np.empty(path.shape[1]), self.arrays
         moved, numbers = np.zeros((-(-len(total) // CHUNK), 2)), np.array(control)
-        found = self.start, path, out, total, moved
-        over_chunks(lambda low, high: moves.sweep(*arrays, gaussian, numbers, key, low, high, *found), len(total))
+        paths = moves.Paths(self.start, path, out, total, moved)
+        over_chunks(lambda low, high: moves.sweep(arrays, gaussian, numbers, key, low, high, paths), len(total))
         return path, out, total, float(moved[:, 0].mean()), float(moved[:, 1].min())
 
     def gaussian(self, path: Array, weights: Array | None, power: float = 1.0, rounds: int = 2, wider: float = _WIDER) -> Any:

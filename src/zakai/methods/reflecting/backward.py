@@ -1,6 +1,12 @@
-"""The backward pass for one state between ends and kinks: the message on a uniform grid, the smoothed density on elements.
+"""The backward pass for one state between ends and kinks, and draws of the state at the start of an interval.
 
-The modes of the operator take a message back over an interval, and finite volumes where these do not serve.
+The message is on a uniform grid, the smoothed density on elements.  The modes of the operator take a message back over an
+interval, and finite volumes where these do not serve.  Draws follow the law
+
+    x ~ p(x) T(x, z),      T(x, z) = s(z) / s(x) sum_j psi_j(x) psi_j(z) exp(-tau lambda_j).
+
+The transition T is that of the modes at Gauss-Lobatto points, in parts of the domain that resolve it.  Where coefficients
+depend on t, it is a product of transitions with those at the middles of substeps.
 """
 
 from __future__ import annotations
@@ -13,13 +19,12 @@ import numpy as np
 from zakai.densities import IntervalDensity
 from zakai.methods._protocol import Backward, Info
 from zakai.methods.line.backward import accuracy
-from zakai.methods.line.course import course_of
+from zakai.methods.line.backward_interval import negligible, smoothing_tolerance
+from zakai.methods.line.coefficients import coefficients, covariance_at, resolved_parts
 from zakai.methods.line.message import SURE, Message, points_of
-from zakai.methods.line.system import NOISE, Prepared
-from zakai.methods.line.tables import covariance_at
+from zakai.methods.line.prepared import NOISE, Prepared, TimeInterval
 from zakai.methods.line.update import factor_at_end
-from zakai.methods.line.volumes import pulled_back
-from zakai.methods.line.way import negligible, smoothing_tolerance
+from zakai.methods.line.volumes import cell_plan_of, pulled_back
 from zakai.methods.reflecting import filter as reflecting_filter
 from zakai.methods.reflecting.elements import (
     SIZES,
@@ -30,18 +35,93 @@ from zakai.methods.reflecting.elements import (
     logarithm,
     moments,
     negligible_of,
+    operator_at,
     placed,
     reached,
     sampled,
     weighted,
 )
 from zakai.methods.reflecting.filter import State
-from zakai.methods.reflecting.paths import draw
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.density import support
 from zakai.numerics.lobatto import Element
 
 Array = Any
+
+PIECE = 10.0  # standard deviations of the noise in which states at the end are taken together
+REACH = 8.0  # of them around, between which the state at the start lies
+RESOLVING = 3.7  # points in a standard deviation
+RESOLVED = 1e-6  # Legendre coefficient of a density that the points of the transition resolve
+FINE = 4  # points in a spacing between which a distribution is interpolated
+SUBSTEPS = 4  # of a part in which the coefficients are polynomials of time
+
+
+@np.errstate(all="ignore")
+def draw(
+    prepared: Prepared, k: int, later: Array, observed: np.ndarray, state: State, rng: np.random.Generator
+) -> tuple[Array, float]:
+    """Return draws (P, 1) of the state at the start of interval k given those at its end, and zero: their law is exact."""
+    start, length = float(prepared.schedule.starts[k]), float(prepared.lengths[k])
+    if length == 0:
+        return later, 0.0
+    z, uniform = later[:, 0], rng.uniform(size=len(later))
+    element, middle, theta = state.element, start + 0.5 * length, prepared.theta.real
+    x = element.points
+    drift = prepared.system.drift(x[:, None], middle, theta)[:, 0]
+    G = covariance_at(prepared.system, x, np.asarray(middle), theta) * np.ones(len(x))
+    slope = float(np.max(np.abs(element.derivative(drift))))
+    deviation = float(np.sqrt(np.min(G) * min(length, 0.5 / max(slope, 1e-300))))
+    wide = REACH * float(np.sqrt(np.max(G) * length))
+    low, high = min(element.lower, float(z.min())), max(element.upper, float(z.max()))
+    result, order = np.empty(len(z)), np.argsort(z)
+    pieces = np.floor((z[order] - low) / (PIECE * deviation)).astype(int)
+    for places in np.split(order, np.flatnonzero(np.diff(pieces)) + 1):
+        first, last = float(z[places].min()), float(z[places].max())
+        near = np.abs(drift[(x >= first - wide) & (x <= last + wide)])
+        reach = wide + length * float(np.max(near, initial=0.0))
+        lower, upper = max(first - reach, low), min(last + reach, high)
+        needed = RESOLVING * 2.0 * float(np.max(element_of(prepared, lower, upper, SIZES[0]).halves)) / deviation
+        piece = element_of(prepared, lower, upper, next((size for size in SIZES if size >= needed), SIZES[-1]))
+        result[places] = _drawn(prepared, k, piece, z[places], observed, state, uniform[places])
+    return np.clip(result, domain_of(prepared).lower, domain_of(prepared).upper)[:, None], 0.0
+
+
+def _drawn(prepared: Prepared, k: int, piece: Element, z: Array, observed: np.ndarray, state: State, uniform: Array) -> Array:
+    """Return the quantiles (P,) of the law of the state at the start, given those at the end z (P,)."""
+    own, values = state.element, np.asarray(state.values).real
+    before = np.maximum(own.at(values, piece.points), 0.0)
+    likely = piece.interpolation(z) @ _transition(prepared, k, piece, before, observed)
+    fine = np.linspace(max(piece.lower, own.lower), min(piece.upper, own.upper), FINE * max(len(before), len(values)) + 1)
+    middles = 0.5 * (fine[1:] + fine[:-1])
+    if piece.unresolved(before * piece.weights) < RESOLVED:
+        mass = (likely * before) @ piece.interpolation(middles).T
+    else:
+        mass = likely @ piece.interpolation(middles).T * own.at(values, middles)
+    mass = np.maximum(mass, 0.0)
+    total = np.concatenate([np.zeros((len(mass), 1)), np.cumsum(mass, axis=1)], axis=1)
+    return np.array([np.interp(u * row[-1], row, fine) for u, row in zip(uniform, total, strict=True)])
+
+
+def _transition(prepared: Prepared, k: int, piece: Element, before: Array, observed: np.ndarray) -> Array:
+    """Return T (N, N) from the points of an element to the densities at them, weighted by what is observed inside."""
+    interval = prepared.interval(k, prepared.inside[k], observed)
+    _, start, length, inside, rates = interval
+    bounds, result = [(0.0, length)], np.eye(len(piece.points))
+    if prepared.system.varying:
+        parts = resolved_parts(prepared, before, piece, interval).bounds  # type: ignore[arg-type]  # by its points
+        cuts = [np.linspace(*part, SUBSTEPS + 1) for part in parts]
+        bounds = [(float(a), float(b)) for cut in cuts for a, b in zip(cut[:-1], cut[1:], strict=True)]
+    for first, last in bounds:
+        middle = np.array([start + 0.5 * (first + last)])
+        known = operator_at(prepared, piece, float(middle[0]))
+        if known is None:
+            return np.full_like(result, np.nan)
+        _, _, potential, _ = coefficients(prepared, piece, middle, inside, rates, before)  # type: ignore[arg-type]
+        modes = known.weighted(potential[0]) if inside.any() else known.modes
+        s = modes.scale[:, None]
+        result = s * (modes.modes @ (np.exp((first - last) * modes.rates)[:, None] * (modes.modes.T @ (result / s))))
+    return np.asarray(result / piece.weights[:, None])
+
 
 POINTS = 256  # of a message, on the whole element of the density
 MODES_REACH = 4.0  # standard deviations of the noise around the supports of density and message
@@ -83,9 +163,9 @@ def _product(prepared: Prepared, state: State, later: Message) -> _Product:
     lower, upper = max(lower, element.lower), min(upper, element.upper)
     top = float(np.max(logs(np.linspace(lower, upper, 4 * element.size))))
     allowed = negligible_of(prepared, float(state.error) + later.error)
-    new, found = sampled(prepared, lambda x: np.exp(logs(x) - top), lower, upper, allowed)
-    total = float(np.sum(found))
-    return _Product(found / total, new, float(np.log(total)) + top)
+    new, result = sampled(prepared, lambda x: np.exp(logs(x) - top), lower, upper, allowed)
+    total = float(np.sum(result))
+    return _Product(result / total, new, float(np.log(total)) + top)
 
 
 @np.errstate(all="ignore")
@@ -103,30 +183,30 @@ def smoothed(prepared: Prepared, state: State, later: Message) -> tuple[Message,
     }
     density = values / element.weights
     first, last = element.points[list(support(density, negligible(prepared)))] - later.origin
-    kept = later._replace(logs=later.logs - log_mass).between(float(first), float(last))
-    return kept, Info(log_mass, np.array([mean]), np.array([[variance]]), health)
+    retained = later._replace(logs=later.logs - log_mass).between(float(first), float(last))
+    return retained, Info(log_mass, np.array([mean]), np.array([[variance]]), health)
 
 
 @np.errstate(all="ignore")
 def step(prepared: Prepared, k: int, later: Message, observed: np.ndarray, state: State) -> Message:
     """Return the message at the start of interval k from that at its end; `state` is the filter's at the start."""
-    start, length, inside = float(prepared.schedule.starts[k]), float(prepared.lengths[k]), prepared.inside[k]
+    inside = prepared.inside[k]
     later, before = later.on(_window(prepared, *(later.origin + end for end in later.ends))), later.variance
     at_end = prepared.schedule.seen[k] & ~inside
     if at_end.any():
         likelihood = factor_at_end(prepared, k, at_end, observed, None)
         later = later._replace(logs=later.logs + likelihood.logs(later.window.points).real)
-    if length == 0:
+    if prepared.lengths[k] == 0:
         return later
-    rates = np.where(inside, observed, 0.0) / length
-    found = None if prepared.system.varying else _by_modes(prepared, later, start, length, inside, rates, state)
-    found = _by_volumes(prepared, later, start, length, inside, rates, state) if found is None else found
-    kept = float(np.clip(later.variance / np.sqrt(max(before * found.variance, 1e-300)), 0.3, 1.0))
-    return found._replace(error=found.error + kept * later.error)
+    interval = prepared.interval(k, inside, observed)
+    result = None if prepared.system.varying else _by_modes(prepared, later, interval, state)
+    result = _by_volumes(prepared, later, interval, state) if result is None else result
+    retained = float(np.clip(later.variance / np.sqrt(max(before * result.variance, 1e-300)), 0.3, 1.0))
+    return result._replace(error=result.error + retained * later.error)
 
 
 def _by_modes(
-    prepared: Prepared, later: Message, start: float, length: float, inside: Array, rates: Array, state: State
+    prepared: Prepared, later: Message, interval: TimeInterval, state: State
 ) -> Message | None:
     """Return the message at the start of an interval by the modes of the operator, None where they do not serve.
 
@@ -135,6 +215,7 @@ def _by_modes(
     s b is projected onto the modes by the quadrature of its own points.  The error of rounding, and of what is not resolved after
     the interval, counts where the density is.
     """
+    _, start, length, inside, _ = interval
     own, values = state.element, np.asarray(state.values).real
     G = covariance_at(prepared.system, own.points, np.asarray(start), prepared.theta.real)
     reach = MODES_REACH * float(np.sqrt(np.max(G) * length))
@@ -152,13 +233,13 @@ def _by_modes(
             return None
         density, modes, root = own.at(values, element.points) * element.weights, known.modes, np.sqrt(element.weights)
         if inside.any():
-            modes, _, constant = weighted(prepared, known, element, start, length, inside, rates, density)
+            modes, _, constant = weighted(prepared, known, element, interval, density)
         between = element.interpolation(after.points)
         psi = (between.T @ (weights * np.exp(between @ known.logs - modes.top))) / root
-        moved = modes.decayed(psi, length)
-        at, log_s, scaled = element.interpolation(own.points), modes.top - known.logs, moved / root
+        propagated = modes.decayed(psi, length)
+        at, log_s, scaled = element.interpolation(own.points), modes.top - known.logs, propagated / root
         own_weights = np.abs(values) * np.exp(at @ log_s)
-        wrong = max(4e-16 * float(np.exp(-length * modes.rates[0])), element.unresolved(moved * root))
+        wrong = max(4e-16 * float(np.exp(-length * modes.rates[0])), element.unresolved(propagated * root))
         wrong = wrong * max(float(np.sqrt(psi @ psi)), float(np.max(np.abs(scaled))))
         error = wrong * float(np.sum(own_weights)) / float(own_weights @ (at @ scaled))
         if 0.0 <= error < SHARE * smoothing_tolerance(prepared):
@@ -166,35 +247,35 @@ def _by_modes(
     else:
         return None
 
-    def worth(x: Array) -> Array:
+    def expectation(x: Array) -> Array:
         at = element.interpolation(x)
         return (at @ scaled) * np.exp(at @ log_s)
 
-    return _on(prepared, state, worth, top + constant, error)
+    return _on(prepared, state, expectation, top + constant, error)
 
 
 def _by_volumes(
-    prepared: Prepared, later: Message, start: float, length: float, inside: Array, rates: Array, state: State
+    prepared: Prepared, later: Message, interval: TimeInterval, state: State
 ) -> Message:
     """Return the message at the start of an interval by finite volumes."""
     element, values = state.element, np.asarray(state.values).real
     ends, (mean, variance) = np.array([0.0, element.upper - element.lower]), later.moments
     shift = element.lower - later.origin
     aim = mean - shift, variance**0.5
-    course = course_of(prepared, values, element, ends, start, length, inside, aim)  # type: ignore[arg-type]  # by its points
-    found = pulled_back(
-        prepared, lambda x: later.at(x + shift), lambda x: element.at(values, element.lower + x), course, start, inside, rates
+    plan = cell_plan_of(prepared, values, element, ends, interval, aim)  # type: ignore[arg-type]  # by its points
+    result = pulled_back(
+        prepared, lambda x: later.at(x + shift), lambda x: element.at(values, element.lower + x), plan, interval
     )
-    if found is None:
+    if result is None:
         return message(prepared, state)._replace(error=np.inf)
-    worth = found
-    return _on(prepared, state, lambda x: worth.at(x - element.lower), worth.log_scale, worth.error)
+    expectation = result
+    return _on(prepared, state, lambda x: expectation.at(x - element.lower), expectation.log_scale, expectation.error)
 
 
-def _on(prepared: Prepared, state: State, worth: Callable[[Array], Array], log_scale: float, error: float) -> Message:
+def _on(prepared: Prepared, state: State, expectation: Callable[[Array], Array], log_scale: float, error: float) -> Message:
     """Return a message by its values, of some scale, where the density is."""
     window = _window(prepared, float(state.lower), float(state.upper))
-    values = worth(np.clip(window.points, state.lower, state.upper))
+    values = expectation(np.clip(window.points, state.lower, state.upper))
     logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + log_scale
     return Message.of(logs, window, window.spacing, error)
 

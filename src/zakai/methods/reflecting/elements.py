@@ -1,4 +1,12 @@
-"""Elements for a density between ends and kinks, and the operator on them."""
+"""A density between ends and kinks on Gauss-Lobatto points: the elements, the operator on them, and its transition.
+
+The modes of the symmetric operator serve every interval in which no coefficient depends on t and no increment acts:
+
+    exp(tau L) = s U exp(-tau lambda) U' / s,      s'/s = (f - G'/2) / G.
+
+A density on other points is projected onto the modes by the quadrature of its own points.  Finite volumes without flux at the
+ends (`line/volumes.py`) take the other intervals.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.errors import InputError
-from zakai.methods.line.coefficients import offset_of, potential_of, precision_of
-from zakai.methods.line.course import kinks_between
-from zakai.methods.line.system import Prepared
-from zakai.methods.line.tables import covariance_at, tables
+from zakai.methods.line.coefficients import covariance_at, offset_of, potential_of, precision_of, tables
+from zakai.methods.line.prepared import Derived, Prepared, TimeInterval
+from zakai.methods.line.transition import Report
+from zakai.methods.line.volumes import SHARE, advanced_by, cell_plan_of, kinks_between
 from zakai.models.domain import Interval
+from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.line.operator import Spectral
-from zakai.numerics.line.panels import GAUSS_NODES, GAUSS_WEIGHTS
 from zakai.numerics.lobatto import Element
 
 Array = Any
@@ -38,7 +46,7 @@ def element_of(prepared: Prepared, lower: float, upper: float, size: int) -> Ele
         return Element(lower, upper, size)
     unit, width, domain = 2.0 ** np.ceil(np.log2(upper - lower)), upper - lower, domain_of(prepared)
     low, high = float(unit * np.floor(lower / unit)), float(unit * np.ceil(upper / unit))
-    known = prepared.once(("kinks", low, high), lambda: kinks_between(prepared, low, high, prepared.model.start).tolist())
+    known = prepared.once(Derived.KINKS, (low, high), lambda: kinks_between(prepared, low, high, prepared.model.start).tolist())
     first = lower + width * (BESIDE if lower <= domain.lower else MARGIN)
     last = upper - width * (BESIDE if upper >= domain.upper else MARGIN)
     return Element(lower, upper, size, tuple(kink for kink in known if first < kink < last))
@@ -139,10 +147,10 @@ class Operator(NamedTuple):
 
 def decomposed(prepared: Prepared, element: Element) -> Operator | None:
     """Return the operator on an element where no coefficient depends on t, None where it has no decomposition."""
-    found: tuple[Operator | None] = prepared.once(
-        ("modes", element), lambda: (operator_at(prepared, element, prepared.model.start),)
+    result: tuple[Operator | None] = prepared.once(
+        Derived.LOBATTO_MODES, element, lambda: (operator_at(prepared, element, prepared.model.start),)
     )
-    return found[0]
+    return result[0]
 
 
 def operator_at(prepared: Prepared, element: Element, t: float) -> Operator | None:
@@ -164,9 +172,10 @@ def operator_at(prepared: Prepared, element: Element, t: float) -> Operator | No
 
 
 def weighted(
-    prepared: Prepared, known: Operator, element: Element, start: float, length: float, inside: Array, rates: Array, values: Array
+    prepared: Prepared, known: Operator, element: Element, interval: TimeInterval, values: Array
 ) -> tuple[Spectral, Array, Any]:
     """Return the modes with the potential of increments less a number, its integral over time, and that of the number."""
+    _, start, length, inside, rates = interval
     h, precision = tables(prepared, element).observation, precision_of(prepared, start, inside)  # type: ignore[arg-type]
     potential, constant = potential_of(h, precision, rates, values)
     offset, _ = offset_of(length * potential, values)
@@ -181,3 +190,148 @@ def moments(values: Array, element: Element) -> tuple[Any, Any]:
     x = element.points - element.lower
     mean = x @ values
     return element.lower + mean, ((x - mean) ** 2) @ values
+
+
+COUNTS = 1e-14  # density relative to the maximum beyond which it is rounding
+EDGE = 1e-12  # density at an end that is not one of the domain, relative to the maximum
+REACH = 7.2  # standard deviations of the noise by which a density widens
+TRIALS = 24  # elements that are tried
+MOST_PARTS = 64  # of an interval that the volumes do not take as a whole
+PEAK = 1.5  # points in a standard deviation of the noise with which the first element begins
+
+
+def propagated(
+    prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
+) -> tuple[Array, Element, Any]:
+    """Return the density after an interval, its points, and the logarithm of its mass."""
+    arguments = prepared, values, element, interval, report, negligible
+    result = None if prepared.system.varying else _by_modes(*arguments)
+    values, element, gained = _by_volumes(*arguments) if result is None else result
+    report.aliasing = max(report.aliasing, element.unresolved(values))
+    report.edge = max(report.edge, *reached(values, element, domain_of(prepared)))
+    real = values.real
+    report.negative = max(report.negative, float(-np.minimum(real, 0.0).sum() / np.abs(real).sum()))
+    mass = np.sum(values)
+    return values / mass, element, gained + np.log(mass)
+
+
+def _by_modes(
+    prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
+) -> tuple[Array, Element, Any] | None:
+    """Return the density after an interval, its points, and the logarithm of its mass; None where modes do not serve."""
+    domain, allowed = domain_of(prepared), max(1e-11, 1e-5 * prepared.tolerance)
+    _, start, length, inside, _ = interval
+    G = covariance_at(prepared.system, element.points, start, prepared.theta).real
+    noise = np.sqrt(np.maximum([np.min(G), np.max(G)], 0.0) * length)
+    counts = np.flatnonzero((values / element.weights).real > COUNTS * np.max((values / element.weights).real))
+    low, high = element.points[[max(counts[0] - 1, 0), min(counts[-1] + 1, len(values) - 1)]]
+    lower, upper = apart(float(low - REACH * noise[1]), float(high + REACH * noise[1]), domain)
+    longest = float(np.max(element_of(prepared, lower, upper, SIZES[0]).halves))
+    needed = min(2.0 * PEAK * longest / max(noise[0], 1e-300), element.size * longest / float(np.max(element.halves)))
+    size = next((size for size in SIZES if size >= min(needed, SIZES[4])), SIZES[-1])
+    for _ in range(TRIALS):
+        new, offset = element_of(prepared, lower, upper, size), 0.0
+        known = decomposed(prepared, new)
+        if known is None:
+            return None
+        modes, inner = known.modes, _projected(values, element, new, known, negligible)
+        if inside.any():
+            modes, weight, offset = weighted(prepared, known, new, interval, modes.scale * inner)
+        result, error = modes.carried(inner, length)
+        if not np.isfinite(result.real).all():
+            return None
+        unresolved, growth = new.unresolved(result), 0.0
+        if inside.any():  # increments mix all waves of the density before, and may raise errors in its tails
+            before = modes.scale * inner
+            unresolved = max(unresolved, new.unresolved(before))
+            raised = new.weights * np.exp((weight - offset).real) * float(np.max((before / new.weights).real))
+            growth = float(np.sum(raised) / np.sum(result.real))
+        coarse = unresolved > negligible
+        # Oscillations of what is not resolved reach the ends as well.
+        left, right = (float(end) > (unresolved if coarse else EDGE) for end in reached(result, new, domain))
+        if coarse and size < SIZES[-1]:
+            size = SIZES[SIZES.index(size) + 1]
+        elif coarse:
+            return None
+        elif left or right:
+            width = upper - lower
+            lower, upper = apart(lower - 0.4 * width * left, upper + 0.4 * width * right, domain)
+        elif error < allowed and (inside.any() or abs(np.sum(result.real) - 1.0) < 1e-3):
+            report.time, report.growth = report.time + error, growth
+            report.aliasing = max(report.aliasing, unresolved)
+            return result, new, offset
+        else:
+            return None
+    return None
+
+
+def _projected(values: Array, element: Element, new: Element, known: Operator, negligible: float) -> Array:
+    """Return a density on some points, divided by s, on those of an operator.
+
+    Where the new points do not resolve it, it is its projection, by the quadrature of its own points.
+    """
+    if element == new:
+        return np.asarray(values / known.modes.scale)
+    result = element.at(values, new.points) * new.weights
+    if new.unresolved(result) < negligible:
+        return np.asarray(result / known.modes.scale)
+    between = new.interpolation(element.points)
+    s = np.exp(between @ known.logs - known.modes.top)
+    return np.asarray((between.T @ (values / s)) / np.sqrt(new.weights))
+
+
+def _by_volumes(
+    prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
+) -> tuple[Array, Element, Any]:
+    """Return the density after an interval, its points, and the logarithm of its mass, in parts where volumes do not settle."""
+    stack, gained, count = [(0.0, interval.length)], 0.0 * values[0], 0
+    while stack:
+        first, last = stack.pop()
+        count += 1
+        result = _part(prepared, values, element, interval.part(first, last), report, negligible)
+        if result is not None:
+            values, element, more = result
+            gained = gained + more
+        elif count + len(stack) < MOST_PARTS:
+            middle = first + 0.25 * (last - first)
+            stack += [(middle, last), (first, middle)]
+        else:
+            report.time = np.inf
+            break
+    return values, element, gained
+
+
+def _part(
+    prepared: Prepared, values: Array, element: Element, interval: TimeInterval, report: Report, negligible: float
+) -> tuple[Array, Element, Any] | None:
+    """Return the density after a part of an interval from finite volumes, None where these do not settle."""
+    domain, at = domain_of(prepared), element
+
+    def before(offsets: Array) -> Array:
+        return at.at(values, at.lower + offsets)
+
+    ends = np.array([0.0, at.upper - at.lower])
+    plan = cell_plan_of(prepared, values, at, ends, interval)  # type: ignore[arg-type]  # by its points
+    if plan is None:
+        return None
+    result = advanced_by(prepared, before, plan, interval, SHARE * prepared.tolerance)
+    if result is None:
+        return None
+    report.time += result.error + plan.unresolved
+    cells = result.cells
+    density = np.log(np.maximum((result.values / cells.widths).real, 1e-300))
+    here = np.flatnonzero(density > np.max(density) - CUT)
+    faces, tiny = cells.origin + cells.faces, 1e-9 * (cells.faces[-1] - cells.faces[0])
+    if faces[0] - domain.lower < tiny:
+        faces[0] = domain.lower
+    if domain.upper - faces[-1] < tiny:
+        faces[-1] = domain.upper
+    lower, upper = with_margin(float(faces[here[0]]), float(faces[here[-1] + 1]), domain)
+    lower, upper = max(lower, float(faces[0])), min(upper, float(faces[-1]))
+    interpolated = cells.density(result.values)
+
+    def after(x: Array) -> Array:
+        return interpolated(np.clip(x - cells.origin, *cells.faces[[0, -1]]))
+
+    element, values = sampled(prepared, after, lower, upper, max(negligible, 1e-2 * result.error))
+    return values / np.sum(values), element, result.log_scale

@@ -15,11 +15,10 @@ import numpy as np
 from zakai.densities import IntervalDensity
 from zakai.errors import InputError
 from zakai.methods._protocol import Info
-from zakai.methods.line.escape import check_escape
-from zakai.methods.line.figures import forgetting, outside_tables, spread
-from zakai.methods.line.moves import Report
-from zakai.methods.line.system import NOISE, Prepared
-from zakai.methods.line.update import factor_at_end
+from zakai.methods.line.domain import check_escape
+from zakai.methods.line.prepared import NOISE, Prepared
+from zakai.methods.line.transition import Report
+from zakai.methods.line.update import error_remainder, factor_at_end, outside_tables, spread
 from zakai.methods.reflecting.elements import (
     CUT,
     SAMPLES,
@@ -31,16 +30,16 @@ from zakai.methods.reflecting.elements import (
     moments,
     negligible_of,
     placed,
+    propagated,
     sampled,
     support,
     with_margin,
     without_nan,
 )
-from zakai.methods.reflecting.moves import propagated
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior
-from zakai.numerics.line.posterior import General, Likelihood, place
-from zakai.numerics.line.segment import RELIABLE
+from zakai.numerics.line.product import General, Likelihood, place
+from zakai.numerics.line.steps import RELIABLE
 from zakai.numerics.lobatto import Element
 from zakai.numerics.prior_grid import mixture_log_density, prior_grid
 
@@ -129,8 +128,8 @@ def _multiplied(
         return np.where(density.real > 0, relative * np.exp(own + logs - top), 0.0), top
 
     new, density = element, values / element.weights
-    found, top = product(new.points, density)
-    if not new.unresolved(found * new.weights) < negligible or _narrow(found * new.weights, new):
+    result, top = product(new.points, density)
+    if not new.unresolved(result * new.weights) < negligible or _narrow(result * new.weights, new):
         ends = place(element.offsets, np.maximum(logarithm(density.real), peak - 70.0), likelihood, element.lower)
         if ends is not None:
             low, high = with_margin(element.lower + ends[0], element.lower + ends[1], domain)
@@ -138,17 +137,17 @@ def _multiplied(
             for size in SIZES:
                 new = element_of(prepared, low, high, size)
                 density = element.at(values, new.points)
-                found, top = product(new.points, density)
-                if new.unresolved(found * new.weights) < negligible:
+                result, top = product(new.points, density)
+                if new.unresolved(result * new.weights) < negligible:
                     break
-    found = found * new.weights
-    report.aliasing = max(report.aliasing, new.unresolved(found))
-    mass = np.sum(found)
-    found = found / mass
-    report.depth = float(found.real @ (peak - logarithm(density.real)))
+    result = result * new.weights
+    report.aliasing = max(report.aliasing, new.unresolved(result))
+    mass = np.sum(result)
+    result = result / mass
+    report.depth = float(result.real @ (peak - logarithm(density.real)))
     growth = np.exp(np.minimum(without_nan(likelihood.logs(new.points)).real + peak - top - np.log(mass.real), 80.0))
     report.growth = max(report.growth, 1.0) * float(np.sum(new.weights * growth))
-    return found, new, np.log(mass) + top
+    return result, new, np.log(mass) + top
 
 
 def _narrow(values: Array, element: Element) -> bool:
@@ -171,8 +170,8 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
     check_escape(prepared, k, element.points, values)
     before, negligible = moments(values, element), negligible_of(prepared, float(state.error))
     if length > 0:
-        rates = np.where(inside, observed, 0.0) / length
-        values, element, gained = propagated(prepared, values, element, k, inside, rates, report, negligible)
+        interval = prepared.interval(k, inside, observed)
+        values, element, gained = propagated(prepared, values, element, interval, report, negligible)
     predicted, floor = moments(values, element), NOISE + report.aliasing + report.edge
     at_end = schedule.seen[k] & ~inside
     if at_end.any():
@@ -183,8 +182,8 @@ def _step(prepared: Prepared, k: int, state: State, observed: np.ndarray) -> tup
         gained = gained + more
     mean, variance = moments(values, element)
     made = 2.0 * report.aliasing + 10.0 * report.edge + report.time + 10.0 * report.negative + min(floor * report.growth, 1.0)
-    kept = forgetting(before[1], predicted[1], variance, spread(prepared, k, length, float(mean.real)))
-    error = max(made + state.error * kept, RELIABLE * prepared.promised)
+    retained = error_remainder(before[1], predicted[1], variance, spread(prepared, k, length, float(mean.real)))
+    error = max(made + state.error * retained, RELIABLE * prepared.promised)
     health = {
         "error_estimate": error,
         "tolerance_ratio": made / prepared.promised,

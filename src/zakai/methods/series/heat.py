@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 
 from zakai.algebra.yau import observation_energy
-from zakai.methods.series.jets import jets
+from zakai.methods.system.jets import jets
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-from zakai.numerics.series import cauchy, derivative, integral, value
+from zakai.numerics.series.power_series import cauchy, derivative, integral, value
 
 REACH = 7.0  # standard deviations of the Gaussian beyond which the kernel is zero: a Taylor polynomial may be anything there
 FORMS = ("log", "sum")

@@ -10,14 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai.errors import InputError
-from zakai.methods._observation import log_likelihood
-from zakai.methods._residuals import Factor, Sensors
 from zakai.methods.series.heat import heat_series
+from zakai.methods.system.observation import log_likelihood
+from zakai.methods.system.residuals import Factor, Sensors
 from zakai.models import features
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
-from zakai.numerics.composed_kernels import SHORTEST, Kernels
-from zakai.numerics.dyadic_grid import SUPPORT, Field, Grid
+from zakai.numerics.series.composed_kernels import SHORTEST, Kernels
+from zakai.numerics.series.dyadic_grid import SUPPORT, Field, Grid
 from zakai.records.schedule import Schedule
 
 Array = np.ndarray

@@ -15,14 +15,14 @@ import numpy as np
 
 from zakai.methods._options import tolerance_of
 from zakai.methods._protocol import Info
-from zakai.methods._yau_system import YauSystem, power_series_of, yau_of
 from zakai.methods.gaussian.affine_system import precision_of
-from zakai.methods.series.kernel import PowerSeries
 from zakai.methods.space import kolmogorov as base
 from zakai.methods.space.filter import State
 from zakai.methods.space.flow import Stepper, regridded
 from zakai.methods.space.observed import Observations
 from zakai.methods.space.system import grid_of, moments_of, prior_on_grid, system_of
+from zakai.methods.yau.kernel import PowerSeries
+from zakai.methods.yau.system import YauSystem, power_series_of, yau_of
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior
 from zakai.numerics.complex_step import is_complex

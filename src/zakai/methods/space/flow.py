@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from zakai.methods._yau_system import YauSystem
-from zakai.methods.series.kernel import PowerSeries
+from zakai.methods.yau.kernel import PowerSeries
+from zakai.methods.yau.system import YauSystem
 from zakai.numerics.flow import Flow, at, integrate, motion, spread_first
 from zakai.numerics.space.field import Field, Report, extrapolated, positive
 from zakai.numerics.space.grid import Grid, gradient, rounded_size, spread

@@ -9,7 +9,7 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from zakai.methods._formula_arrays import translated
+from zakai.methods.system.formula_arrays import translated
 from zakai.models.model import Model
 from zakai.models.numeric import COMPLEX, REAL, program_of
 from zakai.numerics.complex_step import is_complex

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from zakai.errors import InputError
-from zakai.methods._escape_of_states import check_escape
 from zakai.methods._options import tolerance_of
 from zakai.methods._protocol import Info
-from zakai.methods.line.cross import OMITTED
 from zakai.methods.space.cross import CrossSystem, potential_of
 from zakai.methods.space.filter import State
 from zakai.methods.space.observed import MOST_PANELS, Observations
 from zakai.methods.space.short import predicted_on
 from zakai.methods.space.system import System, grid_of, moments_of, prior_on_grid, system_of, valid_noise
+from zakai.methods.system.escape_of_states import check_escape
+from zakai.methods.system.notes import OMITTED
 from zakai.models.features import CROSS_NOISE
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex

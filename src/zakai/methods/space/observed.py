@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from zakai.methods._observation import log_likelihood
 from zakai.methods.space.system import System
+from zakai.methods.system.observation import log_likelihood
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex, log_determinant
 from zakai.numerics.space.average import average, panel_rule

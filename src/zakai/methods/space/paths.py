@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.numerics.space.field import Field
 from zakai.numerics.space.grid import filtered
 from zakai.numerics.space.resample import padded

@@ -13,7 +13,7 @@ import sympy as sp
 
 from zakai.algebra.gauges import exponential_terms
 from zakai.algebra.yau import YauForm
-from zakai.methods._potential import potential_of
+from zakai.methods.system.potential import potential_of
 from zakai.models.features import JUMP_FUNCTIONS
 from zakai.models.functions import Maximum, Minimum, TableFunction
 from zakai.models.model import Model

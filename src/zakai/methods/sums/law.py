@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 import sympy as sp
 
-from zakai.methods._observation import log_likelihood
+from zakai.methods.system.observation import log_likelihood
 from zakai.models.features import OF_OBSERVATION
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function

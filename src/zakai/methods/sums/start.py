@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from zakai.errors import InputError
-from zakai.methods._moments import density_grid
+from zakai.methods.system.prior_moments import density_grid
 from zakai.models.model import Model
 from zakai.models.numeric import numpy_function
 from zakai.models.prior import DensityPrior

@@ -18,12 +18,12 @@ import numpy as np
 import sympy as sp
 
 from zakai.algebra.systems import yau_system
-from zakai.methods._input_pieces import pieces_of
-from zakai.methods._outside_tables import OutsideTables
-from zakai.methods._residuals import Factor as Residuals
-from zakai.methods._residuals import Sensors
 from zakai.methods.gaussian.affine_system import Matrices, precision_of
 from zakai.methods.sums.law import SampleLaw, has_own_law
+from zakai.methods.system.input_pieces import pieces_of
+from zakai.methods.system.outside_tables import OutsideTables
+from zakai.methods.system.residuals import Factor as Residuals
+from zakai.methods.system.residuals import Sensors
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 from zakai.models.prior import DensityPrior

@@ -1,25 +1,88 @@
-"""Averages over an interval of coefficients that vary in time: Magnus' integrator of fourth order without commutators.
+"""Coefficients that vary in time: parts of an interval in which few nodes resolve them, and averages over a part.
 
-The mean takes the place of the coefficients where that is accurate, else two averages with weights, one after the other.
+The averages are those of Magnus' integrator of fourth order without commutators: the mean takes the place of the coefficients
+where that is accurate, else two averages with weights, one after the other.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper
 from zakai.numerics.line.density import highest_of
-from zakai.numerics.line.panels import GAUSS_NODES, GAUSS_WEIGHTS, NODES
-from zakai.numerics.line.terms import CELL, DRIFT, SLOPE, add, exponent_added, observation_of
+from zakai.numerics.line.steps import CELL, DRIFT, IMPOSSIBLE, SLOPE, add, exponent_added, observation_of
 
 Array = NDArray[Any]
 
+NODES = 6
+_nodes, _weights = np.polynomial.legendre.leggauss(NODES)
+GAUSS_NODES: Array = (_nodes + 1.0) / 2.0
+GAUSS_WEIGHTS: Array = _weights / 2.0
+
+PROBES = 129  # times of an interval at which coefficients are compared with their interpolants
+_PROBES_OF_PART = 21
+_MOST = 600
+
+
+def interpolation(points: Array) -> Array:
+    """Return the matrix from values at the Gauss nodes to values at points in [0, 1]."""
+    return np.asarray((2.0 * points[:, None] - 1.0) ** _POWERS @ _COEFFICIENTS)
+
+
+_POWERS = np.arange(NODES)
+_COEFFICIENTS = np.linalg.inv((2.0 * GAUSS_NODES[:, None] - 1.0) ** _POWERS)
+
+
+@lru_cache(maxsize=16)
+def _probes(count: int) -> tuple[Array, Array]:
+    points = np.linspace(0.0, 1.0, count)
+    return points, interpolation(points)
+
+
+class Panels(NamedTuple):
+    """The `bounds` of the parts; `error` is the relative error of the integrals that remains where there are too many."""
+
+    bounds: list[tuple[float, float]]
+    error: float
+
+
+def panels(coefficients: Callable[[Array], Array], start: float, stop: float, tolerance: float = 1e-8) -> Panels:
+    """Return parts of [start, stop] in each of which the polynomial through six Gauss nodes agrees with the coefficients.
+
+    Args:
+        coefficients: function of times (T,) that returns (T, C).
+        start, stop: the interval.
+        tolerance: largest difference, relative to the largest modulus of each coefficient.
+    """
+    accepted: list[tuple[float, float]] = []
+    stack, scale, error = [(start, stop)], np.zeros(1), 0.0
+    while stack:
+        first, last = stack.pop()
+        length = last - first
+        share = length / (stop - start)
+        points, matrix = _probes(max(_PROBES_OF_PART, 1 + int((PROBES - 1) * 2.0 ** np.round(np.log2(share)))))
+        values = coefficients(first + length * points)
+        scale = np.maximum(np.maximum(scale, np.abs(values).max(axis=0)), 1e-300)
+        rest = np.abs(matrix @ coefficients(first + length * GAUSS_NODES) - values).max(axis=0) / scale
+        # What matters is the integral over a part.
+        bad = float(rest.max()) * share
+        if bad <= tolerance * max(share, 1e-3) or share < 1e-9 or len(accepted) + len(stack) > _MOST:
+            if bad > tolerance:
+                error += bad
+            accepted.append((first, last))
+        else:
+            middle = first + 0.5 * length
+            stack += [(middle, last), (first, middle)]
+    return Panels(accepted, error)
+
+
 MOST_MAGNUS = 32  # equal parts of an interval with two averages each
 MEAN, EARLY, LATE, DIFFERENCE, SECOND = 0, 1, 2, 3, 4  # weights of a part
-IMPOSSIBLE = -1e8  # exponent where a formula has no value
 
 
 def _averages() -> Array:
@@ -157,15 +220,15 @@ def averaging(values: Array, parts: Array, spreads: Array, spacing: float, close
     [B, D] / 4 + [B, [B, E]] / 10, and of fifth order 5 |[B, D] / 4|^(5/3) + [B, [B, E]] / 10.
     """
     size = values.size
-    found = np.zeros((8, size))
-    add(found[0], 1.0, values)
+    result = np.zeros((8, size))
+    add(result[0], 1.0, values)
     for operator, of, weight, to in _PRODUCTS:
-        _generated(found[of], parts[operator], spreads[operator], spacing, float(weight), closed, found[to])
+        _generated(result[of], parts[operator], spreads[operator], spacing, float(weight), closed, result[to])
     one, two, mass, limit = 0.0, 0.0, 0.0, 1e-12 * values[highest_of(values)]
     for j in range(size):
         mass += values[j]
         if values[j] > limit:
-            one += abs(found[4, j])
-            two += abs(found[5, j])
+            one += abs(result[4, j])
+            two += abs(result[5, j])
     one, two = 0.25 * one / mass, 0.1 * two / mass
     return one + two, 5.0 * one ** (5.0 / 3.0) + two

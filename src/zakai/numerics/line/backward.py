@@ -1,10 +1,11 @@
-"""Many intervals backward in time for one state, in a compiled loop: by the decomposition of the operator.
+"""Many intervals backward in time for one state, in compiled loops: by modes of the operator, or by adjoints of splittings.
 
-A message b is p(later observations | x) at the points of the filter's grid, up to a constant.  It is kept where its product with
-the filter's density is not negligible, and is zero elsewhere: no path between the supports of two products leads there.
+A message b is p(later observations | x) at the points of the filter's grid, up to a constant.  It is retained where its product
+with the filter's density is not negligible, and is zero elsewhere: no path between the supports of two products leads there.
 
 A decomposition acts on psi = F e^s b on a longer grid, with an F that falls to zero towards its ends
-(`methods/line/gauge.py`); the adjoints of splittings are in `line/adjoint.py`.
+(`methods/line/message.py`).  The adjoint of a splitting (`numerics/line/splitting.py`) is the same splitting with phi replaced by
+-phi and the averages in reverse order.
 """
 
 from __future__ import annotations
@@ -16,8 +17,11 @@ from numba import boolean, float64, int64, types
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
-from zakai.numerics.line.density import circular_moments, highest_of, moments, spectrum, support, waves
+from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, averaged, averaging, operators
+from zakai.numerics.line.density import circular_moments, highest_of, moments, shifted, spectrum, support, waves
 from zakai.numerics.line.modes import decayed, propagate
+from zakai.numerics.line.splitting import STEEPEST, differences, residual, split
+from zakai.numerics.line.steps import SPLIT, Grid, Steps, copied
 from zakai.numerics.line.window import CUT
 
 Array = NDArray[Any]
@@ -83,7 +87,7 @@ class Gauged(NamedTuple):
     stride: int
 
 
-class Taken(NamedTuple):
+class BackwardSteps(NamedTuple):
     """The message before the last `number` intervals, which were taken, and the smoothed densities (K, N) with their reports."""
 
     message: Message
@@ -92,7 +96,7 @@ class Taken(NamedTuple):
     reports: Array
 
 
-_V, _M = float64[::1], float64[:, ::1]
+_V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1]
 
 
 @helper
@@ -140,7 +144,7 @@ def spread(b: Array, first: int, last: int) -> float:
 
 
 @helper
-def kept(before: float, between: float, after: float) -> float:
+def error_share(before: float, between: float, after: float) -> float:
     """Return the share of the error of b that an interval leaves, from variances."""
     return min(max(between / np.sqrt(max(before * after, 1e-300)), 0.3), 1.0)
 
@@ -163,7 +167,7 @@ def _decomposed(
     for j in range(size):
         b[j] = psi[place + stride * j] * np.exp(gauge[at] - gauge[place + stride * j])
     for i in range(lengths.size - 1, -1, -1):
-        tau, row, taken, likelihood = lengths[i], out[i], lengths.size - 1 - i, logs[i]
+        tau, row, completed, likelihood = lengths[i], out[i], lengths.size - 1 - i, logs[i]
         before, top, norm = spread(b, first, last), -np.inf, 0.0
         for j in range(longer):
             top = max(top, likelihood[j])
@@ -186,7 +190,7 @@ def _decomposed(
                 inner = max(now[place + stride * j], ROUNDING * highest)
                 reference = max(reference, np.log(inner * density[j]) - gauge[place + stride * j])
         if not (-np.inf < reference < np.inf):
-            return taken, error, scale, reliable
+            return completed, error, scale, reliable
         for j in range(size):
             b[j] = 0.0
             if density[j] > least:
@@ -196,13 +200,13 @@ def _decomposed(
                 total += density[j] * b[j]
         made = level * weight / total + (0.0 if closed else 10.0 * max(left, right))
         if not (made < ROUGH * most):
-            return taken, error, scale, reliable
+            return completed, error, scale, reliable
         row[LOG_MASS] = scale + top + reference
         first, last = multiplied(b, density, floors[i], negligible, closed, cosines, sines, products[i], row)
         if last < 0:
-            return taken, error, scale, reliable
+            return completed, error, scale, reliable
         at = place + stride * highest_of(products[i])
-        error = made + error * kept(before, between, spread(b, first, last))
+        error = made + error * error_share(before, between, spread(b, first, last))
         row[ERROR] = error
         scale, reliable = np.log(highest / total) - reference, max(SURE * level / highest, LEAST)
         for j in range(longer):
@@ -212,7 +216,7 @@ def _decomposed(
 
 def by_modes(
     message: Message, before: Filtered, gauged: Gauged, logs: Array, lengths: Array, closed: bool, limits: Limits
-) -> Taken:
+) -> BackwardSteps:
     """Return the message before the last intervals, as many as the decomposition takes.
 
     Args:
@@ -226,15 +230,172 @@ def by_modes(
     """
     count, size = len(lengths), len(message.product)
     psi, products, out = message.values.copy(), np.empty((count, size)), np.zeros((count, 6))
-    taken, error, scale, least = _decomposed(
+    completed, error, scale, least = _decomposed(
         psi, message.scale, message.error, message.product, before.densities, before.floors, gauged.modes.ravel(), *gauged[1:],
         logs, lengths, closed, limits.error, limits.negligible, *waves(size), *waves(len(gauged.rates)), products, out,
     )  # fmt: skip
     first, last = 0, len(psi) - 1
-    if taken and not closed:
-        small, peak = np.flatnonzero(psi <= least), gauged.place + gauged.stride * int(np.argmax(products[count - taken]))
+    if completed and not closed:
+        small, peak = np.flatnonzero(psi <= least), gauged.place + gauged.stride * int(np.argmax(products[count - completed]))
         first = int(np.max(small, where=small < peak, initial=-1)) + 1
         last = int(np.min(small, where=small > peak, initial=len(psi))) - 1
     psi = np.maximum(psi, ROUNDING)
-    found = Message(psi, scale, first, last, 0, error, message.product)
-    return Taken(found, taken, products[count - taken :], out[count - taken :])
+    result = Message(psi, scale, first, last, 0, error, message.product)
+    return BackwardSteps(result, completed, products[count - completed :], out[count - completed :])
+
+
+MOST_SUBSTEPS = 512
+EXCURSION = 3.9  # standard deviations of the noise that a path between two points goes beyond them, but for exp(-30)
+_WHOLE = np.ones((1, 5, 1))
+
+
+@helper
+def held(before: Array, by: int, after: Array, noise: float) -> bool:
+    """Return whether a grid holds the paths between two densities on it, with this deviation of the noise in spacings.
+
+    The first density begins `by` points later.  Halfway a path deviates by half of the noise.
+    """
+    low, high = np.inf, -np.inf
+    for values, shift in ((before, by), (after, 0)):
+        _, mean, variance = moments(values)
+        middle, reach = mean + values.size // 2 + shift, 5.0 * np.sqrt(variance)
+        low, high = min(low, middle - reach), max(high, middle + reach)
+    return low - 2.5 * noise >= 0.0 and high + 2.5 * noise <= before.size - 1.0
+
+
+@helper
+def _split(
+    now: Array, product: Array, table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array,
+    averages: Array, observed: Array, inside: bool, tau: float, at: int, first: int, last: int, spacing: float, closed: bool,
+    depth: float, most: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Replace b by that before a split interval; return its error, infinite where it is not accurate, and the constant."""
+    size = now.size
+    phi, slope, curvature, drift, b = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    made, constant, magnus = 0.0, 0.0, 0
+    if averages.shape[0] > 1:
+        both, spreads = np.empty((3, 2, size)), np.empty(3)
+        operators(table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, both, spreads)
+        made, pair = averaging(product, both, spreads, spacing, closed)
+        if not (made <= most):
+            magnus = int(min(max(np.ceil(1.1 * (pair / most) ** 0.25), 1.0), 1e6))
+            made = pair / float(magnus) ** 4
+        if magnus > MOST_MAGNUS or not (made < np.inf):
+            return np.inf, 0.0
+    parts, count = max(magnus, 1), max(2 * magnus, 1)
+    for i in range(count - 1, -1, -1):
+        weights = averages[parts * (parts - 1) // 2 + i // 2]
+        which = MEAN if magnus == 0 else (EARLY if i % 2 == 0 else LATE)
+        length, spread, shift, added = averaged(
+            table, drifts, outputs, precisions, covariances, weights[which], tau, observed, inside, at, spacing, closed, phi,
+            drift, b,
+        )  # fmt: skip
+        if not spread > 0.0:
+            return np.inf, 0.0
+        differences(b, spacing, closed, slope, curvature)
+        error = residual(product, b, slope, curvature, drift, spread, spacing, length)
+        substeps = max((count * error / most) ** 0.25, 1.0)
+        if not (count * substeps < MOST_SUBSTEPS):
+            return np.inf, 0.0
+        whole = int(np.ceil(substeps))
+        narrow = 0.5 * spread / whole < np.log(1e4 * parts * whole / most) / (2.0 * np.pi**2) * spacing * spacing
+        if narrow:
+            for j in range(first + 1, last + 1):
+                if closed or not (abs(phi[j] - phi[j - 1]) + abs(b[j] - b[j - 1]) < STEEPEST):
+                    return np.inf, 0.0
+        for j in range(size):
+            phi[j] = -phi[j]
+        noise, _ = split(now, phi, b, slope, spread, -shift, whole, spacing, depth, closed, narrow)
+        made, constant = made + error / float(whole) ** 4 + noise, constant + added
+        if not (made < most * 2.0 + 1e-2 * most):
+            return np.inf, 0.0
+    return made, constant
+
+
+@kernel(
+    types.Tuple((int64, int64, int64, int64, float64))(  # type: ignore[no-untyped-call]
+        _V, int64, int64, int64, float64, _V, _M, int64[::1], _V, _Q, float64, boolean, _M, boolean[::1], _V, _M, _Q, _T, _T, _M,
+        _T, float64, float64, float64, _M, _M, _M, _M,
+    )
+)  # fmt: skip
+def _adjoint(
+    b: Array, first: int, last: int, start: int, error: float, product: Array, densities: Array, starts: Array, floors: Array,
+    table: Array, spacing: float, closed: bool, logs: Array, inside: Array, lengths: Array, observed: Array,
+    precisions: Array, drifts: Array, outputs: Array, covariances: Array, averages: Array, most: float,
+    negligible: float, cut: float, cosines: Array, sines: Array, products: Array, out: Array,
+) -> tuple[int, int, int, int, float]:  # fmt: skip
+    """How many intervals were taken, and the support, the start and the error of the message b, which is replaced."""
+    size, timed, depth = b.size, table.shape[0] > 1, 8.0 - np.log(cut)
+    for i in range(lengths.size - 1, -1, -1):
+        row, completed, low, high = out[i], lengths.size - 1 - i, 0, size - 1
+        if start < 0 or start + size > table.shape[3]:
+            return completed, first, last, start, error
+        if not closed:  # the paths from one support to the other
+            begins, ends = support(densities[i], SMALLEST)
+            noise = np.sqrt(max(covariances[i].max(), 0.0) * lengths[i]) / spacing
+            if not held(densities[i], starts[i] - start, product, noise):
+                return completed, first, last, start, error
+            margin = int(EXCURSION * noise) + 1
+            low = max(min(first, begins + starts[i] - start) - margin, low)
+            high = min(max(last, ends + starts[i] - start) + margin, high)
+        points = high - low + 1
+        local, now, result = np.empty((table.shape[1], table.shape[2], points)), np.empty(points), np.zeros(size)
+        copied(table[i if timed else 0], start + low, local)
+        at, before = highest_of(product), spread(b, first, last)
+        row[LOG_MASS] = logs[i, at]
+        for j in range(first, last + 1):
+            result[j] = b[j] * np.exp(logs[i, j] - logs[i, at])
+        between = spread(result, first, last)
+        for j in range(points):
+            now[j] = result[low + j]
+        made, constant = _split(
+            now, product[low : high + 1], local, drifts[i], outputs[i], precisions[i], covariances[i], averages, observed[i],
+            inside[i], lengths[i], at - low, first - low, last - low, spacing, closed, depth, most,
+        )  # fmt: skip
+        for j in range(size):
+            result[j] = now[j - low] if low <= j <= high else 0.0
+        row[LOG_MASS] += constant
+        if not (made < np.inf):
+            return completed, first, last, start, error
+        if starts[i] != start:
+            result = shifted(result, starts[i] - start)
+        begins, ends = multiplied(result, densities[i], floors[i], negligible, closed, cosines, sines, products[i], row)
+        if ends < 0:
+            return completed, first, last, start, error
+        first, last, start = begins, ends, starts[i]
+        error = made + error * error_share(before, between, spread(result, first, last))
+        row[ERROR] = error
+        for j in range(size):
+            b[j] = result[j] if first <= j <= last else 0.0
+            product[j] = products[i, j]
+    return lengths.size, first, last, start, error
+
+
+def by_adjoints(
+    message: Message, before: Filtered, grid: Grid, logs: Array, steps: Steps, observed: Array, closed: bool, limits: Limits
+) -> BackwardSteps:
+    """Return the message before the last intervals, as many as the adjoints of splittings take.
+
+    Args:
+        message: b on the grid.
+        before: the filter's densities.
+        grid: the table of the grids.
+        logs: the log-likelihoods of what is observed at the end of each interval (K, N), on the grid of the density there.
+        steps: the intervals.
+        observed: what is observed in them (K, m), zero where nothing is.
+        closed: whether the grid is around the circle.
+        limits: what an interval must keep.
+    """
+    count, size = len(steps.lengths), len(message.values)
+    b, product, products, out = message.values.copy(), message.product.copy(), np.empty((count, size)), np.zeros((count, 6))
+    kinds, lengths, _, precisions, _, _, *rest = steps
+    averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
+    completed, first, last, start, error = _adjoint(
+        b, message.first, message.last, message.start, message.error, product, *before, grid.table, grid.spacing, closed,
+        logs, kinds == SPLIT, lengths, observed, precisions, *rest, averages, limits.splitting, limits.negligible, limits.cut,
+        *waves(size), products, out,
+    )  # fmt: skip
+    if completed:
+        out[-1, LOG_MASS] += message.scale
+    here = slice(count - completed, None)
+    return BackwardSteps(Message(b, 0.0, first, last, start, error, product), completed, products[here], out[here])

@@ -72,10 +72,10 @@ def highest_of(values: Array) -> int:
 @helper
 def shifted(values: Array, by: int) -> Array:
     """Return values on a grid of the same size that begins `by` points later, zero where there are none."""
-    found = np.zeros(values.size)
+    result = np.zeros(values.size)
     for j in range(max(0, by), min(values.size, by + values.size)):
-        found[j - by] = values[j]
-    return found
+        result[j - by] = values[j]
+    return result
 
 
 @kernel(types.UniTuple(int64, 2)(float64[::1], float64))  # type: ignore[no-untyped-call]
@@ -113,9 +113,9 @@ def waves(size: int) -> tuple[Array, Array]:
 def spectrum_of_many(values: Array, cut: float, negligible: float) -> tuple[float, ...]:
     """Return the figures of `spectrum` of a large grid, from all frequencies, by the fast Fourier transform."""
     nyquist, top, total, mass = len(values) // 2, max(values.max(), 0.0), np.abs(values).sum(), values.sum()
-    found = np.abs(np.fft.rfft(values)) / (abs(mass) or np.inf)
-    aliasing, middle = found[nyquist * 7 // 8 :].max(), found[nyquist * 5 // 8 : nyquist * 3 // 4].max()
-    counting = np.flatnonzero(found[: nyquist * 7 // 8] > (negligible if aliasing <= negligible else 4.0 * aliasing))
+    result = np.abs(np.fft.rfft(values)) / (abs(mass) or np.inf)
+    aliasing, middle = result[nyquist * 7 // 8 :].max(), result[nyquist * 5 // 8 : nyquist * 3 // 4].max()
+    counting = np.flatnonzero(result[: nyquist * 7 // 8] > (negligible if aliasing <= negligible else 4.0 * aliasing))
     used = np.flatnonzero(values > (max(cut, min(aliasing, 1e-4)) if cut >= 1e-14 else cut) * top)
     first, last = used[[0, -1]] if len(used) else [len(values) - 1] * 2
     left, right = (np.max(np.abs(ends)) / (top or np.inf) for ends in (values[:2], values[-2:]))

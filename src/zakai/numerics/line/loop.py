@@ -1,8 +1,8 @@
 """Steps on one grid in one compiled loop.
 
-The transition of an interval is by the modes of the operator (`line/modes.py`), a Gaussian kernel (`line/filters.py`) or a
-splitting into diffusion and a potential (`line/splitting.py`).  A sample multiplies the density after the transition
-(`line/step.py`); an increment is a part of the potential, or of the kernel.
+The transition of an interval is by the modes of the operator (`line/modes.py`), a Gaussian kernel (`line/gaussian_kernels.py`) or
+a splitting into diffusion and a potential (`line/splitting.py`).  A sample multiplies the density after the transition
+(`line/steps.py`); an increment is a part of the potential, or of the kernel.
 
 With kernels or potentials the grid is a window of a longer table, and the loop moves it by whole spacings.  It stops before the
 first step that is not accurate enough, or needs another grid or table, and returns why.
@@ -21,28 +21,35 @@ from numpy.typing import NDArray
 from zakai.numerics.compiled import kernel
 from zakai.numerics.line.averages import AVERAGES
 from zakai.numerics.line.density import circular_rows, highest_of, moments, separated, shifted, spectrum, support, waves
-from zakai.numerics.line.filters import BAND, convolved, kernel_of
-from zakai.numerics.line.segment import (
+from zakai.numerics.line.gaussian_kernels import BAND, convolved, kernel_of
+from zakai.numerics.line.product import WEAK_SHARE, weak_error, weaken
+from zakai.numerics.line.splitting import divided
+from zakai.numerics.line.steps import (
     AFTER,
     COLUMNS,
     FAILED,
     KERNEL,
     MARGIN,
     OK,
+    PHI,
     RANGE,
     RELIABLE,
     SPLIT,
+    STATUSES,
     TABLE,
     UNRESOLVED,
     Grid,
     Mechanisms,
     Segment,
     Steps,
-)  # fmt: skip
-from zakai.numerics.line.splitting import divided
-from zakai.numerics.line.step import checked, copied, extent, likelihood, product
-from zakai.numerics.line.terms import PHI, failed, observation_of
-from zakai.numerics.line.weak import WEAK_SHARE, weak_error, weaken
+    checked,
+    copied,
+    extent,
+    failed,
+    likelihood,
+    observation_of,
+    product,
+)
 from zakai.numerics.line.window import ALIGNMENT, CUT
 
 Array = NDArray[Any]
@@ -184,7 +191,7 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
                 densities[i, j] = now[j]
             row[12], row[13], row[14], row[15] = start, move.pairs, move.substeps, move.needed
             home, done = start, i + 1
-            # Whether the same grid serves for the next step: as in `line_window.fitted`.
+            # Whether the same grid serves for the next step: as in `window.fitted`.
             resolving = BAND * (size // 2) / (max(highest, 0.0) + 1.0)
             if resolving < 0.97 or (not near and abs(home + half - length // 2) > length // 4):
                 status = AFTER
@@ -238,4 +245,4 @@ def advance(
     )  # fmt: skip
     if mechanisms.closed:
         circular_rows(densities[:done], cosines, sines, out)
-    return Segment(densities[:done], out[:done], why, out[-1, :3])
+    return Segment(densities[:done], out[:done], STATUSES[why], out[-1, :3])

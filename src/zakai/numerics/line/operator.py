@@ -3,11 +3,14 @@
     L u = (G u)'' / 2 - (f u)' + V u
 
 with the derivatives of the sinc interpolant on the line and of the trigonometric interpolant on the circle: spectrally
-accurate, exact in time for every interval.
+accurate, exact in time for every interval.  Up to `window.LARGEST` points L is a matrix; on larger grids its products with
+vectors are computed by Fourier transforms, because a density on the line vanishes at the ends of its grid, which may as well go
+around a circle.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -214,15 +217,105 @@ class Spectral:
         reach = float(np.sqrt(np.sum(inner.real**2)))
         if not np.isfinite(reach):
             return inner, np.inf
-        found = self.scale * self.decayed(inner, length)
-        top, growth = float(np.max(found.real)), max(1.0, float(np.exp(-length * self.rates[0])))
-        return found, 4e-16 * reach * growth / top if top > 0 else np.inf
+        result = self.scale * self.decayed(inner, length)
+        top, growth = float(np.max(result.real)), max(1.0, float(np.exp(-length * self.rates[0])))
+        return result, 4e-16 * reach * growth / top if top > 0 else np.inf
 
     def decayed(self, inner: Array, length: float) -> Array:
         """Return U exp(-length lambda) U' inner."""
         decay = np.exp(-length * self.rates)
         coefficients = real_product(self.modes.T, inner)
-        moved = decay * coefficients
+        propagated = decay * coefficients
         if self.change is not None:
-            moved = moved + 1j * ((quotients(self.rates, decay, length) * self.change) @ coefficients.real)
-        return real_product(self.modes, moved)
+            propagated = propagated + 1j * ((quotients(self.rates, decay, length) * self.change) @ coefficients.real)
+        return real_product(self.modes, propagated)
+
+
+FOURIER_PART = 6.0  # norm up to which one Taylor series is summed
+FOURIER_TERMS = 80
+
+
+@dataclass(frozen=True, eq=False)
+class FourierOperator:
+    """L for G, one number or (N,), f (N,) and V, one number or (N,), or integrals over time of these; or its adjoint.
+
+    `length` is that of the grid.
+    """
+
+    covariance: Any
+    drift: Array
+    potential: Any
+    length: float
+    adjoint: bool = False
+
+    @property
+    def T(self) -> FourierOperator:  # noqa: N802
+        """The adjoint."""
+        return replace(self, adjoint=not self.adjoint)
+
+    @property
+    def highest(self) -> float:
+        """The wave number of the shortest wave."""
+        return float(np.pi * len(self.drift) / self.length)
+
+    @property
+    def decay(self) -> float:
+        """The most by which diffusion lets the logarithm of the shortest wave decrease."""
+        return 0.5 * self.highest**2 * float(np.max(np.real(self.covariance)))
+
+    def __matmul__(self, values: Array) -> Array:
+        """Return L u for u (N,)."""
+        first, second = _factors(len(values), self.length)
+        if self.adjoint:
+            waves = _waves(values)
+            slope, curvature = (_values(factor * waves, len(values)) for factor in (first, second))
+            return np.asarray(0.5 * self.covariance * curvature + self.drift * slope + self.potential * values)
+        waves = second * _waves(0.5 * self.covariance * values) - first * _waves(self.drift * values)
+        return np.asarray(_values(waves, len(values)) + self.potential * values)
+
+
+class FourierExponential:
+    """exp(L), by Taylor series: it multiplies any number of vectors."""
+
+    def __init__(self, operator: FourierOperator):
+        potential, fastest = np.real(operator.potential), float(np.max(np.abs(operator.drift.real)))
+        self.shift = 0.5 * float(np.max(potential) + np.min(potential) - operator.decay)
+        self.norm = 0.5 * float(operator.decay + np.ptp(potential)) + operator.highest * fastest
+        self.operator = replace(operator, potential=operator.potential - self.shift)
+
+    def __call__(self, vector: Array) -> tuple[Array, float]:
+        """Return exp(L) vector, and an estimate of its relative rounding error."""
+        if not np.isfinite(self.norm):
+            return np.full_like(vector, np.nan), np.inf
+        parts = max(1, int(np.ceil(self.norm / FOURIER_PART)))
+        for _ in range(parts):
+            term, negligible = vector, 1e-17 * np.max(np.abs(vector.real))
+            for k in range(1, FOURIER_TERMS):
+                term = self.operator @ term / (parts * k)
+                vector = vector + term
+                if np.max(np.abs(term.real)) < negligible:
+                    break
+            vector = vector * np.exp(self.shift / parts)
+        return vector, 1e-15 * (1.0 + self.norm)
+
+
+def exponential_of(operator: Array | FourierOperator) -> Exponential | FourierExponential:
+    """Return exp(L) for L as a matrix (N, N) or by Fourier transforms."""
+    return FourierExponential(operator) if isinstance(operator, FourierOperator) else Exponential(operator)
+
+
+@lru_cache(maxsize=16)
+def _factors(size: int, length: float) -> tuple[Array, Array]:
+    """Return what the first and the second derivative multiply waves by."""
+    k = 2.0 * np.pi / length * np.arange(size // 2 + 1)
+    return 1j * np.where(2 * np.arange(len(k)) < size, k, 0.0), -(k**2)
+
+
+def _waves(values: Array) -> Array:
+    """Return the transforms of the real part and, where there is one, of the imaginary part, which may be infinitesimal."""
+    return np.fft.rfft(np.stack([values.real, values.imag]) if np.iscomplexobj(values) else values)
+
+
+def _values(waves: Array, size: int) -> Array:
+    result = np.fft.irfft(waves, size)
+    return result if result.ndim == 1 else result[0] + 1j * result[1]

@@ -4,7 +4,10 @@ With u = s v, v_t = -H v and the decomposition H = U diag(lambda) U', the deriva
 
     U (Q o (U' dH U)) U',   Q_ij = (exp(-tau lambda_i) - exp(-tau lambda_j)) / (lambda_i - lambda_j),
 
-exact for every tau (Daleckii and Krein 1965).
+exact for every tau (Daleckii and Krein 1965).  Without a decomposition Taylor's series of exp(L) u is differentiated term by
+term,
+
+    w_k = L w_k-1 / k,      dw_k = (L dw_k-1 + dL w_k-1) / k.
 """
 
 from __future__ import annotations
@@ -13,15 +16,107 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import float64, void
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from zakai.numerics.compiled import kernel
 from zakai.numerics.complex_step import STEP
-from zakai.numerics.line.operator import Spectral, quotients
-from zakai.numerics.line.polynomial import local_polynomial
-from zakai.numerics.line.window import CUT, SMALL, Window, density_at, gathered, interpolated
+from zakai.numerics.line.operator import DENSE, PART, TERMS, FourierOperator, Spectral, derivatives, exponential_of, quotients
+from zakai.numerics.line.window import CUT, SMALL, Window, density_at, gathered, interpolated, local_polynomial
 
 Array = NDArray[Any]
+
+Coefficients = tuple[Any, Array, Array | None]  # G, one number or (N,), f (N,) and V (N,), or integrals over time of these
+
+LONG = 8.0  # series of an operator with so large a norm take longer than its exponential by complex steps
+
+_M = float64[:, ::1]
+
+
+def exponential_tangents(
+    window: Window, coefficients: Coefficients, changed: Sequence[Coefficients], values: Array, tangents: Array
+) -> tuple[Array, Array]:
+    """Return exp(L) u and its derivatives (p, N).
+
+    Args:
+        window: the grid.
+        coefficients: those of L.
+        changed: the same at p parameters with infinitesimal imaginary parts.
+        values: u (N,).
+        tangents: its derivatives (p, N).
+    """
+    matrix = window.generator(*coefficients)
+    if isinstance(matrix, FourierOperator):
+        return _by_complex_steps(window, changed, values, tangents)
+    size, unit = window.size, 1.0 if window.closed else window.spacing
+    shift = float(np.trace(matrix)) / size
+    norm = float(np.abs(matrix - shift * np.eye(size)).sum(axis=0).max())
+    if not np.isfinite(norm):
+        return np.full_like(values, np.nan), np.full_like(tangents, np.nan)
+    scales = 0.5 / unit**2, 1.0 / unit, 1.0
+    if norm * DENSE > LONG * size**2:
+        return _by_complex_steps(window, changed, values, tangents)
+    rows = np.zeros((3, 1 + len(changed), size))  # of G, f and V: the values, and their derivatives
+    for row, scale, *parts in zip(rows, scales, coefficients, *changed, strict=True):
+        row[0] = 0.0 if parts[0] is None else scale * parts[0]
+        row[1:] = [np.zeros(size) if one is None else scale * np.imag(one) / STEP * np.ones(size) for one in parts[1:]]
+    rows[2, 0] -= shift
+    result = np.concatenate([values[None], tangents])
+    _taylor(np.concatenate(derivatives(size, window.closed)), *rows, result, shift, norm)
+    return result[0], result[1:]
+
+
+def _by_complex_steps(window: Window, changed: Sequence[Coefficients], values: Array, tangents: Array) -> tuple[Array, Array]:
+    pairs = zip(changed, tangents, strict=True)
+    after = np.array([exponential_of(window.generator(*one))(values + 1j * STEP * tangent)[0] for one, tangent in pairs])
+    return after[0].real, after.imag / STEP
+
+
+@kernel(void(_M, _M, _M, _M, _M, float64, float64))
+def _taylor(matrices: Array, covariance: Array, drift: Array, potential: Array, rows: Array, shift: float, norm: float) -> None:
+    """Replace a vector and its derivatives, the rows (1 + p, N), by those after the exponential.
+
+    Args:
+        matrices: those of the first derivative, antisymmetric, and of the second, symmetric (2 N, N).
+        covariance, drift, potential: G / 2, f and V - shift in units of the spacing, and their derivatives (1 + p, N).
+        rows: the vectors.
+        shift: a number that is added to V.
+        norm: a bound of the norm of the operator without it.
+    """
+    count, size = rows.shape
+    parts = max(1, int(np.ceil(norm / PART)))
+    factor = np.exp(shift / parts)
+    products, largest = np.empty((count, 2 * size)), np.empty(count)
+    for _ in range(parts):
+        term = rows.copy()
+        for i in range(count):
+            largest[i] = np.max(np.abs(rows[i]))
+        for k in range(1, TERMS):
+            for i in range(count):
+                for j in range(size):
+                    products[i, j] = drift[0, j] * term[i, j]
+                    products[i, size + j] = covariance[0, j] * term[i, j]
+                    if i > 0:
+                        products[i, j] += drift[i, j] * term[0, j]
+                        products[i, size + j] += covariance[i, j] * term[0, j]
+            propagated = np.dot(products, matrices)
+            scale, settled = 1.0 / (parts * k), True
+            for i in range(count):
+                change = 0.0
+                for j in range(size):
+                    result = propagated[i, j] + potential[0, j] * term[i, j]
+                    if i > 0:
+                        result += potential[i, j] * term[0, j]
+                    result *= scale
+                    rows[i, j] += result
+                    propagated[i, j] = result
+                    change = max(change, abs(result))
+                settled = settled and change <= 1e-17 * largest[i]
+            term = propagated
+            if settled:
+                break
+        rows *= factor
 
 
 class Varied(NamedTuple):
@@ -67,9 +162,9 @@ class Varied(NamedTuple):
             known, shifts = local_polynomial(logs, own, points), local_polynomial(self.scales, own, points)
             scale, at = np.exp(logs - known[top]), np.exp(known - known[top])
             scales, shifts = self.scales - shifts[:, top : top + 1], shifts - shifts[:, top : top + 1]
-            found = np.where(used, np.concatenate([values[None], tangents - values * shifts]) / at, 0.0)
+            result = np.where(used, np.concatenate([values[None], tangents - values * shifts]) / at, 0.0)
             # Interpolation leaves waves everywhere; where they end abruptly, the derivatives spread that.
-            inner, *rest = np.array([gathered(one, points, own) for one in found]) * _faded(own.size, margins)
+            inner, *rest = np.array([gathered(one, points, own) for one in result]) * _faded(own.size, margins)
             changes = np.array(rest)
         decay, coefficients = np.exp(-length * rates), inner @ U
         turned = (self.operators * quotients(rates, decay, length)) @ coefficients
@@ -91,10 +186,10 @@ def extended(values: Array, tangents: Array) -> Array:
     used = np.flatnonzero(values > CUT * np.max(values))
     if len(used) in (0, len(values)):
         return tangents
-    found, small = tangents.copy(), np.flatnonzero(~(values > CUT * np.max(values)))
-    for one in found:
+    result, small = tangents.copy(), np.flatnonzero(~(values > CUT * np.max(values)))
+    for one in result:
         one[small] = values[small] * np.interp(small, used, one[used] / values[used])
-    return found
+    return result
 
 
 def resampled_tangents(values: Array, tangents: Array, window: Window, new: Window) -> Array:
@@ -102,19 +197,19 @@ def resampled_tangents(values: Array, tangents: Array, window: Window, new: Wind
     if new == window:
         return tangents
     tangents = extended(values, tangents)
-    found, density = interpolated(tangents, window, new.offsets), density_at(values, window, new.offsets)
+    result, density = interpolated(tangents, window, new.offsets), density_at(values, window, new.offsets)
     small = np.flatnonzero(density < SMALL * np.max(values))
     scores = tangents / np.where(values > 0, values, np.inf)
-    found[:, small] = density[small] * local_polynomial(scores, window, new.offsets[small])
-    return np.ascontiguousarray(found * (new.spacing / window.spacing))
+    result[:, small] = density[small] * local_polynomial(scores, window, new.offsets[small])
+    return np.ascontiguousarray(result * (new.spacing / window.spacing))
 
 
 def _faded(size: int, margins: tuple[int, int]) -> Array:
     """Return factors (N,) that fall to zero at the two ends of a grid."""
-    found = np.ones(size)
-    for margin, end in zip(margins, (found, found[::-1]), strict=True):
+    result = np.ones(size)
+    for margin, end in zip(margins, (result, result[::-1]), strict=True):
         end[:margin] = ndtr(_FALL * np.linspace(-1.0, 1.0, margin, endpoint=False))
-    return found
+    return result
 
 
 _FALL = 6.0  # standard deviations from the middle to the ends of a factor that falls

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.polynomial import interpolated_logs
+from zakai.numerics.line.window import interpolated_logs
 
 Array = NDArray[Any]
 Bands = tuple[Array, Array, Array]
@@ -125,13 +125,13 @@ class Volumes(NamedTuple):
         steps = np.diff(s) / np.diff(before)
 
         def at(offsets: Array) -> Array:
-            index, found = self.place(offsets), np.zeros(offsets.shape, masses.dtype)
+            index, result = self.place(offsets), np.zeros(offsets.shape, masses.dtype)
             part = np.searchsorted(before[1:-1], index, side="right")
             for j, (smooth, window) in enumerate(parts):
                 here = (part == j) & np.isfinite(index)
                 inner = np.clip(index[here], before[j] + 1e-6, before[j + 1] - 1e-6)  # a face itself lies beyond a window
-                found[here] = interpolated_logs(smooth, window, inner)
-            return found / (steps[part] * np.sqrt(self.scale**2 + (offsets - self.centre) ** 2))
+                result[here] = interpolated_logs(smooth, window, inner)
+            return result / (steps[part] * np.sqrt(self.scale**2 + (offsets - self.centre) ** 2))
 
         return at
 
@@ -147,10 +147,10 @@ def _geometry(cells: Volumes) -> tuple[Array, Array, Array, Array, Array]:
         cells.centre + cells.scale * np.sinh(np.interp(index, before, s))
         for index in (np.arange(cells.size) + 0.5, np.arange(cells.size + 1.0))
     )
-    found = s, before, middles, faces, np.diff(faces)
-    for array in found:
+    result = s, before, middles, faces, np.diff(faces)
+    for array in result:
         array.setflags(write=False)
-    return found
+    return result
 
 
 def volumes(origin: float, centre: float, scale: float, low: float, high: float, size: int) -> Volumes:

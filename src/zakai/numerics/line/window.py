@@ -1,9 +1,9 @@
-"""Uniform grids on the line and the circle that follow a density: choice of the grid, resampling, moments.
+"""Uniform grids on the line and the circle that follow a density: choice of the grid, interpolation, moments.
 
 A density is a vector of probabilities of the grid points.  A smooth density that the grid resolves is band-limited, so that its
 sums are integrals and its values between the points are those of the sinc (line) or trigonometric (circle) interpolant, both to
-rounding.  Grids are taken out of few (spacings a factor of 2^(1/4) apart, centres at multiples of 8 spacings), so that what
-was computed for a grid is found again.
+rounding.  Logarithms and messages are interpolated by polynomials through the nearest eight values.  Grids are taken out of few
+(spacings a factor of 2^(1/4) apart, centres at multiples of 8 spacings), so that what was computed for a grid is used again.
 """
 
 from __future__ import annotations
@@ -16,11 +16,45 @@ from numpy.typing import NDArray
 
 from zakai.numerics.complex_step import angle, is_complex, real_product
 from zakai.numerics.line.density import spectrum, spectrum_of_many, waves
-from zakai.numerics.line.fourier import FourierOperator
-from zakai.numerics.line.operator import generator
-from zakai.numerics.line.polynomial import interpolated_logs
+from zakai.numerics.line.operator import FourierOperator, generator
 
 Array = NDArray[Any]
+
+_STENCIL = np.arange(-3, 5)
+_WEIGHTS = np.array([1.0 / np.prod([float(i - j) for j in _STENCIL if j != i]) for i in _STENCIL])
+
+
+def local_polynomial(values: Array, window: Window, offsets: Array) -> Array:
+    """Return the polynomials through the nearest eight values of functions (..., N) at offsets (J,), constant beyond the grid."""
+    at = (offsets - window.centre) / window.spacing + window.size // 2
+    weights, own = _nearest(values, window, at if window.closed else np.clip(at, 0.0, window.size - 1.0))
+    return np.asarray(np.sum(weights * own, axis=-1))
+
+
+def interpolated_logs(values: Array, window: Window, offsets: Array) -> Array:
+    """Return the exponential of the polynomial through eight logarithms, zero where a value is zero or beyond the grid."""
+    at = (offsets - window.centre) / window.spacing + window.size // 2
+    weights, own = _nearest(values, window, at)
+    with np.errstate(all="ignore"):
+        result = np.exp(np.sum(weights * np.log(own), axis=1))
+    inside = (own.real > 0).all(axis=1) & np.isfinite(result.real)
+    if not window.closed:
+        inside &= (at > -0.5) & (at < window.size - 0.5)
+    return np.where(inside, result, 0.0)
+
+
+def _nearest(values: Array, window: Window, at: Array) -> tuple[Array, Array]:
+    """Return the weights (J, 8) and the values (..., J, 8) of the polynomials at indices of a grid (J,)."""
+    near = np.floor(at)
+    if not window.closed:
+        near = np.clip(near, -_STENCIL[0], window.size - 1 - _STENCIL[-1])
+    distance = (at - near)[:, None] - _STENCIL
+    exact = np.abs(distance) < 1e-12
+    weights = np.where(exact.any(axis=1, keepdims=True), exact, _WEIGHTS / np.where(exact, 1.0, distance))
+    own = values[..., (near[:, None].astype(int) + _STENCIL) % window.size]
+    return weights / np.sum(weights, axis=1, keepdims=True), own
+
+
 Operator = Array | FourierOperator
 
 SIZES = (32, 48, 64, 80, 96, 112, 128, 160, 192, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
@@ -68,9 +102,9 @@ class Window(NamedTuple):
 @lru_cache(maxsize=64)
 def index(size: int) -> Array:
     """Return i - size // 2 (size,)."""
-    found = np.arange(size) - size // 2.0
-    found.setflags(write=False)
-    return found
+    result = np.arange(size) - size // 2.0
+    result.setflags(write=False)
+    return result
 
 
 def size_for(count: float) -> int:
@@ -94,7 +128,7 @@ def quantized(window: Window, low: float, high: float, spacing: float, margin: f
     return window._replace(centre=float(centre), spacing=spacing, size=size)
 
 
-class Figures(NamedTuple):
+class GridCheck(NamedTuple):
     """What decisions about a density are made of.
 
     `left` and `right` are the largest moduli of the two outermost points on each side, relative to the maximum; `first` and
@@ -113,7 +147,7 @@ class Figures(NamedTuple):
     resolving: float
 
 
-def figures(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: float = CUT) -> Figures:
+def grid_check(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: float = CUT) -> GridCheck:
     """Return the figures of a density.
 
     Args:
@@ -124,8 +158,8 @@ def figures(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: fl
     """
     real = np.ascontiguousarray(values.real)
     large = len(real) > LARGE
-    found = spectrum_of_many(real, cut, negligible) if large else spectrum(real, cut, negligible, *waves(len(real)), True)
-    left, right, first, last, negative, aliasing, middle, highest, nyquist = found
+    result = spectrum_of_many(real, cut, negligible) if large else spectrum(real, cut, negligible, *waves(len(real)), True)
+    left, right, first, last, negative, aliasing, middle, highest, nyquist = result
     rough = middle < 6.0 * aliasing
     if aliasing <= negligible or (rough and aliasing < 1e-9):
         resolving = 0.92 * nyquist / (max(highest, 0.0) + 1.0)
@@ -134,10 +168,10 @@ def figures(values: Array, closed: bool, negligible: float = NEGLIGIBLE, cut: fl
         resolving = 1.0 / min(max((np.log(negligible) / np.log(share)) ** 0.5, 1.05), 4.0)
     if closed:
         left = right = 0.0
-    return Figures(left, right, int(first), int(last), negative, aliasing, rough, float(resolving))
+    return GridCheck(left, right, int(first), int(last), negative, aliasing, rough, float(resolving))
 
 
-def fitted(look: Figures, window: Window, most: int = LARGEST, generous: int = 64, margin: float = 0.12) -> Window:
+def fitted(check: GridCheck, window: Window, most: int = LARGEST, generous: int = 64, margin: float = 0.12) -> Window:
     """Return the grid to go on with: the same where it serves, else one that fits the density.
 
     Args:
@@ -147,7 +181,7 @@ def fitted(look: Figures, window: Window, most: int = LARGEST, generous: int = 6
         generous: a grid of up to so many points is kept though fewer would do.
         margin: range of a new grid beyond that of the density, relative to it.
     """
-    needed = look.resolving * window.spacing
+    needed = check.resolving * window.spacing
     if not 0.0 < needed < np.inf:  # the values are not finite
         return window
     if window.closed:
@@ -155,12 +189,12 @@ def fitted(look: Figures, window: Window, most: int = LARGEST, generous: int = 6
         if window.size >= size and (window.size <= 2 * size or window.size <= generous):
             return window
         return window._replace(size=size, spacing=2 * np.pi / size)
-    first, last = look.first, look.last
+    first, last = check.first, check.last
     width = last - first + 1
     least = max(3, window.size // 16)
     inside = first >= least and last < window.size - least
-    resolved = look.resolving >= 0.97
-    enough = width * min(1.0, 1.0 / look.resolving) * 1.12 + ALIGNMENT
+    resolved = check.resolving >= 0.97
+    enough = width * min(1.0, 1.0 / check.resolving) * 1.12 + ALIGNMENT
     thrifty = window.size <= max(generous, 1.6 * size_for(enough))
     if inside and resolved and thrifty and window.size <= most:
         return window
@@ -181,7 +215,7 @@ def enlarged(window: Window, left: bool, right: bool) -> Window:
     return quantized(window, low, high, window.spacing, margin=0.0, most=SIZES[-1])
 
 
-def moved(window: Window, by: float) -> Window:
+def translated(window: Window, by: float) -> Window:
     """Return a grid that is displaced by about a number of its spacings."""
     return window._replace(centre=window.spacing * round((window.centre + by) / window.spacing)) if by else window
 
@@ -210,14 +244,14 @@ def interpolated(values: Array, window: Window, offsets: Array) -> Array:
     exact = np.abs(at - nearest) < 1e-12
     with np.errstate(all="ignore"):
         if window.closed:
-            found = real_product(1.0 / np.tan(np.pi / window.size * distance), signed.T).T * (sine / window.size)
+            result = real_product(1.0 / np.tan(np.pi / window.size * distance), signed.T).T * (sine / window.size)
         else:
-            found = real_product(1.0 / distance, signed.T).T * (sine / np.pi)
+            result = real_product(1.0 / distance, signed.T).T * (sine / np.pi)
     if window.closed:
-        return np.asarray(np.where(exact, values[..., nearest.astype(int) % window.size], found))
+        return np.asarray(np.where(exact, values[..., nearest.astype(int) % window.size], result))
     inside = (at > -0.5) & (at < window.size - 0.5)
     own = values[..., np.where(inside, nearest, 0.0).astype(int)]
-    return np.asarray(np.where(inside, np.where(exact, own, found), 0.0))
+    return np.asarray(np.where(inside, np.where(exact, own, result), 0.0))
 
 
 def gathered(values: Array, offsets: Array, window: Window) -> Array:
@@ -230,9 +264,9 @@ def gathered(values: Array, offsets: Array, window: Window) -> Array:
     signs = np.where(np.arange(window.size) % 2 == 0, 1.0, -1.0)
     with np.errstate(divide="ignore"):
         inverse = np.where(exact[:, None], 0.0, 1.0 / distance)
-    found = (values * sine / np.pi) @ inverse * signs
-    np.add.at(found, nearest[exact].astype(int), values[exact])
-    return np.asarray(found)
+    result = (values * sine / np.pi) @ inverse * signs
+    np.add.at(result, nearest[exact].astype(int), values[exact])
+    return np.asarray(result)
 
 
 def resampled(values: Array, window: Window, new: Window) -> Array:
@@ -248,30 +282,30 @@ def resampled(values: Array, window: Window, new: Window) -> Array:
 
 def density_at(values: Array, window: Window, offsets: Array) -> Array:
     """Return the density at offsets (J,) from the origin, times the spacing of the grid."""
-    found = interpolated(values, window, offsets)
-    found = np.where(found.real > 0, found, 0.0)
+    result = interpolated(values, window, offsets)
+    result = np.where(result.real > 0, result, 0.0)
     bound = SMALL * values.real.max()
-    small = np.flatnonzero(found.real < bound)
+    small = np.flatnonzero(result.real < bound)
     if len(small):
         # There the interpolant is the rounding of large values; small values are interpolated by their logarithms.
         logs = interpolated_logs(values, window, offsets[small])
-        found[small] = np.where(logs.real < 2.0 * bound, logs, 0.0)
-    return found
+        result[small] = np.where(logs.real < 2.0 * bound, logs, 0.0)
+    return result
 
 
 def shifted(values: Array, by: int, size: int) -> Array:
     """Return values (..., N) on a grid of another size that begins `by` points later, zero where there are none."""
-    found = np.zeros((*values.shape[:-1], size), values.dtype)
+    result = np.zeros((*values.shape[:-1], size), values.dtype)
     first, last = max(by, 0), min(by + size, values.shape[-1])
     if last > first:
-        found[..., first - by : last - by] = values[..., first:last]
-    return found
+        result[..., first - by : last - by] = values[..., first:last]
+    return result
 
 
 def _sums_of_waves(values: Array, first: float, k: Array) -> tuple[Array, Array]:
     """Return the sums of real values (N,) with cos(k x) and sin(k x), for the N points x of a circle from the first one on."""
-    found = np.exp(-1j * k * first) * np.fft.rfft(values)[k]
-    return found.real, -found.imag
+    result = np.exp(-1j * k * first) * np.fft.rfft(values)[k]
+    return result.real, -result.imag
 
 
 def moments(values: Array, window: Window) -> tuple[Any, Any]:

@@ -14,7 +14,7 @@ References:
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -25,6 +25,10 @@ from zakai.numerics.particles.formulas import BOX, F1, F2, F3, I2, PROGRAM, bloc
 
 Array = Any
 ADDITIVE, COMMUTING, ORDERED = 0, 1, 2
+# A step is too long for a particle where the estimate of its error by the slopes is this share of the state: a linear decay at a
+# rate 2 / step.  It is halved, three times at once, and again where that is not enough.  What most particles need is measured
+# beforehand; this is for those far out, which a stiff drift would throw to infinity.
+_ROUGH, _PARTS, _LEVELS = 0.25, 8, 3
 # Drift, fields of the noise, ends of the domain, and the kind of the noise.
 MOTION = types.Tuple((PROGRAM, PROGRAM, BOX, types.int64))
 # Times (E, 2), [root, observation, stages] (E, 3): what follows each flow or -1, and its evaluations, 2 or 4; given numbers at
@@ -33,13 +37,68 @@ MOTION = types.Tuple((PROGRAM, PROGRAM, BOX, types.int64))
 EVENTS = types.Tuple((F2, I2, F3, F3, I2))
 
 
+class Buffers(NamedTuple):
+    """What is overwritten.
+
+    Rows of a block (rows, BLOCK), given numbers (L,), the times (2,) of a kick, and of the particles of a block: which a step is
+    too long for, their places, and which needed a still shorter one (BLOCK,).
+    """
+
+    work: Array
+    row: Array
+    time: Array
+    rough: Array
+    marked: Array
+    failed: Array
+
+
+class Stretch(NamedTuple):
+    """A part of a flow.
+
+    The length, the times (2,) and the given numbers (2, L) at both ends of the flow, the evaluations of a step, 2 or 4, and where
+    the part begins and how long it is, as shares of the flow.
+    """
+
+    length: float
+    times: Array
+    given: Array
+    stages: int
+    begin: float
+    part: float
+
+
+class Kick(NamedTuple):
+    """The noise of one substep: its root (n or r, d), the normal numbers (d, size), and the given numbers (2, L)."""
+
+    root: Array
+    noise: Array
+    given: Array
+
+
+class Arrival(NamedTuple):
+    """What `advance` writes.
+
+    The states (n, N) after the events, the integrals (N,) of the drift's output after the first n, zero where there is none, and
+    the states (I, n, N) at the observations, or (0, n, N) where they are not wanted.
+    """
+
+    states: Array
+    gained: Array
+    ends: Array
+
+
+ARRIVAL = types.NamedTuple((F2, F1, F3), Arrival)
+
+
 @helper
-def _flow(program: Any, values: Array, x: Array, work: Array, box: Any, length: float, times: Array, given: Array, row: Array,
-          stages: int, size: int) -> None:  # fmt: skip
-    """Advance the first rows of x (rows, size) by one Runge-Kutta step; `times` and `given` at both ends."""
-    outputs = program[3]
+def _runge_kutta(program: Any, values: Array, x: Array, box: Any, stretch: Any, buffers: Any, size: int) -> int:
+    """Write the change of x (rows, size) by one Runge-Kutta step; mark the particles that it is too long for, and count them."""
+    outputs, work, row, rough = program[3], buffers.work, buffers.row, buffers.rough
+    length, times, given, stages, begin, part = stretch
     count, rows = outputs.size, x.shape[0]
     point, slopes, total = work[:rows], work[rows : rows + count], work[rows + count : rows + 2 * count]
+    excess = work[rows + 2 * count : rows + 3 * count]
+    length = part * length
     for stage in range(stages):
         share = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
         if stage == 0:
@@ -50,28 +109,80 @@ def _flow(program: Any, values: Array, x: Array, work: Array, box: Any, length: 
             for d in range(count):
                 for i in range(size):
                     point[d, i] = x[d, i] + share * length * slopes[d, i]
+        at = begin + part * share
         for j in range(row.size):
-            row[j] = given[0, j] + share * (given[1, j] - given[0, j])
-        load_point(program, values, point, box, times[0] + share * (times[1] - times[0]), row, size)
+            row[j] = given[0, j] + at * (given[1, j] - given[0, j])
+        load_point(program, values, point, box, times[0] + at * (times[1] - times[0]), row, size)
         run_program(program, values, size)
         weight = length / 6.0 if stage == 0 or stage == 3 else length / 3.0
+        sign = length / 6.0 if stage == 0 or stage == 3 else -length / 6.0
         if stages == 2:
             weight = 0.0 if stage == 0 else length
+            sign = 0.5 * length if stage == 0 else -0.5 * length
         for d in range(count):
             result = values[outputs[d]]
             for i in range(size):
                 slopes[d, i] = result[i]
                 total[d, i] = weight * slopes[d, i] + (total[d, i] if stage else 0.0)
-    for d in range(count):
+                excess[d, i] = sign * slopes[d, i] + (excess[d, i] if stage else 0.0)
+    for i in range(size):
+        rough[i] = 0.0
+    for d in range(box[0].size):
         for i in range(size):
-            x[d, i] += total[d, i]
+            fine = abs(excess[d, i]) <= _ROUGH * (abs(x[d, i]) + abs(x[d, i] + total[d, i]))
+            rough[i] += 0.0 if fine else 1.0  # NaN is rough, too
+    marked = 0
+    for i in range(size):
+        marked += rough[i] > 0.0
+    return marked
 
 
 @helper
-def _kick(motion: Any, values: Array, x: Array, work: Array, root: Array, noise: Array, given: Array, row: Array, time: Array,
-          size: int) -> None:  # fmt: skip
+def _flow(program: Any, values: Array, x: Array, box: Any, stretch: Any, buffers: Any, size: int) -> None:
+    """Advance the first rows of x (rows, size) by one Runge-Kutta step, or by as many as a particle needs to be stable."""
+    count, rows, rough = program[3].size, x.shape[0], buffers.rough
+    change = buffers.work[rows + count : rows + 2 * count]
+    left = _runge_kutta(program, values, x, box, stretch, buffers, size)
+    marked, few = buffers.marked, buffers.work[rows + 3 * count : 2 * rows + 3 * count]
+    place = 0
+    for i in range(size):
+        if left and rough[i] > 0.0:
+            marked[place] = i
+            place += 1
+        else:
+            for d in range(count):
+                x[d, i] += change[d, i]
+    for level in range(_LEVELS):
+        if left == 0:
+            break
+        parts = _PARTS ** (level + 1)
+        for c in range(left):
+            buffers.failed[c] = 0.0
+            for d in range(rows):
+                few[d, c] = x[d, marked[c]]
+        for p in range(parts):
+            part = Stretch(stretch.length, stretch.times, stretch.given, 4, p / parts, 1.0 / parts)
+            _runge_kutta(program, values, few, box, part, buffers, left)
+            for c in range(left):
+                buffers.failed[c] += rough[c]
+                for d in range(count):
+                    few[d, c] += change[d, c]
+        kept = 0
+        for c in range(left):
+            if buffers.failed[c] > 0.0 and level < _LEVELS - 1:
+                marked[kept] = marked[c]
+                kept += 1
+            else:
+                for d in range(count):
+                    x[d, marked[c]] = few[d, c]
+        left = kept
+
+
+@helper
+def _kick(motion: Any, values: Array, x: Array, kick: Any, buffers: Any, size: int) -> None:
     """Add the noise of one kick to x; rows of x after those of the drift hold the coefficients of the fields."""
-    fields, kind = motion[1], motion[3]
+    fields, kind, work = motion[1], motion[3], buffers.work
+    root, noise, given = kick
     n, width = motion[2][0].size, root.shape[1]
     if kind == ADDITIVE:
         for d in range(n):
@@ -83,7 +194,7 @@ def _kick(motion: Any, values: Array, x: Array, work: Array, root: Array, noise:
         return
     # The point of the fields: the state, then a coefficient for each field.
     r = root.shape[0]
-    point, rest = work[: n + r], work[n + r :]
+    point, rest = work[: n + r], Buffers(work[n + r :], buffers.row, buffers.time, buffers.rough, buffers.marked, buffers.failed)
     for d in range(n):
         for i in range(size):
             point[d, i] = x[d, i]
@@ -98,7 +209,7 @@ def _kick(motion: Any, values: Array, x: Array, work: Array, root: Array, noise:
                     j = turn if noise[width, i] > 0.0 else width - 1 - turn
                     value = root[a, j] * noise[j, i]
                 point[n + a, i] = value
-        _flow(fields, values, point, rest, motion[2], 1.0, time, given, row, 4, size)
+        _flow(fields, values, point, motion[2], Stretch(1.0, buffers.time, given, 4, 0.0, 1.0), rest, size)
     for d in range(n):
         for i in range(size):
             x[d, i] = point[d, i]
@@ -108,17 +219,15 @@ def _kick(motion: Any, values: Array, x: Array, work: Array, root: Array, noise:
 def run_event(motion: Any, events: Any, e: int, blocks: Any, x: Array, noise: Array, buffers: Any, size: int) -> None:
     """Advance x (rows, size) by one event; `noise` (D, size) is that of all events."""
     times, places, given, roots, rows = events
-    work, row, time = buffers
     n, box = motion[2][0].size, motion[2]
     if times[e, 1] != times[e, 0]:
-        _flow(motion[0], blocks[0], x, work, box, times[e, 1] - times[e, 0], times[e], given[e], row, places[e, 2], size)
+        stretch = Stretch(times[e, 1] - times[e, 0], times[e], given[e], places[e, 2], 0.0, 1.0)
+        _flow(motion[0], blocks[0], x, box, stretch, buffers, size)
     r = places[e, 0]
     if r >= 0:
-        width = rows[r, 1]
-        time[0], time[1] = times[e, 1], times[e, 1]
-        constant = given[e, 1:, :]
-        first = rows[r, 0]
-        _kick(motion, blocks[1], x, work, roots[r, :, :width], noise[first:], _twice(constant), row, time, size)
+        buffers.time[0], buffers.time[1] = times[e, 1], times[e, 1]
+        kick = Kick(roots[r, :, : rows[r, 1]], noise[rows[r, 0] :], _twice(given[e, 1:, :]))
+        _kick(motion, blocks[1], x, kick, buffers, size)
     for d in range(n):
         if box[0][d] > -np.inf or box[1][d] < np.inf:
             for i in range(size):
@@ -138,12 +247,12 @@ def _twice(row: Array) -> Any:
 def buffers_of(motion: Any, events: Any) -> Any:
     """Return what `run_event` overwrites."""
     n, r = motion[2][0].size, events[3].shape[1]
-    return np.empty((6 * (n + r + 2), BLOCK)), np.empty(events[2].shape[2]), np.empty(2)
+    work, row = np.empty((9 * (n + r + 2), BLOCK)), np.empty(events[2].shape[2])
+    return Buffers(work, row, np.empty(2), np.empty(BLOCK), np.empty(BLOCK, np.int64), np.empty(BLOCK))
 
 
-@kernel(types.void(MOTION, EVENTS, F2, F2, types.int64, types.int64, F2, F1, F3))
-def advance(motion: Any, events: Any, start: Array, noise: Array, low: int, high: int, out: Array, gained: Array,
-            ends: Array) -> None:  # fmt: skip
+@kernel(types.void(MOTION, EVENTS, F2, F2, types.int64, types.int64, ARRIVAL))
+def advance(motion: Any, events: Any, start: Array, noise: Array, low: int, high: int, arrival: Any) -> None:
     """Advance the particles from `low` to `high` by all events.
 
     Args:
@@ -153,10 +262,9 @@ def advance(motion: Any, events: Any, start: Array, noise: Array, low: int, high
         noise: standard normal numbers (D, N).
         low: the first particle.
         high: the particle after the last one.
-        out: the states (n, N) after the events.
-        gained: the integrals (N,) of the drift's output after the first n, zero where there is none.
-        ends: the states (I, n, N) at the observations, or (0, n, N) where they are not wanted.
+        arrival: receives the results.
     """
+    out, gained, ends = arrival
     blocks = (block_of(motion[0]), block_of(motion[1]))
     buffers = buffers_of(motion, events)
     n, rows, places = start.shape[0], motion[0][3].size, events[1]

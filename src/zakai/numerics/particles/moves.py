@@ -15,7 +15,7 @@ References:
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -29,9 +29,9 @@ from zakai.numerics.particles.random import KEY, fill_normals, fill_row, uniform
 
 Array = Any
 # The law, and of each observation its time (I,), given numbers (I, L), and which terms count (I, terms).
-OBSERVED = types.Tuple((PROGRAM, F1, F2, F2))
+_OBSERVED = types.Tuple((PROGRAM, F1, F2, F2))
 # The mean (n,) and a root (n, d0) of the prior; without columns the window starts from states that do not move.
-PRIOR = types.Tuple((F1, F2))
+_PRIOR = types.Tuple((F1, F2))
 # The mean (D,), its derivative by the start (D, n), the start to which that refers (n,), the rows of V' (r, D), and s (r,).
 GAUSSIAN = types.Tuple((F1, F2, F1, F2, F1))
 _ACCEPTANCE = np.uint64(1 << 60)  # counters from here on are those of acceptance
@@ -39,10 +39,45 @@ _WORST, _BEST = 0.2, 0.4  # acceptance below which steps become shorter, and abo
 _LONGEST = 0.96  # of the share of the old noise
 
 
+class WindowLaw(NamedTuple):
+    """The law of the noise of a window: the formulas, its events, what is observed in it, and the prior of its first state."""
+
+    motion: Any
+    events: Any
+    observed: Any
+    prior: Any
+
+
+class Paths(NamedTuple):
+    """The particles that `sweep` moves: the states (n, N) at the start of the window and the noise (D, N), which is replaced.
+
+    It writes the states (n, N) at the end, log N(0, I) L / q (N,), and of each chunk the mean acceptance and the change (chunks,
+    2).
+    """
+
+    start: Array
+    noise: Array
+    out: Array
+    total: Array
+    moved: Array
+
+
+class Workspace(NamedTuple):
+    """The slots of the three programs, and what an event overwrites."""
+
+    blocks: Any
+    buffers: Any
+
+
+WINDOW_LAW = types.NamedTuple((MOTION, EVENTS, _OBSERVED, _PRIOR), WindowLaw)
+PATHS = types.NamedTuple((F2, F2, F2, F1, F2), Paths)
+
+
 @helper
-def _follow(motion: Any, events: Any, observed: Any, prior: Any, blocks: Any, start: Array, path: Array, x: Array, total: Array,
-            buffers: Any, size: int) -> None:  # fmt: skip
+def _follow(window: Any, workspace: Any, start: Array, path: Array, x: Array, total: Array, size: int) -> None:
     """Write the states x (rows, size) at the end of a window and the log-likelihoods (size,) of what is observed in it."""
+    motion, events, observed, prior = window
+    blocks, buffers = workspace
     law, times, given, counted = observed
     mean, root = prior
     n, rows, places, d0 = start.shape[0], x.shape[0], events[1], root.shape[1]
@@ -78,8 +113,10 @@ def _follow(motion: Any, events: Any, observed: Any, prior: Any, blocks: Any, st
 
 
 @helper
-def _blocks(motion: Any, observed: Any) -> Any:
-    return block_of(motion[0]), block_of(motion[1]), block_of(observed[0])
+def _workspace(window: Any) -> Any:
+    motion = window.motion
+    blocks = block_of(motion[0]), block_of(motion[1]), block_of(window.observed[0])
+    return Workspace(blocks, buffers_of(motion, window.events))
 
 
 @helper
@@ -114,18 +151,18 @@ def _scale(gaussian: Any, inverse: bool, given: Array, along: Array, size: int) 
                 given[r, i] += entry * along[i]
 
 
-@kernel(types.void(MOTION, EVENTS, OBSERVED, PRIOR, F2, F2, types.int64, types.int64, F2, F1))
-def follow(motion: Any, events: Any, observed: Any, prior: Any, start: Array, path: Array, low: int, high: int, out: Array,
-           total: Array) -> None:  # fmt: skip
+@kernel(types.void(WINDOW_LAW, F2, F2, types.int64, types.int64, F2, F1))
+def follow(window: Any, start: Array, path: Array, low: int, high: int, out: Array, total: Array) -> None:
     """Write the states (n, N) at the end of a window and the log-likelihoods (N,), for the noise (D, N) from given starts."""
     n, D = start.shape[0], path.shape[0]
-    blocks, buffers = _blocks(motion, observed), buffers_of(motion, events)
-    x, own, begin, found = np.empty((motion[0][3].size, BLOCK)), np.empty((D + 1, BLOCK)), np.empty((n, BLOCK)), np.empty(BLOCK)
+    workspace = _workspace(window)
+    x, found = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK)
+    own, begin = np.empty((D + 1, BLOCK)), np.empty((n, BLOCK))
     for first in range(low, high, BLOCK):
         size = min(BLOCK, high - first)
         begin[:, :size] = start[:, first : first + size]
         own[:D, :size] = path[:, first : first + size]
-        _follow(motion, events, observed, prior, blocks, begin, own, x, found, buffers, size)
+        _follow(window, workspace, begin, own, x, found, size)
         out[:, first : first + size] = x[:n, :size]
         total[first : first + size] = found[:size]
 
@@ -166,16 +203,12 @@ def draw(gaussian: Any, share: float, key: Array, start: Array, low: int, high: 
         path[:, first : first + size] = p[:, :size]
 
 
-@kernel(types.void(MOTION, EVENTS, OBSERVED, PRIOR, GAUSSIAN, F1, KEY, types.int64, types.int64, F2, F2, F2, F1, F2))
-def sweep(motion: Any, events: Any, observed: Any, prior: Any, gaussian: Any, control: Array, key: Array, low: int, high: int,
-          start: Array, path: Array, out: Array, total: Array, moved: Array) -> None:  # fmt: skip
+@kernel(types.void(WINDOW_LAW, GAUSSIAN, F1, KEY, types.int64, types.int64, PATHS))
+def sweep(window: Any, gaussian: Any, control: Array, key: Array, low: int, high: int, paths: Any) -> None:
     """Move the noise of the particles from `low` to `high`, in chunks, until their noise has changed enough.
 
     Args:
-        motion: the formulas.
-        events: those of the window.
-        observed: what is observed in it.
-        prior: that of the first state, where its noise moves.
+        window: the law of the noise.
         gaussian: the Gaussian in which moves are reversible.
         control: the power, the sum of acceptance (1 - rho^2) after which it is enough, the most sweeps, the first rho, and the
             share of N(0, I) in q = share N(0, I) + (1 - share) Gaussian; the target is q (N(0, I) L / q)^power, with share one
@@ -183,20 +216,17 @@ def sweep(motion: Any, events: Any, observed: Any, prior: Any, gaussian: Any, co
         key: of the random numbers.
         low: the first particle, a multiple of `CHUNK`.
         high: the particle after the last one.
-        start: the states (n, N) at the start of the window.
-        path: the noise (D, N), which is replaced.
-        out: receives the states (n, N) at the end.
-        total: receives log N(0, I) L / q (N,).
-        moved: receives the mean acceptance and the change of each chunk (chunks, 2).
+        paths: the particles.
     """
+    start, path, out, total, moved = paths
     n, D = start.shape[0], path.shape[0]
     power, enough, most, part = control[0], control[1], int(control[2]), control[4]
     log_det = 0.0
     for factor in gaussian[4]:
         log_det += math.log(factor)
-    blocks, buffers = _blocks(motion, observed), buffers_of(motion, events)
+    workspace = _workspace(window)
     along = np.empty(BLOCK)
-    x, found = np.empty((motion[0][3].size, BLOCK)), np.empty(BLOCK)
+    x, found = np.empty((window.motion[0][3].size, BLOCK)), np.empty(BLOCK)
     begin, new, fresh, m = np.empty((n, BLOCK)), np.empty((D + 1, BLOCK)), np.empty((D, BLOCK)), np.empty((D, BLOCK))
     w, target = np.empty((D, CHUNK)), np.empty(CHUNK)
     for chunk in range(low, high, CHUNK):
@@ -225,7 +255,7 @@ def sweep(motion: Any, events: Any, observed: Any, prior: Any, gaussian: Any, co
                     for r in range(D):
                         for i in range(size):
                             new[r, i] += m[r, i]
-                _follow(motion, events, observed, prior, blocks, begin, new, x, found, buffers, size)
+                _follow(window, workspace, begin, new, x, found, size)
                 for i in range(size):
                     g, phi = log_det, 0.0
                     for r in range(D):

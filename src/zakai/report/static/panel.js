@@ -26,7 +26,7 @@ export class Panel {
    * @param {HTMLElement} element  where the panel is built; what was in it is replaced
    * @param {object} options
    *   label: what the picture shows, for a screen reader; height: in CSS pixels (360); testid: data-testid of the canvas;
-   *   both: whether zooming changes both axes (the horizontal one alone by default);
+   *   compact: without the buttons; both: whether zooming changes both axes (the horizontal one alone by default);
    *   onViewChange(view): called once a frame after the reader moved or zoomed; view = {x: [from, to], y: [from, to], width, height}
    */
   constructor(element, options = {}) {
@@ -85,7 +85,7 @@ export class Panel {
     const ratio = Math.min(3, window.devicePixelRatio || 1);
     const context = sized(this.canvas, width, height, ratio);
     context.font = `12px ${colours.font}`;
-    const yTicks = this._ticks("y", Math.max(2, Math.floor((height - 60) / 45)));
+    const yTicks = this._ticks("y", Math.max(3, Math.floor((height - 50) / 36)));
     const left = Math.min(width / 3, Math.max(34, 12 + Math.max(0, ...yTicks.ticks.map((t) => context.measureText(t.text).width)) + 16));
     this.rect = { x: Math.round(left), y: 8, w: Math.round(width - left - 14), h: Math.round(height - 8 - 42) };
     this.ratio = ratio;
@@ -110,7 +110,7 @@ export class Panel {
   }
 
   _drawAxes(context, yTicks, colours) {
-    const { x, y, w, h } = this.rect, xTicks = this._ticks("x", Math.max(2, Math.floor(w / 85)));
+    const { x, y, w, h } = this.rect, xTicks = this._ticks("x", Math.max(3, Math.floor(w / 75)));
     context.strokeStyle = colours.rule;
     context.fillStyle = colours.faint;
     context.lineWidth = 1;
@@ -285,9 +285,10 @@ export class Panel {
     this.sizes.observe(this.stage);
     const recolour = () => { this.colours = null; this.redraw(); };
     on(matchMedia("(prefers-color-scheme: dark)"), "change", recolour);
+    on(window, "beforeprint", () => { this.colours = null; this.draw(); });
     this.changes = new MutationObserver(recolour);
     for (const one of [document.documentElement, document.body]) {
-      this.changes.observe(one, { attributes: true, attributeFilter: ["class", "style", "data-theme", "data-jp-theme-light"] });
+      this.changes.observe(one, { attributes: true, attributeFilter: ["class", "style", "data-theme", "data-print", "data-jp-theme-light"] });
     }
   }
 
@@ -345,9 +346,9 @@ export class Panel {
     element.replaceChildren();
     this.root = make(element, "div", { font: "13px/1.4 system-ui, -apple-system, 'Segoe UI', Roboto, Arial, sans-serif", position: "relative" },
       { role: "group", "aria-label": label });
-    const bar = make(this.root, "div", { display: "flex", flexWrap: "wrap", alignItems: "center", gap: "2px 10px", minHeight: "30px" });
+    const bar = make(this.root, "div", { display: "flex", flexWrap: "wrap", alignItems: "center", gap: "2px 10px", minHeight: this.options.compact ? "0" : "30px" });
     this.legend = make(bar, "div", { display: "flex", flexWrap: "wrap", gap: "0 10px", flex: "1 1 12rem" }, { role: "group", "aria-label": "Legend" });
-    const tools = make(bar, "div", { display: "flex", gap: "4px", marginLeft: "auto" });
+    const tools = make(bar, "div", { display: this.options.compact ? "none" : "flex", gap: "4px", marginLeft: "auto" });
     this.stage = make(this.root, "div", { position: "relative", height: `${height}px`, width: "100%" });
     this.canvas = make(this.stage, "canvas", { position: "absolute", inset: "0", width: "100%", height: "100%", touchAction: "pan-y", cursor: "crosshair" },
       { tabindex: "0", role: "img", "aria-label": label, "aria-describedby": id, ...(testid ? { "data-testid": testid } : {}) });

@@ -1,0 +1,1 @@
+"""A filter of several states whose density moves in an affine frame."""

@@ -1,0 +1,147 @@
+"""The motion of a density over an interval, by builds and convolutions in affine frames of its own.
+
+One interval of length tau with s substeps of length d = tau / s, from the density u at its start:
+
+    u_1(x) = u(phi(x)) |phi'(x)|,            phi = flow backwards by d / 2,          u_1 <- u_1 * N(0, Q)
+    u_j(x) = u_{j-1}(phi(x)) |phi'(x)|,      phi = flow backwards by d,              u_j <- u_j * N(0, Q),      j = 2 .. s
+    u(x)  = u_s(phi(x)) |phi'(x)| L(x) / Z,  phi = flow backwards by d / 2
+
+Q is the noise of the linearised system, carried to the middle of the substep, so that linear systems are exact; in general the
+error is of order d^2.  Noise after the flow is of first order, and noise in halves needs two builds.  The frame of u_j makes Q
+nearly diagonal, that of u is free.  The log weights of increments are integrated along the flows.
+
+The representation of a density (`numerics/trains/train.py`) offers: a build by cross interpolation, values at points, the
+convolution with a diagonal noise, moments and marginals, weighted points of its mass, and the mass at its edges.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from zakai.methods.frame.build import CLOUD, Builder, Unresolved
+from zakai.methods.frame.placement import Mass
+from zakai.methods.frame.state import Prepared
+from zakai.methods.particles.interval import Interval
+from zakai.methods.particles.programs import Array
+from zakai.numerics.trains.carried import Carried, Likelihood, Term
+from zakai.numerics.trains.train import Train
+
+STRETCHES = (1.0, 1.35, 1.8)  # of a box, while the mass of a motion differs from one
+DEFECT = 3.0  # tolerances of mass that a motion may lose or gain before its box is made wider
+LOST = 0.2  # mass that a chain of substeps may lose before it is divided
+MOST_SUBSTEPS = 128
+ROUNDING = 0.1  # share of the error of a cross interpolation that rounding after a convolution may add
+ALONE = 1e-9  # off-diagonal noise in a frame that needs no correction
+
+
+@dataclass
+class Prediction:
+    """A density before an observation, as a function; points of it; the logarithm of its mass, and the mass that was lost."""
+
+    function: Carried
+    mass: Mass
+    log_mass: float
+    defect: float
+
+
+@dataclass
+class Chain:
+    """The motion of a density over one interval."""
+
+    prepared: Prepared
+    interval: Interval
+    values: Array
+    builder: Builder
+
+    def _carried(self, u: Train, t0: float, t1: float) -> tuple[Carried, Mass]:
+        """Return a density after the flow from t0 to t1 as a function, and points of it."""
+        prepared, motion = self.prepared, self.prepared.motion
+        points, weights = u.cloud(CLOUD)
+        steps = motion.steps(self.interval, points, (t0, t1), self.values, 0.1 * prepared.rule.tolerance)
+        ends, logs = motion.ends(points, motion.path(self.interval, t0, t1, self.values, steps))
+        finite = np.isfinite(ends).all(axis=0) & np.isfinite(logs)
+        if not finite.all():
+            ends, logs, weights = ends[:, finite], logs[finite], weights[finite]
+        if not weights.sum() > 0:
+            raise Unresolved(f"no part of the density is finite after the drift from t = {t0:g} to {t1:g}")
+        mass, top = Mass(ends, weights / weights.sum()), 0.0
+        if prepared.system.weighted:
+            top = float(logs.max())
+            mass = mass.reweighted(logs)
+        back = motion.path(self.interval, t1, t0, self.values, steps)
+        term = Term(u, np.array([1.0, top]), motion.backward, back)
+        nothing = Likelihood(motion.coefficients.law, np.zeros(0), np.zeros(0), t1, 1.0, 0.0)
+        turn = np.full(len(points), np.nan)
+        return Carried((term,), motion.box, turn, nothing), mass
+
+    def _middle(self, u: Train, t0: float, t1: float, length: float) -> tuple[Train, float, float]:
+        """Return the density after the flow from t0 to t1 and the noise about t1, the logarithm of its mass, and the defect."""
+        prepared, builder = self.prepared, self.builder
+        function, mass = self._carried(u, t0, t1)
+        mass = mass.unwrapped(prepared.system.base.angles)
+        mean, P = mass.moments()
+        scale = np.maximum(np.sqrt(np.diag(P)), 1e-12)
+        Q = prepared.motion.noise(self.interval, self.values, t1, length, (mean, scale))
+        best: tuple[float, Train, Array] | None = None
+        for stretch in STRETCHES:
+            v, D = builder.build(function, mass, Q, stretch)
+            defect = abs(v.mass - 1.0)
+            if best is None or prepared.system.weighted or defect < best[0]:
+                best = defect, v, D
+            if prepared.system.weighted or defect < DEFECT * prepared.rule.tolerance:
+                break
+        assert best is not None
+        defect, v, D = best
+        total = v.mass
+        if not total > 0 or not math.isfinite(total):
+            raise Unresolved(f"a density has mass {total:.1g} after the motion to t = {t1:g}")
+        v = v.convolve(np.maximum(np.diag(D), 0.0), ROUNDING * prepared.options.tolerance)
+        log_mass = math.log(total) + float(function.terms[0].scale[1]) if prepared.system.weighted else 0.0
+        return corrected(v, D).scaled(1.0 / total), log_mass, 0.0 if prepared.system.weighted else defect
+
+    def predict(self, u: Train, count: int) -> Prediction:
+        """Return the prediction by so many substeps; Unresolved where the density is lost."""
+        start, stop = self.interval.start, self.interval.stop
+        if stop <= start:
+            return Prediction(*self._carried(u, start, stop), 0.0, 0.0)
+        length, at, log_mass, defect = (stop - start) / count, start, 0.0, 0.0
+        for j in range(count):
+            middle = start + (j + 0.5) * length
+            u, gained, lost = self._middle(u, at, middle, length)
+            log_mass, defect, at = log_mass + gained, defect + lost, middle
+        function, mass = self._carried(u, at, stop)
+        return Prediction(function, mass, log_mass, defect)
+
+    def first(self, u: Train, count: int) -> tuple[Prediction, int]:
+        """Return the prediction by the fewest substeps, `count` or more, that keep the mass, and their number."""
+        while True:
+            try:
+                found = self.predict(u, count)
+            except (Unresolved, np.linalg.LinAlgError):
+                if count >= MOST_SUBSTEPS:
+                    raise
+            else:
+                if found.defect < LOST or count >= MOST_SUBSTEPS:
+                    return found, count
+            count *= 2
+
+
+def corrected(v: Train, D: Array) -> Train:
+    """Return a density with its basis changed so that noise D (n, n), of which the diagonal was applied, has its covariance."""
+    if np.abs(D - np.diag(np.diag(D))).max() < ALONE:
+        return v
+    one = np.eye(len(D))
+    T = np.linalg.cholesky(one + D) / np.sqrt(1.0 + np.diag(D))
+    return v.in_basis(np.ascontiguousarray(v.grid.basis @ T))
+
+
+def extrapolated(finer: Prediction, coarser: Prediction) -> Carried:
+    """Return (4 v - u) / 3 for predictions by substeps d (u) and d / 2 (v), as a function with the mass of v."""
+    (one,), (other,) = finer.function.terms, coarser.function.terms
+    first = Term(one.density, np.array([4.0 / 3.0, one.scale[1]]), one.program, one.path)
+    divisor = one.scale[1] - (coarser.log_mass - finer.log_mass)
+    second = Term(other.density, np.array([-1.0 / 3.0, divisor]), other.program, other.path)
+    return Carried((first, second), finer.function.box, finer.function.turn, finer.function.likelihood)

@@ -1,0 +1,176 @@
+"""One step of the frame filter, and the prior with which it begins.
+
+Stable for other files: `State`, `Prepared` (state.py), `Builder.build` (build.py), `Chain.predict` (chain.py), `update`
+(update.py), and `Train` with `Carried` (numerics/trains).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from zakai.densities._density import wrap
+from zakai.methods._protocol import Info
+from zakai.methods.frame.build import CONTROLS, Builder, Unresolved, difference
+from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
+from zakai.methods.frame.placement import Mass
+from zakai.methods.frame.state import Control, Prepared, State
+from zakai.methods.frame.update import depth_of, update
+from zakai.methods.particles.programs import Array
+from zakai.methods.system.escape_of_states import check_escape
+from zakai.models.prior import DensityPrior
+from zakai.numerics.trains.train import Train, quasi_random
+
+PRIOR_POINTS = 1024
+AUDIT = 10  # intervals between comparisons of s and 2 s substeps, where the last one was within bounds
+ACCEPTED = 10.0  # tolerances of that difference: it is 3 to 20 times the error of what is extrapolated from both
+FIGURES = (
+    "tolerance_ratio", "rank", "mass_defect", "off_grid_error", "edge_mass", "tail_depth", "powers", "substeps", "time_error",
+    "effective_share",
+)  # fmt: skip
+
+
+def init(prepared: Prepared, prior: Any) -> State:
+    """Return the prior on a grid."""
+    model, system, theta = prepared.model, prepared.system, prepared.theta
+    builder = Builder(prepared)
+    density, mass = _density_prior(prepared, prior) if isinstance(prior, DensityPrior) else _mixture(prepared, prior)
+
+    def function(x: Array) -> Array:
+        values = density(x)
+        inside = ((x >= system.lower[:, None]) & (x <= system.upper[:, None])).all(axis=0)
+        return np.where(inside & np.isfinite(values), values, 0.0)
+
+    v, _ = builder.build(function, mass)
+    assert model.n == len(mass.points) and len(theta) == len(prepared.theta)
+    report = builder.reports[-1]
+    control = Control(0, 0.0, -AUDIT, report.off_grid, 0.0)
+    return State.of(v.scaled(1.0 / v.mass), control)
+
+
+def _mixture(prepared: Prepared, prior: Any) -> tuple[Callable[[Array], Array], Mass]:
+    """Return a Gaussian mixture as a function, and points of it."""
+    from scipy.special import ndtri
+
+    weights, means, covs = (np.asarray(part, float) for part in prior.components)
+    n, angles = prepared.model.n, prepared.system.base.angles
+    roots = []
+    for cov in covs:
+        # A direction without variance has the width of rounding.
+        scale = np.sqrt(np.maximum(np.diag(cov), 0.0))
+        scale = np.where(scale > 0, scale, 1e-6 * max(float(scale.max()), 1e-6))
+        unit = cov / np.outer(scale, scale)
+        np.fill_diagonal(unit, 1.0)
+        roots.append(scale[:, None] * np.linalg.cholesky(unit + 1e-10 * np.eye(n)))
+    inverses = [np.linalg.inv(root) for root in roots]
+    factors = [w / (abs(np.linalg.det(root)) * (2 * math.pi) ** (n / 2)) for w, root in zip(weights, roots, strict=True)]
+
+    def density(x: Array) -> Array:
+        total = np.zeros(x.shape[1])
+        for factor, mean, inverse in zip(factors, means, inverses, strict=True):
+            apart = x - mean[:, None]
+            if angles.any():
+                apart[angles] = wrap(apart[angles])
+            total += factor * np.exp(-0.5 * ((inverse @ apart) ** 2).sum(axis=0))
+        return total
+
+    count = max(64, PRIOR_POINTS // len(weights))
+    normal = ndtri(np.clip(quasi_random(count, n), 1e-9, 1 - 1e-9))
+    points = np.concatenate([mean[:, None] + root @ normal for mean, root in zip(means, roots, strict=True)], axis=1)
+    return density, Mass(points, np.repeat(weights / weights.sum() / count, count))
+
+
+def _density_prior(prepared: Prepared, prior: DensityPrior) -> tuple[Callable[[Array], Array], Mass]:
+    """Return a density that is given by a formula or on a grid as a function, and points of it."""
+    from zakai.methods.system.prior_moments import density_grid, prior_moments
+    from zakai.models.numeric import numpy_function
+
+    model, theta = prepared.model, prepared.theta
+    if model.n > 4:
+        prior_moments(model, prior, theta)  # which says what to do
+    grid = density_grid(model, prior, theta, 1e-9)
+    logs = grid.log_values.ravel()
+    top = float(logs.max())
+    log_density = numpy_function(prior.log_density, model)
+    weights = np.exp(logs - top)
+    keep = weights > 1e-12
+    mass = Mass(np.ascontiguousarray(grid.points.reshape(-1, model.n)[keep].T), weights[keep] / weights[keep].sum())
+    return lambda x: np.exp(np.asarray(log_density(x.T, model.start, theta)) - top), mass
+
+
+def direction_of(prepared: Prepared, u: Train) -> Array | None:
+    """Return the mean directions of angles (n,), NaN for other states; None where there is no angle."""
+    angles = prepared.system.base.angles
+    if not angles.any():
+        return None
+    found = np.full(len(angles), np.nan)
+    places = np.flatnonzero(angles)
+    resultant = u.characteristic(u.grid.basis[places]) * np.exp(1j * u.grid.centre[places])
+    found[places] = np.where(np.abs(resultant) > 1e-9, np.angle(resultant), 0.0)
+    return found
+
+
+def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
+    """Return the state after interval k of the schedule and what is observed at its stop, and what the step reports."""
+    u = state.train(prepared.system.periods)
+    check_escape(prepared, k, lambda: u.moments())
+    try:
+        return _step(prepared, k, state, values)
+    except (Unresolved, np.linalg.LinAlgError):
+        n = prepared.model.n
+        health = dict.fromkeys(FIGURES, math.nan)
+        return state, Info(math.nan, np.full(n, math.nan), np.full((n, n), math.nan), health)
+
+
+def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
+    interval, control, rule = prepared.interval(k), state.control, prepared.rule
+    builder = Builder(prepared)
+    chain = Chain(prepared, interval, values, builder)
+    length = interval.stop - interval.start
+    number = control.interval + 1
+    count = min(max(1, math.ceil(length * control.rate - 1e-9)), MOST_SUBSTEPS)
+    u = state.train(prepared.system.periods)
+    prediction, count = chain.first(u, count)
+    audited, time_error = control.audited, control.time_error
+    rate = control.rate
+    exact = prepared.system.base.affine and prepared.system.base.sampled and not prepared.system.base.driven
+    if length > 0 and not exact and (number - audited >= AUDIT or time_error > 0.5 * ACCEPTED * rule.tolerance):
+        prediction, count, time_error = _audited(chain, u, prediction, count)
+        audited, rate = number, 0.5 * count / length
+    updated = update(builder, prediction, prepared.motion.likelihood(interval, values))
+    v = updated.density
+    mean, cov = v.moments(direction_of(prepared, v))
+    depth = depth_of(prediction.function, prediction.mass, v)
+    reports = builder.reports
+    off_grid, edge = sum(report.off_grid for report in reports), max(report.edge for report in reports)
+    error = off_grid + prediction.defect + edge
+    health = {
+        "tolerance_ratio": error / (ACCEPTED * rule.tolerance),
+        "rank": float(max(report.rank for report in reports)),
+        "mass_defect": prediction.defect,
+        "off_grid_error": off_grid,
+        "edge_mass": edge,
+        "tail_depth": depth / math.log(1.0 / rule.tolerance),
+        "powers": float(updated.powers),
+        "substeps": float(count),
+        "time_error": time_error,
+        "effective_share": updated.effective,
+    }
+    moved = control._replace(interval=number, rate=rate, audited=audited, error=error, time_error=time_error)
+    return State.of(v, moved), Info(updated.log_evidence, mean, cov, health)
+
+
+def _audited(chain: Chain, u: Train, coarser: Prediction, count: int) -> tuple[Prediction, int, float]:
+    """Return the prediction extrapolated from s and 2 s substeps that agree, 2 s, and their difference in L1."""
+    tolerance = chain.prepared.rule.tolerance
+    while True:
+        finer, count = chain.first(u, 2 * count)
+        control = finer.mass.control(CONTROLS)
+        error = difference(coarser.function.scaled(coarser.log_mass - finer.log_mass), finer.function, control)
+        if error < ACCEPTED * tolerance or count >= MOST_SUBSTEPS:
+            both = extrapolated(finer, coarser)
+            return Prediction(both, finer.mass, finer.log_mass, finer.defect), count, error
+        coarser = finer

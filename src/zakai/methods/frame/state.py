@@ -1,0 +1,99 @@
+"""What the frame filter is prepared with, and what a step hands to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from zakai.methods.frame.motion import Motion, System
+from zakai.methods.frame.placement import Rule
+from zakai.methods.particles.interval import Interval
+from zakai.methods.particles.programs import Array
+from zakai.models.model import Model
+from zakai.numerics.trains.cross import Options
+from zakai.numerics.trains.grid import Grid
+from zakai.numerics.trains.train import Train
+from zakai.records.schedule import Schedule
+
+# The error of a mean is 1 to 3 times the relative error of the builds, with the control points that happened to be drawn
+# (bearings, turns, re-entry; rms over times and coordinates): the builds have half of the tolerance.
+SHARE = 0.5
+
+
+class Control(NamedTuple):
+    """What decides the next step beside the density.
+
+    `interval` counts intervals, `rate` is the number of substeps per unit time, `audited` the interval of the last comparison of
+    substeps; `error` is the estimate of the error of the mean in standard deviations, `time_error` that of the last comparison.
+    """
+
+    interval: int
+    rate: float
+    audited: int
+    error: float
+    time_error: float
+
+
+class State(NamedTuple):
+    """The density as a train of mass one: its `cores`, its grid, and the controls."""
+
+    cores: tuple[Array, ...]
+    centre: Array
+    basis: Array
+    low: Array
+    step: Array
+    closed: Array
+    control: Control
+
+    def train(self, periods: Array) -> Train:
+        """Return the density."""
+        sizes = np.array([core.shape[1] for core in self.cores])
+        return Train(Grid(self.centre, self.basis, self.low, self.step, sizes, self.closed), self.cores, periods)
+
+    @classmethod
+    def of(cls, train: Train, control: Control) -> State:
+        """Return the state of a density."""
+        grid = train.grid
+        return cls(train.cores, grid.centre, grid.basis, grid.low, grid.step, grid.closed, control)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A system with its parameters, a schedule and the options."""
+
+    system: System
+    theta: Array
+    schedule: Schedule
+    tolerance: float
+    most_rank: int
+    notes: tuple[str, ...] = ()
+
+    @property
+    def model(self) -> Model:
+        """The model."""
+        return self.system.base.model
+
+    @cached_property
+    def motion(self) -> Motion:
+        """The programs for these parameters."""
+        return Motion(self.system, self.theta)
+
+    @cached_property
+    def rule(self) -> Rule:
+        """The accuracy of a build."""
+        return Rule.of(SHARE * self.tolerance)
+
+    @cached_property
+    def options(self) -> Options:
+        """The accuracy of a cross interpolation: the errors of the cores add up."""
+        return Options(0.25 * SHARE * self.tolerance, self.most_rank)
+
+    def interval(self, k: int) -> Interval:
+        """Return an interval of the schedule."""
+        schedule = self.schedule
+        start, stop = float(schedule.starts[k]), float(schedule.stops[k])
+        inputs = None if schedule.inputs is None else schedule.inputs.part(start, stop)
+        return Interval(start, stop, schedule.seen[k], schedule.inside[k], schedule.elapsed[k], inputs)

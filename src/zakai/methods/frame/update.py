@@ -1,0 +1,111 @@
+"""Bayes' rule for a predicted density: one build in the frame of the product, by powers of a sharp or distant likelihood."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from zakai.methods.frame.build import CLOUD, Builder, Unresolved
+from zakai.methods.frame.chain import Prediction
+from zakai.methods.frame.placement import Mass
+from zakai.methods.particles.programs import Array
+from zakai.numerics.trains.carried import Carried, Likelihood
+from zakai.numerics.trains.train import Train
+
+FEW = 30.0  # effective points of the prediction that a likelihood must leave, or powers of it are taken
+MOST_POWERS = 8
+ROUGHLY = 0.01  # relative error that densities between powers of a likelihood need: they only show where the mass is
+OFF_CENTRE, NARROW, WIDE = 0.5, 0.6, 1.6  # shift and deviation of a density in its frame, from which it gets another frame
+
+
+class Updated(NamedTuple):
+    """A density of mass one, the log of the evidence, the share of the points that the likelihood left, and the powers taken."""
+
+    density: Train
+    log_evidence: float
+    effective: float
+    powers: int
+
+
+def update(builder: Builder, prediction: Prediction, likelihood: Likelihood) -> Updated:
+    """Return the density after an observation.
+
+    Every build is one of the prediction times a power of the likelihood, never of a product that was built before.
+    """
+    motion, mass = builder.prepared.motion, prediction.mass
+    if not likelihood.counted.any():
+        v, _ = builder.build(prediction.function, mass)
+        return _normalised(v, prediction, 0.0, 1.0, 0)
+    logs = motion.logs(likelihood, mass.points)
+    if not np.isfinite(logs).any():
+        raise Unresolved("the observation is impossible everywhere in the predicted density")
+    effective = mass.reweighted(logs).effective / mass.effective
+    done, powers = 0.0, 0
+    loose = max(1.0, ROUGHLY / builder.prepared.rule.tolerance)
+    while mass.reweighted((1.0 - done) * _finite(logs)).effective < FEW and powers < MOST_POWERS:
+        power = min(done + (1.0 - done) * _power(mass, (1.0 - done) * _finite(logs)), 1.0)
+        v, _ = _product(builder, prediction, mass.reweighted((power - done) * _finite(logs)), likelihood, power, loose)
+        mass = Mass(*v.cloud(CLOUD))
+        logs, done, powers = motion.logs(likelihood, mass.points), power, powers + 1
+        if not np.isfinite(logs).any():
+            raise Unresolved("the observation is impossible everywhere in the predicted density")
+    mass = mass.reweighted((1.0 - done) * _finite(logs))
+    v, top = _product(builder, prediction, mass, likelihood, 1.0, 1.0)
+    if _off_centre(v):
+        v, top = _product(builder, prediction, Mass(*v.cloud(CLOUD)), likelihood, 1.0, 1.0)
+    return _normalised(v, prediction, top, effective, powers)
+
+
+def _finite(logs: Array) -> Array:
+    """Return logarithms with a number where they are -inf: powers of zero are zero."""
+    return np.maximum(logs, np.max(logs) - 1e6)
+
+
+def _product(
+    builder: Builder, prediction: Prediction, mass: Mass, likelihood: Likelihood, power: float, loose: float
+) -> tuple[Train, float]:
+    """Return the prediction times a power of the likelihood over its largest value on the mass, and the log of that value."""
+    logs = builder.prepared.motion.logs(likelihood, mass.points)
+    top = power * float(np.max(logs[mass.weights > 1e-3 * mass.weights.max()]))
+    function = prediction.function.times(likelihood._replace(power=power, top=top))
+    v, _ = builder.build(function, mass, loose=loose)
+    return v, top
+
+
+def _normalised(v: Train, prediction: Prediction, top: float, effective: float, powers: int) -> Updated:
+    total = v.mass
+    if not total > 0 or not math.isfinite(total):
+        raise Unresolved(f"the density has mass {total:.1g} after the observation")
+    log_evidence = math.log(total) + top + prediction.log_mass + float(prediction.function.terms[0].scale[1])
+    return Updated(v.scaled(1.0 / total), log_evidence, effective, powers)
+
+
+def _off_centre(v: Train) -> bool:
+    """Return whether the moments of a density are far from those of its frame."""
+    grid = v.grid
+    mean, P = v.moments()
+    free = ~grid.closed
+    shift = np.linalg.solve(grid.basis, mean - grid.centre)
+    scale = np.sqrt(np.maximum(np.diag(np.linalg.solve(grid.basis, np.linalg.solve(grid.basis, P).T)), 0.0))
+    return bool((free & ((np.abs(shift) > OFF_CENTRE) | (scale < NARROW) | (scale > WIDE))).any())
+
+
+def _power(mass: Mass, logs: Array) -> float:
+    """Return the largest power of a likelihood that leaves enough effective points, or most of them."""
+    target = min(1.5 * FEW, 0.7 * mass.effective)
+    low, high = -12.0, 0.0  # of log10: powers may be very small at first
+    for _ in range(24):
+        middle = 0.5 * (low + high)
+        if mass.reweighted(10.0**middle * logs).effective > target:
+            low = middle
+        else:
+            high = middle
+    return float(10.0**low)
+
+
+def depth_of(u: Carried, mass: Mass, posterior: Train) -> float:
+    """Return log(max u / u at the posterior mean) of a prediction u of which points are known."""
+    values = u(np.concatenate([posterior.moments()[0][:, None], mass.points], axis=1))
+    return float(math.log(max(values[1:].max(), 1e-300)) - math.log(max(values[0], 1e-300)))

@@ -1,0 +1,113 @@
+"""The direct method for time-varying Yau systems, on a grid, in one to three states.
+
+Chen, Luo and Yau (2017), Theorems 1 to 3, corrected and freed of Assumption 2: for f = L x + l + G grad phi and a quadratic q the
+gauge u = e^phi v makes the Kolmogorov equation linear-quadratic, so that its kernel is Gaussian for any interval.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from zakai.algebra.theorems import limited_direct
+from zakai.errors import InputError
+from zakai.methods._options import one_of, tolerance_of
+from zakai.methods._protocol import Method
+from zakai.methods.grid.yau_yau import BOUNDS, LOST, in_space, on_line
+from zakai.methods.line import filter as line_filter
+from zakai.methods.line import tangents as line_tangents
+from zakai.methods.line.backward import BACKWARD as LINE
+from zakai.methods.line.model import in_pieces
+from zakai.methods.line.prepared import State
+from zakai.methods.line.yau import yau_line_of
+from zakai.methods.yau.system import power_series_of
+from zakai.models import features
+from zakai.models.model import Model
+from zakai.models.prior import GaussianPrior, MixturePrior
+from zakai.records.schedule import Schedule
+
+
+def prepare(
+    model: Model,
+    schedule: Schedule,
+    theta: np.ndarray,
+    *,
+    kernel: str = "flow",
+    splitting: str = "strang",
+    order: int | None = None,
+    tolerance: float | None = None,
+) -> Any:
+    """Return what is prepared for a schedule.
+
+    Args:
+        model: one to three states.
+        schedule: the intervals.
+        theta: parameters (p,).
+        kernel: how the Gaussian kernel of an interval is computed: "flow", the affine Hamiltonian flow, or "power-series",
+            Theorem 3, with intervals divided where the series does not converge.  The series has no inputs: increments of an
+            affine h act as those of a nonlinear h.
+        splitting: of increments with nonlinear h.  "strang", the default: with one state the equation with y linear between
+            observations is solved to the tolerance, with more the observation acts in two halves.  "lie" is the order of the
+            papers, the transition with -h'S^-1 h / 2 inside and then exp(h'S^-1 dy).
+        order: power of the length of an interval after which the series is cut, without dividing the interval; by default the
+            first that leaves a remainder below 1e-13.
+        tolerance: bound on the error of a step: of the mean in standard deviations and of the log-likelihood; by default 1e-7
+            for one state, with substeps for 1e-9.
+
+    Raises:
+        InputError: another word, a tolerance that is out of range, or an order that is no whole number from 1.
+        ConditionError: with the series, a singular G, or a coefficient that is not analytic in time.
+    """
+    one_of("kernel", kernel, ("flow", "power-series"))
+    one_of("splitting", splitting, ("strang", "lie"))
+    series = kernel == "power-series"
+    if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1 or not series):
+        raise InputError(f'option order: {order!r} must be a whole number from 1, and needs kernel="power-series"')
+    if model.n > 1:
+        from zakai.methods.space import direct as space_direct
+
+        options: dict[str, Any] = {"splitting": splitting, "tolerance": tolerance, "kernel": kernel, "order": order}
+        return space_direct.prepare(model, schedule, theta, **options)
+    prepared = line_filter.prepare(model, schedule, theta, tolerance_of(tolerance, 1e-9), in_pieces(model))
+    yau, lie = yau_line_of(model), splitting == "lie"
+    prior = model.prior
+    origin = float(prior.mean[0]) if isinstance(prior, GaussianPrior | MixturePrior) else 0.0
+    inside = prepared.inside & (prepared.inside.all(axis=1, keepdims=True) if lie else True)
+    power_series = power_series_of(model, order) if series else None
+    return replace(
+        prepared, promised=1e-7 if tolerance is None else prepared.tolerance, generous=256 if model.periodic else 128,
+        yau=yau, kernels=yau.kernels(schedule.starts, prepared.lengths, inside, theta, lie, origin, power_series),
+        lie=lie, origin=origin, series=power_series,
+    )  # fmt: skip
+
+
+def variant(model: Model, options: Mapping[str, Any]) -> Method[Any, Any]:
+    """Return the method for the model's number of states and its kinks."""
+    return on_line(METHOD, model) if model.n == 1 else in_space(METHOD, prepare)
+
+
+METHOD: Method[Any, Any] = Method(
+    name="limited-direct",
+    source="Chen, Luo and Yau 2017, Theorems 1-3, corrected; x-coordinate form",
+    exactness="exact between observations for every h in the class; increments with y linear between observations, with one "
+    "state to the tolerance, with more by a symmetric splitting where h is nonlinear",
+    theorem=limited_direct,
+    options={"kernel": "flow", "splitting": "strang", "order": None, "tolerance": None},
+    prepare=prepare,
+    init=line_filter.init,
+    step=line_filter.step,
+    density=line_filter.density,
+    state=State,
+    bounds=BOUNDS,
+    losses=LOST,
+    shorter="raise the option tolerance (command: --option tolerance=...)",
+    variant=variant,
+    valid=line_filter.valid,
+    handles=features.OF_OBSERVATION | {features.INPUTS, features.JUMPS, features.KINKS, features.SINC, features.TABLES},
+    segment=line_filter.segment,
+    tangents=line_tangents.tangents,
+    backward=LINE,
+)

@@ -1,0 +1,256 @@
+"""A message of one state over one interval, backward in time, where the compiled loop refuses it.
+
+A Gaussian kernel is a sum over a grid.  On the circle the transposed exponentials of the filter act, on the line a grid that
+moves (`line/gauged.py`) where the drift carries the density.  Else, where no coefficient depends on t and no increments act
+within, a grid covers the support of the message at the end of the interval, that of the density at its start, and the paths
+between them; psi is moved by its decomposition.  Else grids are fixed (`line/gauged.py`).  Other intervals are for finite
+volumes (`line/volumes.py`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from zakai.methods.line.coefficients import covariance_at, resolved_parts
+from zakai.methods.line.gauged import by_fixed_grids, by_moving_grid
+from zakai.methods.line.kernel import kernel_of
+from zakai.methods.line.message import FEWEST, Message, covering, gauged, points_of, reliable, taper
+from zakai.methods.line.prepared import Prepared, State, TimeInterval
+from zakai.methods.line.transition import MOST_SUBSTEPS, Report, Substep, parts_of_split, travel, trial_substep
+from zakai.methods.line.volumes import cell_plan_of, ends_of, pulled_back
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.backward import EXCURSION
+from zakai.numerics.line.density import support
+from zakai.numerics.line.window import local_polynomial
+
+Array = Any
+
+def by_exponentials(
+    prepared: Prepared, interval: TimeInterval, state: State, later: Message, accepted: float
+) -> tuple[Message, float] | None:
+    """Return the message at the start of an interval, and the error that the interval adds; None where this does not serve.
+
+    Args:
+        prepared: the system.
+        interval: the interval.
+        state: the filter's state at its start.
+        later: the message at its end.
+        accepted: the values relative to the maximum that do not count.
+    """
+    spacing = later.needed
+    for _ in range(MOST_GRIDS):
+        window = covering(later.window, 0.0, 0.0, min(spacing, state.spacing))
+        values = np.exp(later.at(window.offsets) - np.max(later.logs))
+        values, top, error = _transposed(prepared, values, window, interval)
+        check = lw.grid_check(values, True, accepted)
+        if check.aliasing <= accepted or window.size >= lw.LARGEST:
+            break
+        spacing = window.spacing / 1.5
+    else:
+        return None
+    density, least = reliable(state, window), ROUNDING * float(np.max(values))
+    error += 2.0 * check.aliasing + least * float(np.sum(density) / (density @ values))
+    needed = window.spacing * float(np.clip(check.resolving, 1.0, 2.0))
+    logs = np.log(np.maximum(values, least)) + top + float(np.max(later.logs))
+    return Message.of(logs, window, needed, later.error), error
+
+
+def _transposed(
+    prepared: Prepared, values: Array, window: lw.Window, interval: TimeInterval
+) -> tuple[Array, float, float]:
+    """Return a message at the start of an interval, of the sum one, the logarithm of the sum before, and the error."""
+    _, start, length, inside, rates = interval
+    total = float(np.sum(values))
+    values, top, error = values / total, float(np.log(total)), 0.0
+    stack, count = [(0.0, 0.5 * length), (0.5 * length, length)], 0
+    if prepared.system.varying:
+        stack, error = resolved_parts(prepared, values, window, interval)
+    while stack:
+        first, last = stack.pop()
+        trial = trial_substep(prepared, values, window, Substep(start + first, last - first, inside, rates), True)
+        count += 1
+        if trial.split and count + len(stack) < MOST_SUBSTEPS:
+            stack += parts_of_split(prepared, first, last, trial.error)
+            continue
+        total = float(np.sum(trial.values))
+        error += np.inf if trial.split else trial.error
+        top += trial.offset + float(np.log(total))
+        values = trial.values / total
+    return values, top, error
+
+
+ROUNDING = 1e-15  # of the maximum: smaller values of psi are not kept
+RESOLVED = 0.25  # spacing in standard deviations of the noise
+WIDTH = 0.8  # spacing in standard deviations of a Gaussian kernel at which sums are integrals
+MOST_POINTS = 4000  # of such sums
+MOST_GRIDS = 7  # of finer and finer spacing, for a decomposition
+SHARE = 1e-2  # of the tolerance that rounding in psi may leave
+
+
+def negligible(prepared: Prepared) -> float:
+    """Return the values relative to the maximum that do not count."""
+    return float(np.clip(1e-5 * prepared.tolerance, 1e-13, 1e-10))
+
+
+def smoothing_tolerance(prepared: Prepared) -> float:
+    """Return the error of an interval above which a smoother warns."""
+    return max(prepared.tolerance, 1e-6)
+
+
+def pulled(
+    prepared: Prepared, interval: TimeInterval, state: State, later: Message
+) -> tuple[Message, float]:
+    """Return the message at the start of an interval, and the error that the interval adds.
+
+    Args:
+        prepared: the system.
+        interval: the interval.
+        state: the filter's state at its start.
+        later: the message at its end.
+    """
+    own, accepted = state.window, negligible(prepared)
+    low, high = support(np.ascontiguousarray(state.values.real), 1e-13)
+    ends = float(own.offsets[low]), float(own.offsets[high])
+    result = _by_kernel(prepared, interval, ends, later)
+    if result is not None:
+        return result
+    if later.closed:
+        dense = by_exponentials(prepared, interval, state, later, accepted)
+        if dense is not None:
+            return dense
+    arguments, dense = (prepared, interval, state, later, accepted), None
+    if travel(prepared, np.asarray(state.values), own, interval.start, interval.length) > 0.0:
+        dense = by_moving_grid(*arguments)
+        if dense is not None and dense[1] <= smoothing_tolerance(prepared):
+            return dense
+    result = _by_modes(prepared, interval, state, ends, later) or by_fixed_grids(*arguments)
+    if result is not None:
+        return result
+    result = _by_volumes(prepared, interval, state, ends, later)
+    return dense if dense is not None and dense[1] < result[1] else result
+
+
+def _by_kernel(
+    prepared: Prepared, interval: TimeInterval, ends: tuple[float, float], later: Message
+) -> tuple[Message, float] | None:
+    """Return the same of an interval whose kernel is Gaussian, None where it is not or needs many points."""
+    if prepared.yau is None or later.closed:
+        return None
+    report, k = Report(), interval.k
+    kernel = kernel_of(prepared, interval, later.window, report)
+    if kernel is None or not kernel.variance > 0:
+        return None
+    deviation, (low, high) = float(np.sqrt(kernel.variance)), later.ends
+    if (high - low) > MOST_POINTS * WIDTH * deviation:
+        return None
+    spacing = min(max(later.needed, RESOLVED * deviation) / max(abs(kernel.scale), 1e-3), (ends[1] - ends[0]) / FEWEST)
+    fine = points_of(later.window, low, high, min(later.spacing, WIDTH * deviation))
+    new = points_of(later.window, *ends, spacing)
+    x, y, theta = fine.offsets, new.offsets, prepared.theta.real
+    after = later.at(x) + prepared.yau.potential(fine.points, float(prepared.schedule.stops[k]), theta)
+    logs = after - 0.5 * ((x - kernel.scale * y[:, None] - kernel.shift) / deviation) ** 2
+    top = np.max(logs, axis=1)
+    result = np.log(np.sum(np.exp(logs - top[:, None]), axis=1) * fine.spacing / (deviation * np.sqrt(2 * np.pi))) + top
+    result += kernel.constant + y * (kernel.slope + kernel.curvature * y)
+    result -= prepared.yau.potential(new.points, float(prepared.schedule.starts[k]), theta)
+    return Message.of(result, new, new.spacing, later.error), report.time
+
+
+def _by_modes(
+    prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], later: Message
+) -> tuple[Message, float] | None:
+    """Return the same by a decomposition, None where there is none or rounding in psi counts."""
+    if prepared.system.varying or prepared.system.rough or interval.inside.any():
+        return None
+    length, accepted = interval.length, max(negligible(prepared), 30.0 * prepared.negligible)
+    low, high = min(later.ends[0], ends[0]), max(later.ends[1], ends[1])
+    least, most = _noise(prepared, interval.k, state.origin + low, state.origin + high)
+    low, high = low - EXCURSION * most, high + EXCURSION * most  # paths from one support to the other leave both
+    spacing = max(later.needed, RESOLVED * least)
+    for trial in range(MOST_GRIDS):
+        window = covering(later.window, low, high, spacing)
+        if window.size > lw.LARGE:
+            return None
+        operator = gauged(prepared, window)
+        if operator is None:
+            return None
+        psi, top = _psi(later, window, operator.logs)
+        propagated, growth = operator.decayed(psi, length), max(1.0, float(np.exp(-length * operator.rates[0])))
+        highest = float(np.max(propagated))
+        if not 0.0 < highest < np.inf:
+            return None
+        error = 4e-16 * float(np.sqrt(np.sum(psi * psi))) * growth / highest
+        if not _exact(prepared, state, propagated, operator.logs, window, error):
+            return None
+        check = lw.grid_check(propagated, False, accepted)
+        coarse = check.aliasing > accepted and not (check.rough and check.aliasing < 1e-3 * prepared.tolerance)
+        if not coarse or window.size >= lw.LARGEST or (check.rough and trial > 1):
+            break
+        spacing = window.spacing / 1.5
+    made = error + 2.0 * check.aliasing + 10.0 * max(check.left, check.right)
+    if made > smoothing_tolerance(prepared):
+        return None
+    assert operator is not None
+    logs = np.log(np.maximum(propagated, ROUNDING * highest) / window.spacing) - operator.logs + top
+    needed = window.spacing * float(np.clip(check.resolving, 1.0, 2.0))
+    return Message.of(logs, window, needed, later.error).between(*ends), made
+
+
+def _psi(later: Message, window: lw.Window, gauge: Array) -> tuple[Array, float]:
+    """Return the values of psi on a grid times its spacing, divided by the exponential of the second number."""
+    finer = window.spacing > 1.01 * later.spacing
+    fine = covering(later.window, *later.ends, later.spacing) if finer else window
+    logs = later.falling(fine.offsets) + (local_polynomial(gauge, window, fine.offsets) if finer else gauge)
+    top = float(np.max(logs))
+    values = fine.spacing * np.exp(logs - top) * taper(fine.offsets, later.ends, fine.spacing)
+    # Integrals of psi with what the coarse grid resolves.
+    return lw.gathered(values, fine.offsets, window) if finer else values, top
+
+
+def _exact(prepared: Prepared, state: State, psi: Array, gauge: Array, window: lw.Window, error: float) -> bool:
+    """Return whether the error of psi, relative to its maximum, is small in the product with the density at the start."""
+    own, top = state.window, float(np.max(psi))
+    if own.spacing < window.spacing:  # of which the grid may have no point
+        density = reliable(state, own)
+        density, offsets = density[density > 0.0], own.offsets[density > 0.0]
+        log_gauge = local_polynomial(gauge, window, offsets)
+        log_psi = local_polynomial(np.log(np.maximum(psi, ROUNDING * top) / top), window, offsets)
+    else:
+        density = reliable(state, window)
+        inside = density > 0.0
+        density, log_gauge, log_psi = density[inside], gauge[inside], np.log(np.maximum(psi[inside], 0.0) / top)
+    logs, product = np.log(density) - log_gauge, np.log(density) - log_gauge + log_psi
+    shift = np.max(product)
+    allowed = SHARE * smoothing_tolerance(prepared)
+    return bool(max(error, ROUNDING) * np.sum(np.exp(logs - shift)) < allowed * np.sum(np.exp(product - shift)))
+
+
+def _by_volumes(
+    prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], later: Message
+) -> tuple[Message, float]:
+    """Return the same by finite volumes, of infinite error where they do not serve."""
+    values, window = np.asarray(state.values).real, state.window
+    mean, variance = later.moments
+    plan = cell_plan_of(prepared, values, window, ends_of(values, window), interval, (mean, variance**0.5))
+
+    def density(offsets: Array) -> Array:
+        return lw.density_at(values, window, offsets)
+
+    result = pulled_back(prepared, later.falling, density, plan, interval)
+    if result is None:
+        return later._replace(logs=np.full(len(later.logs), np.nan)), np.inf
+    least, _ = _noise(prepared, interval.k, *(state.origin + np.array(later.ends)))
+    needed = min(max(later.needed, 0.5 * RESOLVED * least), window.spacing)
+    new = points_of(window, *ends, needed)
+    values = result.at(new.offsets)
+    logs = np.log(np.maximum(values, ROUNDING * np.max(values))) + result.log_scale
+    return Message.of(logs, new, needed, later.error), result.error
+
+
+def _noise(prepared: Prepared, k: int, low: float, high: float) -> tuple[float, float]:
+    """Return the smallest and the largest standard deviation of the noise of an interval between two states."""
+    middle, length = 0.5 * (prepared.schedule.starts[k] + prepared.schedule.stops[k]), float(prepared.lengths[k])
+    covariance = covariance_at(prepared.system, np.linspace(low, high, 9), middle, prepared.theta.real) * np.ones(9)
+    return float(np.sqrt(max(np.min(covariance), 0.0) * length)), float(np.sqrt(np.max(covariance) * length))

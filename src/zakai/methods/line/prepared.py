@@ -1,0 +1,568 @@
+"""What one-state filters on a grid know without data: `Prepared`, what the compiled loop reads, and intervals cut into parts.
+
+An interval is cut where few nodes do not resolve the coefficients in time, or where noise makes a density far wider.  The
+observation is linear in time within an interval, so that each part has its share of an increment; a sample, or an increment that
+was gathered over more than the interval, belongs to the last part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.methods._protocol import Infos
+from zakai.methods.line.model import System, finite
+from zakai.methods.line.yau import Kernels, YauLine
+from zakai.methods.yau.kernel import PowerSeries
+from zakai.models.model import Model
+from zakai.models.prior import GaussianPrior
+from zakai.numerics.complex_step import log_determinant
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.averages import GAUSS_NODES, interpolation
+from zakai.numerics.line.density import support
+from zakai.numerics.line.gaussian_kernels import kernel_size, packed
+from zakai.numerics.line.steps import FACTOR, KERNEL, SPLIT, SPLIT_FACTOR, Limits, Mechanisms, Steps
+from zakai.numerics.line.window import CUT, Window
+from zakai.records.schedule import Schedule, lengths_of
+
+Array = Any
+
+NOISE = 3e-15  # error of a density relative to its maximum, which matters in its tails
+KERNEL_SHARE = 2e-2  # of the promised error that the splitting of one interval may leave in `limited-direct`
+SHARE = 5e-3  # of the tolerance that the splitting of one interval may leave
+SHARED = 128  # points of the largest grid on which many steps share a decomposition
+CACHE_BYTES = 96 * 2**20  # of tables and decompositions of grids, which are kept for a model
+
+
+@lru_cache(maxsize=8)
+def _grid_cache_of(model: Model, theta: bytes, kind: str, setting: Any) -> GridCache:
+    return GridCache()
+
+
+class Derived(Enum):
+    """What is derived of a model on a grid, and held in the cache."""
+
+    TABLES = "f, h and G at the points of a grid"
+    MODES = "the decomposition of the operator on a grid"
+    MESSAGE_MODES = "the decomposition of the operator of messages on a grid"
+    LOBATTO_MODES = "the decomposition of the operator on an element"
+    EXPONENTIAL = "the exponential of the operator on a grid, for one length"
+    COARSE_GRIDS = "grids and their modes as the compiled loop reads them"
+    PROFILE = "f, f' and G around an origin"
+    TERMS = "the terms of f and h in a table that is longer than a grid"
+    FINE = "an h with kinks at nodes between the points"
+    FINE_OF_GRID = "the same of one grid, and h at its centre"
+    HIDDEN_DRIFT = "the error of f between the points of a grid"
+    PRECISION = "the inverse of S for some coordinates"
+    SAMPLE_NOISE = "the inverse of S of a sample, and the constant of its density"
+    KINKS = "the states between two at which coefficients have kinks"
+
+
+class CacheKey(NamedTuple):
+    """The key of a derived quantity: which, and of what."""
+
+    quantity: Derived
+    at: Hashable
+
+
+class GridCache(dict[CacheKey, tuple[Any, int]]):
+    """Values and their bytes, in the order of their last use; `bytes` is about their sum, which threads may miscount."""
+
+    bytes = 0
+
+    def insert(self, key: CacheKey, value: Any) -> None:
+        """Store a value, and drop those that were used long ago where all are large."""
+        self[key] = value, (size := _bytes_of(value))
+        self.bytes += size
+        if self.bytes > CACHE_BYTES:
+            self.bytes = sum(size for _, size in list(self.values()))
+            while self.bytes > 0.75 * CACHE_BYTES and len(self) > 1:
+                try:
+                    self.bytes -= self.pop(next(iter(self)), (None, 0))[1]
+                except (StopIteration, RuntimeError):  # another thread was faster
+                    break
+
+
+class State(NamedTuple):
+    """The probabilities (N,) of the points of a grid, and an estimate of their relative error so far.
+
+    `log_floor` is the logarithm of the error of small values, relative to the largest.
+    """
+
+    values: np.ndarray
+    origin: float
+    centre: float
+    spacing: float
+    unit: float
+    closed: bool
+    error: float
+    log_floor: float
+
+    @property
+    def window(self) -> lw.Window:
+        """The grid."""
+        return lw.Window(
+            float(self.origin), float(self.centre), float(self.spacing), len(self.values), bool(self.closed), float(self.unit)
+        )
+
+
+class Coefficients(NamedTuple):
+    """What the compiled loop knows of the coefficients in time of K intervals: see `steps.Steps`.
+
+    `parts` (K,) are in how many parts of an interval the Gauss nodes would resolve them, 0 for never.
+    """
+
+    drifts: Array
+    outputs: Array
+    covariances: Array
+    precisions: Array
+    constants: Array
+    parts: Array
+
+
+class TimeInterval(NamedTuple):
+    """Interval k: when it begins, its length, and which increments (m,) act inside at which rates (m,)."""
+
+    k: int
+    start: float
+    length: float
+    inside: np.ndarray
+    rates: np.ndarray
+
+    def part(self, first: float, last: float) -> TimeInterval:
+        """Return the part between two times after the start."""
+        return self._replace(start=self.start + first, length=last - first)
+
+
+class Parts(NamedTuple):
+    """The parts of all intervals: those of interval k are first[k] to first[k + 1] of `prepared`."""
+
+    prepared: Prepared
+    first: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What is known without data.
+
+    `tolerance` is what substeps are chosen for, `promised` the error of a step above which a result warns; `negligible` the
+    spectrum that need not be resolved; `generous` the size of a grid that is retained though fewer points would do; `pieces`
+    whether densities are polynomials between ends and kinks; `grid_cache` holds what was computed for single grids; `shares` (K,)
+    are those of parts in the time of their intervals, and `cut_up` whether these are parts of one interval.
+    """
+
+    model: Model
+    schedule: Schedule
+    theta: np.ndarray
+    system: System
+    tolerance: float
+    lengths: np.ndarray
+    inside: np.ndarray
+    negligible: float
+    generous: int
+    promised: float
+    yau: YauLine | None = None
+    kernels: Kernels | None = None
+    lie: bool = False
+    origin: float = 0.0
+    series: PowerSeries | None = None
+    notes: tuple[str, ...] = ()
+    shares: np.ndarray | None = None
+    pieces: bool = False
+    cut_up: bool = False
+
+    @cached_property
+    def grid_cache(self) -> GridCache:
+        """What was computed for single grids, shared by all schedules of a model with these parameters and this method."""
+        setting = self.pieces, self.tolerance, self.yau is None, self.kernels is None, self.series is None, self.lie, self.origin
+        return _grid_cache_of(self.model, self.theta.tobytes(), self.theta.dtype.str, setting)
+
+    def interval(self, k: int, inside: np.ndarray, observed: np.ndarray) -> TimeInterval:
+        """Return interval k, of a length above zero, in which increments act `inside` (m,)."""
+        length = float(self.lengths[k])
+        rates = np.where(inside & (not self.lie), observed, 0.0) / length
+        return TimeInterval(k, float(self.schedule.starts[k]), length, inside, rates)
+
+    @cached_property
+    def real(self) -> Prepared:
+        """The same at the real part of the parameters, whose tables all directions of a gradient share."""
+        return replace(self, theta=self.theta.real.copy())
+
+    @cached_property
+    def divides(self) -> bool:
+        """Whether the compiled loop can split the transition into diffusion and a potential."""
+        system = self.system
+        smooth = not (system.state_dependent or system.general or system.rough) and system.slope is not None
+        return smooth and system.cross is None and not (self.model.periodic and not system.samples)
+
+    @cached_property
+    def gaussian(self) -> bool:
+        """Whether the compiled loop takes Gaussian kernels and splits, else the decomposition of the operator."""
+        if self.yau is not None:
+            return not self.model.periodic or (self.yau.flat and self.system.samples)
+        return self.divides and (self.system.moving or not self.system.samples)
+
+    @cached_property
+    def timed(self) -> bool:
+        """Whether coefficients vary within an interval that the compiled loop splits."""
+        system = self.system
+        affine = self.yau is not None and self.yau.affine and self.yau.unobserved and not system.samples
+        steady = not system.moving and system.steady_observation and (system.samples or system.steady_noise)
+        return self.gaussian and self.divides and not steady and not affine
+
+    @cached_property
+    def weak(self) -> bool:
+        """Whether the likelihoods of samples have kinks and act in the weak sense."""
+        system = self.system
+        kinked = system.samples and system.kinked_observation and system.steady_observation and not system.general
+        return kinked and not self.model.periodic and not np.iscomplexobj(self.theta)
+
+    @property
+    def smoothing(self) -> bool:
+        """Whether all kinks are those of likelihoods: a transition smooths them, and a finer grid has no more of them."""
+        return self.weak and not self.system.rough
+
+    @property
+    def kinked(self) -> bool:
+        """Whether densities have kinks."""
+        return self.weak or self.system.kinked_drift
+
+    @cached_property
+    def mixed(self) -> bool:
+        """Whether f or h are not known as sums of products of functions of t and of x."""
+        return self.timed and self.system.separated is None
+
+    @cached_property
+    def cut(self) -> float:
+        """The density relative to its maximum that a grid must hold."""
+        kernels = self.yau is not None and self.yau.unobserved and self.yau.steady_gauge
+        if not self.gaussian or not (self.divides or kernels) or self.lie or np.iscomplexobj(self.theta):
+            return lw.CUT
+        if self.model.periodic:
+            return 1e-280  # a grid around the circle holds every value
+        return 1e-32 if self.system.samples else lw.DEEP
+
+    @cached_property
+    def coefficients(self) -> Coefficients:
+        """The coefficients in time of all intervals."""
+        return coefficients_of(self)
+
+    @cached_property
+    def parts(self) -> Parts | None:
+        """The parts of intervals in which the Gauss nodes do not resolve the coefficients, None where they do in all."""
+        return parts_of(self)
+
+    @property
+    def largest(self) -> int:
+        """The points of the largest grid of the compiled loop, and of any grid where a larger one does not help."""
+        return lw.LARGE if self.gaussian else lw.LARGEST
+
+    def largest_for(self, check: lw.GridCheck | None = None, size: int = 0) -> int:
+        """Return the points of the largest grid for a density with some figures on a grid of some size.
+
+        The spectrum of kinks and that of noise fall slowly on every grid, what the largest grid of all does not resolve none
+        does, and noise that grows with the state, and potentials within intervals, are too fast for a large one.
+        """
+        noisy, system = False, self.system
+        if check is not None and check.aliasing > self.negligible:
+            noisy = check.rough if check.aliasing < lw.GROSS else size >= lw.SIZES[-1]
+        slow = noisy or system.kinked_drift or not system.smooth_observation or system.state_dependent or not system.samples
+        return self.largest if slow else lw.SIZES[-1]
+
+    @cached_property
+    def kinds(self) -> np.ndarray:
+        """How the compiled loop takes each interval (K,): FACTOR, SPLIT or KERNEL; -1 where it does not."""
+        return kinds_of(self)
+
+    @cached_property
+    def steps(self) -> Steps:
+        """What the compiled loop reads of all intervals."""
+        return steps_of(self)
+
+    @cached_property
+    def limits(self) -> Array:
+        """What a step of the compiled loop must keep, as the fields of `steps.Limits`."""
+        splitting = SHARE * self.tolerance if self.yau is None else KERNEL_SHARE * self.promised
+        generous = lw.LARGE if self.timed and self.model.periodic else self.generous
+        finest = 512.0 if self.system.samples else 256.0
+        return np.array(Limits(self.negligible, self.promised, splitting, self.cut, generous, finest), float)
+
+    @cached_property
+    def mechanisms(self) -> Mechanisms:
+        """What the compiled loop needs for this model."""
+        system, yau, closed = self.system, self.yau, bool(self.model.periodic)
+        whole = yau is not None and yau.unobserved and yau.steady_gauge and self.kernels is not None
+        always = whole and yau is not None and (not system.moving if system.samples else yau.affine)
+        return Mechanisms(whole, self.divides and not always, system.samples, self.weak, closed)
+
+    @cached_property
+    def fast(self) -> list[bool]:
+        """Which intervals (K,) the compiled loop may take."""
+        result: list[bool] = (self.kinds >= 0).tolist()
+        return result
+
+    def deepest(self, floor: float) -> float:
+        """Return the depth of the tails, as a logarithm below the maximum, to which a density with this floor is accurate."""
+        return max(float(np.log(self.promised) - np.log(max(floor, 1e-300))), 2.3)
+
+    def once(self, quantity: Derived, at: Hashable, make: Callable[[], Any]) -> Any:
+        """Return the derived quantity of a grid, or of what else it is `at`, by `make` where the cache does not hold it.
+
+        A value depends on its key alone.
+        """
+        key = CacheKey(quantity, at)
+        result = self.grid_cache.pop(key, None)
+        if result is None:
+            value = make()
+            self.grid_cache.insert(key, value)
+            return value
+        self.grid_cache[key] = result  # the last one that was used is the last one to go
+        return result[0]
+
+
+def _bytes_of(value: Any) -> int:
+    """Return the bytes of the arrays in a value and in the attributes of its objects."""
+    if isinstance(value, tuple | list):
+        return sum(map(_bytes_of, value))
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    return 64 + sum(map(_bytes_of, getattr(value, "__dict__", {}).values()))
+
+
+RESOLVED = 1e-8  # relative error of the interpolants of coefficients in time
+MOST_PARTS = 16  # in which an interval is cut at a time
+PROBES = np.linspace(0.0, 1.0, 129)  # parts of an interval at which coefficients are compared with their interpolants
+
+
+
+def coefficients_of(prepared: Prepared) -> Coefficients:
+    """Return what the loop needs of the coefficients in time of all intervals."""
+    schedule, system, theta = prepared.schedule, prepared.system, prepared.theta
+    count, seen, m = len(schedule), schedule.seen, system.m
+    starts, lengths, stops = schedule.starts[:, None], prepared.lengths[:, None], schedule.stops[:, None]
+    if prepared.timed:
+        nodes = np.clip(starts + lengths * GAUSS_NODES, starts, np.nextafter(stops, starts))
+        t = np.concatenate([nodes, stops, probed(starts, stops)], axis=1)
+    else:
+        t = np.concatenate([np.full((count, 1), prepared.model.start), stops], axis=1)
+    size = len(GAUSS_NODES) if prepared.timed else 1
+    own, probes, ends = slice(size), slice(size + 1, None), slice(size, size + 1) if system.samples else slice(size)
+    if not system.samples and system.steady_observation and system.steady_noise:
+        ends = slice(1)
+
+    def everywhere(function: Callable[..., np.ndarray], steady: bool) -> np.ndarray:
+        """Return a function of time alone at all times."""
+        result = function(_X, t[:1, :1] if steady else t, theta)
+        return np.broadcast_to(result, (*t.shape, *result.shape[2:]))
+
+    def precision(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if system.general:  # the loop takes only intervals without observations
+            return np.zeros((*noise.shape[:2], m, m)), np.zeros(count)
+        both = (seen[:, :, None] & seen[:, None])[:, None]
+        block = np.where(both, noise, 0.0) + np.eye(m) * ~seen[:, None, :, None]
+        constant = np.zeros(count)
+        if system.samples:
+            constant = -0.5 * (log_determinant(block[:, 0]) + np.log(2 * np.pi) * seen.sum(axis=1))
+        return np.where(both, np.linalg.inv(block), 0.0), constant
+
+    if prepared.mixed:  # the terms of the table are those at the nodes and at the end
+        factors = np.broadcast_to(np.eye(size + 1), (count, size + 1, size + 1))
+    else:
+        assert system.separated is not None
+        factors = everywhere(system.separated[0], False)
+    G = everywhere(system.covariance, system.steady_covariance)[..., 0, 0] if prepared.divides else np.zeros(t.shape)
+    noise = everywhere(system.noise, system.steady_noise)
+    precisions, constants = precision(noise[:, ends])
+    parts = np.ones(count, int)
+    if prepared.timed and count:
+        terms = _mixed_terms(prepared, t) if prepared.mixed else factors
+        parts = parts_needed(terms[:, probes], terms[:, own])
+        if not system.steady_covariance:
+            parts = np.maximum(parts, parts_needed(G[:, probes, None], G[:, own, None]))
+        if not (system.samples or system.steady_noise):
+            parts = np.maximum(parts, parts_needed(precision(noise[:, probes])[0], precisions))
+    drifts, outputs, covariances = (np.array(part, order="C") for part in (factors[:, own], factors[:, ends], G[:, own]))
+    return Coefficients(drifts, outputs, covariances, precisions, constants, parts)
+
+
+_X = np.zeros((1, 1, 1))
+
+
+def _mixed_terms(prepared: Prepared, t: np.ndarray) -> np.ndarray:
+    """Return f, and h of increments, at times (K, T) and points where the state may be (K, T, C)."""
+    system, prior = prepared.system, prepared.model.prior
+    points = np.linspace(-np.pi, np.pi, 9)
+    if isinstance(prior, GaussianPrior) and not prepared.model.domain and not prepared.model.periodic:
+        points = float(prior.mean[0]) + np.linspace(-5.0, 5.0, 9) * float(np.sqrt(prior.cov[0, 0]))
+    terms = system.drift(points[:, None], t[..., None], prepared.theta)
+    if not system.samples:
+        terms = np.concatenate([terms, system.observation(points[:, None], t[..., None], prepared.theta)], axis=-1)
+    return np.asarray(finite(terms).reshape(*t.shape, -1))
+
+
+def probed(starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
+    """Return times (K, P) at which coefficients are compared with their interpolants, of which the last are before the ends."""
+    return np.asarray(np.clip(starts + (stops - starts) * PROBES, starts, np.nextafter(stops, starts)))
+
+
+def parts_needed(exact: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Return in how many parts (K,) interpolants of values at nodes (K, Q, ...) agree with probes (K, P, ...), 0 for never."""
+    exact, nodes = exact.reshape(*exact.shape[:2], -1), nodes.reshape(*nodes.shape[:2], -1)
+    scale = np.maximum(np.abs(exact).max(axis=1), 1e-300)
+    rest = np.abs(_TO_PROBES @ nodes - exact).max(axis=1) / scale
+    excess = rest.max(axis=1) / RESOLVED
+    more = np.ceil(1.1 * np.nan_to_num(excess) ** (1.0 / len(GAUSS_NODES)))
+    return np.where(excess <= 1.0, 1, np.where(np.isfinite(excess), np.clip(more, 2, MOST_PARTS), 0)).astype(int)
+
+
+_TO_PROBES = interpolation(PROBES)
+
+
+def kinds_of(prepared: Prepared) -> np.ndarray:
+    """Return how the compiled loop of `line/loop.py` takes each interval (K,), -1 where it does not."""
+    system, schedule, yau, kernels = prepared.system, prepared.schedule, prepared.yau, prepared.kernels
+    positive = prepared.lengths > 0
+    none = np.full(len(schedule), -1)
+    if not len(schedule) or np.iscomplexobj(prepared.theta) or prepared.lie or (prepared.model.periodic and not system.samples):
+        return none
+    silent = ~schedule.seen.any(axis=1)
+    regular = positive & np.all(schedule.seen == prepared.inside, axis=1)
+    if not prepared.gaussian:
+        usable = system.samples and not system.moving and system.separated is not None
+        return np.where(positive, FACTOR, -1) if usable else none
+    if system.separated is None and not prepared.mixed:
+        return none
+    whole = np.zeros(len(schedule), bool)
+    if kernels is not None and yau is not None and yau.unobserved and yau.steady_gauge:
+        whole = positive & (kernels.place >= 0) & (kernels.errors[kernels.place] == 0)
+    split = positive & prepared.divides & (prepared.coefficients.parts == 1)
+    if system.samples:
+        whole = whole & (silent | (not system.general))
+        return np.where(whole, FACTOR, np.where(split, SPLIT_FACTOR, -1))
+    inside = np.where(whole, KERNEL, -1) if yau is not None and yau.affine else np.where(split, SPLIT, -1)
+    return np.where(silent, np.where(whole, FACTOR, inside), np.where(regular, inside, -1))
+
+
+def steps_of(prepared: Prepared) -> Steps:
+    """Return what the compiled loop reads of all intervals."""
+    kinds, kernels, c = prepared.kinds, prepared.kernels, prepared.coefficients
+    inputs = 1 + prepared.system.m
+    parameters = np.full((len(kinds), kernel_size(inputs)), np.nan)
+    here = np.flatnonzero((kinds == KERNEL) | (kinds == FACTOR))
+    if prepared.gaussian and kernels is not None and len(here):
+        parameters[here] = packed(kernels.transitions, kernels.place[here])
+    precisions = np.where((kinds == KERNEL)[:, None, None, None], 0.0, c.precisions)
+    lengths = np.ascontiguousarray(prepared.lengths)
+    shares = np.ones(len(kinds)) if prepared.shares is None else prepared.shares
+    return Steps(kinds, lengths, shares, precisions, c.constants, parameters, c.drifts, c.outputs, c.covariances)
+
+
+WIDER = 2.0  # ranges of a density by which the noise of a part moves its ends
+REACH = 8.6  # standard deviations to the end of a density
+ROUNDS = 2  # of cutting, after which what is not resolved is left to adaptive substeps
+SUMS = ("time_error", "tolerance_ratio")  # figures of parts that add up
+
+Segment = Callable[[Prepared, slice, State, np.ndarray], tuple[Sequence[State], Infos]]
+
+
+def cut(parts: Parts, rows: slice, observed: np.ndarray) -> tuple[slice, np.ndarray, np.ndarray]:
+    """Return the parts of some intervals, what is observed in them, and which ones are the last of their intervals."""
+    prepared, first = parts.prepared, parts.first[rows.start : rows.stop + 1]
+    assert prepared.shares is not None
+    inner = slice(int(first[0]), int(first[-1]))
+    own = np.where(prepared.inside[inner], prepared.shares[inner, None], 1.0)
+    values = np.repeat(observed, np.diff(first), axis=0) * own
+    return inner, np.where(prepared.schedule.seen[inner], values, 0.0), first[1:] - first[0] - 1
+
+
+def segment_of_parts(
+    parts: Parts, rows: slice, state: State, observed: np.ndarray, run: Segment
+) -> tuple[list[State], Infos]:
+    """Return the states after the intervals of a slice, and their reports, by `run` for the parts."""
+    inner, values, last = cut(parts, rows, observed)
+    states, infos = run(parts.prepared, inner, state, values)
+    begin = np.append(0, last[:-1] + 1)
+    health = {
+        name: figures[last] if name in ("error_estimate", "std_in_spacings")
+        else (np.add if name in SUMS else np.fmax).reduceat(figures, begin)
+        for name, figures in infos.health.items()
+    }  # fmt: skip
+    gained = np.add.reduceat(infos.log_likelihood_increment, begin)
+    return [states[i] for i in last], Infos(gained, infos.mean[last], infos.cov[last], health)
+
+
+def parts_of(prepared: Prepared) -> Parts | None:
+    """Return the parts of the intervals of a schedule, None where no interval needs any."""
+    if not prepared.timed or prepared.kernels is not None or np.iscomplexobj(prepared.theta):
+        return None
+    result, owner = prepared, np.arange(len(prepared.schedule))
+    for _ in range(ROUNDS):
+        schedule = result.schedule
+        needed = np.where(result.lengths > 0, result.coefficients.parts, 1)
+        if not (needed > 1).any():
+            break
+        bounds = [_bounds(result, k, n) if n > 1 else [schedule.starts[k]] for k, n in enumerate(needed)]
+        counts = np.array([len(bound) for bound in bounds])
+        starts = np.concatenate(bounds)
+        stops = np.append(starts[1:], schedule.stops[-1])
+        ends = np.cumsum(counts) - 1
+        stops[ends] = schedule.stops
+        parent = np.repeat(np.arange(len(schedule)), counts)
+        last = np.zeros(len(starts), bool)
+        last[ends] = True
+        whole, inside = lengths_of(starts, stops)[:, None], result.inside[parent]
+        seen = schedule.seen[parent] & (inside | last[:, None])
+        elapsed = np.where(inside, whole, np.where(seen, schedule.elapsed[parent], 0.0))
+        schedule = Schedule(starts, stops, seen, elapsed, schedule.inputs)
+        result = replace(result, schedule=schedule, lengths=schedule.lengths, inside=schedule.inside)
+        owner = owner[parent]
+    if result is prepared:
+        return None
+    first = np.searchsorted(owner, np.arange(len(prepared.schedule) + 1))
+    shares = np.where(result.lengths < prepared.lengths[owner], result.lengths / prepared.lengths[owner], 1.0)
+    return Parts(replace(result, shares=shares), first)
+
+
+def parts_of_step(prepared: Prepared, k: int, values: np.ndarray, window: Window) -> Parts | None:
+    """Return the parts of interval k over which a density grows by a few times each, and its sample; None where it needs none.
+
+    Args:
+        prepared: a system whose transitions the compiled loop splits.
+        k: an interval without increments inside.
+        values, window: the density before it, and its grid.
+    """
+    start, stop, length = (float(part[k]) for part in (prepared.schedule.starts, prepared.schedule.stops, prepared.lengths))
+    split = prepared.gaussian and prepared.divides and prepared.kernels is None and length > 0
+    if prepared.cut_up or not split or window.closed or prepared.inside[k].any():
+        return None
+    if np.iscomplexobj(values) or np.iscomplexobj(prepared.theta):
+        return None
+    t = np.linspace(start, stop, 9)
+    most = float(np.max(prepared.system.covariance(np.zeros((9, 1)), t, prepared.theta)[..., 0, 0]))
+    first, last = support(np.ascontiguousarray(values), CUT)
+    width, bounds = max(last - first, 1) * window.spacing, [start]
+    while not most * (stop - bounds[-1]) <= (WIDER * width / REACH) ** 2:
+        bounds.append(bounds[-1] + (WIDER * width / REACH) ** 2 / most)
+        width *= 1.0 + 2.0 * WIDER
+    count, schedule = len(bounds) + 1, prepared.schedule
+    if count == 2 and not schedule.seen[k].any():
+        return None
+    seen = np.zeros((count, prepared.system.m), bool)
+    seen[-1] = schedule.seen[k]
+    starts, stops = np.array([*bounds, stop]), np.array([*bounds[1:], stop, stop])
+    result = Schedule(starts, stops, seen, np.where(seen, schedule.elapsed[k], 0.0), schedule.inputs)
+    shares = np.append(result.lengths[:-1] / length, 1.0)
+    own = replace(prepared, schedule=result, lengths=result.lengths, inside=result.inside, shares=shares, cut_up=True)
+    return Parts(own, np.array([0, count]))
+
+
+def _bounds(prepared: Prepared, k: int, count: int) -> list[Any]:
+    """Return where the parts of an interval begin: where inputs have a jump or a kink, else in equal steps."""
+    start, stop = float(prepared.schedule.starts[k]), float(prepared.schedule.stops[k])
+    pieces = [first for first, _ in prepared.system.pieces(start, stop)]
+    return pieces if len(pieces) > 1 else list(start + (stop - start) / count * np.arange(count))

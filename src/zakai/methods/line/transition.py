@@ -1,0 +1,489 @@
+"""The density of one state after an interval: by modes, by an exponential of the operator, or by Magnus' series in substeps.
+
+    u_t = (G u)'' / 2 - (f u)' + (h'S^-1 dy/dt - h'S^-1 h / 2) u
+
+Where the drift carries a density far within an interval, as of growth and of motion with little noise, its grid moves with it.
+In x = z + v (t - t0) the equation is the same with the drift f(z + v (t - t0), t) - v, which is small near the density where v
+is its speed.  The speed is a whole number of spacings in a substep, so that a density ends on the points of a grid;
+coefficients depend on time then, whether those of the system do or not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.methods.line.coarse import coarsened
+from zakai.methods.line.coefficients import (
+    EDGE,
+    GROWTH,
+    coefficients,
+    covariance_at,
+    offset_of,
+    on_grid_for_drift,
+    potential_of,
+    precision_of,
+    resolved_parts,
+    spectral,
+    tables,
+)
+from zakai.methods.line.domain import ALLOWED, lost
+from zakai.methods.line.model import finite
+from zakai.methods.line.prepared import NOISE, Derived, Prepared, TimeInterval
+from zakai.methods.line.update import refitted
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.averages import GAUSS_NODES, GAUSS_WEIGHTS
+from zakai.numerics.line.grid_choice import REACH
+from zakai.numerics.line.operator import FourierOperator, exponential_of
+from zakai.numerics.line.product import finer
+
+Array = Any
+
+CONTRACTED = -2.0  # f' times the length of an interval, below which other grids hold a density that becomes much sharper
+MOVING = 0.3  # ranges of a density that it moves in an interval without modes, above which grids move with it
+
+
+def travel(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
+    """Return by how many of its ranges the drift moves a density in an interval, zero where grids do not move with it.
+
+    They do not where noise moves the state as far, or the density becomes much sharper.
+    """
+    system = prepared.system
+    if window.closed or prepared.kinked or system.kinks is not None or system.cross is not None or system.reflecting:
+        return 0.0
+    check, (carried, growth) = lw.grid_check(values, False), displaced(prepared, values, window, start, length)
+    G = covariance_at(system, window.points[[check.first, check.last]], start, prepared.theta.real)
+    noise = float(np.sqrt(np.max(G.real) * length))
+    if growth < CONTRACTED or abs(carried) < noise:
+        return 0.0
+    return abs(carried) / (window.spacing * (check.last - check.first + 1) + 2.0 * REACH * noise)
+
+
+def speed_of(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> float:
+    """Return the speed with which a grid follows a density in a substep: a whole number of its spacings in that time."""
+    carried, _ = displaced(prepared, values, window, start, length)
+    return window.spacing * float(np.round(carried / window.spacing)) / length
+
+
+def displaced(prepared: Prepared, values: Array, window: lw.Window, start: float, length: float) -> tuple[float, float]:
+    """Return about how far the drift carries the mean of a density, by its linearisation there, and f' times the length."""
+    mean, variance = lw.moments(values, window)
+    x = window.origin + float(mean.real) + float(np.sqrt(variance.real)) * np.array([0.0, -0.1, 0.1])
+    here, below, above = finite(prepared.system.drift(x[:, None], start, prepared.theta.real)[:, 0]).tolist()
+    growth = length * (above - below) / (x[2] - x[1])
+    result = length * here * (np.expm1(min(growth, 3.0)) / growth if abs(growth) > 1e-8 else 1.0)
+    return (float(result), float(growth)) if np.isfinite(result) else (0.0, 0.0)
+
+
+Coefficients = tuple[Array, Array, Array, Array]  # f (T, N), G (T,) or (T, N), V (T, N) and a constant (T,)
+
+PARTS = (1, 4, 16)  # of a substep with six nodes each, where the grid moves
+SMOOTHED = 100.0  # decay of the shortest wave of a large grid, as a logarithm, after which a coarser grid serves
+MAGNUS = 0.02  # of the tolerance that one substep of Magnus' series may leave
+
+
+class Substep(NamedTuple):
+    """A part of an interval: when it begins, its length, and which increments act inside at which rates.
+
+    `speed` is that of the grid.  The coefficients in time have six nodes in each of so many `parts`.
+    """
+
+    start: float
+    length: float
+    inside: np.ndarray
+    rates: np.ndarray
+    speed: float = 0.0
+    parts: int = 1
+
+
+class Trial(NamedTuple):
+    """The density after a substep, times exp(-offset); its error; whether a shorter substep is needed.
+
+    `substep` tells how exponentials of the operator gave it, None where its decomposition did; the potential multiplies what is
+    not density by up to exp(lift).
+    """
+
+    values: Array
+    offset: Any
+    error: float
+    split: bool
+    substep: Substep | None = None
+    lift: float = 0.0
+
+
+class Exponents(NamedTuple):
+    """The generators whose exponentials act in turn, each by its G, f and V, less an `offset` and a `constant` of V."""
+
+    generators: list[tuple[Any, Array, Array | None]]
+    offset: float
+    constant: Any
+    lift: float  # nats by which V is larger where there is no mass, infinite where G is negative
+
+
+def trial_substep(prepared: Prepared, values: Array, window: lw.Window, substep: Substep, adjoint: bool = False) -> Trial:
+    """Return the density after a substep; the `adjoint` of the transition takes a message from its end to its start."""
+    inside, moving = substep.inside, bool(substep.speed)
+    if prepared.system.varying or moving:
+        return magnus(prepared, values, window, substep, _at_points(prepared, values, window, substep), adjoint, moving)
+    modes = None if adjoint or inside.any() else by_modes(prepared, values, window, substep.length)
+    if modes is not None:
+        return Trial(modes[0], 0.0, modes[1], False)
+    exponents = exponents_of(prepared, values, window, substep)
+    return _acted(prepared, values, window, substep, exponents, adjoint, not inside.any())
+
+
+def parts_of_split(prepared: Prepared, first: float, last: float, error: float) -> list[tuple[float, float]]:
+    """Return the parts of a substep whose error by Magnus' series, which falls as the fifth power of the length, is too large."""
+    count = int(np.clip(np.ceil(1.1 * (error / (MAGNUS * prepared.tolerance)) ** 0.2), 2, 16))
+    cuts = first + (last - first) * np.arange(1, count) / count
+    return list(zip([first, *cuts], [*cuts, last], strict=True))
+
+
+def exponents_of(prepared: Prepared, values: Array, window: lw.Window, substep: Substep) -> Exponents:
+    """Return the generators of a substep: one where no coefficient depends on t, else those of Magnus' integrator."""
+    if prepared.system.varying or substep.speed:
+        averages = _averaged(substep, _at_points(prepared, values, window, substep))
+        return _of_magnus(prepared, values, averages, bool(substep.speed))
+    known, length = tables(prepared, window), substep.length
+    if not substep.inside.any():
+        return Exponents([(length * known.covariance, length * known.drift, None)], 0.0, 0.0, 0.0)
+    precision = precision_of(prepared, substep.start, substep.inside)
+    potential, constant = potential_of(known.observation, precision, substep.rates, values)
+    potential = length * potential
+    offset, lift = offset_of(potential, values)
+    generator = length * known.covariance, length * known.drift, potential - offset
+    return Exponents([generator], offset, length * constant, lift)
+
+
+def _acted(
+    prepared: Prepared, values: Array, window: lw.Window, substep: Substep, exponents: Exponents, adjoint: bool, keeps: bool
+) -> Trial:
+    """Return a density after the exponentials, or a message after their transposes in reverse order; `keeps` the exponential."""
+    if exponents.lift > GROWTH:
+        return Trial(values, 0.0, 0.0, True)
+    matrices, result, error = [window.generator(*one) for one in exponents.generators], values, 0.0
+    if any(isinstance(one, FourierOperator) and one.decay > SMOOTHED for one in matrices):
+        return Trial(values, 0.0, 0.0, True)
+    if adjoint:
+        matrices = [one.T for one in matrices[::-1]]
+    if len(matrices) == 2:
+        # The part of third order that two exponentials contain; they omit one of fifth order, with a factor that was measured.
+        difference = window.generator(*(late - early for early, late in zip(*exponents.generators, strict=True)))
+        (first, _), difference, now = matrices, difference.T if adjoint else difference, values.real
+        commutator = 0.5 * (first @ (difference @ now) - difference @ (first @ now)).real
+        error = 5.0 * float(np.sum(np.abs(commutator))) ** (5.0 / 3.0)
+        if error > MAGNUS * prepared.tolerance:
+            return Trial(values, 0.0, error, True)
+    for matrix in matrices:
+        key = window, substep.length, adjoint
+        transition = prepared.once(Derived.EXPONENTIAL, key, partial(exponential_of, matrix)) if keeps else exponential_of(matrix)
+        result, rounding = transition(result)
+        error += rounding
+    return Trial(result, exponents.offset + exponents.constant, error, False, substep, exponents.lift)
+
+
+class _Averages(NamedTuple):
+    """The nodes (T,) of a substep, their weights, and there f (T, N), G (T,) or (T, N), V (T, N) and the constant of V (T,)."""
+
+    nodes: Array
+    weights: Array
+    drift: Array
+    covariance: Array
+    potential: Array
+    constant: Array
+
+
+def _at_points(prepared: Prepared, values: Array, window: lw.Window, substep: Substep) -> Callable[[Array], Coefficients]:
+    """Return the function that gives the coefficients at parts of a substep, from zero to one, on a grid that moves with it."""
+
+    def at(nodes: Array) -> Coefficients:
+        times, shifts = substep.start + substep.length * nodes, substep.speed * substep.length * nodes if substep.speed else None
+        drift, *others = coefficients(prepared, window, times, substep.inside, substep.rates, values, shifts)
+        return drift - substep.speed, *others
+
+    return at
+
+
+def _averaged(substep: Substep, at: Callable[[Array], Coefficients], steady: bool = False) -> _Averages:
+    if steady:  # one node serves
+        middle = np.full(1, 0.5)
+        return _Averages(middle, np.full(1, substep.length), *at(middle))
+    nodes = ((np.arange(substep.parts)[:, None] + GAUSS_NODES) / substep.parts).reshape(-1)
+    return _Averages(nodes, substep.length / substep.parts * np.tile(GAUSS_WEIGHTS, substep.parts), *at(nodes))
+
+
+def _of_magnus(prepared: Prepared, values: Array, averages: _Averages, moving: bool) -> Exponents:
+    """Return the generators of the commutator-free Magnus integrator of order four.
+
+    exp(B0 / 2 + 2 B1 / tau) exp(B0 / 2 - 2 B1 / tau),   B0 = int L dt,   B1 = int (t - middle) L dt.
+    """
+    nodes, zeroth, drift, covariance, potential, constant = averages
+    offset, lift = offset_of(zeroth @ potential, values)
+    if prepared.system.steady and not moving:
+        generator = zeroth @ covariance, zeroth @ drift, zeroth @ potential - offset
+        return Exponents([generator], offset, zeroth @ constant, lift)
+    moment = 2.0 * zeroth * (nodes - 0.5)
+    halves = [(w @ covariance, w @ drift, w @ potential - 0.5 * offset) for w in (0.5 * zeroth - moment, 0.5 * zeroth + moment)]
+    lift = np.inf if any(np.any(half[0].real < 0) for half in halves) else lift
+    return Exponents(halves, offset, zeroth @ constant, lift)
+
+
+def magnus(
+    prepared: Prepared, values: Array, window: lw.Window, substep: Substep, at: Callable[[Array], Coefficients], adjoint: bool,
+    moving: bool,
+) -> Trial:  # fmt: skip
+    """Advance a substep by the exponentials of `_of_magnus`, with as many nodes as they need.
+
+    Args:
+        prepared: the system.
+        values, window: the density and its grid.
+        substep: the substep.
+        at: a function that returns f, G, V and a constant, as `coefficients`, at parts of the substep from zero to one.
+        adjoint: whether a message is taken from the end to the start.
+        moving: whether the grid moves.
+    """
+    for parts in PARTS if moving else PARTS[:1]:
+        substep = substep._replace(parts=parts)
+        averages, error, length = _averaged(substep, at, not prepared.system.varying and not moving), 0.0, substep.length
+        if moving:
+            error = _unresolved(window, values, length * averages.drift, length * averages.potential)
+        if error <= MAGNUS * prepared.tolerance:
+            return _acted(prepared, values, window, substep, _of_magnus(prepared, values, averages, moving), adjoint, False)
+    return Trial(values, 0.0, error, True)
+
+
+def _unresolved(window: lw.Window, values: Array, drift: Array, potential: Array) -> float:
+    """Return the error of a density, in its deviations, by integrals over time of coefficients whose nodes do not resolve them.
+
+    It is that of the last two terms of the polynomials of time through each six of the nodes (T, N).
+    """
+    mass = values.real > 1e-6 * np.max(values.real)
+    deviation, parts = float(np.sqrt(lw.moments(values, window)[1].real)), len(drift) // len(GAUSS_NODES)
+    drift, potential = (part.real[:, mass].reshape(parts, len(GAUSS_NODES), -1) for part in (drift, potential))
+    return float(np.abs(_LAST @ drift).max() / deviation + np.abs(_LAST @ potential).max()) / parts
+
+
+_LAST = np.linalg.inv(np.polynomial.legendre.legvander(2.0 * GAUSS_NODES - 1.0, len(GAUSS_NODES) - 1))[-2:]
+
+
+def by_modes(prepared: Prepared, values: Array, window: lw.Window, length: float) -> tuple[Array, float] | None:
+    """Return the density after a time and its error by the decomposition on a grid, None where it does not serve."""
+    decomposed = spectral(prepared, window)
+    if decomposed is None:
+        return None
+    result, error = decomposed(values, length)
+    # Tails that were cut off are jumps in the gauge of the decomposition, which show at the highest frequencies, as does a
+    # density that reaches the ends of the grid: that one needs another grid, not another transition.
+    allowed = 1e-5 * prepared.tolerance
+    check = lw.grid_check(result, window.closed, prepared.negligible)
+    aliased = check.aliasing > max(allowed, 30.0 * prepared.negligible)
+    ended = max(check.left, check.right) > max(EDGE, 4.0 * check.aliasing)
+    return (result, error) if error < max(1e-11, allowed) and (ended or not aliased) else None
+
+
+MOST_SUBSTEPS = 4000
+FEW = 24  # substeps of an interval, after which no large grid is taken
+
+
+class Report:
+    """The worst health figures within one step."""
+
+    def __init__(self) -> None:
+        self.aliasing = self.edge = self.time = self.noise = self.depth = self.growth = self.negative = self.lawless = 0.0
+        self.positive = True  # small values are accurate
+        self.decomposed = True  # the operator has a decomposition on the grid that serves every interval
+
+    def density(self, check: lw.GridCheck) -> None:
+        """Note the figures of a density."""
+        self.aliasing = max(self.aliasing, check.aliasing)
+        self.negative = max(self.negative, check.negative)
+        self.edge = max(self.edge, check.left, check.right)
+
+
+class RecordedTransition(NamedTuple):
+    """A transition: the density and the grid before it, its length, the logarithm of its mass, and the grid after it.
+
+    It is by the modes of that grid, of which at the `margins`, in points, there is no density; or by the exponentials of a
+    `substep`, times exp(-offset).
+    """
+
+    values: Array
+    window: lw.Window
+    length: float
+    log_mass: Any
+    after: lw.Window
+    substep: Substep | None = None
+    offset: Any = 0.0
+    margins: tuple[int, int] = 0, 0
+
+
+class Prediction(NamedTuple):
+    """The density after an interval, its grid, the logarithm of its mass, its figures, and how it was moved, where known."""
+
+    values: Array
+    window: lw.Window
+    gained: Any
+    check: lw.GridCheck | None
+    transitions: tuple[RecordedTransition, ...] = ()
+
+
+def by_decomposition(prepared: Prepared, values: Array, window: lw.Window, length: float, report: Report) -> Prediction | None:
+    """Return the density after an interval without observations inside by modes of its operator, None where they do not serve."""
+    negligible, rough = prepared.negligible, max(1e-10, 1e-3 * prepared.tolerance)
+    carried = coarsened(prepared, values, window, length)
+    if carried is not None:
+        transition = RecordedTransition(values, window, length, 0.0, carried.window, margins=carried.margins)
+        return _normalised(carried.values, carried.window, carried.error, report, negligible, transition)
+    known, begin = lw.grid_check(values, window.closed, negligible).aliasing, window
+    while window.size <= lw.LARGEST:
+        result = by_modes(prepared, values, window, length)
+        if result is None or not lost(float(np.sum(result[0].real))) < 1e-3:
+            return None
+        check = lw.grid_check(result[0], window.closed, negligible)
+        if check.aliasing > 30.0 * negligible and (check.aliasing > rough or not check.rough):
+            return None
+        bound = max(EDGE, 4.0 * check.aliasing)
+        left, right = check.left > bound, check.right > bound
+        if not (left or right):
+            missing = lost(float(np.sum(result[0].real)))
+            if missing > ALLOWED * prepared.tolerance:
+                return None
+            report.time += missing
+            if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
+                report.aliasing = max(report.aliasing, lw.grid_check(values, window.closed, negligible).aliasing - known)
+            transition = RecordedTransition(values, window, length, 0.0, window)
+            return _normalised(result[0], window, result[1], report, negligible, transition)
+        new = lw.enlarged(window, left, right)
+        if new == window:
+            return None
+        values, window = lw.resampled(values, window, new), new
+    return None
+
+
+def by_substeps(
+    prepared: Prepared,
+    values: Array,
+    window: lw.Window,
+    interval: TimeInterval,
+    report: Report,
+    moving: bool = False,
+) -> Prediction:
+    """Return the density after an interval, by exponentials of its operator, on grids that move with it or stand."""
+    result, tails = _by_substeps(prepared, values, window, interval, report, moving)
+    if NOISE * np.exp(min(tails, 690.0)) > 0.1 * prepared.tolerance:
+        # Increments far from the density may multiply rounding errors in its tails: compare with a density that has more of them.
+        noisy, _ = _by_substeps(prepared, values + NOISE * np.max(values.real), window, interval, Report(), moving)
+        (mean, variance), (other, another) = (lw.moments(one.values.real, one.window) for one in (result, noisy))
+        report.time += float(np.nan_to_num(abs(mean - other) / np.sqrt(variance) + abs(another / variance - 1.0), nan=1.0))
+    return result
+
+
+def _by_substeps(
+    prepared: Prepared,
+    values: Array,
+    window: lw.Window,
+    interval: TimeInterval,
+    report: Report,
+    moving: bool,
+) -> tuple[Prediction, float]:
+    """Return the same, and the logarithm of a bound on the growth of small values relative to the density."""
+    system, negligible, check = prepared.system, prepared.negligible, None
+    _, start, length, inside, rates = interval
+    gained: Any = 0.0
+    rough, resolved = max(1e-10, 1e-3 * prepared.tolerance), 30.0 * negligible
+    report.positive = False
+    bounds = [(0.0, length)]
+    if system.varying:
+        parts = resolved_parts(prepared, values, window, interval)
+        bounds, report.time = parts.bounds, report.time + parts.error
+    stack = bounds[::-1]
+    substeps, transitions, speed, tails = 0, [], 0.0, 0.0
+    while stack:
+        first, last = stack.pop()
+        substeps += 1
+        large = window.size > lw.LARGEST and substeps < FEW
+        most = lw.SIZES[-1] if large else lw.LARGEST
+        if not np.isfinite(values.real).all():
+            return Prediction(values, window, np.float64(np.nan), check), tails
+        begin, grown = window, False
+        known = lw.grid_check(values, window.closed, negligible).aliasing
+        while True:
+            if moving:
+                speed = speed_of(prepared, values, window, start + first, last - first)
+            trial = trial_substep(prepared, values, window, Substep(start + first, last - first, inside, rates, speed))
+            report.decomposed = trial.substep is None
+            total = float(np.sum(trial.values.real))
+            missing = 0.0 if inside.any() else lost(total)
+            failed = not 1e-100 < total < 1e6 or missing > 1e-3
+            split = (trial.split or failed) and last - first > 1e-12 * length and substeps + len(stack) < MOST_SUBSTEPS
+            if split:
+                break
+            check = lw.grid_check(trial.values, window.closed, negligible)
+            coarse = check.aliasing > resolved and (check.aliasing > rough or not check.rough)
+            coarse = coarse and (not prepared.weak or known <= resolved)  # a finer grid has no more of the spectrum of a kink
+            bound = max(EDGE, 4.0 * check.aliasing)
+            left, right = check.left > bound, check.right > bound
+            if not (left or right or coarse):
+                break
+            new = window
+            smooth = lw.grid_check(values, window.closed, negligible).aliasing < 0.1 * rough
+            if check.aliasing > lw.GROSS and smooth:
+                new = window  # what such an attempt shows of the edges is not the density
+            elif left or right:
+                new, grown = lw.enlarged(new, left, right), True
+            if coarse and window.size < most and not (check.aliasing > lw.GROSS and smooth):
+                new = lw.refined(new) if grown else finer(values, window, check)
+            if new.size <= most and new != window and not window.size == new.size == lw.SIZES[-1]:
+                values = lw.resampled(values, window, new)
+                window = new
+                continue
+            # The grid is as large as it may be: take a shorter substep, unless that does not help.
+            helps = smooth and check.aliasing > rough and (not check.rough or check.aliasing > lw.GROSS)
+            split = (left or right or helps) and last - first > 1e-12 * length
+            split = split and substeps + len(stack) < MOST_SUBSTEPS
+            break
+        if split:
+            if trial.split and trial.error > 0:
+                stack += parts_of_split(prepared, first, last, trial.error)[::-1]
+            else:
+                middle = first + (last - first) * (0.25 if last - first > 1e-3 * length else 0.0625)
+                stack += [(middle, last), (first, middle)]
+            check = lw.grid_check(values, window.closed, negligible)
+            values, window = refitted(prepared, values, window, check, large=substeps < FEW)
+            values, window = on_grid_for_drift(prepared, values, window, start + first, length - first)
+            continue
+        assert check is not None
+        if prepared.smoothing and stack:  # what a kink leaves everywhere
+            check = check._replace(aliasing=0.0, left=0.0, right=0.0)
+        report.density(check)
+        if window != begin:  # noise that the new grid has brought, which the transition smooths before it is seen
+            brought = lw.grid_check(values, window.closed, negligible).aliasing
+            report.aliasing = max(report.aliasing, brought - known)
+        report.time += trial.error + missing
+        begin, after = window, lw.translated(window, speed * (last - first))
+        before, values = values, np.where(trial.values.real > 0, trial.values, 0.0)
+        mass = np.sum(values)
+        transitions.append(RecordedTransition(before, begin, last - first, np.log(mass), after, trial.substep, trial.offset))
+        tails = max(tails + trial.lift - float(np.log(mass.real)), 0.0)
+        values, window = values / mass, after
+        gained = gained + np.log(mass) + trial.offset
+        if stack:
+            values, window = refitted(prepared, values, window, check, large=substeps < FEW)
+            values, window = on_grid_for_drift(prepared, values, window, start + last, length - last)
+    if substeps >= MOST_SUBSTEPS:
+        report.time = np.inf
+    return Prediction(values, window, gained, check, tuple(transitions)), tails
+
+
+def _normalised(
+    result: Array, window: lw.Window, error: float, report: Report, negligible: float, transition: RecordedTransition
+) -> Prediction:
+    check = lw.grid_check(result, window.closed, negligible)
+    report.density(check)
+    report.time, report.decomposed = report.time + error, True
+    result = np.where(result.real > 0, result, 0.0)
+    mass = np.sum(result)
+    return Prediction(result / mass, window, np.log(mass), check, (transition._replace(log_mass=np.log(mass)),))

@@ -1,0 +1,1 @@
+"""Time-varying Yau systems: their coefficients, their gauge, and power series of their kernels."""

@@ -1,0 +1,307 @@
+"""The grid for a density after an interval, and the grid for its product with a likelihood that may be much narrower.
+
+After an interval the grid is one out of few, by the linear equation around the middle of the density.  For a product the
+logarithm of the density is linear between the points of its grid; the likelihood is known by rows on a finer grid, `PER` points
+in a spacing, and by polynomials through eight of them between: the values of h, or the logarithm itself.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import helper
+from zakai.numerics.line.density import highest_of
+from zakai.numerics.line.window import ALIGNMENT, SIZES
+
+Array = NDArray[Any]
+
+PER = 8  # points of rows in a spacing of the grid
+_STENCIL = 8
+_WEIGHTS = np.array([1.0 / np.prod([float(i - j) for j in range(8) if j != i]) for i in range(8)])
+_DEPTH = 36.0  # logarithm below the largest value from which cells are left out
+_TAIL = 32.0  # logarithm below the largest value at the ends of the range
+_SMALL = 1e-8  # value of a density relative to its maximum below which its logarithm is interpolated
+_CHANGE = 1.0  # of the likelihood in a cell, in standard deviations, up to which a cell is not divided
+_LEVELS = 80
+_MOST_CELLS = 4096
+
+
+@helper
+def weigh(at: float, size: int, stride: int, weights: Array) -> int:
+    """Write the weights of the polynomial through eight points of a row, `stride` apart, at an index; return the first point."""
+    first = min(max(int(np.floor(at / stride)) - 3, 0), (size - 1) // stride - _STENCIL + 1)
+    total = 0.0
+    for k in range(_STENCIL):
+        distance = at / stride - (first + k)
+        if abs(distance) < 1e-9:
+            for l in range(_STENCIL):
+                weights[l] = 1.0 if l == k else 0.0
+            return first * stride
+        weights[k] = _WEIGHTS[k] / distance
+        total += weights[k]
+    for k in range(_STENCIL):
+        weights[k] /= total
+    return first * stride
+
+
+@helper
+def weighed(row: Array, first: int, stride: int, weights: Array) -> float:
+    """Return the value of the polynomial of a row."""
+    total = 0.0
+    for k in range(_STENCIL):
+        total += weights[k] * row[first + k * stride]
+    return total
+
+
+@helper
+def log_likelihood(h: Array, general: bool, precision: Array, observed: Array) -> float:
+    """Return -(y - h)'S^-1 (y - h) / 2, or the logarithm itself where that is what is known."""
+    if general:
+        return h[0] if h[0] > -1e150 else -1e150
+    total = 0.0
+    for i in range(observed.size):
+        for l in range(observed.size):
+            if precision[i, l] != 0.0:
+                total -= 0.5 * (observed[i] - h[i]) * precision[i, l] * (observed[l] - h[l])
+    return total if total > -1e150 else -1e150
+
+
+@helper
+def _surveyed(
+    left: float, width: float, logs: Array, rows: Array, general: bool, precision: Array, observed: Array, weights: Array,
+    h: Array,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return the largest of five values of the product in a cell, and the largest and the smallest of the likelihood."""
+    highest, top, bottom = -np.inf, -np.inf, np.inf
+    for p in range(5):
+        x = left + 0.25 * p * width
+        first = weigh(x * PER, rows.shape[1], 1, weights)
+        for i in range(rows.shape[0]):
+            h[i] = weighed(rows[i], first, 1, weights)
+        result = log_likelihood(h, general, precision, observed)
+        j = min(int(x), logs.size - 2)
+        highest = max(highest, logs[j] + (x - j) * (logs[j + 1] - logs[j]) + result)
+        top, bottom = max(top, result), min(bottom, result)
+    return highest, top, bottom
+
+
+@helper
+def placed(
+    logs: Array, first: int, last: int, rows: Array, general: bool, precision: Array, observed: Array
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return the range of the product as indices of the grid, and the narrowest cell in it; NaN where there are too many.
+
+    Cells whose bound is far below the largest value are left out, and the others divided until the likelihood hardly changes.
+
+    Args:
+        logs: the logarithm of the density (N,).
+        first, last: the points between which it is not negligible.
+        rows: h (m, T), or the log-likelihood (1, T), T = PER (N - 1) + 1.
+        general: whether that is the log-likelihood.
+        precision, observed: S^-1 and y.
+    """
+    left, width, level, best = np.empty(_MOST_CELLS), np.empty(_MOST_CELLS), np.empty((_MOST_CELLS, 3)), -np.inf
+    weights, h, count, done = np.empty(_STENCIL), np.empty(rows.shape[0]), last - first, 0
+    for j in range(count):
+        left[j], width[j] = first + j, 1.0
+    for _ in range(_LEVELS):
+        for c in range(done, count):
+            highest, top, bottom = _surveyed(left[c], width[c], logs, rows, general, precision, observed, weights, h)
+            level[c, 0], level[c, 1], level[c, 2], best = highest, top, bottom, max(best, highest)
+        # What is not left out is kept at the front, what is to be divided at the back.
+        retained, more = done, _MOST_CELLS
+        for c in range(done, count):
+            highest, spread = level[c, 0], level[c, 1] - level[c, 2]
+            if highest + 0.5 * spread + 1.0 >= best - _DEPTH:
+                depth = best - highest
+                change = np.sqrt(2.0 * (depth + spread)) - np.sqrt(2.0 * depth)
+                if change > _CHANGE and width[c] > 1e-13 * logs.size:
+                    if count + 2 * (_MOST_CELLS - more + 1) > _MOST_CELLS // 2:
+                        return np.nan, np.nan, np.nan
+                    more -= 1
+                    left[more], width[more] = left[c], width[c]
+                else:
+                    left[retained], width[retained], level[retained, 0] = left[c], width[c], highest
+                    retained += 1
+        done = count = retained
+        for c in range(more, _MOST_CELLS):
+            for part in range(2):
+                left[count], width[count] = left[c] + 0.5 * part * width[c], 0.5 * width[c]
+                count += 1
+        if count == done:
+            break
+    low, high, finest = np.inf, -np.inf, np.inf
+    for c in range(done):
+        if level[c, 0] >= best - _TAIL:
+            low, high, finest = min(low, left[c]), max(high, left[c] + width[c]), min(finest, width[c])
+    return low, high, finest
+
+
+@helper
+def interpolated(values: Array, top: float, at: Array, result: Array, weights: Array) -> None:
+    """Write the interpolant of a positive density at indices of its grid; small values by their logarithms."""
+    signed = np.empty(values.size)
+    for j in range(values.size):
+        signed[j] = values[j] if j % 2 == 0 else -values[j]
+    for i in range(at.size):
+        result[i] = 0.0
+    for j in range(values.size):
+        if signed[j] != 0.0:
+            for i in range(at.size):
+                result[i] += signed[j] / (at[i] - j)
+    for i in range(at.size):
+        near = np.floor(at[i] + 0.5)
+        if abs(at[i] - near) < 1e-12:
+            result[i] = values[int(near)] if 0 <= near < values.size else 0.0
+        else:
+            sine = np.sin(np.pi * (at[i] - near)) / np.pi
+            result[i] *= sine if near % 2 == 0 else -sine
+        if not (result[i] >= _SMALL * top):
+            first, logs = weigh(at[i], values.size, 1, weights), 0.0
+            for k in range(weights.size):
+                logs += weights[k] * np.log(values[first + k]) if weights[k] != 0.0 else 0.0
+            result[i] = np.exp(logs) if logs < np.log(2.0 * _SMALL * top) and 0 <= at[i] <= values.size - 1 else 0.0
+
+
+@helper
+def differences(h: Array, centre: Array, general: bool, precision: Array, observed: Array) -> float:
+    """Return a log-likelihood less that where h is `centre`; large numbers cancel before they are squared."""
+    if general:
+        return h[0] - centre[0]
+    total = 0.0
+    for i in range(centre.size):
+        for l in range(centre.size):
+            if precision[i, l] != 0.0:
+                total += (h[i] - centre[i]) * precision[i, l] * (observed[l] - 0.5 * (h[l] + centre[l]))
+    return total
+
+
+@helper
+def sampled(
+    q: Array, first: int, last: int, rows: Array, general: bool, precision: Array, observed: Array, grid_first: float,
+    grid_spacing: float, unit: float, now: Array, b: Array,
+) -> tuple[float, float, float, float, bool]:  # fmt: skip
+    """Write a density on a grid for its product with a likelihood, and the logarithm of that.
+
+    Returns:
+        The centre of the grid and its spacing, which is NaN where the product has no range; the value of the likelihood of which
+        the logarithms are differences; the error of these; and whether the grid has enough points.
+    """
+    top, n, m, weights = q[highest_of(q)], now.size, rows.shape[0], np.empty(8)
+    logs = np.empty(q.size)
+    for j in range(q.size):
+        logs[j] = np.log(max(q[j], 1e-30 * top))
+    low, high, finest = placed(logs, first, last, rows, general, precision, observed)
+    width = (high - low) * grid_spacing
+    spacing = unit * 2.0 ** (0.25 * np.ceil(4.0 * np.log2(width / (n - ALIGNMENT - 2) / unit)))
+    if not (width > 0.0 and spacing > 0.0):
+        return 0.0, np.nan, 0.0, np.inf, True
+    apart = ALIGNMENT * spacing
+    centre = apart * np.floor((grid_first + 0.5 * (low + high) * grid_spacing) / apart + 0.5)
+    at, h, middle, rough, unsure = np.empty(n), np.empty((n, m)), np.empty(m), np.empty(m), 0.0
+    for i in range(n):
+        at[i] = (centre + spacing * (i - n // 2) - grid_first) / grid_spacing
+    interpolated(q, top, at, now, weights)
+    for i in range(n):
+        begin = weigh(at[i] * PER, rows.shape[1], 1, weights)
+        for r in range(m):
+            h[i, r] = weighed(rows[r], begin, 1, weights)
+    best, most = -np.inf, 0
+    for i in range(n):
+        b[i] = log_likelihood(h[i], general, precision, observed)
+        if now[i] > 0.0 and np.log(now[i]) + b[i] > best:
+            best, most = np.log(now[i]) + b[i], i
+    for r in range(m):
+        middle[r] = h[most, r]
+    constant, total = b[most], 0.0
+    for i in range(n):
+        b[i] = differences(h[i], middle, general, precision, observed)
+        weight = np.exp(np.log(now[i]) + b[i] + constant - best) if now[i] > 0.0 else 0.0
+        if weight > 1e-12:
+            begin = weigh(at[i] * PER, rows.shape[1], 2, weights)
+            for r in range(m):
+                rough[r] = weighed(rows[r], begin, 2, weights)
+            unsure += weight * abs(differences(rough, middle, general, precision, observed) - b[i])
+            total += weight
+    return centre, spacing, constant, unsure / total, spacing <= finest * grid_spacing
+
+
+PROFILE = 4096  # offsets at which f and G are known without a grid
+REACH = 7.6  # standard deviations of the noise by which the support grows
+FAR = 3.0  # ranges of a density that it moves in an interval, above which grids move with it
+_SPACING = 0.34  # spacing in standard deviations of the noise, at most: the shortest wave decays by exp(-42)
+_MARGIN = 7.2  # of them beyond the support: the waves that R' leaves everywhere end there, and spread from the ends
+_NARROW = 7.0  # support of a density in standard deviations of the noise
+_APART = 32  # the centres of coarse grids are multiples of so many spacings
+_SIZES = np.array(SIZES)
+
+
+class Outlook(NamedTuple):
+    """The spacing and the ends of a grid for the density after an interval, and the margin beyond these.
+
+    The spacing is NaN where the density moves so far that the grid should move with it.
+    """
+
+    spacing: float
+    left: float
+    right: float
+    margin: float
+
+
+@helper
+def outlook(low: float, high: float, tau: float, unit: float, profile: Array) -> Outlook:
+    """Return what grid a density between two offsets needs after an interval, by the linear equation around its middle.
+
+    Args:
+        low, high: the ends of the support.
+        tau: the length of the interval.
+        unit: the scale of spacings.
+        profile: f, f' and G (3, L) at offsets that are unit / PER apart, or of one point, of which only G is read: then the
+            spacing is infinite where the interval makes the support far wider, else zero.
+    """
+    if profile.shape[1] == 1:
+        return Outlook(np.inf if high - low < _NARROW * np.sqrt(profile[2, 0] * tau) else 0.0, low, high, 0.0)
+    middle, per, last = profile.shape[1] // 2, PER / unit, profile.shape[1] - 1.0
+    first, stop = int(min(max(np.floor(low * per) + middle, 0.0), last)), int(min(max(np.ceil(high * per) + middle, 0.0), last))
+    least, most = profile[2, first], profile[2, first]
+    for i in range(first, stop + 1):
+        least, most = min(least, profile[2, i]), max(most, profile[2, i])
+    wide = np.sqrt(most * tau)
+    at = (first + stop) // 2
+    here = -tau * profile[1, at]
+    shift = tau * profile[0, at] * relative(here)
+    there = -tau * profile[1, int(min(max(at + shift * per, 0.0), last))]
+    fast, slow = max(here, there, 0.0), max(min(here, there), -1.0)
+    spacing = _SPACING * np.sqrt(least * tau * relative(2.0 * fast))
+    spacing = unit * 2.0 ** (0.5 * np.floor(2.0 * np.log2(spacing / unit) + 1e-9))
+    half, centre = 0.5 * (high - low) * np.exp(-slow) + REACH * wide * np.sqrt(relative(2.0 * slow)), 0.5 * (low + high)
+    spacing = np.nan if abs(shift) > 2.0 * FAR * half else spacing
+    return Outlook(spacing, centre - half + min(shift, 0.0), centre + half + max(shift, 0.0), _MARGIN * wide)
+
+
+@helper
+def relative(x: float) -> float:
+    """Return (1 - exp(-x)) / x."""
+    return (1.0 - np.exp(-max(x, -5.0))) / max(x, -5.0) if abs(x) > 1e-8 else 1.0
+
+
+@helper
+def wanted(low: float, high: float, spacing: float, margin: float, answer: Array) -> None:
+    """Write the centre, the spacing and the size of a grid from `low` to `high` with a margin on both sides."""
+    apart = _APART * spacing
+    answer[0], answer[1], answer[2] = apart * np.floor(0.5 * (low + high) / apart + 0.5), spacing, np.inf
+    for known in _SIZES[::-1]:
+        if known >= (high - low + 2.0 * margin) / spacing + _APART + 2:
+            answer[2] = float(known)
+
+
+@helper
+def place_of(index: Array, answer: Array) -> int:
+    """Return which of the known grids is wanted, -1 for none."""
+    for g in range(index.shape[0]):
+        if index[g, 0] == answer[0] and index[g, 1] == answer[1] and index[g, 2] == answer[2]:
+            return g
+    return -1

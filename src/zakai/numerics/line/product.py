@@ -1,0 +1,346 @@
+"""The product of a density on a grid with a likelihood that may be much narrower, stand far in its tails, or have kinks.
+
+Of a function F with a kink, sums over a grid of F times a smooth function are accurate to second order only, and operators that
+contain F too.  With the values
+
+    F_j = int psi(t) F(x_j + t spacing) dt,     psi = sum_k c_k B(t - k),     B the cubic B-spline,
+
+c such that psi has the moments of a point mass up to degree 2 K + 1, they are as accurate as those of smooth functions are: the
+spectrum of psi is zero where the grid folds frequencies.  Sums over nodes between the points stand for the integral.  The
+difference to a rule of smaller K estimates the error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import float64, int64, types, void
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import kernel
+from zakai.numerics.line import window as lw
+from zakai.numerics.line.density import moments, support
+from zakai.numerics.line.steps import exponent_added
+
+Array = NDArray[Any]
+
+_DEPTH = 36.0  # logarithm below the best bound from which parts of the line are left out
+_LEVELS = 80
+_MOST_CELLS = 4096
+_NOTHING = 1e-290
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """log l(x) = constant - (value - h(x))'(precision)(value - h(x)) / 2; `observation` maps points (J,) to h (m, J).
+
+    With `linear`, log l(x) = constant + h(x)'(precision) value.
+    """
+
+    observation: Callable[[Array], Array]
+    value: Array
+    precision: Array
+    constant: Any
+    linear: bool = False
+    known: tuple[lw.Window, Array] | None = None  # h at the points of a grid
+
+    def logs(self, points: Array) -> Array:
+        """Return log l (J,), minus infinity where h has no value."""
+        return self.of(self.observation(points))
+
+    def of(self, h: Array) -> Array:
+        """Return log l (J,) for values of h (m, J)."""
+        if self.linear:
+            logs = self.constant + np.sum(h * (self.precision @ self.value)[:, None], axis=0)
+            return np.where(np.isnan(logs.real), -np.inf, logs)
+        rest = self.value[:, None] - h
+        with np.errstate(all="ignore"):
+            logs = self.constant - 0.5 * np.sum(rest * (self.precision @ rest), axis=0)
+        return np.where(np.isnan(logs.real), -np.inf, logs)
+
+
+@dataclass(frozen=True)
+class General:
+    """Any likelihood, by its values: `log_density` maps points (J,) to log l (J,), NaN where there is none."""
+
+    log_density: Callable[[Array], Array]
+    linear = False
+
+    def logs(self, points: Array) -> Array:
+        """Return log l (J,), minus infinity where it has no value."""
+        result = self.log_density(points)
+        return np.where(np.isnan(result.real), -np.inf, result)
+
+
+Likelihood = Gaussian | General
+
+
+class Product(NamedTuple):
+    """The normalised product on its grid, the logarithm of its mass, and how deep in the tails of the density it stands.
+
+    `growth` is the factor by which an error that is uniform, relative to the maximum of the density, is relative to the product.
+    """
+
+    values: Array
+    log_mass: Any
+    depth: float
+    growth: float
+    window: lw.Window
+
+
+def multiplied(values: Array, window: lw.Window, likelihood: Likelihood, rough: float) -> Product:
+    """Return the product of probabilities and a likelihood, on a grid that resolves it.
+
+    Args:
+        values: (N,) probabilities of the points of `window`.
+        window: the grid.
+        likelihood: the likelihood.
+        rough: the largest spectrum at the highest frequencies, relative to the mass, with which the grid is kept.
+    """
+    product = _product(values, window, values, window, likelihood)
+    check = lw.grid_check(product.values, window.closed)
+    resolved = check.aliasing <= 1e-11 or (check.aliasing <= rough and check.rough)
+    if resolved and max(check.left, check.right) < 1e-10:
+        return product
+    new = lw.fitted(check, window) if likelihood.linear else _placed(values, window, likelihood)
+    for _ in range(12):
+        new_values = lw.resampled(values, window, new)
+        if not new_values.any():  # the observation contradicts all that is known, which the depth reports
+            new_values = np.full_like(new_values, _NOTHING)
+        product = _product(values, window, new_values, new, likelihood)
+        if not np.isfinite(product.log_mass.real):
+            return product
+        check = lw.grid_check(product.values, new.closed)
+        noisy = check.rough and check.aliasing < lw.GROSS
+        if check.aliasing <= 1e-11 or new.size >= (lw.LARGE if noisy else lw.SIZES[-1]):
+            break
+        before, new = new, finer(product.values, new, check)
+        if new == before:
+            break
+    return product
+
+
+def finer(values: Array, window: lw.Window, check: lw.GridCheck) -> lw.Window:
+    """Return a finer grid that holds a density, of which modes may be far apart; the same grid where there is none."""
+    low, high = window.offsets[list(support(np.ascontiguousarray(values.real), lw.CUT))]
+    factor = max(1.0 / check.resolving, 2**0.5)
+    while factor > 1.1:
+        if window.closed:
+            new, holds = lw.refined(window, factor), True
+        else:
+            new = lw.quantized(window, low, high, 1.001 * window.spacing / factor, most=lw.SIZES[-1])
+            holds = new.size * new.spacing > 1.04 * (high - low)
+        if holds and new.spacing < 0.95 * window.spacing:
+            return new
+        factor /= 2**0.25
+    return window
+
+
+def _product(values: Array, window: lw.Window, new_values: Array, new: lw.Window, likelihood: Likelihood) -> Product:
+    if isinstance(likelihood, Gaussian) and likelihood.known is not None and likelihood.known[0] == new:
+        logs = likelihood.of(likelihood.known[1])
+    else:
+        logs = likelihood.logs(new.points)
+    if np.iscomplexobj(logs) or np.iscomplexobj(new_values):
+        logs, new_values = logs.astype(complex), new_values.astype(complex)
+    top_of_density = float(values.real.max()) * new.spacing / window.spacing
+    return Product(*_normalized(np.ascontiguousarray(new_values), np.ascontiguousarray(logs), top_of_density), new)
+
+
+_R, _C = types.float64, types.complex128
+
+
+@kernel(
+    types.Tuple((_R[::1], _R, _R, _R))(_R[::1], _R[::1], _R),  # type: ignore[no-untyped-call]
+    types.Tuple((_C[::1], _C, _R, _R))(_C[::1], _C[::1], _R),  # type: ignore[no-untyped-call]
+)
+def _normalized(values: Array, logs: Array, largest: float) -> tuple[Array, Any, float, float]:
+    """values exp(logs) normalised, the logarithm of its sum, how deep below `largest` its mass is, and the growth of errors."""
+    size = values.size
+    result = np.zeros(size, values.dtype)
+    own = np.empty(size)
+    top = -np.inf
+    for i in range(size):
+        own[i] = np.log(values[i].real) if values[i].real > 0 else -np.inf
+        top = max(top, own[i] + logs[i].real)
+    mass = 0.0 * values[0]
+    if not (-np.inf < top < np.inf):
+        return values, mass - np.inf, np.inf, np.inf
+    for i in range(size):
+        if own[i] > -np.inf and logs[i].real > -np.inf:
+            # Relative to the largest product: neither factor needs to be a number there.
+            result[i] = values[i] / np.exp(own[i]) * np.exp(own[i] + logs[i] - top)
+            mass += result[i]
+    depth, growth, reference = 0.0, 0.0, np.log(largest)
+    for i in range(size):
+        result[i] /= mass
+        growth += np.exp(min(logs[i].real + reference - top - np.log(mass.real), 80.0))
+        if result[i].real > 0:
+            depth += result[i].real * (reference - own[i])
+    return result, np.log(mass) + top, depth, growth
+
+
+def _placed(values: Array, window: lw.Window, likelihood: Likelihood) -> lw.Window:
+    """Return a grid for the product; the same where no number compares parts of it, which the depth reports."""
+    top = values.real.max()
+    result = place(window.offsets, np.log(np.maximum(values.real, 1e-30 * top)), likelihood, window.origin)
+    if result is None:
+        return window
+    low, high, finest = result
+    spacing = min(window.spacing, max(finest, (high - low) / 370.0))
+    if window.closed:
+        size = lw.size_for(min(2 * np.pi / spacing, lw.SIZES[-1]))
+        return window._replace(size=size, spacing=2 * np.pi / size)
+    return lw.quantized(window, low, high, spacing, margin=0.3, most=lw.SIZES[-1])
+
+
+def _surveyed(ends: Array, prior: Callable[[Array], Array], likelihood: Likelihood, origin: float) -> tuple[Array, Array, Array]:
+    """Return for cells between offsets `ends` (J, 2) what the placing of a grid needs, from values at five points of each.
+
+    A change d of the logarithm counts as the distance from the maximum of a Gaussian between depths D and D + d.
+
+    Args:
+        ends: (J, 2).
+        prior: logarithm of the density at offsets.
+        likelihood: the likelihood.
+        origin: the point from which offsets count.
+
+    Returns:
+        The logarithm of the product at the ends (J, 2), a bound of it (J,) and by how much it changes, in deviations (J,).
+    """
+    points = ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * np.linspace(0.0, 1.0, 5)
+    logs = np.maximum(likelihood.logs(origin + points.reshape(-1)).real.reshape(points.shape), -1e150)
+    product = prior(points) + logs
+    highest, range_ = product.max(axis=1), logs.max(axis=1) - logs.min(axis=1)
+    depth = np.maximum(product.max() - highest, 0.0)
+    change = np.sqrt(2.0 * (depth + range_)) - np.sqrt(2.0 * depth)
+    return product[:, [0, -1]], highest + 0.5 * range_ + 1.0, change
+
+
+def place(offsets: Array, logs: Array, likelihood: Likelihood, origin: float) -> tuple[float, float, float] | None:
+    """Return the ends of the product of a density and a likelihood, and the smallest cell that resolves it.
+
+    Cells whose bound is far below the best value are left out, and the others divided until the likelihood hardly changes in any.
+
+    Args:
+        offsets: points (N,) relative to the origin.
+        logs: the logarithm of the density at these (N,).
+        likelihood: the likelihood.
+        origin: the point from which offsets count.
+    """
+
+    def prior(points: Array) -> Array:
+        return np.asarray(np.interp(points.reshape(-1), offsets, logs, left=-200.0, right=-200.0)).reshape(points.shape)
+
+    cells = np.stack([offsets[:-1], offsets[1:]], axis=1)
+    for _ in range(_LEVELS):
+        product, bound, change = _surveyed(cells, prior, likelihood, origin)
+        best = float(product.max())
+        if not np.isfinite(best):
+            return None
+        keep = bound >= best - _DEPTH  # equal, where the logarithms are so large that nothing can be subtracted
+        cells, change, product = cells[keep], change[keep], product[keep]
+        widths = cells[:, 1] - cells[:, 0]
+        divide = (change > 0.7) & (widths > 1e-14 * np.max(np.abs(offsets)) + 1e-300)
+        if not divide.any() or len(cells) > _MOST_CELLS:
+            break
+        quarters = cells[divide, :1] + widths[divide, None] * np.linspace(0.0, 1.0, 5)
+        parts = np.stack([quarters[:, :-1], quarters[:, 1:]], axis=2).reshape(-1, 2)
+        cells = np.concatenate([cells[~divide], parts])
+    product, _, _ = _surveyed(cells, prior, likelihood, origin)
+    good = (product >= product.max() - 32.0).any(axis=1)
+    return float(cells[good, 0].min()), float(cells[good, 1].max()), float((cells[good, 1] - cells[good, 0]).min())
+
+
+_V, _M = float64[::1], float64[:, ::1]
+
+PARTS = 16  # nodes of a spacing
+_WITHIN = 8  # places of which the mean is the value of a node
+REACH = 5  # spacings on both sides of a point
+WEAK_SHARE = 0.05  # of the tolerance that a sample may leave in the weak sense
+_POSITIONS = (np.arange(2 * REACH * PARTS) + 0.5) / PARTS - REACH
+
+
+def _rule(order: int, derivative: int) -> Array:
+    """Return the weights of the nodes for K = `order`, of F or its derivative."""
+    apart = _POSITIONS[:, None] - np.arange(-order, order + 1)
+    near, far = (np.maximum(reach - np.abs(apart), 0.0) for reach in (1.0, 2.0))
+    basis = (2.0 * near**2 - 0.5 * far**2) * np.sign(apart) if derivative else (far**3 - 4.0 * near**3) / 6.0
+    degrees = np.arange(2 * order + 1) + derivative
+    return np.asarray(basis @ np.linalg.solve((_POSITIONS[:, None] ** degrees).T @ basis, 1.0 * (degrees == derivative)))
+
+
+_VALUES, _SLOPES, _OTHER = _rule(3, 0), _rule(3, 1), _rule(2, 0)
+
+
+def nodes(points: Array, spacing: float) -> Array:
+    """Return where `at_nodes` needs the values of a function on a grid (N,)."""
+    count = (len(points) + 2 * REACH - 1) * PARTS + 2
+    first = points[0] - spacing * (REACH + 1.0 / PARTS)
+    return np.asarray(first + spacing / (PARTS * _WITHIN) * (np.arange(count * _WITHIN) + 0.5))
+
+
+def at_nodes(values: Array) -> Array:
+    """Return a function at the nodes (..., (N + 2 REACH - 1) PARTS): means, less what the curvature of a smooth one adds."""
+    means = values.reshape(*values.shape[:-1], -1, _WITHIN).mean(axis=-1)
+    curvature = means[..., 2:] - 2.0 * means[..., 1:-1] + means[..., :-2]
+    return np.ascontiguousarray(means[..., 1:-1] - (1.0 - _WITHIN**-2) / 24.0 * curvature)
+
+
+def weak(values: Array, spacing: float) -> tuple[Array, Array]:
+    """Return a function and its derivative (N,) from values at the nodes."""
+    windows = np.lib.stride_tricks.sliding_window_view(values, len(_POSITIONS))[::PARTS]
+    return windows @ _VALUES, windows @ _SLOPES / spacing
+
+
+@kernel(void(_M, int64, _M, _V, _V, _V, _V))
+def weaken(fine: Array, start: int, precision: Array, observed: Array, centre: Array, b: Array, change: Array) -> None:
+    """Replace log-likelihoods b (N,) of h at the points by those of its values at nodes.
+
+    Args:
+        fine: h at the nodes (m, F) of a longer grid.
+        start: the first point.
+        precision, observed: S^-1 and y.
+        centre: the values of h of which b is zero.
+        b: receives the logarithms.
+        change: receives the relative difference of another rule.
+    """
+    m, size, length = fine.shape[0], b.size, (b.size + 2 * REACH - 1) * PARTS
+    h, logs = np.empty((m, length)), np.zeros(length)
+    for i in range(m):
+        for f in range(length):
+            h[i, f] = fine[i, start * PARTS + f]
+    exponent_added(h, centre, precision, observed, 1.0, 1.0, logs)
+    tops = np.empty(length // PARTS)
+    for cell in range(tops.size):
+        tops[cell] = -np.inf
+        for f in range(cell * PARTS, (cell + 1) * PARTS):
+            tops[cell] = max(tops[cell], logs[f])
+        for f in range(cell * PARTS, (cell + 1) * PARTS):
+            logs[f] = np.exp(logs[f] - tops[cell])
+    for j in range(size):
+        one, other, top = 0.0, 0.0, max(tops[j + REACH - 1], tops[j + REACH])
+        for cell in range(2 * REACH):
+            here, there = 0.0, 0.0
+            for f in range(PARTS):
+                here += _VALUES[cell * PARTS + f] * logs[(j + cell) * PARTS + f]
+                there += _OTHER[cell * PARTS + f] * logs[(j + cell) * PARTS + f]
+            scale = np.exp(min(tops[j + cell] - top, 600.0))
+            one, other = one + scale * here, other + scale * there
+        change[j] = 1.0
+        if 0.0 < one < np.inf:
+            b[j], change[j] = top + np.log(one), 1.0 - other / one
+
+
+@kernel(float64(_V, _V))
+def weak_error(now: Array, change: Array) -> float:
+    """Return the change of mass, mean and variance, in deviations, by relative changes of a density."""
+    mean, variance = moments(now)[1:]
+    mass, first, second = 0.0, 0.0, 0.0
+    for j in range(now.size):
+        at, part = (j - now.size // 2 - mean) / np.sqrt(variance), now[j] * change[j]
+        mass, first, second = mass + part, first + part * at, second + part * (at * at - 1.0)
+    return abs(mass) + abs(first) + abs(second)

@@ -1,0 +1,331 @@
+"""What the steps of the compiled loop of one-state filters share: arguments, results, and all of a step but its transition.
+
+A term (4 + m, T) has the rows phi of Gaussian kernels or of a decomposition, the integral of f over the spacing above a point,
+f, f' and h.  The functions of an interval are sums of terms with factors that depend on time.  A sample multiplies the density,
+
+    v -> v exp(b),      b = h'S^-1 (y - h / 2).
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zakai.numerics.compiled import helper
+from zakai.numerics.exponentials import exponentiate
+from zakai.numerics.line.density import spectrum
+from zakai.numerics.line.grid_choice import FAR, log_likelihood
+
+Array = NDArray[Any]
+
+COLUMNS = (
+    "gained", "mean", "variance", "aliasing", "edge", "negative", "time", "depth", "growth", "made", "error", "log_floor",
+    "start", "pairs", "substeps", "needed",
+)  # fmt: skip
+# The transition: whole with a sample after it, split with increments inside, whole with increments inside, split with a sample.
+FACTOR, SPLIT, KERNEL, SPLIT_FACTOR = 0, 1, 2, 3
+RELIABLE = 1e-3  # of the promised error: smaller estimates are not reported
+MARGIN = 96  # points of a table of coefficients in time beyond the grid, of which a third may be used before it is made again
+
+
+class Status(Enum):
+    """Why a compiled loop ends, in words; the kernels return the numbers of these."""
+
+    OK = "all steps are done"
+    FAILED = "a step misses the tolerance, or a number is not finite"
+    RANGE = "the step needs a grid with another range or spacing, which the answer tells"
+    AFTER = "the next step needs another grid"
+    TABLE = "the next step needs another table of the coefficients in time"
+    UNRESOLVED = "the product with a sample needs a much finer grid"
+    NARROW = "the density is so narrow that a coarser grid for its transition and one of its own serve it better"
+    BROAD = "the density is so broad that one grid serves it better"
+    GRID = "the modes of the grid in the answer are not known"
+    SIZE = "the product with a sample needs a grid of more points"
+
+    @property
+    def number(self) -> int:
+        """The number that kernels return."""
+        return STATUSES.index(self)
+
+
+STATUSES = list(Status)
+OK, FAILED, RANGE, AFTER, TABLE, UNRESOLVED, NARROW, BROAD, GRID, SIZE = range(len(STATUSES))  # for kernels
+
+
+class Mechanisms(NamedTuple):
+    """What the steps of a record may need; only that is compiled.
+
+    `kernels` or `splits` or both; `samples`: samples after the transition; `weak`: their likelihoods have kinks and act in the
+    weak sense; `closed`: grids around the circle.
+    """
+
+    kernels: bool
+    splits: bool
+    samples: bool
+    weak: bool
+    closed: bool
+
+
+class Grid(NamedTuple):
+    """The data of a grid: terms `table` (K, R, 4 + m, T) as in `line/steps.py`, K = 1 where they do not depend on the interval.
+
+    The table is longer than the grid, which begins at `start`; its first point is `offset` away from the origin of the kernels.
+    `fine` (m, F) are the values of an h with kinks at the nodes of `line/product.py`, else empty.
+    """
+
+    table: Array
+    start: int
+    offset: float
+    spacing: float
+    fine: Array
+
+
+class Steps(NamedTuple):
+    """K intervals.
+
+    `kinds` (K,) are FACTOR, SPLIT, KERNEL or SPLIT_FACTOR.  `shares` (K,) are the parts of `Limits.splitting` that an interval
+    may leave.  `precisions` (K, P, m, m) are the inverses of S, zero where nothing is observed.  `constants` (K,) are those of
+    the log-likelihoods.  `kernels` (K, .) are the parameters of Gaussian kernels (`gaussian_kernels.kernel_of`), NaN where the
+    transition is split.  `drifts` (K, Q, R) and `outputs` (K, P, R) are the factors of the terms of f and h, and `covariances`
+    (K, Q) are G, at the Gauss nodes of an interval, or one number where they do not
+    depend on time.
+    """
+
+    kinds: Array
+    lengths: Array
+    shares: Array
+    precisions: Array
+    constants: Array
+    kernels: Array
+    drifts: Array
+    outputs: Array
+    covariances: Array
+
+    def part(self, rows: slice) -> Steps:
+        """Return some of the intervals."""
+        return Steps(*(part[rows] for part in self))
+
+
+class Limits(NamedTuple):
+    """What a step must keep.
+
+    `negligible` is the spectrum that need not be resolved, `error` the largest error that is made, `splitting` that of the
+    splitting of one interval, `cut` the density relative to its maximum that a grid must hold, `generous` the size of a grid that
+    is kept though fewer points would do, and `finest` that of the largest grid that is taken so that kernels are filters of
+    positive numbers.
+    """
+
+    negligible: float
+    error: float
+    splitting: float
+    cut: float
+    generous: float
+    finest: float
+
+
+class Segment(NamedTuple):
+    """The densities (K, N) after the first steps and their reports (K, len(COLUMNS)).
+
+    The column `start` of a report is the first point of the grid in the table.  `status` is why the loop ended, and `answer` the
+    range of the grid that it needs, relative to the centre of the present one, and its spacing.
+    """
+
+    densities: Array
+    reports: Array
+    status: Status
+    answer: Array
+
+
+IMPOSSIBLE = -1e8  # exponent where a formula has no value
+PHI, CELL, DRIFT, SLOPE, OBSERVED = 0, 1, 2, 3, 4  # rows of a term
+
+
+class Transition(NamedTuple):
+    """The figures of a transition.
+
+    `error` is that of a splitting, infinite where the transition failed; `rounding` the rounding error and `clipped` the largest
+    value that may have become zero, relative to the maximum; `spread` the variance of its noise and `contraction` the factor of
+    deviations; `needed` the spacing that filters of positive numbers need, where that of the grid is larger, else zero;
+    `log_factor` a constant of the logarithm of the mass; `pairs` of averages and `substeps` of a splitting.
+    """
+
+    error: float
+    rounding: float
+    clipped: float
+    spread: float
+    contraction: float
+    needed: float
+    log_factor: float
+    pairs: float
+    substeps: float
+
+
+@helper
+def failed(spread: float, needed: float) -> Transition:
+    """Return the figures of a transition that failed."""
+    return Transition(np.inf, np.inf, 1.0, spread, 1.0, needed, 0.0, 0.0, 0.0)
+
+
+@helper
+def add(to: Array, weight: float, values: Array) -> None:
+    """Add values with a weight."""
+    for j in range(to.size):
+        to[j] += weight * values[j]
+
+
+@helper
+def observation_of(table: Array, outputs: Array, at: int) -> tuple[Array, Array]:
+    """Return h (m, N), the sum of terms (R, 4 + m, N) with factors (R,), and its values (m,) at a point."""
+    h, centre = np.zeros((table.shape[1] - OBSERVED, table.shape[2])), np.empty(table.shape[1] - OBSERVED)
+    for r in range(outputs.size):
+        if outputs[r] != 0.0:
+            for i in range(centre.size):
+                add(h[i], outputs[r], table[r, OBSERVED + i])
+    for i in range(centre.size):
+        centre[i] = h[i, at]
+    return h, centre
+
+
+@helper
+def exponent_added(h: Array, centre: Array, precision: Array, observed: Array, weight: float, share: float, b: Array) -> float:
+    """Add h'S^-1 (weight y - share h / 2) less its value where h is `centre` (m,); return that value.
+
+    Large numbers cancel in this way before they are squared.
+    """
+    constant = 0.0
+    for i in range(centre.size):
+        weighted, own = 0.0, h[i]
+        for l in range(centre.size):
+            if precision[i, l] != 0.0:
+                weighted += precision[i, l] * (weight * observed[l] - share * centre[l])
+                constant += centre[i] * precision[i, l] * (weight * observed[l] - 0.5 * share * centre[l])
+                pull, other = 0.5 * share * precision[i, l], h[l]
+                for j in range(b.size):
+                    b[j] -= pull * (other[j] - centre[l]) * (own[j] - centre[i])
+        for j in range(b.size):
+            b[j] += weighted * (own[j] - centre[i])
+    return constant
+
+
+_OVERFLOW = 690.0
+_LEAST = 1e-280  # value of a density where its product with a likelihood is largest
+_MOST_GROWTH = 1e80
+
+
+@helper
+def extent(
+    now: Array, low: int, high: int, channel: Array, drifts: Array, table: Array, spread: float, tau: float, middle: float,
+    spacing: float, cut: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Return the range of points that a density occupies until it is after the transition, as if it were Gaussian.
+
+    It is NaN where the density moves so far that the grid should move with it.
+    """
+    half, by = now.size // 2, 0.0
+    left, right = float(low - half), float(high - half)
+    if np.isnan(channel[0]):
+        down, up = 0.0, 0.0
+        for r in range(drifts.size):
+            down, up = down + drifts[r] * table[r, DRIFT, low], up + drifts[r] * table[r, DRIFT, high]
+        by = min(abs(down), abs(up)) * tau / spacing if down * up > 0.0 else 0.0
+        left, right = left + min(down * tau / spacing, 0.0), right + max(up * tau / spacing, 0.0)
+    else:
+        shift, spread = (channel[1] + (channel[0] - 1.0) * middle) / spacing, channel[2]
+        left, right = channel[0] * left + shift, channel[0] * right + shift
+    centre, width = 0.5 * (left + right), 0.5 * abs(right - left)
+    width = np.sqrt(width * width - 2.0 * np.log(cut) * spread / spacing**2) + 2.0
+    if by > FAR * (high - low + 2.0 * (width - 0.5 * (right - left))):
+        return np.nan, np.nan
+    return min(centre - width + half, float(low)), max(centre + width + half, float(high))
+
+
+@helper
+def checked(
+    now: Array, low: int, high: int, weak: bool, positive: bool, closed: bool, search: bool, cut: float,
+    negligible: float, spacing: float, cosines: Array, sines: Array, answer: Array,
+) -> tuple[int, float, float, float, float, float]:  # fmt: skip
+    """Normalise a prediction that is accurate; return OK, its mass, aliasing, mass at the ends, negative mass, highest frequency.
+
+    The frequency is found with `search`.  `answer` receives the support; where another grid is needed, its range in points and
+    its spacing.
+    """
+    size = now.size
+    left, right, first, last, negative, aliasing, middle, highest, _ = spectrum(now, cut, negligible, cosines, sines, search)
+    bound = max(100.0 * cut, 0.0 if positive else 4.0 * aliasing)
+    edge = 0.0 if closed else max(left, right)
+    if not positive:  # what is outside of the band is filtered too
+        aliasing = max(aliasing, middle)
+    answer[0], answer[1], answer[2] = float(low), float(high), 0.7 * spacing
+    status, mass = OK, 0.0
+    if not (aliasing <= 30.0 * negligible):
+        status = RANGE if not weak and aliasing < np.inf else FAILED
+    elif not (edge <= bound):
+        status = RANGE if edge < np.inf else FAILED
+        answer[0] = min(low, (0 if left > bound else low) - size // 3 * (left > bound))
+        answer[1] = max(high, (size if right > bound else high) + size // 3 * (right > bound))
+        answer[2] = spacing
+    else:
+        for j in range(size):
+            now[j] = max(now[j], 0.0)
+            mass += now[j]
+        if not (1e-200 < mass < 1e200):
+            status = FAILED
+        for j in range(size):
+            now[j] /= mass
+        answer[0], answer[1] = first, last
+    return status, mass, aliasing, edge, negative, highest
+
+
+@helper
+def copied(table: Array, start: int, to: Array) -> None:
+    """Copy the columns of terms (R, 4 + m, T) from `start` on."""
+    for r in range(to.shape[0]):
+        for i in range(to.shape[1]):
+            for j in range(to.shape[2]):
+                to[r, i, j] = table[r, i, start + j]
+
+
+@helper
+def likelihood(h: Array, centre: Array, precision: Array, observed: Array, b: Array) -> float:
+    """Write the logarithm b of the likelihood relative to where h is `centre` (m,); return it there, without its constant."""
+    for j in range(b.size):
+        b[j] = 0.0
+    exponent_added(h, centre, precision, observed, 1.0, 1.0, b)
+    return log_likelihood(centre, False, precision, observed)
+
+
+@helper
+def product(now: Array, b: Array) -> tuple[float, float, float]:
+    """Replace probabilities by their normalised product with exp(b).
+
+    Returns:
+        The logarithm of the sum, which is NaN where the product almost vanishes; by how much errors relative to the maximum
+        grow; and the depth of the product below the maximum of the density, in nats.
+    """
+    largest, top, best, total, growth, depth = 0.0, 0, -np.inf, 0.0, 0.0, 0.0
+    logs = np.empty(now.size)
+    for j in range(now.size):
+        if not (b[j] > IMPOSSIBLE):
+            b[j] = IMPOSSIBLE
+        largest = max(largest, now[j])
+        logs[j] = np.log(now[j]) if now[j] > 0 else -np.inf
+        if logs[j] + b[j] > best:
+            best, top = logs[j] + b[j], j
+    if not (best < np.inf and now[top] > _LEAST):
+        return np.nan, growth, depth
+    reference, scale, factors = np.log(largest), 1.0 / now[top], np.empty(now.size)
+    for j in range(now.size):
+        factors[j] = min(b[j] - b[top], _OVERFLOW)
+    exponentiate(factors)
+    for j in range(now.size):
+        growth += factors[j]
+        now[j] = now[j] * scale * factors[j] if b[j] - b[top] < _OVERFLOW else np.exp(logs[j] + b[j] - best)
+        total += now[j]
+    for j in range(now.size):
+        now[j] /= total
+        if now[j] > 0:
+            depth += now[j] * (reference - logs[j])
+    return np.log(total) + best, min(growth / total * largest * scale, _MOST_GROWTH), depth

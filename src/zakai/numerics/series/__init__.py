@@ -1,0 +1,1 @@
+"""Kernels of the methods by series: power series, dyadic and sinc grids."""

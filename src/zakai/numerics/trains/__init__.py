@@ -1,0 +1,1 @@
+"""Functions of several variables as tensor trains of quintic B-splines on a grid; kernels that know no model."""

@@ -1,0 +1,76 @@
+"""A density after a motion and times a likelihood, as a function of points for `cross`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.numerics.trains.kernels import values_at
+from zakai.numerics.trains.train import Train
+
+Array = Any
+
+
+class Path(NamedTuple):
+    """Runge-Kutta steps: `times` at both ends (E, 2), and the given numbers there (E, 2, L)."""
+
+    times: Array
+    given: Array
+
+
+class Likelihood(NamedTuple):
+    """The program of a log density, its given numbers, which terms count, the time, the power, and the log of what divides it."""
+
+    program: tuple[Any, ...]
+    given: Array
+    counted: Array
+    time: float
+    power: float
+    top: float
+
+
+class Term(NamedTuple):
+    """A density, [factor, logarithm of what divides it], and the path from a point back to it, with the program of its motion."""
+
+    density: Train
+    scale: Array
+    program: tuple[Any, ...]
+    path: Path
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """The sum of one or two terms, times a likelihood; zero outside of `box` and beyond half a turn from `turn` (n,)."""
+
+    terms: tuple[Term, ...]
+    box: tuple[Array, Array]
+    turn: Array
+    likelihood: Likelihood
+
+    def __call__(self, x: Array) -> Array:
+        """Return the values (P,) at points x (n, P)."""
+        terms = [
+            (term.density.arrays, term.scale, term.program, self.box, (term.path.times, term.path.given)) for term in self.terms
+        ]
+        if len(terms) == 1:
+            terms.append((terms[0][0], np.zeros(2), *terms[0][2:]))
+        law = self.likelihood
+        out = np.empty(x.shape[1])
+        arrays = law.program, law.given, law.counted, np.array([law.time, law.power, law.top])
+        values_at(tuple(terms), arrays, self.turn, np.ascontiguousarray(x), out)
+        return out
+
+    def times(self, likelihood: Likelihood) -> Carried:
+        """Return the same density times another likelihood."""
+        return replace(self, likelihood=likelihood)
+
+    def about(self, turn: Array) -> Carried:
+        """Return the same density with angles on another turn."""
+        return replace(self, turn=turn)
+
+    def scaled(self, log_factor: float) -> Carried:
+        """Return the density times the exponential of a number."""
+        terms = (term._replace(scale=term.scale - np.array([0.0, log_factor])) for term in self.terms)
+        return replace(self, terms=tuple(terms))

@@ -1,0 +1,144 @@
+"""Cross interpolation of a function of points as a tensor train.
+
+A sweep evaluates the fibres A = F(left[k] x axis k x right[k + 1]) for one axis after the other, and takes as the next index
+set rows of A that interpolate it (`kernels.skeleton`).  The sets on the other side have some points more than the rank, so that
+it can grow; after a sweep with too large an error at control points they get those that were worst.
+
+References:
+    Oseledets and Tyrtyshnikov 2010, TT-cross approximation for multidimensional arrays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zakai.numerics.trains.grid import Grid
+from zakai.numerics.trains.kernels import fibre_points, skeleton
+from zakai.numerics.trains.train import Train
+
+Array = Any
+SEEDS = 2  # points of the mass in the sets of the first sweep, beyond two
+KEPT_GAIN = 0.7  # ratio of the errors of two sweeps above which another one gains too little
+MOST_SWEEPS = 6
+WORST = 3  # control points with the largest errors that join the sets
+
+
+Function = Callable[[Array], Array]  # the values (P,) at points x (n, P)
+
+
+class Options(NamedTuple):
+    """The relative error of a core, the largest rank, and the error at control points, relative to it, that is small enough."""
+
+    tolerance: float
+    most_rank: int
+    enough: float = 8.0
+
+
+class Built(NamedTuple):
+    """A train; the evaluations and the sweeps, the error at control points, and whether a rank met its limit."""
+
+    train: Train
+    evaluations: int
+    sweeps: int
+    error: float
+    capped: bool
+
+
+@dataclass
+class _Cross:
+    """The index sets to the left (r, k) and to the right (r, n - k) of every bond k."""
+
+    grid: Grid
+    function: Function
+    options: Options
+    left: list[Array]
+    right: list[Array]
+    evaluations: int = 0
+    capped: bool = False
+
+    def fibres(self, k: int) -> Array:
+        """Return F at left[k] x axis k x right[k + 1]: (a, N, b)."""
+        grid, B = self.grid, self.grid.basis
+        left, right = self.left[k].T, self.right[k + 1].T
+        L = grid.centre[:, None] + B[:, :k] @ (grid.low[:k, None] + grid.step[:k, None] * left)
+        R = B[:, k + 1 :] @ (grid.low[k + 1 :, None] + grid.step[k + 1 :, None] * right)
+        axis = B[:, k, None] * grid.axis(k)
+        a, N, b = L.shape[1], axis.shape[1], R.shape[1]
+        x = np.empty((grid.n, a * N * b))
+        fibre_points(L, axis, R, x)
+        self.evaluations += a * N * b
+        return self.function(x).reshape(a, N, b)
+
+    def _skeleton(self, A: Array) -> tuple[Array, Array, Array]:
+        """Return rows, C with A ~ C A[rows], and the pivot columns."""
+        most = min(self.options.most_rank, *A.shape)
+        rows, columns, out = np.empty(most, np.int64), np.empty(most, np.int64), np.empty((len(A), most))
+        tolerance = self.options.tolerance / math.sqrt(max(self.grid.n - 1, 1))
+        r = skeleton(np.ascontiguousarray(A), tolerance, most, rows, columns, out)
+        self.capped = self.capped or r == self.options.most_rank
+        return rows[:r], out[:, :r], columns[:r]
+
+    def sweep_right(self) -> list[Array]:
+        cores = []
+        for k in range(self.grid.n - 1):
+            A = self.fibres(k)
+            a, N, b = A.shape
+            rows, C, columns = self._skeleton(A.reshape(a * N, b))
+            i, j = np.divmod(rows, N)
+            self.right[k + 1] = self.right[k + 1][columns]
+            self.left[k + 1] = np.concatenate([self.left[k][i], j[:, None]], axis=1)
+            cores.append(C.reshape(a, N, -1))
+        return [*cores, self.fibres(self.grid.n - 1)]
+
+    def sweep_left(self) -> list[Array]:
+        cores = []
+        for k in range(self.grid.n - 1, 0, -1):
+            A = self.fibres(k)
+            a, N, b = A.shape
+            rows, C, columns = self._skeleton(A.reshape(a, N * b).T)
+            j, i = np.divmod(rows, b)
+            self.left[k] = self.left[k][columns]
+            self.right[k] = np.concatenate([j[:, None], self.right[k + 1][i]], axis=1)
+            cores.append(C.T.reshape(-1, N, b))
+        return [self.fibres(0), *cores[::-1]]
+
+
+def cross(grid: Grid, function: Function, control: Array, options: Options, periods: Array) -> Built:
+    """Return a function on a grid as a train.
+
+    Args:
+        grid: the grid.
+        function: the function.
+        control: points (n, P) of its mass; the values at the nearest points of the grid decide how many sweeps are made.
+        options: the accuracy.
+        periods: (n,), 2 pi for angles and 0 for other states.
+    """
+    n, index = grid.n, grid.index_of(control)
+    values = function(grid.x_of(grid.low[:, None] + grid.step[:, None] * index.T))
+    order = np.argsort(-np.abs(values), kind="stable")
+    seeds = index[order[np.linspace(0, len(order) // 2, 2 * SEEDS + 2).astype(int)]]
+    left = [np.zeros((1, 0), np.int64)] * (n + 1)
+    right = [*(seeds[:, k:] for k in range(n)), np.zeros((1, 0), np.int64)]
+    work = _Cross(grid, function, options, left, right, len(index))
+    size = np.maximum(np.abs(values), 1e-2 * np.abs(values).max())
+    last, sweep = math.inf, 0
+    while True:
+        cores = work.sweep_left() if sweep % 2 else work.sweep_right()
+        train = Train(grid, tuple(map(np.ascontiguousarray, cores)), periods)
+        errors = np.abs(train.on_grid(index) - values) / size
+        error = float(errors.mean())
+        sweep += 1
+        if error < options.enough * options.tolerance or error > KEPT_GAIN * last or sweep == MOST_SWEEPS:
+            return Built(train, work.evaluations, sweep, error, work.capped)
+        last = error
+        worst = index[np.argsort(-errors * size, kind="stable")[:WORST]]
+        for k in range(1, n):
+            if sweep % 2:  # a sweep to the right comes next to the left, and takes the sets of the left
+                work.left[k] = np.concatenate([work.left[k], worst[:, :k]])
+            else:
+                work.right[k] = np.concatenate([work.right[k], worst[:, k:]])

@@ -1,0 +1,361 @@
+"""Values of a density that is carried by a flow and multiplied by a likelihood, at many points: no Python between points.
+
+    v(x) = sum_j a_j u_j(phi_j(x)) exp(int c along phi_j)  *  p(z | x)^power / e^top
+
+A motion is a program of formulas (`numerics/particles/formulas.py`) whose first n outputs are the velocity and whose last is the
+rate c of the logarithm, with the ends of the domain; a path is a list of Runge-Kutta steps through known numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import types
+
+from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.formula_kernel import BLOCK
+from zakai.numerics.particles.formulas import BOX, F1, F2, F3, I1, PROGRAM, block_of, evaluate, load_point, run_program
+from zakai.numerics.trains.grid import PAD, taps
+
+Array = Any
+# Times at both ends of each step (E, 2), and the given numbers there (E, 2, L).
+PATH = types.Tuple((F2, F3))
+# Centre, inverse of the basis, low, step, sizes; periods (0 or 2 pi); ranks (n + 1,), their padded values, offsets, coefficients.
+TRAIN = types.Tuple((F1, F2, F1, F1, I1, F1, I1, I1, I1, F1))
+# Ranks (n + 1,), sizes (n,), where each core begins (n,), and the cores in the order (N, a, b).
+PACKED = types.Tuple((I1, I1, I1, F1))
+# A train, [factor, logarithm of what it is divided by], the motion, the domain, and the path to it.
+TERM = types.Tuple((TRAIN, F1, PROGRAM, BOX, PATH))
+# The law, its given numbers, which terms count, and [time, power, top]; no term counts: no likelihood.
+LAW = types.Tuple((PROGRAM, F1, F1, F1))
+LARGEST_LOG = 500.0  # of a factor; the exponential of more is cut
+
+
+@kernel(types.void(PROGRAM, BOX, PATH, F2, F2))
+def flow(program: Any, box: Any, path: Any, x: Array, out: Array) -> None:
+    """Write the ends of paths that begin at points x (n, P), and below them the integral of the last output: (n + 1, P)."""
+    times, given = path
+    n, count, outputs = x.shape[0], x.shape[1], program[3]
+    rows = n + 1
+    values = block_of(program)
+    point, slopes, total = np.empty((rows, BLOCK)), np.empty((rows, BLOCK)), np.empty((rows, BLOCK))
+    row = np.empty(given.shape[2])
+    for first in range(0, count, BLOCK):
+        size = min(BLOCK, count - first)
+        now = out[:, first : first + size]
+        for d in range(n):
+            for i in range(size):
+                now[d, i] = x[d, first + i]
+        for i in range(size):
+            now[n, i] = 0.0
+        for e in range(times.shape[0]):
+            length = times[e, 1] - times[e, 0]
+            for stage in range(4):
+                share = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
+                for d in range(rows):
+                    for i in range(size):
+                        point[d, i] = now[d, i] + (share * length * slopes[d, i] if stage else 0.0)
+                for j in range(row.size):
+                    row[j] = given[e, 0, j] + share * (given[e, 1, j] - given[e, 0, j])
+                load_point(program, values, point, box, times[e, 0] + share * length, row, size)
+                run_program(program, values, size)
+                weight = length / 6.0 if stage == 0 or stage == 3 else length / 3.0
+                for d in range(rows):
+                    result = values[outputs[d]]
+                    for i in range(size):
+                        slopes[d, i] = result[i]
+                        total[d, i] = weight * slopes[d, i] + (total[d, i] if stage else 0.0)
+            for d in range(rows):
+                for i in range(size):
+                    now[d, i] += total[d, i]
+
+
+@kernel(types.void(TRAIN, F2, types.boolean, F1, F1), reordered=True)
+def add_train(train: Any, x: Array, moved: bool, scale: Array, out: Array) -> None:
+    """Add the values of a train at points x (n, P) to `out` (P,).
+
+    v <- sum_d w_d(z_k) v C_k[j + d] over the axes, times scale[0] and, if moved, exp(x[n] - scale[1]); a value that is not a
+    number counts as zero.
+    """
+    centre, inverse, low, step, sizes, periods, ranks, padded, offsets, flat = train
+    n, count = low.size, x.shape[1]
+    width = 0
+    for k in range(n + 1):
+        width = max(width, ranks[k] + 4)
+    w, v, c, y, s = np.empty(6), np.empty(width), np.zeros(6 * width), np.empty(n), np.empty(n)
+    for p in range(count):
+        for d in range(n):
+            y[d] = x[d, p] - centre[d]
+            if periods[d] > 0.0:
+                y[d] -= periods[d] * math.floor(y[d] / periods[d] + 0.5)
+        inside = True
+        for k in range(n):
+            z = 0.0
+            for d in range(n):
+                z += inverse[k, d] * y[d]
+            s[k] = (z - low[k]) / step[k]
+            inside = inside and s[k] > -2.9 and s[k] < sizes[k] + 1.9
+        if not inside:
+            continue
+        v[0] = 1.0
+        for k in range(n):
+            j = int(math.floor(s[k]))
+            taps(s[k] - j, w)
+            a, wide = ranks[k], padded[k]
+            for d in range(6):
+                for i in range(a):
+                    c[d * wide + i] = w[d] * v[i]
+                for i in range(a, wide):
+                    c[d * wide + i] = 0.0
+            stride = (sizes[k] + 2 * PAD) * wide
+            base = offsets[k] + (j - 2 + PAD) * wide
+            for q in range(ranks[k + 1]):
+                row = flat[base + q * stride : base + q * stride + 6 * wide]
+                t = 0.0
+                for r in range(6 * wide):
+                    t += c[r] * row[r]
+                v[q] = t
+        value = scale[0] * v[0]
+        if moved:
+            value *= math.exp(min(x[n, p] - scale[1], LARGEST_LOG))
+        if value == value:
+            out[p] += value
+
+
+@helper
+def _within(x: Array, p: int, turn: Array, box: Any) -> bool:
+    """Return whether point p is in the domain and on the turn of the angles about `turn` (n,), NaN for other states."""
+    for d in range(turn.size):
+        if abs(x[d, p] - turn[d]) > math.pi * (1.0 + 1e-6) or x[d, p] < box[0][d] or x[d, p] > box[1][d]:
+            return False
+    return True
+
+
+@kernel(types.void(types.Tuple((TERM, TERM)), LAW, F1, F2, F1))
+def values_at(terms: Any, law: Any, turn: Array, x: Array, out: Array) -> None:
+    """Write the values of a carried density times its likelihood at points x (n, P); zero outside of the domain.
+
+    Args:
+        terms: densities with their paths; a factor of zero leaves one out, a path without steps takes it where it is.
+        law: the likelihood.
+        turn: the centre (n,) of the turn on which angles are taken, NaN for other states.
+        x: the points.
+        out: receives the values (P,).
+    """
+    n, count = x.shape
+    ends = np.empty((n + 1, count))
+    for p in range(count):
+        out[p] = 0.0
+    for term in terms:
+        train, scale, program, box, path = term
+        if scale[0] != 0.0:
+            if path[0].shape[0]:
+                flow(program, box, path, x, ends)
+                add_train(train, ends, True, scale, out)
+            else:
+                add_train(train, x, False, scale, out)
+    law_program, known, counted, numbers = law
+    domain = terms[0][3]
+    for p in range(count):
+        if not _within(x, p, turn, domain):
+            out[p] = 0.0
+    used = False
+    for k in range(counted.size):
+        used = used or counted[k] != 0.0
+    if used:
+        logs = np.empty((counted.size, count))
+        evaluate(law_program, domain, x, numbers[0], known, 0, count, logs)
+        for p in range(count):
+            if out[p] != 0.0:
+                total = 0.0
+                for k in range(counted.size):
+                    if counted[k] != 0.0:
+                        total += logs[k, p]
+                value = out[p] * math.exp(min(numbers[1] * total - numbers[2], LARGEST_LOG)) if total == total else 0.0
+                out[p] = value if value == value else 0.0
+
+
+@kernel(types.void(F2, F2, F2, F2))
+def fibre_points(left: Array, axis: Array, right: Array, out: Array) -> None:
+    """Write all sums left[:, i] + axis[:, j] + right[:, k] (n, a N b), the last index fastest."""
+    for d in range(out.shape[0]):
+        p = 0
+        for i in range(left.shape[1]):
+            for j in range(axis.shape[1]):
+                base = left[d, i] + axis[d, j]
+                for k in range(right.shape[1]):
+                    out[d, p] = base + right[d, k]
+                    p += 1
+
+
+@kernel(types.int64(F2, types.float64, types.int64, I1, I1, F2), reordered=True)
+def skeleton(A: Array, tolerance: float, most: int, rows: Array, columns: Array, out: Array) -> int:
+    """Write rows of A (m, b) whose span interpolates it, and return their number r.
+
+    Pivoted Gram-Schmidt to a relative error in the Frobenius norm, then rows of nearly maximal volume.
+
+    Args:
+        A: the matrix.
+        tolerance: the relative error.
+        most: the largest r.
+        rows: receives the rows (r,).
+        columns: receives the columns (r,) that were pivots.
+        out: receives C (m, r) with A ~ C A[rows], with contiguous rows of its first m r numbers.
+    """
+    m, b = A.shape
+    most = min(most, b, m)
+    Q, rest, norms, total = np.empty((most, m)), np.empty((b, m)), np.empty(b), 0.0
+    for q in range(b):
+        norms[q] = 0.0
+        for p in range(m):
+            rest[q, p] = A[p, q]
+            norms[q] += A[p, q] * A[p, q]
+        total += norms[q]
+    r = 0
+    while r < most:
+        left, best = 0.0, 0
+        for q in range(b):
+            left += norms[q]
+            if norms[q] > norms[best]:
+                best = q
+        if (r > 0 and left <= tolerance * tolerance * total) or norms[best] <= 1e-28 * total:
+            break
+        v = Q[r]
+        for p in range(m):
+            v[p] = rest[best, p]
+        for s in range(r):  # once more against the others, for orthogonality
+            f = 0.0
+            for p in range(m):
+                f += Q[s, p] * v[p]
+            for p in range(m):
+                v[p] -= f * Q[s, p]
+        size = 0.0
+        for p in range(m):
+            size += v[p] * v[p]
+        size = 1.0 / math.sqrt(size)
+        for p in range(m):
+            v[p] *= size
+        columns[r] = best
+        r += 1
+        for q in range(b):
+            f, size = 0.0, 0.0
+            for p in range(m):
+                f += v[p] * rest[q, p]
+            for p in range(m):
+                rest[q, p] -= f * v[p]
+                size += rest[q, p] * rest[q, p]
+            norms[q] = size
+        norms[best] = 0.0
+    r = max(r, 1)
+    C = out[:m, :r]
+    for p in range(m):
+        for q in range(r):
+            C[p, q] = Q[q, p] if total > 0.0 else 0.0
+    for q in range(r):
+        rows[q] = q
+    if total == 0.0:
+        columns[0] = 0
+        return 1
+    for turn in range(r + 40):
+        # Elimination, in which each column takes its largest row, then exchanges of rows while they enlarge the volume.
+        largest, i, j = -1.0, 0, min(turn, r - 1)
+        for p in range(m):
+            if turn < r:
+                if abs(C[p, j]) > largest:
+                    largest, i = abs(C[p, j]), p
+            else:
+                for q in range(r):
+                    if abs(C[p, q]) > largest:
+                        largest, i, j = abs(C[p, q]), p, q
+        if turn >= r and largest <= 1.1:
+            break
+        pivot = C[i, j]
+        row = C[i].copy()
+        row[j] -= 1.0
+        for p in range(m):
+            f = C[p, j] / pivot
+            if f != 0.0:
+                for q in range(r):
+                    C[p, q] -= f * row[q]
+        rows[j] = i
+    return r
+
+
+@kernel(types.void(PACKED, F1, F2, types.boolean, F2), reordered=True)
+def draw(packed: Any, right: Array, share: Array, flat: bool, out: Array) -> None:
+    """Draw grid positions by conditional sampling, one axis after the other; negative values count as zero.
+
+    Args:
+        packed: a train.
+        right: its cores times the sums over all axes to the right (N, a), one after the other.
+        share: uniform numbers (n, P).
+        flat: each conditional law is drawn in proportion to its square root.
+        out: receives positions in units of the spacing (n, P), the probability of the cell, and that of having been drawn by the
+            square roots: (n + 2, P).
+    """
+    ranks, sizes, offsets, cores = packed
+    n, count = share.shape
+    width, longest = 1, 1
+    for k in range(n):
+        width, longest = max(width, ranks[k + 1]), max(longest, sizes[k])
+    v, next_v, w, root = np.empty(width), np.empty(width), np.empty(longest), np.empty(longest)
+    for p in range(count):
+        v[0] = 1.0
+        likely, drawn, at_right = 1.0, 1.0, 0
+        for k in range(n):
+            a, b, N = ranks[k], ranks[k + 1], sizes[k]
+            total, root_total = 0.0, 0.0
+            for i in range(N):
+                t = 0.0
+                for q in range(a):
+                    t += v[q] * right[at_right + i * a + q]
+                w[i] = max(t, 0.0)
+                root[i] = math.sqrt(w[i])
+                total += w[i]
+                root_total += root[i]
+            at_right += N * a
+            chosen, chosen_total = (root, root_total) if flat else (w, total)
+            u, j, before = share[k, p] * chosen_total, 0, 0.0
+            while j < N - 1 and before + chosen[j] < u:
+                before += chosen[j]
+                j += 1
+            out[k, p] = j + min(max((u - before) / (chosen[j] + 1e-300), 0.0), 1.0) - 0.5
+            likely *= w[j] / (total + 1e-300)
+            drawn *= root[j] / (root_total + 1e-300)
+            top = 0.0
+            for q in range(b):
+                t = 0.0
+                for s in range(a):
+                    t += v[s] * cores[offsets[k] + (j * a + s) * b + q]
+                next_v[q] = t
+                top = max(top, abs(t))
+            for q in range(b):
+                v[q] = next_v[q] / (top + 1e-300)
+        out[n, p] = likely
+        out[n + 1, p] = drawn
+
+
+@kernel(types.void(PACKED, types.int64[:, ::1], F1), reordered=True)
+def values_on_grid(packed: Any, index: Array, out: Array) -> None:
+    """Write the values of a train at grid indices (P, n)."""
+    ranks, sizes, offsets, cores = packed
+    count, n = index.shape
+    width = 1
+    for k in range(n + 1):
+        width = max(width, ranks[k])
+    v, next_v = np.empty(width), np.empty(width)
+    for p in range(count):
+        v[0] = 1.0
+        for k in range(n):
+            a, b = ranks[k], ranks[k + 1]
+            base = offsets[k] + index[p, k] * a * b
+            for q in range(b):
+                t = 0.0
+                for s in range(a):
+                    t += v[s] * cores[base + s * b + q]
+                next_v[q] = t
+            for q in range(b):
+                v[q] = next_v[q]
+        out[p] = v[0]

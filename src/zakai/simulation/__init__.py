@@ -1,0 +1,1 @@
+"""Simulated paths of the state and records of their observations."""
