@@ -231,6 +231,20 @@ def test_a_thin_joint_density_integrates_to_one_and_its_regions_hold_their_proba
     assert arrays["levels"][0] == pytest.approx([0.5, 0.05], abs=0.06 if particles else 0.01)
 
 
+def test_a_joint_density_on_a_slanted_grid_is_that_density_where_an_angle_passes_pi():
+    i, j = np.meshgrid(np.arange(64) - 32, np.arange(48) - 24, indexing="ij")
+    angle = 2 * np.pi * i / 64
+    logs = 8 * np.cos(angle - 3.0) - 0.5 * (0.4 * j) ** 2
+    basis = np.array([[2 * np.pi / 64, 0.0], [0.0, 0.3]])
+    density = GridDensity(logs, np.array([0.0, 5.0]), basis, ("x", "y"), (True, False))
+    _, arrays = read(plane_bytes(One(density), ("x", "y"), [0]))
+    assert joint_mass(arrays, 0) == pytest.approx(1.0, abs=2e-3)
+    for at in ([40, 40], [20, 50], [61, 33]):
+        place = arrays["origin"][0] + arrays["basis"][0] @ at
+        shown = arrays["values"][0][at[1], at[0]] / 65535 * arrays["peak"][0]
+        assert shown == pytest.approx(float(density.pdf(place)), abs=1e-4 * arrays["peak"][0])
+
+
 def test_a_joint_density_needs_two_states():
     fake, _ = fake_result(observations=5, state=("theta", "rate"), periodic=("theta",))
     header, arrays = read(plane_bytes(fake, (0, 1), [0, -1]))
