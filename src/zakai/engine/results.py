@@ -91,7 +91,7 @@ class FilterResult:
         table = _display.html_table(repr(self), ("", f"mean at {when}", "deviation"), rows, self.warnings)
         from zakai.report import notebook_picture
 
-        return table + notebook_picture(self)
+        return table + str(notebook_picture(self))
 
     @property
     def cov(self) -> np.ndarray:

@@ -80,7 +80,7 @@ def _window(density: Density, size: int) -> tuple[np.ndarray, np.ndarray, np.nda
     mean, cov = density.mean(), density.cov()
     floor = 1e-18 * np.maximum(1.0, mean**2)
     factor = np.linalg.cholesky(cov + np.diag(np.maximum(floor, 1e-12 * np.diag(cov))))
-    half = _REACH
+    half: Any = _REACH
     if any(density.periodic):  # an axis of its own for each, no wider than the circle
         factor = np.diag(np.sqrt(np.diag(cov) + floor))
         half = np.where(density.periodic, np.minimum(_REACH, np.pi / np.diag(factor)), _REACH)
