@@ -17,7 +17,7 @@ FOLDERS = """
     records simulation
     methods methods/system methods/gaussian methods/gaussian/extended methods/sums methods/yau methods/line methods/reflecting
     methods/space methods/grid methods/particles methods/frame methods/series
-    notes engine diagnostics inference peers studies report cli
+    notes engine diagnostics inference peers studies report studio cli
 """.split()
 EVERYWHERE = {"errors", "_display", "_progress", "_registry"}
 SOURCE = Path(zakai.__file__).parent

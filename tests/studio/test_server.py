@@ -172,17 +172,16 @@ def test_a_task_that_fails_is_one_line_and_never_a_traceback(page: Page):
 
 def test_a_task_that_needs_too_much_memory_ends_with_advice():
     program = """
-from zakai.studio.worker import answer, limit_memory
+from pathlib import Path
 import numpy as np
-class Session:
-    forgotten = False
-    def answer(self, request, report):
-        return {}, {"array": np.ones(1 << 29)}
-    def forget(self):
-        self.forgotten = True
+from zakai.studio.session import Session
+from zakai.studio.tasks import TASKS
+from zakai.studio.worker import answer, limit_memory
+TASKS["large"] = lambda *_: ({}, {"array": np.ones(1 << 29)})
 limit_memory(2.0)
-session = Session()
-print(answer(session, {"id": 1, "do": "run"}, 2.0, None), session.forgotten)
+session = Session(Path())
+session.results["main"] = None
+print(answer(session, {"id": 1, "do": "large"}, 2.0, None), not session.results)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert "more memory than it may have (2 GiB)" in done.stdout and "--memory" in done.stdout and "True" in done.stdout

@@ -119,7 +119,7 @@ def residuals(session: Session, request: Mapping[str, Any], report: Report) -> A
 
 def compare(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
     """Return the table of results by their names."""
-    from zakai.engine.compare import compare as table
+    from zakai.diagnostics.compare import compare as table
 
     names = [str(name) for name in request.get("names") or []]
     labels = request.get("labels") or {}
@@ -131,7 +131,7 @@ def compare(session: Session, request: Mapping[str, Any], report: Report) -> Ans
 
 def fit(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
     """Fit parameters, with intervals of their profile likelihoods where these are wanted."""
-    from zakai.engine.fit import fit as run_fit
+    from zakai.inference.fit import fit as run_fit
 
     model = session.model(request)
     found = session.given(model, request)

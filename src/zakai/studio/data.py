@@ -13,12 +13,12 @@ from zakai.errors import InputError
 from zakai.models._errors import listing
 from zakai.models.clock import clock
 from zakai.models.model import Model
-from zakai.models.simulate import simulate
 from zakai.records import Inputs, Record, Truth
 from zakai.records.csv import Dates, clock_of, read_table
 from zakai.records.dates import date_of
 from zakai.records.dialect import dialect_of
 from zakai.records.header import cells_of, header_of
+from zakai.simulation.simulate import simulate
 
 MOST_ROWS, MOST_COLUMNS = 1_000_000, 200
 MOST_SIMULATED = 200_000  # observations that are drawn on demand

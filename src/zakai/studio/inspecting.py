@@ -112,7 +112,7 @@ def methods(session: Session, request: Mapping[str, Any], report: Report) -> Ans
 
 def expected(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
     """Return how long some methods take for a record, in words; the measurement of all ends after a few seconds."""
-    from zakai.engine.expected_time import expected_seconds
+    from zakai.diagnostics.expected_time import expected_seconds
     from zakai.numerics.compiled import working_time
 
     model = session.model(request)

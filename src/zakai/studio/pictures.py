@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zakai.errors import InputError
-from zakai.report.axes import joint_map
 from zakai.report.frames import pack, unpack
 from zakai.report.picture import picture_bytes
+from zakai.report.plane import plane_bytes
 
 MOST_COLUMNS, MOST_ROWS = 1_200, 400
+JOINT_TIMES = 41  # at which the density of two states can be seen
 Arrays = dict[str, np.ndarray]
 
 
@@ -44,13 +45,8 @@ def density_picture(result: Any, state: int, truth: Any, view: View, extent: Any
     return {"frame": np.frombuffer(frame, np.uint8)}
 
 
-def joint_picture(result: Any, pair: tuple[int, int], k: int) -> tuple[dict[str, Any], Arrays]:
-    """Return the density of two states at time number k, with the levels that bound the regions that hold 95% and 50%."""
-    density = result.density(k).marginal(pair)
-    x, y, values, levels = joint_map(density)
-    top = float(values.max()) or 1.0
-    image = np.rint(255.0 * values / top).astype(np.uint8)
-    cov = density.cov()
-    scale = float(np.sqrt(max(cov[0, 0] * cov[1, 1], np.finfo(float).tiny)))
-    header = {"time": float(result.times[k]), "levels": (levels / top).tolist(), "correlation": float(cov[0, 1]) / scale}
-    return header, {"x": np.asarray(x, float), "y": np.asarray(y, float), "density": image}
+def joint_picture(result: Any, pair: tuple[int, int], truth: Any) -> Arrays:
+    """Return the frame of the density of two states at evenly spaced times, the start and the end among them."""
+    last = len(result.times) - 1
+    index = np.unique(np.linspace(0, last, min(JOINT_TIMES, last + 1)).round().astype(int))
+    return {"frame": np.frombuffer(plane_bytes(result, pair, index.tolist(), truth=truth), np.uint8)}

@@ -48,6 +48,7 @@ class Settings:
     follow: Source | None = None
     tables: Path | None = None
     memory: float = 4.0
+    version: str = ""
     port: int = 0
     token: str = field(default_factory=new_token)
 
@@ -160,12 +161,10 @@ class Studio:
             await self.stop_following()
 
     def _hello(self) -> dict[str, Any]:
-        from zakai import __version__
-
         source = self.settings.follow
         return {
             "do": "hello",
-            "version": __version__,
+            "version": self.settings.version,
             "model": self.settings.model,
             "record": self.first,
             "follow": None if source is None else source.name,

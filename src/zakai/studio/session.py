@@ -1,4 +1,4 @@
-"""What the worker does for each request: one function for each word in `do`.
+"""What the worker keeps: models, records and results.
 
 A request names everything that it needs (the model's text, the record, the method), so that a new worker answers it as the old
 one would have; what was read or computed last is kept, by these texts.
@@ -20,7 +20,7 @@ from zakai.models.model import Model
 from zakai.records import Truth
 from zakai.studio import data
 
-Report = Callable[[int, int | None], None]
+Report = Callable[[int, int | None], None]  # receives what is done of how much
 Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
 KEPT_MODELS, KEPT_RECORDS, KEPT_RESULTS = 8, 3, 6
 MODEL = "model"  # what errors call the text of the page
@@ -43,18 +43,6 @@ class Session:
         self.records: OrderedDict[tuple[str, str], data.Given] = OrderedDict()
         self.results: OrderedDict[str, Held] = OrderedDict()
         self.online: Any = None
-
-    def answer(self, request: Mapping[str, Any], report: Report) -> Answer:
-        """Return what a request asks for."""
-        from zakai.studio import after, exports, inspecting, live, running
-
-        tasks: dict[str, Callable[..., Answer]] = {
-            **inspecting.TASKS, **running.TASKS, **after.TASKS, **exports.TASKS, **live.TASKS,
-        }  # fmt: skip
-        task = tasks.get(str(request.get("do")))
-        if task is None:
-            raise InputError(f"there is no task {str(request.get('do'))[:40]!r}; reload the page")
-        return task(self, request, report)
 
     def model(self, request: Mapping[str, Any]) -> Model:
         """Return the model of a request's text, with its own values of parameters where it gives some."""

@@ -20,6 +20,7 @@ from typing import Any, BinaryIO
 from zakai.errors import ZakaiError
 from zakai.studio.frames import ENVELOPE, packed
 from zakai.studio.session import Session
+from zakai.studio.tasks import carried_out
 
 FULL = "the computation needs more memory than it may have ({:g} GiB): take a shorter record or a larger tolerance, or start "
 FULL += "zakai studio with a larger --memory"
@@ -45,7 +46,7 @@ def answer(session: Session, request: dict[str, Any], memory: float, report: Cal
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("ignore")
             warnings.simplefilter("always", UserWarning)
-            header, arrays = session.answer(request, report)
+            header, arrays = carried_out(session, request, report)
         notes = list(dict.fromkeys(str(one.message) for one in caught if one.category is UserWarning))
         return packed({**head, "notes": notes, **header}, arrays)
     except ZakaiError as error:
@@ -94,7 +95,6 @@ def main() -> None:
 def _load() -> None:
     """Import what every page needs, while it is still being opened."""
     from zakai.report import equations  # noqa: F401
-    from zakai.studio import inspecting, running  # noqa: F401
 
 
 def _report(output: Output, number: int, given: Any, done: int, total: int | None) -> None:
