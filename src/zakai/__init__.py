@@ -39,6 +39,7 @@ _PUBLIC = {
     "sample": "zakai.inference.bayes",
     "compare": "zakai.diagnostics.compare",
     "Comparison": "zakai.diagnostics.compare",
+    "widget": "zakai.report.widget",
     "load_result": "zakai.engine.stored",
     "cite": "zakai.citations",
     "Density": "zakai.densities",

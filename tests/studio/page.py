@@ -57,5 +57,7 @@ class Page:
 
 def studio(**settings: Any) -> tuple[TestClient, str]:
     """A client of a studio, and its token."""
-    made = Settings(port=PORT, **settings)
-    return TestClient(Studio(made).application(), base_url=ORIGIN, headers={"origin": ORIGIN}), made.token
+    made = Studio(Settings(port=PORT, **settings))
+    client = TestClient(made.application(), base_url=ORIGIN, headers={"origin": ORIGIN})
+    client.studio = made
+    return client, made.settings.token

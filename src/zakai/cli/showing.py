@@ -7,6 +7,7 @@ import threading
 import webbrowser
 from pathlib import Path
 
+import zakai
 from zakai.errors import InputError
 
 
@@ -23,7 +24,7 @@ def studio(model: str | None, record: str | None, port: int, browser: bool, memo
             raise
         raise InputError(f"studio: {missing} is not installed; pip install 'zakai[studio]'") from error
 
-    settings = Settings(memory=memory)
+    settings = Settings(memory=memory, version=zakai.__version__)
     if model is not None:
         settings.model, settings.tables = _text(model)
     if record == "-":

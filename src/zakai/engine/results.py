@@ -88,7 +88,10 @@ class FilterResult:
         deviation = np.sqrt(np.maximum(self.variance[-1], 0.0))
         rows = [(name, *map(_display.number, row)) for name, *row in zip(self.state, self.mean[-1], deviation, strict=True)]
         when = _display.number(self.times[-1]) if self.dates is None else str(self.dates[-1].astype("datetime64[s]"))
-        return _display.html_table(repr(self), ("", f"mean at {when}", "deviation"), rows, self.warnings)
+        table = _display.html_table(repr(self), ("", f"mean at {when}", "deviation"), rows, self.warnings)
+        from zakai.report import notebook_picture
+
+        return table + str(notebook_picture(self))
 
     @property
     def cov(self) -> np.ndarray:

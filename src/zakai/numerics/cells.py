@@ -13,7 +13,7 @@ from zakai.numerics.compiled import kernel
 
 Array = NDArray[Any]
 
-_SEEN = 1e-6  # of the largest value of a density: what is below everywhere is outside of its window
+SEEN = 1e-6  # of the largest value of a density: what is below everywhere is outside of its window
 _SUMMED = 1e-10  # of the largest value on the grid: smaller terms change nothing that is drawn
 _REACH = 7.0  # standard deviations at which a Gaussian is below 1e-10 of its peak
 
@@ -33,15 +33,15 @@ def grid_cells(log_values: Array, closed: bool, count: int) -> tuple[float, floa
     values = np.exp(log_values - np.max(log_values))
     size = len(values)
     if closed:
-        first, length = _arc(values > _SEEN)
-        start, terms = _arc(values > _SUMMED)
+        first, length = arc(values > SEEN)
+        start, terms = arc(values > _SUMMED)
         low, high = first - 1.0, first + length + 0.0
         if 2 * (high - low) > size:  # the whole circle, from the point opposite to the mean
             mean = np.angle(values @ np.exp(2j * np.pi / size * np.arange(size))) * size / (2 * np.pi)
             low, high = mean - 0.5 * size, mean + 0.5 * size
             start, terms = 0, size
     else:
-        seen, summed = np.flatnonzero(values > _SEEN), np.flatnonzero(values > _SUMMED)
+        seen, summed = np.flatnonzero(values > SEEN), np.flatnonzero(values > _SUMMED)
         low, high = max(seen[0] - 1.0, -0.5), min(seen[-1] + 1.0, size - 0.5)
         start, terms = int(summed[0]), int(summed[-1] - summed[0] + 1)
     within = max(1, math.ceil(2.0 * (high - low) / count))  # two points for each of the grid
@@ -55,7 +55,7 @@ def grid_cells(log_values: Array, closed: bool, count: int) -> tuple[float, floa
     return low, high, out
 
 
-def _arc(inside: Array) -> tuple[int, int]:
+def arc(inside: Array) -> tuple[int, int]:
     """Return the first index and the length of the shortest arc of a circle that holds all places that are `inside`."""
     places = np.flatnonzero(inside)
     gaps = np.diff(np.append(places, places[0] + len(inside)))

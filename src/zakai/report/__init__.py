@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["diagnostics_figure", "posterior_figure", "save_figure", "write_report"]
+__all__ = ["diagnostics_figure", "notebook_picture", "posterior_figure", "save_figure", "write_report"]
 
 
 def __getattr__(name: str) -> Any:
@@ -12,6 +12,10 @@ def __getattr__(name: str) -> Any:
         from zakai.report.html import write_report
 
         return write_report
+    if name == "notebook_picture":
+        from zakai.report.scripts import notebook_picture
+
+        return notebook_picture
     if name in __all__:
         from zakai.report import pictures
 

@@ -37,7 +37,7 @@ class Panel:
     def add(self, kind: str, x: Any = None, y: Any = None, **more: Any) -> Panel:
         """Add a series: its kind, its arrays, and its style as `static/chart.js` describes them."""
         one: dict[str, Any] = {"kind": kind}
-        arrays = {"x": x, "y": y, **{key: more.pop(key) for key in ("spread", "low", "high") if np.ndim(more.get(key)) == 1}}
+        arrays = {"x": x, "y": y, **{key: more.pop(key) for key in ("spread", "low", "high") if np.ndim(more.get(key, 0.0)) == 1}}
         for key, values in arrays.items():
             if values is not None:
                 name = f"a{len(self._chart._arrays)}"

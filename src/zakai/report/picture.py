@@ -90,7 +90,7 @@ def picture_bytes(
         lines.add("observations", *observed, dots=True)
     if known is not None:
         lines.add("truth", times[inside], known[inside])
-    names = state_names(result)
+    names, ranged = state_names(result), inside if alone else slice(None)
     header = {
         "kind": "density",
         "key": f"{names[number]}-{zlib.crc32(means.tobytes() + variances.tobytes()):08x}",
@@ -101,9 +101,7 @@ def picture_bytes(
         "levels": list(LEVELS),
         "window": [float(times[inside[0]]), float(times[inside[-1]])],
         "extent": [float(times[k]) for k in ((inside[0], inside[-1]) if alone else (0, -1))],
-        "range": value_range(
-            *((one if one is None or not alone else one[inside]) for one in (means, variances, known)), periodic
-        ),
+        "range": value_range(means[ranged], variances[ranged], None if known is None else known[ranged], periodic),
         "complete": len(index) == len(inside),
         "coverage": None if known is None else coverage(arrays["quantiles"], arrays["truth"], periodic),
         "lines": lines.described,

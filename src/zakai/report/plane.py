@@ -9,14 +9,16 @@ import numpy as np
 
 from zakai.densities import Density
 from zakai.densities._values import wrap
+from zakai.densities.grid import GridDensity, interpolation
 from zakai.densities.points import PointMasses
 from zakai.errors import InputError
+from zakai.numerics.cells import SEEN, arc
 from zakai.report.charts import clock_header
 from zakai.report.frames import pack
 from zakai.report.heatmap import is_periodic, state_names, true_states
 from zakai.report.picture import number_of
 
-SIZE = 80  # points along an axis of the window
+SIZE = 81  # points along an axis of the window; odd, so that the mean is one
 PROBABILITIES = (0.5, 0.95)
 _REACH = 5.0  # standard deviations along each axis of the window
 _SCALE = 65535
@@ -73,10 +75,12 @@ def plane_bytes(
 
 def _window(density: Density, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return origin (2,), basis (2, 2) and values (size, size): value [j, i] is that at origin + basis (i, j)."""
+    if isinstance(density, GridDensity):
+        return _of_grid(density, size)
     mean, cov = density.mean(), density.cov()
     floor = 1e-18 * np.maximum(1.0, mean**2)
     factor = np.linalg.cholesky(cov + np.diag(np.maximum(floor, 1e-12 * np.diag(cov))))
-    half = _REACH
+    half: Any = _REACH
     if any(density.periodic):  # an axis of its own for each, no wider than the circle
         factor = np.diag(np.sqrt(np.diag(cov) + floor))
         half = np.where(density.periodic, np.minimum(_REACH, np.pi / np.diag(factor)), _REACH)
@@ -90,6 +94,24 @@ def _window(density: Density, size: int) -> tuple[np.ndarray, np.ndarray, np.nda
     points = np.where(density.periodic, wrap(points), points)
     logs = np.asarray(density.log_density(points.reshape(-1, 2)), dtype=float).reshape(size, size)
     return origin, basis, np.exp(np.where(np.isnan(logs), -np.inf, logs))
+
+
+def _of_grid(density: GridDensity, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return origin, basis and values along the axes of the density's own grid."""
+    top = float(density.log_values.max())
+    values, ends, kernels = np.exp(density.log_values - top), [], []
+    for axis, (count, closed) in enumerate(zip(values.shape, density._closed, strict=True)):
+        inside = values.max(axis=1 - axis) > SEEN
+        first, length = (
+            arc(inside) if closed else (int(np.argmax(inside)), int(count - np.argmax(inside[::-1]) - np.argmax(inside)))
+        )
+        low, high = (first - 1.0, first + length + 0.0) if closed else (max(first - 1.0, -0.5), min(first + length, count - 0.5))
+        index = np.linspace(low, min(high, low + count), size) - count // 2
+        ends.append((index[0], index[1] - index[0]))
+        kernels.append(interpolation(index, count, closed))
+    fine = np.maximum(kernels[0] @ values @ kernels[1].T, 0.0) * np.exp(top - density._log_scale)
+    starts, steps = np.array(ends).T
+    return density.centre + density.basis @ starts, density.basis * steps, fine.T
 
 
 def _of_points(density: PointMasses, origin: np.ndarray, basis: np.ndarray, size: int) -> np.ndarray:

@@ -9,10 +9,13 @@ import zlib
 from functools import cache
 from html import escape
 from importlib.resources import files
+from typing import Any
 
+_COLUMNS, _ROWS = 600, 128  # of the picture of a notebook
 _MODULES = ("axes", "panel", "density", "plane", "chart")
 _IMPORT = re.compile(r'^import \{([^}]*)\} from "\./(\w+)\.js";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async )?(?:class|function|const) (\w+))", re.MULTILINE)
+_COMMENT = re.compile(r"^ *(?://[^\n]*|/\*\*.*?\*/)\n|^ +", re.MULTILINE | re.DOTALL)  # on lines of their own, and indentation
 # Nothing is fetched, whatever a file that was put into the page says, and no script runs but ours.
 _POLICY = "default-src 'none'; script-src '{script}'; style-src 'unsafe-inline'"
 
@@ -25,7 +28,7 @@ def bundle(last: str) -> str:
     """
     parts = []
     for name in (*_MODULES, last):
-        text = files("zakai.report").joinpath("static", f"{name}.js").read_text(encoding="utf-8")
+        text = _COMMENT.sub("", files("zakai.report").joinpath("static", f"{name}.js").read_text(encoding="utf-8"))
         exported = _EXPORT.findall(text)
         text = _EXPORT.sub("", _IMPORT.sub(r"const {\1} = $\2;", text))
         parts.append(f"const ${name} = (() => {{\n{text}return {{ {', '.join(exported)} }};\n}})();\n")
@@ -57,3 +60,23 @@ def framed(kind: str, frame: bytes, identifier: str, note: str = "", height: int
     """Return a picture with its caption."""
     caption = f"<figcaption>{escape(note)}</figcaption>" if note else ""
     return f"<figure>{picture(kind, frame, identifier, height)}{caption}</figure>"
+
+
+def embedded(kind: str, frame: bytes, label: str, height: int = 360) -> str:
+    """Return a picture for a notebook: a document of its own, so that nothing of it reaches the notebook, nor the reverse."""
+    page = (
+        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">{policy()}<title>{escape(label)}</title></head>'
+        f'<body style="margin:4px">{picture(kind, frame, "picture", height)}{script()}</body></html>'
+    )
+    return (
+        f'<iframe title="{escape(label)}" sandbox="allow-scripts" srcdoc="{escape(page)}" loading="lazy" '
+        f'style="width:100%;height:{height + 56}px;border:0"></iframe>'
+    )
+
+
+def notebook_picture(result: Any) -> str:
+    """Return the density over time of the first state of a result, for a notebook."""
+    from zakai.report.heatmap import state_names
+    from zakai.report.picture import picture_bytes
+
+    return embedded("density", picture_bytes(result, 0, None, _COLUMNS, _ROWS), f"Density of {state_names(result)[0]} over time")

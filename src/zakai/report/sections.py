@@ -36,7 +36,7 @@ def posterior(result: Any, truth: np.ndarray | None) -> str:
         note = "Every time is drawn." if header["complete"] else (
             f"{len(arrays['times']):,} of {total:,} densities are drawn, evenly spaced; of the mean, the extremes."
         )  # fmt: skip
-        if header["periodic"] and not header["complete"]:
+        if any(line["role"] == "mean" and line["dots"] for line in header["lines"]):
             note += " Between them the angle may have gone either way round: the means are dots."
         if header["coverage"] is not None:
             note += f" The band holds the true state at {header['coverage']:.1%} of them."

@@ -25,8 +25,8 @@ def thinned(values: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
     low = np.where(np.isfinite(values), values, np.inf)
     high = np.where(np.isfinite(values), values, -np.inf)
     if count >= 8 * most:  # parts of one length, all at once
-        size = count // (most // 2)
-        whole = size * (most // 2)
+        size = -(-count // (most // 2))
+        whole = count - count % size
         starts = np.arange(0, whole, size)
         kept = np.concatenate(
             [starts + low[:whole].reshape(-1, size).argmin(1), starts + high[:whole].reshape(-1, size).argmax(1)]

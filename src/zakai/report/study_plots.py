@@ -10,7 +10,7 @@ from zakai.report.charts import Chart, axis
 from zakai.report.comparisons import MOST, Curve, error_curves, log_range, nees_curves, spans_decades, works
 from zakai.report.study_pictures import FEW
 
-DASHES = ([], [7, 3], [2, 2], [8, 2, 2, 2], [12, 3])
+DASHES: tuple[list[int], ...] = ([], [7, 3], [2, 2], [8, 2, 2, 2], [12, 3])
 
 
 def error(outcome: Any, point: int) -> bytes:

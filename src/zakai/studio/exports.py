@@ -138,7 +138,7 @@ def _literal(text: str) -> str:
 
 
 def _one_line(text: str) -> str:
-    return re.sub(r'[^\w .,:;()+-]', " ", text)[:100].strip()
+    return re.sub(r"[^\w .,:;()+-]", " ", text)[:100].strip()
 
 
 def shell(session: Session, request: Mapping[str, Any], report: Report) -> Answer:

@@ -57,7 +57,7 @@ class Source:
 
 def _read(blocks: asyncio.Queue[bytes], loop: asyncio.AbstractEventLoop) -> None:
     while True:
-        block = sys.stdin.buffer.read1(AT_ONCE)  # type: ignore[attr-defined]
+        block = sys.stdin.buffer.read1(AT_ONCE)  # type: ignore[union-attr]
         try:
             asyncio.run_coroutine_threadsafe(blocks.put(block), loop).result()
         except RuntimeError:  # the server has ended

@@ -7,11 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.report.axes import joint_map
+from zakai.errors import InputError
 from zakai.report.frames import pack, unpack
 from zakai.report.picture import picture_bytes
+from zakai.report.plane import plane_bytes
 
 MOST_COLUMNS, MOST_ROWS = 1_200, 400
+JOINT_TIMES = 41  # at which the density of two states can be seen
 Arrays = dict[str, np.ndarray]
 
 
@@ -25,11 +27,13 @@ class View(NamedTuple):
     @classmethod
     def of(cls, request: Mapping[str, Any]) -> View:
         """Return the view that a request names; what it leaves out is everything."""
-        ends = [request.get(key) for key in ("from", "to")]
-        window = None if None in ends else (float(ends[0]), float(ends[1]))  # type: ignore[arg-type]
-        columns = int(np.clip(int(request.get("columns") or cls._field_defaults["columns"]), 2, MOST_COLUMNS))
-        rows = int(np.clip(int(request.get("rows") or cls._field_defaults["rows"]), 8, MOST_ROWS))
-        return cls(window, columns, rows)
+        wanted = {key: request.get(key) for key in ("from", "to", "columns", "rows")}
+        if not all(value is None or isinstance(value, int | float) for value in wanted.values()):
+            raise InputError("the view of the picture is not in numbers; reload the page")
+        begin, end = wanted["from"], wanted["to"]
+        columns = int(np.clip(wanted["columns"] or cls._field_defaults["columns"], 2, MOST_COLUMNS))
+        rows = int(np.clip(wanted["rows"] or cls._field_defaults["rows"], 8, MOST_ROWS))
+        return cls(None if begin is None or end is None else (float(begin), float(end)), columns, rows)
 
 
 def density_picture(result: Any, state: int, truth: Any, view: View, extent: Any = None) -> Arrays:
@@ -41,13 +45,8 @@ def density_picture(result: Any, state: int, truth: Any, view: View, extent: Any
     return {"frame": np.frombuffer(frame, np.uint8)}
 
 
-def joint_picture(result: Any, pair: tuple[int, int], k: int) -> tuple[dict[str, Any], Arrays]:
-    """Return the density of two states at time number k, with the levels that bound the regions that hold 95% and 50%."""
-    density = result.density(k).marginal(pair)
-    x, y, values, levels = joint_map(density)
-    top = float(values.max()) or 1.0
-    image = np.rint(255.0 * values / top).astype(np.uint8)
-    cov = density.cov()
-    scale = float(np.sqrt(max(cov[0, 0] * cov[1, 1], np.finfo(float).tiny)))
-    header = {"time": float(result.times[k]), "levels": (levels / top).tolist(), "correlation": float(cov[0, 1]) / scale}
-    return header, {"x": np.asarray(x, float), "y": np.asarray(y, float), "density": image}
+def joint_picture(result: Any, pair: tuple[int, int], truth: Any) -> Arrays:
+    """Return the frame of the density of two states at evenly spaced times, the start and the end among them."""
+    last = len(result.times) - 1
+    index = np.unique(np.linspace(0, last, min(JOINT_TIMES, last + 1)).round().astype(int))
+    return {"frame": np.frombuffer(plane_bytes(result, pair, index.tolist(), truth=truth), np.uint8)}

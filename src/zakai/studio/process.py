@@ -15,6 +15,7 @@ from zakai.studio.frames import ENVELOPE, packed
 
 LARGEST_FRAME = 1 << 30
 SUPERSEDED_AFTER = 1.0  # seconds after which a request ends when a newer one of its kind arrives
+ENOUGH = 1.0  # seconds in which a request of a page that is gone may end by itself
 SWITCHES = {"OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
 Send = Callable[[bytes], Awaitable[None]]
 
@@ -35,6 +36,7 @@ class Worker:
         self.reader: asyncio.Task[None] | None = None
         self.lock, self.idle = asyncio.Lock(), asyncio.Event()
         self.idle.set()
+        self.deaf = False  # whether answers are for a page that is gone
 
     async def start(self) -> None:
         """Begin a process, unless there is one."""
@@ -67,6 +69,19 @@ class Worker:
         if running is not None:
             await self._end()
             await self.send(packed({"id": running.get("id"), "do": running.get("do"), "error": "cancelled", "cancelled": True}))
+
+    async def abandon(self) -> None:
+        """Forget what waits, and what runs unless it is nearly done, since a new process takes seconds; its answer is dropped."""
+        self.waiting.clear()
+        running = self.running
+        try:
+            self.deaf = True
+            await asyncio.wait_for(self.idle.wait(), ENOUGH)
+        except TimeoutError:
+            if self.running is running and running is not None:
+                await self._end()
+        finally:
+            self.deaf = False
 
     async def close(self) -> None:
         """End the process for good."""
@@ -120,7 +135,7 @@ class Worker:
                 current = self.running is not None and number == self.number
                 if last and current:
                     self.running = None
-                if current:
+                if current and not self.deaf:
                     await self.send(frame)
                 if last:
                     await self._next()

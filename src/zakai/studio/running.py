@@ -102,14 +102,10 @@ def picture(session: Session, request: Mapping[str, Any], report: Report) -> Ans
 
 
 def joint(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
-    """Return the density of two states at the time nearest to one that is given."""
+    """Return the density of two states at several times."""
     held = session.held(request)
-    result = held.result
-    pair = state_of(result, request, "across"), state_of(result, request, "up")
-    if pair[0] == pair[1]:
-        raise InputError("two states: choose two different ones")
-    k = int(np.argmin(np.abs(result.times - float(request.get("time") or 0.0))))
-    return pictures.joint_picture(result, pair, k)
+    pair = state_of(held.result, request, "across"), state_of(held.result, request, "up")
+    return {}, pictures.joint_picture(held.result, pair, held.truth)
 
 
 def slide(session: Session, request: Mapping[str, Any], report: Report) -> Answer:

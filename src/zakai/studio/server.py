@@ -48,6 +48,7 @@ class Settings:
     follow: Source | None = None
     tables: Path | None = None
     memory: float = 4.0
+    version: str = ""
     port: int = 0
     token: str = field(default_factory=new_token)
 
@@ -143,7 +144,7 @@ class Studio:
                 await older.send_text(json.dumps({"do": "replaced"}))
                 await older.close(4001)
         await self.stop_following()
-        await asyncio.gather(self.quick.cancel(), self.runner.cancel())
+        await asyncio.gather(self.quick.abandon(), self.runner.abandon())
         await socket.send_text(json.dumps(self._hello()))
         try:
             while True:
@@ -160,12 +161,10 @@ class Studio:
             await self.stop_following()
 
     def _hello(self) -> dict[str, Any]:
-        from zakai import __version__
-
         source = self.settings.follow
         return {
             "do": "hello",
-            "version": __version__,
+            "version": self.settings.version,
             "model": self.settings.model,
             "record": self.first,
             "follow": None if source is None else source.name,

@@ -1,4 +1,4 @@
-"""What the worker holds between requests: models, records and results.
+"""What the worker keeps: models, records and results.
 
 A request names everything that it needs (the model's text, the record, the method), so that a new worker answers it as the old
 one would have; what was read or computed last is kept, by these texts.
@@ -20,7 +20,7 @@ from zakai.models.model import Model
 from zakai.records import Truth
 from zakai.studio import data
 
-Report = Callable[[int, int | None], None]
+Report = Callable[[int, int | None], None]  # receives what is done of how much
 Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
 KEPT_MODELS, KEPT_RECORDS, KEPT_RESULTS = 8, 3, 6
 MODEL = "model"  # what errors call the text of the page
@@ -67,9 +67,7 @@ class Session:
         # A simulated record stays that of the text while parameters are changed.
         base = self.model({"text": request["text"]})
         key = (str(request["text"]), json.dumps(wanted, sort_keys=True))
-        return _kept(
-            self.records, key, KEPT_RECORDS, lambda: data.given(base if simulated else model, wanted, self.folder)
-        )
+        return _kept(self.records, key, KEPT_RECORDS, lambda: data.given(base if simulated else model, wanted, self.folder))
 
     def held(self, request: Mapping[str, Any], key: str = "name") -> Held:
         """Return the result that a request names."""

@@ -1,4 +1,4 @@
-"""What the worker does for each request: one function for each word in `do`."""
+"""The tasks of the worker by their names: one function for each word in `do` of a request."""
 
 from __future__ import annotations
 
@@ -10,13 +10,17 @@ from zakai.studio import after, exports, inspecting, live, running
 from zakai.studio.session import Answer, Report, Session
 
 TASKS: dict[str, Callable[..., Answer]] = {
-    **inspecting.TASKS, **running.TASKS, **after.TASKS, **exports.TASKS, **live.TASKS,
-}  # fmt: skip
+    **inspecting.TASKS,
+    **running.TASKS,
+    **after.TASKS,
+    **exports.TASKS,
+    **live.TASKS,
+}
 
 
-def answer(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
-    """Return what a request asks for."""
-    task = TASKS.get(str(request.get("do")))
-    if task is None:
-        raise InputError(f"there is no task {str(request.get('do'))[:40]!r}; reload the page")
-    return task(session, request, report)
+def carried_out(session: Session, request: Mapping[str, Any], report: Report) -> Answer:
+    """Return the header and the arrays of the answer to a request."""
+    name = str(request.get("do"))
+    if name not in TASKS:
+        raise InputError(f"there is no task {name[:40]!r}; reload the page")
+    return TASKS[name](session, request, report)

@@ -34,6 +34,8 @@ def place_of_error(text: str, message: str) -> Place | None:
     if found:
         line, column = int(found[1]), int(found[2])
         start = _offset(text, line, column)
+        if text[start : start + 1] in ("", "\n"):  # something is missing at the end of the line
+            start = text.rfind("\n", 0, start) + 1
         return Place(start, max(start + 1, _end_of_line(text, start)), line, column)
     if "(at end of document)" in message:
         return _place(text, max(0, len(text.rstrip()) - 1), len(text.rstrip()))

@@ -20,6 +20,7 @@ from typing import Any, BinaryIO
 from zakai.errors import ZakaiError
 from zakai.studio.frames import ENVELOPE, packed
 from zakai.studio.session import Session
+from zakai.studio.tasks import carried_out
 
 FULL = "the computation needs more memory than it may have ({:g} GiB): take a shorter record or a larger tolerance, or start "
 FULL += "zakai studio with a larger --memory"
@@ -45,9 +46,7 @@ def answer(session: Session, request: dict[str, Any], memory: float, report: Cal
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("ignore")
             warnings.simplefilter("always", UserWarning)
-            from zakai.studio import tasks  # with the first request, so that a worker starts at once
-
-            header, arrays = tasks.answer(session, request, report)
+            header, arrays = carried_out(session, request, report)
         notes = list(dict.fromkeys(str(one.message) for one in caught if one.category is UserWarning))
         return packed({**head, "notes": notes, **header}, arrays)
     except ZakaiError as error:
@@ -83,6 +82,7 @@ def main() -> None:
     output = Output(os.fdopen(os.dup(1), "wb"))
     os.dup2(2, 1)  # what a library prints does not get between the frames
     session = Session(folder)
+    _load()
     for line in sys.stdin.buffer:
         request = json.loads(line)
         number = int(request["number"])
@@ -90,6 +90,11 @@ def main() -> None:
         output.send(number, answer(session, request, memory, report), True)
         if request.get("do") in ("run", "smooth", "fit"):
             gc.collect()  # results hold one another
+
+
+def _load() -> None:
+    """Import what every page needs, while it is still being opened."""
+    from zakai.report import equations  # noqa: F401
 
 
 def _report(output: Output, number: int, given: Any, done: int, total: int | None) -> None:

@@ -19,7 +19,7 @@ export class PlaneView extends Panel {
   constructor(element, options = {}) {
     super(element, { label: "Joint density of two states", height: 420, both: true, ...options });
     const row = make(this.root, "label", { display: "flex", gap: "10px", alignItems: "center", flexWrap: "wrap" });
-    this.said = make(row, "span", { minWidth: "9rem", fontVariantNumeric: "tabular-nums" });
+    this.when = make(row, "span", { minWidth: "9rem", fontVariantNumeric: "tabular-nums" });
     this.slider = make(row, "input", { flex: "1 1 10rem" }, { type: "range", min: "0", step: "1", "aria-label": "Time", ...(options.testid ? { "data-testid": `${options.testid}-time` } : {}) });
     this.slider.addEventListener("input", () => {
       this.show(Number(this.slider.value));
@@ -51,7 +51,7 @@ export class PlaneView extends Panel {
     this.at = k;
     this.slider.value = String(k);
     const when = this.frame.header.clock ? moment(times[k], this.frame.header.clock, span) : `t = ${moment(times[k], null, span)}`;
-    this.said.textContent = when;
+    this.when.textContent = when;
     this.slider.setAttribute("aria-valuetext", when);
     this.redraw();
   }

@@ -161,11 +161,13 @@ class Studio {
 
   /** Filter the record with the method that is chosen. */
   async run() {
-    if (!this.model || this.running) return;
+    if (this.running) { this.again = true; return; }
+    if (!this.model) return;
     if (!this.model.prior) { this.say("The model has no prior: add a table [prior] to filter; it can be analysed without.", true); return; }
     this.busy(true, "Filtering …");
     const found = await this.ask("run", { ...this.request, name: "main" }, { progress: (done, total) => this.progressed(done, total) });
     this.busy(false);
+    if (this.again) { this.again = false; if (found) { await this.run(); return; } }
     if (!found) return;
     this.summary = found;
     this.remember();
@@ -210,7 +212,8 @@ class Studio {
       button.setAttribute("aria-selected", String(key === name));
       button.tabIndex = key === name ? 0 : -1;
     }
-    this.tabs.get(name).open?.();
+    clearTimeout(this.opening); // one who passes by on the way to another part does not wait for this one
+    this.opening = setTimeout(() => this.tabs.get(name).open?.(), 200);
     this.remember();
   }
 

@@ -66,7 +66,7 @@ export class Editor {
     this.copy.replaceChildren(...nodes, "\n");
     const count = text.split("\n").length;
     this.lines.replaceChildren(...Array.from({ length: count }, (_, k) => h("span", { class: this.place?.line === k + 1 ? "wrong" : "" }, `${k + 1}\n`)));
-    this.text.rows = Math.min(24, Math.max(6, count + 1));
+    this.text.rows = Math.min(24, Math.max(6, count));
     this._follow();
   }
 

@@ -4,7 +4,7 @@ import { byId, field, h } from "./dom.js";
 
 const SIGNS = { true: ["✓", "holds"], false: ["✗", "does not hold"], null: ["?", "not decided"] };
 const ABOUT = {
-  tolerance: "wanted accuracy of the mean, in standard deviations", seed: "of random draws", particles: "a fixed number", most_particles: "at most",
+  tolerance: "in standard deviations", seed: "of random draws", particles: "a fixed number", most_particles: "at most",
 };
 
 export class Method {

@@ -1,4 +1,4 @@
-// The smaller pictures: lines and bands over time, a histogram, and the joint density of two states.
+// The smaller pictures: lines and bands over time, and a histogram.
 
 import { text } from "./axes.js";
 import { Panel, drawSeries } from "./panel.js";
@@ -102,52 +102,6 @@ export class BarPanel extends Panel {
     const width = (this.high - this.low) / this.heights.length, k = Math.floor((x - this.low) / width);
     if (k < 0 || k >= this.heights.length) return null;
     return { x, y, lines: [`${text(this.low + k * width, 3)} to ${text(this.low + (k + 1) * width, 3)}`, text(this.heights[k], 4)] };
-  }
-}
-
-/** The density of two states: show({x, y, density (uint8, rows of y), levels, names}). */
-export class JointPanel extends Panel {
-  constructor(element, options = {}) { super(element, { both: true, ...options }); }
-
-  show({ x, y, density, levels, names }) {
-    Object.assign(this, { gridX: x, gridY: y, density, levels });
-    this.axes = { x: { title: names[0] }, y: { title: names[1] } };
-    this.setHome([x[0], x[x.length - 1]], [y[0], y[y.length - 1]]);
-  }
-
-  _at2(x, y) {
-    const across = this.gridX.length, up = this.gridY.length;
-    const i = ((x - this.gridX[0]) / (this.gridX[across - 1] - this.gridX[0])) * (across - 1), j = ((y - this.gridY[0]) / (this.gridY[up - 1] - this.gridY[0])) * (up - 1);
-    if (!(i >= 0 && j >= 0 && i <= across - 1 && j <= up - 1)) return 0;
-    const a = Math.min(across - 2, Math.floor(i)), b = Math.min(up - 2, Math.floor(j)), s = i - a, t = j - b, at = (p, q) => this.density[q * across + p];
-    return (1 - t) * ((1 - s) * at(a, b) + s * at(a + 1, b)) + t * ((1 - s) * at(a, b + 1) + s * at(a + 1, b + 1));
-  }
-
-  paint(context, place, colours) {
-    if (!this.density) return;
-    const across = Math.round(place.w * this.ratio), down = Math.round(place.h * this.ratio);
-    const image = context.createImageData(across, down), pixels = new Uint32Array(image.data.buffer), values = new Float32Array(across * down);
-    for (let row = 0, at = 0; row < down; row++) {
-      const y = this.view.y[1] - ((row + 0.5) / down) * (this.view.y[1] - this.view.y[0]);
-      for (let column = 0; column < across; column++, at++) {
-        const x = this.view.x[0] + ((column + 0.5) / across) * (this.view.x[1] - this.view.x[0]);
-        values[at] = this._at2(x, y);
-        pixels[at] = colours.table[Math.round(values[at])];
-      }
-    }
-    context.putImageData(image, Math.round(place.x * this.ratio), Math.round(place.y * this.ratio));
-    context.fillStyle = colours.band;
-    const size = 1 / this.ratio;
-    for (const level of this.levels) { // a line where the density passes the level
-      for (let row = 1; row < down; row++) for (let column = 1; column < across; column++) {
-        const at = row * across + column, above = values[at] >= 255 * level;
-        if (above !== values[at - 1] >= 255 * level || above !== values[at - across] >= 255 * level) context.fillRect(place.x + column * size, place.y + row * size, 1, 1);
-      }
-    }
-  }
-
-  describe(x, y) {
-    return this.density ? { x, y, lines: [`${this.axes.x.title} ${text(x)}`, `${this.axes.y.title} ${text(y)}`, `${Math.round(this._at2(x, y) / 2.55)}% of the peak`] } : null;
   }
 }
 

@@ -42,7 +42,7 @@ export class Parameters {
 
   _slider(name, value) {
     const range = h("input", { type: "range", min: "0", max: String(STEPS), step: "1", "data-testid": `slider-${name}`, "aria-label": name,
-      oninput: () => this._drag(name), onchange: () => this._release() });
+      onpointerdown: () => { this.held = true; }, oninput: () => this._drag(name), onchange: () => this._release() });
     const box = h("input", { type: "text", inputMode: "decimal", class: "value", "aria-label": `value of ${name}`, "data-testid": `value-${name}`, onchange: () => {
       const now = Number(box.value.replace("−", "-"));
       if (!Number.isFinite(now)) { this._set(name, this.inputs[name].now); return; }
@@ -70,7 +70,6 @@ export class Parameters {
     one.range.setAttribute("aria-valuetext", one.box.value);
     this.dragged = true;
     this._wanted(performance.now());
-    this.settled();
   }
 
   get values() { return Object.fromEntries(Object.entries(this.inputs).map(([name, one]) => [name, one.now])); }
@@ -96,8 +95,10 @@ export class Parameters {
 
   _said() { return Object.entries(this.values).map(([name, value]) => `${name} = ${number(value, 4)}`).join(", "); }
 
+  /** The pointer has let go; keys are waited for, since each of them is a change. */
   _release() {
-    this.settled.now();
+    if (this.held) this.settled.now(); else this.settled();
+    this.held = false;
   }
 
   async _settle() {

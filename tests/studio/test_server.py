@@ -1,0 +1,226 @@
+"""The server of the studio: who is answered, what is taken, and that a request can neither block nor break it."""
+
+from __future__ import annotations
+
+import re
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from starlette.websockets import WebSocketDisconnect
+
+import zakai
+from studio.page import HOST, ORIGIN, PORT, Page, studio
+
+SPIRAL = zakai.gallery.text("spiral-sensor")
+SIMULATED = {"kind": "simulate", "until": 1.0, "step": 0.02, "seed": 1}
+
+
+@pytest.fixture(scope="module")
+def served():
+    client, token = studio()
+    with client:
+        yield client, token
+
+
+@pytest.fixture
+def page(served):
+    client, token = served
+    with client.websocket_connect(f"/{token}/socket", headers={"host": HOST, "origin": ORIGIN}) as socket:
+        yield Page(client, token, socket)
+
+
+WAYS = {
+    "without a token": ("/", {}, "GET"),
+    "with a wrong token": ("/?token=guessed", {}, "GET"),
+    "with the token twice": ("/?token={token}&token=x", {}, "GET"),
+    "by a name that resolves here": ("/?token={token}", {"host": f"attacker.example:{PORT}"}, "GET"),
+    "with the host of another port": ("/?token={token}", {"host": f"127.0.0.1:{PORT + 1}"}, "GET"),
+    "from another origin": ("/?token={token}", {"origin": "https://attacker.example"}, "GET"),
+    "from another port of this machine": ("/{token}/record", {"origin": "http://127.0.0.1:9"}, "POST"),
+    "by a form": ("/{token}/record", {"origin": "null", "content-type": "application/x-www-form-urlencoded"}, "POST"),
+    "by a request that says no origin": ("/{token}/record", {"origin": ""}, "POST"),
+    "by a script tag of another site": ("/{token}/app.js", {"sec-fetch-site": "cross-site", "origin": ""}, "GET"),
+    "by a page of another port": ("/{token}/app.js", {"sec-fetch-site": "same-site", "origin": ""}, "GET"),
+    "for the files without a token": ("/static/app.js", {}, "GET"),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_request_is_refused(served, way: str):
+    client, token = served
+    path, headers, method = WAYS[way]
+    answer = client.request(
+        method, path.format(token=token), headers={"host": HOST, **headers}, content=b"time,x\n1,2\n" * (method == "POST")
+    )
+    assert answer.status_code == 403
+    assert "open the address that zakai studio printed" in answer.text
+
+
+@pytest.mark.parametrize(
+    ("path", "headers"),
+    [
+        ("/{token}/socket", {"host": HOST, "origin": "https://attacker.example"}),
+        ("/{token}/socket", {"host": "attacker.example", "origin": "http://attacker.example"}),
+        ("/guessed/socket", {"host": HOST, "origin": ORIGIN}),
+        ("/{token}/socket", {"host": HOST, "origin": ""}),
+        ("/socket", {"host": HOST, "origin": ORIGIN}),
+    ],
+)
+def test_a_websocket_is_refused(served, path: str, headers: dict[str, str]):
+    client, token = served
+    with pytest.raises(WebSocketDisconnect), client.websocket_connect(path.format(token=token), headers=headers):
+        pass
+
+
+def test_the_page_is_answered_with_a_policy_that_loads_nothing_from_elsewhere(served):
+    client, token = served
+    answer = client.get(f"/?token={token}", headers={"host": HOST, "origin": ""})
+    assert answer.status_code == 200
+    policy = answer.headers["content-security-policy"]
+    assert "default-src 'none'" in policy and "frame-ancestors 'none'" in policy
+    assert not re.search(r"unsafe|https?:|\*", policy)
+    assert not re.search(r"<script(?![^>]*src)|style=|\bon\w+=|https?://", answer.text)
+    for name in ("app.js", "studio.css", "density.js", "axes.js", "panel.js", "icon.svg"):
+        assert client.get(f"/{token}/{name}", headers={"host": HOST}).status_code == 200
+    assert client.get(f"/{token}/..%2Fserver.py", headers={"host": HOST}).status_code == 404
+
+
+def test_an_upload_is_bounded_and_a_bad_one_is_one_message(page: Page):
+    assert page.upload(b"").json() == {"error": "the file is empty; drop a CSV file with a header"}
+    assert "more than 1,000,000 rows" in page.upload(b"1\n" * 1_000_001).json()["error"]
+    assert "larger than 64 MiB" in page.upload(b"x" * ((64 << 20) + 1)).json()["error"]
+    for body in (
+        b"\0\1\2",
+        b"time,y1,y2\n1,2\n",
+        b"time,y1,y2\n2,1,1\n1,1,1\n",
+        b"a,b\n1,2\n",
+        b"time," + b"c," * 300 + b"\n",
+        b"\xff\xfe",
+    ):
+        number = page.upload(body).json()["file"]
+        data = {"kind": "file", "file": number, "name": "mine.csv"}
+        said = page.ask("columns", **data).get("error") or page.ask("describe", text=SPIRAL, data=data)["error"]
+        assert said.startswith("mine.csv") and "\n" not in said
+    other = {"kind": "file", "file": "../../etc/passwd"}
+    assert "drop the file again" in page.ask("describe", text=SPIRAL, data=other)["error"]
+
+
+def test_a_record_of_a_file_is_filtered_as_by_the_library(page: Page, tmp_path):
+    model = zakai.load_model("gallery:spiral-sensor")
+    _, record = zakai.simulate(model, np.arange(1, 41) * 0.02, seed=7)
+    record.to_csv(tmp_path / "r.csv", ["first", "second"])
+    data = {"kind": "file", "file": page.upload((tmp_path / "r.csv").read_bytes()).json()["file"], "columns": ["second", "first"]}
+    answer = page.ask("run", text=SPIRAL, data=data, name="main")
+    swapped = zakai.Record(record.times, record.values[:, ::-1], "increments")
+    assert answer["log_likelihood"] == zakai.filter(model, swapped).log_likelihood
+    assert page.ask("picture", name="main")["frame"].size > 1000
+
+
+def test_the_newest_of_several_requests_is_answered(page: Page):
+    page.ask("run", text=SPIRAL, data=SIMULATED, name="main")
+    for _ in range(20):
+        last = page.send("picture", name="main", channel="picture")
+    answered = []
+    while not answered or answered[-1] != last:
+        answered.append(page.receive()["id"])
+    assert len(answered) < 20
+
+
+def test_a_run_is_cancelled_and_the_next_request_is_answered(page: Page):
+    lorenz = zakai.gallery.text("lorenz")
+    page.send("run", text=lorenz, data={"kind": "simulate", "until": 200.0, "step": 0.01, "seed": 0}, method="yau-yau")
+    time.sleep(1.0)
+    page.send("cancel")
+    while not (answer := page.receive()).get("cancelled"):
+        pass
+    assert answer["error"] == "cancelled"
+    assert page.ask("describe", text=SPIRAL, data=SIMULATED)["rows"] == 50
+
+
+def test_text_that_takes_long_does_not_keep_the_next_one_waiting(page: Page):
+    page.send("algebra", text=zakai.gallery.text("lorenz"))
+    assert page.ask("check", text=SPIRAL)["model"]["state"] == ["x"]
+
+
+def test_a_task_that_fails_is_one_line_and_never_a_traceback(page: Page):
+    page.ask("run", text=SPIRAL, data=SIMULATED, name="main")
+    given = {"text": SPIRAL, "data": SIMULATED}
+    for request in (
+        {"do": "run", "text": SPIRAL},
+        {"do": "picture", "name": "none"},
+        {"do": "run", "text": None, "data": 3},
+        {"do": "fit", **given},
+        {"do": "__init__"},
+        {"do": "export", "what": "/etc/passwd"},
+        {"do": "run", "text": SPIRAL, "data": {"kind": "simulate", "until": 1e9, "step": 1e-9}},
+        {"do": "slide", "text": SPIRAL, "name": "none"},
+        {"do": "joint", "name": "main", "across": "x", "up": "x"},
+        {"do": "run", **given, "options": {"x": 1}},
+        {"do": "run", **given, "method": "benes"},
+        {"do": "picture", "name": "main", "from": "a", "to": 1},
+        {"do": "run", "text": SPIRAL, "data": {"kind": "simulate", "until": "much", "step": []}},
+    ):
+        said = page.ask(**request)["error"]
+        assert "\n" not in said and "Traceback" not in said and "fault of zakai" not in said, request
+    page.socket.send_text("[1, 2")
+    assert "no request" in page.receive()["error"]
+
+
+def test_a_task_that_needs_too_much_memory_ends_with_advice():
+    program = """
+from pathlib import Path
+import numpy as np
+from zakai.studio.session import Session
+from zakai.studio.tasks import TASKS
+from zakai.studio.worker import answer, limit_memory
+TASKS["large"] = lambda *_: ({}, {"array": np.ones(1 << 29)})
+limit_memory(2.0)
+session = Session(Path())
+session.results["main"] = None
+print(answer(session, {"id": 1, "do": "large"}, 2.0, None), not session.results)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert "more memory than it may have (2 GiB)" in done.stdout and "--memory" in done.stdout and "True" in done.stdout
+
+
+def test_a_worker_that_the_system_ends_is_replaced(served, page: Page):
+    client, _ = served
+    page.send("run", text=zakai.gallery.text("lorenz"), data={"kind": "simulate", "until": 200.0, "step": 0.01, "seed": 0})
+    time.sleep(0.5)
+    client.studio.runner.process.kill()
+    while "error" not in (answer := page.receive()):
+        pass
+    assert "it needed more memory than it may have" in answer["error"]
+    assert page.ask("describe", text=SPIRAL, data=SIMULATED)["rows"] == 50
+
+
+def test_the_script_of_a_record_from_a_file_computes_the_same(page: Page, tmp_path):
+    text = zakai.gallery.text("kalman-bucy-1d")
+    data = {"kind": "file", "file": page.upload(b"time,y\n0.5,0.1\n1.25,\n2,-0.3\n").json()["file"], "name": "mine.csv"}
+    answer = page.ask("run", text=text, data=data, name="main")
+    script = page.ask("export", what="filter.py", text=text, data=data)["bytes"].tobytes()
+    (tmp_path / "filter.py").write_bytes(script)
+    done = subprocess.run([sys.executable, "filter.py"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert f"log-likelihood {answer['log_likelihood']!r}" in done.stdout
+    stored = page.ask("export", what="result.nc", name="main")["bytes"].tobytes()
+    (tmp_path / "stored.nc").write_bytes(stored)
+    assert zakai.load_result(tmp_path / "stored.nc").log_likelihood == answer["log_likelihood"]
+
+
+def test_what_is_not_valid_on_the_command_line_is_one_line():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        for arguments, words in (
+            (["nosuch.toml"], "nosuch.toml"),
+            (["gallery:benes", "nosuch.csv"], "nosuch.csv"),
+            (["--port", port], "--port"),
+        ):
+            command = [sys.executable, "-m", "zakai", "studio", "--no-browser", *arguments]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+            assert done.returncode == 2 and words in done.stderr and done.stderr.count("\n") == 1
