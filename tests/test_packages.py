@@ -28,6 +28,7 @@ ENTRIES = {
     ("algebra/analysis.py", "plot"): "zakai.report.axes",
     ("engine/results.py", "plot"): "zakai.report.axes",
     ("engine/results.py", "report"): "zakai.report",
+    ("engine/results.py", "_repr_html_"): "zakai.report",
     ("engine/results.py", "residuals"): "zakai.diagnostics.residuals",
     ("engine/results.py", "predict_observations"): "zakai.diagnostics.observed_ahead",
     ("inference/fit.py", "plot"): "zakai.report.axes",
