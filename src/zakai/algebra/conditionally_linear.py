@@ -2,8 +2,8 @@
 
     du = (a(u, t) + A(u, t) v) dt + g_u(u, t) dv,      dv = (b(u, t) + B(u, t) v) dt + g_v(u, t) dv,      h = c(u, t) + C(u, t) v
 
-Drift and observation are affine in v = (v_1, ..., v_k) for all v if and only if their second derivatives by every pair of them are
-zero.  A state is excluded by itself where its own second derivative is not zero, or the noise, a law that is not Gaussian, an
+Drift and observation are affine in v = (v_1, ..., v_k) for all v if and only if their second derivatives by every pair of them
+are zero.  A state is excluded by itself where its own second derivative is not zero, or the noise, a law that is not Gaussian, an
 angle or a domain contains it; two states exclude each other where their mixed derivative is not zero.  The largest set in which
 no pair is excluded is taken; of several the first that moves the others not at all, then the first in the order of the states.
 

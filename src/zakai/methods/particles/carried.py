@@ -53,7 +53,7 @@ def _given_away(prepared: Prepared, k: int, state: State) -> bool:
     length = interval.stop - interval.start
     if length <= 0:
         return True  # how long the others will be is not known
-    u = np.zeros(0) if interval.inputs is None else interval.inputs.at(interval.start, prepared.model.input_hold)
+    u = np.zeros(0) if interval.inputs is None else np.array(interval.inputs.at(interval.start, prepared.model.input_hold))
     program = tuple(system.information.at(prepared.theta))
     point = np.ascontiguousarray((state.particles @ np.exp(state.log_weights))[:, None])
     rate = float(prepared.motion.values(program, point, interval.start, u)[0, 0])

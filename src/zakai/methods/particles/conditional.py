@@ -215,7 +215,7 @@ class ConditionalSystem(System):
 
     def _conditional(self, mean: Array, cov: Array) -> tuple[Array, Array, Array]:
         """Return the mean (n,) and the spread (n, d) of u and E(v | u) for a Gaussian, and the entries of the covariance of v."""
-        u, v = self.drawn_states, list(self.block.linear)
+        u, v = self.drawn_states, np.array(self.block.linear)
         R = root(cov[np.ix_(u, u)])
         along = np.linalg.lstsq(R, cov[np.ix_(u, v)], rcond=None)[0].T if R.shape[1] else np.zeros((len(v), 0))
         spread = np.zeros((len(mean), R.shape[1]))

@@ -115,7 +115,7 @@ def moments(particles: Array, weights: Array, angles: Array) -> tuple[Array, Arr
 
 
 class Moments(NamedTuple):
-    """The mean (n',) of the coordinates, deviations (n, N) and covariance (n, n) of the states, and deviations of particles (n',)."""
+    """The mean (n',) of the coordinates, deviations (n, N) and covariance (n, n) of the states, the spread (n',) of particles."""
 
     mean: Array
     deviations: Array

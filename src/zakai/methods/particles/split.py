@@ -18,10 +18,14 @@ from zakai.models.model import Model
 
 
 class Split(NamedTuple):
-    """The numbers of the states that each particle carries by their mean and covariance, none where `reason` says why not."""
+    """The numbers of the states that each particle carries by their mean and covariance, none where `reason` says why not.
+
+    `coupled`: whether they move the others, so that the path of those says something about them.
+    """
 
     linear: tuple[int, ...]
     reason: str
+    coupled: bool = False
 
 
 @once_for_a_model
@@ -52,7 +56,7 @@ def split_of(model: Model) -> Split:
         noisy = noisy_others(model, linear)
         if is_zero(model.covariance.extract(noisy, noisy).det()) is not False:
             return Split((), f"the noise of {', '.join(model.state[i] for i in noisy)} is singular")
-    return Split(tuple(linear), "")
+    return Split(tuple(linear), "", bool(moved_by(model, linear)))
 
 
 def reads(model: Model, j: int, linear: list[int]) -> bool:
