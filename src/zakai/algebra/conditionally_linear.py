@@ -50,10 +50,16 @@ class ConditionallyLinear(tuple[str, ...]):
 
 
 class Formula(NamedTuple):
-    """A formula of a model, and what it is in words."""
+    """A formula of a model, what it is in words, and its symbols."""
 
     name: str
     formula: sp.Expr
+    symbols: frozenset[sp.Symbol]
+
+    @classmethod
+    def of(cls, name: str, formula: sp.Expr) -> Formula:
+        """Return the formula with its symbols."""
+        return cls(name, formula, frozenset(formula.free_symbols))
 
 
 @once_for_a_model
@@ -89,26 +95,26 @@ def gaussian_coordinates(model: Model) -> list[bool]:
 def _affine_formulas(model: Model) -> Iterator[Formula]:
     """Return what must be affine."""
     for name, formula in zip(model.state, model.drift, strict=True):
-        yield Formula(f"the drift of {name}", formula)
+        yield Formula.of(f"the drift of {name}", formula)
     if model.log_density is None:
         for name, formula, linear in zip(model.observation_names, model.observation, gaussian_coordinates(model), strict=True):
             if linear:
-                yield Formula(f"the observation {name}", formula)
+                yield Formula.of(f"the observation {name}", formula)
 
 
 def _free_formulas(model: Model) -> Iterator[Formula]:
     """Return what must be free of linear states."""
     for matrix, name in ((model.diffusion, "the diffusion"), (model.process_noise, "the process noise")):
-        yield from (Formula(name, entry) for entry in matrix.todok().values())
-    yield from (Formula("the cross noise", entry) for entry in model.cross_noise.todok().values())
+        yield from (Formula.of(name, entry) for entry in matrix.todok().values())
+    yield from (Formula.of("the cross noise", entry) for entry in model.cross_noise.todok().values())
     if model.log_density is not None:
-        yield Formula("the log density of the observation", model.log_density)
+        yield Formula.of("the log density of the observation", model.log_density)
         return
-    yield from (Formula("the observation noise", entry) for entry in model.observation_noise.todok().values())
-    yield from (Formula("a parameter of the law of the observations", entry) for entry in model.family_parameters.values())
+    yield from (Formula.of("the observation noise", entry) for entry in model.observation_noise.todok().values())
+    yield from (Formula.of("a parameter of the law of the observations", entry) for entry in model.family_parameters.values())
     for name, formula, linear in zip(model.observation_names, model.observation, gaussian_coordinates(model), strict=True):
         if not linear:
-            yield Formula(f"the observation {name}, which is an angle or not Gaussian,", formula)
+            yield Formula.of(f"the observation {name}, which is an angle or not Gaussian,", formula)
 
 
 def _excluded(model: Model) -> Iterator[tuple[int, str]]:
@@ -118,11 +124,11 @@ def _excluded(model: Model) -> Iterator[tuple[int, str]]:
         if name in model.periodic or name in model.domain:
             yield i, f"{name} is an angle" if name in model.periodic else f"{name} has a domain"
             continue
-        reading = next((one for one in free if one.formula.has(symbol)), None)
+        reading = next((one for one in free if symbol in one.symbols), None)
         if reading is not None:
             yield i, f"{reading.name} depends on {name}"
             continue
-        curved = next((one for one in affine if one.formula.has(symbol) and not _is_affine(one.formula, symbol)), None)
+        curved = next((one for one in affine if symbol in one.symbols and not _is_affine(one.formula, symbol)), None)
         if curved is not None:
             yield i, f"{curved.name} contains {_part(curved.formula, symbol)}"
 
@@ -131,7 +137,7 @@ def _pairs(model: Model, states: list[int]) -> dict[tuple[int, int], str]:
     """Return the pairs of states that are linear each by itself and not together, with the reason."""
     found: dict[tuple[int, int], str] = {}
     for one in _affine_formulas(model):
-        own = [i for i in states if one.formula.has(model.x[i])]
+        own = [i for i in states if model.x[i] in one.symbols]
         for i in own:
             slope = sp.diff(one.formula, model.x[i])
             for j in own:

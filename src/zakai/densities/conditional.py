@@ -120,11 +120,20 @@ class ConditionalParticleDensity(DensityMethods):
         weights, points, covs = np.full(most, 1.0 / most), self.points[places], self.covs[places]
         return ConditionalParticleDensity(weights, points, self.names, self.periodic, self.linear, covs)
 
+    def drawn(self) -> ParticleDensity:
+        """Return the particles with one draw of the linear states each, always the same."""
+        return ParticleDensity(self.weights, self._with_draws(np.arange(len(self.weights)), generator(0)), self.names, self.periodic)
+
     def sample(self, key: object, count: int) -> np.ndarray:
         rng, count = generator(key), sample_size(count)
-        places = np.searchsorted(np.cumsum(self.weights) / self.weights.sum(), rng.random(count)).clip(0, len(self.weights) - 1)
+        places = np.searchsorted(np.cumsum(self.weights) / self.weights.sum(), rng.random(count))
+        x = self._with_draws(places.clip(0, len(self.weights) - 1), rng)
+        return np.where(self.periodic, wrap(x), x)
+
+    def _with_draws(self, places: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Return draws (count, n) from the Gaussians of particles."""
         values, vectors = np.linalg.eigh(self.covs[places])
-        normal = rng.standard_normal((count, len(self.linear)))
+        normal = rng.standard_normal((len(places), len(self.linear)))
         x = self.points[places]
         x[:, self.linear] += np.einsum("cij,cj,cj->ci", vectors, np.sqrt(np.maximum(values, 0.0)), normal)
-        return np.where(self.periodic, wrap(x), x)
+        return x

@@ -17,6 +17,9 @@ from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 
 
+MOST = 10  # linear states: a particle carries k (k + 1) / 2 entries of their covariance, each with a rate of k products
+
+
 class Split(NamedTuple):
     """The numbers of the states that each particle carries by their mean and covariance, none where `reason` says why not.
 
@@ -52,6 +55,8 @@ def split_of(model: Model) -> Split:
         linear = [i for i in linear if model.x[i] not in seen]
     if not linear:
         return Split((), f"{', '.join(quiet)}, without noise of its own, would give the linear states away")
+    if len(linear) > MOST:
+        return Split((), f"they are {len(linear)}, more than {MOST}")
     if is_coupled(model, linear):
         noisy = noisy_others(model, linear)
         if is_zero(model.covariance.extract(noisy, noisy).det()) is not False:
