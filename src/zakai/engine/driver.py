@@ -181,11 +181,10 @@ def check_records(model: Model, record: Record | Sequence[Record]) -> list[Recor
     Raises:
         InputError: the model and a record do not go together.
     """
-    many = isinstance(record, list | tuple)
-    if many and record and not any(isinstance(one, Record) for one in record):
+    if isinstance(record, list | tuple) and record and not any(isinstance(one, Record) for one in record):
         what = f"a {type(record).__name__} of {type(record[0]).__name__}"
         raise InputError(f"filter: expected a Record or a list of them, got {what}; make one by zakai.Record(times, values)")
-    records: list[Any] = list(record) if many else [record]  # type: ignore[arg-type]
+    records: list[Any] = list(record) if isinstance(record, list | tuple) else [record]
     found: list[Record] = []
     for index, one in enumerate(records):
         for given, kind, how in (
@@ -194,7 +193,7 @@ def check_records(model: Model, record: Record | Sequence[Record]) -> list[Recor
         ):
             if not isinstance(given, kind):
                 raise InputError(f"filter: expected a {kind.__name__}, got a {type(given).__name__}; {how}")
-        with named(f"records[{index}]") if many else nullcontext():
+        with named(f"records[{index}]") if isinstance(record, list | tuple) else nullcontext():
             check_model(model)
             own = one.of(model)
             own.check(model)

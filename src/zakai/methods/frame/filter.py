@@ -146,8 +146,8 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     exact = prepared.system.base.affine and prepared.system.base.sampled and not prepared.system.base.driven
     if length > 0 and not exact and number - audited >= AUDIT:
         prediction, found = _audited(chain, u, prediction, count)
-        time_error, count, rate = found.error, found.count, found.wanted / length
-        audited = number if found.wanted <= found.count // 2 else audited
+        time_error, count, rate = found.error, found.substeps, found.wanted / length
+        audited = number if found.wanted <= found.substeps // 2 else audited
     updated = update(builder, prediction, prepared.motion.likelihood(interval, values))
     v, rule = updated.density, builder.rule
     mean, cov = v.moments(direction_of(prepared, v))
@@ -175,7 +175,7 @@ class Audit(NamedTuple):
     """A comparison of s and 2 s substeps: their difference in L1, 2 s, and the number that the tolerance asks for."""
 
     error: float
-    count: int
+    substeps: int
     wanted: int
 
 
