@@ -8,7 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from zakai.densities._density import DensityMethods, coordinate_numbers, deviations, generator, probabilities, sample_size, wrap
+from zakai.densities._density import DensityMethods, deviations
+from zakai.densities._values import coordinate_numbers, generator, probabilities, sample_size, wrap
 from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.particles import ParticleDensity
 
@@ -122,7 +123,8 @@ class ConditionalParticleDensity(DensityMethods):
 
     def drawn(self) -> ParticleDensity:
         """Return the particles with one draw of the linear states each, always the same."""
-        return ParticleDensity(self.weights, self._with_draws(np.arange(len(self.weights)), generator(0)), self.names, self.periodic)
+        points = self._with_draws(np.arange(len(self.weights)), generator(0))
+        return ParticleDensity(self.weights, points, self.names, self.periodic)
 
     def sample(self, key: object, count: int) -> np.ndarray:
         rng, count = generator(key), sample_size(count)

@@ -16,7 +16,6 @@ from zakai.models.features import OBSERVED_PATH
 from zakai.models.kept import once_for_a_model
 from zakai.models.model import Model
 
-
 MOST = 10  # linear states: a particle carries k (k + 1) / 2 entries of their covariance, each with a rate of k products
 
 
