@@ -19,6 +19,7 @@ from zakai.errors import InputError
 from zakai.methods._protocol import Infos, stacked
 from zakai.methods._states import Joined
 from zakai.methods.system.escape import EscapeError
+from zakai.notes.escape import notes_on_escape
 from zakai.notes.health import warnings_of_run
 from zakai.notes.lengths import distances_of_lengths, notes_on_lengths
 from zakai.notes.misfit import notes_on_law
@@ -248,6 +249,7 @@ class Run:
         record = record_along(self.record, schedule)
         undefined = notes_on_formulas(noted, theta, record, result.mean, result.variance)
         undefined += notes_on_domain(noted, theta, record, result.mean, result.variance)
+        undefined += notes_on_escape(method.name, noted, schedule, theta, result.mean, result.cov)
         lengths = notes_on_lengths(schedule, distances)
         misfit = notes_on_law(noted, theta, schedule, self.values, infos)
         result.warnings.extend([*undefined, *self.notes, *lengths, *misfit, *self.health_warnings(result)])
