@@ -111,7 +111,8 @@ class Builder:
     def _crossed(
         self, placed: Placed, function: Callable[[Array], Array], control: Mass, options: Options
     ) -> tuple[Train, Report]:
-        built = cross(placed.grid, function, control.points, options, self.prepared.system.periods)
+        expected = max(function.terms[0].density.ranks) if isinstance(function, Carried) else 1
+        built = cross(placed.grid, function, control.points, options, self.prepared.system.periods, expected)
         self._edges = built.train.edges()
         error = difference(built.train.evaluate, function, control)
         rank = max(built.train.ranks)
