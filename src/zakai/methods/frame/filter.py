@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from zakai.densities._density import wrap
-from zakai.methods.system.escape_of_states import check_escape
 from zakai.methods._protocol import Info
 from zakai.methods.frame.build import CONTROLS, Builder, difference
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
@@ -22,6 +21,7 @@ from zakai.methods.frame.placement import Mass
 from zakai.methods.frame.state import Control, Prepared, State, Substeps, Unresolved
 from zakai.methods.frame.update import depth_of, update
 from zakai.methods.particles.programs import Array
+from zakai.methods.system.escape_of_states import check_escape
 from zakai.models.prior import DensityPrior
 from zakai.numerics.trains.train import Train, quasi_random
 
