@@ -29,7 +29,7 @@ def test_a_grid_of_six_states_is_refused_and_particles_are_named():
 
 def test_a_method_that_does_not_hold_names_one_that_does():
     first, second = refusal("benes", state=["x"], drift=["x - x**3"], observation=["x"])
-    assert first.startswith("<python>: benes does not hold: it fails that ")
+    assert first.startswith("model: benes does not hold: it fails that ")
     assert second.startswith('yau-yau holds: method="auto" takes it;')
 
 

@@ -104,7 +104,7 @@ def test_what_is_not_finite_is_explained_by_its_innermost_cause(formula, x, expe
 def test_noise_that_stops_being_noise_is_refused_with_its_first_time():
     model = Model(state=["x"], drift=["0"], observation=["x"], observation_noise=[["1 - t"]], process_noise=[["4 - t"]])
     check_noise_at(model, [0.0, 0.9])
-    with pytest.raises(InputError, match=r"<python>: observation_noise: is not positive definite at t = 1;"):
+    with pytest.raises(InputError, match=r"model: observation_noise: is not positive definite at t = 1;"):
         check_noise_at(model, [0.5, 1.0, 2.0])
     model = Model(state=["x"], drift=["0"], observation=["x"], process_noise=[["4 - t"]], diffusion=[["1/(t - 2)"]])
     check_noise_at(model, [4.0])

@@ -39,6 +39,11 @@ def text(analysis: Analysis) -> str:
         "q": None if analysis.q is None else _text(analysis.q),
         "algebra": _algebra(analysis.algebra),
         "observed_block": None if block is None else _observed_block(block),
+        "conditionally_linear": {
+            "states": list(analysis.conditionally_linear),
+            "given": list(analysis.conditionally_linear.given),
+            "reason": analysis.conditionally_linear.reason,
+        },
         "blocks": [_part(block, part) for block, part in zip(analysis.blocks, analysis.by_blocks)],
         "explosion": None if explosion is None else {"start": explosion.start, "time": explosion.time},
         "methods": {

@@ -49,6 +49,8 @@ def text(analysis: Analysis) -> str:
     if analysis.observed_block is not None and len(analysis.observed_block.symbols) < model.n:
         values = ", at the parameters' values" if model.parameters else ""
         blocks.append([f"Observed block, which moves by itself{values}", *_observed_block(analysis.observed_block)])
+    if analysis.conditionally_linear and analysis.conditionally_linear.given:
+        blocks.append(["Linear given the other states", *_conditionally_linear(analysis)])
     if analysis.by_blocks:
         blocks.append(["Blocks that have nothing to do with each other", *_parts(analysis)])
     for name, conditions in analysis.methods.items():
@@ -170,6 +172,13 @@ def _observed_block(block: ObservedBlock) -> Iterator[str]:
     yield f"  E dn dn' = {_flat(block.covariance)} dt,  h = {[*block.observation]}"
     if block.linear:
         yield "  it is linear: for a normal prior its filter is that of Kalman and Bucy, whatever the rest of the state does"
+
+
+def _conditionally_linear(analysis: Analysis) -> Iterator[str]:
+    found = analysis.conditionally_linear
+    yield f"  {', '.join(found)}  given  {', '.join(found.given)}"
+    for reason in found.reason.split("; "):
+        yield from _wrapped("    ", reason, 6)
 
 
 def _parts(analysis: Analysis) -> Iterator[str]:

@@ -16,6 +16,7 @@ from zakai import _display
 from zakai.algebra import _json, _page
 from zakai.algebra.blocks import Block, blocks
 from zakai.algebra.choice import Division, divided, recommended
+from zakai.algebra.conditionally_linear import ConditionallyLinear, conditionally_linear
 from zakai.algebra.conditions import Condition, all_hold
 from zakai.algebra.estimation_algebra import EstimationAlgebra, estimation_algebra
 from zakai.algebra.explosion import Explosion, explosion
@@ -75,6 +76,11 @@ class Analysis:
         """An autonomous W x, as small as possible, that h is a function of."""
         block = observed_block(self.model)
         return block if isinstance(block, ObservedBlock) else None
+
+    @cached_property
+    def conditionally_linear(self) -> ConditionallyLinear:
+        """The names of the states that are linear given the others, with the reason."""
+        return conditionally_linear(self.model)
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:

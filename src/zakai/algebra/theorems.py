@@ -180,7 +180,11 @@ def tensor_train(model: Model) -> tuple[Condition, ...]:
     """Any smooth system of two to eight states without reflecting ends, whose f and g do not jump."""
     source = "cross interpolation of a density in a moving frame"
     conditions = [determined(model), Condition("there are two to eight states", 2 <= model.n <= 8, f"n = {model.n}", source)]
-    return (*conditions, *on_characteristics(model), *reflecting_ends(model))
+    jumps = [call for part in (*model.drift, *model.covariance) for call in part.atoms(*features.JUMP_FUNCTIONS)]
+    if found := [call for call in jumps if call.has(*model.x)]:
+        words = f"a formula contains {short(str(found[0]))}"
+        conditions.append(Condition("f and g do not jump where the state changes", False, words, source))
+    return (*conditions, *reflecting_ends(model))
 
 
 @once_for_a_model

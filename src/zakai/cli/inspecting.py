@@ -49,6 +49,8 @@ def methods(source: str | None, record_path: Path | None = None, inputs_path: Pa
         open_ones = [c for c in conditions if c.holds is held]
         verdict = {True: "holds", False: "fails: ", None: "undecided: "}[held]
         words = verdict + ("" if held else f"{open_ones[0].statement} ({open_ones[0].evidence})")
+        if held and name == "guided-particles":
+            words += _split(model)
         if held and record is not None:
             words += f"; {_expected(model, record, name, ends)} for this record"
         rows.append((name, words))
@@ -56,6 +58,22 @@ def methods(source: str | None, record_path: Path | None = None, inputs_path: Pa
     print(f"\nauto takes: {analysis.recommended or 'none, for none that it tries holds'}")
     if analysis.division is not None:
         print(textwrap.fill(analysis.division.why, 110, break_on_hyphens=False))
+
+
+def _split(model: Model) -> str:
+    """Return what particles do with states that are linear given the others, after "; "; nothing where there are none."""
+    from zakai.algebra.conditionally_linear import conditionally_linear
+    from zakai.methods.particles.split import split_of
+
+    found, split = conditionally_linear(model), split_of(model)
+    if not found or not found.given:
+        return ""
+    if not split.linear:
+        return f"; {', '.join(found)} linear given {', '.join(found.given)}, and drawn with moves of the past: {split.reason}"
+    linear = [model.state[i] for i in split.linear]
+    given = ", ".join(name for name in model.state if name not in linear)
+    unless = ", if the path of these does not give them away within an interval" if split.coupled else ""
+    return f"; each particle carries the mean and the covariance of {', '.join(linear)} given {given}{unless}"
 
 
 def _record(path: Path, model: Model, inputs_path: Path | None) -> Record:

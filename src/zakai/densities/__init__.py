@@ -1,6 +1,7 @@
 """Conditional densities: Gaussian mixtures, densities on a grid, weighted points, products of blocks; one protocol."""
 
 from zakai.densities._density import Density
+from zakai.densities.conditional import ConditionalParticleDensity
 from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
 from zakai.densities.interval import IntervalDensity
@@ -11,6 +12,6 @@ from zakai.densities.product import ProductDensity
 from zakai.densities.tensor_train import TensorTrainDensity
 
 __all__ = [
-    "Density", "GaussianMixture", "GridDensity", "IntervalDensity", "MappedDensity", "ParticleDensity", "PointMasses",
-    "ProductDensity", "TensorTrainDensity",
+    "ConditionalParticleDensity", "Density", "GaussianMixture", "GridDensity", "IntervalDensity", "MappedDensity",
+    "ParticleDensity", "PointMasses", "ProductDensity", "TensorTrainDensity",
 ]  # fmt: skip

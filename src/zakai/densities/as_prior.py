@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from zakai.densities._density import Density
+from zakai.densities.conditional import ConditionalParticleDensity
 from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
 from zakai.densities.interval import IntervalDensity
@@ -47,7 +48,7 @@ def plain(density: Density) -> GaussianMixture | GridDensity | IntervalDensity |
     """Return the same density as a mixture with positive weights, on a grid, or between the ends of a domain."""
     if isinstance(density, IntervalDensity | MappedDensity):
         return density
-    if isinstance(density, ParticleDensity):
+    if isinstance(density, ParticleDensity | ConditionalParticleDensity):
         return density.thinned(MOST_KERNELS).smoothed
     if isinstance(density, PointMasses):
         return density.smoothed

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zakai.algebra.systems import affine_observation
-from zakai.densities import Density, GaussianMixture, GridDensity, IntervalDensity, PointMasses
+from zakai.densities import ConditionalParticleDensity, Density, GaussianMixture, GridDensity, IntervalDensity, PointMasses
 from zakai.densities.mapped import MappedDensity
 from zakai.engine.setting import Setting
 from zakai.methods.system.residuals import Sensors
@@ -49,6 +49,8 @@ class Mixture(NamedTuple):
         """Return a density as a mixture, without what is negligible; None where it is none."""
         if isinstance(density, GaussianMixture):
             return None if any(density.periodic) else cls(density.weights, density.means, density.covs, ())
+        if isinstance(density, ConditionalParticleDensity):
+            density = density.drawn()
         if isinstance(density, PointMasses):
             return cls(density.weights, density.points, None, ())
         if isinstance(density, IntervalDensity):

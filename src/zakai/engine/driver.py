@@ -181,14 +181,19 @@ def check_records(model: Model, record: Record | Sequence[Record]) -> list[Recor
     Raises:
         InputError: the model and a record do not go together.
     """
-    many = isinstance(record, list | tuple)
-    records: list[Any] = list(record) if many else [record]  # type: ignore[arg-type]
+    if isinstance(record, list | tuple) and record and not any(isinstance(one, Record) for one in record):
+        what = f"a {type(record).__name__} of {type(record[0]).__name__}"
+        raise InputError(f"filter: expected a Record or a list of them, got {what}; make one by zakai.Record(times, values)")
+    records: list[Any] = list(record) if isinstance(record, list | tuple) else [record]
     found: list[Record] = []
     for index, one in enumerate(records):
-        for given, kind, how in ((model, Model, "zakai.load_model"), (one, Record, "zakai.read_record")):
+        for given, kind, how in (
+            (model, Model, "zakai.load_model reads one from a file"),
+            (one, Record, "zakai.Record(times, values) makes one, zakai.read_record reads one from a file"),
+        ):
             if not isinstance(given, kind):
-                raise InputError(f"filter: expected a {kind.__name__}, got a {type(given).__name__}; {how} reads one from a file")
-        with named(f"records[{index}]") if many else nullcontext():
+                raise InputError(f"filter: expected a {kind.__name__}, got a {type(given).__name__}; {how}")
+        with named(f"records[{index}]") if isinstance(record, list | tuple) else nullcontext():
             check_model(model)
             own = one.of(model)
             own.check(model)

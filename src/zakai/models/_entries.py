@@ -73,6 +73,8 @@ def kind_of(value: Any) -> str:
         return "a table"
     if isinstance(value, list | tuple | np.ndarray | sympy.MatrixBase):
         return "a list"
+    if isinstance(value, type(print) | type(kind_of) | np.ufunc):
+        return "a function; write its formula as text, as in '-x', which is also read by the analysis"
     return "nothing" if value is None else f"a {type(value).__name__}"
 
 
@@ -167,10 +169,17 @@ def vector_of_formulas(value: Any, length: int | None, expected: str) -> list[st
 
 
 def matrix_of_formulas(value: Any, rows: int, columns: int | None, expected: str) -> list[list[str]]:
-    """Rows of formulas, all of one length; one formula is a matrix of size one where that is allowed."""
+    """Rows of formulas, all of one length; one formula is a matrix of size one where that is allowed, and so is a list of it."""
     if _is_formula(value) and rows == 1 and columns in (1, None):
         value = [[value]]
     table = items(value, rows, expected)
+    if table and all(map(_is_formula, table)):
+        if rows == 1:
+            table = [table]
+        else:
+            entries = [[_written(entry) if i == j else "0" for j in range(rows)] for i, entry in enumerate(table)]
+            diagonal = ", ".join(f"[{', '.join(row)}]" for row in entries)
+            raise InputError(f"expected {expected}, got a list of {rows}; write [{diagonal}] for a diagonal matrix")
     for index, row in enumerate(table):
         with named(f"[{index}]"):
             row = items(row, None, expected)
@@ -179,6 +188,11 @@ def matrix_of_formulas(value: Any, rows: int, columns: int | None, expected: str
                 raise InputError(f"expected {expected}: {columns} in each row, got {len(row)}")
             table[index] = vector_of_formulas(row, columns, expected)
     return table
+
+
+def _written(entry: Any) -> str:
+    """Return a formula as it stands in a list."""
+    return f'"{entry}"' if isinstance(entry, str) else str(entry)
 
 
 def square_of_formulas(value: Any, size: int, expected: str) -> list[list[str]]:

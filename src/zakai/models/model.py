@@ -34,6 +34,9 @@ FormulaRows = Sequence[Formulas]
 _OWN = ("text", "observation_law", "_kept")  # what depends on the values of the parameters, or on the prior
 
 
+_SOURCE = "model"  # what errors call a model that is not from a file
+
+
 class Model:
     """A continuous-time stochastic system and what is observed of it.
 
@@ -137,7 +140,7 @@ class Model:
         **unknown: Any,
     ):
         given = {key: value for key, value in locals().items() if key in KEYS and value is not None}
-        self._read({**given, **unknown}, source="<python>", text=None, folder=Path())
+        self._read({**given, **unknown}, source=_SOURCE, text=None, folder=Path())
 
     @classmethod
     def _from_file(cls, keys: Mapping[str, Any], source: str, text: str | None, folder: Path | None = None) -> Model:

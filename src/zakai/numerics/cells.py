@@ -15,6 +15,7 @@ Array = NDArray[Any]
 
 SEEN = 1e-6  # of the largest value of a density: what is below everywhere is outside of its window
 _SUMMED = 1e-10  # of the largest value on the grid: smaller terms change nothing that is drawn
+_AT = 1e-8  # distance from a grid point, in spacings, at which the interpolant is its value
 _REACH = 7.0  # standard deviations at which a Gaussian is below 1e-10 of its peak
 
 
@@ -75,7 +76,7 @@ def _interpolate(signed: Array, start: int, low: float, cell: float, within: int
             nearest = math.floor(x + 0.5)
             rest = x - nearest
             sign = 1.0 if int(nearest) % 2 == 0 else -1.0
-            if abs(rest) < 1e-12:
+            if abs(rest) < _AT:
                 total += sign * signed[int(nearest)] if 0 <= nearest < len(signed) else 0.0
                 continue
             found = 0.0
@@ -91,6 +92,8 @@ def _interpolate(signed: Array, start: int, low: float, cell: float, within: int
 )
 def _interpolate_on_circle(signed: Array, size: int, start: int, low: float, cell: float, within: int, out: Array) -> None:
     """Write the averages over cells of the trigonometric interpolant of `size` values, of which those not given are zero."""
+    angles = np.pi / size * np.arange(len(signed))
+    cosines, sines = np.cos(angles), np.sin(angles)
     for r in range(len(out)):
         total = 0.0
         for s in range(within):
@@ -98,14 +101,18 @@ def _interpolate_on_circle(signed: Array, size: int, start: int, low: float, cel
             nearest = math.floor(x + 0.5)
             rest = x - nearest
             sign = 1.0 if int(nearest) % 2 == 0 else -1.0
-            if abs(rest) < 1e-12:
+            if abs(rest) < _AT:
                 at = int(nearest) % size
                 total += signed[at] * (1.0 if at % 2 == 0 else -1.0) if at < len(signed) else 0.0
                 continue
             found = 0.0
-            for i in range(len(signed)):
-                angle = math.pi * (x - i) / size
-                found += signed[i] / (math.sin(angle) if size % 2 else math.tan(angle))
+            c, d = math.cos(math.pi * x / size), math.sin(math.pi * x / size)
+            if size % 2:
+                for i in range(len(signed)):
+                    found += signed[i] / (d * cosines[i] - c * sines[i])
+            else:
+                for i in range(len(signed)):
+                    found += signed[i] * (c * cosines[i] + d * sines[i]) / (d * cosines[i] - c * sines[i])
             total += sign * math.sin(math.pi * rest) / size * found
         out[r] = max(total / within, 0.0)
 

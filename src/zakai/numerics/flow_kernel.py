@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from zakai.numerics.compiled import helper, kernel
@@ -96,27 +98,25 @@ def _ends(powers: Array, twice: int, depth: int, ahead: Array, back: Array) -> b
 
 def _signature(number: str) -> str:
     stack = f"{number}[:, :, ::1]"
-    return f"void({stack}, f8[::1], f8[:, ::1], f8[:, ::1], i8, i8[::1], {stack}, {stack}, b1[::1])"
+    return f"void({stack}, f8[::1], UniTuple(f8[:, ::1], 2), i8, i8[::1], UniTuple({stack}, 2), b1[::1])"
 
 
 @kernel(_signature("f8"), _signature("c16"))
 def panels(
-    values: Array, lengths: Array, to_legendre: Array, to_powers: Array, twice: int, depths: Array,
-    ahead: Array, back: Array, coarse: Array,
-) -> None:  # fmt: skip  # pragma: no cover
+    values: Array, lengths: Array, polynomials: Any, twice: int, depths: Array, solutions: Any, coarse: Array
+) -> None:  # pragma: no cover
     """Solve J panels.
 
     Args:
         values: The generators [A f; c 0] (J, S, (2n + k)^2) at the nodes.
         lengths: The lengths (J,) of the panels.
-        to_legendre: The matrix (S, S) from values at the nodes to coefficients of Legendre's polynomials.
-        to_powers: The matrix (S, S) from these to those of the powers of tau in [-1, 1].
+        polynomials: The matrix (S, S) from values at the nodes to coefficients of Legendre's polynomials, and that from these to
+            the coefficients of the powers of tau in [-1, 1].
         twice: 2n.
         depths: The orders (J,) by which every entry of the solution has appeared.
-        ahead: The solutions [Y r; c s] (J, 2n + k, 2n + k) at the ends, see `_ends`.
-        back: The solutions at the beginnings.
+        solutions: The solutions [Y r; c s] (J, 2n + k, 2n + k) at the ends, see `_ends`, and those at the beginnings.
         coarse: Whether the terms of the series do not suffice (J,).
     """
     for j in range(len(values)):
-        powers = _powers(values[j], 0.5 * lengths[j], to_legendre, to_powers)
-        coarse[j] = not _ends(powers, twice, depths[j], ahead[j], back[j])
+        powers = _powers(values[j], 0.5 * lengths[j], polynomials[0], polynomials[1])
+        coarse[j] = not _ends(powers, twice, depths[j], solutions[0][j], solutions[1][j])

@@ -53,8 +53,8 @@ def solve(c: Coefficients, lengths: Array) -> tuple[Transition, Array]:
     patterns = (values != 0.0).any(axis=1).reshape(count, rows, rows)[:, :twice, :twice]
     depths = np.array([_depth(pattern.tobytes(), twice) for pattern in patterns], int)
     ahead, back, coarse = np.empty((count, rows, rows), kind), np.empty((count, rows, rows), kind), np.empty(count, bool)
-    to_legendre, to_powers = (_TO_LEGENDRE, _TO_POWERS) if size > 1 else (_ONE, _ONE)
-    panels(values, np.ascontiguousarray(lengths), to_legendre, to_powers, twice, depths, ahead, back, coarse)
+    polynomials = (_TO_LEGENDRE, _TO_POWERS) if size > 1 else (_ONE, _ONE)
+    panels(values, np.ascontiguousarray(lengths), polynomials, twice, depths, (ahead, back), coarse)
     half, weights = 0.5 * lengths, WEIGHTS if size > 1 else np.full(1, 2.0)
     growth = half[:, None] * (weights @ c.constant.reshape(count, size, k))
     trace = 0.5 * half * (np.trace(c.matrix, axis1=1, axis2=2).reshape(count, size) * weights).sum(axis=1)

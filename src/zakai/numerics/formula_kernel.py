@@ -127,18 +127,18 @@ def _block(given: Any) -> Any:
 
 
 @kernel(
-    "void(int64[:, ::1], float64[::1], int64[::1], int64[::1], float64[:, ::1], float64, float64, int64, float64[::1],"
-    " float64[:, ::1], float64[::1], float64[:, ::1])"
+    "void(Tuple((int64[:, ::1], float64[::1], int64[::1], int64[::1])), float64[:, ::1], float64, float64, int64,"
+    " Tuple((float64[::1], float64[:, ::1], float64[::1])), float64[:, ::1])"
 )
-def _flow(
-    code: Any, given: Any, coordinates: Any, outputs: Any, x: Any, t0: float, t1: float, steps: int,
-    centre: Any, inverse: Any, limits: Any, out: Any,
-) -> None:  # fmt: skip
+def _flow(program: Any, x: Any, t0: float, t1: float, steps: int, box: Any, out: Any) -> None:
     """Write the change (k, J) of points x (n, J), the first n outputs being their velocity: Runge-Kutta steps of order four.
 
-    A point that after a step has an index beyond a limit (n,), relative to a centre, is given up: its change is NaN.  Without
-    steps the outputs at t0 are written.
+    `program` has the arrays of `Formulas`.  `box` has a centre (n,), the inverse (n, n) of a basis, and limits (n,): a point that
+    after a step has an index beyond a limit, relative to the centre, is given up: its change is NaN.  Without steps the outputs
+    at t0 are written.
     """
+    code, given, coordinates, outputs = program
+    centre, inverse, limits = box
     n, count = x.shape
     values = _block(given)
     slopes, total = np.zeros((outputs.size, BLOCK)), np.zeros((outputs.size, BLOCK))
@@ -229,6 +229,6 @@ class Formulas:
             limits: components in this basis, relative to the centre, beyond which a point is given up: its change is NaN (n,).
         """
         out = np.empty((self.outputs.size, len(x)))
-        points = np.ascontiguousarray(x.T)
-        _flow(self.code, self.given, self.coordinates, self.outputs, points, t0, t1, steps, centre, inverse, limits, out)
+        program = (self.code, self.given, self.coordinates, self.outputs)
+        _flow(program, np.ascontiguousarray(x.T), t0, t1, steps, (centre, inverse, limits), out)
         return out.T

@@ -180,23 +180,20 @@ def worse(worst: float, change: float, scale: float) -> float:  # pragma: no cov
 
 
 @kernel(
-    "void(UniTuple(Tuple((i8[:, ::1], f8[::1], i8[::1], i8[::1], f8[::1])), 5), b1[::1], b1[::1], b1,"
+    "void(UniTuple(Tuple((i8[:, ::1], f8[::1], i8[::1], i8[::1], f8[::1])), 5), Tuple((b1[::1], b1[::1], b1)),"
     " Tuple((i8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, :, ::1])),"
     " Tuple((f8[::1], f8[::1], f8[:, ::1], b1[:, ::1], b1[:, ::1], f8[:, ::1], f8[:, :, ::1])),"
-    " f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1])"
+    " f8[:, ::1], f8[::1], f8[:, ::1], Tuple((f8[:, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1])))"
 )
 def segment(
-    programs: Any, periodic: Array, angles: Array, samples: bool, parts: Any, intervals: Any, values: Array,
-    mean: Array, cov: Array, means: Array, covs: Array, gains: Array, figures: Array,
-) -> None:  # fmt: skip  # pragma: no cover
+    programs: Any, kinds: Any, parts: Any, intervals: Any, values: Array, mean: Array, cov: Array, after: Any
+) -> None:  # pragma: no cover
     """Advance a Gaussian over R intervals.
 
     Args:
         programs: f, df/dx, G and the derivatives of f by t and by inputs; h and dh/dx; f; h; S, without outputs where it does not
             depend on the state.
-        periodic: The states (n,) that are angles.
-        angles: The observations (m,) that are angles.
-        samples: Whether the observations are samples.
+        kinds: The states (n,) that are angles, the observations (m,) that are, and whether the observations are samples.
         parts: The first part (R + 1) of each interval, and of the J parts the starts, the lengths, the inputs (J, p) at the
             start, their derivatives, and the covariances (J, 2, m, m) of the rates in both halves.
         intervals: The stops and the lengths (R,), the inputs (R, p) at the stops, the coordinates (R, m) that act inside, those
@@ -204,12 +201,13 @@ def segment(
         values: What is observed (R, m), zero where nothing is.
         mean: The mean (n,) before, which is overwritten.
         cov: The covariance (n, n), likewise.
-        means: The means (R, n) after each interval.
-        covs: The covariances (R, n, n).
-        gains: The increments (R,) of the log-likelihood.
-        figures: How far from linear the system is (`methods/gaussian/extended/linearisation.py`), and the largest weight of
-            another image of an angle, as in `models/angles.py` (2, R).
+        after: What is written: the means (R, n) and the covariances (R, n, n) after each interval, the increments (R,) of the
+            log-likelihood, and two figures (2, R), how far from linear the system is
+            (`methods/gaussian/extended/linearisation.py`), and the largest weight of another image of an angle
+            (`models/angles.py`).
     """
+    periodic, angles, samples = kinds
+    means, covs, gains, figures = after
     motion, sensor, drift, observation, noise = programs
     first, starts, lengths, inputs, rates, rate_noise = parts
     stops, spans_of_time, end_inputs, inside, at_end, spans, end_noise = intervals

@@ -9,7 +9,7 @@ from zakai.errors import InputError
 from zakai.records.header import columns_fault, quoted
 from zakai.records.writing import default_names
 
-HINT = "or give columns=[...] in the order of the observations (command: --columns a,b)"
+HINT = "or give the columns in the order of the observations, by columns=[...] where they are read (command: --columns a,b)"
 
 
 class Columns(NamedTuple):

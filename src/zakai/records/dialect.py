@@ -16,7 +16,7 @@ SEPARATORS = {",": "a comma", ";": "a semicolon", "\t": "a tab"}
 _OTHERS = {"|": "a bar", " ": "a space", ":": "a colon"}
 _MISSING = re.compile(r'(^|,)\s*"?(?:NA|N/A|n/a|na|null|NULL|None|<NA>|#N/A)"?\s*(?=,|$)')
 _DECIMAL_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)(e[+-]?\d+)?", re.IGNORECASE)
-_TIMES = ("time", "t")  # names of the first column: `t` is the time in formulas too
+TIMES = ("time", "t")  # names of the first column: `t` is the time in formulas too
 _ROW_NUMBERS = ("", "index", "unnamed: 0")  # names of a column of row numbers before the time
 
 
@@ -63,7 +63,7 @@ def dialect_of(lines: Sequence[str]) -> Dialect | None:
             continue
         if comment and NUMBER.fullmatch(_split(line, _separator(line))[0].replace(",", ".")):
             header = lines[comment - 1].lstrip().lstrip("#").strip()
-            if _split(header, _separator(header))[0].strip().lower() in _TIMES:
+            if _split(header, _separator(header))[0].strip().lower() in TIMES:
                 return _of_header(header, comment)
         return _of_header(line, place + 1)
     return None
@@ -82,10 +82,10 @@ def _of_header(header: str, line: int) -> Dialect:
     cells = [cell.strip() for cell in _split(header, separator)] if separator != "," else []
     text = ",".join(_quoted(cell) for cell in cells) if cells else header
     first, _, rest = text.partition(",")
-    numbered = first.strip().strip('"').lower() in _ROW_NUMBERS and rest.partition(",")[0].strip().strip('"').lower() in _TIMES
+    numbered = first.strip().strip('"').lower() in _ROW_NUMBERS and rest.partition(",")[0].strip().strip('"').lower() in TIMES
     text = rest if numbered else text
     first, comma, rest = text.partition(",")
-    text = f"time{comma}{rest}" if first.strip().strip('"').lower() in _TIMES else text
+    text = f"time{comma}{rest}" if first.strip().strip('"').lower() in TIMES else text
     return Dialect(separator, numbered, text, line)
 
 

@@ -16,6 +16,7 @@ from zakai.errors import InputError
 from zakai.models._errors import listing, named
 from zakai.records.columns import observed_columns
 from zakai.records.dates import Clock, read_times
+from zakai.records.dialect import TIMES
 from zakai.records.inputs import Inputs, check_inputs, expected_inputs
 from zakai.records.numbers import LARGEST, numbers_in_time, real_numbers
 from zakai.records.writing import default_names, write_table
@@ -195,7 +196,7 @@ class Record:
         columns: Sequence[str] | None = None,
         inputs: Sequence[str] = (),
     ) -> Record:
-        """Return a record from a DataFrame: its column `time` or else its index, and the other columns as values.
+        """Return a record from a DataFrame: its column `time`, `Time` or `t`, else its index, and the other columns as values.
 
         Args:
             frame: a pandas DataFrame of K rows; missing values are not-observed.
@@ -222,8 +223,12 @@ class Record:
             raise InputError("Record.from_pandas needs pandas: pip install 'zakai[pandas]'") from None
         if not isinstance(frame, pandas.DataFrame):
             raise InputError(f"Record.from_pandas takes a DataFrame, not {type(frame).__name__}")
-        times = frame["time"] if "time" in frame.columns else frame.index.to_series()
-        rest = frame.drop(columns="time", errors="ignore")
+        known_times = [name for name in frame.columns if str(name).strip().lower() in TIMES]
+        if len(known_times) > 1:
+            listed = listing(map(str, known_times))
+            raise InputError(f"Record.from_pandas: the columns {listed} may all be the time; drop all but one")
+        times = frame[known_times[0]] if known_times else frame.index.to_series()
+        rest = frame.drop(columns=known_times)
         inputs = [inputs] if isinstance(inputs, str) else list(inputs)
         for name in inputs:
             if list(rest.columns).count(name) != 1:

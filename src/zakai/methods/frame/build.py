@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zakai.methods.frame.placement import Mass, Placed, closed_axes, place, with_spacing
+from zakai.methods.frame.placement import Mass, Placed, Rule, closed_axes, place, with_spacing
 from zakai.methods.frame.state import Prepared
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Carried
@@ -17,14 +17,13 @@ from zakai.numerics.trains.train import Train
 
 CONTROLS = 600  # with 96 the tails of a skewed density of three states were never seen, at any tolerance
 CLOUD = 1024
+# The error of a mean is 1 to 3 times the relative error of the builds, with the control points that happened to be drawn
+# (bearings, turns, re-entry; rms over times and coordinates): the builds have half of the tolerance.
+SHARE, CORES = 0.5, 0.25
 EDGE = 0.3  # share of the tolerance that may be near an end of an axis
 ROUGH = 4.0  # tolerances of error off the grid, above which the grid is made finer
 WIDER = 0.25  # share of a box that is added at both ends of an axis with mass there
 FLOOR = 1e-3  # of the largest value, below which errors do not count relative to the value
-
-
-class Unresolved(ArithmeticError):
-    """A density that no grid holds: the substep is too long, or the density was lost."""
 
 
 class Report(NamedTuple):
@@ -41,10 +40,28 @@ class Report(NamedTuple):
 
 @dataclass
 class Builder:
-    """Builds densities for one step, and keeps the reports of all builds."""
+    """Builds densities for one step, and keeps the reports of all builds.
+
+    The errors of the builds of an interval add up: each has a `share` of its tolerance.
+    """
 
     prepared: Prepared
     reports: list[Report] = field(default_factory=list)
+    share: float = 1.0
+
+    def for_substeps(self, count: int) -> None:
+        """Set the share for an interval of so many substeps, of which one has two builds."""
+        self.share = 2.0 / (count + 1)
+
+    @property
+    def rule(self) -> Rule:
+        """The accuracy of a build."""
+        return Rule.of(self.share * self.prepared.tolerance * SHARE)
+
+    @property
+    def options(self) -> Options:
+        """The accuracy of a cross interpolation: the errors of the cores add up."""
+        return Options(CORES * self.share * self.prepared.tolerance * SHARE, self.prepared.most_rank)
 
     def build(
         self, function: Callable[[Array], Array], mass: Mass, noise: Array | None = None, stretch: float = 1.0, loose: float = 1.0
@@ -60,8 +77,8 @@ class Builder:
             stretch: a factor of the box.
             loose: a factor of the tolerance; the errors of a density that only shows where mass is do not count.
         """
-        prepared, angles = self.prepared, self.prepared.system.base.angles
-        rule, options = prepared.rule, prepared.options
+        angles = self.prepared.system.base.angles
+        rule, options = self.rule, self.options
         if loose != 1.0:
             rule, options = rule._replace(tolerance=loose * rule.tolerance), options._replace(tolerance=loose * options.tolerance)
         mass = mass.unwrapped(angles)

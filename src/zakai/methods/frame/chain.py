@@ -17,13 +17,14 @@ convolution with a diagonal noise, moments and marginals, weighted points of its
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from zakai.methods.frame.build import CLOUD, Builder, Unresolved
+from zakai.methods.frame.build import CLOUD, Builder
 from zakai.methods.frame.placement import Mass
-from zakai.methods.frame.state import Prepared
+from zakai.methods.frame.state import Prepared, Unresolved
+from zakai.methods.frame.weak_points import WeakPoints
 from zakai.methods.particles.interval import Interval
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Carried, Likelihood, Term
@@ -46,6 +47,11 @@ class Prediction:
     log_mass: float
     defect: float
 
+    @property
+    def log_scale(self) -> float:
+        """The logarithm of the density over the values of the function."""
+        return self.log_mass + float(self.function.terms[0].scale[1])
+
 
 @dataclass
 class Chain:
@@ -60,7 +66,7 @@ class Chain:
         """Return a density after the flow from t0 to t1 as a function, and points of it."""
         prepared, motion = self.prepared, self.prepared.motion
         points, weights = u.cloud(CLOUD)
-        steps = motion.steps(self.interval, points, (t0, t1), self.values, 0.1 * prepared.rule.tolerance)
+        steps = motion.steps(self.interval, points, (t0, t1), self.values, 0.1 * self.builder.rule.tolerance)
         ends, logs = motion.ends(points, motion.path(self.interval, t0, t1, self.values, steps))
         finite = np.isfinite(ends).all(axis=0) & np.isfinite(logs)
         if not finite.all():
@@ -79,34 +85,63 @@ class Chain:
 
     def _middle(self, u: Train, t0: float, t1: float, length: float) -> tuple[Train, float, float]:
         """Return the density after the flow from t0 to t1 and the noise about t1, the logarithm of its mass, and the defect."""
-        prepared, builder = self.prepared, self.builder
+        prepared = self.prepared
         function, mass = self._carried(u, t0, t1)
+        if prepared.system.kicked:
+            return self._kicked(function, mass, t1, length)
         mass = mass.unwrapped(prepared.system.base.angles)
         mean, P = mass.moments()
         scale = np.maximum(np.sqrt(np.diag(P)), 1e-12)
         Q = prepared.motion.noise(self.interval, self.values, t1, length, (mean, scale))
+        v, D, total = self._built(function, mass, Q)
+        v = v.convolve(np.maximum(np.diag(D), 0.0), ROUNDING * self.builder.options.tolerance)
+        return corrected(v, D).scaled(1.0 / total), *self._of_mass(function, total)
+
+    def _of_mass(self, function: Carried, total: float) -> tuple[float, float]:
+        """Return the logarithm of the mass that a motion leaves, and the defect where it should be one."""
+        if self.prepared.system.weighted:
+            return math.log(total) + float(function.terms[0].scale[1]), 0.0
+        return 0.0, abs(total - 1.0)
+
+    def _built(self, function: Carried, mass: Mass, noise: Array | None) -> tuple[Train, Array, float]:
+        """Return a moved density, the noise in its frame, and its mass; on a wider box where mass is missing."""
+        prepared = self.prepared
         best: tuple[float, Train, Array] | None = None
         for stretch in STRETCHES:
-            v, D = builder.build(function, mass, Q, stretch)
+            v, D = self.builder.build(function, mass, noise, stretch)
             defect = abs(v.mass - 1.0)
             if best is None or prepared.system.weighted or defect < best[0]:
                 best = defect, v, D
-            if prepared.system.weighted or defect < DEFECT * prepared.rule.tolerance:
+            if prepared.system.weighted or defect < DEFECT * self.builder.rule.tolerance:
                 break
         assert best is not None
-        defect, v, D = best
-        total = v.mass
-        if not total > 0 or not math.isfinite(total):
-            raise Unresolved(f"a density has mass {total:.1g} after the motion to t = {t1:g}")
-        v = v.convolve(np.maximum(np.diag(D), 0.0), ROUNDING * prepared.options.tolerance)
-        log_mass = math.log(total) + float(function.terms[0].scale[1]) if prepared.system.weighted else 0.0
-        return corrected(v, D).scaled(1.0 / total), log_mass, 0.0 if prepared.system.weighted else defect
+        _, v, D = best
+        if not v.mass > 0 or not math.isfinite(v.mass):
+            raise Unresolved(f"a density has mass {v.mass:.1g} after a motion")
+        return v, D, v.mass
+
+    def _kicked(self, function: Carried, mass: Mass, t: float, length: float) -> tuple[Train, float, float]:
+        """Return a moved density after noise that depends on the state: one build for each column of its root."""
+        motion = self.prepared.motion
+        log_mass, defect, v = 0.0, 0.0, function.terms[0].density
+        kicks = motion.kicks(self.interval, t, length)
+        for c in kicks or [np.zeros(self.prepared.system.base.r)]:
+            spread, mass = WeakPoints(self.builder, self.interval, self.values, (t, length)).spread(function, mass, c)
+            v, _, total = self._built(spread, mass, None)
+            gained, lost = self._of_mass(function, total)
+            log_mass, defect = log_mass + gained, defect + lost
+            v = v.scaled(1.0 / total)
+            nowhere = motion.path(self.interval, t, t, self.values, 1)
+            function = replace(function, terms=(Term(v, np.array([1.0, 0.0]), motion.backward, nowhere),))
+            mass = Mass(*v.cloud(CLOUD))
+        return v, log_mass, defect
 
     def predict(self, u: Train, count: int) -> Prediction:
         """Return the prediction by so many substeps; Unresolved where the density is lost."""
         start, stop = self.interval.start, self.interval.stop
         if stop <= start:
             return Prediction(*self._carried(u, start, stop), 0.0, 0.0)
+        self.builder.for_substeps(count)
         length, at, log_mass, defect = (stop - start) / count, start, 0.0, 0.0
         for j in range(count):
             middle = start + (j + 0.5) * length

@@ -6,18 +6,19 @@ Stable for other files: `State`, `Prepared` (state.py), `Builder.build` (build.p
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.densities._density import wrap
+from zakai.densities._values import wrap
 from zakai.methods._protocol import Info
-from zakai.methods.frame.build import CONTROLS, Builder, Unresolved, difference
+from zakai.methods.frame.build import CONTROLS, Builder, difference
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
 from zakai.methods.frame.placement import Mass
-from zakai.methods.frame.state import Control, Prepared, State
+from zakai.methods.frame.state import Control, Prepared, State, Unresolved
 from zakai.methods.frame.update import depth_of, update
 from zakai.methods.particles.programs import Array
 from zakai.methods.system.escape_of_states import check_escape
@@ -26,7 +27,10 @@ from zakai.numerics.trains.train import Train, quasi_random
 
 PRIOR_POINTS = 1024
 AUDIT = 10  # intervals between comparisons of s and 2 s substeps, where the last one was within bounds
-ACCEPTED = 10.0  # tolerances of that difference: it is 3 to 20 times the error of what is extrapolated from both
+# The difference of s and 2 s substeps in L1 is the error of s substeps times 3 / 4: with this share of the tolerance s are taken.
+# What is extrapolated from both has a third to a twentieth of it.
+TIME_SHARE, ACCEPTED = 1.0, 10.0
+RATIO = 5.0  # tolerances that the estimate of an interval may reach
 FIGURES = (
     "tolerance_ratio", "rank", "mass_defect", "off_grid_error", "edge_mass", "tail_depth", "powers", "substeps", "time_error",
     "effective_share",
@@ -68,13 +72,17 @@ def _mixture(prepared: Prepared, prior: Any) -> tuple[Callable[[Array], Array], 
     inverses = [np.linalg.inv(root) for root in roots]
     factors = [w / (abs(np.linalg.det(root)) * (2 * math.pi) ** (n / 2)) for w, root in zip(weights, roots, strict=True)]
 
+    turns = itertools.product(*[(-2 * np.pi, 0.0, 2 * np.pi) if angle else (0.0,) for angle in angles])
+    images = [np.array(turn) for turn in turns]
+
     def density(x: Array) -> Array:
         total = np.zeros(x.shape[1])
         for factor, mean, inverse in zip(factors, means, inverses, strict=True):
             apart = x - mean[:, None]
             if angles.any():
                 apart[angles] = wrap(apart[angles])
-            total += factor * np.exp(-0.5 * ((inverse @ apart) ** 2).sum(axis=0))
+            for image in images:
+                total += factor * np.exp(-0.5 * ((inverse @ (apart + image[:, None])) ** 2).sum(axis=0))
         return total
 
     count = max(64, PRIOR_POINTS // len(weights))
@@ -126,7 +134,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
 
 
 def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
-    interval, control, rule = prepared.interval(k), state.control, prepared.rule
+    interval, control = prepared.interval(k), state.control
     builder = Builder(prepared)
     chain = Chain(prepared, interval, values, builder)
     length = interval.stop - interval.start
@@ -134,21 +142,21 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     count = min(max(1, math.ceil(length * control.rate - 1e-9)), MOST_SUBSTEPS)
     u = state.train(prepared.system.periods)
     prediction, count = chain.first(u, count)
-    audited, time_error = control.audited, control.time_error
-    rate = control.rate
+    audited, time_error, rate = control.audited, control.time_error, control.rate
     exact = prepared.system.base.affine and prepared.system.base.sampled and not prepared.system.base.driven
-    if length > 0 and not exact and (number - audited >= AUDIT or time_error > 0.5 * ACCEPTED * rule.tolerance):
-        prediction, count, time_error = _audited(chain, u, prediction, count)
-        audited, rate = number, 0.5 * count / length
+    if length > 0 and not exact and number - audited >= AUDIT:
+        prediction, found = _audited(chain, u, prediction, count)
+        time_error, count, rate = found.error, found.substeps, found.wanted / length
+        audited = number if found.wanted <= found.substeps // 2 else audited
     updated = update(builder, prediction, prepared.motion.likelihood(interval, values))
-    v = updated.density
+    v, rule = updated.density, builder.rule
     mean, cov = v.moments(direction_of(prepared, v))
     depth = depth_of(prediction.function, prediction.mass, v)
     reports = builder.reports
     off_grid, edge = sum(report.off_grid for report in reports), max(report.edge for report in reports)
     error = off_grid + prediction.defect + edge
     health = {
-        "tolerance_ratio": error / (ACCEPTED * rule.tolerance),
+        "tolerance_ratio": error / (RATIO * prepared.tolerance),
         "rank": float(max(report.rank for report in reports)),
         "mass_defect": prediction.defect,
         "off_grid_error": off_grid,
@@ -163,14 +171,24 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     return State.of(v, moved), Info(updated.log_evidence, mean, cov, health)
 
 
-def _audited(chain: Chain, u: Train, coarser: Prediction, count: int) -> tuple[Prediction, int, float]:
-    """Return the prediction extrapolated from s and 2 s substeps that agree, 2 s, and their difference in L1."""
-    tolerance = chain.prepared.rule.tolerance
+class Audit(NamedTuple):
+    """A comparison of s and 2 s substeps: their difference in L1, 2 s, and the number that the tolerance asks for."""
+
+    error: float
+    substeps: int
+    wanted: int
+
+
+def _audited(chain: Chain, u: Train, coarser: Prediction, count: int) -> tuple[Prediction, Audit]:
+    """Return the prediction extrapolated from s and 2 s substeps, and how they differ."""
+    allowed = TIME_SHARE * chain.prepared.tolerance
     while True:
-        finer, count = chain.first(u, 2 * count)
+        finer, more = chain.first(u, 2 * count)
         control = finer.mass.control(CONTROLS)
-        error = difference(coarser.function.scaled(coarser.log_mass - finer.log_mass), finer.function, control)
-        if error < ACCEPTED * tolerance or count >= MOST_SUBSTEPS:
+        error = difference(coarser.function.scaled(coarser.log_scale - finer.log_scale), finer.function, control)
+        wanted = math.ceil(max(0.5, math.sqrt(error / (0.7 * allowed))) * 0.5 * more - 1e-9)
+        if error < ACCEPTED * allowed or 2 * more > MOST_SUBSTEPS:
             both = extrapolated(finer, coarser)
-            return Prediction(both, finer.mass, finer.log_mass, finer.defect), count, error
-        coarser = finer
+            found = Audit(error, more, min(wanted, MOST_SUBSTEPS))
+            return Prediction(both, finer.mass, finer.log_mass, finer.defect), found
+        coarser, count = finer, more

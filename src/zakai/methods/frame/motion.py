@@ -4,6 +4,13 @@ For increments the law of x given the path y is that of `methods/particles/syste
 divergence of the drift, so that a density carried backwards along the flow needs one integral,
 
     u(x, t1) = u(phi(x), t0) exp(int_(t1)^(t0) (div f - V) dt),      phi the flow from t1 back to t0
+
+Noise that depends on the state is a sum over weak points: with the flow psi_c of g(x) c over unit time,
+
+    u(x) <- sum_q w_q u(psi_c^-1(x)) |psi_c^-1'(x)|,      c = node_q sqrt(d) R_j,      for one column R_j of a root of Q at a time
+
+in the order 1, 2, ..., r, ..., 2, 1 with half of the variance before and after, so that a substep is of second order (where the
+fields commute, each once).
 """
 
 from __future__ import annotations
@@ -18,11 +25,13 @@ import sympy as sp
 from zakai.methods.particles.interval import Interval, noise_about_middle
 from zakai.methods.particles.interval import Motion as Coefficients
 from zakai.methods.particles.programs import Array, Expressions
+from zakai.methods.particles.system import root
 from zakai.methods.particles.system import system_of as formulas_of
 from zakai.models.functions import without_jumps
 from zakai.models.kept import kept
 from zakai.models.model import Model
 from zakai.numerics.particles.formulas import evaluate
+from zakai.numerics.particles.motion import ADDITIVE, COMMUTING
 from zakai.numerics.trains.carried import Likelihood, Path
 from zakai.numerics.trains.kernels import flow
 
@@ -37,8 +46,17 @@ class System:
         self.base = formulas_of(model)
         f, V = list(self.base.formulas[: model.n]), (*self.base.formulas[model.n :], sp.S.Zero)[0]
         divergence = sum((without_jumps(part, symbol) for part, symbol in zip(f, model.x, strict=True)), sp.S.Zero)
-        self.backward = Expressions([*f, divergence - V], model, self.base.given)
-        self.forward = Expressions([*f, V], model, self.base.given)
+        given, rate = self.base.given, divergence - V
+        self.kicked = self.base.kind != ADDITIVE
+        if self.kicked:
+            # One program moves along f, with the switch one, and along g c, with the switch zero.
+            switch, c = sp.Dummy("switch", real=True), [sp.Dummy(f"c{a}", real=True) for a in range(self.base.r)]
+            field = list(model.diffusion * sp.Matrix(c))
+            spread = sum((without_jumps(part, symbol) for part, symbol in zip(field, model.x, strict=True)), sp.S.Zero)
+            f, rate, V = [switch * a + b for a, b in zip(f, field, strict=True)], switch * rate + spread, switch * V
+            given = (*given, switch, *c)
+        self.backward = Expressions([*f, rate], model, given)
+        self.forward = Expressions([*f, V], model, given)
         self.weighted = not self.base.sampled
         self.periods = np.where(self.base.angles, 2 * np.pi, 0.0)
         self.lower, self.upper = self.base.box
@@ -78,15 +96,16 @@ class Motion:
     def path(self, interval: Interval, t0: float, t1: float, values: Array, steps: int) -> Path:
         """Return about so many steps from t0 to t1, before or after it, without a jump of an input inside of a step."""
         low, high = min(t0, t1), max(t0, t1)
-        width = self.system.base.drift.width
         if high <= low:
-            return Path(np.zeros((0, 2)), np.zeros((0, 2, width)))
+            return Path(np.zeros((0, 2)), np.zeros((0, 2, self.system.backward.width)))
         ends = low + (high - low) * np.arange(1, steps + 1) / steps
         ends[-1] = high
         if interval.inputs is not None:
             ends = np.unique(np.concatenate([ends, interval.inputs.within(low, high)]))
         times = np.column_stack([np.append(low, ends[:-1]), ends])
         given = self.coefficients.given_numbers(interval, times, values)
+        if self.system.kicked:
+            given = np.concatenate([given, np.ones((len(times), 2, 1)), np.zeros((len(times), 2, self.system.base.r))], axis=2)
         if t1 < t0:
             times, given = times[::-1, ::-1], given[::-1, ::-1]
         return Path(np.ascontiguousarray(times), np.ascontiguousarray(given))
@@ -136,6 +155,33 @@ class Motion:
         # The value at the interval's end is the limit from inside, as for the flows.
         given = self.path(interval, t, t + 1e-9 * length, values, 1).given[0, 0]
         return noise_about_middle(coefficients.matrix(*about, t, given), G, length)
+
+    def kicks(self, interval: Interval, t: float, length: float) -> list[Array]:
+        """Return the coefficients of the fields g (r,) for one deviation of each noise of a substep, in order."""
+        base = self.system.base
+        u = None if interval.inputs is None else interval.inputs.at(t, base.model.input_hold)
+        P = np.zeros((base.m, base.m)) if base.cross is None else base.precision(t, interval.inside, self.theta, u)
+        columns = list((root(base.own_noise(t, P, self.theta, u)) * np.sqrt(length)).T)
+        if base.kind == COMMUTING or len(columns) < 2:
+            return columns
+        halves = [np.sqrt(0.5) * column for column in columns[:-1]]
+        return [*halves, columns[-1], *halves[::-1]]
+
+    def kick(self, interval: Interval, values: Array, middle: tuple[float, float], c: Array, steps: int) -> Path:
+        """Return the path along g c, to be followed forwards; its clock goes over the substep about its middle.
+
+        Args:
+            interval: the interval.
+            values: what is observed (m,).
+            middle: of the substep, and its length, which is negative for the way back.
+            c: coefficients (r,).
+            steps: of Runge-Kutta.
+        """
+        t, length = middle
+        row = self.coefficients.given_numbers(interval, np.array([[t, t]]), values)[0, 0]
+        ends = t + length * (np.arange(steps + 1) / steps - 0.5)
+        given = np.tile(np.concatenate([row, [0.0], c / abs(length)]), (steps, 2, 1))
+        return Path(np.column_stack([ends[:-1], ends[1:]]), np.ascontiguousarray(given))
 
     def likelihood(self, interval: Interval, values: Array) -> Likelihood:
         """Return the law of what is observed at the end of an interval; no term counts where nothing is."""

@@ -15,7 +15,10 @@ import numpy as np
 from zakai.numerics.trains.grid import Grid
 
 Array = Any
-TOGETHER = 0.03  # difference of noise, in variances of the density, up to which two axes have one triangular block
+# Difference of noise, in variances of the density, up to which two axes have one triangular block: at most .03, and this many
+# tolerances of a build.  What is left off the diagonal is a linear map of the frame instead of a convolution, which is wrong for
+# a density that is not Gaussian; with .03 alone that adds up over substeps (a robot with a wide heading: .007 deviations).
+TOGETHER, TOGETHER_TOLERANCES = 0.03, 1.0
 LEFT_OUT = 1e-3  # share of the tolerance that a box may leave out: every separated part with more mass is kept
 REACH = 1.3  # of the extreme of the mass
 FEWEST_POINTS = 10  # along an axis: six splines and two points beyond both ends
@@ -88,10 +91,10 @@ class Rule(NamedTuple):
         return cls(tolerance, math.sqrt(2 * math.log(1 / tolerance)) + 0.7, 64)
 
 
-def frame_of(P: Array, Q: Array | None = None) -> tuple[Array, Array]:
+def frame_of(P: Array, Q: Array | None, together: float) -> tuple[Array, Array]:
     """Return B with B B' = P, triangular as far as the noise leaves it free, and D = B^-1 Q B^-T, nearly diagonal.
 
-    Axes whose noise differs by less than `TOGETHER` form a group, inside of which B is triangular.
+    Axes whose noise differs by less than `together` form a group, inside of which B is triangular.
     """
     d, n = np.sqrt(np.maximum(np.diag(P), 1e-300)), len(P)
     C = d[:, None] * np.linalg.cholesky(P / d / d[:, None] + 1e-9 * np.eye(n))
@@ -101,7 +104,7 @@ def frame_of(P: Array, Q: Array | None = None) -> tuple[Array, Array]:
     noise, W = np.linalg.eigh(0.5 * (T + T.T))
     free, V, start = list(range(n)), np.zeros((n, n)), 0
     for stop in range(1, n + 1):
-        if stop < n and noise[stop] - noise[stop - 1] < TOGETHER * (1 + noise[stop]):
+        if stop < n and noise[stop] - noise[stop - 1] < together * (1 + noise[stop]):
             continue
         group = W[:, start:stop]
         rows = sorted(sorted(free, key=lambda i: -np.sum(group[i] ** 2))[: stop - start])
@@ -146,7 +149,8 @@ def place(
     B, D, free = np.eye(len(mean)), np.diag(np.zeros(len(mean)) if noise is None else np.diag(noise)), np.flatnonzero(~closed)
     if len(free):
         block = np.ix_(free, free)
-        B[block], D[block] = frame_of(P[block], None if noise is None else noise[block])
+        together = min(TOGETHER, TOGETHER_TOLERANCES * rule.tolerance)
+        B[block], D[block] = frame_of(P[block], None if noise is None else noise[block], together)
     z = np.linalg.solve(B, mass.points - mean[:, None])
     heavy = z[:, mass.heavy(rule.tolerance)]
     low = -stretch * np.maximum(rule.width, -REACH * heavy.min(axis=1))

@@ -9,18 +9,16 @@ from typing import NamedTuple
 import numpy as np
 
 from zakai.methods.frame.motion import Motion, System
-from zakai.methods.frame.placement import Rule
 from zakai.methods.particles.interval import Interval
 from zakai.methods.particles.programs import Array
 from zakai.models.model import Model
-from zakai.numerics.trains.cross import Options
 from zakai.numerics.trains.grid import Grid
 from zakai.numerics.trains.train import Train
 from zakai.records.schedule import Schedule
 
-# The error of a mean is 1 to 3 times the relative error of the builds, with the control points that happened to be drawn
-# (bearings, turns, re-entry; rms over times and coordinates): the builds have half of the tolerance.
-SHARE = 0.5
+
+class Unresolved(ArithmeticError):
+    """A density that no grid holds: the substep is too long, or the density was lost."""
 
 
 class Control(NamedTuple):
@@ -80,16 +78,6 @@ class Prepared:
     def motion(self) -> Motion:
         """The programs for these parameters."""
         return Motion(self.system, self.theta)
-
-    @cached_property
-    def rule(self) -> Rule:
-        """The accuracy of a build."""
-        return Rule.of(SHARE * self.tolerance)
-
-    @cached_property
-    def options(self) -> Options:
-        """The accuracy of a cross interpolation: the errors of the cores add up."""
-        return Options(0.25 * SHARE * self.tolerance, self.most_rank)
 
     def interval(self, k: int) -> Interval:
         """Return an interval of the schedule."""

@@ -75,5 +75,5 @@ METHOD: Method[Prepared, State] = Method(
     differentiable=False,
     valid=valid,
     shorter="raise the option tolerance (command: --option tolerance=...)",
-    handles=frozenset(features.ASSUMPTIONS) - {features.OBSERVED_PATH, features.STATE_DEPENDENT_DIFFUSION},
+    handles=frozenset(features.ASSUMPTIONS) - {features.OBSERVED_PATH},
 )

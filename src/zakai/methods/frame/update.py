@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zakai.methods.frame.build import CLOUD, Builder, Unresolved
+from zakai.methods.frame.build import CLOUD, Builder
 from zakai.methods.frame.chain import Prediction
 from zakai.methods.frame.placement import Mass
+from zakai.methods.frame.state import Unresolved
 from zakai.methods.particles.programs import Array
 from zakai.numerics.trains.carried import Carried, Likelihood
 from zakai.numerics.trains.train import Train
@@ -43,7 +44,7 @@ def update(builder: Builder, prediction: Prediction, likelihood: Likelihood) -> 
         raise Unresolved("the observation is impossible everywhere in the predicted density")
     effective = mass.reweighted(logs).effective / mass.effective
     done, powers = 0.0, 0
-    loose = max(1.0, ROUGHLY / builder.prepared.rule.tolerance)
+    loose = max(1.0, ROUGHLY / builder.rule.tolerance)
     while mass.reweighted((1.0 - done) * _finite(logs)).effective < FEW and powers < MOST_POWERS:
         power = min(done + (1.0 - done) * _power(mass, (1.0 - done) * _finite(logs)), 1.0)
         v, _ = _product(builder, prediction, mass.reweighted((power - done) * _finite(logs)), likelihood, power, loose)
@@ -78,7 +79,7 @@ def _normalised(v: Train, prediction: Prediction, top: float, effective: float, 
     total = v.mass
     if not total > 0 or not math.isfinite(total):
         raise Unresolved(f"the density has mass {total:.1g} after the observation")
-    log_evidence = math.log(total) + top + prediction.log_mass + float(prediction.function.terms[0].scale[1])
+    log_evidence = math.log(total) + top + prediction.log_scale
     return Updated(v.scaled(1.0 / total), log_evidence, effective, powers)
 
 

@@ -114,10 +114,8 @@ def segment(
     assert prepared.loop is not None
     means, covs = (np.array(field_of(states, name)[1:, 0]) for name in ("mean", "cov"))
     moved, masses = Exponents(*(np.array(field, order="C") for field in later)), np.empty(len(values))
-    gaussian_backward.segment(
-        rows.start, moved.centre, moved.information[0], moved.slopes[0], moved.logs, *prepared.loop,
-        np.ascontiguousarray(values), means, covs, masses,
-    )  # fmt: skip
+    parts = (moved.centre, moved.information[0], moved.slopes[0], moved.logs)
+    gaussian_backward.segment(rows.start, parts, *prepared.loop, np.ascontiguousarray(values), means, covs, masses)
     return moved, Infos(masses, means + prepared.setup.origin, covs, health_of_gaussians(covs))
 
 

@@ -26,7 +26,7 @@ from zakai.models.model import Model
 from zakai.models.prior import GaussianPrior, MixturePrior
 from zakai.numerics.complex_step import is_complex
 from zakai.numerics.families import Family, exponents, move, observe, weigh
-from zakai.numerics.gaussian.step import segment
+from zakai.numerics.gaussian.step import Loop, segment
 from zakai.numerics.transition import Array, Transition, at
 from zakai.records.schedule import Schedule
 
@@ -81,7 +81,7 @@ class Prepared:
     stops: Array
     frequencies: Array
     transitions: Transition
-    loop: tuple[Any, ...] | None
+    loop: Loop | None
     ends: Ends
     notes: tuple[str, ...]
 
@@ -119,9 +119,10 @@ def prepare(model: Model, schedule: Schedule, theta: Array, kind: type[AffineSys
     if gauge.trivial and setup.quadratic is None:
         # The Gaussian itself may carry a derivative where nothing else does.
         dtype = complex if is_complex(setup.theta) else float
-        parts = [np.ascontiguousarray(part, dtype) for part in (*transitions, ends.whiten, ends.slope, ends.intercept)]
+        moves = [np.ascontiguousarray(part, dtype) for part in transitions]
+        affine = [np.ascontiguousarray(part, dtype) for part in (ends.whiten, ends.slope, ends.intercept)]
         level = np.ascontiguousarray(ends.constant, dtype)
-        loop = (lengths, frequencies, *parts, ends.observed, level, ends.relative)
+        loop = Loop((lengths, frequencies, *moves), (*affine, ends.observed, level, ends.relative))
     return Prepared(model, setup, gauge, lengths, schedule.stops, frequencies, transitions, loop, ends, notes)
 
 
@@ -211,11 +212,11 @@ def is_single(prepared: Prepared, state: State) -> bool:
 def segment_of_gaussian(prepared: Prepared, rows: slice, state: State, values: Array) -> tuple[Sequence[State], Infos]:
     """Return the states after the intervals of a slice, and their reports, for one Gaussian."""
     assert prepared.loop is not None
-    origin, dtype = prepared.setup.origin, prepared.loop[2].dtype
+    origin, dtype = prepared.setup.origin, prepared.loop.motion[2].dtype
     mean, cov = state.mean[0].astype(dtype), state.cov[0].astype(dtype)
     (count, _), n = values.shape, len(mean)
     means, covs, gains = np.empty((count, 1, n), dtype), np.empty((count, 1, n, n), dtype), np.empty(count, dtype)
-    segment(rows.start, mean, cov, *prepared.loop, np.ascontiguousarray(values), means[:, 0], covs[:, 0], gains)
+    segment(rows.start, mean, cov, *prepared.loop, np.ascontiguousarray(values), (means[:, 0], covs[:, 0], gains))
     gains[0] += state.log_mass[0]
     fields = {"mean": means, "cov": covs, "log_mass": np.zeros((count, 1)), "time": prepared.stops[rows].tolist()}
     infos = Infos(gains, means[:, 0] + origin, covs[:, 0], health_of_gaussians(covs[:, 0]))

@@ -74,7 +74,7 @@ def back(
         before = states[begin - first : k + 1 - first]
         for stride in (0,) if split else STRIDES:
             values = observed[begin - first : k + 1 - first]
-            completed = _on_one_grid(prepared, here, before, later, product, grid, window, stride, values)
+            completed = _on_one_grid(prepared, here, before, later, (product, grid), window, stride, values)
             if completed is not None:
                 return completed
     return None
@@ -104,12 +104,12 @@ def _exact(prepared: Prepared, k: int, state: State) -> bool:
 
 
 def _on_one_grid(
-    prepared: Prepared, here: slice, before: Sequence[State], later: Message, product: Array, grid: lw.Window, window: lw.Window,
-    stride: int, observed: Array,
+    prepared: Prepared, here: slice, before: Sequence[State], later: Message, smoothed: tuple[Array, lw.Window],
+    window: lw.Window, stride: int, observed: Array,
 ) -> BackwardSegment | None:  # fmt: skip
     """Return the message before intervals, moved on one grid, None where none is taken."""
     limits = lb.Limits(smoothing_tolerance(prepared), SHARE * prepared.tolerance, negligible(prepared), prepared.cut)
-    now, start, longer, gauge = lw.resampled(product, grid, window), 0, window, np.zeros(1)
+    now, start, longer, gauge = lw.resampled(*smoothed, window), 0, window, np.zeros(1)
     filtered, centres = _before(before, window)
     if not stride:
         table = grid_of(prepared, window, here)
@@ -120,7 +120,7 @@ def _on_one_grid(
         logs = log_likelihoods(prepared, here, observed, window.origin + ends[:, None] + window.spacing * lw.index(window.size))
         message, steps = _on(later, window, start, now), prepared.steps.part(here)
         observed = np.ascontiguousarray(observed, float)
-        completed = by_adjoints(message, filtered, table, logs, steps, observed, window.closed, limits)
+        completed = by_adjoints(message, filtered, table, steps, lb.Observed(logs, observed, window.closed), limits)
     else:
         lengths = np.ascontiguousarray(prepared.lengths[here])
         longer = _longer(prepared, window, stride, float(np.max(lengths)))

@@ -33,6 +33,7 @@ from zakai.numerics.line.steps import (
     SLOPE,
     Grid,
     Segment,
+    Start,
     Status,
 )
 
@@ -249,10 +250,8 @@ def _on_one_table(prepared: Prepared, rows: slice, state: State, observed: np.nd
     grid = grid_of(prepared, state.window, here)
     if grid is None:
         return None, Status.FAILED, np.zeros(3)
-    segment = advance(
-        prepared.mechanisms, np.ascontiguousarray(state.values), grid, prepared.steps, rows.start, observed[:together],
-        float(state.error), float(state.log_floor), prepared.limits,
-    )  # fmt: skip
+    start = Start(np.ascontiguousarray(state.values), float(state.error), float(state.log_floor))
+    segment = advance(prepared.mechanisms, start, grid, prepared.steps, rows.start, observed[:together], prepared.limits)
     return (_piece(rows.start, state, grid.start, segment) if len(segment.reports) else None), segment.status, segment.answer
 
 

@@ -71,21 +71,23 @@ def advanced(prepared: Prepared, k: int, stop: int, state: State, observed: np.n
         k, stop: the intervals.
         state: the state before them.
         observed: what is observed (K, m).
-        way: whether the steps stay on the grid of the state, see `numerics/line/modes.py`.
+        placement: whether the steps stay on the grid of the state, see `numerics/line/modes.py`.
     """
     system, window, steps, stays = prepared.system, state.window, prepared.steps, placement == lm.STAY
     general, special = system.general or prepared.weak, system.general or not system.steady_observation or prepared.weak
     key, profile = (window.origin, window.unit, window.closed), profile_of(prepared, window)
     coarse, rows, at = prepared.once(Derived.COARSE_GRIDS, key, Coarse), np.empty((0, 0, 0)), 0
+    start = lm.Start(np.ascontiguousarray(state.values), float(state.centre), float(state.spacing), float(state.error))
+    frame = lm.Frame(window.unit, window.closed, profile)
     owner, count = (-2, stop - k) if not special else (-1, min(TOGETHER, stop - k) if stays else 1)
     for _ in range(NEW):
         n = window.size if stays else SIZES[at]
         cosines, sines = waves(n)
         densities, places, out = np.empty((count, n)), np.empty((count + 1, 4)), np.zeros((count, len(COLUMNS)))
+        samples = lm.Samples(k, observed[:count], steps.lengths, steps.precisions[:, 0], steps.constants)
         done, number = lm.advance(
-            np.ascontiguousarray(state.values), float(state.centre), float(state.spacing), window.unit, window.closed, profile,
-            coarse.numbers, coarse.index, rows, owner, general, placement, k, observed[:count], steps.lengths,
-            steps.precisions[:, 0], steps.constants, float(state.error), prepared.limits, cosines, sines, densities, places, out,
+            start, frame, lm.KnownGrids(coarse.numbers, coarse.index), lm.Special(rows, owner, general), placement, samples,
+            prepared.limits, lm.Results(cosines, sines, densities, places, out),
         )  # fmt: skip
         if window.closed:
             circular_rows(densities[:done], cosines, sines, out)

@@ -30,7 +30,8 @@ class Formulas(NamedTuple):
 
     `slope` is f', `spread` G' and G''; `cross` is g C with its derivative and h' (3, m), None for independent noises.
     `separated` are the functions a (R,) of t and g (R, 2 + m) of x with (f, f', h) = sum a_r g_r; `kinks` (K,) are zero where
-    f, G or an h that acts within intervals has a kink or a jump.
+    f, G or an h that acts within intervals has a kink or a jump.  `resolved` tells that the six Gauss nodes of an interval
+    resolve all coefficients in time that act within it: polynomials of t of degree five at most.
     """
 
     drift: Function
@@ -43,6 +44,7 @@ class Formulas(NamedTuple):
     outside: OutsideTables
     separated: tuple[Function, Function] | None
     kinks: Function | None
+    resolved: bool
 
 
 @once_for_a_model
@@ -52,6 +54,7 @@ def _formulas(model: Model) -> Formulas:
     f, G, h = model.drift[0], model.covariance[0], list(model.observation)
     joint = list(model.diffusion * model.cross_noise) if CROSS_NOISE in model.features else []
     cross = [*joint, *[sp.diff(entry, x) for entry in [*joint, *h]]]
+    terms = _separated(model)
     return Formulas(
         numpy_function(model.drift, model, (1,)),
         numpy_function([sp.diff(f, x)], model, (1,)) if _continuous(f, x) else None,
@@ -61,8 +64,11 @@ def _formulas(model: Model) -> Formulas:
         numpy_function(model.observation_noise, model, (m, m)),
         numpy_function(cross, model, (3, m)) if joint else None,
         OutsideTables(model),
-        _separated(model),
+        None if terms is None else (
+            numpy_function(list(terms), model, (len(terms),)), numpy_function(_terms_of_x(terms, x), model, (len(terms), 2 + m))
+        ),
         numpy_function(roots, model, (len(roots),)) if (roots := _roots(model)) else None,
+        terms is not None and _resolved(model, [*terms, G]),
     )
 
 
@@ -95,8 +101,8 @@ def _zeros(model: Model, formulas: list[sp.Expr]) -> set[sp.Expr]:
     return {root for root in result if root.has(x) and not root.free_symbols & given}
 
 
-def _separated(model: Model) -> tuple[Function, Function] | None:
-    """Return f, f' and h as sums of products of functions of t and of x, None where they are not shown to be such."""
+def _separated(model: Model) -> dict[sp.Expr, list[sp.Expr]] | None:
+    """Return the factors in t of f and h, and the functions of x that they multiply, None where none are shown."""
     x, given = model.x[0], {model.t, *model.u}
     terms: dict[sp.Expr, list[sp.Expr]] = {}
     for row, formula in enumerate([model.drift[0], *model.observation]):
@@ -112,8 +118,22 @@ def _separated(model: Model) -> tuple[Function, Function] | None:
             terms.setdefault(factor, [sp.Integer(0)] * (1 + model.m))[row] += part
     if len(terms) > _MOST_TERMS:
         return None
-    parts = [[row[0], sp.diff(row[0], x) if _continuous(row[0], x) else sp.nan, *row[1:]] for row in terms.values()]
-    return numpy_function(list(terms), model, (len(terms),)), numpy_function(sp.Matrix(parts), model, (len(parts), 2 + model.m))
+    return terms
+
+
+def _terms_of_x(terms: dict[sp.Expr, list[sp.Expr]], x: sp.Symbol) -> sp.Matrix:
+    """Return the parts of f, f' and h that the factors in t multiply."""
+    return sp.Matrix([[row[0], sp.diff(row[0], x) if _continuous(row[0], x) else sp.nan, *row[1:]] for row in terms.values()])
+
+
+def _resolved(model: Model, coefficients: list[sp.Expr]) -> bool:
+    """Return whether coefficients, and S within intervals, are polynomials of t of degree five at most."""
+    inside = [] if model.observation_kind == "samples" else list(model.observation_noise)
+    varying = [part for part in coefficients if part.free_symbols & {model.t, *model.u}]
+    steady = not any(part.free_symbols & {model.t, *model.u} for part in inside)
+    return steady and all(
+        not part.free_symbols & set(model.u) and part.is_polynomial(model.t) and sp.degree(part, model.t) <= 5 for part in varying
+    )
 
 
 _MOST_TERMS = 8
@@ -201,6 +221,7 @@ class System:
         self.slope, self.spread = self._optional(formulas.slope), self._optional(formulas.spread)
         self.cross, self.kinks = self._optional(formulas.cross), self._optional(formulas.kinks)
         self.separated = None if formulas.separated is None else (self._bound(formulas.separated[0]), formulas.separated[1])
+        self.resolved = formulas.resolved
         self.tabulated, self._outside = bool(formulas.outside), self._bound(formulas.outside)
 
     def _bound(self, function: Function) -> Function:

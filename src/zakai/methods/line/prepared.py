@@ -60,6 +60,7 @@ class Derived(Enum):
     HIDDEN_DRIFT = "the error of f between the points of a grid"
     PRECISION = "the inverse of S for some coordinates"
     SAMPLE_NOISE = "the inverse of S of a sample, and the constant of its density"
+    STEADY = "a coefficient that depends neither on x nor on t"
     KINKS = "the states between two at which coefficients have kinks"
 
 
@@ -339,15 +340,15 @@ MOST_PARTS = 16  # in which an interval is cut at a time
 PROBES = np.linspace(0.0, 1.0, 129)  # parts of an interval at which coefficients are compared with their interpolants
 
 
-
 def coefficients_of(prepared: Prepared) -> Coefficients:
     """Return what the loop needs of the coefficients in time of all intervals."""
     schedule, system, theta = prepared.schedule, prepared.system, prepared.theta
     count, seen, m = len(schedule), schedule.seen, system.m
     starts, lengths, stops = schedule.starts[:, None], prepared.lengths[:, None], schedule.stops[:, None]
+    resolved = system.resolved and not prepared.mixed
     if prepared.timed:
         nodes = np.clip(starts + lengths * GAUSS_NODES, starts, np.nextafter(stops, starts))
-        t = np.concatenate([nodes, stops, probed(starts, stops)], axis=1)
+        t = np.concatenate([nodes, stops] if resolved else [nodes, stops, probed(starts, stops)], axis=1)
     else:
         t = np.concatenate([np.full((count, 1), prepared.model.start), stops], axis=1)
     size = len(GAUSS_NODES) if prepared.timed else 1
@@ -355,9 +356,12 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
     if not system.samples and system.steady_observation and system.steady_noise:
         ends = slice(1)
 
-    def everywhere(function: Callable[..., np.ndarray], steady: bool) -> np.ndarray:
-        """Return a function of time alone at all times."""
-        result = function(_X, t[:1, :1] if steady else t, theta)
+    def everywhere(function: Callable[..., np.ndarray], name: str | None) -> np.ndarray:
+        """Return a function of time alone at all times; one that is constant has a name."""
+        if name:
+            result = prepared.once(Derived.STEADY, name, lambda: function(_X, np.full((1, 1), prepared.model.start), theta))
+        else:
+            result = function(_X, t, theta)
         return np.broadcast_to(result, (*t.shape, *result.shape[2:]))
 
     def precision(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -374,12 +378,16 @@ def coefficients_of(prepared: Prepared) -> Coefficients:
         factors = np.broadcast_to(np.eye(size + 1), (count, size + 1, size + 1))
     else:
         assert system.separated is not None
-        factors = everywhere(system.separated[0], False)
-    G = everywhere(system.covariance, system.steady_covariance)[..., 0, 0] if prepared.divides else np.zeros(t.shape)
-    noise = everywhere(system.noise, system.steady_noise)
+        factors = everywhere(system.separated[0], None)
+    G = np.zeros(t.shape)
+    if prepared.divides:
+        G = everywhere(system.covariance, "G" if system.steady_covariance else None)[..., 0, 0]
+    noise = everywhere(system.noise, "S" if system.steady_noise else None)
     precisions, constants = precision(noise[:, ends])
     parts = np.ones(count, int)
-    if prepared.timed and count:
+    if resolved and prepared.timed:
+        parts = np.isfinite(factors).all(axis=(1, 2)).astype(int)
+    elif prepared.timed and count:
         terms = _mixed_terms(prepared, t) if prepared.mixed else factors
         parts = parts_needed(terms[:, probes], terms[:, own])
         if not system.steady_covariance:

@@ -25,7 +25,7 @@ from zakai.methods.line.transition import RecordedTransition, Substep, exponents
 from zakai.methods.line.update import factor_of
 from zakai.numerics.complex_step import STEP
 from zakai.numerics.line import window as lw
-from zakai.numerics.line.splitting import Coefficients, Interval, through
+from zakai.numerics.line.splitting import Interval, TangentCoefficients, through
 from zakai.numerics.line.steps import SPLIT
 from zakai.numerics.line.tangents import Varied, exponential_tangents, extended, resampled_tangents
 
@@ -159,7 +159,7 @@ class _Walk:
             if interval is not None and len(table) == len(self.shifted):
                 own_table = table[:, i if table.shape[1] > 1 else 0, :, :, starts[i + 1] : starts[i + 1] + window.size]
                 time = [np.array([getattr(one.coefficients, name)[piece.first + i] for one in self.shifted]) for name in IN_TIME]
-                coefficients = Coefficients(own_table, *time)
+                coefficients = TangentCoefficients(own_table, *time)
             if interval is None or coefficients is None:
                 self._singly(piece.first + i, states[i], states[i + 1], observed[i])
                 window = states[i + 1].window

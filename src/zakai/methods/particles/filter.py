@@ -29,15 +29,17 @@ from zakai.methods.particles.interval import (
     Events,
     Interval,
     Motion,
+    Observed,
     Pilots,
     Scheme,
     Steps,
     steps_of,
+    with_update,
 )
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Control, Prepared, Rule, State
-from zakai.methods.particles.system import drawn, gaussian_prior
-from zakai.methods.particles.window import Observed, Target, Window, taken
+from zakai.methods.particles.system import System
+from zakai.methods.particles.window import Target, Window, taken
 from zakai.methods.system.escape_of_states import RARE, check_escape
 from zakai.numerics.particles.chunks import over_chunks
 from zakai.numerics.particles.population import effective, next_power, normalised, systematic
@@ -68,23 +70,29 @@ SURE, TRUSTED, TRUSTED_LESS, LONGER = 0.5, 8, 2, 4.0
 
 def init(prepared: Prepared, prior: Any) -> State:
     """Return draws of the prior with equal weights."""
-    n, count, system = prepared.system.n, prepared.rule.particles, prepared.system
-    gaussian = gaussian_prior(prior)
-    key = prepared.key(0, PRIOR)
-    if gaussian is None:
-        rng = np.random.Generator(np.random.Philox(key=key))
-        particles, first = drawn(prepared.model, prior, prepared.theta, count, rng), np.zeros((0, count))
-        gaussian = np.zeros(n), np.zeros((n, 0))
-    else:
-        first = np.empty((gaussian[1].shape[1], count))
-        normals(key, 0, count, first)
-        particles = np.ascontiguousarray(gaussian[0][:, None] + gaussian[1] @ first)
+    system, count = prepared.system, prepared.rule.particles
+    gaussian = system.gaussian_prior(prior)
+    if gaussian is not None:
+        return begun(prepared, gaussian, count)
+    rng = np.random.Generator(np.random.Philox(key=prepared.key(0, PRIOR)))
+    nowhere = np.zeros(system.n), np.zeros((system.n, 0))
+    return _at_start(prepared, system.drawn(prior, prepared.theta, count, rng), np.zeros((0, count)), nowhere)
+
+
+def begun(prepared: Prepared, gaussian: tuple[Array, Array], count: int) -> State:
+    """Return draws of a Gaussian with a mean (n,) and a root (n, d) of its covariance."""
+    first = np.empty((gaussian[1].shape[1], count))
+    normals(prepared.key(0, PRIOR), 0, count, first)
+    return _at_start(prepared, np.ascontiguousarray(gaussian[0][:, None] + gaussian[1] @ first), first, gaussian)
+
+
+def _at_start(prepared: Prepared, particles: Array, first: Array, gaussian: tuple[Array, Array]) -> State:
+    system, count = prepared.system, particles.shape[1]
     width = system.law.width if system.law is not None else system.factor.width  # type: ignore[union-attr]
-    terms = len(prepared.motion.law[3])
-    window = Window.begin(particles, first, gaussian, (width, terms))
-    logs = np.full(count, -np.log(count))
+    window = Window.begin(particles, first, gaussian, (width, len(prepared.motion.law[3])))
+    logs, nothing = np.full(count, -np.log(count)), np.zeros(system.n)
     control = Control(0, 0.0, 4, 0.0, 0.0, 0, VARIANCE, 0, 0.0, 0.0, 0, 0.0)
-    return State(particles, logs, window, Genealogy.begin(count), control, np.zeros(n), np.zeros(n))
+    return State(particles, logs, window, Genealogy.begin(count), control, nothing, nothing)
 
 
 def reduced(state: State) -> State:
@@ -104,6 +112,21 @@ def moments(particles: Array, weights: Array, angles: Array) -> tuple[Array, Arr
     if angles.any():
         deviations[angles] = wrap(deviations[angles])
     return mean, deviations, (deviations * weights) @ deviations.T
+
+
+class Moments(NamedTuple):
+    """The mean (n',) of the coordinates, deviations (n, N) and covariance (n, n) of the states, the spread (n',) of particles."""
+
+    mean: Array
+    deviations: Array
+    cov: Array
+    spread: Array
+
+
+def _moments(system: System, particles: Array, weights: Array) -> Moments:
+    mean, deviations, cov = moments(particles, weights, system.angles)
+    n, spread = system.model.n, np.sqrt(np.maximum(np.diag(cov), 0.0))
+    return Moments(mean, deviations[:n], system.widened(mean, cov[:n, :n]), spread)
 
 
 class Cloud(NamedTuple):
@@ -150,33 +173,36 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     try:
         return _step(prepared, k, state, values)
     except np.linalg.LinAlgError:
-        n = prepared.system.n
+        n = prepared.model.n
         none = np.full(n, np.nan)
         return state, Info(np.nan, none, np.full((n, n), np.nan), dict.fromkeys(FIGURES, np.nan), none, np.nan)
 
 
 FIGURES = (
     "effective_sample_size", "particles", "founders", "largest_weight", "tempering_levels", "acceptance", "time_error",
-    "monte_carlo_error", "log_likelihood_error", "lower_bound", "guided", "moved",
+    "monte_carlo_error", "log_likelihood_error", "lower_bound", "guided", "moved", "linear_states",
 )  # fmt: skip
 
 
 def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
     def at_start() -> tuple[Array, Array]:
-        weights = np.exp(state.log_weights)
+        n, weights = prepared.model.n, np.exp(state.log_weights)
         mean = state.particles @ weights
-        return mean, (state.particles - mean[:, None]) * weights @ (state.particles - mean[:, None]).T
+        apart = (state.particles - mean[:, None])[:n]
+        return mean[:n], system.widened(mean, apart * weights @ apart.T)
 
+    system = prepared.system
     check_escape(prepared, k, at_start, infinity=False)
     motion, interval, control = prepared.motion, prepared.interval(k), state.control
-    angles, number, rule = prepared.system.angles, control.interval + 1, prepared.rule
+    number, rule, n = control.interval + 1, prepared.rule, prepared.model.n
     cloud = Cloud(state.particles, state.log_weights, state.window, state.genealogy)
     weights = np.exp(cloud.logs)
-    before, apart, _ = moments(cloud.particles, weights, angles)
-    scale = np.maximum(np.sqrt(apart**2 @ weights), 1e-12)
+    before, _, cov, _ = _moments(system, cloud.particles, weights)
+    scale = np.maximum(system.scales(cov), 1e-12)
     steps, control = _steps(prepared, interval, values, state, (before, scale))
     events = motion.events(interval, steps.scheme, values, before, scale)
     observed = _observed(prepared, interval, values)
+    events = with_update(events, system, observed)
     wanted = _wanted(rule, len(weights), control.variance)
     if effective(weights) < RESAMPLE_BELOW * len(weights) or wanted != len(weights):
         cloud, _ = cloud.resampled(weights, wanted, prepared.key(number, RESAMPLING))
@@ -187,7 +213,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     cloud = cloud._replace(window=cloud.window.appended(motion, events, observed, done.noise, cloud.particles))
     weights = np.exp(cloud.logs)
     size, largest = effective(weights), float(weights.max())
-    mean, deviations, cov = moments(cloud.particles, weights, angles)
+    mean, deviations, cov, own = _moments(system, cloud.particles, weights)
     found = variances(cloud.genealogy, weights, deviations)
     doubtful = size < TEMPER_BELOW * len(weights) or done.levels > 3
     acceptance, moved = done.acceptance, 0.0
@@ -197,7 +223,7 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     if factor > MOVE_GAIN * floor and urgency >= MOVE_SHARE * last and cloud.window.width:
         cloud, acceptance, doubtful_move = _moved(prepared, cloud, weights, number)
         weights = np.exp(cloud.logs)
-        mean, deviations, cov = moments(cloud.particles, weights, angles)
+        mean, deviations, cov, own = _moments(system, cloud.particles, weights)
         found = variances(cloud.genealogy, weights, deviations)
         floor = _excess(found.largest, cov, len(weights))
         # A move that gained little is repeated when there is more to gain.
@@ -205,12 +231,12 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         last, urgency, moved = cloud.window.length, 0.0, 1.0
         doubtful = doubtful or doubtful_move
     spread = np.sqrt(np.maximum(np.diag(cov), 0.0))
-    # What the data says of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
-    known = np.maximum(done.predicted, 1e-300)
-    contraction = np.minimum(1.0, spread / known) ** 2
+    # What the weights say of a coordinate makes a shift of the prediction smaller by the ratio of the variances.
+    contraction = np.where(done.predicted > 0, np.minimum(1.0, own / np.maximum(done.predicted, 1e-300)) ** 2, 1.0)
     shift = _carried(motion, events, before, state.shift) + steps.shift
     # A shifted prediction changes the log density of an observation by the shift times an innovation.
-    shifted = control.shifted + float(((shift / known) ** 2 * (1.0 - contraction)).max())
+    known = np.maximum(spread**2 + done.predicted[:n] ** 2 - own[:n] ** 2, 1e-300)
+    shifted = control.shifted + float((shift[:n] ** 2 / known * (1.0 - contraction[:n])).max())
     shift = shift * contraction
     genealogy, evidence = of_log_likelihood(cloud.genealogy, found)
     cloud, evidence = cloud._replace(genealogy=genealogy), evidence + shifted
@@ -224,14 +250,15 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "largest_weight": largest,
         "tempering_levels": float(done.levels),
         "acceptance": acceptance,
-        "time_error": float((np.abs(shift) / positive).max()),
+        "time_error": float((np.abs(shift[:n]) / positive).max()),
         "monte_carlo_error": float(np.sqrt(share.max())),
         "log_likelihood_error": float(np.sqrt(evidence)),
         "lower_bound": float(doubtful or cloud.genealogy.age < until or found.families[-2] < FEW_FAMILIES),
         "guided": float(done.guided),
         "moved": moved,
+        "linear_states": float(system.linear),
     }
-    info = Info(done.gained, mean, cov, health, np.sqrt(found.largest + shift**2), float(np.sqrt(evidence)))
+    info = Info(done.gained, mean[:n], cov, health, np.sqrt(found.largest + shift[:n] ** 2), float(np.sqrt(evidence)))
     variance = 0.8 * control.variance + 0.2 * len(weights) * float(share.mean())
     control = control._replace(
         interval=number, variance=variance, last=last, urgency=urgency, floor=floor, doubtful_until=until, shifted=shifted
@@ -284,7 +311,7 @@ def _observed(prepared: Prepared, interval: Interval, values: Array) -> Observed
     m, late = system.m, np.flatnonzero(interval.seen & ~interval.inside)
     P = np.zeros((m, m))
     if len(late):
-        S, spans = system.noise(np.zeros(system.n), t, theta, u), interval.elapsed
+        S, spans = system.noise(np.zeros(system.model.n), t, theta, u), interval.elapsed
         P[np.ix_(late, late)] = np.linalg.inv((S * np.minimum(spans[:, None], spans))[np.ix_(late, late)])
     r = interval.elapsed * (P @ values)
     P = P * np.outer(interval.elapsed, interval.elapsed)
@@ -298,15 +325,18 @@ def _advanced(prepared: Prepared, cloud: Cloud, events: Events, observed: Observ
     noise = np.empty((events.width, count))
     key = prepared.key(number, NOISE)
     over_chunks(lambda low, high: normals(key, low, high, noise), count)
-    particles, gained = motion.advanced(events, cloud.particles, noise)
+    ends = None if prepared.system.update is None else np.empty((1, *cloud.particles.shape))
+    particles, gained = motion.advanced(events, cloud.particles, noise, ends)
+    seen = particles if ends is None else ends[0]  # before the update
     lost = ~(np.abs(particles) < FAR).all(axis=0)  # NaN, too
     if lost.any():
         particles[:, lost] = cloud.particles[:, lost]
-    predicted = _spread(particles, cloud.logs, prepared.system.angles)
-    if not (observed.counted.any() or len(motion.arrays[0][3]) > prepared.system.n) and not lost.any():
+        seen[:, lost] = cloud.particles[:, lost]
+    predicted = _moments(prepared.system, particles, np.exp(cloud.logs)).spread
+    if prepared.system.sampled and not observed.counted.any() and not lost.any():
         return Advanced(cloud._replace(particles=particles), 0.0, noise, predicted)
     share = float(lost.mean())
-    logs = gained + _log_likelihood(motion, particles, observed)
+    logs = gained + _log_likelihood(motion, seen, observed)
     logs[lost | np.isnan(logs)] = -np.inf
     weights, top = normalised(cloud.logs + logs)
     plain = Advanced(cloud._replace(particles=particles, logs=cloud.logs + logs - top), top, noise, predicted, lost=share)
@@ -335,12 +365,6 @@ class Drawn(NamedTuple):
     path: Array
     logs: Array
     gaussian: Any
-
-
-def _spread(particles: Array, logs: Array, angles: Array) -> Array:
-    weights = np.exp(logs)
-    _, deviations, _ = moments(particles, weights, angles)
-    return np.sqrt(deviations**2 @ weights)
 
 
 def _log_likelihood(motion: Motion, particles: Array, observed: Observed) -> Array:

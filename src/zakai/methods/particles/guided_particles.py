@@ -9,15 +9,15 @@ from __future__ import annotations
 import numpy as np
 
 from zakai.algebra.theorems import any_model as theorem
-from zakai.densities import ParticleDensity
 from zakai.errors import InputError
 from zakai.methods._options import real_number, whole_number
 from zakai.methods._protocol import Method
-from zakai.methods.particles.backward import BACKWARD
-from zakai.methods.particles.filter import MOST_GROWTH, VARIANCE, init, reduced, step
+from zakai.methods.particles.carried import BACKWARD, density, step, valid
+from zakai.methods.particles.conditional import conditional_system
+from zakai.methods.particles.filter import MOST_GROWTH, VARIANCE, init, reduced
+from zakai.methods.particles.split import split_of
 from zakai.methods.particles.state import Prepared, Rule, State
-from zakai.methods.particles.system import system_of
-from zakai.methods.particles.validity import valid
+from zakai.methods.particles.system import System, system_of
 from zakai.models import features
 from zakai.models.model import Model
 from zakai.numerics.complex_step import is_complex
@@ -35,6 +35,7 @@ def prepare(
     particles: int | None = None,
     most_particles: int | None = None,
     seed: int = 0,
+    split: bool | None = None,
 ) -> Prepared:
     """Return the programs of the formulas.
 
@@ -46,6 +47,8 @@ def prepare(
         particles: a fixed number of particles instead.
         most_particles: the largest number; by default four times that of the start.
         seed: of the draws.
+        split: whether particles carry a Kalman filter for the states that are linear given the others; by default where it
+            pays.
 
     Raises:
         InputError: another value of an option.
@@ -57,19 +60,28 @@ def prepare(
         count = whole_number("particles", particles, 2, 10**8)
         if count > most:
             raise InputError(f"option particles: {count} is more than most_particles, {most}; leave one of them out")
-        rule = Rule(count, count, None, seed)
+        rule = Rule(count, count, None, seed, split is True)
     else:
         count = min(int(np.ceil(VARIANCE / tolerance**2)), most)
-        rule = Rule(count, min(most, MOST_GROWTH * count), tolerance, seed)
+        rule = Rule(count, min(most, MOST_GROWTH * count), tolerance, seed, split is True)
     assert not is_complex(theta)
-    return Prepared(system_of(model), np.asarray(theta, float), schedule, rule)
+    return Prepared(_system(model, split), np.asarray(theta, float), schedule, rule)
 
 
-def density(prepared: Prepared, state: State) -> ParticleDensity:
-    """Return the weighted particles."""
-    model, weights = prepared.model, np.exp(state.log_weights)
-    periodic = tuple(name in model.periodic for name in model.state)
-    return ParticleDensity(weights / weights.sum(), state.particles.T, model.state, periodic)
+def _system(model: Model, split: object) -> System:
+    """Return the system with or without a Kalman filter in each particle.
+
+    Raises:
+        InputError: `split` is no boolean, or is asked for where it is not possible.
+    """
+    if split not in (None, True, False):
+        raise InputError(f"option split: {split!r} is not true or false")
+    if split is False:
+        return system_of(model)
+    found = conditional_system(model)
+    if split and found.update is None:
+        raise InputError(f"option split: {split_of(model).reason}; leave it out")
+    return found
 
 
 BOUNDS = {
@@ -91,7 +103,7 @@ METHOD: Method[Prepared, State] = Method(
     source="Gordon, Salmond and Smith 1993; moves of the past: Gilks and Berzuini 2001; standard errors: Lee and Whiteley 2018",
     exactness="convergent: in 1 / sqrt(particles), with a standard error that is reported, and of second order in a substep",
     theorem=theorem,
-    options={"tolerance": TOLERANCE, "particles": None, "most_particles": None, "seed": 0},
+    options={"tolerance": TOLERANCE, "particles": None, "most_particles": None, "seed": 0, "split": None},
     prepare=prepare,
     init=init,
     step=step,

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
-from zakai.methods.particles.programs import Array
+from zakai.methods.particles.programs import Array, Expressions
 from zakai.methods.particles.system import System, root
 from zakai.numerics.particles.chunks import over_chunks
 from zakai.numerics.particles.formulas import evaluate
-from zakai.numerics.particles.motion import ADDITIVE, ORDERED, Arrival, advance
+from zakai.numerics.particles.motion import ADDITIVE, ORDERED, UPDATE, Arrival, advance
 from zakai.numerics.particles.random import key_of, normals
 from zakai.records.inputs import Inputs
 
@@ -54,6 +54,30 @@ class Events(NamedTuple):
         return int(self.rows[-1].sum()) if len(self.rows) else 0
 
 
+class Observed(NamedTuple):
+    """What is observed at the end of an interval: the time, the numbers given to the law (L,), and which terms count (T,)."""
+
+    time: float
+    given: Array
+    counted: Array
+
+
+def with_update(events: Events, system: System, observed: Observed) -> Events:
+    """Return the events of an interval and the update of the state by the observation at its end, where there is one."""
+    if system.update is None:
+        return events
+    given = np.pad(events.given, ((0, 0), (0, 0), (0, system.width - events.given.shape[2])))
+    if not observed.counted.any():
+        return events._replace(given=given)
+    row = np.zeros((1, 2, system.width))
+    row[0, :, : len(observed.given)] = observed.given
+    return events._replace(
+        times=np.append(events.times, [[observed.time, observed.time]], axis=0),
+        places=np.append(events.places, [[-1, -1, UPDATE]], axis=0),
+        given=np.append(given, row, axis=0),
+    )
+
+
 class Scheme(NamedTuple):
     """The number of substeps of an interval, and the evaluations of the drift in a flow, 2 or 4."""
 
@@ -70,9 +94,11 @@ class Motion:
 
     @cached_property
     def arrays(self) -> tuple[Any, ...]:
-        """The drift, the fields of the noise, the ends of the domain, and the kind of the noise."""
+        """The drift, the fields of the noise, the ends of the domain, the kind of the noise, and the update of the state."""
         system = self.system
-        return tuple(system.drift.at(self.theta)), tuple(system.fields.at(self.theta)), system.box, system.kind
+        update = Expressions([], system.model) if system.update is None else system.update
+        drift, fields, update_ = (tuple(part.at(self.theta)) for part in (system.drift, system.fields, update))
+        return drift, fields, system.box, system.kind, update_
 
     @cached_property
     def law(self) -> tuple[Any, ...]:
@@ -118,13 +144,14 @@ class Motion:
         system = self.system
         if system.cross is None and not system.timed:
             return self._constant_covariance
-        g = system.diffusion(np.zeros(system.n), t, self.theta, u)
+        g = system.diffusion(np.zeros(system.model.n), t, self.theta, u)
         return np.asarray(g @ system.own_noise(t, P, self.theta, u) @ g.T)
 
     @cached_property
     def _constant_covariance(self) -> Array:
         system, t = self.system, float(self.system.model.start)
-        g, Q = system.diffusion(np.zeros(system.n), t, self.theta), system.process_noise(np.zeros(system.n), t, self.theta)
+        at = np.zeros(system.model.n)
+        g, Q = system.diffusion(at, t, self.theta), system.process_noise(at, t, self.theta)
         return np.asarray(g @ Q @ g.T)
 
     @cached_property
@@ -349,7 +376,7 @@ def _time_errors(
     shared = _coarse_noise(motion, coarse, fine, noise)
     y, finer = motion.advanced(fine, pilots.states, noise)
     centred = y - y.mean(axis=1, keepdims=True)
-    spread = np.maximum(centred.std(axis=1), 1e-300)
+    spread = np.maximum(centred.std(axis=1), 1e-9 * scale)
 
     def change(stages: int) -> tuple[float, Array, float]:
         places = coarse.places.copy()

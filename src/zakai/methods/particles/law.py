@@ -58,7 +58,12 @@ class Numbers(NamedTuple):
 
 
 class Law:
-    """log p(z | x, u, t) as a program whose outputs are the terms of a sum, and the numbers that it needs."""
+    """log p(z | x, u, t) as a program whose outputs are the terms of a sum, and the numbers that it needs.
+
+    `more` are the symbols of coordinates after those of the state.
+    """
+
+    more: tuple[sp.Symbol, ...] = ()
 
     def __init__(self, model: Model):
         self.model, m = model, model.m
@@ -73,7 +78,7 @@ class Law:
         self.joint = model.log_density is None and self.coupled and self.fixed
         self._gaussian = [j for j in range(m) if model.observation_family[j] == "gaussian"]
         terms, self._terms = self._formulas(shapes)
-        self._expressions = Expressions(terms, model, self.numbers.symbols)
+        self._expressions = Expressions(terms, model, self.numbers.symbols, self.more)
         used = set().union(*(term.free_symbols for term in terms))
         self.reads = np.array([symbol in used for symbol in model.x])
         self.is_gaussian = model.log_density is None and set(model.observation_family) == {"gaussian"}

@@ -95,8 +95,8 @@ class Expressions:
                     first = slot
         rows, numbers = table_rows([_polynomials(table, orders) for table, orders in tables])
         self._program = Program(
-            np.array(lines, np.int64).reshape(-1, 5), np.array(values + constants),
-            np.array(coordinates + [NEITHER] * len(constants)), np.array(program.outputs, np.int64), rows, numbers,
+            np.array(lines, np.int64).reshape(-1, 5), np.array(values + constants, float),
+            np.array(coordinates + [NEITHER] * len(constants), np.int64), np.array(program.outputs, np.int64), rows, numbers,
         )  # fmt: skip
 
     def at(self, theta: Array) -> Program:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 from zakai.methods.particles.errors import Genealogy
 from zakai.methods.particles.interval import Interval, Motion
 from zakai.methods.particles.programs import Array
-from zakai.methods.particles.system import System
+from zakai.methods.particles.system import System, system_of
 from zakai.methods.particles.window import Window
 from zakai.models.model import Model
 from zakai.numerics.particles.random import key_of
@@ -57,12 +57,16 @@ class State(NamedTuple):
 
 @dataclass(frozen=True)
 class Rule:
-    """The options: the particles at the start, their largest number, the wanted standard error or none, and the seed."""
+    """The options: the particles at the start, their largest number, the wanted standard error or none, and the seed.
+
+    `split`: whether particles carry a Kalman filter for linear states even where draws leave a smaller error.
+    """
 
     particles: int
     most: int
     tolerance: float | None
     seed: int
+    split: bool
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,11 @@ class Prepared:
     def motion(self) -> Motion:
         """The programs for these parameters."""
         return Motion(self.system, self.theta)
+
+    @cached_property
+    def plain(self) -> Prepared:
+        """The same for particles that carry no Kalman filter."""
+        return replace(self, system=system_of(self.model))
 
     def interval(self, k: int) -> Interval:
         """Return an interval of the schedule."""

@@ -11,7 +11,7 @@ Where g depends on the state the drift is that of Stratonovich, f - sum (Q - C K
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import sympy as sp
@@ -28,27 +28,73 @@ from zakai.numerics.particles.motion import ADDITIVE, COMMUTING, ORDERED
 _MOST_ENTRIES = 400  # of the Jacobian of a drift that is checked for being affine
 
 
+class Noise(NamedTuple):
+    """The fields g (n, r) of the noise with its covariance Q (r, r), the coordinates x (n,), and those after the states."""
+
+    fields: sp.Matrix
+    Q: sp.Matrix
+    x: tuple[sp.Symbol, ...]
+    more: tuple[sp.Symbol, ...]
+
+
 class System:
     """The formulas of a model as programs."""
 
     def __init__(self, model: Model):
-        n, m, x = model.n, model.m, model.x
+        n, m = model.n, model.m
         self.model, self.n, self.m, self.inputs = model, n, m, len(model.u)
         self.sampled = model.observation_kind == "samples"
-        self.law = Law(model) if self.sampled else None
-        g, Q = sp.Matrix(model.diffusion), sp.Matrix(model.process_noise)
-        state_dependent = bool(g.free_symbols & set(x))
-        drift = list(model.drift)
         self.numbers = Numbers.of(m, not model.observation_noise.is_diagonal() or not model.cross_noise.is_zero_matrix)
-        given: list[sp.Symbol] = []
-        if not self.sampled:
+        self.observe = Expressions(list(model.observation) if model.log_density is None else [sp.S.Zero], model)
+        self.noise = numpy_function(model.observation_noise, model, (m, m))
+        cross, r = model.cross_noise, model.diffusion.cols
+        self.cross = None if cross.is_zero_matrix else numpy_function(cross, model, (r, m))
+        self.law: Law | None = None
+        self.factor: Expressions | None = None
+        self.update: Expressions | None = None  # of the state by an observation
+        self.linear = 0  # the number of states of which particles carry the mean and the covariance
+        self._set_formulas()
+        self.box = (np.full(n, -np.inf), np.full(n, np.inf))
+        for name, interval in model.domain.items():
+            place = model.state.index(name)
+            self.box[0][place], self.box[1][place] = interval.lower, interval.upper
+        self.angles = np.array([name in model.periodic for name in model.state])
+        self.affine = self.kind == ADDITIVE and _is_affine(model)
+        self.driven = bool(model.drift.free_symbols & {model.t, *model.u})  # whether f depends on time
+        self.timed = bool(model.inputs) or any(
+            part.has(model.t) for part in (model.diffusion, model.process_noise, model.observation_noise, model.cross_noise)
+        )
+
+    def _set_formulas(self) -> None:
+        """Set the programs of the motion and of the observation."""
+        model, given = self.model, list[sp.Symbol]()
+        drift, potential = list(model.drift), list[sp.Expr]()
+        if self.sampled:
+            self.law = Law(model)
+        else:
             given = [*self.numbers.z, *(self.numbers.P[pair] for pair in self.numbers.pairs)]
-            drift = self._with_increments(drift)
-        self.kind, r = ADDITIVE, g.shape[1]
+            *drift, weight = self._with_increments(drift)
+            potential.append(weight)
+            self.factor = Expressions([self._factor()], model, given)
+        noise = Noise(sp.Matrix(model.diffusion), sp.Matrix(model.process_noise), model.x, ())
+        self._set_motion(noise, drift, potential, given)
+
+    def _set_motion(self, noise: Noise, drift: list[sp.Expr], potential: list[sp.Expr], given: list[sp.Symbol]) -> None:
+        """Set the programs of drift and noise.
+
+        Args:
+            noise: that of all coordinates.
+            drift: of all coordinates, of the Ito kind.
+            potential: the logarithm of the weight per unit time, if there is one.
+            given: the symbols of the given numbers after the inputs.
+        """
+        model, (g, Q, x, more) = self.model, noise
+        n, r = g.shape
+        self.kind, self.r = ADDITIVE, r
         fields: list[sp.Expr] = [sp.S.Zero]
         coefficients = tuple(sp.Dummy(f"c{a}", real=True) for a in range(r))
         self.root_pairs: list[tuple[int, int]] = []
-        if state_dependent:
+        if g.free_symbols & set(x):
             along = [[[_along(g[i, a], g[:, b], x) for b in range(r)] for a in range(r)] for i in range(n)]
             diagonal = Q.is_diagonal() and model.cross_noise.is_zero_matrix
             commute = all(
@@ -60,29 +106,14 @@ class System:
             for i in range(n):
                 terms = [q * (along[i][a][b] + along[i][b][a]) / (4 if a == b else 2) for (a, b), q in Q_given.items()]
                 drift[i] -= sum(terms, sp.S.Zero)
-            given += Q_given.values()
+            given = [*given, *Q_given.values()]
             fields = [sum((g[i, a] * coefficients[a] for a in range(r)), sp.S.Zero) for i in range(n)]
+        else:
+            self.diffusion = numpy_function(g, model, (n, r))
         self.formulas, self.given = tuple(drift), tuple(given)
-        self.drift = Expressions(drift, model, given)
-        self.fields = Expressions(fields, model, given, coefficients)
-        self.observe = Expressions(list(model.observation) if model.log_density is None else [sp.S.Zero], model)
-        h = [*self.numbers.z, *(self.numbers.P[pair] for pair in self.numbers.pairs)]
-        self.factor = None if self.sampled else Expressions([self._factor()], model, h)
-        self.r = r
-        self.diffusion = numpy_function(model.diffusion, model, (n, r))
-        self.process_noise = numpy_function(model.process_noise, model, (r, r))
-        self.noise = numpy_function(model.observation_noise, model, (m, m))
-        self.cross = None if model.cross_noise.is_zero_matrix else numpy_function(model.cross_noise, model, (r, m))
-        self.box = (np.full(n, -np.inf), np.full(n, np.inf))
-        for name, interval in model.domain.items():
-            place = model.state.index(name)
-            self.box[0][place], self.box[1][place] = interval.lower, interval.upper
-        self.angles = np.array([name in model.periodic for name in model.state])
-        self.affine = not state_dependent and _is_affine(model)
-        self.driven = bool(model.drift.free_symbols & {model.t, *model.u})  # whether f depends on time
-        self.timed = bool(model.inputs) or any(
-            part.has(model.t) for part in (model.diffusion, model.process_noise, model.observation_noise, model.cross_noise)
-        )
+        self.drift = Expressions([*drift, *potential], model, given, more)
+        self.fields = Expressions(fields, model, given, (*more, *coefficients))
+        self.process_noise = numpy_function(Q, model, (r, r))
 
     def _with_increments(self, drift: list[sp.Expr]) -> list[sp.Expr]:
         """Return the drift given the increments, and the logarithm of the weight per unit time."""
@@ -109,17 +140,53 @@ class System:
         """Return the inverse (m, m) of the noise of the observed coordinates per unit time, zero elsewhere."""
         P, which = np.zeros((self.m, self.m)), np.flatnonzero(seen)
         if len(which):
-            S = self.noise(np.zeros(self.n), t, theta, u)
+            S = self.noise(np.zeros(self.model.n), t, theta, u)
             P[np.ix_(which, which)] = np.linalg.inv(S[np.ix_(which, which)])
         return P
 
     def own_noise(self, t: float, P: Array, theta: Array, u: Array | None) -> Array:
         """Return Q - C K C' (r, r): the noise of the state that is independent of that of the observations."""
-        Q = np.asarray(self.process_noise(np.zeros(self.n), t, theta, u))
+        Q = np.asarray(self.process_noise(np.zeros(self.model.n), t, theta, u))
         if self.cross is None:
             return Q
-        C = self.cross(np.zeros(self.n), t, theta, u)
+        C = self.cross(np.zeros(self.model.n), t, theta, u)
         return Q - C @ P @ C.T
+
+
+    @property
+    def width(self) -> int:
+        """The number of given numbers of an event."""
+        return max(self.drift.width, 0 if self.update is None else self.update.width)
+
+    def widened(self, mean: Array, cov: Array) -> Array:
+        """Return the covariance (n, n) of the states from that of the particles."""
+        return cov
+
+    def scales(self, cov: Array) -> Array:
+        """Return standard deviations (n,) of the coordinates from the covariance of the states."""
+        return np.sqrt(np.maximum(np.diag(cov), 0.0))
+
+    def gaussian_prior(self, prior: Any) -> tuple[Array, Array] | None:
+        """Return the mean (n,) and a root (n, d) of the covariance of a Gaussian prior, None for another one."""
+        return (np.array(prior.mean, float), root(prior.cov)) if isinstance(prior, GaussianPrior) else None
+
+    def drawn(self, prior: Any, theta: Array, count: int, rng: np.random.Generator) -> Array:
+        """Return states (n, count) drawn from a prior that is not Gaussian.
+
+        Raises:
+            InputError: a density in more than four coordinates.
+        """
+        model = self.model
+        if isinstance(prior, MixturePrior):
+            return np.ascontiguousarray(prior.sample(rng, count).T)
+        assert isinstance(prior, DensityPrior)
+        if model.n > 4:
+            prior_moments(model, prior, theta)  # which says what to do
+        from zakai.densities import GridDensity
+
+        grid = density_grid(model, prior, theta, 1e-9)
+        density = GridDensity(grid.log_values, grid.centre, grid.basis, model.state, (False,) * model.n)
+        return np.ascontiguousarray(density.sample(rng, count).T)
 
 
 def _along(function: sp.Expr, field: sp.Matrix, x: tuple[sp.Symbol, ...]) -> sp.Expr:
@@ -142,29 +209,6 @@ def _is_affine(model: Model) -> bool:
 def system_of(model: Model) -> System:
     """Return the programs of a model, made once."""
     return kept(model, System, lambda: System(model))
-
-
-def gaussian_prior(prior: Any) -> tuple[Array, Array] | None:
-    """Return the mean (n,) and a root (n, d) of the covariance of a Gaussian prior, None for another one."""
-    return (np.array(prior.mean, float), root(prior.cov)) if isinstance(prior, GaussianPrior) else None
-
-
-def drawn(model: Model, prior: Any, theta: Array, count: int, rng: np.random.Generator) -> Array:
-    """Return states (n, count) drawn from a prior that is not Gaussian.
-
-    Raises:
-        InputError: a density in more than four coordinates.
-    """
-    if isinstance(prior, MixturePrior):
-        return np.ascontiguousarray(prior.sample(rng, count).T)
-    assert isinstance(prior, DensityPrior)
-    if model.n > 4:
-        prior_moments(model, prior, theta)  # which says what to do
-    from zakai.densities import GridDensity
-
-    grid = density_grid(model, prior, theta, 1e-9)
-    density = GridDensity(grid.log_values, grid.centre, grid.basis, model.state, (False,) * model.n)
-    return np.ascontiguousarray(density.sample(rng, count).T)
 
 
 def root(Q: Array) -> Array:

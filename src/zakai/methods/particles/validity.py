@@ -8,6 +8,7 @@ from zakai.methods.particles.errors import DEPTH
 from zakai.methods.particles.programs import Array
 from zakai.methods.particles.state import Prepared, State
 from zakai.methods.particles.window import INTERVALS, Window
+from zakai.numerics.particles.motion import UPDATE
 
 
 def valid(prepared: Prepared, state: State) -> bool:
@@ -40,7 +41,7 @@ def _genealogy(state: State, count: int) -> bool:
 
 def _window(prepared: Prepared, window: Window, count: int) -> bool:
     system = prepared.system
-    n, rows = system.n, system.r if system.kind else system.n
+    n, rows, width = system.n, system.r if system.kind else system.n, system.width
     if not 0 <= window.length <= INTERVALS or window.mean.shape != (n,) or window.root.ndim != 2:
         return False
     I = window.length
@@ -55,12 +56,12 @@ def _window(prepared: Prepared, window: Window, count: int) -> bool:
         if window.ends[k].size and window.ends[k].shape != (n, own):
             return False
         E, J = len(events.times), len(events.rows)
-        if events.times.shape != (E, 2) or events.places.shape != (E, 3) or events.given.shape != (E, 2, system.drift.width):
+        if events.times.shape != (E, 2) or events.places.shape != (E, 3) or events.given.shape != (E, 2, width):
             return False
         if events.roots.shape[:2] != (J, rows) or events.rows.shape != (J, 3) or not E:
             return False
         places = events.places
-        if not np.isin(places[:, 2], (2, 4)).all():
+        if not np.isin(places[:, 2], (UPDATE, 2, 4)).all():
             return False
         if places[:, 0].min() < -1 or places[:, 0].max() >= J or places[:, 1].min() < -1 or places[:, 1].max() > 0:
             return False

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zakai.methods.particles.interval import Events, Motion
+from zakai.methods.particles.interval import Events, Motion, Observed
 from zakai.methods.particles.programs import Array
 from zakai.numerics.particles import moves
 from zakai.numerics.particles.chunks import CHUNK, over_chunks
@@ -27,14 +27,6 @@ _EMPTY = np.zeros(0, np.int32)
 _NO_EVENTS = Events(
     np.zeros((0, 2)), np.zeros((0, 3), np.int64), np.zeros((0, 2, 0)), np.zeros((0, 0, 0)), np.zeros((0, 3), np.int64)
 )  # fmt: skip
-
-
-class Observed(NamedTuple):
-    """What is observed at the end of an interval: the time, the numbers given to the law (L,), and which terms count (T,)."""
-
-    time: float
-    given: Array
-    counted: Array
 
 
 class Window(NamedTuple):

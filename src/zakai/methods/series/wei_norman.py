@@ -154,7 +154,7 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
             if not left > 0 or not np.isfinite(state.log_scale):
                 break
             before, refine = state, prepared.points is None and health.aliasing > RESOLVED
-            state, tau, shift, logs = _part(system, state, left, rates, which, precision, whole, health, refine)
+            state, tau, shift, logs = _part(system, state, left, _Inside(rates, which, precision, whole), health, refine)
             left = left - tau if tau < left else 0.0
             if part > (PATIENCE if whole else 4 * PATIENCE) and MOST_PARTS * tau < left:
                 break
@@ -175,11 +175,20 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
     return state._replace(log_scale=state.log_scale - log_mass), Info(log_mass, mean, cov, health.figures)
 
 
+class _Inside(NamedTuple):
+    """What is observed within an interval: the rates (m,), their coordinates, their precision, and whether all are observed."""
+
+    rates: Array
+    which: Array
+    precision: Array
+    whole: bool
+
+
 def _part(
-    system: System, state: State, left: float, rates: Array, which: Array, precision: Array, whole: bool, health: Health,
-    refine: bool,
+    system: System, state: State, left: float, inside: _Inside, health: Health, refine: bool
 ) -> tuple[State, float, Array, Array]:
     """Advance by the longest part that the grid and the statistics allow; return its length, the shift and the multiplier."""
+    rates, which, precision, whole = inside
     sizes = state.field.sizes
     if refine and (bigger := sizes + 8 * (4 - system.n)).max() <= MOST_POINTS[system.n]:
         sizes = bigger

@@ -5,26 +5,28 @@ The message is exp(-(x - a)'Lambda (x - a) / 2 + q.(x - a) + c).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from zakai.numerics.compiled import helper, kernel
+from zakai.numerics.gaussian.step import loop_signature
 from zakai.numerics.small_matrices import dot, multiply, one_plus, solve, symmetrise
 from zakai.numerics.transition import Array
 
 
 @helper
-def _weigh(
-    centre: Array, information: Array, slope: Array, log: Array, mean: Array, cov: Array
-) -> float:  # pragma: no cover
+def _weigh(message: Any, mean: Array, cov: Array) -> float:  # pragma: no cover
     """Multiply a message and a Gaussian, and return the logarithm of the mass of their product.
 
     Afterwards the message is about the Gaussian's mean, their product has mass one, and the moments are those of the product.
 
     Args:
-        centre: a (n,); with `information` Lambda (n, n), `slope` q (n,) and `log` c (1,) the message, in place.
+        message: The centre a (n,), the information Lambda (n, n), the slope q (n,) and c (1,), in place.
         mean: The mean (n,) and `cov` the covariance (n, n), in place.
         cov: See `mean`.
     """
+    centre, information, slope, log = message
     n = len(mean)
     away, left, right = np.empty(n), np.empty((n, n)), np.empty((n, n))
     for i in range(n):
@@ -47,11 +49,7 @@ def _weigh(
 
 
 @helper
-def _retreat(
-    k: int, centre: Array, information: Array, slope: Array, log: Array, lengths: Array, frequencies: Array,
-    flow: Array, offset: Array, noise: Array, own: Array, vector: Array, constant: Array,
-    whiten: Array, ends: Array, intercept: Array, observed: Array, level: Array, relative: bool, values: Array,
-) -> None:  # fmt: skip  # pragma: no cover
+def _retreat(k: int, message: Any, motion: Any, ends: Any, values: Array) -> None:  # pragma: no cover
     """Take a message from the end of interval k to its start, in place.
 
     With W = (I + Gamma Lambda)^-1 and the shift s = Psi a + b - a of the centre, Lambda becomes Psi'Lambda W Psi + Omega,
@@ -60,27 +58,27 @@ def _retreat(
 
     Args:
         k: The interval.
-        centre: As for `_weigh`, with the following three.
-        information: See `centre`.
-        slope: See `centre`.
-        log: See `centre`.
-        lengths: As for `gaussian_step.segment`, with the following; `own` are the `Transition.information`, `ends` the slopes of
-            what is observed at the ends.
+        message: As for `_weigh`.
+        motion: As in `Loop`, and `ends` too; the information of a transition is Omega.
+        ends: See `motion`.
         values: The observations (m,).
     """
+    centre, information, slope, log = message
+    lengths, frequencies, flow, offset, noise, own, vector, constant = motion
+    whiten, slopes, intercept, observed, level, relative = ends
     n, m = len(centre), len(values)
     for i in range(m):
         if not observed[k, i]:
             continue
         white = dot(whiten[k, i], values)
-        rest = white - intercept[k, i] - dot(ends[k, i], centre)
+        rest = white - intercept[k, i] - dot(slopes[k, i], centre)
         log[0] -= 0.5 * rest * rest
         if relative:
             log[0] += 0.5 * white * white
         for a in range(n):
-            slope[a] += rest * ends[k, i, a]
+            slope[a] += rest * slopes[k, i, a]
             for b in range(n):
-                information[a, b] += ends[k, i, a] * ends[k, i, b]
+                information[a, b] += slopes[k, i, a] * slopes[k, i, b]
     log[0] += level[k]
     if not lengths[k] > 0:
         return
@@ -118,31 +116,25 @@ def _retreat(
 
 
 _VECTOR, _ROWS, _STACK = "f8[::1]", "f8[:, ::1]", "f8[:, :, ::1]"
-_ENDS = f"{_STACK}, {_STACK}, {_ROWS}, b1[:, ::1], {_VECTOR}, b1"
-_MESSAGE = f"{_VECTOR}, {_ROWS}, {_VECTOR}, {_VECTOR}"
+_MESSAGE = f"Tuple(({_VECTOR}, {_ROWS}, {_VECTOR}, {_VECTOR}))"
 
 
-@kernel(
-    f"void(i8, {_MESSAGE}, {_VECTOR}, {_ROWS}, {', '.join([_STACK] * 6)}, {_ENDS}, {_ROWS}, {_ROWS}, {_STACK}, {_VECTOR})"
-)
+@kernel(f"void(i8, {_MESSAGE}, {loop_signature('f8')}, {_ROWS}, {_ROWS}, {_STACK}, {_VECTOR})")
 def segment(
-    first: int, centre: Array, information: Array, slope: Array, log: Array, lengths: Array, frequencies: Array,
-    flow: Array, offset: Array, noise: Array, own: Array, vector: Array, constant: Array,
-    whiten: Array, ends: Array, intercept: Array, observed: Array, level: Array, relative: bool,
-    values: Array, means: Array, covs: Array, masses: Array,
-) -> None:  # fmt: skip  # pragma: no cover
+    first: int, message: Any, motion: Any, ends: Any, values: Array, means: Array, covs: Array, masses: Array
+) -> None:  # pragma: no cover
     """Smooth the Gaussians of intervals, from the last to the first, and take the message to the start of the first.
 
     Args:
         first: The first interval; `values` (R, m) are the observations of R intervals.
-        centre: As for `_retreat`, with the following.
+        message: As for `_weigh`.
+        motion: As in `Loop`, and `ends` too.
+        ends: See `motion`.
+        values: See `first`.
         means: The filtered means (R, n) and `covs` (R, n, n) at the ends of the intervals, which become the smoothed ones.
         covs: See `means`.
         masses: The logarithms (R,) of the masses of the products, as `_weigh` returns them.
     """
     for row in range(len(values) - 1, -1, -1):
-        masses[row] = _weigh(centre, information, slope, log, means[row], covs[row])
-        _retreat(
-            first + row, centre, information, slope, log, lengths, frequencies, flow, offset, noise, own, vector, constant,
-            whiten, ends, intercept, observed, level, relative, values[row],
-        )  # fmt: skip
+        masses[row] = _weigh(message, means[row], covs[row])
+        _retreat(first + row, message, motion, ends, values[row])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from zakai.numerics.compiled import kernel
@@ -9,37 +11,53 @@ from zakai.numerics.small_matrices import congruence, dot, one_plus, solve, symm
 from zakai.numerics.transition import Array
 
 
+class Loop(NamedTuple):
+    """What is known of K intervals without data, as the compiled loops receive it: plain tuples, which Numba takes fastest.
+
+    `motion` has the lengths (K,) of the intervals, the factors (K, m) from observations to rates inside of an interval, and the
+    fields of `Transition`: flow (its `map`), offset, noise, information, vector and constant.
+
+    `ends` has what is observed at the ends, `whiten` values = `slope` x + `intercept` + noise of variance one: whiten (K, m, m),
+    slope (K, m, n), intercept (K, m), the rows that are observed (K, m), the level (K,) that is added to the logarithm, and
+    whether |whiten values|^2 / 2 is added, too, because the evidence is relative to noise alone.
+    """
+
+    motion: tuple[Array, ...]
+    ends: tuple[Any, ...]
+
+
+def loop_signature(number: str) -> str:
+    """Return the Numba types of the fields of a `Loop` with real or complex numbers."""
+    vector, rows, stack = (f"{number}[{axes}::1]" for axes in ("", ":, ", ":, :, "))
+    motion = f"Tuple((f8[::1], f8[:, ::1], {', '.join([stack] * 6)}))"
+    return f"{motion}, Tuple(({stack}, {stack}, {rows}, b1[:, ::1], {vector}, b1))"
+
+
 def _signature(number: str) -> str:
     vector, rows, stack = (f"{number}[{axes}::1]" for axes in ("", ":, ", ":, :, "))
-    real = "f8[:, ::1]"
-    stacks = ", ".join([stack] * 6)
-    ends = f"{stack}, {stack}, {rows}, b1[:, ::1], {vector}, b1"
-    return f"void(i8, {vector}, {rows}, f8[::1], {real}, {stacks}, {ends}, {real}, {rows}, {stack}, {vector})"
+    loop = loop_signature(number)
+    return f"void(i8, {vector}, {rows}, {loop}, f8[:, ::1], Tuple(({rows}, {stack}, {vector})))"
 
 
 @kernel(_signature("f8"), _signature("c16"))
 def segment(
-    first: int, mean: Array, cov: Array, lengths: Array, frequencies: Array,
-    flow: Array, offset: Array, noise: Array, information: Array, vector: Array, constant: Array,
-    whiten: Array, slope: Array, intercept: Array, observed: Array, level: Array, relative: bool,
-    values: Array, means: Array, covs: Array, gains: Array,
-) -> None:  # fmt: skip  # pragma: no cover
+    first: int, mean: Array, cov: Array, motion: Any, ends: Any, values: Array, after: Any
+) -> None:  # pragma: no cover
     """Advance a Gaussian over the intervals from `first` on, one for each row of `values`.
 
     Args:
         first: The first interval; the arrays of what is prepared have a leading axis of intervals.
         mean: The mean (n,) before, and then after.
         cov: The covariance (n, n), likewise.
-        lengths: The lengths of the intervals.
-        frequencies: The factors (K, m) from observations to rates inside of an interval.
-        flow: `Transition.map`; `offset`, `noise`, `information`, `vector` and `constant` are its other fields.
-        whiten: What is observed at the end is `whiten` values = `slope` x + `intercept` + noise of variance one in the rows that
-            are `observed`; `level` (K,) is added to the logarithm, and |whiten values|^2 / 2 where it is `relative`.
+        motion: As in `Loop`.
+        ends: As in `Loop`.
         values: The observations (R, m).
-        means: The means (R, n) after each interval.
-        covs: The covariances (R, n, n) after each interval.
-        gains: The logarithms (R,) of what the mass gains in each interval.
+        after: What is written: the means (R, n) and the covariances (R, n, n) after each interval, and the logarithms (R,) of
+            what the mass gains in it.
     """
+    lengths, frequencies, flow, offset, noise, information, vector, constant = motion
+    whiten, slope, intercept, observed, level, relative = ends
+    means, covs, gains = after
     m, n = values.shape[1], len(mean)
     inputs = np.ones(1 + m)
     left, across, pull = np.empty((n, n), cov.dtype), np.empty((n, n), cov.dtype), np.empty(n, cov.dtype)

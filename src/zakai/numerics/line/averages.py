@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper
 from zakai.numerics.line.density import highest_of
-from zakai.numerics.line.steps import CELL, DRIFT, IMPOSSIBLE, SLOPE, add, exponent_added, observation_of
+from zakai.numerics.line.steps import CELL, DRIFT, IMPOSSIBLE, SLOPE, Coefficients, add, exponent_added, observation_of
 
 Array = NDArray[Any]
 
@@ -105,20 +105,20 @@ AVERAGES = _averages()  # those of n parts begin at n (n - 1) / 2
 
 @helper
 def averaged(
-    table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, weights: Array, tau: float,
-    observed: Array, inside: bool, at: int, spacing: float, closed: bool, phi: Array, drift: Array, b: Array,
-) -> tuple[float, float, float, float]:  # fmt: skip
+    table: Array, c: Coefficients, weights: Array, at: int, spacing: float, closed: bool, fields: tuple[Array, Array, Array]
+) -> tuple[float, float, float, float]:
     """Write phi, f and b of an average; return length, int G dt, shift and the constant of b."""
+    (phi, drift, b), tau = fields, c.length
     size, fraction, spread, mean, constant = b.size, 0.0, 0.0, 0.0, 0.0
     for j in range(size):
         phi[j], drift[j], b[j] = 0.0, 0.0, 0.0
     for q in range(weights.size):
         fraction += weights[q]
-        spread += weights[q] * covariances[q] * tau
+        spread += weights[q] * c.covariances[q] * tau
     for r in range(table.shape[0]):
         weight = 0.0
         for q in range(weights.size):
-            weight += weights[q] * drifts[q, r]
+            weight += weights[q] * c.drifts[q, r]
         if weight != 0.0:
             for j in range(size):
                 phi[j] += weight * table[r, CELL, j]
@@ -135,11 +135,11 @@ def averaged(
         drift[j] /= fraction
         phi[j] = (phi[j] / fraction - mean * spacing) / G
         b[j] = -0.5 * length * ((drift[j] - mean) * (drift[j] + mean) / G + b[j] / fraction) - own
-    if inside:
-        for q in range(outputs.shape[0]):
-            w = fraction if outputs.shape[0] == 1 else weights[q]
-            h, centre = observation_of(table, outputs[q], at)
-            constant += exponent_added(h, centre, precisions[q], observed, w, w * tau, b)
+    if c.inside:
+        for q in range(c.outputs.shape[0]):
+            w = fraction if c.outputs.shape[0] == 1 else weights[q]
+            h, centre = observation_of(table, c.outputs[q], at)
+            constant += exponent_added(h, centre, c.precisions[q], c.observed, w, w * tau, b)
     for j in range(size):
         if not (b[j] > IMPOSSIBLE):
             b[j] = IMPOSSIBLE
@@ -187,29 +187,27 @@ _PRODUCTS = np.array(
 
 
 @helper
-def operators(
-    table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, averages: Array, tau: float,
-    observed: Array, inside: bool, at: int, to: Array, spreads: Array,
-) -> None:  # fmt: skip
+def operators(table: Array, c: Coefficients, averages: Array, at: int, to: Array, spreads: Array) -> None:
     """Write f and the potential (3, 2, N), and int G dt (3,), of B, D and E in a part of an interval, see `averaging`."""
+    tau = c.length
     to[:] = 0.0
     for i in range(3):
         weights, whole = averages[MEAN if i == 0 else (DIFFERENCE if i == 1 else SECOND)], 0.0
         spreads[i] = 0.0
         for q in range(weights.size):
-            spreads[i] += tau * weights[q] * covariances[q]
+            spreads[i] += tau * weights[q] * c.covariances[q]
             whole += weights[q]
         for r in range(table.shape[0]):
             weight = 0.0
             for q in range(weights.size):
-                weight += tau * weights[q] * drifts[q, r]
+                weight += tau * weights[q] * c.drifts[q, r]
             if weight != 0.0:
                 add(to[i, 0], weight, table[r, DRIFT])
-        if inside and (i == 0 or outputs.shape[0] > 1):
-            for q in range(outputs.shape[0]):
-                w = whole if outputs.shape[0] == 1 else weights[q]
-                h, centre = observation_of(table, outputs[q], at)
-                exponent_added(h, centre, precisions[q], observed, w, w * tau, to[i, 1])
+        if c.inside and (i == 0 or c.outputs.shape[0] > 1):
+            for q in range(c.outputs.shape[0]):
+                w = whole if c.outputs.shape[0] == 1 else weights[q]
+                h, centre = observation_of(table, c.outputs[q], at)
+                exponent_added(h, centre, c.precisions[q], c.observed, w, w * tau, to[i, 1])
 
 
 @helper

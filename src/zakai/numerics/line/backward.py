@@ -20,8 +20,20 @@ from zakai.numerics.compiled import helper, kernel
 from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, averaged, averaging, operators
 from zakai.numerics.line.density import circular_moments, highest_of, moments, shifted, spectrum, support, waves
 from zakai.numerics.line.modes import decayed, propagate
-from zakai.numerics.line.splitting import STEEPEST, differences, residual, split
-from zakai.numerics.line.steps import SPLIT, Grid, Steps, copied
+from zakai.numerics.line.splitting import STEEPEST, Filtering, differences, residual, split
+from zakai.numerics.line.steps import (
+    CONSTANTS_TYPE,
+    GRID_TYPE,
+    RESULTS_TYPE,
+    SPLIT,
+    STEPS_TYPE,
+    Coefficients,
+    Constants,
+    Grid,
+    Results,
+    Steps,
+    copied,
+)
 from zakai.numerics.line.window import CUT
 
 Array = NDArray[Any]
@@ -96,12 +108,29 @@ class BackwardSteps(NamedTuple):
     reports: Array
 
 
-_V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1]
+class Observed(NamedTuple):
+    """What is observed in intervals.
+
+    `logs` (K, N) are the log-likelihoods of what is observed at their ends, `values` (K, m) what is observed in them, zero where
+    nothing is; `closed` is whether the grids go around the circle.
+    """
+
+    logs: Array
+    values: Array
+    closed: bool
+
+
+_V, _M = float64[::1], float64[:, ::1]
+MESSAGE = types.NamedTuple([_V, float64, int64, int64, int64, float64, _V], Message)
+FILTERED = types.NamedTuple([_M, int64[::1], _V], Filtered)
+GAUGED = types.NamedTuple([_V, _V, _V, int64, int64], Gauged)
+OBSERVED = types.NamedTuple([_M, _M, boolean], Observed)
+LIMITS = types.NamedUniTuple(float64, 4, Limits)
 
 
 @helper
 def multiplied(
-    b: Array, density: Array, floor: float, negligible: float, closed: bool, cosines: Array, sines: Array, product: Array,
+    b: Array, density: Array, floor: float, negligible: float, closed: bool, waves: tuple[Array, Array], product: Array,
     row: Array,
 ) -> tuple[int, int]:  # fmt: skip
     """Write the product with a density, of sum one, and its report; divide b by the sum; return the support, or (0, -1)."""
@@ -117,11 +146,11 @@ def multiplied(
     for j in range(size):
         product[j] /= total
         b[j] /= total
-    left, right, _, _, _, aliasing, _, _, _ = spectrum(product, CUT, SMALLEST, cosines, sines, False)
+    left, right, _, _, _, aliasing, _, _, _ = spectrum(product, CUT, SMALLEST, *waves, False)
     row[LOG_MASS] += np.log(total)
     row[ALIASING], row[EDGE] = aliasing, 0.0 if closed else max(left, right)
     if closed:
-        row[MEAN_AT], row[VARIANCE] = circular_moments(product, cosines, sines)
+        row[MEAN_AT], row[VARIANCE] = circular_moments(product, *waves)
     else:
         _, row[MEAN_AT], row[VARIANCE] = moments(product)
     if not (aliasing <= UNRESOLVED):
@@ -151,15 +180,23 @@ def error_share(before: float, between: float, after: float) -> float:
 
 @kernel(
     types.Tuple((int64, float64, float64, float64))(  # type: ignore[no-untyped-call]
-        _V, float64, float64, _V, _M, _V, _V, _V, _V, int64, int64, _M, _V, boolean, float64, float64, _M, _M, _M, _M, _M, _M
+        MESSAGE, FILTERED, GAUGED, OBSERVED, _V, LIMITS, types.UniTuple(_M, 4), RESULTS_TYPE
     )
 )  # fmt: skip
 def _decomposed(
-    psi: Array, scale: float, error: float, product: Array, densities: Array, floors: Array, modes: Array, rates: Array,
-    gauge: Array, place: int, stride: int, logs: Array, lengths: Array, closed: bool, most: float, negligible: float,
-    cosines: Array, sines: Array, long_cosines: Array, long_sines: Array, products: Array, out: Array,
+    message: Message, filtered: Filtered, gauged: Gauged, observed: Observed, lengths: Array, limits: Limits,
+    waves: tuple[Array, Array, Array, Array], results: Results,
 ) -> tuple[int, float, float, float]:  # fmt: skip
-    """How many intervals were taken, the error, the logarithm of the scale of psi, which is replaced, and its reliable values."""
+    """How many intervals were taken, the error, the logarithm of the scale of psi, which is replaced, and its reliable values.
+
+        psi(start) = U exp(-tau lambda) U' (l psi(stop)),      l the likelihood of what is observed at the end
+    """
+    psi, scale, _, _, _, error, product = message
+    densities, _, floors = filtered
+    modes, rates, gauge, place, stride = gauged
+    logs, _, closed = observed
+    most, negligible, (products, out) = limits.error, limits.negligible, results
+    cosines, sines, long_cosines, long_sines = waves
     size, longer, reliable, ratio = product.size, rates.size, 0.0, 0.0
     b, now = np.empty(size), np.empty(longer)
     first, last = (0, size - 1) if closed else support(product, negligible)
@@ -202,7 +239,7 @@ def _decomposed(
         if not (made < ROUGH * most):
             return completed, error, scale, reliable
         row[LOG_MASS] = scale + top + reference
-        first, last = multiplied(b, density, floors[i], negligible, closed, cosines, sines, products[i], row)
+        first, last = multiplied(b, density, floors[i], negligible, closed, (cosines, sines), products[i], row)
         if last < 0:
             return completed, error, scale, reliable
         at = place + stride * highest_of(products[i])
@@ -230,9 +267,10 @@ def by_modes(
     """
     count, size = len(lengths), len(message.product)
     psi, products, out = message.values.copy(), np.empty((count, size)), np.zeros((count, 6))
+    both = *waves(size), *waves(len(gauged.rates))
     completed, error, scale, least = _decomposed(
-        psi, message.scale, message.error, message.product, before.densities, before.floors, gauged.modes.ravel(), *gauged[1:],
-        logs, lengths, closed, limits.error, limits.negligible, *waves(size), *waves(len(gauged.rates)), products, out,
+        message._replace(values=psi), before, gauged._replace(modes=gauged.modes.ravel()), Observed(logs, out, closed), lengths,
+        limits, both, Results(products, out),
     )  # fmt: skip
     first, last = 0, len(psi) - 1
     if completed and not closed:
@@ -265,17 +303,27 @@ def held(before: Array, by: int, after: Array, noise: float) -> bool:
 
 @helper
 def _split(
-    now: Array, product: Array, table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array,
-    averages: Array, observed: Array, inside: bool, tau: float, at: int, first: int, last: int, spacing: float, closed: bool,
-    depth: float, most: float,
+    now: Array, product: Array, table: Array, c: Coefficients, averages: Array, places: tuple[int, int, int],
+    shape: tuple[float, bool], accuracy: tuple[float, float],
 ) -> tuple[float, float]:  # fmt: skip
-    """Replace b by that before a split interval; return its error, infinite where it is not accurate, and the constant."""
-    size = now.size
+    """Replace b by that before a split interval; return its error, infinite where it is not accurate, and the constant.
+
+    Args:
+        now: b (N,).
+        product: the smoothed density (N,) at the end.
+        table: the terms of f and h at the points.
+        c: the coefficients of the interval.
+        averages: the weights of averages.
+        places: the point of which exponents are differences, and the first and the last point of b.
+        shape: the spacing, and whether the grid goes around the circle.
+        accuracy: the depth of the tails and the largest error.
+    """
+    size, (at, first, last), (spacing, closed), (depth, most) = now.size, places, shape, accuracy
     phi, slope, curvature, drift, b = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     made, constant, magnus = 0.0, 0.0, 0
     if averages.shape[0] > 1:
         both, spreads = np.empty((3, 2, size)), np.empty(3)
-        operators(table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, both, spreads)
+        operators(table, c, averages[0], at, both, spreads)
         made, pair = averaging(product, both, spreads, spacing, closed)
         if not (made <= most):
             magnus = int(min(max(np.ceil(1.1 * (pair / most) ** 0.25), 1.0), 1e6))
@@ -286,10 +334,7 @@ def _split(
     for i in range(count - 1, -1, -1):
         weights = averages[parts * (parts - 1) // 2 + i // 2]
         which = MEAN if magnus == 0 else (EARLY if i % 2 == 0 else LATE)
-        length, spread, shift, added = averaged(
-            table, drifts, outputs, precisions, covariances, weights[which], tau, observed, inside, at, spacing, closed, phi,
-            drift, b,
-        )  # fmt: skip
+        length, spread, shift, added = averaged(table, c, weights[which], at, spacing, closed, (phi, drift, b))
         if not spread > 0.0:
             return np.inf, 0.0
         differences(b, spacing, closed, slope, curvature)
@@ -305,7 +350,7 @@ def _split(
                     return np.inf, 0.0
         for j in range(size):
             phi[j] = -phi[j]
-        noise, _ = split(now, phi, b, slope, spread, -shift, whole, spacing, depth, closed, narrow)
+        noise, _ = split(now, phi, b, slope, Filtering(spread, -shift, float(whole), depth, narrow), spacing, closed)
         made, constant = made + error / float(whole) ** 4 + noise, constant + added
         if not (made < most * 2.0 + 1e-2 * most):
             return np.inf, 0.0
@@ -314,17 +359,22 @@ def _split(
 
 @kernel(
     types.Tuple((int64, int64, int64, int64, float64))(  # type: ignore[no-untyped-call]
-        _V, int64, int64, int64, float64, _V, _M, int64[::1], _V, _Q, float64, boolean, _M, boolean[::1], _V, _M, _Q, _T, _T, _M,
-        _T, float64, float64, float64, _M, _M, _M, _M,
+        MESSAGE, FILTERED, GRID_TYPE, STEPS_TYPE, OBSERVED, LIMITS, CONSTANTS_TYPE, RESULTS_TYPE
     )
 )  # fmt: skip
 def _adjoint(
-    b: Array, first: int, last: int, start: int, error: float, product: Array, densities: Array, starts: Array, floors: Array,
-    table: Array, spacing: float, closed: bool, logs: Array, inside: Array, lengths: Array, observed: Array,
-    precisions: Array, drifts: Array, outputs: Array, covariances: Array, averages: Array, most: float,
-    negligible: float, cut: float, cosines: Array, sines: Array, products: Array, out: Array,
+    message: Message, filtered: Filtered, grid: Grid, steps: Steps, seen: Observed, limits: Limits, known: Constants,
+    results: Results,
 ) -> tuple[int, int, int, int, float]:  # fmt: skip
     """How many intervals were taken, and the support, the start and the error of the message b, which is replaced."""
+    b, _, first, last, start, error, product = message
+    densities, starts, floors = filtered
+    table, _, _, spacing, _ = grid
+    kinds, lengths, _, precisions, _, _, drifts, outputs, covariances = steps
+    logs, observed, closed = seen
+    _, most, negligible, cut = limits
+    averages, cosines, sines = known
+    products, out = results
     size, timed, depth = b.size, table.shape[0] > 1, 8.0 - np.log(cut)
     for i in range(lengths.size - 1, -1, -1):
         row, completed, low, high = out[i], lengths.size - 1 - i, 0, size - 1
@@ -348,10 +398,11 @@ def _adjoint(
         between = spread(result, first, last)
         for j in range(points):
             now[j] = result[low + j]
+        c = Coefficients(drifts[i], outputs[i], precisions[i], covariances[i], observed[i], lengths[i], kinds[i] == SPLIT)
+        places = at - low, first - low, last - low
         made, constant = _split(
-            now, product[low : high + 1], local, drifts[i], outputs[i], precisions[i], covariances[i], averages, observed[i],
-            inside[i], lengths[i], at - low, first - low, last - low, spacing, closed, depth, most,
-        )  # fmt: skip
+            now, product[low : high + 1], local, c, averages, places, (spacing, closed), (depth, most)
+        )
         for j in range(size):
             result[j] = now[j - low] if low <= j <= high else 0.0
         row[LOG_MASS] += constant
@@ -359,7 +410,7 @@ def _adjoint(
             return completed, first, last, start, error
         if starts[i] != start:
             result = shifted(result, starts[i] - start)
-        begins, ends = multiplied(result, densities[i], floors[i], negligible, closed, cosines, sines, products[i], row)
+        begins, ends = multiplied(result, densities[i], floors[i], negligible, closed, (cosines, sines), products[i], row)
         if ends < 0:
             return completed, first, last, start, error
         first, last, start = begins, ends, starts[i]
@@ -372,7 +423,7 @@ def _adjoint(
 
 
 def by_adjoints(
-    message: Message, before: Filtered, grid: Grid, logs: Array, steps: Steps, observed: Array, closed: bool, limits: Limits
+    message: Message, before: Filtered, grid: Grid, steps: Steps, observed: Observed, limits: Limits
 ) -> BackwardSteps:
     """Return the message before the last intervals, as many as the adjoints of splittings take.
 
@@ -380,21 +431,16 @@ def by_adjoints(
         message: b on the grid.
         before: the filter's densities.
         grid: the table of the grids.
-        logs: the log-likelihoods of what is observed at the end of each interval (K, N), on the grid of the density there.
         steps: the intervals.
-        observed: what is observed in them (K, m), zero where nothing is.
-        closed: whether the grid is around the circle.
+        observed: what is observed in them; the log-likelihoods are on the grid of the density at the end of each.
         limits: what an interval must keep.
     """
     count, size = len(steps.lengths), len(message.values)
     b, product, products, out = message.values.copy(), message.product.copy(), np.empty((count, size)), np.zeros((count, 6))
-    kinds, lengths, _, precisions, _, _, *rest = steps
-    averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
+    known = Constants(AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE, *waves(size))
     completed, first, last, start, error = _adjoint(
-        b, message.first, message.last, message.start, message.error, product, *before, grid.table, grid.spacing, closed,
-        logs, kinds == SPLIT, lengths, observed, precisions, *rest, averages, limits.splitting, limits.negligible, limits.cut,
-        *waves(size), products, out,
-    )  # fmt: skip
+        message._replace(values=b, product=product), before, grid, steps, observed, limits, known, Results(products, out)
+    )
     if completed:
         out[-1, LOG_MASS] += message.scale
     here = slice(count - completed, None)

@@ -69,12 +69,25 @@ def log_likelihood(h: Array, general: bool, precision: Array, observed: Array) -
     return total if total > -1e150 else -1e150
 
 
+class Likelihood(NamedTuple):
+    """A likelihood by rows on the grid of a density (N,).
+
+    `rows` are h (m, T), or the log-likelihood (1, T) where it is `general`, T = PER (N - 1) + 1; `precision` and `observed` are
+    S^-1 and y.
+    """
+
+    rows: Array
+    general: bool
+    precision: Array
+    observed: Array
+
+
 @helper
 def _surveyed(
-    left: float, width: float, logs: Array, rows: Array, general: bool, precision: Array, observed: Array, weights: Array,
-    h: Array,
-) -> tuple[float, float, float]:  # fmt: skip
+    left: float, width: float, logs: Array, likelihood: Likelihood, weights: Array, h: Array
+) -> tuple[float, float, float]:
     """Return the largest of five values of the product in a cell, and the largest and the smallest of the likelihood."""
+    rows, general, precision, observed = likelihood
     highest, top, bottom = -np.inf, -np.inf, np.inf
     for p in range(5):
         x = left + 0.25 * p * width
@@ -90,8 +103,8 @@ def _surveyed(
 
 @helper
 def placed(
-    logs: Array, first: int, last: int, rows: Array, general: bool, precision: Array, observed: Array
-) -> tuple[float, float, float]:  # fmt: skip
+    logs: Array, first: int, last: int, likelihood: Likelihood
+) -> tuple[float, float, float]:
     """Return the range of the product as indices of the grid, and the narrowest cell in it; NaN where there are too many.
 
     Cells whose bound is far below the largest value are left out, and the others divided until the likelihood hardly changes.
@@ -99,17 +112,15 @@ def placed(
     Args:
         logs: the logarithm of the density (N,).
         first, last: the points between which it is not negligible.
-        rows: h (m, T), or the log-likelihood (1, T), T = PER (N - 1) + 1.
-        general: whether that is the log-likelihood.
-        precision, observed: S^-1 and y.
+        likelihood: the likelihood.
     """
     left, width, level, best = np.empty(_MOST_CELLS), np.empty(_MOST_CELLS), np.empty((_MOST_CELLS, 3)), -np.inf
-    weights, h, count, done = np.empty(_STENCIL), np.empty(rows.shape[0]), last - first, 0
+    weights, h, count, done = np.empty(_STENCIL), np.empty(likelihood.rows.shape[0]), last - first, 0
     for j in range(count):
         left[j], width[j] = first + j, 1.0
     for _ in range(_LEVELS):
         for c in range(done, count):
-            highest, top, bottom = _surveyed(left[c], width[c], logs, rows, general, precision, observed, weights, h)
+            highest, top, bottom = _surveyed(left[c], width[c], logs, likelihood, weights, h)
             level[c, 0], level[c, 1], level[c, 2], best = highest, top, bottom, max(best, highest)
         # What is not left out is kept at the front, what is to be divided at the back.
         retained, more = done, _MOST_CELLS
@@ -181,20 +192,28 @@ def differences(h: Array, centre: Array, general: bool, precision: Array, observ
 
 @helper
 def sampled(
-    q: Array, first: int, last: int, rows: Array, general: bool, precision: Array, observed: Array, grid_first: float,
-    grid_spacing: float, unit: float, now: Array, b: Array,
-) -> tuple[float, float, float, float, bool]:  # fmt: skip
+    q: Array, ends: tuple[int, int], grid: tuple[float, float, float], likelihood: Likelihood, now: Array, b: Array
+) -> tuple[float, float, float, float, bool]:
     """Write a density on a grid for its product with a likelihood, and the logarithm of that.
+
+    Args:
+        q: the density (N,) on a coarse grid.
+        ends: the points between which it is not negligible.
+        grid: the first point of the coarse grid, its spacing, and the unit of spacings.
+        likelihood: the likelihood.
+        now: receives the density (n,).
+        b: receives the logarithm (n,).
 
     Returns:
         The centre of the grid and its spacing, which is NaN where the product has no range; the value of the likelihood of which
         the logarithms are differences; the error of these; and whether the grid has enough points.
     """
+    (grid_first, grid_spacing, unit), (rows, general, precision, observed) = grid, likelihood
     top, n, m, weights = q[highest_of(q)], now.size, rows.shape[0], np.empty(8)
     logs = np.empty(q.size)
     for j in range(q.size):
         logs[j] = np.log(max(q[j], 1e-30 * top))
-    low, high, finest = placed(logs, first, last, rows, general, precision, observed)
+    low, high, finest = placed(logs, ends[0], ends[1], likelihood)
     width = (high - low) * grid_spacing
     spacing = unit * 2.0 ** (0.25 * np.ceil(4.0 * np.log2(width / (n - ALIGNMENT - 2) / unit)))
     if not (width > 0.0 and spacing > 0.0):

@@ -23,24 +23,34 @@ from zakai.numerics.line.averages import AVERAGES
 from zakai.numerics.line.density import circular_rows, highest_of, moments, separated, shifted, spectrum, support, waves
 from zakai.numerics.line.gaussian_kernels import BAND, convolved, kernel_of
 from zakai.numerics.line.product import WEAK_SHARE, weak_error, weaken
-from zakai.numerics.line.splitting import divided
+from zakai.numerics.line.splitting import Accuracy, divided
 from zakai.numerics.line.steps import (
     AFTER,
     COLUMNS,
+    CONSTANTS_TYPE,
     FAILED,
+    GRID_TYPE,
     KERNEL,
     MARGIN,
     OK,
     PHI,
     RANGE,
     RELIABLE,
+    RESULTS_TYPE,
     SPLIT,
+    START_TYPE,
     STATUSES,
+    STEPS_TYPE,
     TABLE,
     UNRESOLVED,
+    Coefficients,
+    Constants,
     Grid,
     Mechanisms,
+    Resolution,
+    Results,
     Segment,
+    Start,
     Steps,
     checked,
     copied,
@@ -55,7 +65,7 @@ from zakai.numerics.line.window import ALIGNMENT, CUT
 Array = NDArray[Any]
 
 COARSE = 1e-5  # spectrum of a product at the highest frequencies from which a somewhat finer grid does not serve
-_V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1]
+_V, _M = float64[::1], float64[:, ::1]
 
 
 @cache
@@ -63,17 +73,18 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
     """Return the loop with the code of these mechanisms only."""
     @kernel(
         types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]
-            _V, int64, _Q, _T, _M, _M, float64, float64, int64, _M, int64[::1], _V, _V, _Q, _V, _M, _T, _T, _M, float64, float64,
-            _V, _M, _M, _M
+            START_TYPE, GRID_TYPE, STEPS_TYPE, int64, _M, _V, CONSTANTS_TYPE, RESULTS_TYPE
         )
     )  # fmt: skip
     def advance(
-        values: Array, start: int, table: Array, averages: Array, cosines: Array, sines: Array, offset: float, spacing: float,
-        begin: int, observed: Array, kinds: Array, lengths: Array, shares: Array, precisions: Array, constants: Array,
-        kernel_parameters: Array, drifts: Array, outputs: Array, covariances: Array, error: float, log_floor: float,
-        limits: Array, densities: Array, out: Array, fine: Array,
-    ) -> tuple[int, int]:  # fmt: skip
-        """Return the number of steps, and why the loop ended; the last row of `out` receives the answer."""
+        state: Start, grid: Grid, steps: Steps, begin: int, observed: Array, limits: Array, known: Constants, results: Results
+    ) -> tuple[int, int]:
+        """Return the number of steps, and why the loop ended; the last report receives the answer."""
+        values, error, log_floor = state
+        table, start, offset, spacing, fine = grid
+        kinds, lengths, shares, precisions, constants, kernel_parameters, drifts, outputs, covariances = steps
+        averages, cosines, sines = known
+        densities, out = results
         negligible, most, generous, size, length = limits[0], limits[1], limits[4], values.size, table.shape[3]
         half, timed, movable, near = size // 2, table.shape[0] > 1, not closed, length == size + 2 * MARGIN
         now, local = values.copy(), np.empty((table.shape[1], table.shape[2], size))
@@ -87,6 +98,7 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
             if samples:
                 for j in range(observed.shape[1]):
                     seen |= precisions[k, 0, j, j] != 0.0
+            c = Coefficients(drifts[k], outputs[k], precisions[k], covariances[k], observed[i], tau, inside)
             cut = max(limits[3], min(30.0 * np.exp(log_floor), CUT))
             low, high = support(now, cut)
             if place != start or timed:
@@ -95,10 +107,8 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
             if kernels:
                 kernel_of(kernel_parameters[k], observed[i], tau if kind == KERNEL else np.inf, channel)
             if movable:
-                first, last = extent(
-                    now, low, high, channel, drifts[k, 0], local, covariances[k, 0] * tau, tau,
-                    offset + spacing * (start + half), spacing, cut,
-                )  # fmt: skip
+                middle = offset + spacing * (start + half)
+                first, last = extent(now, (low, high), channel, local, c, middle, spacing, cut)
                 answer[0], answer[1], answer[2], status = first, last, spacing, OK
                 if not (last - first < 1e9):
                     status = FAILED
@@ -124,19 +134,17 @@ def _loop(kernels: bool, splits: bool, samples: bool, weak: bool, closed: bool) 
                 middle = offset + spacing * (start + half)
                 move = convolved(now, local[0, PHI], channel, middle, spacing, finest, depth, closed)
             elif splits:
-                move = divided(
-                    now, local, drifts[k], outputs[k], precisions[k], covariances[k], averages, observed[i], inside, tau, spacing,
-                    closed, depth, limits[2] * shares[k], finest,
-                )  # fmt: skip
+                accuracy = Accuracy(depth, limits[2] * shares[k], finest)
+                move = divided(now, local, c, averages, spacing, closed, accuracy)
             if not (move.error < np.inf and move.rounding < max(1e-11, 1e-3 * most)):
                 answer[0], answer[1], answer[2] = float(low), float(high), move.needed
                 status = RANGE if move.needed > 0.0 and not (move.error < np.inf) else FAILED
                 break
             positive = move.needed == 0.0
+            asked = Resolution(positive, weak or not seen, cut, negligible, spacing)
             status, mass, aliasing, edge, negative, highest = checked(
-                now, low, high, weak, positive, closed, weak or not seen, cut, negligible, spacing, cosines, sines,
-                answer,
-            )  # fmt: skip
+                now, (low, high), weak, closed, asked, (cosines, sines), answer
+            )
             if status != OK:
                 break
             predicted, gained = moments(now)[2], np.log(mass) + constants[k] + move.log_factor
@@ -220,29 +228,23 @@ _WHOLE = np.ones((1, 5, 1))
 
 
 def advance(
-    mechanisms: Mechanisms, values: Array, grid: Grid, steps: Steps, first: int, observed: Array, error: float, log_floor: float,
-    limits: Array,
-) -> Segment:  # fmt: skip
+    mechanisms: Mechanisms, state: Start, grid: Grid, steps: Steps, first: int, observed: Array, limits: Array
+) -> Segment:
     """Return steps, as many as are accurate on one grid.
 
     Args:
         mechanisms: what the steps may need.
-        values: probabilities (N,).
+        state: where the steps begin.
         grid: the grid.
         steps: the intervals, of which `first` is the first that is taken.
         observed: what is observed in the intervals from there on (K, m), zero where nothing is.
-        error: the estimate of the relative error of `values`.
-        log_floor: the logarithm of the error of small values, relative to the largest.
         limits: what a step must keep, as the fields of `Limits`.
     """
-    count, size = len(observed), len(values)
-    densities, out = np.empty((count, size)), np.empty((count + 1, len(COLUMNS)))
-    averages = AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE
-    cosines, sines = waves(size)
-    done, why = _loop(*mechanisms)(
-        values, grid.start, grid.table, averages, cosines, sines, grid.offset, grid.spacing, first, observed, *steps, error,
-        log_floor, limits, densities, out, grid.fine,
-    )  # fmt: skip
+    count, size = len(observed), len(state.values)
+    results = Results(np.empty((count, size)), np.empty((count + 1, len(COLUMNS))))
+    known = Constants(AVERAGES if steps.covariances.shape[1] > 1 else _WHOLE, *waves(size))
+    done, number = _loop(*mechanisms)(state, grid, steps, first, observed, limits, known, results)
+    densities, out = results
     if mechanisms.closed:
-        circular_rows(densities[:done], cosines, sines, out)
-    return Segment(densities[:done], out[:done], STATUSES[why], out[-1, :3])
+        circular_rows(densities[:done], known.cosines, known.sines, out)
+    return Segment(densities[:done], out[:done], STATUSES[number], out[-1, :3])

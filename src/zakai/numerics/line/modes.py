@@ -16,7 +16,7 @@ grid that resolves this deviation serve, and the product with the likelihood has
 from __future__ import annotations
 
 from math import erfc
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import boolean, float64, int64, types, void
@@ -27,6 +27,7 @@ from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.density import highest_of, moments, separated, spectrum, support
 from zakai.numerics.line.grid_choice import (
     PER,
+    Likelihood,
     Outlook,
     differences,
     log_likelihood,
@@ -127,10 +128,18 @@ def gathered(values: Array, at: Array, result: Array) -> None:
         result[j] = -result[j]
 
 
+class Modes(NamedTuple):
+    """The rows of U' (N^2,), lambda (N,), and log s (T,) at the points of rows."""
+
+    modes: Array
+    rates: Array
+    scale: Array
+
+
 @helper
 def carried(
-    now: Array, at: Array, same: bool, closed: bool, scale: Array, modes: Array, rates: Array, tau: float, first: int, last: int,
-    most: float, propagated: Array,
+    now: Array, at: Array, shape: tuple[bool, bool], known: Modes, tau: float, ends: tuple[int, int], most: float,
+    propagated: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """Write the density (N,) of the grid of the modes after an interval; return its rounding error and that of the scale.
 
@@ -139,15 +148,14 @@ def carried(
     Args:
         now: the density (n,) before.
         at: its points as indices of the grid of the modes.
-        same: whether these are the points of the grid of the modes.
-        closed: whether the grid goes around the circle.
-        scale: log s (T,) at the points of rows.
-        modes, rates: the rows of U' and lambda.
+        shape: whether these are the points of the grid of the modes, and whether it goes around the circle.
+        known: the modes.
         tau: the length of the interval.
-        first, last: the points between which the density is kept.
+        ends: the points between which the density is retained.
         most: the largest error.
-        moved: receives the density.
+        propagated: receives the density.
     """
+    (same, closed), (modes, rates, scale), (first, last) = shape, known, ends
     size, top, weights = propagated.size, highest_of(now), np.empty(8)
     inner, logs, after, unsure, total, end = np.zeros(now.size), np.zeros(now.size), np.empty(size), 0.0, 0.0, 0.0
     limit, reference = CUT * now[top], scale[PER * top] if same else 0.0
@@ -199,6 +207,70 @@ def carried(
     return (noise + _SPREAD * end) * highest / largest, unsure
 
 
+class Start(NamedTuple):
+    """A density (n,), the centre of its grid, relative to the origin, its spacing, and the estimate of its relative error."""
+
+    values: Array
+    centre: float
+    spacing: float
+    error: float
+
+
+class Frame(NamedTuple):
+    """What all grids share: the unit of spacings, whether they go around the circle, and the `profile` of `outlook`."""
+
+    unit: float
+    closed: bool
+    profile: Array
+
+
+class KnownGrids(NamedTuple):
+    """Grids one after the other in `numbers`, and the centre, spacing, size and first number of each (G, 4).
+
+    There are lambda (N,), U' (N, N), a cosine and a sine (N,) of the lowest frequency, log s and h (1 + m, T) at PER points in a
+    spacing.
+    """
+
+    numbers: Array
+    entries: Array
+
+
+class Special(NamedTuple):
+    """h, or where it is `general` the log-likelihood, of the first intervals (S, ., T) on the grid `owner`.
+
+    The owner is -1 for none, and -2 where the h of `KnownGrids` holds.  T is N for steps that stay.  With a second row of
+    log-likelihoods they act in the weak sense, and that row is their relative change by another rule.
+    """
+
+    rows: Array
+    owner: int
+    general: bool
+
+
+class Samples(NamedTuple):
+    """What is observed (K, m) from interval `begin` on, and as in `steps.Steps` of all intervals lengths, S^-1 and constants."""
+
+    begin: int
+    observed: Array
+    lengths: Array
+    precisions: Array
+    constants: Array
+
+
+class Results(NamedTuple):
+    """The `waves` of the size n of densities, and what receives the results.
+
+    These are the densities (K, n); the centres, the spacings, which grid of modes was taken, and its points at either end at
+    which there is no density (K + 1, 4); and the reports.
+    """
+
+    cosines: Array
+    sines: Array
+    densities: Array
+    places: Array
+    reports: Array
+
+
 STAY, OWN, PLACE = range(3)  # steps on the grid of the density; on its own grid the first transition, or none
 _EDGE = 1e-11  # density at the outermost points, relative to the maximum
 _TRIALS = 6  # coarse grids on which a step is tried
@@ -206,14 +278,14 @@ _TRIALS = 6  # coarse grids on which a step is tried
 
 @kernel(
     types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]
-        _V, float64, float64, float64, boolean, _M, _V, _M, _T, int64, boolean, int64, int64, _M, _V, _T, _V, float64, _V, _M, _M,
-        _M, _M, _M
+        types.NamedTuple([_V, float64, float64, float64], Start), types.NamedTuple([float64, boolean, _M], Frame),
+        types.NamedTuple([_V, _M], KnownGrids), types.NamedTuple([_T, int64, boolean], Special), int64,
+        types.NamedTuple([int64, _M, _V, _T, _V], Samples), _V, types.NamedUniTuple(_M, 5, Results)
     )
 )  # fmt: skip
 def advance(
-    values: Array, centre: float, spacing: float, unit: float, closed: bool, profile: Array, known: Array, index: Array,
-    special: Array, owner: int, general: bool, placement: int, begin: int, observed: Array, lengths: Array, precisions: Array,
-    constants: Array, error: float, limits: Array, cosines: Array, sines: Array, densities: Array, places: Array, out: Array,
+    start: Start, frame: Frame, grids: KnownGrids, given: Special, placement: int, samples: Samples, limits: Array,
+    results: Results,
 ) -> tuple[int, int]:  # fmt: skip
     """Return the number of steps, and why the loop ended.
 
@@ -221,26 +293,21 @@ def advance(
     or the range of the grid that the step needs, relative to the centre of the present one, and its spacing (RANGE).
 
     Args:
-        values, centre, spacing: the density (n,) and its grid, relative to the origin; `unit` is the scale of spacings.
-        closed: whether the grid goes around the circle.
-        profile: as in `outlook`.
-        known, index: grids one after the other, and the centre, spacing, size and first number of each (G, 4).  There are
-            lambda (N,), U' (N, N), a cosine and a sine (N,) of the lowest frequency, log s and h (1 + m, T) at PER points in a
-            spacing.
-        special, owner: h or the log-likelihood of the first intervals (S, ., T) on one of the grids, -1 where that of `known`
-            holds.  T is N for steps that stay.  With a second row of log-likelihoods they act in the weak sense, and that row is
-            their relative change by another rule.
-        general: whether there are log-likelihoods in place of h.
-        way: STAY, OWN or PLACE.
-        begin: the first interval.
-        observed: what is observed (K, m).
-        lengths, precisions, constants: as in `steps.Steps`.
-        error: the estimate of the relative error of `values`.
+        start: the density and its grid.
+        frame: what all grids share.
+        grids: the grids whose modes are known.
+        given: the likelihoods, or an h that depends on t.
+        placement: STAY, OWN or PLACE.
+        samples: what is observed.
         limits: as the fields of `steps.Limits`.
-        cosines, sines: `waves` of the size of densities.
-        densities, places, out: receive the densities (K, n); the centres, the spacings, which grid of modes was taken, and its
-            points at either end at which there is no density (K + 1, 4); and the reports.
+        results: what receives the results.
     """
+    values, centre, spacing, error = start
+    unit, closed, profile = frame
+    known, index = grids
+    special, owner, general = given
+    begin, observed, lengths, precisions, constants = samples
+    cosines, sines, densities, places, out = results
     negligible, allowed, generous = limits[0], limits[1], limits[4]
     now, n, answer, place, stays = values.copy(), densities.shape[1], places[-1], -1, placement == STAY
     weak = general and special.shape[1] == 2
@@ -280,7 +347,9 @@ def advance(
             for j in range(now.size):
                 at[j] = (centre + spacing * (j - half) - begin_at) / coarse
             first, last = inset, size - 1 - inset
-            rounding, unsure = carried(now, at, alone, closed, scale, modes, rates, tau, first, last, 0.1 * allowed, propagated)
+            rounding, unsure = carried(
+                now, at, (alone, closed), Modes(modes, rates, scale), tau, (first, last), 0.1 * allowed, propagated
+            )
             aliasing, top = unresolved(propagated, cosine, sine), propagated[highest_of(propagated)]
             on_left = max(abs(propagated[first]), abs(propagated[first + 1]))
             on_right = max(abs(propagated[last]), abs(propagated[last - 1]))
@@ -332,10 +401,10 @@ def advance(
                 now[j] = propagated[j]
         else:
             now = np.empty(n)
+            likelihood = Likelihood(rows, general, precisions[k], observed[i])
             centre, spacing, constant, more, enough = sampled(
-                propagated, max(from_ - 1, first), min(to + 1, last), rows, general, precisions[k], observed[i], begin_at, coarse,
-                unit, now, b,
-            )  # fmt: skip
+                propagated, (max(from_ - 1, first), min(to + 1, last)), (begin_at, coarse, unit), likelihood, now, b
+            )
             if not enough:
                 return i, SIZE
             for j in range(n):

@@ -36,7 +36,7 @@ from zakai.numerics.exponentials import exponentiate
 from zakai.numerics.line.averages import AVERAGES, EARLY, LATE, MEAN, MOST_MAGNUS, averaged, averaging, operators
 from zakai.numerics.line.density import highest_of, moments
 from zakai.numerics.line.gaussian_kernels import filtered, narrow_taps, taps_of, wrapped
-from zakai.numerics.line.steps import CELL, DRIFT, IMPOSSIBLE, OBSERVED, SLOPE, Transition, failed
+from zakai.numerics.line.steps import CELL, DRIFT, IMPOSSIBLE, OBSERVED, SLOPE, Coefficients, Transition, failed
 
 Array = NDArray[Any]
 
@@ -45,11 +45,32 @@ OVERFLOW = 690.0
 STEEPEST = 0.5  # change of exponents between points for which the filter of a narrow kernel is accurate
 
 
+class Accuracy(NamedTuple):
+    """What a splitting must keep.
+
+    `depth` is that of the tails, as a logarithm below the maximum, to which filters are accurate, `most` the largest error, and
+    `finest` the smallest spacing that may be asked for.
+    """
+
+    depth: float
+    most: float
+    finest: float
+
+
+class Filtering(NamedTuple):
+    """The filter of an average: int G dt, the shift, substeps, and as in `Accuracy` the depth; the kernel is `narrow` or not."""
+
+    spread: float
+    shift: float
+    substeps: float
+    depth: float
+    narrow: bool
+
+
 @helper
 def divided(
-    now: Array, table: Array, drifts: Array, outputs: Array, precisions: Array, covariances: Array, averages: Array,
-    observed: Array, inside: bool, tau: float, spacing: float, closed: bool, depth: float, most: float, finest: float,
-) -> Transition:  # fmt: skip
+    now: Array, table: Array, c: Coefficients, averages: Array, spacing: float, closed: bool, accuracy: Accuracy
+) -> Transition:
     """Replace a density by that after a split interval, in as many averages and substeps as its error asks for.
 
     The samples of a Gaussian of the variance V, in squares of the spacing, are a filter of positive numbers with the relative
@@ -57,23 +78,20 @@ def divided(
 
     Args:
         now: the density (N,).
-        table, drifts, outputs, precisions, covariances, observed: see `steps.Grid` and `steps.Steps`.
+        table: see `steps.Grid`.
+        c: the coefficients of the interval.
         averages: the weights of `line/averages.py`.
-        inside: whether the observation acts inside the interval.
-        tau: the length of the interval.
         spacing: the spacing of the grid.
         closed: whether it goes around the circle.
-        depth: the depth of the tails, as a logarithm below the maximum, to which filters are accurate.
-        most: the largest error.
-        finest: the smallest spacing that may be asked for.
+        accuracy: what is asked of the result.
     """
-    size, at, varying = now.size, highest_of(now), averages.shape[0] > 1
+    size, at, varying, (depth, most, finest) = now.size, highest_of(now), averages.shape[0] > 1, accuracy
     begin, phi, drift = now.copy(), np.empty(size), np.empty(size)
     b, first, second = np.empty(size), np.empty(size), np.empty(size)
     magnus, substeps = 0.0, 1.0  # pairs of averages, one after the other, or the mean
     both, spreads = np.empty((3, 2, size if varying else 1)), np.empty(3)
     if varying:
-        operators(table, drifts, outputs, precisions, covariances, averages[0], tau, observed, inside, at, both, spreads)
+        operators(table, c, averages[0], at, both, spreads)
         mean_error, pair_error = averaging(now, both, spreads, spacing, closed)
         if mean_error > most:
             magnus = max(np.ceil(1.1 * (pair_error / most) ** 0.25), 1.0)
@@ -88,10 +106,7 @@ def divided(
         for i in range(2 * parts if magnus > 0.0 else 1):
             weights = averages[parts * (parts - 1) // 2 + i // 2]
             which = MEAN if magnus == 0.0 else (EARLY if i % 2 == 0 else LATE)
-            length, own_spread, shift, added = averaged(
-                table, drifts, outputs, precisions, covariances, weights[which], tau, observed, inside, at, spacing, closed, phi,
-                drift, b,
-            )  # fmt: skip
+            length, own_spread, shift, added = averaged(table, c, weights[which], at, spacing, closed, (phi, drift, b))
             if not (own_spread > 0.0):
                 return failed(spread, 0.0)
             variance = 0.5 * own_spread / substeps
@@ -100,14 +115,15 @@ def divided(
                 if closed or needed > finest:
                     return failed(spread, needed)
             differences(b, spacing, closed, first, second)
-            noise, end = split(now, phi, b, first, own_spread, shift, substeps, spacing, depth, closed, needed > 0.0)
+            filtering = Filtering(own_spread, shift, substeps, depth, needed > 0.0)
+            noise, end = split(now, phi, b, first, filtering, spacing, closed)
             if needed > 0.0 and not (noise < 1e-2 * most):  # perhaps the exponents vary too much between points
                 return failed(spread, max(needed, 0.6 * spacing))
             splitting += residual(now, b, first, second, drift, own_spread, spacing, length) / substeps**4
             rounding, clipped, spread, constant = rounding + noise, max(clipped, end), spread + own_spread, constant + added
             if varying and (magnus == 0.0 or i % 2 == 1):
                 if parts > 1:
-                    operators(table, drifts, outputs, precisions, covariances, weights, tau, observed, inside, at, both, spreads)
+                    operators(table, c, weights, at, both, spreads)
                 mean_error, pair_error = averaging(now, both, spreads, spacing, closed)
                 time, pairs = time + (pair_error if magnus > 0.0 else mean_error), pairs + pair_error
             total = moments(now)[0]
@@ -198,13 +214,13 @@ def residual(
 
 @helper
 def split(
-    now: Array, phi: Array, b: Array, first: Array, spread: float, shift: float, substeps: float, spacing: float, depth: float,
-    closed: bool, narrow: bool,
-) -> tuple[float, float]:  # fmt: skip
+    now: Array, phi: Array, b: Array, first: Array, filtering: Filtering, spacing: float, closed: bool
+) -> tuple[float, float]:
     """Replace a density by that after an average, in substeps; return the rounding error and what may have become zero.
 
     The filter of a narrow kernel is accurate where v is band-limited, that is where the exponents change little between points.
     """
+    spread, shift, substeps, depth, narrow = filtering
     size, count, weight, part = now.size, 2 * int(substeps), 1.0 / (6.0 * substeps), spread / (2.0 * substeps)
     correction, negligible, clipped, steepest = spread / (72.0 * substeps**3), 1e-13 * now[highest_of(now)], 0.0, 0.0
     early, middle, joint, late, work = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
@@ -276,7 +292,7 @@ class Interval(NamedTuple):
     narrow: bool
 
 
-class Coefficients(NamedTuple):
+class TangentCoefficients(NamedTuple):
     """The terms of f and h on the grid (p, R, 4 + m, N), and the other coefficients in time as in `steps.Steps`, for p."""
 
     table: Array
@@ -296,7 +312,7 @@ class _Average(NamedTuple):
     shift: Array
 
 
-def through(interval: Interval, coefficients: Coefficients, density: Array, tangents: Array) -> tuple[Array, Array, Array]:
+def through(interval: Interval, coefficients: TangentCoefficients, density: Array, tangents: Array) -> tuple[Array, Array, Array]:
     """Return a density (N,) and its derivatives (p, N) after an interval, but for a factor, and its logarithm (p,)."""
     v, dv, at = density, tangents, int(np.argmax(density))
     log_factor = np.zeros(len(tangents), complex)
@@ -317,7 +333,7 @@ def _weights(interval: Interval, nodes: int) -> list[Array]:
     return [AVERAGES[n * (n - 1) // 2 + part, which] for part in range(n) for which in (EARLY, LATE)]
 
 
-def _averaged(interval: Interval, c: Coefficients, weights: Array, at: int) -> _Average:
+def _averaged(interval: Interval, c: TangentCoefficients, weights: Array, at: int) -> _Average:
     tau, fraction = interval.length, float(np.sum(weights))
     length, spread = fraction * tau, tau * (c.covariances @ weights)
     G = (spread / length)[:, None]

@@ -12,6 +12,7 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import float64, int64, types
 from numpy.typing import NDArray
 
 from zakai.numerics.compiled import helper
@@ -126,6 +127,69 @@ class Limits(NamedTuple):
     finest: float
 
 
+class Start(NamedTuple):
+    """Where steps begin: probabilities (N,), the estimate of their relative error, and the logarithm of that of small values.
+
+    The last is relative to the largest value.
+    """
+
+    values: Array
+    error: float
+    log_floor: float
+
+
+class Constants(NamedTuple):
+    """The weights of averages (P, 5, Q), and the cosines and sines (N / 2 + 1, N) of a grid."""
+
+    averages: Array
+    cosines: Array
+    sines: Array
+
+
+class Results(NamedTuple):
+    """What receives the densities (K, N) and the reports (K, .)."""
+
+    densities: Array
+    reports: Array
+
+
+# Their types in kernels.
+_V, _M, _T, _Q = float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1]
+START_TYPE = types.NamedTuple([_V, float64, float64], Start)
+GRID_TYPE = types.NamedTuple([_Q, int64, float64, float64, _M], Grid)
+STEPS_TYPE = types.NamedTuple([int64[::1], _V, _V, _Q, _V, _M, _T, _T, _M], Steps)
+CONSTANTS_TYPE = types.NamedTuple([_T, _M, _M], Constants)
+RESULTS_TYPE = types.NamedUniTuple(_M, 2, Results)
+
+
+class Coefficients(NamedTuple):
+    """The coefficients of one interval as a transition reads them: a row of `Steps`, what is observed, and the length.
+
+    With `inside` the observation acts inside the interval.
+    """
+
+    drifts: Array
+    outputs: Array
+    precisions: Array
+    covariances: Array
+    observed: Array
+    length: float
+    inside: bool
+
+
+class Resolution(NamedTuple):
+    """What is asked of a prediction on a grid; `positive` tells that small values are accurate.
+
+    The highest frequency is found with `search`.
+    """
+
+    positive: bool
+    search: bool
+    cut: float
+    negligible: float
+    spacing: float
+
+
 class Segment(NamedTuple):
     """The densities (K, N) after the first steps and their reports (K, len(COLUMNS)).
 
@@ -217,14 +281,14 @@ _MOST_GROWTH = 1e80
 
 @helper
 def extent(
-    now: Array, low: int, high: int, channel: Array, drifts: Array, table: Array, spread: float, tau: float, middle: float,
-    spacing: float, cut: float,
-) -> tuple[float, float]:  # fmt: skip
+    now: Array, ends: tuple[int, int], channel: Array, table: Array, c: Coefficients, middle: float, spacing: float, cut: float
+) -> tuple[float, float]:
     """Return the range of points that a density occupies until it is after the transition, as if it were Gaussian.
 
     It is NaN where the density moves so far that the grid should move with it.
     """
-    half, by = now.size // 2, 0.0
+    half, by, tau, spread, (low, high) = now.size // 2, 0.0, c.length, c.covariances[0] * c.length, ends
+    drifts = c.drifts[0]
     left, right = float(low - half), float(high - half)
     if np.isnan(channel[0]):
         down, up = 0.0, 0.0
@@ -244,16 +308,15 @@ def extent(
 
 @helper
 def checked(
-    now: Array, low: int, high: int, weak: bool, positive: bool, closed: bool, search: bool, cut: float,
-    negligible: float, spacing: float, cosines: Array, sines: Array, answer: Array,
-) -> tuple[int, float, float, float, float, float]:  # fmt: skip
+    now: Array, ends: tuple[int, int], weak: bool, closed: bool, asked: Resolution, waves: tuple[Array, Array], answer: Array
+) -> tuple[int, float, float, float, float, float]:
     """Normalise a prediction that is accurate; return OK, its mass, aliasing, mass at the ends, negative mass, highest frequency.
 
-    The frequency is found with `search`.  `answer` receives the support; where another grid is needed, its range in points and
+    `answer` receives the support; where another grid is needed, its range in points and
     its spacing.
     """
-    size = now.size
-    left, right, first, last, negative, aliasing, middle, highest, _ = spectrum(now, cut, negligible, cosines, sines, search)
+    size, (low, high), (positive, search, cut, negligible, spacing) = now.size, ends, asked
+    left, right, first, last, negative, aliasing, middle, highest, _ = spectrum(now, cut, negligible, *waves, search)
     bound = max(100.0 * cut, 0.0 if positive else 4.0 * aliasing)
     edge = 0.0 if closed else max(left, right)
     if not positive:  # what is outside of the band is filtered too

@@ -6,7 +6,7 @@ An interval is a list of events: a Runge-Kutta step of order two or four, and a 
 depends on the state a kick is the flow of the fields g_j(x) sqrt(d) w_j over unit time, together where the fields commute, else
 one after the other in an order that a further normal number decides.  With half of a substep's flow before and half after its
 kick the law is that of the equation to second order in the substep.  The drift's outputs after the first n are integrated along
-the way.
+the way.  An observation may change the state: of particles that carry a Kalman filter, its mean and its covariance.
 
 References:
     Ninomiya and Victoir 2008, Weak approximation of stochastic differential equations.
@@ -29,11 +29,12 @@ ADDITIVE, COMMUTING, ORDERED = 0, 1, 2
 # rate 2 / step.  It is halved, three times at once, and again where that is not enough.  What most particles need is measured
 # beforehand; this is for those far out, which a stiff drift would throw to infinity.
 _ROUGH, _PARTS, _LEVELS = 0.25, 8, 3
-# Drift, fields of the noise, ends of the domain, and the kind of the noise.
-MOTION = types.Tuple((PROGRAM, PROGRAM, BOX, types.int64))
-# Times (E, 2), [root, observation, stages] (E, 3): what follows each flow or -1, and its evaluations, 2 or 4; given numbers at
-# both ends (E, 2, L), roots (J, n or r, d), and the first row of the noise of each root, its width, and 1 where a coin follows
-# (J, 3).
+UPDATE = 0  # instead of the evaluations of a flow
+# Drift, fields of the noise, ends of the domain, the kind of the noise, and what an observation makes of the state.
+MOTION = types.Tuple((PROGRAM, PROGRAM, BOX, types.int64, PROGRAM))
+# Times (E, 2), [root, observation, stages] (E, 3): what follows each flow or -1, and its evaluations, 2 or 4, or `UPDATE`; given
+# numbers at both ends (E, 2, L), roots (J, n or r, d), and the first row of the noise of each root, its width, and 1 where a coin
+# follows (J, 3).
 EVENTS = types.Tuple((F2, I2, F3, F3, I2))
 
 
@@ -216,10 +217,24 @@ def _kick(motion: Any, values: Array, x: Array, kick: Any, buffers: Any, size: i
 
 
 @helper
+def _update(program: Any, values: Array, x: Array, box: Any, time: float, given: Array, size: int) -> None:
+    """Replace the state by what an observation makes of it."""
+    load_point(program, values, x, box, time, given, size)
+    run_program(program, values, size)
+    for d in range(program[3].size):
+        result = values[program[3][d]]
+        for i in range(size):
+            x[d, i] = result[i]
+
+
+@helper
 def run_event(motion: Any, events: Any, e: int, blocks: Any, x: Array, noise: Array, buffers: Any, size: int) -> None:
     """Advance x (rows, size) by one event; `noise` (D, size) is that of all events."""
     times, places, given, roots, rows = events
     n, box = motion[2][0].size, motion[2]
+    if places[e, 2] == UPDATE:
+        _update(motion[4], blocks[2], x, box, times[e, 1], given[e, 0], size)
+        return
     if times[e, 1] != times[e, 0]:
         stretch = Stretch(times[e, 1] - times[e, 0], times[e], given[e], places[e, 2], 0.0, 1.0)
         _flow(motion[0], blocks[0], x, box, stretch, buffers, size)
@@ -265,7 +280,7 @@ def advance(motion: Any, events: Any, start: Array, noise: Array, low: int, high
         arrival: receives the results.
     """
     out, gained, ends = arrival
-    blocks = (block_of(motion[0]), block_of(motion[1]))
+    blocks = (block_of(motion[0]), block_of(motion[1]), block_of(motion[4]))
     buffers = buffers_of(motion, events)
     n, rows, places = start.shape[0], motion[0][3].size, events[1]
     x, own = np.empty((rows, BLOCK)), np.empty((max(noise.shape[0], 1), BLOCK))

@@ -63,7 +63,7 @@ class Paths(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """The slots of the three programs, and what an event overwrites."""
+    """The slots of the programs, and what an event overwrites."""
 
     blocks: Any
     buffers: Any
@@ -98,11 +98,11 @@ def _follow(window: Any, workspace: Any, start: Array, path: Array, x: Array, to
         k = places[e, 1]
         if k < 0 or counted[k].sum() == 0.0:
             continue
-        load_point(law, blocks[2], x, motion[2], times[k], given[k], size)
-        run_program(law, blocks[2], size)
+        load_point(law, blocks[3], x, motion[2], times[k], given[k], size)
+        run_program(law, blocks[3], size)
         for term in range(law[3].size):
             if counted[k, term] != 0.0:
-                values = blocks[2][law[3][term]]
+                values = blocks[3][law[3][term]]
                 for i in range(size):
                     total[i] += values[i]
     for i in range(size):
@@ -115,7 +115,7 @@ def _follow(window: Any, workspace: Any, start: Array, path: Array, x: Array, to
 @helper
 def _workspace(window: Any) -> Any:
     motion = window.motion
-    blocks = block_of(motion[0]), block_of(motion[1]), block_of(window.observed[0])
+    blocks = block_of(motion[0]), block_of(motion[1]), block_of(motion[4]), block_of(window.observed[0])
     return Workspace(blocks, buffers_of(motion, window.events))
 
 

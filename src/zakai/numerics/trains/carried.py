@@ -19,6 +19,10 @@ class Path(NamedTuple):
     times: Array
     given: Array
 
+    def then(self, other: Path) -> Path:
+        """Return the steps of this path and those of another one after it."""
+        return Path(np.concatenate([self.times, other.times]), np.concatenate([self.given, other.given]))
+
 
 class Likelihood(NamedTuple):
     """The program of a log density, its given numbers, which terms count, the time, the power, and the log of what divides it."""
@@ -42,7 +46,7 @@ class Term(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """The sum of one or two terms, times a likelihood; zero outside of `box` and beyond half a turn from `turn` (n,)."""
+    """The sum of some terms, times a likelihood; zero outside of `box` and beyond half a turn from `turn` (n,)."""
 
     terms: tuple[Term, ...]
     box: tuple[Array, Array]
@@ -54,13 +58,15 @@ class Carried:
         terms = [
             (term.density.arrays, term.scale, term.program, self.box, (term.path.times, term.path.given)) for term in self.terms
         ]
-        if len(terms) == 1:
+        if len(terms) % 2:
             terms.append((terms[0][0], np.zeros(2), *terms[0][2:]))
-        law = self.likelihood
-        out = np.empty(x.shape[1])
+        law, total = self.likelihood, np.zeros(x.shape[1])
         arrays = law.program, law.given, law.counted, np.array([law.time, law.power, law.top])
-        values_at(tuple(terms), arrays, self.turn, np.ascontiguousarray(x), out)
-        return out
+        x, out = np.ascontiguousarray(x), np.empty(x.shape[1])
+        for pair in zip(terms[::2], terms[1::2], strict=True):
+            values_at(pair, arrays, self.turn, x, out)
+            total += out
+        return total
 
     def times(self, likelihood: Likelihood) -> Carried:
         """Return the same density times another likelihood."""

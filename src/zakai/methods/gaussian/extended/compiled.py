@@ -82,8 +82,7 @@ def advance(loop: Loop, rows: slice, mean: Array, cov: Array, values: Array) -> 
     means, covs, gains, figures = np.empty((count, n)), np.empty((count, n, n)), np.empty(count), np.empty((2, count))
     parts = (loop.first[rows.start : rows.stop + 1], *loop.parts)
     intervals = tuple(part[rows] for part in loop.intervals)
-    segment(
-        loop.programs, loop.periodic, loop.angles, loop.samples, parts, intervals, np.array(values, float, order="C"),
-        np.array(mean, float), np.array(cov, float, order="C"), means, covs, gains, figures,
-    )  # fmt: skip
+    kinds, observed = (loop.periodic, loop.angles, loop.samples), np.array(values, float, order="C")
+    before = np.array(mean, float), np.array(cov, float, order="C")
+    segment(loop.programs, kinds, parts, intervals, observed, *before, (means, covs, gains, figures))
     return means, covs, gains, figures
