@@ -100,6 +100,7 @@ def test_a_model_of_the_gallery_is_loaded_and_a_record_of_the_user_filtered(page
 def test_the_density_follows_a_slider_while_it_is_dragged_and_is_filtered_again_when_it_is_released(page: Page):
     before, said = picture(page), likelihood(page)
     slider = page.get_by_test_id("slider-s")
+    slider.scroll_into_view_if_needed()
     box = slider.bounding_box()
     page.mouse.move(box["x"] + 0.34 * box["width"], box["y"] + box["height"] / 2)
     page.mouse.down()

@@ -244,6 +244,7 @@ def bound(port: int) -> socket.socket:
         found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         found.bind((HOST, port))
+        found.listen()  # so that the address can be opened as soon as it is printed
     except (OSError, OverflowError) as error:
         found.close()
         reason = getattr(error, "strerror", None) or error
