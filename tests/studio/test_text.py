@@ -8,7 +8,7 @@ import pytest
 
 import zakai
 from zakai.models.files import read_model
-from zakai.studio.text import place_of_error, with_values
+from zakai.studio.text import place_of_error, shown, with_values
 
 TEXT = """# A comment that stays.
 name  = "two states"
@@ -80,6 +80,12 @@ def test_a_value_is_replaced_where_it_stands_and_the_rest_is_kept(changes, line:
     assert text.startswith("# A comment that stays.\n")
     before, after = tomllib.loads(TEXT), tomllib.loads(text)
     assert {key: after[key] for key in before if key not in changes} == {key: before[key] for key in before if key not in changes}
+
+
+def test_a_number_of_thousands_of_digits_is_kept():
+    text = f"start = 0x{'f' * 5000}\nname = 'x'\n"
+    assert tomllib.loads(with_values(text, {"name": "y"})) == {"start": int("f" * 5000, 16), "name": "y"}
+    assert shown(tomllib.loads(text))["start"].startswith("0xfff")
 
 
 def test_a_key_is_removed():

@@ -33,7 +33,8 @@ MOST_ROWS = 1_000_000
 MOST_FILES = 20  # that are kept; of more the oldest goes
 LARGEST_MESSAGE = 4 << 20
 HOST = "127.0.0.1"
-QUICK = {"check", "write", "gallery", "columns", "methods", "algebra"}  # answered beside a run
+QUICK = {"check", "write", "gallery", "columns"}  # answered while one types
+LONGER = {"methods", "algebra"}  # answered beside a run, until the model is another one
 KINDS = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 STATIC = files("zakai.studio").joinpath("static")
 SHARED = files("zakai.report").joinpath("static")  # the picture of a density, which the report shows too
@@ -54,7 +55,7 @@ class Settings:
 
 
 class Studio:
-    """The state of the server: a folder, two workers, and the page that is connected."""
+    """The state of the server: a folder, three workers, and the page that is connected."""
 
     def __init__(self, settings: Settings):
         self.settings = settings
@@ -62,6 +63,7 @@ class Studio:
         self.page: WebSocket | None = None
         self.sending = asyncio.Lock()
         self.quick = Worker(self.folder, settings.memory, self.send, impatient=True)
+        self.thinker = Worker(self.folder, settings.memory, self.send, impatient=True)
         self.runner = Worker(self.folder, settings.memory, self.send)
         self.following: asyncio.Task[None] | None = None
         self.first: dict[str, Any] | None = None
@@ -72,6 +74,11 @@ class Studio:
             shutil.copyfile(settings.record, self.folder / f"{number}.csv")
             self.first = {"file": number, "name": settings.record.name}
 
+    @property
+    def workers(self) -> tuple[Worker, ...]:
+        """The processes: for what must be quick, for what is about the model alone, and for what is about a record."""
+        return self.quick, self.thinker, self.runner
+
     def application(self) -> Guard:
         """Return the application, which answers nobody but the own page."""
 
@@ -80,7 +87,7 @@ class Studio:
             await asyncio.gather(self.quick.start(), self.runner.start())
             yield
             await self.stop_following()
-            await asyncio.gather(self.quick.close(), self.runner.close())
+            await asyncio.gather(*(one.close() for one in self.workers))
             shutil.rmtree(self.folder, ignore_errors=True)
 
         base = "/{token}"
@@ -144,7 +151,7 @@ class Studio:
                 await older.send_text(json.dumps({"do": "replaced"}))
                 await older.close(4001)
         await self.stop_following()
-        await asyncio.gather(self.quick.abandon(), self.runner.abandon())
+        await asyncio.gather(*(one.abandon() for one in self.workers))
         await socket.send_text(json.dumps(self._hello()))
         try:
             while True:
@@ -182,7 +189,8 @@ class Studio:
         elif what == "unfollow":
             await self.stop_following()
         else:
-            await (self.quick if what in QUICK else self.runner).ask(request)
+            worker = self.quick if what in QUICK else self.thinker if what in LONGER else self.runner
+            await worker.ask(request)
 
     async def send(self, frame: bytes) -> None:
         """Send a frame to the page, if there is one."""
@@ -236,6 +244,7 @@ def bound(port: int) -> socket.socket:
         found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         found.bind((HOST, port))
+        found.listen()  # so that the address can be opened as soon as it is printed
     except (OSError, OverflowError) as error:
         found.close()
         reason = getattr(error, "strerror", None) or error

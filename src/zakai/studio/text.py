@@ -159,7 +159,7 @@ def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int | Decimal | float):
-        return str(value)
+        return _digits(value)
     if isinstance(value, list):
         return "[" + ", ".join(map(_toml, value)) + "]"
     if isinstance(value, Mapping):
@@ -185,7 +185,15 @@ def shown(value: Any) -> Any:
         return {str(key): shown(part) for key, part in value.items()}
     if isinstance(value, list):
         return [shown(part) for part in value]
-    return value if isinstance(value, bool) else str(value)
+    return value if isinstance(value, bool) else _digits(value)
+
+
+def _digits(value: Any) -> str:
+    """Return a number as TOML has it; an integer of thousands of digits as a hexadecimal one, which takes less time."""
+    try:
+        return str(value)
+    except ValueError:
+        return hex(value)
 
 
 def _entries(text: str, start: int) -> Iterator[tuple[tuple[int, ...], int, int]]:

@@ -7,6 +7,8 @@ const ABOUT = {
   tolerance: "in standard deviations", seed: "of random draws", particles: "a fixed number", most_particles: "at most",
 };
 
+const short = (text) => (text.length > 90 ? `${text.slice(0, 88)} …` : text);
+
 export class Method {
   constructor(studio) {
     this.studio = studio;
@@ -49,7 +51,7 @@ export class Method {
       const [sign, said] = SIGNS[one.holds], open = one.conditions.filter(({ holds }) => holds !== true);
       return h("li", {}, h("details", {},
         h("summary", {}, h("span", { class: `sign ${one.holds}`, title: said, "aria-label": said }, sign), h("strong", {}, one.name),
-          h("span", { class: "because" }, this.times[one.name] ? ` ${this.times[one.name]}` : open.length ? ` ${open[0].statement}: ${open[0].evidence}` : "")),
+          h("span", { class: "because" }, this.times[one.name] ? ` ${this.times[one.name]}` : open.length ? ` ${short(`${open[0].statement}: ${open[0].evidence}`)}` : "")),
         h("p", { class: "small" }, one.about),
         h("ul", {}, one.conditions.map(({ statement, holds, evidence, source }) => h("li", {}, h("span", { class: `sign ${holds}`, "aria-label": SIGNS[holds][1] }, SIGNS[holds][0]), ` ${statement}`, h("small", {}, ` ${evidence} · ${source}`))))));
     }));

@@ -41,7 +41,7 @@ export class Observations extends Lazy {
       const place = h("div", {});
       this.panel.append(h("h3", {}, name), place);
       const x = arrays.times;
-      new LinePanel(place, { label: `Observation ${name} and its prediction`, height: 220, testid: `observed-${name}` }).show({ x: {}, y: { title: name }, series: [
+      new LinePanel(place, { label: `Observation ${name} and its prediction`, height: 260, testid: `observed-${name}` }).show({ x: {}, y: { title: name }, series: [
         { role: "band", text: "95% predicted", x, lower: part(arrays.lower, j, m), upper: part(arrays.upper, j, m), colour: "series" },
         { role: "mean", text: "predicted mean", x, y: part(arrays.mean, j, m), colour: "ink" },
         { role: "seen", text: "observed", x, y: part(arrays.values, j, m), dots: true, colour: "truth" },
@@ -67,9 +67,9 @@ export class Residuals extends Lazy {
           [`mean square of the scores ${number(one.power, 3)} is 1`, ...verdict(one.variance, one.power > 1 ? "the noise is too small, or there is a bias" : "the noise is too large")],
           ["no autocorrelation (Ljung-Box)", ...verdict(one.independence, "the dynamics are wrong")],
         ]));
-      new BarPanel(histogram, { label: `Histogram of ${one.name}`, height: 190, testid: `pit-${one.name}` }).show({ heights: one.heights, band: one.band, level: 1, x: { title: "probability" }, y: { title: "density" } });
+      new BarPanel(histogram, { label: `Histogram of ${one.name}`, height: 190, compact: true, testid: `pit-${one.name}` }).show({ heights: one.heights, band: one.band, level: 1, x: { title: "probability" }, y: { title: "density" } });
       const count = one.autocorrelation.length, bound = 1.96 / Math.sqrt(one.count), most = Math.max(0.3, ...one.autocorrelation.map(Math.abs));
-      new BarPanel(lags, { label: "Autocorrelation", height: 190 }).show({ heights: one.autocorrelation, low: 0.5, high: count + 0.5, band: [-bound, bound], level: 0, x: { title: "lag" }, y: { title: "correlation" }, range: [-1.1 * most, 1.1 * most] });
+      new BarPanel(lags, { label: "Autocorrelation", height: 190, compact: true }).show({ heights: one.autocorrelation, low: 0.5, high: count + 0.5, band: [-bound, bound], level: 0, x: { title: "lag" }, y: { title: "correlation" }, range: [-1.1 * most, 1.1 * most] });
       new LinePanel(scores, { label: "Normal scores over time", height: 180 }).show({ y: { title: "deviations" }, series: [{ role: "scores", text: "normal score", x: arrays[`times${j}`], y: arrays[`scores${j}`], dots: true }], marks: [{ y: -1.96 }, { y: 1.96 }, { y: 0, dash: [] }] });
     });
   }

@@ -3,7 +3,7 @@
 import { debounced, h, number, table } from "./dom.js";
 import { LinePanel } from "./panels.js";
 
-const STEPS = 400, ROWS = 128, FEWEST = 120, MOST = 260; // of a slider; cells and densities of a picture while one is dragged
+const STEPS = 400, ROWS = 128, FEWEST = 100, MOST = 190; // of a slider; cells and densities of a picture while one is dragged
 
 export class Parameters {
   constructor(studio) {
@@ -80,7 +80,7 @@ export class Parameters {
     if (studio.running || !studio.summary || studio.result.name !== "main") return;
     if (this.inflight) { this.next = since; return; }
     this.inflight = true;
-    const { from, to, width } = studio.result.seen(), columns = Math.round(Math.min(MOST, Math.max(FEWEST, width / 3)));
+    const { from, to, width } = studio.result.seen(), columns = Math.round(Math.min(MOST, Math.max(FEWEST, width / 4)));
     const found = await studio.ask("slide", { ...studio.request, name: "main", values: this.values, state: studio.result.coordinate, from, to, columns, rows: ROWS });
     this.inflight = false;
     if (found && this.dragged) { // an answer after the release is late
@@ -141,7 +141,7 @@ export class Parameters {
     const place = h("div", {});
     this.drawn.replaceChildren(h("h3", {}, `Log-likelihood along ${parameter}`), place, h("p", { class: "small" }, "The dashed line is 1.92 below the highest value: what is above it is the 95% interval where the other parameters are known."));
     const shown = heights.map((value) => (value < best - 20 ? NaN : value));
-    new LinePanel(place, { label: `Log-likelihood along ${parameter}`, height: 220 }).show({ x: { title: parameter }, y: { title: "log-likelihood" },
+    new LinePanel(place, { label: `Log-likelihood along ${parameter}`, height: 260 }).show({ x: { title: parameter }, y: { title: "log-likelihood" },
       series: [{ role: "l", text: "log-likelihood", x: values, y: shown }, { role: "d", text: "", x: values, y: shown, dots: true }], marks: [{ y: best - 1.92 }, { x: one.now, dash: [2, 2] }] });
   }
 }
