@@ -123,7 +123,7 @@ def warnings_of_run(
     limits: Mapping[str, float] = lost or {}
     said: list[str] = []
     first = _lost_by_figure(result, limits, said)
-    bad = ~np.isfinite(result.log_likelihood_increments)
+    bad: Array = ~np.isfinite(result.log_likelihood_increments)
     if bad.any():
         gone = int(np.argmax(bad))
         if gone <= first:
@@ -134,7 +134,7 @@ def warnings_of_run(
         )
         first = min(first, gone)
     else:
-        without = ~np.isfinite(result.mean).all(axis=1) | ~np.isfinite(result.cov).all(axis=(1, 2))
+        without: Array = ~np.isfinite(result.mean).all(axis=1) | ~np.isfinite(result.cov).all(axis=(1, 2))
         if without.any():
             when = result.times[np.argmax(without)]
             said.append(

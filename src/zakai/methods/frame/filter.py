@@ -93,7 +93,7 @@ def _mixture(prepared: Prepared, prior: Any) -> tuple[Callable[[Array], Array], 
 
 def _density_prior(prepared: Prepared, prior: DensityPrior) -> tuple[Callable[[Array], Array], Mass]:
     """Return a density that is given by a formula or on a grid as a function, and points of it."""
-    from zakai.methods._moments import density_grid, prior_moments
+    from zakai.methods.system.prior_moments import density_grid, prior_moments
     from zakai.models.numeric import numpy_function
 
     model, theta = prepared.model, prepared.theta
