@@ -134,7 +134,7 @@ def warnings_of_run(
         )
         first = min(first, gone)
     else:
-        without: Array = ~np.isfinite(result.mean).all(axis=1) | ~np.isfinite(result.cov).all(axis=(1, 2))
+        without: Array = np.asarray(~np.isfinite(result.mean).all(axis=1) | ~np.isfinite(result.cov).all(axis=(1, 2)))
         if without.any():
             when = result.times[np.argmax(without)]
             said.append(
