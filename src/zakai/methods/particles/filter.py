@@ -210,7 +210,9 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     if done.lost > 0.5 * RARE:
         check_escape(prepared, k, at_start)
     cloud = done.cloud
-    cloud = cloud._replace(window=cloud.window.appended(motion, events, observed, done.noise, cloud.particles))
+    # Of many coordinates the states at the end are not kept: an interval is run again when it leaves the window.
+    end = cloud.particles if system.n <= 2 * n else np.zeros((0, 0))
+    cloud = cloud._replace(window=cloud.window.appended(motion, events, observed, done.noise, end))
     weights = np.exp(cloud.logs)
     size, largest = effective(weights), float(weights.max())
     mean, deviations, cov, own = _moments(system, cloud.particles, weights)
