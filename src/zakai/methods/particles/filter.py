@@ -63,6 +63,7 @@ VARIANCE = 5.0  # that of a mean times N, in variances of the state, that the nu
 MOST_GROWTH = 4
 # Share of the allowed time error below which its measurement is trusted in so many more intervals, if it is certain or not, and
 # the ratio of the errors of two lengths up to which that holds.
+REPEATED, NARROWEST = 2.0, 0.02  # excess of the time error at which an interval is repeated, and least narrowing that counts
 SURE, TRUSTED, TRUSTED_LESS, LONGER = 0.5, 8, 2, 4.0
 
 
@@ -83,8 +84,8 @@ def init(prepared: Prepared, prior: Any) -> State:
     terms = len(prepared.motion.law[3])
     window = Window.begin(particles, first, gaussian, (width, terms))
     logs = np.full(count, -np.log(count))
-    control = Control(0, 0.0, 4, 0.0, 0.0, 0, VARIANCE, 0, 0.0, 0.0, 0, 0.0)
-    return State(particles, logs, window, Genealogy.begin(count), control, np.zeros(n), np.zeros(n))
+    control = Control(0, 0.0, 4, 0.0, 0.0, 0, 1.0, VARIANCE, 0, 0.0, 0.0, 0, 0.0)
+    return State(particles, logs, window, Genealogy.begin(count), control, np.zeros(n), np.zeros(n), np.ones(n))
 
 
 def reduced(state: State) -> State:
@@ -174,13 +175,21 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     weights = np.exp(cloud.logs)
     before, apart, _ = moments(cloud.particles, weights, angles)
     scale = np.maximum(np.sqrt(apart**2 @ weights), 1e-12)
-    steps, control = _steps(prepared, interval, values, state, (before, scale))
-    events = motion.events(interval, steps.scheme, values, before, scale)
     observed = _observed(prepared, interval, values)
     wanted = _wanted(rule, len(weights), control.variance)
     if effective(weights) < RESAMPLE_BELOW * len(weights) or wanted != len(weights):
         cloud, _ = cloud.resampled(weights, wanted, prepared.key(number, RESAMPLING))
-    done = _advanced(prepared, cloud, events, observed, number)
+    start, narrow = cloud, control.narrow
+    for last_turn in (False, True):
+        # Errors are measured in deviations after the observation, by how much the last one, or this one, has narrowed them.
+        steps, control = _steps(prepared, interval, values, state, (before, narrow * scale))
+        events = motion.events(interval, steps.scheme, values, before, scale)
+        done = _advanced(prepared, start, events, observed, number)
+        found_narrow = _narrowing(done, angles)
+        if last_turn or steps.error * narrow <= REPEATED * TIME_ERROR * found_narrow:
+            break
+        narrow = found_narrow
+    measured = state.last_scale if steps.shift is state.last_shift else narrow * scale
     if done.lost > 0.5 * RARE:
         check_escape(prepared, k, at_start)
     cloud = done.cloud
@@ -234,9 +243,10 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
     info = Info(done.gained, mean, cov, health, np.sqrt(found.largest + shift**2), float(np.sqrt(evidence)))
     variance = 0.8 * control.variance + 0.2 * len(weights) * float(share.mean())
     control = control._replace(
-        interval=number, variance=variance, last=last, urgency=urgency, floor=floor, doubtful_until=until, shifted=shifted
-    )
-    return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, steps.shift), info
+        interval=number, narrow=found_narrow, variance=variance, last=last, urgency=urgency, floor=floor, doubtful_until=until,
+        shifted=shifted,
+    )  # fmt: skip
+    return State(cloud.particles, cloud.logs, cloud.window, cloud.genealogy, control, shift, steps.shift, measured), info
 
 
 def _steps(
@@ -248,8 +258,9 @@ def _steps(
     guess = min(max(1, round(control.substeps * length)), MOST_SUBSTEPS)
     if length <= 0:
         return Steps(Scheme(1, 4), np.zeros(len(mean)), 0.0, 0.0), control
-    # The error of an interval is of the third order of its length.
+    # The error of an interval is of the third order of its length, and was measured in deviations of that time.
     ratio = (length / control.length) ** 3 if control.trusted else np.inf
+    ratio *= max(1.0, float((state.last_scale / scale).max()))
     if ratio <= LONGER and control.error * ratio <= SURE * TIME_ERROR:
         known = Steps(Scheme(guess, control.stages), state.last_shift, control.error, control.error)
         return known, control._replace(trusted=control.trusted - 1)
@@ -335,6 +346,12 @@ class Drawn(NamedTuple):
     path: Array
     logs: Array
     gaussian: Any
+
+
+def _narrowing(done: Advanced, angles: Array) -> float:
+    """Return the smallest ratio of the deviations after and before the observation."""
+    spread = _spread(done.cloud.particles, done.cloud.logs, angles)
+    return float(np.clip(np.nanmin(spread / np.maximum(done.predicted, 1e-300)), NARROWEST, 1.0))
 
 
 def _spread(particles: Array, logs: Array, angles: Array) -> Array:
