@@ -186,7 +186,7 @@ def test_every_part_of_the_page_opens_by_keyboard(page: Page):
         "residuals": "canvas[data-testid=pit-y1]",
         "joint": "p",
         "compare": "[data-testid=keep]",
-        "live": "[data-testid=follow]",
+        "stream": "[data-testid=follow]",
         "algebra": "[data-testid=verdict]",
         "export": "pre",
     }

@@ -10,7 +10,7 @@ from pathlib import Path
 
 AT_ONCE = 1 << 17  # bytes
 MOST_KEPT = 1 << 24  # bytes of standard input that a page which is loaded again receives again
-PAUSE = 0.2  # seconds between two looks at a file
+PAUSE = 0.2  # seconds until a file is read again
 
 
 class Source:
