@@ -13,7 +13,7 @@ MOST = 8
 PUBLIC = {"zakai.inference.bayes.sample", "zakai.models.model.__init__"}
 WITHOUT = ("cli", "peers", "studies")
 # To be done: no folder may be added, and one without such functions must leave.
-LEFT = {"numerics/line", "numerics/space", "methods/line", "methods/space"}
+LEFT = {"numerics/space", "methods/space"}
 
 
 def arguments(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:

@@ -77,6 +77,19 @@ def test_a_density_that_is_finer_than_every_grid_is_said_to_be_lost(method):
     assert result.warnings[0].startswith("the density was lost at t = 0.2")
 
 
+def test_four_states_on_a_grid_are_advised_to_take_particles():
+    keys = {"state": list("abcd"), "drift": ["-a + b*c", "-b", "-c", "-d + a"], "observation": ["a"]}
+    model = zakai.Model(**keys, observation_kind="samples", prior={"kind": "gaussian", "mean": [0] * 4, "cov": [1] * 4})
+    method = zakai.online(model, "yau-yau").feeds[0].setting.method
+    assert method.shorter == "take guided-particles"
+    result = zakai.filter(linear(), zakai.Record([0.1, 0.2], [0.1, 0.3], "samples"), "yau-yau")
+    result.health["error_estimate"] = np.array([0.0, 0.05, 0.5])
+    result.health["tolerance_ratio"] = np.array([np.nan, 7.0, 3.0])
+    assert warnings_of_run(result)[0].endswith("; compare with guided-particles")
+    result.state = tuple("abcd")
+    assert warnings_of_run(result)[0].endswith("; take guided-particles")
+
+
 def dense(times, values, h, noise, x):
     """Means and deviations of dx = -x dt + dv from N(0, 1), by sums over all points with any likelihood."""
     points, logs, before, moments = np.zeros(1), np.zeros(1), 0.0, []

@@ -1,5 +1,7 @@
 """Drifts that reach infinity, or have a pole, within an interval: one line, or the right answer."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -201,3 +203,32 @@ def test_a_fit_passes_by_values_that_explode():
     model = model_of(["a*x**3 - x"], variance=0.1, parameters={"a": -0.5})
     _, record = zakai.simulate(model, np.arange(0.5, 4.1, 0.5), seed=2)
     assert np.isfinite(zakai.fit(model, record, parameters=["a"], start={"a": 0.05}).log_likelihood)
+
+
+@pytest.mark.parametrize("method", ["extended-kalman-bucy", "ekf", "ukf", "enkf", "particle"])
+def test_a_method_without_a_density_says_that_the_drift_leads_to_infinity(method):
+    prior = {"kind": "gaussian", "mean": [2.0], "cov": [[1.0]]}
+    model = zakai.Model(state=["x"], drift=["x**3"], observation=["x"], observation_kind="samples", prior=prior)
+    result = zakai.filter(model, zakai.Record([0.5, 1.0], [2.0, 2.2], "samples"), method)
+    # dx = x^3 dt reaches infinity by t = 0.5 from every x > 1: of N(2, 1) a share of 0.84.
+    found = [re.search(r"takes x to infinity between t = 0 and 0.5 with probability ([.\d]+)", text) for text in result.warnings]
+    assert [0.75 < float(one[1]) < 0.9 for one in found if one] == [True]
+    tame = zakai.Model(state=["x"], drift=["-x"], observation=["x"], observation_kind="samples", prior=prior)
+    assert not any("infinity" in text for text in zakai.filter(tame, zakai.Record([0.5], [2.0], "samples"), method).warnings)
+
+
+@pytest.mark.parametrize("method", ["hu-yau", "general-direct"])
+@pytest.mark.parametrize(("drift", "mean"), [(["1/x", "-y"], 1.0), (["1/x", "x - y"], 1.0), (["-tan(x)", "-y"], 0.2)])
+def test_a_method_that_integrates_over_all_states_does_not_hold_beside_a_pole(drift, mean, method):
+    prior = {"kind": "gaussian", "mean": [mean, 0.5], "cov": [0.01, 0.1]}
+    model = zakai.Model(state=["x", "y"], drift=drift, observation=["x", "y"], observation_kind="increments", prior=prior)
+    record = zakai.Record([0.1, 0.2], [[0.1, 0.2], [0.1, 0.2]], "increments")
+    with pytest.raises(zakai.ConditionError, match=r"f is finite at all states \((x|cos\(x\)) vanishes\)"):
+        zakai.filter(model, record, method)
+
+
+def test_a_block_beside_a_pole_names_the_domain():
+    prior = {"kind": "gaussian", "mean": [1.0, 0.5], "cov": [0.01, 0.1]}
+    model = zakai.Model(state=["x", "y"], drift=["1/x", "-y"], observation=["x", "y"], observation_kind="increments", prior=prior)
+    with pytest.raises(zakai.InputError, match=r"block x: drift\[0\] = 1/x is infinite at .*give \[domain\] x = \{ lower = 0 \}"):
+        zakai.filter(model, zakai.Record([0.1], [[0.1, 0.2]], "increments"))

@@ -62,3 +62,31 @@ def test_a_process_near_the_limit_of_feller_has_the_exact_law(name):
         assert result.variance[k - 2, 0] == pytest.approx(weights @ ((x - mean) ** 2 * p), abs=4e-6)
     assert result.log_likelihood == pytest.approx(log_likelihood, abs=4e-6)
     assert not result.warnings
+
+
+@pytest.mark.parametrize("name", ["bessel at the limit", "square root at the limit", "square root near it"])
+def test_smoothing_near_the_limit_of_feller_has_the_exact_law(name):
+    drift, diffusion, transition = CASES[name]
+    model = zakai.Model(
+        state=["x"], drift=[drift], diffusion=[[diffusion]], observation=["x"], observation_kind="samples",
+        observation_noise=[[str(NOISE)]], domain={"x": {"lower": 0}},
+        prior={"kind": "density", "log_density": "-5*(x - 1.5)**2 - 0.02/x"},
+    )  # fmt: skip
+    times, values = np.array([0.8, 1.0]), np.array([0.6, 0.2])
+    result = zakai.smooth(model, zakai.Record(times, values[:, None], "samples"), "yau-yau")
+    nodes, weights = np.polynomial.legendre.leggauss(260)
+    root = 1.6 * (nodes + 1)
+    x, weights = root**2, 3.2 * root * weights
+    moves = [transition(length, x[:, None], x) for length in (0.8, 0.2)]
+    likelihoods = [np.exp(-((value - x) ** 2) / (2 * NOISE)) for value in values]
+    forward, backward = [np.exp(-5 * (x - 1.5) ** 2 - 0.02 / x)], [np.ones_like(x)]
+    for move, likelihood in zip(moves, likelihoods, strict=True):
+        forward.append(((weights * forward[-1]) @ move) * likelihood)
+    for move, likelihood in zip(moves[::-1], likelihoods[::-1], strict=True):
+        backward.insert(0, move @ (weights * likelihood * backward[0]))
+    for k, (p, b) in enumerate(zip(forward, backward, strict=True)):
+        law = weights * p * b / (weights @ (p * b))
+        mean = law @ x
+        assert result.mean[k, 0] == pytest.approx(mean, abs=4e-6)
+        assert result.variance[k, 0] == pytest.approx(law @ (x - mean) ** 2, abs=4e-6)
+    assert not result.warnings

@@ -70,3 +70,18 @@ def test_the_law_is_checked_at_the_time_and_the_inputs_of_the_first_observation(
     assert np.isfinite(zakai.filter(model, record).log_likelihood)
     with pytest.raises(zakai.InputError, match=r"observation\[0\] = u\*exp\(-x\*\*2\): is -0.7.*bernoulli"):
         zakai.filter(model, zakai.Record([0.1, 0.2], [[1.0], [1.0]], "samples", zakai.Inputs([0.0], [[-1.0]])))
+
+
+@pytest.mark.parametrize("key", ["drift", "observation", "diffusion"])
+@pytest.mark.parametrize("method", ["auto", "ekf"])
+@pytest.mark.parametrize("kind", ["samples", "increments"])
+def test_a_formula_without_a_value_at_every_state_of_the_prior_is_refused_by_its_key(key, method, kind):
+    keys = {"drift": ["-x"], "observation": ["x"], key: ["sqrt(x - 100)"]}
+    model = zakai.Model(state=["x"], observation_kind=kind, prior=PRIOR, **keys)
+    with pytest.raises(zakai.InputError, match=rf"{key}.*sqrt\(x - 100\): square root of a negative .*no state of the prior"):
+        zakai.filter(model, zakai.Record([0.1], [0.2], kind), method)
+
+
+def test_a_formula_with_a_value_at_one_end_of_the_prior_is_filtered_with_a_warning():
+    model = model_of("sqrt(x + 1)")
+    assert any("square root of a negative number" in text for text in filtered(model).warnings)

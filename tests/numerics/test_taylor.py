@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import mpmath
 import numpy as np
 import pytest
 import sympy
 
 from zakai.errors import ConditionError
 from zakai.methods.system.jets import Expansion
+from zakai.models.functions import ComplementaryError, Floor, LogGamma, Minimum, Sinc
 from zakai.numerics.series.power_series import cholesky, derivative, inverse, product, value
 
 t, a = sympy.symbols("t a")
@@ -39,6 +41,22 @@ def test_coefficients_are_the_derivatives_over_the_factorials(expression):
         np.testing.assert_allclose(found[v], exact, rtol=1e-11, atol=1e-12)
 
 
+# Taylor coefficients of degree 0 to 5 at x = 1.3, by mpmath with 30 digits.
+SPECIAL = {
+    "lgamma": (LogGamma(t, 0), mpmath.loggamma), "digamma": (LogGamma(t, 1), mpmath.digamma), "sinc": (Sinc(t, 0), mpmath.sinc),
+    "erfc": (ComplementaryError(t), mpmath.erfc),
+    "inside": (LogGamma(2 + sympy.sin(t), 0), lambda x: mpmath.loggamma(2 + mpmath.sin(x))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SPECIAL)
+def test_special_functions_have_the_series_of_an_independent_library(name):
+    expression, function = SPECIAL[name]
+    with mpmath.workdps(30):
+        expected = [float(one) for one in mpmath.taylor(function, mpmath.mpf("1.3"), 5)]
+    np.testing.assert_allclose(expand(expression, np.array([1.3]), 6)[:, 0], expected, rtol=1e-10, atol=1e-13)
+
+
 def test_the_absolute_value_follows_the_side_on_which_the_point_lies():
     np.testing.assert_array_equal(
         expand(sympy.Abs(t), np.array([-2.0, 2.0]), 3), [[2, 2], [-1, 1], [0, 0]]
@@ -52,7 +70,8 @@ def test_parameters_take_their_values():
 @pytest.mark.parametrize(
     ("expression", "words"),
     [(sympy.sqrt(t), "about t = 0"), (sympy.Abs(t), "about t = 0"), (1 / t, "about t = 0"),
-     (sympy.gamma(t + 1), "not known"), (a * t, "not known")],
+     (sympy.gamma(t + 1), "not known"), (a * t, "not known"),
+     (Floor(t), "the power series of floor is not known"), (Minimum(t, 1), "of min is not known")],
 )  # fmt: skip
 def test_what_has_no_series_is_said_with_the_expression_and_the_time(expression, words):
     with pytest.raises(ConditionError, match=words):

@@ -12,6 +12,7 @@ import zakai
 from report.fakes import fake_result
 from report.frames import read
 from zakai.densities import GaussianMixture
+from zakai.densities.conditional import ConditionalParticleDensity
 from zakai.densities.grid import GridDensity
 from zakai.densities.interval import IntervalDensity
 from zakai.densities.mapped import IntervalMap, MappedDensity
@@ -131,6 +132,16 @@ def test_particles_are_drawn_by_their_kernels():
     rows = arrays["cells"].shape[1]
     middles = arrays["low"][0] + (arrays["high"][0] - arrays["low"][0]) * (np.arange(rows) + 0.5) / rows
     np.testing.assert_allclose(arrays["cells"][0] / 65535 * arrays["peak"][0], particles.pdf(middles[:, None]), atol=2e-3)
+
+
+def test_particles_with_gaussians_are_wider_than_their_means():
+    random = np.random.default_rng(1)
+    points = random.normal(0.0, 0.1, (2000, 1))
+    density = ConditionalParticleDensity(np.full(2000, 1 / 2000), points, ("x",), (False,), (0,), np.full((2000, 1, 1), 4.0))
+    _, arrays = drawn(density)
+    assert arrays["quantiles"][:, 0] == pytest.approx(
+        norm.ppf([0.025, 0.975], points.mean(), np.hypot(2.0, points.std())), rel=2e-3
+    )
 
 
 def test_points_that_coincide_and_a_state_known_exactly_are_columns_too():

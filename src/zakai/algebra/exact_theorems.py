@@ -10,6 +10,7 @@ from zakai.algebra._readable import short
 from zakai.algebra.affine import affine
 from zakai.algebra.conditions import Condition
 from zakai.algebra.gauges import gauge
+from zakai.algebra.poles import finite_drift
 from zakai.algebra.quadratics import decided_q
 from zakai.algebra.systems import definite_covariance, determined
 from zakai.algebra.yau import NoYauForm, affine_drift, affine_h, no_form_text, yau_form
@@ -76,6 +77,7 @@ def hu_yau(model: Model) -> tuple[Condition, ...]:
             words,
             "the nodes of this method",
         ),
+        *finite_drift(model),
         *posterior_on_the_line(model),
     )
 

@@ -24,6 +24,7 @@ from zakai.algebra.feature_conditions import (
     reflecting_ends,
 )
 from zakai.algebra.identities import all_zero
+from zakai.algebra.poles import finite_drift
 from zakai.algebra.quadratics import decided_q
 from zakai.algebra.systems import CLY, affine_observation, definite_covariance, determined
 from zakai.algebra.yau import YauForm, no_form_text, yau_form
@@ -120,7 +121,8 @@ def general_direct(model: Model) -> tuple[Condition, ...]:
         return tuple(conditions)
     source = f"{_SURVEY}, (32) corrected"
     own = inputs_of_increments(model)
-    return (*conditions, *own, *_yau_conditions(model, source, lambda form: _few_directions(model, form)))
+    few = _yau_conditions(model, source, lambda form: _few_directions(model, form))
+    return (*conditions, *own, *few, *finite_drift(model))
 
 
 @once_for_a_model

@@ -61,7 +61,7 @@ def methods(source: str | None, record_path: Path | None = None, inputs_path: Pa
 
 
 def _split(model: Model) -> str:
-    """Return what particles do with states that are linear given the others, after "; "; nothing where there are none."""
+    """Return what particles do with states that are linear given the others, after a semicolon; "" where there are none."""
     from zakai.algebra.conditionally_linear import conditionally_linear
     from zakai.methods.particles.split import split_of
 

@@ -123,8 +123,8 @@ class ConditionalParticleDensity(DensityMethods):
 
     def drawn(self) -> ParticleDensity:
         """Return the particles with one draw of the linear states each, always the same."""
-        drawn = self._with_draws(np.arange(len(self.weights)), generator(0))
-        return ParticleDensity(self.weights, drawn, self.names, self.periodic)
+        points = self._with_draws(np.arange(len(self.weights)), generator(0))
+        return ParticleDensity(self.weights, points, self.names, self.periodic)
 
     def sample(self, key: object, count: int) -> np.ndarray:
         rng, count = generator(key), sample_size(count)

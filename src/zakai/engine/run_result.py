@@ -11,6 +11,7 @@ from zakai.engine.along_path import record_along
 from zakai.engine.loop import Run, joined
 from zakai.engine.results import FilterResult
 from zakai.engine.versions import versions
+from zakai.notes.escape import notes_on_escape
 from zakai.notes.lengths import distances_of_lengths, notes_on_lengths
 from zakai.notes.misfit import notes_on_law
 from zakai.notes.model import notes_on_domain, notes_on_formulas
@@ -56,6 +57,7 @@ def result_of_run(run: Run, why: str, considered: Mapping[str, tuple[Condition, 
     record = record_along(run.record, schedule)
     undefined = notes_on_formulas(noted, theta, record, result.mean, result.variance)
     undefined += notes_on_domain(noted, theta, record, result.mean, result.variance)
+    undefined += notes_on_escape(method.name, noted, schedule, theta, result.mean, result.cov)
     lengths = notes_on_lengths(schedule, distances)
     misfit = notes_on_law(noted, theta, schedule, run.values, infos)
     result.warnings.extend([*undefined, *run.notes, *lengths, *misfit, *run.health_warnings(result)])

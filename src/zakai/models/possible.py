@@ -1,34 +1,41 @@
-"""Whether a sample has a law at the mean of the prior."""
+"""Whether the formulas have values within the prior, and a sample a law at its mean."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import sympy as sp
 
 from zakai.errors import InputError
 from zakai.models.families import FAMILIES
+from zakai.models.numeric import explain_nonfinite, numpy_function
 from zakai.models.prior import DensityPrior
 
 if TYPE_CHECKING:
     from zakai.models.model import Model
 
 ROUNDING = 1e-12  # of the largest variance, below which a negative one is rounding
+REACH = np.linspace(-8.0, 8.0, 33)  # standard deviations of the prior within which a formula must have a value somewhere
 LIKELY = 0.5  # a location that every family has
 
 
 def check_possible(model: Model, t: float, u: Any = None) -> None:
-    """Raise InputError where the law of a sample is impossible at the mean of the prior, as a negative probability is.
+    """Raise InputError where a formula has no value at any state of the prior, or a sample no law at its mean.
 
-    The mean of one component of a mixture at which it is possible is enough. What has no value there, as log(-1), is not
-    checked, and neither is a prior that is given by its density, but for formulas that do not depend on the state.
+    A negative probability is no law. The mean of one component of a mixture at which it is possible is enough. What has no value
+    there, as log(-1), is not checked, and neither is a prior that is given by its density, but for formulas that do not depend on
+    the state.
 
     Args:
         model: the model, with a prior.
         t: a time of observation.
         u: the inputs (number of inputs,) at that time; a model with inputs is not checked without them.
     """
-    if model.observation_kind != "samples" or model.log_density is not None or (model.inputs and u is None):
+    if model.inputs and u is None:
+        return
+    _check_values(model, t, u)
+    if model.observation_kind != "samples" or model.log_density is not None:
         return
     known = not isinstance(model.prior, DensityPrior) and model.prior is not None
     points = model.prior.components[1] if known else np.zeros((1, model.n))  # type: ignore[union-attr]
@@ -36,6 +43,31 @@ def check_possible(model: Model, t: float, u: Any = None) -> None:
         faults = [_fault(model, x, t, u, known) for x in points]
     if all(faults):
         raise InputError(f"{model.source}: {faults[0]}")
+
+
+def _check_values(model: Model, t: float, u: Any) -> None:
+    """Raise InputError where a formula of the state is finite at none of the states within eight deviations of the prior."""
+    if isinstance(model.prior, DensityPrior) or model.prior is None:
+        return
+    _, means, covs = model.prior.components
+    deviations = np.sqrt(np.maximum(np.diagonal(covs, axis1=1, axis2=2), 0.0))
+    points = (means[:, None, None] + REACH[:, None, None] * deviations[:, None, None] * np.eye(model.n)).reshape(-1, model.n)
+    for name, interval in model.domain.items():
+        points = points[interval.contains(points[:, model.state.index(name)])]
+    if not len(points):
+        return
+    for key in ("drift", "diffusion", "observation"):
+        formulas = [formula for formula in getattr(model, key) if _is_partial(formula, model)]
+        with np.errstate(all="ignore"):
+            values = numpy_function(formulas, model)(points, t, model.theta(), u) if formulas else np.zeros((1, 0))
+        if not np.isfinite(values).any(axis=0).all():
+            reason = explain_nonfinite(model, key, getattr(model, key), points[len(points) // 2], t, u)
+            raise InputError(f"{model.source}: {reason}, and no state of the prior has a value; change the formula, or the prior")
+
+
+def _is_partial(formula: Any, model: Model) -> bool:
+    """Return whether a formula of the state may have no value."""
+    return bool(formula.free_symbols & set(model.x)) and formula.has(sp.log, sp.Pow, sp.asin, sp.acos)
 
 
 def _fault(model: Model, x: Any, t: float, u: Any, known: bool) -> str:

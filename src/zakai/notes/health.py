@@ -3,16 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from zakai.engine.results import FilterResult
-
 Array = NDArray[Any]
 Bounds = Mapping[str, tuple[float, str]]
+
+
+class Result(Protocol):
+    """What is checked of a result."""
+
+    @property
+    def times(self) -> Array:
+        """The times (K+1,)."""
+
+    @property
+    def state(self) -> tuple[str, ...]:
+        """The names of the states (n,)."""
+
+    @property
+    def mean(self) -> Array:
+        """The means (K+1, n)."""
+
+    @property
+    def cov(self) -> Array:
+        """The covariances (K+1, n, n)."""
+
+    @property
+    def log_likelihood_increments(self) -> Array:
+        """The evidence of each step (K+1,)."""
+
+    @property
+    def health(self) -> Mapping[str, Array]:
+        """Figures of each step (K+1,)."""
+
+    @property
+    def bounds(self) -> Bounds:
+        """The bounds of figures, with the words of their warnings."""
+
+
 _MORE_OBSERVATIONS = "give more frequent observations"
 _OTHER_METHOD = "take another method that holds"
 _PARTICLES, _COMPARE = "take guided-particles", "compare with guided-particles"
@@ -79,7 +110,7 @@ def warnings_of_step(health: Mapping[str, Any], bounds: Bounds, lost: Mapping[st
 
 
 def warnings_of_run(
-    result: FilterResult, lost: Mapping[str, float] | None = None, distances: Callable[[], Array | None] = lambda: None
+    result: Result, lost: Mapping[str, float] | None = None, distances: Callable[[], Array | None] = lambda: None
 ) -> list[str]:
     """Return a sentence for every bound that a result exceeds, and for values that are not finite.
 
@@ -92,7 +123,7 @@ def warnings_of_run(
     limits: Mapping[str, float] = lost or {}
     said: list[str] = []
     first = _lost_by_figure(result, limits, said)
-    bad = ~np.isfinite(result.log_likelihood_increments)
+    bad: Array = ~np.isfinite(result.log_likelihood_increments)
     if bad.any():
         gone = int(np.argmax(bad))
         if gone <= first:
@@ -103,7 +134,7 @@ def warnings_of_run(
         )
         first = min(first, gone)
     else:
-        without = ~np.isfinite(result.mean).all(axis=1) | ~np.isfinite(result.cov).all(axis=(1, 2))
+        without: Array = np.asarray(~np.isfinite(result.mean).all(axis=1) | ~np.isfinite(result.cov).all(axis=(1, 2)))
         if without.any():
             when = result.times[np.argmax(without)]
             said.append(
@@ -111,7 +142,7 @@ def warnings_of_run(
                 f"nothing there can be trusted; {_OTHER_METHOD}"
             )
     for name, (bound, what) in result.bounds.items():
-        over = result.health[name] > bound if name in result.health else np.zeros(0, bool)
+        over = np.asarray(result.health[name] > bound) if name in result.health else np.zeros(0, bool)
         if name == "tolerance_ratio" and "error_estimate" in result.health:
             over[first:] = False
             said += _of_tolerance(result, over, distances) if over.any() else []
@@ -128,7 +159,7 @@ def warnings_of_run(
     return said
 
 
-def _lost_by_figure(result: FilterResult, limits: Mapping[str, float], said: list[str]) -> int:
+def _lost_by_figure(result: Result, limits: Mapping[str, float], said: list[str]) -> int:
     """Return the first row at which a figure says that the density is lost, K+1 where none does; append its sentence."""
     rows = {name: np.flatnonzero(result.health[name] > limit) for name, limit in limits.items() if name in result.health}
     rows = {name: found for name, found in rows.items() if len(found)}
@@ -146,7 +177,7 @@ def _lost_by_figure(result: FilterResult, limits: Mapping[str, float], said: lis
     return first
 
 
-def _of_tolerance(result: FilterResult, over: Array, distances: Callable[[], Array | None]) -> list[str]:
+def _of_tolerance(result: Result, over: Array, distances: Callable[[], Array | None]) -> list[str]:
     """Return by how much the moments may be off, and from when on, where steps missed the tolerance; nothing if by little.
 
     The estimate of the method is a bound, and so is the distance from a result of a coarser tolerance: the smaller one counts.

@@ -15,6 +15,7 @@ import numpy as np
 
 from zakai.densities import Density
 from zakai.densities._values import wrap
+from zakai.densities.conditional import ConditionalParticleDensity
 from zakai.densities.gaussian import GaussianMixture
 from zakai.densities.grid import GridDensity
 from zakai.densities.points import PointMasses
@@ -102,6 +103,8 @@ def _window(density: Density, rows: int) -> _Column:
     if isinstance(density, PointMasses):
         if not np.ptp(density.points) > 0:
             return _point(float(density.points[0, 0]), rows)
+        density = density.smoothed
+    if isinstance(density, ConditionalParticleDensity):
         density = density.smoothed
     if isinstance(density, GridDensity):
         return _of_grid(density, rows)

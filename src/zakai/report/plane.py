@@ -9,6 +9,7 @@ import numpy as np
 
 from zakai.densities import Density
 from zakai.densities._values import wrap
+from zakai.densities.conditional import ConditionalParticleDensity
 from zakai.densities.grid import GridDensity, interpolation
 from zakai.densities.points import PointMasses
 from zakai.errors import InputError
@@ -22,6 +23,7 @@ SIZE = 81  # points along an axis of the window; odd, so that the mean is one
 PROBABILITIES = (0.5, 0.95)
 _REACH = 5.0  # standard deviations along each axis of the window
 _SCALE = 65535
+_MOST_KERNELS = 1000  # of a mixture that is evaluated at every point
 
 
 def plane_bytes(
@@ -77,6 +79,8 @@ def _window(density: Density, size: int) -> tuple[np.ndarray, np.ndarray, np.nda
     """Return origin (2,), basis (2, 2) and values (size, size): value [j, i] is that at origin + basis (i, j)."""
     if isinstance(density, GridDensity):
         return _of_grid(density, size)
+    if isinstance(density, ConditionalParticleDensity):
+        density = density.thinned(_MOST_KERNELS).smoothed
     mean, cov = density.mean(), density.cov()
     floor = 1e-18 * np.maximum(1.0, mean**2)
     factor = np.linalg.cholesky(cov + np.diag(np.maximum(floor, 1e-12 * np.diag(cov))))

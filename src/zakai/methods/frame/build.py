@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -20,6 +21,7 @@ CLOUD = 1024
 # The error of a mean is 1 to 3 times the relative error of the builds, with the control points that happened to be drawn
 # (bearings, turns, re-entry; rms over times and coordinates): the builds have half of the tolerance.
 SHARE, CORES = 0.5, 0.25
+USUAL, LEAST_FORGOTTEN = 0.6, 0.1  # sqrt(1 - share^2) of a radar track, for which the share above was chosen; the least
 EDGE = 0.3  # share of the tolerance that may be near an end of an axis
 ROUGH = 4.0  # tolerances of error off the grid, above which the grid is made finer
 WIDER = 0.25  # share of a box that is added at both ends of an axis with mass there
@@ -42,26 +44,34 @@ class Report(NamedTuple):
 class Builder:
     """Builds densities for one step, and keeps the reports of all builds.
 
-    The errors of the builds of an interval add up: each has a `share` of its tolerance.
+    The errors of the builds of an interval add up: each has a `share` of its tolerance.  So do those of the intervals of which
+    the data leaves the share `remembered` each.
     """
 
     prepared: Prepared
     reports: list[Report] = field(default_factory=list)
     share: float = 1.0
+    remembered: float = 0.0
 
     def for_substeps(self, count: int) -> None:
         """Set the share for an interval of so many substeps, of which one has two builds."""
         self.share = 2.0 / (count + 1)
 
     @property
+    def _tolerance(self) -> float:
+        """The error of a build: errors of the intervals that are remembered add up as their squares do."""
+        forgotten = math.sqrt(max(1.0 - self.remembered**2, LEAST_FORGOTTEN**2))
+        return SHARE * self.share * min(1.0, forgotten / USUAL) * self.prepared.tolerance
+
+    @property
     def rule(self) -> Rule:
         """The accuracy of a build."""
-        return Rule.of(self.share * self.prepared.tolerance * SHARE)
+        return Rule.of(self._tolerance)
 
     @property
     def options(self) -> Options:
         """The accuracy of a cross interpolation: the errors of the cores add up."""
-        return Options(CORES * self.share * self.prepared.tolerance * SHARE, self.prepared.most_rank)
+        return Options(CORES * self._tolerance, self.prepared.most_rank)
 
     def build(
         self, function: Callable[[Array], Array], mass: Mass, noise: Array | None = None, stretch: float = 1.0, loose: float = 1.0
@@ -101,7 +111,8 @@ class Builder:
     def _crossed(
         self, placed: Placed, function: Callable[[Array], Array], control: Mass, options: Options
     ) -> tuple[Train, Report]:
-        built = cross(placed.grid, function, control.points, options, self.prepared.system.periods)
+        expected = max(function.terms[0].density.ranks) if isinstance(function, Carried) else 1
+        built = cross(placed.grid, function, control.points, options, self.prepared.system.periods, expected)
         self._edges = built.train.edges()
         error = difference(built.train.evaluate, function, control)
         rank = max(built.train.ranks)

@@ -112,7 +112,9 @@ class Chain:
             defect = abs(v.mass - 1.0)
             if best is None or prepared.system.weighted or defect < best[0]:
                 best = defect, v, D
-            if prepared.system.weighted or defect < DEFECT * self.builder.rule.tolerance:
+            tolerance = self.builder.rule.tolerance
+            # What the cross interpolation misses is not outside of the box.
+            if prepared.system.weighted or defect < DEFECT * tolerance or self.builder.reports[-1].on_grid > tolerance:
                 break
         assert best is not None
         _, v, D = best

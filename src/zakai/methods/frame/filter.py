@@ -9,16 +9,16 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from zakai.densities._values import wrap
+from zakai.densities._density import wrap
 from zakai.methods._protocol import Info
 from zakai.methods.frame.build import CONTROLS, Builder, difference
 from zakai.methods.frame.chain import MOST_SUBSTEPS, Chain, Prediction, extrapolated
 from zakai.methods.frame.placement import Mass
-from zakai.methods.frame.state import Control, Prepared, State, Unresolved
+from zakai.methods.frame.state import Control, Prepared, State, Substeps, Unresolved
 from zakai.methods.frame.update import depth_of, update
 from zakai.methods.particles.programs import Array
 from zakai.methods.system.escape_of_states import check_escape
@@ -29,11 +29,11 @@ PRIOR_POINTS = 1024
 AUDIT = 10  # intervals between comparisons of s and 2 s substeps, where the last one was within bounds
 # The difference of s and 2 s substeps in L1 is the error of s substeps times 3 / 4: with this share of the tolerance s are taken.
 # What is extrapolated from both has a third to a twentieth of it.
-TIME_SHARE, ACCEPTED = 1.0, 10.0
-RATIO = 5.0  # tolerances that the estimate of an interval may reach
+TIME_SHARE, GAIN, ACCEPTED, SAFETY = 1.0, 4.0, 8.0, 0.7
+WITHIN = 3.0  # tolerances that the error of a mean may reach
 FIGURES = (
-    "tolerance_ratio", "rank", "mass_defect", "off_grid_error", "edge_mass", "tail_depth", "powers", "substeps", "time_error",
-    "effective_share",
+    "error_estimate", "tolerance_ratio", "rank", "mass_defect", "off_grid_error", "edge_mass", "tail_depth", "powers",
+    "substeps", "time_error", "effective_share",
 )  # fmt: skip
 
 
@@ -51,7 +51,7 @@ def init(prepared: Prepared, prior: Any) -> State:
     v, _ = builder.build(function, mass)
     assert model.n == len(mass.points) and len(theta) == len(prepared.theta)
     report = builder.reports[-1]
-    control = Control(0, 0.0, -AUDIT, report.off_grid, 0.0)
+    control = Control(0, Substeps(0.0, -AUDIT, False, 0.0), 0.5 * report.off_grid, 0.0)
     return State.of(v.scaled(1.0 / v.mass), control)
 
 
@@ -135,28 +135,29 @@ def step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State
 
 def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[State, Info]:
     interval, control = prepared.interval(k), state.control
-    builder = Builder(prepared)
+    builder = Builder(prepared, remembered=control.kept)
     chain = Chain(prepared, interval, values, builder)
     length = interval.stop - interval.start
     number = control.interval + 1
-    count = min(max(1, math.ceil(length * control.rate - 1e-9)), MOST_SUBSTEPS)
+    count = min(max(1, math.ceil(length * control.time.rate - 1e-9)), MOST_SUBSTEPS)
     u = state.train(prepared.system.periods)
     prediction, count = chain.first(u, count)
-    audited, time_error, rate = control.audited, control.time_error, control.rate
+    time = control.time
     exact = prepared.system.base.affine and prepared.system.base.sampled and not prepared.system.base.driven
-    if length > 0 and not exact and number - audited >= AUDIT:
-        prediction, found = _audited(chain, u, prediction, count)
-        time_error, count, rate = found.error, found.substeps, found.wanted / length
-        audited = number if found.wanted <= found.substeps // 2 else audited
+    if length > 0 and not exact and (time.both or number - time.audited >= AUDIT):
+        prediction, count, time = _audited(chain, u, prediction, count, number)
     updated = update(builder, prediction, prepared.motion.likelihood(interval, values))
     v, rule = updated.density, builder.rule
     mean, cov = v.moments(direction_of(prepared, v))
     depth = depth_of(prediction.function, prediction.mass, v)
     reports = builder.reports
     off_grid, edge = sum(report.off_grid for report in reports), max(report.edge for report in reports)
-    error = off_grid + prediction.defect + edge
+    # Errors of different builds have different signs; the error of a mean is about half of the error in L1 at most.
+    kept = _kept(prediction, prepared, cov)
+    error = math.hypot(kept * control.error, 0.5 * (off_grid + prediction.defect + edge + time.error))
     health = {
-        "tolerance_ratio": error / (RATIO * prepared.tolerance),
+        "error_estimate": error,
+        "tolerance_ratio": error / (WITHIN * prepared.tolerance),
         "rank": float(max(report.rank for report in reports)),
         "mass_defect": prediction.defect,
         "off_grid_error": off_grid,
@@ -164,31 +165,38 @@ def _step(prepared: Prepared, k: int, state: State, values: Array) -> tuple[Stat
         "tail_depth": depth / math.log(1.0 / rule.tolerance),
         "powers": float(updated.powers),
         "substeps": float(count),
-        "time_error": time_error,
+        "time_error": time.error,
         "effective_share": updated.effective,
     }
-    moved = control._replace(interval=number, rate=rate, audited=audited, error=error, time_error=time_error)
+    moved = Control(number, time, error, 0.8 * control.kept + 0.2 * kept if number > 1 else kept)
     return State.of(v, moved), Info(updated.log_evidence, mean, cov, health)
 
 
-class Audit(NamedTuple):
-    """A comparison of s and 2 s substeps: their difference in L1, 2 s, and the number that the tolerance asks for."""
+def _kept(prediction: Prediction, prepared: Prepared, cov: Array) -> float:
+    """Return the share of an earlier error that an observation leaves: the ratio of the deviations, as a geometric mean."""
+    _, P = prediction.mass.unwrapped(prepared.system.base.angles).moments()
+    before, after = np.linalg.slogdet(P), np.linalg.slogdet(cov)
+    if before[0] <= 0 or after[0] <= 0:
+        return 1.0
+    return float(min(1.0, math.exp(0.5 * (after[1] - before[1]) / len(cov))))
 
-    error: float
-    substeps: int
-    wanted: int
 
-
-def _audited(chain: Chain, u: Train, coarser: Prediction, count: int) -> tuple[Prediction, Audit]:
-    """Return the prediction extrapolated from s and 2 s substeps, and how they differ."""
-    allowed = TIME_SHARE * chain.prepared.tolerance
+def _audited(chain: Chain, u: Train, coarser: Prediction, count: int, number: int) -> tuple[Prediction, int, Substeps]:
+    """Return the prediction extrapolated from s and 2 s substeps, 2 s, and what their difference says of the next intervals."""
+    allowed, length = TIME_SHARE * chain.prepared.tolerance, chain.interval.stop - chain.interval.start
     while True:
         finer, more = chain.first(u, 2 * count)
         control = finer.mass.control(CONTROLS)
         error = difference(coarser.function.scaled(coarser.log_scale - finer.log_scale), finer.function, control)
-        wanted = math.ceil(max(0.5, math.sqrt(error / (0.7 * allowed))) * 0.5 * more - 1e-9)
+        # What the builds of both differ by is not an error of time.
+        error = max(error - sum(report.off_grid for report in chain.builder.reports), 0.3 * error)
         if error < ACCEPTED * allowed or 2 * more > MOST_SUBSTEPS:
-            both = extrapolated(finer, coarser)
-            found = Audit(error, more, min(wanted, MOST_SUBSTEPS))
-            return Prediction(both, finer.mass, finer.log_mass, finer.defect), found
+            break
         coarser, count = finer, more
+    # s substeps have an error of second order, what is extrapolated one of fourth; three times as many are needed for it.
+    plain = 0.5 * more * max(0.5, math.sqrt(error / (SAFETY * allowed)))
+    both = 0.5 * more * max(0.5, (error / (GAIN * SAFETY * allowed)) ** 0.25)
+    extrapolate = plain > 3.0 * both
+    found = Substeps((both if extrapolate else plain) / length, number, extrapolate, error / GAIN)
+    extra = extrapolated(finer, coarser)
+    return Prediction(extra, finer.mass, finer.log_mass, finer.defect), more, found

@@ -21,18 +21,29 @@ class Unresolved(ArithmeticError):
     """A density that no grid holds: the substep is too long, or the density was lost."""
 
 
+class Substeps(NamedTuple):
+    """How an interval is divided: substeps per unit time, and whether s and 2 s are extrapolated in every interval.
+
+    `audited` is the interval of the last comparison of s and 2 s, and `error` the error in L1 that it left.
+    """
+
+    rate: float
+    audited: int
+    both: bool
+    error: float
+
+
 class Control(NamedTuple):
     """What decides the next step beside the density.
 
-    `interval` counts intervals, `rate` is the number of substeps per unit time, `audited` the interval of the last comparison of
-    substeps; `error` is the estimate of the error of the mean in standard deviations, `time_error` that of the last comparison.
+    The number of intervals, the substeps, the estimate of the error of the mean in standard deviations, and the share of an error
+    that an observation leaves, a mean over the last ones.
     """
 
     interval: int
-    rate: float
-    audited: int
+    time: Substeps
     error: float
-    time_error: float
+    kept: float
 
 
 class State(NamedTuple):

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from zakai.methods.line.coefficients import covariance_at, resolved_parts
+from zakai.methods.line.domain import ends_of_leak
 from zakai.methods.line.gauged import by_fixed_grids, by_moving_grid
 from zakai.methods.line.kernel import kernel_of
 from zakai.methods.line.message import FEWEST, Message, covering, gauged, points_of, reliable, taper
 from zakai.methods.line.prepared import Prepared, State, TimeInterval
 from zakai.methods.line.transition import MOST_SUBSTEPS, Report, Substep, parts_of_split, travel, trial_substep
-from zakai.methods.line.volumes import cell_plan_of, ends_of, pulled_back
+from zakai.methods.line.volumes import WIDENINGS, cell_plan_of, ends_of, pulled_back
 from zakai.numerics.line import window as lw
 from zakai.numerics.line.backward import EXCURSION
 from zakai.numerics.line.density import support
@@ -99,9 +100,7 @@ def smoothing_tolerance(prepared: Prepared) -> float:
     return max(prepared.tolerance, 1e-6)
 
 
-def pulled(
-    prepared: Prepared, interval: TimeInterval, state: State, later: Message
-) -> tuple[Message, float]:
+def pulled(prepared: Prepared, interval: TimeInterval, state: State, later: Message) -> tuple[Message, float]:
     """Return the message at the start of an interval, and the error that the interval adds.
 
     Args:
@@ -120,6 +119,11 @@ def pulled(
         dense = by_exponentials(prepared, interval, state, later, accepted)
         if dense is not None:
             return dense
+    leak = ends_of_leak(prepared, own, np.array(ends), interval.start, interval.length)
+    if leak is not None:  # a grid loses mass at a natural end, in both directions of time
+        result = _by_volumes(prepared, interval, state, ends, later, leak)
+        if result[1] <= smoothing_tolerance(prepared):
+            return result
     arguments, dense = (prepared, interval, state, later, accepted), None
     if travel(prepared, np.asarray(state.values), own, interval.start, interval.length) > 0.0:
         dense = by_moving_grid(*arguments)
@@ -228,12 +232,15 @@ def _exact(prepared: Prepared, state: State, psi: Array, gauge: Array, window: l
 
 
 def _by_volumes(
-    prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], later: Message
+    prepared: Prepared, interval: TimeInterval, state: State, ends: tuple[float, float], later: Message, leak: Array | None = None
 ) -> tuple[Message, float]:
-    """Return the same by finite volumes, of infinite error where they do not serve."""
+    """Return the same by finite volumes, of infinite error where they do not serve; with a leak they reach its ends."""
     values, window = np.asarray(state.values).real, state.window
     mean, variance = later.moments
-    plan = cell_plan_of(prepared, values, window, ends_of(values, window), interval, (mean, variance**0.5))
+    widening = np.inf if leak is None else WIDENINGS[-1] * (ends[1] - ends[0])
+    plan = cell_plan_of(prepared, values, window, ends_of(values, window), interval, (mean, variance**0.5), widening)
+    if plan is not None and leak is not None:
+        plan = plan._replace(cells=plan.cells.reaching(*leak))
 
     def density(offsets: Array) -> Array:
         return lw.density_at(values, window, offsets)

@@ -80,10 +80,10 @@ def drawn(prepared: Prepared, state: State) -> State:
     normals(prepared.key(state.control.interval, _DRAWS), 0, count, noise)
     P = covariances(system.block, state.particles[n:])
     values, vectors = np.linalg.eigh(P)
-    particles = np.ascontiguousarray(state.particles[:n])
+    particles = state.particles[:n].copy()
     particles[list(system.block.linear)] += np.einsum("pij,pj,jp->ip", vectors, np.sqrt(np.maximum(values, 0.0)), noise)
-    bare = particle_filter.reduced(state)
-    return bare._replace(particles=particles, shift=state.shift[:n], last_shift=state.last_shift[:n])
+    reduced = particle_filter.reduced(state)
+    return reduced._replace(particles=particles, shift=state.shift[:n], last_shift=state.last_shift[:n])
 
 
 def density(prepared: Prepared, state: State) -> ParticleDensity | ConditionalParticleDensity:

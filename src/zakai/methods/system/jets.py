@@ -10,6 +10,7 @@ makes one more degree correct.  No difference quotient or symbolic derivative is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,7 @@ import sympy
 
 from zakai.errors import ConditionError, InputError
 from zakai.models._program import Program
+from zakai.models.functions import log_gamma, sinc
 from zakai.models.model import Model
 from zakai.models.numeric import COMPLEX, REAL, program_of
 from zakai.numerics.series.power_series import cauchy, derivative, integral
@@ -160,7 +162,36 @@ def _rule(name: str) -> Callable[[Any], Any]:
     return lambda u: _RULES[name](u) if isinstance(u, Jet) else _plain(name, u)
 
 
-_OPERATIONS = REAL | {name: _rule(name) for name in _RULES} | {"power": _power, "general_power": _power}
+def _composed(function: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:
+    """Return the rule of a function whose derivative of order k is `function(u, k)`: its Taylor polynomial about u(0)."""
+
+    def rule(u: Any, order: int) -> Any:
+        if not isinstance(u, Jet):
+            return function(u, order)
+        rest, degree = u - u.first, len(u.coefficients) - 1
+        w = u.constant(0.0)
+        for k in range(degree, -1, -1):
+            w = w * rest + function(u.first, order + k) / math.factorial(k)
+        return w
+
+    return rule
+
+
+def _refused(name: str) -> Callable[..., Any]:
+    """Return the rule of a function whose series is not known here."""
+
+    def rule(*operands: Any) -> Any:
+        if any(isinstance(operand, Jet) for operand in operands):
+            raise ConditionError(f'the power series of {name} is not known; use kernel="flow", or the method yau-yau')
+        return REAL[name](*operands)
+
+    return rule
+
+
+_ARITHMETIC = {"add", "multiply", "divide", "power", "general_power"}
+_OPERATIONS = {name: function if name in _ARITHMETIC else _refused(name) for name, function in REAL.items()}
+_OPERATIONS |= {name: _rule(name) for name in _RULES} | {"power": _power, "general_power": _power}
+_OPERATIONS |= {"lgamma": _composed(log_gamma), "sinc": _composed(sinc)}
 
 
 class _Variable:

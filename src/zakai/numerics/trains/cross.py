@@ -22,10 +22,10 @@ from zakai.numerics.trains.kernels import fibre_points, skeleton
 from zakai.numerics.trains.train import Train
 
 Array = Any
-SEEDS = 2  # points of the mass in the sets of the first sweep, beyond two
+SEEDS, FEWEST_SEEDS = 2, 6  # points of the mass in the sets of the first sweep beyond the rank that is expected, and at least
 KEPT_GAIN = 0.7  # ratio of the errors of two sweeps above which another one gains too little
 MOST_SWEEPS = 6
-WORST = 3  # control points with the largest errors that join the sets
+WORST = 8  # control points with the largest errors that join the sets: the rank can grow by so many in a sweep
 
 
 Function = Callable[[Array], Array]  # the values (P,) at points x (n, P)
@@ -108,7 +108,7 @@ class _Cross:
         return [self.fibres(0), *cores[::-1]]
 
 
-def cross(grid: Grid, function: Function, control: Array, options: Options, periods: Array) -> Built:
+def cross(grid: Grid, function: Function, control: Array, options: Options, periods: Array, expected: int = 1) -> Built:
     """Return a function on a grid as a train.
 
     Args:
@@ -117,11 +117,12 @@ def cross(grid: Grid, function: Function, control: Array, options: Options, peri
         control: points (n, P) of its mass; the values at the nearest points of the grid decide how many sweeps are made.
         options: the accuracy.
         periods: (n,), 2 pi for angles and 0 for other states.
+        expected: the rank that is expected.
     """
     n, index = grid.n, grid.index_of(control)
     values = function(grid.x_of(grid.low[:, None] + grid.step[:, None] * index.T))
     order = np.argsort(-np.abs(values), kind="stable")
-    seeds = index[order[np.linspace(0, len(order) // 2, 2 * SEEDS + 2).astype(int)]]
+    seeds = index[order[np.linspace(0, len(order) // 2, max(FEWEST_SEEDS, min(expected + SEEDS, options.most_rank))).astype(int)]]
     left = [np.zeros((1, 0), np.int64)] * (n + 1)
     right = [*(seeds[:, k:] for k in range(n)), np.zeros((1, 0), np.int64)]
     work = _Cross(grid, function, options, left, right, len(index))

@@ -98,7 +98,8 @@ export class DensityView extends Panel {
         // Lines of more points than pixels would hide the density.
         const crowd = (values.length / place.w) * Math.min(1, (this.view.x[1] - this.view.x[0]) / (frame.header.window[1] - frame.header.window[0] || 1));
         context.globalAlpha = dots ? 1 : Math.min(1, Math.max(line.role === "band" ? 0.35 : 0.7, 0.8 / crowd));
-        drawSeries(context, this, frame.arrays[line.times], values, { ...style, dots, size: values.length > 500 ? 1.4 : 2 });
+        const dash = crowd > 0.5 ? [] : style.dash; // dashes of a crowded line are not seen, and slow
+        drawSeries(context, this, frame.arrays[line.times], values, { ...style, dash, dots, size: values.length > 500 ? 1.4 : 2 });
       }
       context.restore();
     }
