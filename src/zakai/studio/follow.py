@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
 import threading
 from collections.abc import AsyncIterator
@@ -57,7 +58,8 @@ class Source:
 
 def _read(blocks: asyncio.Queue[bytes], loop: asyncio.AbstractEventLoop) -> None:
     while True:
-        block = sys.stdin.buffer.read1(AT_ONCE)  # type: ignore[union-attr]
+        # Python's own reader would be locked by this thread when the interpreter ends.
+        block = os.read(sys.stdin.fileno(), AT_ONCE)
         try:
             asyncio.run_coroutine_threadsafe(blocks.put(block), loop).result()
         except RuntimeError:  # the server has ended

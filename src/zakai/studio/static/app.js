@@ -167,7 +167,6 @@ class Studio {
     this.busy(true, "Filtering …");
     const found = await this.ask("run", { ...this.request, name: "main" }, { progress: (done, total) => this.progressed(done, total) });
     this.busy(false);
-    if (this.again) { this.again = false; if (found) { await this.run(); return; } }
     if (!found) return;
     this.summary = found;
     this.remember();
@@ -184,13 +183,15 @@ class Studio {
     document.body.classList.toggle("busy", on);
     this.progressed(0, null);
     if (on) this.say(said);
+    if (!on && this.again) { this.again = false; setTimeout(() => this.run()); } // what was wanted meanwhile
     clearTimeout(this.patience);
-    if (on) this.patience = setTimeout(() => this.running && this.say(`${said} The first run on a machine compiles kernels, which takes up to a minute.`), 6000);
+    if (on) this.patience = setTimeout(() => this.running && !this.reported && this.say(`${said} The first run on a machine compiles kernels, which takes up to a minute.`), 6000);
   }
 
   progressed(done, total) {
     const bar = byId("progress");
     bar.classList.toggle("open", !total);
+    this.reported = Boolean(total);
     if (total) {
       const share = Math.round((100 * done) / total);
       bar.setAttribute("aria-valuenow", share);
